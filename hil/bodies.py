@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from hil.config import LabConfig
+from hil.crazyflie.failures import MOTOR_FAILURES
 from hil.crazyflie.quadrotor import Quadrotor
 from hil.errors import LabError, blame, hint
 from hil.floaty.failures import SERVO_FAILURES
@@ -37,7 +38,10 @@ def crazyflie(config: LabConfig, rng: np.random.Generator, p_WB: Vector) -> Body
 
 
 BODIES: dict[str, Make] = {"floaty": floaty, "crazyflie": crazyflie}
-FAILURES: dict[str, Mapping[str, Failure]] = {"floaty": SERVO_FAILURES}  # kinds of faults by body
+FAILURES: dict[str, Mapping[str, Failure]] = {  # kinds of faults by body
+    "floaty": SERVO_FAILURES,
+    "crazyflie": MOTOR_FAILURES,
+}
 MEASURED: Mapping[str, tuple[float, float]] = (
     PAPER_TABLE  # `plant.constant_factors`: values and their uncertainty
 )

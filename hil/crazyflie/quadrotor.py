@@ -57,7 +57,9 @@ RPM = DUTY + 4  # (4,) of the propellers
 SPIN_UP = RPM + 4  # (4,) [rpm/s]
 SUPPLY = SPIN_UP + 4  # [V] at the motors' drivers
 STRENGTH = SUPPLY + 1  # (4,) thrust and torque over the nominal
-THRUST = STRENGTH + 4  # (4,) [N]
+CURRENT = STRENGTH + 4  # (4,) 0: the motor's wire is broken
+OBEYS = CURRENT + 4  # (4,) 0: the duty stays
+THRUST = OBEYS + 4  # (4,) [N]
 LAG = THRUST + 4  # [s]
 ARM_XY = LAG + 1  # [m]
 MOTOR_POWER = ARM_XY + 1  # [W/N]
@@ -143,7 +145,7 @@ def steady_rpm(volts: float) -> float:
 def spin(s: State, duration: float) -> None:
     """Bring the propellers towards the speeds of their voltages, for `duration` [s]."""
     for i in range(4):
-        wanted = steady_rpm(s[DUTY + i] * s[SUPPLY])
+        wanted = steady_rpm(s[DUTY + i] * s[SUPPLY] * s[CURRENT + i])
         n = s[RPM + i]
         s[RPM + i] = wanted + (n - wanted) * exp(-duration / s[LAG])
         s[SPIN_UP + i] = (s[RPM + i] - n) / duration
@@ -257,7 +259,6 @@ class Quadrotor(InTunnel):
     """
 
     outputs: Sequence[tuple[int, int]] = OUTPUTS
-    settings: Mapping[str, Setting] = {}
 
     def __init__(
         self,
@@ -283,6 +284,7 @@ class Quadrotor(InTunnel):
         s[at.FRICTION] = config.floor_friction
         s[at.LIMIT_RADIUS], s[at.LIMIT_ABOVE], s[IMPACT_MAX] = config.room, config.ceiling, config.impact
         s[at.LIMIT_COS_TILT] = cos(config.tilt)
+        s[CURRENT : CURRENT + 4] = s[OBEYS : OBEYS + 4] = 1.0
         s[STRENGTH : STRENGTH + 4] = 1.0 + config.motor_spread * normal(rng, 4)
         self._config = config
         self._evaluate, self._advance = bound(evaluate, s), bound(advance, s, self._draws, self._now_us)
@@ -291,6 +293,11 @@ class Quadrotor(InTunnel):
         self.rpm, self.thrust = self._view(RPM, 4), self._view(THRUST, 4)
         self._electronics = self._power = battery.electronics_power
         self._drawn_us, self._drawn_J = 0, 0.0
+        self.settings: Mapping[str, Setting] = {
+            f"motor.{name}.{i + 1}": self._setting(place + i)
+            for name, place in (("strength", STRENGTH), ("current", CURRENT), ("obeys", OBEYS))
+            for i in range(4)
+        }
         sunk = config.mass * GRAVITY / (4.0 * config.floor_stiffness)
         self.place((0.0, 0.0, config.foot_below - sunk) if p_WB is None else p_WB, UPRIGHT)
 
@@ -298,7 +305,11 @@ class Quadrotor(InTunnel):
         """Take the compare counts of M1 to M4; a PWM period of 3 us is no delay."""
         self.advance(now_us)
         for i, count in enumerate(counts):
-            self._s[DUTY + i] = min(max(count, 0), PWM_STEPS) / PWM_STEPS
+            if self._s[OBEYS + i] != 0.0:
+                self._s[DUTY + i] = min(max(count, 0), PWM_STEPS) / PWM_STEPS
+
+    def _setting(self, place: int) -> Setting:
+        return Setting(lambda: float(self._s[place]), lambda value: self._s.__setitem__(place, value))
 
     def draw(self, now_us: int, cell_V: float) -> float:
         """Return the mean power [W] of electronics and motors since the last call; the motors run on `cell_V` [V]."""

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Literal
 
 from hil.arguments import checked, fits, shown
 from hil.bodies import FAILURES
+from hil.config import DEFAULT_PROFILE
 from hil.errors import LabError, blame, hint
 from hil.world.body import Failure
 
@@ -50,7 +51,8 @@ class Knob:
 class Kind:
     """A kind of fault. `low` and `high` bound its size; where they are the same, the size is fixed.
 
-    `outcome` is that of the hover with the default profile, for the default size and duration, 6 s after it begins:
+    `outcome` is that of the hover with the default profile, for the default size and duration, 6 s after it begins; of a
+    robot that ships besides Floaty, with its profile:
 
         holds     all limits of the hover hold
         degrades  a limit fails, the robot flies on
@@ -70,7 +72,7 @@ class Kind:
     duration_s: float = math.inf  # default; inf: to the end of the flight
     link: Literal["", "radio", "mavlink"] = ""  # the only one on which it acts
     markers: bool = False  # acts on markers: only with `markers.enabled`
-    body: str = ""  # the only one that has the part that fails
+    body: str = ""  # the only one that has the part that fails, also the name of its profile
 
     @property
     def sized(self) -> bool:
@@ -80,6 +82,8 @@ class Kind:
     @property
     def needs(self) -> str:
         """The requirements on the flight, as options of `floaty fly`; empty: none."""
+        if self.body not in ("", DEFAULT_PROFILE):
+            return f"--profile {self.body}"
         return f"--link {self.link}" if self.link else f"--set {MARKERS_ON}" if self.markers else ""
 
     def acts_on(self, body: str) -> bool:

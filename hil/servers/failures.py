@@ -1,10 +1,12 @@
 """MAVLink's artificial failures as faults: the kinds of faults for each unit and failure, and the answers.
 
 A failure lasts until its unit is set to OK, and replaces the one before, so that a repeated command
-acts once. Instance 0 stands for all of a unit; flaps are 1 to 4, every other unit has one instance.
+acts once. Instance 0 stands for all of a unit; the actuators of a body are counted from 1, every other unit has one
+instance.
 """
 
 import math
+from fnmatch import fnmatchcase
 from functools import partial
 
 from firmware_py.wire.mavlink_numbers import Failing, Result, Unit
@@ -12,12 +14,11 @@ from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Fault, Switchboard, why_not
 from hil.laboratory.robot import Robot
 
-FLAPS = 4
 ANSWER_US = 100_000  # a line is cut after the answer has passed, and ...
 DEAF_S = 3.0  # ... ends by itself: no command could set it to OK
 CUT = "serial.cut"
 
-# The kinds of faults for each way of failing; {} stands for the number of the flap.
+# The kinds of faults for each way of failing; * stands for the actuators of the robot's body, {} for the number of one.
 KindsByFailing = dict[Failing, tuple[str, ...]]
 # The IMU is one part: its gyro does not fail alone.
 _IMU: KindsByFailing = {
@@ -25,10 +26,11 @@ _IMU: KindsByFailing = {
     Failing.STUCK: ("imu.freeze",),
     Failing.GARBAGE: ("imu.noise",),
 }
-_FLAP: KindsByFailing = {
-    Failing.STUCK: ("servo.stuck.{}",),
-    Failing.WRONG: ("servo.trim.{}",),
-    Failing.SLOW: ("servo.slow.{}",),
+_ACTUATOR: KindsByFailing = {
+    Failing.OFF: ("*.stop.{}",),
+    Failing.STUCK: ("*.stuck.{}",),
+    Failing.WRONG: ("*.trim.{}",),
+    Failing.SLOW: ("*.slow.{}",),
 }
 TABLE: dict[Unit, KindsByFailing] = {
     Unit.GYRO: {**_IMU, Failing.WRONG: ("imu.bias.p", "imu.bias.q", "imu.bias.r")},
@@ -41,8 +43,8 @@ TABLE: dict[Unit, KindsByFailing] = {
         Failing.INTERMITTENT: ("mocap.dropout",),
     },
     Unit.BATTERY: {Failing.OFF: ("battery.sag",)},
-    Unit.MOTOR: _FLAP,  # a Floaty has no other motors than its servos
-    Unit.SERVO: _FLAP,
+    Unit.MOTOR: _ACTUATOR,  # a Floaty has no other motors than its servos
+    Unit.SERVO: _ACTUATOR,
     Unit.SIGNAL: {Failing.OFF: (CUT,), Failing.GARBAGE: ("serial.bit_errors",)},
 }
 SIZES = {(Unit.POSES, Failing.INTERMITTENT): 0.5}  # every other frame
@@ -60,18 +62,24 @@ class Failures:
         if unit not in TABLE or failing not in (Failing.OK, *TABLE[Unit(unit)]):
             return Result.UNSUPPORTED
         kinds = TABLE[Unit(unit)]
-        count = FLAPS if kinds is _FLAP else 1
+        count = len(self._robot.body.outputs) if kinds is _ACTUATOR else 1
         if not 0 <= instance <= count:
             return Result.DENIED
         instances = (instance,) if instance else tuple(range(1, count + 1))
         size = SIZES.get((Unit(unit), Failing(failing)))
-        begin = [_fault(name, size) for name in _names(kinds.get(Failing(failing), ()), instances)]
-        if any(why_not(KINDS[fault.kind], self._robot) for fault in begin):
+        begin = [_fault(name, size) for name in self._names(kinds.get(Failing(failing), ()), instances)]
+        none = failing != Failing.OK and not begin
+        if none or any(why_not(KINDS[fault.kind], self._robot) for fault in begin):
             return Result.UNSUPPORTED
-        end = {name for names in kinds.values() for name in _names(names, instances)}
+        end = {name for names in kinds.values() for name in self._names(names, instances)}
         delay_us = ANSWER_US if any(fault.kind == CUT for fault in begin) else 0
         self._robot.events.at(now_us + delay_us, partial(self._switch, end, begin))
         return Result.ACCEPTED
+
+    def _names(self, patterns: tuple[str, ...], instances: tuple[int, ...]) -> list[str]:
+        own = [name for name, kind in KINDS.items() if kind.body in ("", self._robot.config.robot.body)]
+        wanted = [pattern.format(instance) for pattern in patterns for instance in instances]
+        return sorted({name for name in own for pattern in wanted if fnmatchcase(name, pattern)})
 
     def _switch(self, end: set[str], begin: list[Fault], now_us: int) -> None:
         """End the faults of these kinds and begin others."""
@@ -80,10 +88,6 @@ class Failures:
                 self._switchboard.end(fault, now_us)
         for fault in begin:
             self._switchboard.act(fault, now_us)
-
-
-def _names(names: tuple[str, ...], instances: tuple[int, ...]) -> list[str]:
-    return sorted({name.format(instance) for name in names for instance in instances})
 
 
 def _fault(name: str, size: float | None) -> Fault:

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from hil.crazyflie.failures import MOTOR_FAILURES
 from hil.crazyflie.quadrotor import PWM_STEPS, Quadrotor, QuadrotorConfig, steady_rpm
 from hil.errors import LabError
+from hil.laboratory.fault_kinds import KINDS
 from hil.world.config import BatteryConfig, TunnelConfig
 
 G = 9.81
@@ -248,6 +250,49 @@ def test_a_plain_law_through_the_mixer_takes_off_holds_and_stays_level() -> None
     assert body.p_WB[2] == pytest.approx(1.0, abs=0.05)
     assert abs(body.q_WB[0]) == pytest.approx(1.0, abs=1e-3)
     assert np.abs(body.omega_B).max() < 0.2
+
+
+def test_a_weak_propeller_gives_its_share_and_no_other_changes() -> None:
+    body = spun_up((0.6,) * 4)
+    before = body.thrust.copy()
+    body.settings["motor.strength.2"].turn(0.8 * body.settings["motor.strength.2"].read())
+    body.advance(1_001_000)
+    assert body.thrust / before == pytest.approx([1.0, 0.8, 1.0, 1.0], rel=1e-6)
+
+
+def test_a_motor_without_current_runs_out_and_comes_back() -> None:
+    body = spun_up((0.6,) * 4)
+    body.hold()
+    before = body.rpm[2]
+    body.settings["motor.current.3"].turn(0.0)
+    body.advance(1_000_000 + 647_000)
+    assert body.rpm[2] == pytest.approx(before * math.exp(-10), rel=1e-6)
+    assert body.rpm[1] == pytest.approx(before, rel=1e-6)
+    body.settings["motor.current.3"].turn(1.0)
+    body.advance(3_000_000)
+    assert body.rpm[2] == pytest.approx(before, rel=1e-6)
+
+
+def test_a_stuck_motor_stays_at_its_command_until_it_obeys_again() -> None:
+    body = spun_up((0.6,) * 4)
+    body.hold()
+    before = body.rpm[3]
+    body.settings["motor.obeys.4"].turn(0.0)
+    body.set_counts(1_000_000, (0, 0, 0, 0))
+    body.advance(2_000_000)
+    assert body.rpm[3] == pytest.approx(before, rel=1e-6)
+    assert body.rpm[:3] == pytest.approx([0.0] * 3, abs=1.0)
+    body.settings["motor.obeys.4"].turn(1.0)
+    body.set_counts(2_000_000, (0, 0, 0, 0))
+    body.advance(3_000_000)
+    assert body.rpm[3] == pytest.approx(0.0, abs=1.0)
+
+
+def test_every_fault_of_a_motor_turns_a_setting_of_it() -> None:
+    settings = make().settings
+    assert {failure.setting for failure in MOTOR_FAILURES.values()} == set(settings)
+    assert all(name[-1] == failure.setting[-1] for name, failure in MOTOR_FAILURES.items())
+    assert KINDS["motor.weak.1"].needs == "--profile crazyflie"
 
 
 def test_seeds_draw_other_motors() -> None:

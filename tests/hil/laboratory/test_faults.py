@@ -37,6 +37,7 @@ from support.command import Cli
 from support.flights import hover
 
 HOVER = EXPERIMENTS["hover"]
+OF_FLOATY = {name: kind for name, kind in KINDS.items() if kind.body in ("", "floaty")}
 Settings = tuple[str, ...]
 
 
@@ -101,6 +102,7 @@ def test_every_default_is_a_size_that_its_kind_allows() -> None:
         ("mocap.dropout@1=1.5", "size 1.5: expected 0..1"),
         ("push.x@1=nan", "size nan: expected -20..20 N"),
         ("servo.stuck.1@1=0.5", "this kind has no size to choose"),
+        ("motor.stop.1@1", "acts on a part of crazyflie only; this flight is one of floaty"),
         ("push.x@30", "the flight ends 30 s after the release, before it begins"),
         ("marker.swap@1", "fault marker.swap@1: needs --set markers.enabled=true"),
         ("serial.cut@1", "acts with --link mavlink only; this flight has --link radio"),
@@ -333,7 +335,9 @@ def test_a_fault_acts_from_its_begin_to_its_end(sign: Sign) -> None:
 
 def test_every_kind_has_a_sign() -> None:
     known = {sign.fault.partition("=")[0] for sign in SIGNS}
-    assert known | {"battery.sag"} == set(KINDS)  # see below
+    assert known | {"battery.sag"} == set(
+        OF_FLOATY
+    )  # see below; the Crazyflie's: tests/hil/crazyflie/test_quadrotor.py
 
 
 def test_a_sagging_battery_is_what_the_board_reads() -> None:
@@ -394,7 +398,7 @@ def test_side_wind_blows_either_way_up_to_20_metres_per_second(
 def test_a_fault_turns_its_own_knobs_and_no_other(link: str) -> None:
     """Every knob stands away from where it rests, so that one that is put back shows."""
     flight = lockstep_flight(Request.of(HOVER, overrides=[MARKERS_ON], duration_s=1.0, link=link))
-    kinds = [kind for kind in KINDS.values() if kind.link in ("", link)]
+    kinds = [kind for kind in OF_FLOATY.values() if kind.link in ("", link)]
     knobs = list(dict.fromkeys(knob for kind in kinds for knob in kind.knobs))
 
     def turn(kind: Kind, share: float) -> None:
@@ -488,7 +492,7 @@ LONGEST = {
     "marker.noise@1:0.7=6": "failsafe",  # it fits too badly
 }
 STATED = {
-    **{f"{name}@1": kind.outcome for name, kind in KINDS.items()},
+    **{f"{name}@1": kind.outcome for name, kind in OF_FLOATY.items()},
     **LONGER,
     **LONGEST,
 }

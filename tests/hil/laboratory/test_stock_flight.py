@@ -14,6 +14,7 @@ from hil.crazyflie.log_table import log_table
 from hil.devices.crazyflie_signals import stock_signals
 from hil.errors import LabError
 from hil.experiments.hover import HOVER
+from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.lockstep import image_at
 from hil.laboratory.request import why_left
 from hil.servers.server import Plan, Server
@@ -112,6 +113,16 @@ def test_follows_steps_and_a_figure_of_eight_within_its_limits(experiment: str, 
 
 
 @needs_image
+@pytest.mark.parametrize("kind", ["motor.weak.1", "motor.stop.2", "motor.stuck.3"])
+def test_hover_with_a_failed_motor_is_lost_where_that_is_stated(kind: str, tmp_path: Path) -> None:
+    fault = f"{kind}@4"
+    result = fly(
+        "hover", tmp_path / "run", profile=PROFILE, board=ELF, duration_s=12.0, faults=[fault]
+    ).result
+    assert (result.outcome == "lost") == (KINDS[kind].outcome == "lost"), result.cause
+
+
+@needs_image
 def test_same_seed_has_the_same_hash_and_an_unknown_parameter_one_line(tmp_path: Path) -> None:
     one, other = (
         fly("hover", tmp_path / name, profile=PROFILE, board=ELF, duration_s=7.5).result.hash for name in "ab"
@@ -149,7 +160,7 @@ def test_served_robot_stands_on_the_floor_with_the_profiles_parameters_and_feels
             server.lab.end_at(end_us)
             server.lab.run()
             heights.append(asl.read())
-        assert heights[0] == pytest.approx(21.1, abs=0.5)  # [m] of 1013.25 hPa in the driver's atmosphere
+        assert heights[0] == pytest.approx(0.0, abs=0.5)
         assert heights[1] - heights[0] == pytest.approx(2.0, abs=0.5)
     finally:
         server.ends.close()

@@ -5,7 +5,12 @@ import math
 import pytest
 
 from firmware_py.wire.memories import CONFIG_SIZE, RadioSettings, encode_config
+from hil.config import load_config
+from hil.events import EventQueue
 from hil.laboratory.fault_kinds import KINDS
+from hil.laboratory.faults import Switchboard
+from hil.laboratory.robot import Ports, Robot, Site, Streams, nobody_listens
+from hil.servers.failures import Failures
 from support.mavlink_lab import MavlinkLab
 
 INJECT = 420
@@ -78,6 +83,20 @@ def test_an_instance_that_is_not_there_is_denied(lab: MavlinkLab, unit: int, ins
     failing = OFF if unit == BATTERY else STUCK
     assert lab.command(INJECT, unit, failing, instance) == DENIED
     assert lab.faults == {}
+
+
+def test_another_bodys_motors_fail_instead() -> None:
+    events = EventQueue()
+    site = Site(load_config("crazyflie"), events, Streams.of_seed(1), lambda *_: None)
+    robot = Robot(site, Ports(nobody_listens))
+    board = Switchboard(robot)
+    failures = Failures(robot, board)
+    assert failures.inject(0, MOTOR, SLOW, 0) == UNSUPPORTED
+    assert failures.inject(0, MOTOR, OFF, 2) == ACCEPTED
+    assert failures.inject(0, MOTOR, OFF, 5) == DENIED
+    events.run(0)
+    assert [fault.kind for fault in board.active] == ["motor.stop.2"]
+    assert robot.body.settings["motor.current.2"].read() == 0.0
 
 
 def test_a_command_that_comes_twice_acts_once_and_another_takes_its_place(lab: MavlinkLab) -> None:
