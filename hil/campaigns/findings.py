@@ -322,14 +322,17 @@ def _worst(spec: Spec, flights: pa.Table, limits: tuple[Limited, ...]) -> tuple[
         lost = row["outcome"] == "lost"
         order = (0.0, row["metric.flown"]) if lost else (1.0, -max(beyond.values(), default=0.0))
         ranked.append((order, row["index"], row["outcome"], row["error"] or ", ".join(beyond)))
-    found = []
-    for _, index, outcome, why in sorted(ranked)[:WORST]:
-        try:
-            command = command_of(draw(spec, index).request()) or "(an experiment that no command names)"
-        except LabError as error:
-            command = f"({error})"
-        found.append(Worst(index, outcome, why, command))
-    return tuple(found)
+    return tuple(
+        Worst(index, outcome, why, again(spec, index)) for _, index, outcome, why in sorted(ranked)[:WORST]
+    )
+
+
+def again(spec: Spec, index: int) -> str:
+    """Return the command that flies a flight again, or in parentheses why there is none."""
+    try:
+        return command_of(draw(spec, index).request()) or "(an experiment that no command names)"
+    except LabError as error:
+        return f"({error})"
 
 
 def _beyond(limit: Limited, value: float) -> float:

@@ -1,8 +1,9 @@
 """The report of a campaign: `report.html`, which is self-contained, and `result.json` for programs."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -11,10 +12,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
 from hil.campaigns.config import Spec, spec_text
 from hil.campaigns.dataset import Dataset, about
-from hil.campaigns.findings import FailureMap, Findings, Limited, find
+from hil.campaigns.findings import FailureMap, Findings, Limited, again, find
 from hil.campaigns.sampling import CubeAxis, value_at
 from hil.laboratory.metrics import SHOWN
 from hil.pictures import curves
@@ -27,20 +29,22 @@ GRID = 60
 TICKS = 5
 SHADES = 10
 BINS = (5, 40)  # of a histogram, by the number of flights
+CELLS = (10, 8)  # of a failure map
+NAMED = 3  # flights of a cell, those that failed first
 FEW = 100  # flights, up to which a histogram shows each and counts linearly
 
 
 def write_report(named: str, spec: Spec, dataset: Dataset, complete: bool) -> tuple[Path, Findings]:
     """Write report and result of the dataset of a campaign, as the user names it; return report and findings."""
     folder, findings = dataset.folder, find(spec, dataset.table())
-    histograms = [one for one in findings.limits if len(one.values) > 1]
+    histograms = [one for one in findings.limits if len(one.values) > 1 and np.ptp(one.values) > 0.0]
     drawn = None if findings.failure_map is None else _map(findings.failure_map)
+    image = data_uri(png(lambda: drawn.figure)) if drawn is not None else ""  # which places its axes
     page = write_page(
         folder / REPORT, "campaign.html.j2", spec=spec, found=findings, complete=complete,
         histograms=data_uri(png(lambda: _histograms(histograms))) if histograms else "",
-        failure_map=data_uri(png(lambda: drawn.figure)) if drawn is not None else "",
-        places=drawn.places([one.index for one in findings.worst]) if drawn is not None else {},
-        named=quote(named), begun=about(dataset.plan)["commit"],
+        failure_map=image, map_cells=sorted(drawn.cells(spec), key=MapCell.holds) if drawn is not None else [],
+        named=quote(named), begun=about(dataset.plan)["commit"], folder=quote(str(folder)),
     )  # fmt: skip
     text = json.dumps(_content(spec, findings, complete), indent=2)
     (folder / RESULT).write_text(text + "\n", encoding="utf-8")
@@ -87,7 +91,14 @@ def _histograms(limits: list[Limited]) -> Figure:
     for axes, one in zip(grid, limits, strict=False):
         scale, unit = SHOWN.get(one.metric.unit, (1.0, one.metric.unit))
         count = len(one.values)
-        axes.hist(one.values * scale, bins=int(np.clip(2.0 * np.sqrt(count), *BINS)), color=curves.BLUE)
+        width = np.ptp(one.values) / int(np.clip(2.0 * np.sqrt(count), *BINS))
+        first, last = ((end - one.bound) / width for end in (one.values.min(), one.values.max()))
+        edges = one.bound + width * np.arange(
+            np.floor(first), np.ceil(last) + 1.5
+        )  # the limit is one of them
+        fails = (one.values > one.bound) if one.metric.bound == "max" else (one.values < one.bound)
+        parts = [one.values[~fails] * scale, one.values[fails] * scale]
+        axes.hist(parts, bins=edges * scale, stacked=True, color=[curves.BLUE, curves.RED])
         axes.axvline(one.bound * scale, color=curves.RED, linestyle="--")
         if count > FEW:
             axes.set_yscale("log")  # so that the few failures are visible
@@ -105,20 +116,58 @@ def _histograms(limits: list[Limited]) -> Figure:
 
 
 @dataclass(frozen=True, slots=True)
+class MapCell:
+    """A part of a failure map with flights in it."""
+
+    place: tuple[float, float, float, float]  # left, bottom, width, height [% of the figure]
+    text: str  # the values there
+    failed: int
+    flown: int
+    flights: tuple[tuple[int, bool, str], ...]  # number, whether it failed, command that flies it again
+
+    def holds(self) -> float:
+        """Return the share of its flights that held."""
+        return 1.0 - self.failed / self.flown
+
+
+@dataclass(frozen=True, slots=True)
 class DrawnMap:
-    """A failure map as a figure, and where the flights in it are."""
+    """A failure map as a figure, and which flights are in it."""
 
     figure: Figure
     axes: Axes
-    flights: dict[int, tuple[float, float]]  # the points that are drawn, by the flights' numbers
+    across: CubeAxis
+    up: CubeAxis
+    points: NDArray[np.float64]  # (N, 2) on those axes
+    flights: NDArray[np.int64]  # (N,) their numbers
+    failed: NDArray[np.bool_]  # (N,)
 
-    def places(self, flights: Sequence[int]) -> dict[int, tuple[float, float]]:
-        """Return where flights are in the figure, once it was written [% from its left and lower edge]."""
-        size, shown = self.figure.bbox.size, [one for one in flights if one in self.flights]
-        return {
-            one: tuple((100.0 * self.axes.transData.transform(self.flights[one]) / size).tolist())
-            for one in shown
-        }
+    def cells(self, spec: Spec) -> Iterator[MapCell]:
+        """Yield the cells with flights, once the figure was written."""
+        which = np.minimum((self.points * CELLS).astype(int), np.array(CELLS) - 1)
+        for row, column in product(range(CELLS[1]), range(CELLS[0])):
+            inside = np.flatnonzero((which == (column, row)).all(axis=1))
+            if not len(inside):
+                continue
+            low, high = (np.array([column + n, row + n]) / CELLS for n in (0, 1))
+            corners = 100.0 * self.axes.transData.transform(np.array([low, high])) / self.figure.bbox.size
+            first = inside[np.argsort(~self.failed[inside], kind="stable")][:NAMED]
+            yield MapCell(
+                (*corners[0].tolist(), *np.diff(corners, axis=0)[0].tolist()),
+                f"{_range(self.across, low[0], high[0])}, {_range(self.up, low[1], high[1])}",
+                int(self.failed[inside].sum()),
+                len(inside),
+                tuple((n := int(self.flights[at]), bool(self.failed[at]), again(spec, n)) for at in first),
+            )
+
+
+def _range(axis: CubeAxis, low: float, high: float) -> str:
+    """Return the name of an axis and its values between two places."""
+    if axis.varies is None:
+        return f"{'with' if high == 1.0 else 'without'} {axis.name}"
+    if axis.varies.choice is not None:
+        return f"{axis.name} {value_at(axis.varies, 0.5 * (low + high))}"
+    return f"{axis.name} {value_at(axis.varies, low):.3g} to {value_at(axis.varies, high):.3g}"
 
 
 def _map(found: FailureMap) -> DrawnMap:
@@ -153,8 +202,10 @@ def _map(found: FailureMap) -> DrawnMap:
     axes.set_ylabel(found.axes[up].name)
     axes.set_yticks(*_ticks(found.axes[up]))
     axes.legend(loc="upper left", bbox_to_anchor=(1.2, 1.0))
-    numbers, places = found.flights[those].tolist(), found.points[those][:, (across, up)].tolist()
-    return DrawnMap(figure, axes, dict(zip(numbers, map(tuple, places), strict=True)))
+    return DrawnMap(
+        figure, axes, found.axes[across], found.axes[up],
+        found.points[those][:, (across, up)], found.flights[those], found.failed[those],
+    )  # fmt: skip
 
 
 def _ticks(axis: CubeAxis) -> tuple[list[float], list[str]]:

@@ -32,7 +32,8 @@ def planted(job: Job) -> Row:
     """A flight that fails by its push alone, at once."""
     faults = job.options["faults"]
     size = float(str(faults[0]).partition("=")[2]) if faults else 0.0
-    metrics = dict.fromkeys(METRICS, 0.0) | {"max_y": size / 100.0, "flown": 0.3, "rms_x": math.nan}
+    known = {"max_y": size / 100.0, "in_box": 1.0 - size / 1000.0, "flown": 0.3, "rms_x": math.nan}
+    metrics = dict.fromkeys(METRICS, 0.0) | known
     passed = size < BAD_PUSH
     return Row(job, "completed", "", passed, f"{job.index:064x}", metrics, {"in_box": passed})
 

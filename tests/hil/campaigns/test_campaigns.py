@@ -19,12 +19,13 @@ from scipy.stats import binomtest
 
 from hil.campaigns.config import Spec
 from hil.campaigns.dataset import ARRIVING, FLIGHTS, Dataset
-from hil.campaigns.findings import find
+from hil.campaigns.findings import Findings, find
 from hil.campaigns.jobs import Job, Row, fly_job
 from hil.campaigns.report import write_report
 from hil.campaigns.run import Flyer, Standing, conduct, interval
 from hil.campaigns.sampling import draw, plan_of
 from hil.errors import LabError
+from support.browser import BROWSER, browser
 from support.campaigns import BAD_PUSH, planted, spec_of
 from support.full_disk import small_files
 from support.html_page import Page
@@ -222,32 +223,70 @@ def test_what_was_planted_is_found(tmp_path: Path) -> None:
     assert all(one.command.startswith("floaty fly hover --seed ") for one in found.worst)
 
 
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Findings]:
+    """The report of a campaign, and what it found."""
+    folder, spec = tmp_path_factory.mktemp("campaign"), spec_of(flights=128, sampling="sobol")
+    flown_into(folder, spec, workers(2))
+    dataset = Dataset(folder, plan_of(spec), resume=True)
+    return write_report("my spec.toml", spec, dataset, complete=True)
+
+
 @pytest.mark.long
-def test_the_report_has_rates_influences_commands_and_pictures(tmp_path: Path) -> None:
-    spec = spec_of(flights=128, sampling="sobol")
-    flown_into(tmp_path, spec, workers(2))
-    path, found = write_report(
-        "my spec.toml", spec, Dataset(tmp_path, plan_of(spec), resume=True), complete=True
-    )
-    page = Page(path.read_text(encoding="utf-8"))
+def test_the_report_has_rates_influences_commands_and_pictures(reported: tuple[Path, Findings]) -> None:
+    path, found = reported
+    text = path.read_text(encoding="utf-8")
+    page = Page(text)
     assert [len(page.tables[name]) for name in ("limits", "worst")] == [1 + len(found.limits), 1 + 10]
     assert len(page.tables["influences"]) == 1 + len(found.influences) > 2
-    assert "floaty campaign &#39;my spec.toml&#39; --shrink FLIGHT" in path.read_text(encoding="utf-8")
+    assert "floaty campaign &#39;my spec.toml&#39; --shrink FLIGHT" in text
     assert [picture[:4] for picture in page.pictures] == [b"\x89PNG"] * 2
+    told = json.loads((path.parent / "result.json").read_text())
+    assert (told["failed"], told["flown"]) == (found.rate.failed, 128)
+
+
+@pytest.mark.long
+def test_a_cell_of_the_failure_map_leads_to_its_flights(reported: tuple[Path, Findings]) -> None:
+    path, found = reported
     text = path.read_text(encoding="utf-8")
-    rings = re.findall(
-        r'href="#flight-(\d+)" title="flight \1" style="left: ([\d.]+)%; bottom: ([\d.]+)%"', text
+    cells = re.findall(
+        r'href="#(cell-\d+)" title="([^"]*): (\d+) of (\d+) failed" '
+        r'style="left: ([\d.]+)%; bottom: ([\d.]+)%; width: ([\d.]+)%; height: ([\d.]+)%"',
+        text,
     )
-    assert {int(flight) for flight, _, _ in rings} == {one.index for one in found.worst}
-    assert all(f'<tr id="flight-{flight}">' in text for flight, _, _ in rings)
-    with Image.open(io.BytesIO(page.pictures[1])) as picture:
+    assert sum(int(cell[3]) for cell in cells) == 64, "half of the flights get a push"
+    assert sum(int(cell[2]) for cell in cells) == found.rate.failed
+    with Image.open(io.BytesIO(Page(text).pictures[1])) as picture:
         pixels = np.asarray(picture.convert("RGB")).astype(int)
     height, width, _ = pixels.shape
-    for _, x, y in rings:
-        red, green, _ = pixels[round(height * (1 - float(y) / 100)), round(width * float(x) / 100)]
-        assert red > 1.5 * green, "the point of a flight that failed"
-    told = json.loads((tmp_path / "result.json").read_text())
-    assert (told["failed"], told["flown"]) == (found.rate.failed, 128)
+    for name, _, failed, _, *place in cells:
+        left, bottom, wide, high = (float(share) / 100 for share in place)
+        part = pixels[
+            round(height * (1 - bottom - high)) : round(height * (1 - bottom)),
+            round(width * left) : round(width * (left + wide)),
+        ]
+        if int(failed):
+            assert (np.abs(part - (0xD5, 0x5E, 0x00)).max(axis=2) < 8).any(), (
+                "a point of a flight that failed"
+            )
+        rows = text.split(f'<tbody id="{name}">')[1].split("</tbody>")[0]
+        number, out, report = re.findall(r"<td>(\d+)|--out (\S+)</code>|<a href=\"([^\"]+)\"", rows)[:3]
+        assert out[1] == f"{path.parent}/flight-{number[0]}"
+        assert report[2] == f"flight-{number[0]}/report.html"
+
+
+@pytest.mark.long
+@pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine")
+def test_the_report_fits_a_phone_and_its_cells_lead_down(
+    reported: tuple[Path, Findings], tmp_path: Path
+) -> None:
+    with browser(tmp_path) as tab:
+        for width in (390, 1180):
+            tab.open(reported[0].as_uri(), width)
+            assert tab.value("document.documentElement.scrollWidth") <= width
+            tab.value("[...document.querySelectorAll('.map a')].at(-1).click()")
+            assert tab.value("document.querySelector('tbody:target tr') !== null")
+        assert tab.errors == []
 
 
 @pytest.mark.long
