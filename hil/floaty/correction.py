@@ -18,7 +18,7 @@ from hil.floaty.paper_table import PAPER_TABLE
 from hil.floaty.shape import MIX
 from hil.world import layout as at
 from hil.world.config import PlantConfig
-from hil.world.fixed_order import fit_polynomial, product
+from hil.world.fixed_order import fit_polynomial
 from hil.world.motion import GRAVITY, evaluate
 from hil.world.plates import LIFT_U4_MAX, State
 
@@ -112,7 +112,7 @@ def slope(c: State, cause: str) -> State:
 def linearise(s: State, speed: float, point: OperatingPoint = LEVEL) -> Constants:
     """Return the constants of the plant in `s` about a point of a uniform flow of `speed` [m/s]: the level hover."""
     c = calm(s, speed)
-    c[at.FLAPS : at.FLAPS + 4] += product(MIX, np.array(point.inputs)[:, None])[:, 0]
+    c[at.FLAPS : at.FLAPS + 4] += sum(column * u for column, u in zip(MIX.T, point.inputs, strict=True))
     c[at.SIDE_WIND : at.SIDE_WIND + 3] = point.side_wind
     c[at.Q : at.Q + 4] = from_euler_zyx(*point.attitude)
     u1, u2, u3, u4 = (slope(c, cause).tolist() for cause in ("u1", "u2", "u3", "u4"))
