@@ -55,6 +55,11 @@ class RobotConfig(Section):
         description="floaty, crazyflie, or the file with a body of your own (docs/tutorials/your-own-robot.md)",
     )
 
+    @property
+    def has_plates(self) -> bool:
+        """Whether it is a Floaty: four flaps in mirror symmetry, of flat plates, whose geometry the profile gives."""
+        return self.body == "floaty"
+
 
 class LabConfig(FirmwareConfig):
     """What is flashed, and the world around it."""

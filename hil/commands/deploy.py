@@ -238,6 +238,10 @@ def write(folder: Path, profile: str, overrides: tuple[str, ...]) -> None:
     from hil.config import load_config
 
     config = load_config(profile, overrides)
+    if config.pilot.enabled:
+        raise LabError(
+            f"profile {profile}: its robot flies with the Crazyflie's own firmware, not with the app"
+        )
     try:
         files = write_app(config, " ".join((profile, *overrides)), folder)
     except ExportError as error:

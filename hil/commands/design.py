@@ -170,7 +170,12 @@ def point_of(robot: Robot) -> "Point":
     from hil.design.trim import opening_at, scaled
 
     speed, angle = robot.speed, robot.angle
-    point = own_point_of(load_config(robot.profile, robot.overrides))
+    config = load_config(robot.profile, robot.overrides)
+    if not config.robot.has_plates:
+        raise LabError(
+            f"profile {robot.profile}: floaty design takes robots of flat plates; this one's body is {config.robot.body}"
+        )
+    point = own_point_of(config)
     geometry, opening = scaled(point.geometry, robot.length, robot.mass), point.opening
     if speed is not None and angle is not None:
         raise LabError(f"--speed {speed:g} --angle {angle:g}: one follows from the other; give one of them")

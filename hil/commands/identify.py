@@ -29,7 +29,10 @@ folder_type = click.Path(path_type=Path)
 
 @click.command()
 @click.argument("runs", metavar="RUN...", type=folder_type, nargs=-1, required=True)
-@profile_option
+@click.option(
+    "--profile", metavar="NAME|FILE",
+    help="With which a bare telemetry.csv was flown, and the base of a written profile  [default: the first RUN's].",
+)  # fmt: skip
 @click.option(
     "--validate", type=folder_type, metavar="RUN", help="A flight to be predicted, which is not fitted."
 )
@@ -45,22 +48,22 @@ folder_type = click.Path(path_type=Path)
     help="Page and pictures.",
 )
 def identify(
-    runs: tuple[Path, ...], profile: str, validate: Path | None, profile_out: Path | None, out: Path
+    runs: tuple[Path, ...], profile: str | None, validate: Path | None, profile_out: Path | None, out: Path
 ) -> int:
     """Identify the robot from RUNs: run folders, also of `floaty station`, or telemetry.csv files.
 
-    --profile is that with which a bare telemetry.csv was flown, and the base of a written profile. Exit code 0: at least one
-    constant is identified; 1: none; 2: bad input.
+    Exit code 0: at least one constant is identified; 1: none; 2: bad input.
     """
     require("floaty identify", "identify", "scipy")
     from hil.identify.identify import IDENTIFIED
     from hil.identify.identify import identify as identify_records
     from hil.identify.pages import write_pages
     from hil.identify.profile_out import write_profile
-    from hil.identify.record import load_record
+    from hil.identify.record import load_record, profile_of
 
     if profile_out is not None and profile_out.suffix != ".toml":
         raise LabError(f"--profile-out {profile_out}: a profile's name ends in .toml")
+    profile = profile or profile_of(runs[0])
     held_out = None if validate is None else load_record(validate, profile)
     found = identify_records([load_record(run, profile) for run in runs])
     _print_constants(found)
@@ -79,23 +82,22 @@ def _print_constants(found: "Identification") -> None:
 
     from hil.identify.identify import interval_text
 
+    cells = {
+        "constant": [one.name for one in found.constants],
+        "paper": [interval_text(*one.paper) for one in found.constants],
+        "truth": [interval_text(one.truth) for one in found.constants],
+        "paper's method": [interval_text(*one.two_controllers) for one in found.constants],
+        "instruments": [interval_text(*one.instrumental) for one in found.constants],
+        "joint fit": [interval_text(*one.joint) for one in found.constants],
+        "unit": [one.unit for one in found.constants],
+        "verdict": [f"{one.verdict}: {one.why}" for one in found.constants],
+    }
+    shown = {heading: column for heading, column in cells.items() if any(column)}
     table = Table(title="constants, with the half width of their 95 % interval")
-    for heading in (
-        "constant",
-        "paper",
-        "truth",
-        "paper's method",
-        "instruments",
-        "joint fit",
-        "unit",
-        "verdict",
-    ):
+    for heading in shown:
         table.add_column(heading, no_wrap=heading != "verdict")
-    for one in found.constants:
-        table.add_row(
-            one.name, interval_text(*one.paper), interval_text(one.truth), interval_text(*one.two_controllers),
-            interval_text(*one.instrumental), interval_text(*one.joint), one.unit, f"{one.verdict}: {one.why}",
-        )  # fmt: skip
+    for row in zip(*shown.values(), strict=True):
+        table.add_row(*row)
     wide_console().print(table)
     if found.excited:
         periods = ", ".join(

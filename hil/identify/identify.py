@@ -8,19 +8,20 @@ log; `weak` when its sign and size are known; else `not identifiable`: its numbe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import combinations
 from math import hypot, isnan, nan
 
 import numpy as np
 
-from hil.design.axes import AXES
+from hil.design.axes import AXES, NUISANCES
 from hil.errors import LabError
 from hil.floaty.correction import OperatingPoint
 from hil.floaty.paper_table import PAPER_TABLE
 from hil.floaty.plant import Plant
-from hil.identify.joint import Estimate, Excited, excited_axes, instrumental, joint
+from hil.identify.joint import Estimate, Excited, excited_axes, identities, instrumental, joint
 from hil.identify.plates import turns_of
 from hil.identify.record import Record
 from hil.identify.response import DELAY, LAG, UNIT
@@ -111,9 +112,10 @@ def identify(records: Sequence[Record]) -> Identification:
     by_instruments = instrumental(excited, 1.0 / model.flap_rate)
     fitted = _joint(excited, by_instruments, rich[0]) if excited else Estimate({}, {}, nan)
     constants = []
+    paper = PAPER_TABLE if records[0].config.robot.has_plates else {}
     for name, truth in _truths(records[0], rich, excited).items():
         constant = IdentifiedConstant(
-            name, UNIT[name], PAPER_TABLE.get(name, (nan, nan)), truth, printed.get(name, (nan, nan)),
+            name, UNIT[name], paper.get(name, (nan, nan)), truth, printed.get(name, (nan, nan)),
             (by_instruments.values.get(name, nan), by_instruments.errors.get(name, nan)),
             (fitted.values.get(name, nan), fitted.errors.get(name, nan)), "", "",
         )  # fmt: skip
@@ -124,10 +126,18 @@ def identify(records: Sequence[Record]) -> Identification:
 
 
 def _joint(excited: Sequence[Excited], by_instruments: Estimate, record: Record) -> Estimate:
-    """Return the joint fit, begun at the instruments' constants and at the profile's."""
-    config, turns = record.config, turns_of(record)
+    """Return the joint fit, begun at the instruments' constants and at the profile's; of a Floaty with what plates do."""
+    config, turns = record.config, dict.fromkeys(NUISANCES, 0.0)
+    known: Callable[[Mapping[str, float]], list[float]] = _nothing
+    if config.robot.has_plates:
+        turns = turns_of(record)
+        known = partial(identities, speed=config.plant.airspeed, turns=turns)
     begin = [by_instruments.values, {**config.model.model_dump(), **turns}]
-    return joint(excited, 1.0 / config.model.flap_rate, begin, config.plant.airspeed, turns)
+    return joint(excited, 1.0 / config.model.flap_rate, begin, known)
+
+
+def _nothing(values: Mapping[str, float]) -> list[float]:
+    return []
 
 
 def _truths(record: Record, rich: Sequence[Record], excited: Sequence[Excited]) -> dict[str, float]:
@@ -147,10 +157,10 @@ def operating_point(record: Record) -> OperatingPoint:
 
 
 def truth_of(record: Record) -> dict[str, float]:
-    """Return the plant's own constants at the point where a simulated robot flew; none for a real flight."""
-    if not record.simulated:
-        return {}
+    """Return the plant's own constants at the point where a simulated Floaty flew; none for another flight."""
     config = record.config
+    if not record.simulated or not config.robot.has_plates:
+        return {}
     plant = Plant(config.geometry, config.plant, config.tunnel, config.actuators, Streams.of_seed(1).gusts)
     return {**asdict(plant.linearise(operating_point(record))), LAG: config.actuators.tau}
 

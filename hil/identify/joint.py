@@ -171,8 +171,9 @@ class Fit:
     records: Sequence[int]
     scale: Array
     lag: float  # [s] of the profile
-    speed: float  # [m/s] of the tunnel
-    turns: Mapping[str, float]  # the plates' x_rate and y_rate
+    known: Callable[
+        [Mapping[str, float]], list[float]
+    ]  # by how much constants differ from what is known, in its units
 
     def parted(self, x: Array) -> tuple[dict[str, float], dict[int, float]]:
         """Return constants by name, and by record how late poses are [s]."""
@@ -183,9 +184,9 @@ class Fit:
     def prior(self, x: Array) -> Array:
         """Return by how much parameters differ from what is known without the flight."""
         values, late = self.parted(x)
-        known = [(values[LAG] / self.lag - 1) / LAG_SPREAD, (values[DELAY] - DELAY_S) / DELAY_SPREAD_S]
-        known += [(late[record] - LATE_S) / LATE_SPREAD_S for record in self.records]
-        return np.array([*known, *identities(values, self.speed, self.turns)])
+        usual = [(values[LAG] / self.lag - 1) / LAG_SPREAD, (values[DELAY] - DELAY_S) / DELAY_SPREAD_S]
+        usual += [(late[record] - LATE_S) / LATE_SPREAD_S for record in self.records]
+        return np.array([*usual, *self.known(values)])
 
     def errors(self, x: Array) -> Array:
         """Return all errors in units of their scatter."""
@@ -220,12 +221,12 @@ def joint(
     excited: Sequence[Excited],
     lag: float,
     begin: Sequence[Mapping[str, float]],
-    speed: float,
-    turns: Mapping[str, float],
+    known: Callable[[Mapping[str, float]], list[float]],
 ) -> Estimate:
     """Return all excited axes' constants, lag and delay by the joint fit, the best of those from several beginnings.
 
-    `lag` [s] is the profile's, `speed` [m/s] the tunnel's, `turns` the plates' x_rate and y_rate.
+    `lag` [s] is the profile's; `known` returns by how much constants differ from what is known without the flight, in units
+    of its uncertainty.
     """
     names = [name for axis in AXES if any(one.axis is axis for one in excited) for name in axis.constants]
     names += [LAG, DELAY]
@@ -235,7 +236,7 @@ def joint(
     starts += [starts[0] | {LAG: lag * (1 + LAG_SPREAD)}, starts[0] | {LAG: lag * (1 - LAG_SPREAD)}]
     size = np.abs([starts[0][name] for name in names])
     scale = np.concatenate([np.maximum(size, 1e-3), np.full(len(records), LATE_SPREAD_S)])
-    fit = Fit(excited, names, records, scale, lag, speed, turns)
+    fit = Fit(excited, names, records, scale, lag, known)
     solutions = [fit.solved(np.array([*(one[name] for name in names), *late]) / scale) for one in starts]
     found = min(solutions, key=lambda result: float(result.cost))
     misfit = 2 * found.cost / max(1, len(found.fun) - len(found.x))
@@ -256,7 +257,8 @@ def joint(
 def identities(values: Mapping[str, float], speed: float, turns: Mapping[str, float]) -> list[float]:
     """Return by how much constants differ from what holds for any flat plates in a flow, in units of what is usual.
 
-    A horizontal velocity tilts the wind as the same angle of the robot does (docs/explanation/plant.md).
+    A horizontal velocity tilts the wind as the same angle of the robot does (docs/explanation/plant.md). `speed` [m/s] is
+    the tunnel's, `turns` the plates' x_rate and y_rate.
     """
     left = []
     if "roll_vy" in values:

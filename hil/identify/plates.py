@@ -42,8 +42,10 @@ def straightened(record: Record) -> Straightened:
     """Return inputs as if their effects were linear, and the accelerations along y and z that are not.
 
     Along z these are what roll and sideways velocity do to a robot that leans in a side wind. The flaps follow their
-    commands by the profile's lag.
+    commands by the profile's lag. How another robot than Floaty bends is not known: its record stays as it is.
     """
+    if not record.config.robot.has_plates:
+        return Straightened(record.u, np.zeros((len(record.t), 2)))
     step, config = record.period_s, record.config
     share = 1.0 - np.exp(-step * config.model.flap_rate)
     t = np.arange(record.u_t[0], record.u_t[-1] + step, step)

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from firmware_py.wire.supervisor import State
 from ground_station.telemetry_log import POSE_COLUMNS, TELEMETRY, TIME_COLUMN
-from hil.config import LabConfig, load_config
+from hil.config import DEFAULT_PROFILE, LabConfig, load_config
 from hil.errors import LabError
 from hil.floaty.shape import MIX, SIGNS
 from hil.laboratory.recorder import load_log, release_of
@@ -58,6 +58,11 @@ class Record:
     def period_s(self) -> float:
         """Between two rows, the usual one."""
         return float(np.median(np.diff(self.t)))
+
+
+def profile_of(path: Path) -> str:
+    """Return the profile with which a run folder was flown; the default one for a bare `telemetry.csv`."""
+    return read_result(path).request.profile if path.is_dir() else DEFAULT_PROFILE
 
 
 def load_record(path: Path, profile: str) -> Record:

@@ -9,6 +9,7 @@ import pytest
 from hil.bodies import make_body
 from hil.config import load_config
 from hil.errors import LabError
+from hil.identify.record import profile_of
 from hil.laboratory.faults import parse
 from hil.laboratory.metrics import column, free_flight
 from hil.laboratory.recorder import load_log, stored_in
@@ -62,6 +63,11 @@ def test_its_log_has_its_motion_and_no_flaps(flown: Result) -> None:
     assert column(log, "flow.z").mean() == pytest.approx(10.0, abs=0.5)
     assert column(log, "battery.power").min() >= 2.3
     assert not [name for name in log.column_names if name.startswith(("truth.flap", "force."))]
+
+
+def test_what_is_identified_from_its_flights_changes_its_profile(flown: Result, tmp_path: Path) -> None:
+    assert profile_of(flown.folder) == flown.request.profile != "floaty"
+    assert profile_of(tmp_path / "telemetry.csv") == "floaty"
 
 
 def test_same_seed_same_hash(flown: Result, tmp_path: Path) -> None:

@@ -52,6 +52,8 @@ def test_a_failed_limit_is_exit_code_one(cli: Cli) -> None:
         (["fly", "hover", "--set", "controler.gain_z=1"], "did you mean controller?"),
         (["fly", "hover", "--out", "/proc/floaty/run"], "--out /proc/floaty/run: cannot be written"),
         (["fly", "hover", "--seeds", "2", "--view"], "--seeds 2"),
+        (["design", "--profile", "crazyflie"], "takes robots of flat plates; this one's body is crazyflie"),
+        (["deploy", "write", "app", "--profile", "crazyflie"], "own firmware, not with the app"),
         (
             ["station", "--link", "udp://127.0.0.1:1", "--tlog", "t.tlog"],
             "--tlog t.tlog: --link udp://127.0.0.1:1: only mavlink:",

@@ -37,11 +37,11 @@ def simulated(inputs: Array, matrix: Array, column: Array) -> Array:
 
 
 def flight(
-    seed: int, seconds: float = 136.0, rms: float = 0.05, disturbance: float = 1.0
+    seed: int, seconds: float = 136.0, rms: float = 0.05, disturbance: float = 1.0, **changed: float
 ) -> dict[str, Array]:
     """The columns of telemetry.csv of a robot that a multisine on u2 excites and gusts of 30 ms disturb."""
     rng = np.random.default_rng(seed)
-    k = PITCH
+    k = PITCH | changed
     matrix = np.array([
         [-1 / k["lag"], 0, 0, 0, 0],
         [0, 0, 1, 0, 0],
@@ -166,6 +166,16 @@ def test_what_is_not_excited_is_not_identifiable(tmp_path: Path) -> None:
     assert {found.constant(name).why for name in ("roll_u1", "yaw_rate", "z_u4")} == {
         "its axis is not excited"
     }
+
+
+def test_another_robot_is_identified_without_what_holds_for_plates(tmp_path: Path) -> None:
+    profile = tmp_path / "profile.toml"
+    profile.write_text('base = "floaty"\n[robot]\nbody = "robot.py"\n')
+    columns = flight(1, pitch_vx=-60.0)  # plates have pitch_pitch over the airspeed, -130
+    found = identify([load_record(written(tmp_path, columns), str(profile))])
+    value, half = found.constant("pitch_vx").joint
+    assert abs(value + 60.0) <= half < 40.0
+    assert np.isnan([(*one.paper, one.truth) for one in found.constants]).all()
 
 
 @pytest.mark.long
