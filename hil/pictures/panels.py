@@ -89,7 +89,7 @@ class Spell:
 class Instant:
     """A moment of a flight that every figure marks."""
 
-    kind: str  # operator, lost
+    kind: str  # operator, lost, paper
     t_s: float
     text: str
 

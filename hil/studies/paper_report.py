@@ -1,7 +1,7 @@
 """The report of the paper: `report.html` with its pages for readers, `result.json` for programs.
 
 `report.html` has the table and the contents, `EXPERIMENT.html` the figures of one experiment as in the paper (every trial
-light, the one with the median error dark), `drag-model.html` and `studies.html` the rest.
+light, the one with the median error dark) beside the paper's numbers, `drag-model.html` and `studies.html` the rest.
 """
 
 import json
@@ -78,7 +78,7 @@ def write_paper(
     ]
     common = {"pages": pages, "metrics": METRICS, "spread": Spread.of, "profile": PROFILES[0]}
     for name, row, trials in paper.rows:
-        figures = _figures(trials)
+        figures = _figures(row, trials)
         shown = [one for _, pictures in figures for one in pictures]
         kinds = dict.fromkeys(kind for one in shown for kind in one.marks.kinds)
         write_page(
@@ -98,16 +98,17 @@ def write_paper(
     )  # fmt: skip
 
 
-def _figures(both: Sequence[Trials]) -> list[tuple[str, list[PageFigure]]]:
+def _figures(row: PaperRow, both: Sequence[Trials]) -> list[tuple[str, list[PageFigure]]]:
     """Return the profiles with the pictures of a row, the default profile first."""
     figures = []
     for trials in both:
         ordered = trials.representative_first()
         if not ordered:
             continue
-        logs = [load_log(row.folder) for row in ordered]
+        logs = [load_log(one.folder) for one in ordered]
         own = pictures_of(find_experiment(ordered[0].job.experiment))
         marks = marks_of_flight(logs[0], ordered[0].error if ordered[0].outcome == "lost" else None)
+        marks = replace(marks, instants=(*marks.instants, *row.marks))
         drawn = [draw(one, marks, *(logs if own else logs[:1])) for one in own or OF_EVERY_FLIGHT]
         shown = [replace(one, name=f"{trials.profile}-{one.name}", alone=True) for one in drawn]
         figures.append((trials.profile, shown))

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from math import radians
 
 from hil.experiments.identification import IDENTIFICATION
+from hil.experiments.yaw import BEGIN_S
+from hil.pictures.panels import Instant
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +31,10 @@ class PaperRow:
     claims: Mapping[str, MetricClaim]  # by metric, in the order of the table
     why: str = ""  # why it misses the paper's value, if it does
     note: str = ""  # how to read ours
+    marks: tuple[Instant, ...] = ()  # numbers of the paper that have a place on our picture's time axis
 
 
+SETTLED = (Instant("paper", BEGIN_S + 0.5, "paper: settled"),)
 SILENT = MetricClaim()
 NEVER_LOST = MetricClaim("0", 0.0)
 MOSTLY = MetricClaim("mostly", 0.5)
@@ -98,12 +102,14 @@ ROWS: Mapping[str, PaperRow] = {
         },
         note="Within 5 % of the step. It takes flaps opened through zero: between 0 and 52° the time-optimal bound is "
         "0.47 s, without a controller, a filter or a delay.",
+        marks=SETTLED,
     ),
     "yaw-step-0": PaperRow(
         "Yaw step of 110°, flaps 0..52°", "settles in less than 0.5 s; steps up to 110°", YAW,
         {"settle": MetricClaim("< 0.5 s", 0.5), "overshoot": SILENT, "peak_rate": SILENT, "max_z": SILENT},
         "The firmware's range of the flaps allows ±25° about hover: with 110 rad/s² per rad and a damping of 7.7 1/s even "
         "the best switching needs 0.47 s to 5 %. The paper names neither range nor band.",
+        marks=SETTLED,
     ),
     "yaw-sine-0.02": _sine("0.02"),
     "yaw-sine-0.05": _sine("0.05"),

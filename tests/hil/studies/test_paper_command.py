@@ -17,6 +17,7 @@ from hil.design.sweeps import point_of
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import METRICS
 from hil.laboratory.request import Options
+from hil.pictures.panels import Instant
 from hil.studies.catalogue import PROFILES
 from hil.studies.paper import Paper, Spread, Trials
 from hil.studies.paper_report import write_paper
@@ -160,7 +161,8 @@ def test_what_misses_the_paper_is_told_whatever_the_limits_say(result: Row) -> N
 @pytest.mark.long
 def test_the_badges_say_which_kind_of_verdict_they_are(result: Row, tmp_path: Path) -> None:
     good = trials(result, True, True)
-    row = PaperRow("t", "c", "p", {"rms_x": MetricClaim("0", 0.0)}, "why")
+    marks = (Instant("paper", 0.5, "paper: settled"),)
+    row = PaperRow("t", "c", "p", {"rms_x": MetricClaim("0", 0.0)}, "why", marks=marks)
     study = StudyResult(
         Study("s", "q", "a", "", (0.0, 1.0), ()),
         (
@@ -181,6 +183,9 @@ def test_the_badges_say_which_kind_of_verdict_they_are(result: Row, tmp_path: Pa
         ),
     ):
         page = write_paper(tmp_path, paper).read_text(encoding="utf-8")
+        (_, shown, _), *_ = paper.rows
+        of_one = (tmp_path / "t.html").read_text(encoding="utf-8")
+        assert ('"paper: settled"' in of_one) == bool(shown.marks)
         assert re.findall(r'class="verdict \w+">([^<]+)<', page) == badges
         assert (
             Page(page).links[: 1 + len(paper.studies)] == ["t.html", "studies.html"][: 1 + len(paper.studies)]
