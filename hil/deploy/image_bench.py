@@ -16,13 +16,13 @@ from firmware_py.wire.crtp import PORT_PARAMETERS, Packet, decode, encode
 from firmware_py.wire.parameters import CHANNEL_WRITE, encode_ident
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.supervisor import Cause
+from hil.bodies import make_body
 from hil.config import LabConfig
 from hil.devices.board import VirtualBoard
 from hil.devices.image_firmware import ChipImage, ImageFirmware
 from hil.devices.imu import VirtualImu
 from hil.errors import LabError
 from hil.events import EventQueue
-from hil.floaty.plant import Plant
 from hil.laboratory.robot import BENCH_NOISE, Streams
 
 STEP_US = 1_000
@@ -114,9 +114,7 @@ class ImageBench:
         streams = Streams.of_seed(1)
         self._imu = VirtualImu(config.imu, streams.imu)
         self._imu.set_noise_scale(BENCH_NOISE)
-        self._plant = Plant(
-            config.geometry, config.plant, config.tunnel, config.actuators, streams.gusts, config.flight.home
-        )
+        self._body = make_body(config, streams.gusts, config.flight.home)
         self._firmware = ImageFirmware(flashed, board, self._sample)
         board.run_on(self._firmware.kernel, EventQueue())
         self._table = self._firmware.parameters
@@ -219,7 +217,7 @@ class ImageBench:
             self._firmware.parts.sample(self._sample())
 
     def _sample(self) -> ImuCounts:
-        return self._imu.sample(self._plant)
+        return self._imu.sample(self._body)
 
     def _take(self, now_us: int, data: bytes) -> bool:
         self._answers.append(data)

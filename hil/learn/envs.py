@@ -313,10 +313,14 @@ def fleet_of(setup: Setup, count: int) -> Fleet:
     """Return the fast robots of a setup. Raises `LabError` for what only the whole laboratory has."""
     if setup.faults:
         raise LabError(f'faults = {setup.faults!r}: need fidelity="firmware"')
+    board = load_config(setup.profile, settings_of(setup.overrides))
+    if not board.robot.has_plates:
+        raise LabError(
+            f'profile = {setup.profile!r}: its body is {board.robot.body}; only floaty has fidelity="fast"'
+        )
     unused, _ = seeding.np_random(0)  # these plants never advance
     worlds = [
         Plant(world.geometry, world.plant, world.tunnel, world.actuators, unused, world.flight.home)
         for world in (load_config(setup.profile, settings) for settings in setup.settings())
     ]
-    board = load_config(setup.profile, settings_of(setup.overrides))
     return Fleet(board, worlds, count, setup.pose_delay_us, setup.errors)

@@ -139,7 +139,7 @@ def write_tuned(path: Path, base: str, config: LabConfig, about: str) -> None:
 
 def worst_settings(tuned: Tuned, config: LabConfig) -> list[tuple[str, ...]]:
     """Return the settings that make the plant the worst of the drawn robots, as far as the plant can represent them."""
-    if config.plant.variant == "plate":
+    if config.plant.variant == "plate" or not config.robot.has_plates:
         return []
     plant = Plant(config.geometry, config.plant, config.tunnel, config.actuators, Streams.of_seed(1).gusts)
     truth, factors = asdict(plant.linearise()), config.plant.constant_factors

@@ -196,6 +196,10 @@ def test_the_errors_of_the_fast_model_are_those_of_the_laboratory_s_hover(tmp_pa
     [
         ({"task": "Hoover"}, "task 'Hoover': unknown; did you mean Hover?"),
         ({"task": "Hover", "fidelity": "slow"}, "fidelity = 'slow': expected fast or firmware"),
+        (
+            {"task": "Hover", "profile": "crazyflie"},
+            "profile = 'crazyflie': its body is crazyflie; only floaty has",
+        ),
         ({"task": "Hover", "duration_s": 0.0}, "duration_s = 0.0: expected seconds, above 0 and up to 3600"),
         ({"task": "Hover", "pose_delay_us": 130_000}, "pose_delay_us = 130000: expected 0..120000"),
         ({"task": "Hover", "robots": "tabel"}, "campaign 'tabel': neither the name of a campaign"),
