@@ -85,6 +85,12 @@ class LabConfig(FirmwareConfig):
         default_factory=dict, description="limits by experiment that replace the experiment's own"
     )
 
+    def reads(self, section: str) -> bool:
+        """Whether a section has an effect on this robot; a body in a file may read them all."""
+        if self.pilot.enabled:  # neither Floaty's body nor its firmware
+            return section not in {"geometry", "plant", "actuators", *FirmwareConfig.model_fields}
+        return section != "quadrotor" or not self.robot.has_plates
+
 
 def profile_names() -> list[str]:
     return sorted({path.stem for folder in _FOLDERS if folder.is_dir() for path in folder.glob("*.toml")})

@@ -190,6 +190,9 @@ class Request:
             raise LabError(
                 f"--duration {self.duration_s:g}: expected seconds, above 0 and up to {DURATION_MAX_S:g}"
             )
+        for override in self.overrides[len(self.experiment.settings) :]:
+            if not self.config.reads(override.partition(".")[0].strip()):
+                raise LabError(f"--set {override}: has no effect on the robot of profile {self.profile}")
         on_top = self.planned_faults[len(self.experiment.faults) :]
         check(on_top, self.duration_s, self.bench.link, self.config)
         check_limits(self.limits, self.experiment.metrics)

@@ -36,7 +36,7 @@ class World(Protocol):
 
     @property
     def plant(self) -> PlantConfig:
-        """Of it: tether, ground and limits."""
+        """Of it: tether, ground, limits, and the factors on mass and inertia."""
 
     @property
     def battery(self) -> BatteryConfig:
@@ -62,7 +62,10 @@ class RigidBody(InTunnel):
         s = np.zeros(at.SIZE)
         super().__init__(s, Tunnel(world.tunnel, s), world.plant, rng_gust)
         self._check_masses()
-        s[at.MASS], s[at.INERTIA : at.INERTIA + 3] = self.mass, self.inertia
+        s[at.MASS] = self.mass * world.plant.mass_factor
+        s[at.INERTIA : at.INERTIA + 3] = np.multiply(self.inertia, world.plant.inertia_factor)
+        if world.plant.constant_factors or world.plant.drag_factor != 1.0:
+            raise LabError("plant.constant_factors and plant.drag_factor act on floaty only")
         self.counts: tuple[int, ...] = (0, 0, 0, 0)
         self._electronics = world.battery.electronics_power
         self._failed: str | None = None

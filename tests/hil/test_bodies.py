@@ -90,6 +90,19 @@ def test_a_body_in_free_fall_falls_as_galileo_says(tmp_path: Path) -> None:
     assert body.state.tolist() == [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 
+def test_it_may_be_heavier_than_designed_but_has_no_constants_of_floaty(tmp_path: Path) -> None:
+    def falls(*overrides: str) -> float:
+        config = load_config(project(tmp_path, FLOATING), overrides)
+        body = make_body(config, np.random.default_rng(1), (0.0, 0.0, 1.15))
+        body.advance(1_000)
+        return float(body.specific_force_B[2])
+
+    assert falls() == pytest.approx(9.81)
+    assert falls("plant.mass_factor=1.25") == pytest.approx(9.81 / 1.25)
+    with pytest.raises(LabError, match=r"plant\.constant_factors and plant\.drag_factor act on floaty only"):
+        falls("plant.constant_factors={yaw_u3=1.1}")
+
+
 def test_a_torque_turns_it_and_a_push_moves_it(tmp_path: Path) -> None:
     robot = FLOATING.replace("(0.0, 0.0, 0.0)", "(0.0, 0.0, 1e-3)")
     body = make_body(load_config(project(tmp_path, robot)), np.random.default_rng(1), (0.0, 0.0, 1.15))

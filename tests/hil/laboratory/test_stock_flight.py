@@ -41,6 +41,21 @@ def test_flight_too_short_for_take_off_and_landing_is_refused(tmp_path: Path) ->
     assert Request.of(HOVER, profile=PROFILE, board=str(image), duration_s=7.5).times is not None
 
 
+@pytest.mark.parametrize(
+    ("profile", "override"),
+    [(PROFILE, "controller.gain_z=3"), (PROFILE, "actuators.tau=0.1"), ("floaty", "quadrotor.mass=0.03")],
+)
+def test_setting_that_nothing_on_the_robot_reads_is_refused(
+    profile: str, override: str, tmp_path: Path
+) -> None:
+    image = tmp_path / "cf2.elf"
+    image.write_bytes(b"")
+    with pytest.raises(
+        LabError, match=rf"^--set {override}: has no effect on the robot of profile {profile}$"
+    ):
+        Request.of(HOVER, profile=profile, board=str(image), overrides=[override])
+
+
 def test_goals_stay_in_the_room() -> None:
     config = load_config(PROFILE)
     assert why_left(config, (0.0, 1.9, 1.0)) == ""
