@@ -293,6 +293,7 @@ class Quadrotor(InTunnel):
         self.rpm, self.thrust = self._view(RPM, 4), self._view(THRUST, 4)
         self._electronics = self._power = battery.electronics_power
         self._drawn_us, self._drawn_J = 0, 0.0
+        self._commanded = np.zeros(4)  # share of the PWM period
         self.settings: Mapping[str, Setting] = {
             f"motor.{name}.{i + 1}": self._setting(place + i)
             for name, place in (("strength", STRENGTH), ("current", CURRENT), ("obeys", OBEYS))
@@ -305,8 +306,9 @@ class Quadrotor(InTunnel):
         """Take the compare counts of M1 to M4; a PWM period of 3 us is no delay."""
         self.advance(now_us)
         for i, count in enumerate(counts):
+            self._commanded[i] = duty = min(max(count, 0), PWM_STEPS) / PWM_STEPS
             if self._s[OBEYS + i] != 0.0:
-                self._s[DUTY + i] = min(max(count, 0), PWM_STEPS) / PWM_STEPS
+                self._s[DUTY + i] = duty
 
     def _setting(self, place: int) -> Setting:
         return Setting(lambda: float(self._s[place]), lambda value: self._s.__setitem__(place, value))
@@ -321,15 +323,20 @@ class Quadrotor(InTunnel):
         return self._power
 
     def channels(self) -> tuple[Channel, ...]:
-        """Return speed and thrust of the rotors."""
+        """Return speed and thrust of the rotors, and the thrust that each would settle at if nothing had failed."""
         return tuple(
-            Channel(
-                "float32",
-                partial(_same, view),
-                (Quantity(tuple(f"rotor.{name}_{i}" for i in (1, 2, 3, 4)), unit),),
+            Channel("float32", read, (Quantity(tuple(f"rotor.{name}_{i}" for i in (1, 2, 3, 4)), unit),))
+            for name, read, unit in (
+                ("rpm", partial(_same, self.rpm), "rpm"),
+                ("thrust", partial(_same, self.thrust), "N"),
+                ("command", self._commanded_thrust, "N"),
             )
-            for name, view, unit in (("rpm", self.rpm, "rpm"), ("thrust", self.thrust, "N"))
         )
+
+    def _commanded_thrust(self) -> NDArray[np.float64]:
+        volts = self._commanded * self._s[SUPPLY]
+        c0, c1, c2, c3 = V_TO_THRUST
+        return np.where(volts > IDLE_V, c0 + volts * (c1 + volts * (c2 + volts * c3)), 0.0)
 
     @property
     def lost(self) -> str | None:

@@ -73,6 +73,12 @@ def actuators(log: pa.Table) -> tuple[tuple[str, Curves], ...]:
     return tuple((name, plot) for name, plot in moving if plot.fits(log.column_names))
 
 
+def command_of(plot: Curves, log: pa.Table) -> Curves | None:
+    """Return the commands of actuators in their own unit; None where the log has none."""
+    command = FLAPS_COMMAND if plot is FLAPS else ROTORS_COMMAND if plot is ROTORS else None
+    return command if command is not None and command.fits(log.column_names) else None
+
+
 def since_release(log: pa.Table) -> NDArray[np.float64]:
     """Return the time of every row [s], zero at the release."""
     return np.asarray(1e-6 * (column(log, "t") - release_of(log.schema.metadata)))
@@ -142,6 +148,9 @@ MOTORS = Curves(
 )
 FLAPS_COMMAND = Curves(
     _four("command "), FLAP_COLOURS, "deg", _degrees(*_four("control.flap_")), needs="control.flap_1"
+)
+ROTORS_COMMAND = Curves(
+    _four("command "), FLAP_COLOURS, "mN", plain(*_four("rotor.command_"), scale=1e3), needs="rotor.command_1"
 )
 INPUTS = Curves(
     ("u1 roll", "u2 pitch", "u3 yaw", "u4 height"),

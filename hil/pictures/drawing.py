@@ -1,6 +1,6 @@
 """Draws figures as PNG: size, style, and panels in matplotlib, which is loaded here.
 
-Grey: the robot was still held; red: a fault was in force; pink: failsafe; yellow strip at the bottom: a flap at its limit;
+Grey: the robot was still held; red: a fault was in force; pink: failsafe; yellow strip below: a command at its limit;
 dotted blue: an operator's action; black: the flight was lost.
 """
 
@@ -31,10 +31,10 @@ from hil.pictures.panels import INK, Marks, Panel, Plot, Series, marks_of_flight
 
 MARK_LENGTH = 28  # letters
 WIDTH, DPI = 9.2, 115  # [in], 1/in
-SPELL_COLOURS = {"held": GREY, "fault": RED, "failsafe": PINK, "flap limit": YELLOW}
+SPELL_COLOURS = {"held": GREY, "fault": RED, "failsafe": PINK, "limit": YELLOW}
 INSTANT_COLOURS = {"operator": BLUE, "lost": INK}
 SHADE = 0.18  # opacity
-STRIP = 0.04  # of the axes' height: flaps at their limits
+STRIP = 0.04  # of the axes' height: commands at their limits
 STYLE: Any = {
     "axes.grid": True,
     "axes.spines.right": False,
@@ -120,8 +120,8 @@ def _draw(axes: Axes, panel: Panel) -> None:
 def draw_marks(axes: Sequence[Axes], marks: Marks) -> None:
     """Shade and mark the events; the first axes name them. The time axis is zero at the release."""
     for spell in marks.spells:
-        high = STRIP if spell.kind == "flap limit" else 1.0
-        alpha = 0.9 if spell.kind == "flap limit" else SHADE
+        high = STRIP if spell.kind == "limit" else 1.0
+        alpha = 0.9 if spell.kind == "limit" else SHADE
         for one in axes:
             one.axvspan(
                 spell.begin_s, spell.end_s, 0.0, high, color=SPELL_COLOURS[spell.kind], alpha=alpha, linewidth=0

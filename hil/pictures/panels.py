@@ -14,7 +14,7 @@ from firmware_py.wire.supervisor import State
 from hil.laboratory.faults import spans_of
 from hil.laboratory.metrics import column, free_flight
 from hil.laboratory.recorder import release_of, stored_in
-from hil.pictures.curves import GREY, Curves, marks_of, since_release
+from hil.pictures.curves import GREY, MOTORS, Curves, marks_of, since_release
 
 Signal = NDArray[np.float64]  # (N,)
 ROUNDING = 1e-6  # [rad] float32 of a command at its limit
@@ -79,7 +79,7 @@ class Still:
 class Spell:
     """An interval of a flight that every figure shades."""
 
-    kind: str  # held, fault, failsafe, flap limit
+    kind: str  # held, fault, failsafe, limit
     begin_s: float
     end_s: float
     text: str = ""
@@ -132,8 +132,8 @@ def marks_of_flight(log: pa.Table, lost: str | None = None) -> Marks:
         if begin_s < times[-1]:
             spells.append(Spell("fault", begin_s, min(end_s, float(times[-1])), str(span.fault)))
     spells += _spells("failsafe", times, column(log, "supervisor.state") == State.FAILSAFE)
-    for flap, at_limit in saturated(log):
-        spells += _spells("flap limit", times, at_limit & (times > 0.0), f"flap {flap}")
+    for name, at_limit in saturated(log):
+        spells += _spells("limit", times, at_limit & (times > 0.0), name)
     instants = [Instant("operator", 1e-6 * (us - release_us), text) for us, text in marks_of(log)]
     free = free_flight(log)
     if lost is not None and free.num_rows:
@@ -153,8 +153,13 @@ def _spells(kind: str, times: Signal, acts: NDArray[np.bool_], text: str = "") -
     return (Spell(kind, begin_s, end_s, text) for begin_s, end_s in joined)
 
 
-def saturated(flight: pa.Table) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-    """Yield the flaps whose commands reach an end of their range, and the rows in which they do."""
+def saturated(flight: pa.Table) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Yield the flaps and motors whose commands reach an end of their range, and the rows in which they do."""
+    if MOTORS.fits(flight.column_names):
+        for name, share in zip(MOTORS.names, MOTORS.read(flight).T, strict=True):
+            if (share >= 100.0).any():
+                yield name, share >= 100.0
+        return
     limits = stored_in(flight.schema.metadata, "config").get("allocation")
     # a real board does not report its commands
     if limits is None or "control.flap_1" not in flight.column_names:
@@ -165,7 +170,7 @@ def saturated(flight: pa.Table) -> Iterator[tuple[int, NDArray[np.bool_]]]:
             opening >= limits["opening_max"] - ROUNDING
         )
         if at_limit.any():
-            yield flap, at_limit
+            yield f"flap {flap}", at_limit
 
 
 def lanes(states: Iterable[tuple[str, Signal, list[str], dict[str, str]]], end_s: float) -> tuple[Bar, ...]:

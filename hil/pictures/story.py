@@ -44,7 +44,7 @@ class Moment:
 
 
 def story_of(log: pa.Table, result: Result) -> list[Moment]:
-    """Return release, faults, the first limit passed, the first saturated flap, failsafes and loss in the order of time."""
+    """Return release, faults, the first limit passed, the first command at its limit, failsafes and loss, in order."""
     release_us = release_of(log.schema.metadata)
     free = free_flight(log)
     if free.num_rows == 0:
@@ -59,8 +59,8 @@ def story_of(log: pa.Table, result: Result) -> list[Moment]:
     if passed:
         row, name = min(passed)
         moments.append(Moment(seconds[row], f"first limit passed: {name}"))
-    for flap, at_limit in saturated(free):
-        moments.append(Moment(seconds[_first(at_limit)], f"flap {flap} saturates for the first time"))
+    for name, at_limit in saturated(free):
+        moments.append(Moment(seconds[_first(at_limit)], f"{name} saturates for the first time"))
     failsafe = column(free, "supervisor.state") == State.FAILSAFE
     for row in np.flatnonzero(np.diff(failsafe, prepend=False)).tolist():
         moments.append(Moment(seconds[row], f"failsafe {'begins' if failsafe[row] else 'ends'}"))
@@ -75,13 +75,14 @@ def _first(wrong: NDArray[np.bool_]) -> int:
 
 def _passed(flight: pa.Table, result: Result) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """Yield the limits that failed and have an instant at which they were passed, and the rows beyond them."""
-    error = np.abs(position_error(flight))
+    error, times = np.abs(position_error(flight)), since_release(flight)
+    open_loop = column(flight, "supervisor.state") != State.FLYING
     beyond: Mapping[str, tuple[NDArray[np.float64], float | None]] = {
         **{f"max_{axis}": (error[:, index], None) for index, axis in enumerate("xyz")},
         **{f"within_6cm_{axis}": (error[:, index], NEAR) for index, axis in enumerate("xyz")},
         "in_box": (error.max(axis=1), BOX),
         "attitude_max": (np.abs(attitude_error(flight)).max(axis=1), None),
-        "uncontrolled": ((column(flight, "supervisor.state") != State.FLYING).astype(np.float64), 0.5),
+        "uncontrolled": (np.cumsum(open_loop * np.diff(times, prepend=times[0])), None),
     }
     for verdict in result.verdicts:
         if not verdict.holds and verdict.metric in beyond:
@@ -191,12 +192,10 @@ def _begin(spell: Spell) -> float:
 
 def _plot(rows: pa.Table, window_s: tuple[float, float]) -> Plot:
     """Draw the truth with what the board believed and commanded."""
-    commanded = curves.FLAPS_COMMAND.needs in rows.column_names
     moving = [
-        _with(plot, curves.FLAPS_COMMAND, "command", rows, name)
-        if commanded and plot is curves.FLAPS
-        else panel(plot, rows, name)
+        panel(plot, rows, name) if command is None else _with(plot, command, "command", rows, name)
         for name, plot in curves.actuators(rows)
+        for command in [curves.command_of(plot, rows)]
     ]
     return Plot(
         (
@@ -224,6 +223,7 @@ def _with(curve: Curves, other: Curves, name: str, rows: pa.Table, label: str) -
 GAP_MS = 50.0  # without a fused pose: worth a sentence
 FAR_DEG = 10.0  # of a flap from its command, for longer than a servo needs
 FAR_S = 0.1
+FAR_MN = 7.0  # of a rotor's mean thrust from its command: a tenth of that in a hover
 OUTWARDS = np.array([1.0, -1.0, 1.0, -1.0])  # the sign of an opening flap's angle
 
 
@@ -231,7 +231,7 @@ def evidence(rows: pa.Table) -> list[str]:
     """Return sentences about rows of a log; none about fewer than two."""
     if rows.num_rows < 2:
         return []
-    return [*_robot(rows), *_belief(rows), *_poses(rows), *_limits(rows), *_flaps(rows)]
+    return [*_robot(rows), *_belief(rows), *_poses(rows), *_limits(rows), *_flaps(rows), *_rotors(rows)]
 
 
 def _robot(rows: pa.Table) -> Iterator[str]:
@@ -269,8 +269,8 @@ def _poses(rows: pa.Table) -> Iterator[str]:
 def _limits(rows: pa.Table) -> Iterator[str]:
     times = since_release(rows)
     shown = [
-        f"flap {flap} for {at_limit.mean() * (times[-1] - times[0]):.2f} s, from {times[_first(at_limit)]:.2f} s on"
-        for flap, at_limit in saturated(rows)
+        f"{name} for {at_limit.mean() * (times[-1] - times[0]):.2f} s, from {times[_first(at_limit)]:.2f} s on"
+        for name, at_limit in saturated(rows)
     ]
     if shown:
         yield f"Commands at their limits: {'; '.join(shown)}."
@@ -291,6 +291,18 @@ def _flaps(rows: pa.Table) -> Iterator[str]:
                 f"Flap {flap + 1} was up to {away[:, flap].max():.0f} deg away from its command: at {times[row]:.2f} s it "
                 f"stood at {angles[row, flap]:.0f} deg, and the board believed {believed[row, flap]:.0f} deg."
             )
+
+
+def _rotors(rows: pa.Table) -> Iterator[str]:
+    if curves.command_of(curves.ROTORS, rows) is None:
+        return
+    given, wanted = curves.ROTORS.read(rows).mean(axis=0), curves.ROTORS_COMMAND.read(rows).mean(axis=0)
+    apart = given - wanted
+    for index in np.flatnonzero(
+        np.abs(apart - np.median(apart)) > FAR_MN
+    ).tolist():  # the ground helps them all
+        name = curves.ROTORS.names[index]
+        yield f"{name} gave {given[index]:.0f} mN on average where {wanted[index]:.0f} mN were commanded."
 
 
 def _largest(curve: Curves, rows: pa.Table) -> str:

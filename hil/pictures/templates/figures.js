@@ -2,7 +2,7 @@
 (function () {
   "use strict";
   const told = JSON.parse(document.getElementById("figures").textContent);
-  const SHADES = { held: "#8888882e", fault: "#d55e002e", failsafe: "#cc79a74d", "flap limit": "#b8a900" };
+  const SHADES = { held: "#8888882e", fault: "#d55e002e", failsafe: "#cc79a74d", limit: "#b8a900" };
   const MARKS = { operator: "#0072b2", lost: "#000000", paper: "#d04030" };
   const AXIS_PX = 84, INCH_PX = 88, TICKS_PX = 17, STRIP_PX = 4, RIGHT_PX = 10, TEXT = "11px system-ui, sans-serif";
   const PRINTED_PX = 690; // what fits beside the margins of a page of A4
@@ -39,7 +39,7 @@
     ctx.clip();
     for (const spell of marks.spells) {
       const begin = u.valToPos(spell.begin_s, "x", true), end = u.valToPos(spell.end_s, "x", true);
-      const high = spell.kind === "flap limit" ? STRIP_PX * devicePixelRatio : bbox.height;
+      const high = spell.kind === "limit" ? STRIP_PX * devicePixelRatio : bbox.height;
       ctx.fillStyle = SHADES[spell.kind];
       ctx.fillRect(begin, bbox.top + bbox.height - high, Math.max(end - begin, 1), high);
     }

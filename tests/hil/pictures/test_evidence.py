@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from hil.experiments import EXPERIMENTS
@@ -16,7 +17,7 @@ from hil.laboratory.run import fly
 from hil.pictures.curves import since_release
 from hil.pictures.figures import course_of, goal_moves
 from hil.pictures.panels import saturated
-from hil.pictures.story import evidence, failures_of
+from hil.pictures.story import _rotors, evidence, failures_of
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +62,8 @@ def test_commands_at_their_limits_are_named_with_how_long_they_stood_there(folde
     log = load_log(folder)
     rows = log.filter(since_release(log) >= 1.5)
     (limits,) = [sentence for sentence in evidence(rows) if sentence.startswith("Commands at their limits: ")]
-    for flap, at_limit in saturated(rows):
-        (told,) = [part for part in limits.split(": ")[1].split("; ") if part.startswith(f"flap {flap} ")]
+    for name, at_limit in saturated(rows):
+        (told,) = [part for part in limits.split(": ")[1].split("; ") if part.startswith(f"{name} ")]
         _, stood_s, from_s = numbers(told.rstrip("."))
         assert stood_s == pytest.approx(0.01 * at_limit.sum(), abs=0.02)
         assert from_s == pytest.approx(since_release(rows)[np.argmax(at_limit)], abs=0.006)
@@ -87,3 +88,24 @@ def test_the_course_is_the_flight_from_the_first_goal_red_while_a_fault_is_in_fo
     times = since_release(free)
     within = ((times >= 0.5) & (times <= 0.9)) | (times >= 1.2)
     assert (course.troubled == within).mean() > 0.98
+
+
+def rotors(count: int, *given_mN: float) -> pa.Table:
+    """A log of rotors that all should give 70 mN."""
+    columns = {f"rotor.thrust_{i + 1}": [1e-3 * given] * count for i, given in enumerate(given_mN)}
+    columns |= {f"rotor.command_{i}": [0.07] * count for i in (1, 2, 3, 4)}
+    return pa.table({"t": [10_000 * row for row in range(count)]} | columns)
+
+
+def test_a_rotor_that_gives_less_than_commanded_is_named_and_the_ground_under_all_is_not() -> None:
+    assert list(_rotors(rotors(5, 70.0, 13.0, 68.0, 71.0))) == [
+        "M2 gave 13 mN on average where 70 mN were commanded."
+    ]
+    assert list(_rotors(rotors(5, 90.0, 91.0, 90.0, 92.0))) == []
+    assert list(_rotors(rotors(5, 70.0, 13.0, 68.0, 71.0).drop_columns("rotor.command_1"))) == []
+
+
+def test_a_motor_whose_command_is_at_the_top_is_named() -> None:
+    words = {f"motor.m{i}": [65535, 40000] if i == 2 else [40000, 40000] for i in (1, 2, 3, 4)}
+    found = {name: at.tolist() for name, at in saturated(pa.table({**words, "rotor.thrust_1": [0.0, 0.0]}))}
+    assert found == {"M2": [True, False]}

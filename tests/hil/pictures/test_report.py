@@ -267,7 +267,7 @@ def test_faults_failsafe_flap_limits_and_loss_are_marked_for_every_figure_and_sh
         ("fault", "push.x@0.3=1", exact(0.3), exact(0.4)),
         ("fault", "servo.slow.2@1=0.5", exact(1.0), exact(1.99)),
         ("failsafe", "", exact(0.6), exact(0.7)),
-        ("flap limit", "flap 2", exact(0.55), exact(0.6)),
+        ("limit", "flap 2", exact(0.55), exact(0.6)),
     ]
     assert marks["instants"] == [{"kind": "lost", "t_s": exact(1.99), "text": "fell"}]
     windows = {name: plot["window"] for name, plot in page.plots.items() if plot["alone"]}
