@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
 
+from firmware_py.export.boards import BOARDS, PYTHON
 from hil.bodies import MEASURED
 from hil.config import DEFAULT_PROFILE, read_toml
 from hil.errors import LabError, hint
@@ -100,6 +101,9 @@ class Spec(_Part):
     settings: tuple[str, ...] = Field((), description="section.key=value, of every flight")
     duration_s: float | None = Field(None, gt=0, description="free flight [s]; default: the experiment's")
     link: Literal["radio", "mavlink"] = "radio"
+    board: str = Field(
+        PYTHON, description=f"{', '.join(BOARDS)}, or the image of a Crazyflie's firmware, an ELF file"
+    )
     flights: int = Field(ge=1, le=10_000_000)
     seeds: int = Field(1, ge=1, description="flights per point, profile and experiment")
     seed: int = Field(1, ge=0, le=2**61, description="of the sampling, and of the first flight")
@@ -184,6 +188,7 @@ def read_spec(path: Path) -> Spec:
         update={
             "experiments": tuple(str(folder / one) if ".py" in one else one for one in spec.experiments),
             "profiles": tuple(str(folder / one) if one.endswith(".toml") else one for one in spec.profiles),
+            "board": spec.board if spec.board in BOARDS else str(folder / spec.board),
         }
     )
 

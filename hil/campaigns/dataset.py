@@ -17,7 +17,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from firmware_py.export.boards import PYTHON
 from firmware_py.logic.loading import digest_of
+from hil.bodies import digest_of_body
 from hil.campaigns.jobs import Plan, Row
 from hil.config import load_config
 from hil.errors import LabError, writing
@@ -123,9 +125,11 @@ class Dataset:
 def about(plan: Plan) -> dict[str, Any]:
     """Return what identifies a plan: if it is equal, flights of the same number are equal."""
     sources = [find_experiment(name).source for name in plan.experiments]
+    board = Path(plan.job(0).options.get("board", PYTHON))
     return {
         **plan.about,
         "experiments": [source and source.sha256 for source in sources],
+        "image": hashlib.sha256(board.read_bytes()).hexdigest()[:16] if board.is_file() else "",
         "profiles": {name: _digest_of(name) for name in plan.profiles},
         "commit": commit(),
         "versions": versions(),
@@ -134,7 +138,8 @@ def about(plan: Plan) -> dict[str, Any]:
 
 def _digest_of(profile: str) -> str:
     config = load_config(profile)
-    return hashlib.sha256((config.model_dump_json() + digest_of(config.logic)).encode()).hexdigest()[:16]
+    files = digest_of(config.logic) + digest_of_body(config)
+    return hashlib.sha256((config.model_dump_json() + files).encode()).hexdigest()[:16]
 
 
 def _difference(name: str, before: Any, now: Any) -> str:

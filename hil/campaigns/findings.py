@@ -212,7 +212,7 @@ def _limits(spec: Spec, flights: pa.Table) -> tuple[Limited, ...]:
     for cell in range(cells):
         drawn = draw(spec, cell)
         profile = drawn.options["profile"]
-        plain = Options(profile=profile, overrides=spec.settings, duration_s=spec.duration_s, link=spec.link)
+        plain = Options(**{**drawn.options, "overrides": spec.settings, "faults": ()})
         request = replace(drawn, options=plain).request()
         rows = _of_cell(flights, drawn.experiment, profile)
         for name, bound in request.limits.items():

@@ -205,6 +205,7 @@ def draw_at(spec: Spec, shares: NDArray[np.float64], index: int, point: int, cel
         profile=spec.profiles[profile], seed=spec.seed + base * spec.seeds + repetition,
         overrides=(*spec.settings, *(f"{name}={_toml(value)}" for name, value in parameters.items())),
         faults=tuple(filter(None, faults)), duration_s=spec.duration_s, link=spec.link,
+        board=spec.board,
     )  # fmt: skip
     return Job(index, spec.experiments[experiment], options, parameters, limits=spec.limits)
 

@@ -109,6 +109,11 @@ class ModelledLine:
         """Return the link that flies the stock firmware. Raises `LabError` for a parameter that the image lacks."""
         config, flashed = request.config, self.robot.firmware.flashed
         table = {} if flashed is None else flashed.parameters
+        if "floaty.armed" in table:
+            raise LabError(
+                f"--board {request.bench.board}: it has Floaty's app, which drives servos; the robot of profile "
+                f"{request.profile} takes Bitcraze's firmware as it is"
+            )
         for group, values in config.pilot.parameters.items():
             for name in values:
                 if f"{group}.{name}" not in table:

@@ -166,6 +166,21 @@ def test_no_room_for_a_flight_s_own_files_ends_the_campaign_and_is_no_row() -> N
     gc.collect()  # the telemetry log that found no room
 
 
+@pytest.mark.parametrize(("changed", "what"), [("robot.py", "profiles"), ("cf2.elf", "image")])
+def test_a_campaign_continues_with_the_files_with_which_it_began(
+    changed: str, what: str, tmp_path: Path
+) -> None:
+    (tmp_path / "own.toml").write_text('base = "floaty"\n[robot]\nbody = "robot.py"\n')
+    for name in ("robot.py", "cf2.elf"):
+        (tmp_path / name).write_text("x = 1\n")
+    spec = spec_of(profiles=[str(tmp_path / "own.toml")], board=str(tmp_path / "cf2.elf"))
+    Dataset(tmp_path / "out", plan_of(spec), resume=False).close()
+    Dataset(tmp_path / "out", plan_of(spec), resume=True).close()
+    (tmp_path / changed).write_text("x = 2\n")
+    with pytest.raises(LabError, match=rf"--resume: {what}.* was .* and is .*: choose another --out"):
+        Dataset(tmp_path / "out", plan_of(spec), resume=True)
+
+
 def test_a_folder_is_not_mistaken_for_another_campaign(tmp_path: Path) -> None:
     spec = spec_of()
     flown_into(tmp_path / "out", spec, limited(workers(1), 3))

@@ -72,6 +72,7 @@ def test_the_example_flies_the_hover_on_every_robot_that_the_table_allows() -> N
         ),
         (HOVER.replace("hover", "hovver"), "experiment 'hovver': unknown; did you mean hover?"),
         (HOVER + 'profiles = ["flaoty"]', "did you mean floaty?"),
+        (HOVER + 'board = "cf2.elf"', "cf2.elf: expected python, c, cortex-m4, an image"),
     ],
 )
 def test_a_bad_spec_is_one_line_and_exit_code_two(
@@ -105,10 +106,13 @@ def test_a_bad_option_is_one_line_and_exit_code_two(
 
 def test_files_that_a_spec_names_begin_at_its_folder(tmp_path: Path) -> None:
     path = tmp_path / "own.toml"
-    path.write_text('experiments = ["mine.py:PUSHED", "hover"]\nprofiles = ["lab.toml"]\nflights = 1\n')
+    path.write_text(
+        'experiments = ["mine.py:PUSHED", "hover"]\nprofiles = ["lab.toml"]\nboard = "cf2.elf"\nflights = 1\n'
+    )
     spec = read_spec(path)
     assert spec.experiments == (f"{tmp_path}/mine.py:PUSHED", "hover")
     assert spec.profiles == (f"{tmp_path}/lab.toml",)
+    assert spec.board == f"{tmp_path}/cf2.elf"
 
 
 def test_a_missing_extra_says_how_to_install_it(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:

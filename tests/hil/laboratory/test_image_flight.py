@@ -57,6 +57,12 @@ def test_the_image_falls_into_its_failsafe_when_poses_stop_and_recovers(tmp_path
     assert "FLOATY: supervisor: flying" in said(tmp_path)
 
 
+@flies
+def test_an_image_with_the_app_flies_no_crazyflie(tmp_path: Path) -> None:
+    with pytest.raises(LabError, match=r"it has Floaty's app, which drives servos"):
+        hover(tmp_path / "run", profile="crazyflie", board=ELF)
+
+
 @pytest.mark.long
 @flies
 def test_the_image_answers_a_push_as_the_python_board_does(tmp_path: Path) -> None:
