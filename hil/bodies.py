@@ -18,7 +18,16 @@ from hil.world.body import Body, Failure, Vector
 
 Make = Callable[[LabConfig, np.random.Generator, Vector], Body]
 OWN = "Robot"  # what a file defines: a class or function that is called as a `Make`
-SIZES = {"state": 13, "p_WB": 3, "q_WB": 4, "omega_B": 3, "specific_force_B": 3, "flow_W": 3, "pushes": 6}
+SIZES = {
+    "state": 13,
+    "p_WB": 3,
+    "q_WB": 4,
+    "omega_B": 3,
+    "specific_force_B": 3,
+    "flow_W": 3,
+    "pushes": 6,
+    "vibration": 2,
+}
 PARTS = (
     "outputs", "tunnel", "settings", "look", "markers", "lost", "advance", "set_counts", "draw", "hold", "release",
     "put_back", "push", "channels",

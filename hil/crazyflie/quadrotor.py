@@ -72,7 +72,8 @@ ROTOR_ABOVE = ROTOR_RADIUS + 1
 IMPACT_MAX = ROTOR_ABOVE + 1
 TOUCHED = IMPACT_MAX + 1  # 1: the feet were on the floor a step before
 SINKING = TOUCHED + 1  # [m/s] when the step began
-SIZE = SINKING + 1
+SHAKING = SINKING + 1  # (2,) [rad/s, m/s2] per rms of the rotors' squared speeds [rpm2]
+SIZE = SHAKING + 2
 
 LEFT_ROOM, TOO_HIGH, HIT_FLOOR, TUMBLED = 1, 2, 3, 4  # causes in LOST
 LOSS_TEXTS = {
@@ -111,6 +112,12 @@ class QuadrotorConfig(Section):
         "gain g in T/T0 = 1 + g (R / 4 z)2; gym-pybullet-drones, cf2x; 1: Cheeseman and Bennett",
     )
     foot_below: float = number(0.015, "(0, 0.1]", "feet below the centre of mass [m]; chosen")
+    vibration: tuple[float, float] = Field(
+        (0.02, 0.5),
+        description="rms of what the rotors add to one sample of gyro [rad/s] and accelerometer [m/s2] in a hover, over the "
+        "square of their speeds; chosen: Bitcraze's Kalman filter assumes 0.1 rad/s, and its test of one propeller passes "
+        "1.1 m/s2 (2.5 g2 in 100 samples of two axes)",
+    )
     floor_stiffness: float = number(
         150.0, "(0, 5000]", "under one foot [N/m]; chosen: 0.5 mm under the weight"
     )
@@ -139,6 +146,12 @@ def steady_rpm(volts: float) -> float:
     thrust = max(c0 + volts * (c1 + volts * (c2 + volts * c3)), 0.0)
     a, b = RPM_TO_THRUST
     return (-a + math.sqrt(a * a + 4.0 * b * thrust)) / (2.0 * b)
+
+
+def hover_rpm(mass: float) -> float:
+    """Return the speed [rpm] of four rotors that carry a mass [kg]."""
+    a, b = RPM_TO_THRUST
+    return (-a + math.sqrt(a * a + b * mass * GRAVITY)) / (2.0 * b)
 
 
 @compiled
@@ -177,6 +190,12 @@ def evaluate(s: State) -> None:
         mz -= TURN[i] * torque
         turning += RADIANS_PER_RPM * n
         momentum += s[ROTOR_INERTIA] * RADIANS_PER_RPM * TURN[i] * n
+    squares = 0.0
+    for i in range(4):
+        square = s[RPM + i] * s[RPM + i]
+        squares += square * square
+    s[at.VIBRATION] = s[SHAKING] * math.sqrt(squares)
+    s[at.VIBRATION + 1] = s[SHAKING + 1] * math.sqrt(squares)
     f = at.DRAG
     for i in range(3):
         s[f + i] = s[ROTOR_DRAG + i // 2] * turning * s[at.WIND + i]
@@ -276,6 +295,7 @@ class Quadrotor(InTunnel):
         s[ARM_XY] = config.arm * math.sqrt(0.5)
         s[LAG], s[ROTOR_INERTIA], s[MOTOR_POWER] = config.rotor_lag, config.rotor_inertia, config.motor_power
         s[ROTOR_DRAG : ROTOR_DRAG + 2] = config.rotor_drag
+        s[SHAKING : SHAKING + 2] = np.array(config.vibration) / (2.0 * hover_rpm(config.mass) ** 2)
         s[GROUND_GAIN], s[ROTOR_RADIUS] = config.ground_effect, config.rotor_radius
         s[ROTOR_ABOVE] = config.rotor_above
         s[at.FOOT_SPREAD], s[at.FOOT_BELOW] = s[ARM_XY], config.foot_below

@@ -1,7 +1,8 @@
 """The BMI088 on the virtual board: angular rate and specific force at the centre of mass to int16 counts at 1 kHz.
 
 One `sample` is one data-ready: call it once per millisecond, after `body.advance`. Chain: second-order low pass, bias,
-white noise, rounding, saturation; compiled. Sensor frame S is B turned about z by `azimuth`; counts come in S.
+white noise of sensor and motors, rounding, saturation; compiled. Sensor frame S is B turned
+about z by `azimuth`; counts come in S.
 """
 
 import math
@@ -32,30 +33,37 @@ COS, SIN = cos(S_AZIMUTH), sin(S_AZIMUTH)  # of the default
 
 
 @compiled
-def channel(row: View, truth: float, draw: float) -> int:
-    """Filter (transposed form II, b = B0 (1, 2, 1)), disturb and round one channel; returns counts."""
+def channel(row: View, truth: float, shaken: float, draw: float) -> int:
+    """Filter (transposed form II, b = B0 (1, 2, 1)), disturb and round one channel; returns counts.
+
+    `shaken`: the noise of vibration, beside the sensor's own.
+    """
     low = row[B0] * truth + row[NOW_1]
     row[NOW_1] = 2.0 * row[B0] * truth - row[A1] * low + row[NOW_2]
     row[NOW_2] = row[B0] * truth - row[A2] * low
     if row[STUCK] == 0.0:
-        value = row[SCALE] * (low + row[BIAS] + row[FAULT_BIAS] + row[NOISE] * draw)
+        noise = row[NOISE] if shaken == 0.0 else math.sqrt(row[NOISE] * row[NOISE] + shaken * shaken)
+        value = row[SCALE] * (low + row[BIAS] + row[FAULT_BIAS] + noise * draw)
         row[COUNT] = min(max(math.floor(value + 0.5), -row[RANGE]), row[RANGE] - 1.0)
     return int(row[COUNT])
 
 
 @compiled
-def channels(rows: View, omega_B: View, specific_force_B: View, draws: View, counts: Counts) -> None:
+def channels(
+    rows: View, omega_B: View, specific_force_B: View, vibration: View, draws: View, counts: Counts
+) -> None:
     """Turn rates and specific force into S and then into counts, with the next row of noise."""
     ox, oy, fx, fy = omega_B[0], omega_B[1], specific_force_B[0], specific_force_B[1]
     c, s = rows[0, AXIS_COS], rows[0, AXIS_SIN]
+    turned, pushed = vibration[0], vibration[1]
     counts[LEFT] -= 1
     noise = draws[counts[LEFT]]
-    counts[0] = channel(rows[0], c * ox + s * oy, noise[0])
-    counts[1] = channel(rows[1], c * oy - s * ox, noise[1])
-    counts[2] = channel(rows[2], omega_B[2], noise[2])
-    counts[3] = channel(rows[3], c * fx + s * fy, noise[3])
-    counts[4] = channel(rows[4], c * fy - s * fx, noise[4])
-    counts[5] = channel(rows[5], specific_force_B[2], noise[5])
+    counts[0] = channel(rows[0], c * ox + s * oy, turned, noise[0])
+    counts[1] = channel(rows[1], c * oy - s * ox, turned, noise[1])
+    counts[2] = channel(rows[2], omega_B[2], turned, noise[2])
+    counts[3] = channel(rows[3], c * fx + s * fy, pushed, noise[3])
+    counts[4] = channel(rows[4], c * fy - s * fx, pushed, noise[4])
+    counts[5] = channel(rows[5], specific_force_B[2], pushed, noise[5])
 
 
 SAMPLE_RATE = 1000.0  # [Hz]
@@ -105,7 +113,13 @@ class VirtualImu:
         if self._body is not body:
             self._body = body
             self._measure = bound(
-                channels, self._rows, body.omega_B, body.specific_force_B, self._draws, self._counts
+                channels,
+                self._rows,
+                body.omega_B,
+                body.specific_force_B,
+                body.vibration,
+                self._draws,
+                self._counts,
             )
         if self._left == 0:
             self._draws[:] = normal(self._rng, (NOISE_ROWS, 6))

@@ -23,7 +23,7 @@ from hil.crazyflie.shockburst import Air
 from hil.devices.board import InjectFailure, Memory, Thief, VirtualBoard, unsupported
 from hil.devices.board_firmware import Executor, PowerOn, PythonBoard
 from hil.devices.cameras import VirtualMocap
-from hil.devices.imu import VirtualImu
+from hil.devices.imu import GYRO_COUNTS, VirtualImu
 from hil.devices.markers import Sighting
 from hil.devices.rigid_body import make_markers
 from hil.devices.uart import VirtualSerial
@@ -33,8 +33,9 @@ from hil.world.battery import Battery, open_circuit_voltage
 from hil.world.body import Body, Carrier
 
 IMU_PERIOD_US = 1_000
-# Share of the noise in flight before the fans run; the stock firmware requires less than 100 counts squared.
-BENCH_NOISE = 0.05
+# Share of a gyro's noise in flight before the fans run, where it is more than the stock firmware accepts at rest: it
+# requires less than 100 counts squared.
+BENCH_NOISE, BENCH_GYRO = 0.05, 10.0 / GYRO_COUNTS  # [rad/s]
 MOCAP_PHASE_US = 7_000  # so that a pose of 40 ms reaches the estimator 1-3 ms before its step
 
 See = Callable[[MocapFrame, int, Sighting | None], None]  # (frame, now_us, sighting of the markers)
@@ -141,7 +142,7 @@ class Robot:
             self.uart.read()  # a booted processor starts with an empty buffer
         self.board.boot(now_us)
         specimen = deepcopy(self.imu)  # so that the sensor's noise in flight is the same for every board
-        specimen.set_noise_scale(BENCH_NOISE)
+        specimen.set_noise_scale(BENCH_NOISE if self.config.imu.gyro_noise > BENCH_GYRO else 1.0)
         rest = None if now_us else lambda: specimen.sample(self.body)
         start = PowerOn(
             self.board, self.config, self.uart is not None, self._ports.polled, rest, self.body.outputs,

@@ -85,6 +85,10 @@ class Motion(Protocol):
         """(3,) [m/s2] as measured by an accelerometer at the centre of mass; (0, 0, g) at rest."""
 
     @property
+    def vibration(self) -> View:
+        """(2,) [rad/s, m/s2] rms per axis of what motors add to the rate and the specific force of one sample."""
+
+    @property
     def flow_W(self) -> View:
         """(3,) [m/s] of the air at the centre of mass."""
 

@@ -65,6 +65,7 @@ class InTunnel:
         self.p_WB, self.v_WB, self.q_WB = self._view(at.P, 3), self._view(at.V, 3), self._view(at.Q, 4)
         self.omega_B = self._view(at.OMEGA, 3)
         self.specific_force_B, self.flow_W = self._view(at.SPECIFIC_FORCE, 3), self._view(at.FLOW, 3)
+        self.vibration = self._view(at.VIBRATION, 2)
 
     def _view(self, start: int, count: int) -> View:
         view = self._s[start : start + count]

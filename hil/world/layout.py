@@ -42,6 +42,7 @@ PLATE_FORCES = _take(15)  # [N] base and four flaps as isolated plates, in W
 ACC = _take(3)  # [m/s2] of the centre of mass, in W, gravity included
 ALPHA = _take(3)  # [rad/s2] in B
 SPECIFIC_FORCE = _take(3)  # [m/s2] as measured by an accelerometer at the centre of mass, in B
+VIBRATION = _take(2)  # [rad/s], [m/s2] rms of rate and specific force by what turns, per axis
 PULL = _take(3)  # [N] of the tether, in W
 GROUND = _take(6)  # force [N] of the net, in W, and its torque [N m], in B
 

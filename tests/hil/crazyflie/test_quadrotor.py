@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from hil.crazyflie.failures import MOTOR_FAILURES
-from hil.crazyflie.quadrotor import PWM_STEPS, Quadrotor, QuadrotorConfig, steady_rpm
+from hil.crazyflie.quadrotor import PWM_STEPS, Quadrotor, QuadrotorConfig, hover_rpm, steady_rpm
 from hil.errors import LabError
 from hil.laboratory.fault_kinds import KINDS
 from hil.world.config import BatteryConfig, TunnelConfig
@@ -293,6 +293,19 @@ def test_every_fault_of_a_motor_turns_a_setting_of_it() -> None:
     assert {failure.setting for failure in MOTOR_FAILURES.values()} == set(settings)
     assert all(name[-1] == failure.setting[-1] for name, failure in MOTOR_FAILURES.items())
     assert KINDS["motor.weak.1"].needs == "--profile crazyflie"
+
+
+def test_vibration_grows_with_the_square_of_the_rotors_speeds() -> None:
+    hovering = spun_up((0.625,) * 4, hover_volts() / 0.625)
+    assert hovering.vibration == pytest.approx([0.02, 0.5], rel=0.005)
+    assert hover_rpm(0.029) == pytest.approx(hovering.rpm, rel=0.003)
+    one = spun_up((0.625, 0.0, 0.0, 0.0), hover_volts() / 0.625)
+    assert one.vibration == pytest.approx([0.01, 0.25], rel=0.005)
+    slow = spun_up((0.4,) * 4)
+    assert slow.vibration == pytest.approx(
+        hovering.vibration * (slow.rpm[0] / hovering.rpm[0]) ** 2, rel=1e-6
+    )
+    assert make(None).vibration.tolist() == [0.0, 0.0]
 
 
 def test_seeds_draw_other_motors() -> None:

@@ -7,6 +7,8 @@ import pytest
 from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation
 
+from hil.bodies import make_body
+from hil.config import load_config
 from hil.devices.config import ImuConfig
 from hil.devices.imu import VirtualImu
 from hil.errors import LabError
@@ -154,3 +156,19 @@ def test_noise_can_be_scaled_but_not_to_nonsense() -> None:
     for scale in (-1.0, math.nan):
         with pytest.raises(LabError, match="noise scale"):
             imu.set_noise_scale(scale)
+
+
+@pytest.mark.parametrize(("own", "duty"), [(0.01, 160), (0.01, 0), (0.0, 160)])
+def test_vibration_adds_to_the_sensors_own_noise_as_independent_noise_does(own: float, duty: int) -> None:
+    body = make_body(load_config("crazyflie"), np.random.default_rng(1), (0.0, 0.0, 1.0))
+    body.hold()
+    body.draw(0, 3.9)
+    body.set_counts(0, 4 * [duty])
+    body.advance(2_000_000)
+    assert (body.vibration[0] > 0.01) == (duty > 0)
+    config = ImuConfig(gyro_noise=own, accel_noise=own, gyro_bias=0, accel_bias=0)
+    imu = VirtualImu(config, np.random.default_rng(1))
+    counts = np.array([imu.sample(body) for _ in range(5_000)])[50:]
+    gyro, accel = np.hypot(own, body.vibration)
+    assert counts[:, :3].std(axis=0) * GYRO_LSB == pytest.approx(3 * [gyro], rel=0.05)
+    assert counts[:, 3:].std(axis=0) * ACCEL_LSB == pytest.approx(3 * [accel], rel=0.05)
