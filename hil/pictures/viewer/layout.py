@@ -14,6 +14,8 @@ VIEWS = (
     ("Position error [cm]", "position"),
     ("Attitude error [deg]", "attitude"),
     ("Flap angles, commands pale; colours of the scene [deg]", "flaps"),
+    ("Thrust of the rotors, commands pale [mN]", "rotors"),
+    ("Words of the motors [%]", "motors"),
     ("Inputs [deg]", "inputs"),
     ("Estimate - truth [cm, deg]", "miss"),
     ("Age of the pose, by stage [ms]", "age"),
@@ -27,7 +29,7 @@ VIEWS = (
 LEGEND = """
 | drawn | what |
 |---|---|
-| plates, flaps 1 to 4 | the true robot, of a real flight by the cameras; flaps in the colours of their curves |
+| robot with flaps or rotors 1 to 4 | the true one, of a real flight by the cameras; flaps in the colours of their curves |
 | white outline | the board's estimate |
 | red box, cross and outline | the goal: 20 cm around it, the robot as it should be; its line points along the wanted x |
 | white line, red line | the path of the last 4 s; the goal's, of the last and the next 15 s |

@@ -24,7 +24,8 @@ PLOTS: Mapping[str, Curves] = {
     "flaps/command": curves.FLAPS_COMMAND,
     "inputs": curves.INPUTS,
     "rotors/thrust": curves.ROTORS,
-    "rotors/command": curves.MOTORS,
+    "rotors/command": curves.ROTORS_COMMAND,
+    "motors": curves.MOTORS,
     "miss/position": curves.POSITION_MISS,
     "miss/attitude": curves.ATTITUDE_MISS,
     "age/pose": curves.AGE,
@@ -39,7 +40,7 @@ PLOTS: Mapping[str, Curves] = {
     "queue": curves.QUEUE,
     "processor/all": monitor.LOAD,  # of a real board; a simulated one's is by task
 }
-PALE = "flaps/command"
+PALE = ("flaps/command", "rotors/command")
 LIMITS = {  # they also keep the axes' scales fixed
     "position/limit": curves.NEAR_CM, "position/box": 100 * BOX, "attitude/limit": curves.ATTITUDE_DEG,
 }  # fmt: skip
@@ -151,6 +152,6 @@ class Plots:
         self._track.static(f"state/{path}", lane)
 
     def _name_curves(self, path: str, plot: Curves | Rates) -> None:
-        width, opacity = (1.0, 120) if path == PALE else (1.6, 255)
+        width, opacity = (1.0, 120) if path in PALE else (1.6, 255)
         colours, widths = rgba_array(plot.colours, opacity), [width] * len(plot.names)
         self._track.static(f"plot/{path}", rr.SeriesLines(names=plot.names, colors=colours, widths=widths))

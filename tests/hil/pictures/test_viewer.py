@@ -414,7 +414,9 @@ def test_a_view_stands_in_the_blueprint_when_the_log_has_its_curves(folder: Path
     simulated = load_log(folder).schema
     known = {path for _, path in views_of(simulated)}
     assert {"position", "processor", "battery", "link/rate", "queue"} <= known
-    assert "link/air" not in known
+    assert not {"link/air", "rotors", "motors"} & known
+    rotors = [(f"rotor.{name}_{i}", pa.float32()) for name in ("thrust", "command") for i in (1, 2, 3, 4)]
+    assert {"rotors", "motors"} <= {path for _, path in views_of(pa.schema(rotors))}
     real = {path for _, path in views_of(real_log().schema)}
     assert {"position", "flaps", "age", "link/rate", "link/loss"} <= real
     assert not {"processor", "battery", "queue"} & real
