@@ -197,6 +197,13 @@ def read(path: Path) -> bytes:
         raise ExportError(f"{path}: {error.strerror or error}") from None
 
 
+def call_frames(dwarf: Any, content: bytes) -> list[Any]:
+    """Return the entries of a part of .debug_frame, as pyelftools reads them."""
+    from elftools.dwarf.callframe import CallFrameInfo
+
+    return list(CallFrameInfo(BytesIO(content), len(content), 0, dwarf.structs).get_entries())
+
+
 def _is_in_ram(address: int) -> bool:
     return any(base <= address < base + size for _, base, size in MEMORIES)
 

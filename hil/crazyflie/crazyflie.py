@@ -124,7 +124,7 @@ class Crazyflie:
 
     # What the chip does to the outside
 
-    def _act(self, why: Why) -> None:
+    def _act(self, why: int) -> None:
         if why & Why.SERIAL:
             for kind, data in self._decoder.take(self.chip.sent(SYSLINK_USART)):
                 self._answer(kind, data)

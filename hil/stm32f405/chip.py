@@ -6,7 +6,7 @@ is taken to keep up with the core.
 """
 
 import mmap
-from enum import IntFlag
+from enum import IntEnum
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ SOURCES = Path(__file__).parent / "native"
 POWER_ON, SOFTWARE, WATCHDOG = 0x0C00_0000, 0x1400_0000, 0x2400_0000
 
 
-class Why(IntFlag):
+class Why(IntEnum):
     """Why a run ended before its time: `WHY_...` of machine.h."""
 
     TIME = 0
@@ -98,13 +98,13 @@ class Chip:
         self._cpu.ctl_set_tlb_mode(unicorn_const.UC_TLB_VIRTUAL)  # machine.c says who may execute
         self._numbers = _register_numbers(arm_const)
         self._map(unicorn_const)
-        self._sums = _sums(code, base, constants)
         self._ffi = declared()
         self._library: Any = self._ffi.dlopen(str(library))
         self.state: Any = self._ffi.new("struct machine *")
         if self._ffi.sizeof(self.state[0]) != self._library.machine_size():
             raise LabError(f"{library} was not compiled from the machine.h that lies here")
-        arrays: tuple[NDArray[Any], ...] = (self.flash, self.ram, self.ccm, *self._sums)
+        self._before = _sums_before(code, base, constants, self._library.SUM_INSTRUCTIONS)
+        arrays: tuple[NDArray[Any], ...] = (self.flash, self.ram, self.ccm, self._before)
         memories = [self._pointer(array) for array in arrays]
         if self._library.machine_attach(self.state, self._engine(uclib), *memories):
             raise LabError("unicorn refuses the machine's hooks")
@@ -144,7 +144,7 @@ class Chip:
 
     def _pointer(self, array: NDArray[Any]) -> Any:
         """Return the address of an array, which must live as long as the chip."""
-        return self._ffi.from_buffer("uint32_t[]" if array.itemsize == 4 else "uint8_t[]", array)
+        return self._ffi.from_buffer(f"uint{8 * array.itemsize}_t[]", array)
 
     # Time
 
@@ -158,14 +158,14 @@ class Chip:
         """Microseconds since power-on."""
         return int(self.state.now) // CYCLES_PER_US
 
-    def run(self, until_cycles: int) -> Why:
-        """Run up to an instant, or until something outside is to be done."""
+    def run(self, until_cycles: int) -> int:
+        """Run up to an instant, or until something outside is to be done; return why it ended, a sum of `Why`."""
         if self.breakpoints | self.crash_points != self._planted:
             self._plant(self.breakpoints | self.crash_points)
-        why = self._library.machine_run(self.state, until_cycles)
+        why: int = self._library.machine_run(self.state, until_cycles)
         if why & Why.LOW_READ:
             self._map_alias()
-        return Why(why) if why else Why.TIME
+        return why
 
     def _map_alias(self) -> None:
         """Let flash be seen at 0 as well, as it is from a start on."""
@@ -174,10 +174,10 @@ class Chip:
         rights = const.UC_PROT_READ | const.UC_PROT_EXEC
         self._cpu.mem_map_ptr(0, self.flash.size, rights, self.flash.ctypes.data)
 
-    def step(self) -> Why:
+    def step(self) -> int:
         """Execute one instruction."""
         self._cpu.ctl_flush_tb()  # hooks act on what is translated after them, and until it is forgotten
-        why = Why(self._library.machine_step(self.state))
+        why: int = self._library.machine_step(self.state)
         if why & Why.LOW_READ:
             self._map_alias()
         self._cpu.ctl_flush_tb()
@@ -294,12 +294,12 @@ def _memory(size: int) -> NDArray[np.uint8]:
     return np.frombuffer(mmap.mmap(-1, size), np.uint8)
 
 
-def _sums(code: bytes, base: int, constants: frozenset[int]) -> list[NDArray[np.uint32]]:
-    """Return how many instructions and cycles begin before each half word of flash."""
+def _sums_before(code: bytes, base: int, constants: frozenset[int], first_bit: int) -> NDArray[np.uint64]:
+    """Return the cycles and, from a bit on, instructions that begin before each half word of flash."""
     before = (base - FLASH) // 2
     counted = count(code, constants)
-    after = FLASH_SIZE // 2 + 1 - before - counted.cycles.size
-    return [np.pad(sums, (before, after), "edge") for sums in (counted.instructions, counted.cycles)]
+    sums = counted.cycles + (counted.instructions.astype(np.uint64) << np.uint64(first_bit))
+    return np.pad(sums, (before, FLASH_SIZE // 2 + 1 - before - sums.size), "edge")
 
 
 def _register_numbers(arm_const: Any) -> dict[str, int]:

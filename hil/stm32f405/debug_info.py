@@ -9,24 +9,36 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from struct import unpack_from
 from typing import Any
 
+from firmware_py.export.elf import call_frames
 from hil.errors import LabError, hint
 
 SP, LR, PC = 13, 14, 15
 DEEPEST = 32
+SHARED = MAXIMUM = (
+    0xFFFF_FFFF  # in .debug_frame (32-bit DWARF), the mark of an entry that several functions share
+)
 
 
 class CallFrames:
-    """The rules of one image."""
+    """The rules of one image. Of its thousands of entries, only those of the functions in a backtrace are decoded."""
 
     def __init__(self, dwarf: Any) -> None:
-        entries = dwarf.CFI_entries() if dwarf.has_CFI() else []
-        self._entries = sorted(
-            (entry for entry in entries if "initial_location" in entry.header),
-            key=lambda entry: int(entry["initial_location"]),
-        )
-        self._starts = [entry["initial_location"] for entry in self._entries]
+        self._dwarf = dwarf
+        section = dwarf.debug_frame_sec
+        self._content = section.stream.getvalue() if section else b""
+        self._entries = sorted(self._headers())
+
+    def _headers(self) -> Iterator[tuple[int, int, int, int]]:
+        """Yield begin and end of a function's code, where its entry is, and where the entry that several share."""
+        at = 0
+        while at < len(self._content):
+            length, shared, begin, size = unpack_from("<4I", self._content, at)
+            if shared != SHARED:
+                yield begin, begin + size, at, shared
+            at += 4 + length
 
     def backtrace(self, registers: dict[int, int], read_word: Callable[[int], int]) -> Iterator[int]:
         """Yield the pc, then an address in the caller, in its caller, and so on, as far as the rules go.
@@ -60,15 +72,19 @@ class CallFrames:
 
     def _rules_at(self, address: int) -> dict[Any, Any] | None:
         """Return how the frame of a function is undone at an address."""
-        index = bisect_right(self._starts, address) - 1
-        entry = self._entries[index] if index >= 0 else None
-        if entry is None or address >= entry["initial_location"] + entry["address_range"]:
+        index = bisect_right(self._entries, (address, MAXIMUM)) - 1
+        begin, end, at, shared = self._entries[index] if index >= 0 else (0, 0, 0, 0)
+        if not begin <= address < end:
             return None
+        # Two entries alone, the second referring to the first, which is at 0.
+        content = self._entry(shared) + self._entry(at)[:4] + bytes(4) + self._entry(at)[8:]
+        common, own = call_frames(self._dwarf, content)
         # A function that keeps nothing on its stack has no rows of its own, only those that all functions begin with.
-        rows = [
-            row for row in entry.get_decoded().table if row["pc"] <= address
-        ] or entry.cie.get_decoded().table
+        rows = [row for row in own.get_decoded().table if row["pc"] <= address] or common.get_decoded().table
         return rows[-1] if rows else None
+
+    def _entry(self, at: int) -> bytes:
+        return self._content[at : at + 4 + int(unpack_from("<I", self._content, at)[0])]
 
 
 AGGREGATES = ("DW_TAG_structure_type", "DW_TAG_union_type")

@@ -112,14 +112,14 @@ class DebuggedChip:
         self._chip, self._server = chip, server
         self._wish = Wish.STAND
 
-    def run(self, until_cycles: int) -> Why:
+    def run(self, until_cycles: int) -> int:
         """Run up to an instant, or until something outside is to be done, as `Chip.run`.
 
         Raises `KeyboardInterrupt` when the debugger ends it.
         """
         if self._wish is Wish.STAND or self._server.wants_to_stop():
             self._hold(SIGINT)
-        seen = Why.TIME
+        seen: int = Why.TIME
         while True:
             stands = self._wish is Wish.STEP
             # What is to be done outside is done between two blocks, as without a debugger.

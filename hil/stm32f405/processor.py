@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from hil.events import EventQueue
-from hil.stm32f405.chip import CYCLES_PER_US, Chip, Why
+from hil.stm32f405.chip import CYCLES_PER_US, Chip
 from hil.stm32f405.freertos import FreeRtos
 
 NEVER_US = 1 << 62
@@ -38,7 +38,7 @@ class ChipProcessor:
     queues: tuple[Any, ...] = ()
 
     def __init__(
-        self, chip: Chip, kernel: FreeRtos | None, act: Callable[[Why], None], run: Callable[[int], Why]
+        self, chip: Chip, kernel: FreeRtos | None, act: Callable[[int], None], run: Callable[[int], int]
     ) -> None:
         """`run` lets the chip run as `Chip.run` does, and `act` gets why it ended before its time."""
         self.chip = chip

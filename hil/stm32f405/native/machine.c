@@ -74,10 +74,10 @@ static void count(struct machine *m, uint64_t address, uint32_t size)
 {
     uint64_t begin = address < FLASH_SIZE ? address : address - FLASH_BASE;
     if (begin + size <= FLASH_SIZE) {
-        uint64_t first = begin / 2, last = (begin + size) / 2;
-        m->instructions += m->instructions_before[last] - m->instructions_before[first];
-        m->now += m->cycles_before[last] - m->cycles_before[first];
-        m->stacks = m->stackers_before[last] != m->stackers_before[first];
+        uint64_t passed = m->before[(begin + size) / 2] - m->before[begin / 2];
+        m->now += passed & ((1u << SUM_INSTRUCTIONS) - 1);
+        m->instructions += passed >> SUM_INSTRUCTIONS & ((1u << (SUM_STACKERS - SUM_INSTRUCTIONS)) - 1);
+        m->stacks = passed >> SUM_STACKERS != 0;
     } else { /* in RAM: as if all were narrow */
         m->instructions += size / 2;
         m->now += size / 2;
@@ -252,7 +252,7 @@ static int lowers_stack(uint16_t first)
 static int look_at_code(struct machine *m)
 {
     uint16_t at[2];
-    uint64_t hook;
+    uint64_t hook, stackers = 0;
     int failed = 0;
     for (uint64_t i = 0; i + sizeof at <= FLASH_SIZE; i += sizeof *at) {
         memcpy(at, m->flash + i, sizeof at);
@@ -260,9 +260,10 @@ static int look_at_code(struct machine *m)
         if (at[0] == 0xBF30 || divides) /* WFI */
             failed |= m->engine.hook_add(m->engine.uc, &hook, HOOK_CODE, divides ? (void *)on_division : (void *)on_sleep, m,
                                          FLASH_BASE + i, FLASH_BASE + i);
-        m->stackers_before[i / 2 + 1] = m->stackers_before[i / 2] + lowers_stack(at[0]);
+        stackers += lowers_stack(at[0]);
+        m->before[i / 2 + 1] += stackers << SUM_STACKERS;
     }
-    m->stackers_before[FLASH_SIZE / 2] = m->stackers_before[FLASH_SIZE / 2 - 1];
+    m->before[FLASH_SIZE / 2] += stackers << SUM_STACKERS;
     return failed;
 }
 
@@ -273,7 +274,7 @@ uint64_t machine_size(void)
 
 /* Lay out a machine in zeroed memory, its buses mapped and its hooks set; the engine and the memories are there. */
 int machine_attach(struct machine *m, const struct engine *engine, uint8_t *flash, uint8_t *ram, uint8_t *ccm,
-                   const uint32_t *instructions_before, const uint32_t *cycles_before)
+                   uint64_t *before)
 {
     const uint64_t everywhere[2] = {1, 0};
     const uint64_t not_memory[3][2] = {{0, CCM_BASE - 1}, {CCM_BASE + CCM_SIZE, RAM_BASE - 1}, {RAM_BASE + RAM_SIZE, UINT32_MAX}};
@@ -282,8 +283,7 @@ int machine_attach(struct machine *m, const struct engine *engine, uint8_t *flas
     m->flash = flash;
     m->ram = ram;
     m->ccm = ccm;
-    m->instructions_before = instructions_before;
-    m->cycles_before = cycles_before;
+    m->before = before;
     uc_engine *uc = engine->uc;
     int failed = engine->mmio_map(uc, 0x40000000, PERIPHERALS_SIZE, peripheral_read, m, peripheral_write, m);
     failed |= engine->mmio_map(uc, 0x50000000, PERIPHERALS_SIZE, usb_read, m, usb_write, m);

@@ -23,6 +23,9 @@ enum {
     DEVICES = 8, BREAKPOINTS = 64, LOW_WRITERS = 16, WATCHPOINTS = 8, LINE_BYTES = 4096, TASKS = 32, SWITCHES = 4096,
 };
 
+/* Three sums in one number, from these bits on: cycles, instructions, and modulo 2^16 what may lower a stack pointer. */
+enum { SUM_CYCLES = 0, SUM_INSTRUCTIONS = 28, SUM_STACKERS = 48 };
+
 /* Exceptions, B1.5.2. */
 enum { RESET = 1, NMI, HARD_FAULT, MEMORY_FAULT, BUS_FAULT, USAGE_FAULT, SVC = 11, PENDSV = 14, SYSTICK };
 
@@ -147,8 +150,8 @@ struct machine {
     struct task_switch task_switch[SWITCHES];
     struct engine engine;
     uint64_t until, due[SLOTS];
-    const uint32_t *instructions_before, *cycles_before; /* of every half word of flash */
-    uint32_t stackers_before[FLASH_SIZE / 2 + 1], stacks; /* of what may lower a stack pointer; whether the last block has it */
+    uint64_t *before; /* sums of `SUM_...` over what begins before each half word of flash */
+    uint32_t stacks;  /* whether the last block may lower a stack pointer */
     uint64_t next_address;
     uint8_t *flash, *ram, *ccm;
     uint8_t executed[RAM_SIZE / PAGE_SIZE]; /* pages of RAM from which code was executed */
@@ -183,7 +186,7 @@ struct machine {
 /* What Python calls. */
 uint64_t machine_size(void);
 int machine_attach(struct machine *m, const struct engine *engine, uint8_t *flash, uint8_t *ram, uint8_t *ccm,
-                   const uint32_t *instructions_before, const uint32_t *cycles_before);
+                   uint64_t *before);
 int machine_device(struct machine *m, uint32_t bus, uint32_t address, uint8_t *memory, uint32_t size, uint32_t address_bytes,
                    uint32_t pairs);
 void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause);
