@@ -77,7 +77,7 @@ class Failures:
         return Result.ACCEPTED
 
     def _names(self, patterns: tuple[str, ...], instances: tuple[int, ...]) -> list[str]:
-        own = [name for name, kind in KINDS.items() if kind.body in ("", self._robot.config.robot.body)]
+        own = [name for name, kind in KINDS.items() if kind.acts_on(self._robot.config.robot.body)]
         wanted = [pattern.format(instance) for pattern in patterns for instance in instances]
         return sorted({name for name in own for pattern in wanted if fnmatchcase(name, pattern)})
 

@@ -9,7 +9,7 @@ import pytest
 from firmware_py.geometry import yaw_quaternion
 from hil.experiments import EXPERIMENTS, measures
 from hil.laboratory.fault_kinds import KINDS, MARKERS_ON
-from hil.laboratory.faults import Fault
+from hil.laboratory.faults import Fault, why_not
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import attitude_error, measure
 from hil.laboratory.request import MAVLINK, RADIO, Request
@@ -84,7 +84,7 @@ def test_faults_that_together_leave_a_knobs_range_stop_at_its_end_and_give_it_ba
     flight = lockstep_flight(
         Request.of(EXPERIMENTS["hover"], overrides=[MARKERS_ON], duration_s=1.0, link=link)
     )
-    kinds = {name: kind for name, kind in KINDS.items() if kind.link in ("", link)}
+    kinds = {name: kind for name, kind in KINDS.items() if not why_not(kind, flight.robot)}
     knobs = [knob for kind in kinds.values() for knob in kind.knobs]
     before = [knob.read(flight.robot) for knob in knobs]
     robot, board = flight.robot, flight.switchboard
