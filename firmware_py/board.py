@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Protocol
 
-from firmware_py.wire.mavlink_numbers import Result
+from firmware_py.wire.mavlink_numbers import CommandResult
 
 # Gyro x y z, accelerometer x y z, int16, sensor frame. The six are passed on and not unpacked: code compiled by mypyc would
 # take a tuple of known length apart and put it together again at every hand.
@@ -47,5 +47,5 @@ class Board(Protocol):
     def reset(self) -> None:
         """Reset the processor, as its own instruction does; EEPROM and deck memory keep what they have."""
 
-    def inject_failure(self, unit: int, failing: int, instance: int) -> Result:
+    def inject_failure(self, unit: int, failing: int, instance: int) -> CommandResult:
         """Let a part of the robot fail, by MAVLink's numbers; hardware that cannot do that answers UNSUPPORTED."""

@@ -29,7 +29,7 @@ from firmware_py.rtos.statistics import Statistics
 from firmware_py.running import Running, StockState
 from firmware_py.signals import Signals
 from firmware_py.stock_names import stock_parameters, stock_variables
-from firmware_py.supervisor import Supervisor
+from firmware_py.supervisor import CoreSupervisor
 from firmware_py.tasks import estimator_task, power_task, sensors_task, stabilizer_task
 from firmware_py.variables import log_variables
 from firmware_py.wire import WireError
@@ -85,7 +85,7 @@ class Firmware:
         self._console = Console(self.link, board)
         self._notices = Notices(self.kernel, self._console.write)
         self.pilot = Pilot(core)
-        self._supervisor = Supervisor(core, self._console.write, self.pilot, self._client_is_there)
+        self._supervisor = CoreSupervisor(core, self._console.write, self.pilot, self._client_is_there)
         self._imu_ready = self.kernel.create_binary_semaphore("imuReady")
         data_ready = self.kernel.create_binary_semaphore("dataReady")
         estimator_run = self.kernel.create_binary_semaphore("runTaskSemaphore")
@@ -165,12 +165,12 @@ class Firmware:
         from firmware_py.links.mavlink_poses import PoseService
         from firmware_py.links.mavlink_setpoints import SetpointService
         from firmware_py.links.mavlink_streams import StreamService
-        from firmware_py.links.mavlink_telemetry import FlightMessages, World
+        from firmware_py.links.mavlink_telemetry import FlightMessages, PoseInWorld
 
         core, supervisor = self._core, self._supervisor
         setpoints = SetpointService(stack, running.pilot, config.home)
         poses = PoseService(stack, self.measurements, running.localisation, setpoints)
-        world = World(core.estimator.fields, core.control.fields, setpoints)
+        world = PoseInWorld(core.estimator.fields, core.control.fields, setpoints)
         messages = FlightMessages(stack, supervisor, world, poses, self.variables, self._measured)
         streams = StreamService(stack, messages.streams(config.rates))
         MavlinkParameters(stack, own)

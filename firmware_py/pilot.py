@@ -19,14 +19,14 @@ from firmware_py.core.structs import (
 from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks
 from firmware_py.geometry import Vector, to_euler_zyx
-from firmware_py.planner import Motion, Path, Phase, Planner, stay
+from firmware_py.planner import Path, PathPoint, Phase, Planner, stay
 from firmware_py.wire.crtp import Correction
 
 # When a pose arrived on board [us], the pose, whether it is absolute, and the goal at the instant at which it was true, in
 # the frame of the pose; None: the goal is not known.
-Arrived = tuple[int, Correction, bool, Motion | None]
+Arrived = tuple[int, Correction, bool, PathPoint | None]
 
-ORIGIN = Motion((0.0, 0.0, 0.0), 0.0)
+ORIGIN = PathPoint((0.0, 0.0, 0.0), 0.0)
 SETPOINT_SILENCE_US = 2_000_000  # Crazyflie firmware: COMMANDER_WDT_TIMEOUT_SHUTDOWN
 
 
@@ -35,8 +35,8 @@ class Pilot:
 
     def __init__(self, core: CoreBlocks) -> None:
         self.planner = Planner()
-        self.goal: Motion | None = None
-        self.here: Motion | None = None  # the last absolute pose
+        self.goal: PathPoint | None = None
+        self.here: PathPoint | None = None  # the last absolute pose
         self.seen_us = -1  # when the last pose came
         self._setpoint_us: int | None = None  # when the last set-point came, while they lead
         self._core = core
@@ -83,7 +83,7 @@ class Pilot:
         data = self._core.data.fields
         data.poses_absolute = i32(absolute)
         data.setpoint[:3] = place
-        put_goal(data, None if goal is None else Motion(goal, 0.0))
+        put_goal(data, None if goal is None else PathPoint(goal, 0.0))
         return bool(self._core.run.call("admits"))
 
     def follow(self, path: Path, now_us: int, lands: bool = False) -> None:
@@ -105,13 +105,13 @@ class Pilot:
         self.planner.stop()
         self._setpoint_us = None
 
-    def begin(self, now_us: int) -> Motion | None:
+    def begin(self, now_us: int) -> PathPoint | None:
         """Where a new path begins: where the present one is, else where the robot is; None when that is not known."""
         if self.planner.phase(now_us) is not Phase.IDLE:
             return self.planner.at(now_us)
         return self.here if self.absolute else ORIGIN
 
-    def frame(self, now_us: int) -> Motion | None:
+    def frame(self, now_us: int) -> PathPoint | None:
         """Where the origin of the estimate is in X now; None while they are the same."""
         return self.planner.at(now_us) if self.planner.phase(now_us) is not Phase.IDLE else self.goal
 
@@ -120,7 +120,7 @@ class Pilot:
         self.seen_us = now_us
         age_us = int(self._core.parameters.fields.default_age_us) if pose.age_us is None else pose.age_us
         if self.absolute:
-            self.here = Motion(pose.p_GB, to_euler_zyx(pose.q_GB)[2])
+            self.here = PathPoint(pose.p_GB, to_euler_zyx(pose.q_GB)[2])
         if self.planner.phase(now_us) is not Phase.IDLE:
             self.goal = self.planner.at(now_us - age_us)
         else:
@@ -128,7 +128,7 @@ class Pilot:
         return now_us, pose, self.absolute, self.goal
 
 
-def put_goal(data: Input, goal: Motion | None) -> None:
+def put_goal(data: Input, goal: PathPoint | None) -> None:
     """Hand the core the goal in the frame of the poses."""
     if goal is None:
         data.goal_kind = i32(GOAL_NONE)

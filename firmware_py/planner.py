@@ -19,7 +19,7 @@ Coefficients = tuple[float, ...]  # ascending powers of the time in a piece
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class PathPoint:
     """Where the path is at an instant, and how it moves."""
 
     position: Vector
@@ -52,7 +52,7 @@ class Path:
         """How long it takes."""
         return sum(piece.duration for piece in self.pieces) * self.timescale
 
-    def at(self, t: float) -> Motion:
+    def at(self, t: float) -> PathPoint:
         """The motion at a time; before the beginning and after the end it rests there."""
         stands = not 0.0 <= t < self.duration
         t = min(max(t, 0.0), self.duration) / self.timescale
@@ -60,9 +60,9 @@ class Path:
             t = self.duration / self.timescale - t
         motion = self._placed(_evaluate(*_find(self.pieces, t)))
         if stands:
-            return Motion(motion.position, motion.yaw)
+            return PathPoint(motion.position, motion.yaw)
         rate = (-1.0 if self.reverse else 1.0) / self.timescale
-        return Motion(
+        return PathPoint(
             motion.position,
             motion.yaw,
             _scaled(motion.velocity, rate),
@@ -79,9 +79,9 @@ class Path:
             t += piece.duration
         yield self.at(self.duration).position
 
-    def _placed(self, motion: Motion) -> Motion:
+    def _placed(self, motion: PathPoint) -> PathPoint:
         if self.turn == 0.0:
-            return Motion(
+            return PathPoint(
                 _sum(motion.position, self.shift),
                 motion.yaw,
                 motion.velocity,
@@ -90,7 +90,7 @@ class Path:
             )
         first, q = self._first(), yaw_quaternion(self.turn)
         offset = rotate(q, _sum(motion.position, _scaled(first, -1.0)))
-        return Motion(
+        return PathPoint(
             _sum(_sum(first, offset), self.shift),
             motion.yaw + self.turn,
             rotate(q, motion.velocity),
@@ -137,7 +137,7 @@ class Planner:
         """Whether nothing of the path is left."""
         return self.phase(now_us) is Phase.IDLE or self._time(now_us) >= self._path.duration
 
-    def at(self, t_us: int) -> Motion:
+    def at(self, t_us: int) -> PathPoint:
         """Where to be at an instant; only while it is not idle."""
         return self._path.at(self._time(t_us))
 
@@ -160,31 +160,33 @@ def stay(position: Vector, yaw: float) -> Path:
     return Path((Piece(0.0, ((x,), (y,), (z,), (yaw,))),))
 
 
-def straight_up(begin: Motion, height: float, yaw: float, duration: float) -> Path:
+def straight_up(begin: PathPoint, height: float, yaw: float, duration: float) -> Path:
     """To a height above or below, from rest to rest, turning to a yaw on the shorter side."""
     x, y, _ = begin.position
     return between(
-        Motion(begin.position, begin.yaw),
-        Motion((x, y, height), begin.yaw + wrap_angle(yaw - begin.yaw)),
+        PathPoint(begin.position, begin.yaw),
+        PathPoint((x, y, height), begin.yaw + wrap_angle(yaw - begin.yaw)),
         duration,
     )
 
 
-def go_to(begin: Motion, position: Vector, yaw: float, duration: float, relative: bool, linear: bool) -> Path:
+def go_to(
+    begin: PathPoint, position: Vector, yaw: float, duration: float, relative: bool, linear: bool
+) -> Path:
     """From a motion to a position and a yaw: to rest, or in a straight line at constant speed."""
     if relative:
         position, yaw = _sum(begin.position, position), begin.yaw + yaw
     turn = wrap_angle(yaw - begin.yaw)
-    end = Motion(position, begin.yaw + turn)
+    end = PathPoint(position, begin.yaw + turn)
     if linear and duration > 0.0:
         velocity = _scaled(_sum(position, _scaled(begin.position, -1.0)), 1.0 / duration)
         rate = turn / duration
-        begin = Motion(begin.position, begin.yaw, velocity, (0.0, 0.0, 0.0), rate)
-        end = Motion(end.position, end.yaw, velocity, (0.0, 0.0, 0.0), rate)
+        begin = PathPoint(begin.position, begin.yaw, velocity, (0.0, 0.0, 0.0), rate)
+        end = PathPoint(end.position, end.yaw, velocity, (0.0, 0.0, 0.0), rate)
     return between(begin, end, duration)
 
 
-def between(begin: Motion, end: Motion, duration: float) -> Path:
+def between(begin: PathPoint, end: PathPoint, duration: float) -> Path:
     """The one piece from one motion to another without jerk at its ends; without time for it, the end at once."""
     if duration <= 0.0:
         axes = ((end.position[0],), (end.position[1],), (end.position[2],), (end.yaw,))
@@ -253,9 +255,9 @@ def _find(pieces: Sequence[Piece], t: float) -> tuple[Piece, float]:
     return pieces[-1], min(t, pieces[-1].duration)
 
 
-def _evaluate(piece: Piece, t: float) -> Motion:
+def _evaluate(piece: Piece, t: float) -> PathPoint:
     (x, vx, ax), (y, vy, ay), (z, vz, az), (yaw, yaw_rate, _) = (_derivatives(axis, t) for axis in piece.axes)
-    return Motion((x, y, z), yaw, (vx, vy, vz), (ax, ay, az), yaw_rate)
+    return PathPoint((x, y, z), yaw, (vx, vy, vz), (ax, ay, az), yaw_rate)
 
 
 def _derivatives(powers: Coefficients, t: float) -> Vector:

@@ -14,7 +14,7 @@ from firmware_py.links.parameters import ParameterStorage
 from firmware_py.links.platform import PlatformService
 from firmware_py.pilot import Arrived, Pilot
 from firmware_py.rtos import Queue
-from firmware_py.supervisor import Supervisor
+from firmware_py.supervisor import CoreSupervisor
 
 if TYPE_CHECKING:
     from firmware_py.links.mavlink_stack import MavlinkStack
@@ -34,7 +34,7 @@ class Running:
 
     board: Board
     core: CoreBlocks
-    supervisor: Supervisor
+    supervisor: CoreSupervisor
     measurements: Queue[Arrived]
     stack: CrtpStack
     localisation: LocalisationService

@@ -44,7 +44,7 @@ RESTING = (  # log variables that stay zero
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class InertGroup:
     """Parameters of one group that are stored and have no effect, with the stock defaults."""
 
     names: str  # "group.one two three"
@@ -55,43 +55,43 @@ class Setting:
 
 
 SETTINGS = (
-    Setting("activeMarker.back", U8, (3,), True),
-    Setting("colorLedBot.brightCorr", U8, (1,)),
-    Setting("colorLedBot.wrgb8888", U32, (0,)),
-    Setting("colorLedTop.brightCorr", U8, (1,)),
-    Setting("colorLedTop.wrgb8888", U32, (0,)),
-    Setting("commander.enHighLevel", U8, (0,)),  # without effect on the stock board, too
-    Setting("flightmode.althold", U8, (0,)),
-    Setting("kalman.initialX initialY initialZ", F32, (0, 0, 0), unit="m"),  # the next pose decides
-    Setting("kalman.initialYaw", F32, (0,), unit="rad"),
-    Setting("led.bitmask", U8, (0,)),
-    Setting("led_deck_ctrl.rgb888", U32, (0,)),
-    Setting("lighthouse.bsCalibReset", U8, (0,)),
-    Setting("lighthouse.systemType", U8, (2,)),
-    Setting("locSrv.enLhAngleStream", U8, (0,)),
-    Setting("loco.mode", U8, (0,)),
-    Setting("pid_attitude.roll_kp roll_ki roll_kd", F32, (6, 3, 0), True),
-    Setting("pid_attitude.pitch_kp pitch_ki pitch_kd", F32, (6, 3, 0), True),
-    Setting("pid_attitude.yaw_kp yaw_ki yaw_kd", F32, (6, 1, 0.35), True),
-    Setting("pid_rate.roll_kp roll_ki roll_kd", F32, (250, 500, 2.5), True),
-    Setting("pid_rate.pitch_kp pitch_ki pitch_kd", F32, (250, 500, 2.5), True),
-    Setting("pid_rate.yaw_kp yaw_ki yaw_kd", F32, (120, 16.7, 0), True),
-    Setting("posCtlPid.xKp xKi xKd", F32, (2, 0, 0), True),
-    Setting("posCtlPid.yKp yKi yKd", F32, (2, 0, 0), True),
-    Setting("posCtlPid.zKp zKi zKd", F32, (2, 0.5, 0), True),
-    Setting("posCtlPid.thrustBase", U16, (36000,), True),
-    Setting("velCtlPid.vxKp vxKi vxKd vxKFF", F32, (25, 1, 0, 0), True),
-    Setting("velCtlPid.vyKp vyKi vyKd vyKFF", F32, (25, 1, 0, 0), True),
-    Setting("velCtlPid.vzKp vzKi vzKd", F32, (25, 15, 0), True),
-    Setting("ring.effect", U8, (0,), True),
-    Setting("ring.fadeColor", U32, (0,)),
-    Setting("ring.fadeTime", F32, (0.5,), unit="s"),
-    Setting("ring.headlightEnable", U8, (0,)),
-    Setting("ring.solidRed solidGreen solidBlue", U8, (20, 20, 20)),
-    Setting("sound.effect", U8, (0,), True),
-    Setting("stabilizer.estimator", U8, (2,)),  # whatever its value, Floaty's own estimator runs
-    Setting("stabilizer.controller", U8, (0,)),  # and controls
-    Setting("tdoaEngine.logId logOthrId", U8, (0, 0)),
+    InertGroup("activeMarker.back", U8, (3,), True),
+    InertGroup("colorLedBot.brightCorr", U8, (1,)),
+    InertGroup("colorLedBot.wrgb8888", U32, (0,)),
+    InertGroup("colorLedTop.brightCorr", U8, (1,)),
+    InertGroup("colorLedTop.wrgb8888", U32, (0,)),
+    InertGroup("commander.enHighLevel", U8, (0,)),  # without effect on the stock board, too
+    InertGroup("flightmode.althold", U8, (0,)),
+    InertGroup("kalman.initialX initialY initialZ", F32, (0, 0, 0), unit="m"),  # the next pose decides
+    InertGroup("kalman.initialYaw", F32, (0,), unit="rad"),
+    InertGroup("led.bitmask", U8, (0,)),
+    InertGroup("led_deck_ctrl.rgb888", U32, (0,)),
+    InertGroup("lighthouse.bsCalibReset", U8, (0,)),
+    InertGroup("lighthouse.systemType", U8, (2,)),
+    InertGroup("locSrv.enLhAngleStream", U8, (0,)),
+    InertGroup("loco.mode", U8, (0,)),
+    InertGroup("pid_attitude.roll_kp roll_ki roll_kd", F32, (6, 3, 0), True),
+    InertGroup("pid_attitude.pitch_kp pitch_ki pitch_kd", F32, (6, 3, 0), True),
+    InertGroup("pid_attitude.yaw_kp yaw_ki yaw_kd", F32, (6, 1, 0.35), True),
+    InertGroup("pid_rate.roll_kp roll_ki roll_kd", F32, (250, 500, 2.5), True),
+    InertGroup("pid_rate.pitch_kp pitch_ki pitch_kd", F32, (250, 500, 2.5), True),
+    InertGroup("pid_rate.yaw_kp yaw_ki yaw_kd", F32, (120, 16.7, 0), True),
+    InertGroup("posCtlPid.xKp xKi xKd", F32, (2, 0, 0), True),
+    InertGroup("posCtlPid.yKp yKi yKd", F32, (2, 0, 0), True),
+    InertGroup("posCtlPid.zKp zKi zKd", F32, (2, 0.5, 0), True),
+    InertGroup("posCtlPid.thrustBase", U16, (36000,), True),
+    InertGroup("velCtlPid.vxKp vxKi vxKd vxKFF", F32, (25, 1, 0, 0), True),
+    InertGroup("velCtlPid.vyKp vyKi vyKd vyKFF", F32, (25, 1, 0, 0), True),
+    InertGroup("velCtlPid.vzKp vzKi vzKd", F32, (25, 15, 0), True),
+    InertGroup("ring.effect", U8, (0,), True),
+    InertGroup("ring.fadeColor", U32, (0,)),
+    InertGroup("ring.fadeTime", F32, (0.5,), unit="s"),
+    InertGroup("ring.headlightEnable", U8, (0,)),
+    InertGroup("ring.solidRed solidGreen solidBlue", U8, (20, 20, 20)),
+    InertGroup("sound.effect", U8, (0,), True),
+    InertGroup("stabilizer.estimator", U8, (2,)),  # whatever its value, Floaty's own estimator runs
+    InertGroup("stabilizer.controller", U8, (0,)),  # and controls
+    InertGroup("tdoaEngine.logId logOthrId", U8, (0, 0)),
 )
 
 

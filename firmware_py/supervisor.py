@@ -14,7 +14,7 @@ from firmware_py.pilot import Pilot
 from firmware_py.wire.supervisor import Cause, State
 
 
-class Supervisor:
+class CoreSupervisor:
     """Requests to the core's supervisor, and a view on it."""
 
     def __init__(

@@ -13,9 +13,9 @@ from firmware_py.core.structs import POSE_NO_CORRECTION
 from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks, CoreCosts
 from firmware_py.pilot import Arrived, Pilot, put_goal
-from firmware_py.planner import Motion
+from firmware_py.planner import PathPoint
 from firmware_py.rtos import Kernel, Queue, Semaphore
-from firmware_py.supervisor import Supervisor, wrapped
+from firmware_py.supervisor import CoreSupervisor, wrapped
 from firmware_py.wire.crtp import Correction
 
 Task = Generator[int, None, None]
@@ -51,7 +51,7 @@ def stabilizer_task(  # noqa: PLR0913 - what a task uses is wired once
     board: Board,
     data_ready: Semaphore,
     estimator_run: Semaphore,
-    supervisor: Supervisor,
+    supervisor: CoreSupervisor,
     core: CoreBlocks,
     costs: CoreCosts,
 ) -> Task:
@@ -110,7 +110,12 @@ def power_task(kernel: Kernel, board: Board, core: CoreBlocks) -> Task:
 
 
 def hand_pose_to_core(
-    kernel: Kernel, core: CoreBlocks, arrived_us: int, pose: Correction, absolute: bool, goal: Motion | None
+    kernel: Kernel,
+    core: CoreBlocks,
+    arrived_us: int,
+    pose: Correction,
+    absolute: bool,
+    goal: PathPoint | None,
 ) -> int:
     """Hand a pose to the core; returns what became of it, `POSE_...`."""
     data = core.data.fields

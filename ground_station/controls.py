@@ -19,7 +19,7 @@ class ControlsError(Exception):
     """The board refuses, does not know the parameter, or does not answer; the text is one line."""
 
 
-class Action(Enum):
+class ControlAction(Enum):
     """What may be requested."""
 
     LIST = "list"  # parameters and their values: all, or at least those whose names begin with a name
@@ -31,10 +31,10 @@ class Action(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class ControlRequest:
     """One request; `name` is the board's own."""
 
-    action: Action
+    action: ControlAction
     name: str = ""
     value: float = nan
 

@@ -13,7 +13,7 @@ from math import degrees, hypot, isfinite, radians
 
 from firmware_py.table import OF_PROFILE, on_board
 from firmware_py.wire.supervisor import State
-from ground_station.controls import Action, Answer, ControlsError, Request, Settings
+from ground_station.controls import Answer, ControlAction, ControlRequest, ControlsError, Settings
 from ground_station.program import Cockpit
 from ground_station.trajectory import Goal, Hold, Trajectory
 
@@ -35,7 +35,7 @@ REACH = 1.0  # [m] from home, beyond which a goal is refused as a mistake: the t
 WELL, WELL_US = 0.10, 5_000_000
 
 # A dialogue with the board; returns what was done, empty if there is nothing to note.
-Talk = Generator[Request, Settings, str]
+Talk = Generator[ControlRequest, Settings, str]
 FindTrajectory = Callable[[str], Callable[[Goal, int], Trajectory]]
 
 
@@ -178,8 +178,8 @@ class Operator:
     def _write(self, words: list[str]) -> Talk:
         typed, text = _words(words, "set NAME VALUE", 2)
         (name, factor), value = on_board(typed), _number(text)
-        ((known, before),) = yield Request(Action.READ, name)
-        ((known, after),) = yield Request(Action.WRITE, name, factor * value)
+        ((known, before),) = yield ControlRequest(ControlAction.READ, name)
+        ((known, after),) = yield ControlRequest(ControlAction.WRITE, name, factor * value)
         self._good.setdefault(known, before)
         self._set[known] = after
         self._well_since_us = None
@@ -189,18 +189,18 @@ class Operator:
     def _read(self, words: list[str]) -> Talk:
         (typed,) = _words(words, "get NAME", 1)
         name, factor = on_board(typed)
-        ((known, value),) = yield Request(Action.READ, name)
+        ((known, value),) = yield ControlRequest(ControlAction.READ, name)
         own = f" ({known} {value:.6g})" if known != typed else ""
         self._say(f"{typed} {value / factor:.6g}{own}")
         return ""
 
     def _learn(self) -> Talk:
-        yield Request(Action.LIST)
+        yield ControlRequest(ControlAction.LIST)
         return ""
 
     def _list(self, words: list[str]) -> Talk:
         group = words[0].lower() if words else ""
-        values = yield Request(Action.LIST, group)
+        values = yield ControlRequest(ControlAction.LIST, group)
         self.known = tuple(dict.fromkeys((*self.known, *(name for name, _ in values))))
         chosen = [f"{name} {value:.6g}" for name, value in values if name.lower().startswith(group)]
         if not chosen:
@@ -213,7 +213,7 @@ class Operator:
         _words(words, command, 0)
         if command == "stop":
             self._note("stop")  # whether it was acknowledged or not
-        yield Request(Action(command))
+        yield ControlRequest(ControlAction(command))
         done = {"save": "saved", "arm": "armed", "stop": "stopped"}
         return done[command]
 
@@ -223,7 +223,7 @@ class Operator:
         if not changed:
             raise ControlsError("nothing to reset: the values that are set are those that last flew well")
         for name, value in changed.items():
-            ((_, self._set[name]),) = yield Request(Action.WRITE, name, value)
+            ((_, self._set[name]),) = yield ControlRequest(ControlAction.WRITE, name, value)
             self._well_since_us = None  # the others have not flown beside it
         return "reset " + ", ".join(f"{name} {value:.6g}" for name, value in changed.items())
 

@@ -13,7 +13,7 @@ from firmware_py.wire import WireError
 from firmware_py.wire.supervisor import State
 from ground_station.clock import clock_us, epoch_us, wait
 from ground_station.config import CaptureConfig, GroundConfig
-from ground_station.controls import Answer, Request
+from ground_station.controls import Answer, ControlRequest
 from ground_station.errors import LinkError, MocapError
 from ground_station.frame_rate import FrameRate
 from ground_station.links.frame_log import FrameLog
@@ -100,7 +100,7 @@ def fly(
         LiveStation(link, ground, source, rate, say, over, turn).run()
 
 
-def ask(link: LiveLink, request: Request) -> Answer:
+def ask(link: LiveLink, request: ControlRequest) -> Answer:
     """Send a request to a board that is connected and not flown from here; raises `LinkError` when it is lost."""
     link.ask(clock_us(), request)
     while (answer := link.answer(clock_us())) is None:

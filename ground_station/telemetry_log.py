@@ -10,7 +10,7 @@ from math import nan
 from pathlib import Path
 
 from firmware_py.geometry import to_euler_zyx
-from firmware_py.wire.telemetry import ALL_BLOCKS, Block, Sample
+from firmware_py.wire.telemetry import ALL_BLOCKS, Sample, TelemetryBlock
 from ground_station.latency import STAGES, LatencyBudget
 from ground_station.mocap import MocapFrame
 from ground_station.tracker import Track
@@ -41,7 +41,7 @@ _GROUND_COLUMNS = (
 )
 
 
-def _columns_of(blocks: tuple[Block, ...]) -> tuple[list[str], dict[int, int]]:
+def _columns_of(blocks: tuple[TelemetryBlock, ...]) -> tuple[list[str], dict[int, int]]:
     """The telemetry columns' titles, and where each block begins among them."""
     titles: list[str] = []
     first: dict[int, int] = {}
@@ -57,7 +57,7 @@ _TIMES = (TIME_COLUMN, POSE_COLUMNS[0])  # to the microsecond
 class TelemetryLog:
     """Writes the CSV file at `path`, of samples of `blocks`; an unwritable path raises `OSError`."""
 
-    def __init__(self, path: Path, blocks: tuple[Block, ...] = ALL_BLOCKS) -> None:
+    def __init__(self, path: Path, blocks: tuple[TelemetryBlock, ...] = ALL_BLOCKS) -> None:
         titles, self._first_column = _columns_of(blocks)
         self._empty = [nan] * len(titles)
         formats = ["%.6f" if title in _TIMES else "%.7g" for title in (*_GROUND_COLUMNS, *titles)]

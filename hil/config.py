@@ -26,7 +26,7 @@ from hil.devices.config import ImuConfig, MarkersConfig, MocapConfig, SerialConf
 from hil.errors import LabError, hint
 from hil.floaty.geometry import check
 from hil.floaty.shape import check_hover
-from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 
 DEFAULT_PROFILE = "floaty"
 Overrides = Sequence[str] | Mapping[str, Any]  # "section.key=value", or the values by "section.key"
@@ -67,7 +67,7 @@ class LabConfig(FirmwareConfig):
     robot: RobotConfig = Field(default_factory=RobotConfig)
     geometry: GeometryConfig = Field(default_factory=GeometryConfig)
     plant: PlantConfig = Field(default_factory=PlantConfig)
-    actuators: ServoConfig = Field(default_factory=ServoConfig)
+    actuators: PlantServoConfig = Field(default_factory=PlantServoConfig)
     quadrotor: QuadrotorConfig = Field(default_factory=QuadrotorConfig)
     battery: BatteryConfig = Field(default_factory=BatteryConfig)
     tunnel: TunnelConfig = Field(default_factory=TunnelConfig)

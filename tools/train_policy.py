@@ -66,7 +66,7 @@ class Adapter(VecEnv):
         return [False] * self.num_envs
 
 
-class Progress(BaseCallback):
+class PrintedProgress(BaseCallback):
     """Print one line per 25 rollouts."""
 
     def _on_step(self) -> bool:
@@ -135,7 +135,7 @@ def main() -> None:
             "net_arch": {"pi": [48, 48], "vf": [64, 64]}, "activation_fn": torch.nn.Tanh, "log_std_init": -1.0,
         },
     )  # fmt: skip
-    model.learn(int(args.steps), callback=Progress())
+    model.learn(int(args.steps), callback=PrintedProgress())
     network = Network(model.policy).eval()
     torch.onnx.export(network, (torch.zeros(1, 20),), str(args.out), input_names=["observation"],
                       output_names=["action"], dynamo=False)  # fmt: skip

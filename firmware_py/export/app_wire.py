@@ -3,7 +3,7 @@
 from enum import IntEnum
 
 from firmware_py.wire import core_port, crtp, localisation
-from firmware_py.wire.core_port import HEALTH, LAYOUTS, LOOP, Call, Hil, Kind, Layout, Refusal
+from firmware_py.wire.core_port import HEALTH, LAYOUTS, LOOP, Call, Hil, Message, PacketLayout, Refusal
 from firmware_py.wire.supervisor import Cause, State
 
 C_TYPES = {"B": "uint8_t", "b": "int8_t", "H": "uint16_t", "h": "int16_t", "I": "uint32_t"}
@@ -43,7 +43,7 @@ def wire_header() -> str:
         f"#define FLOATY_STATE_TEXTS {_texts('', *State)}",
         f"#define FLOATY_CAUSE_TEXTS {_texts(', ', *Cause)}",
         *(f"#define FLOATY_{one.name.upper()}_OF_CORE {_of_core(one)}" for one in (HEALTH, LOOP)),
-        *(_enumeration(kind) for kind in (Kind, Refusal, Call, Hil)),
+        *(_enumeration(kind) for kind in (Message, Refusal, Call, Hil)),
         f"#define FLOATY_CALLS {len(Call)}",
         *(_struct(layout) for layout in LAYOUTS),
     )) + "\n"  # fmt: skip
@@ -61,13 +61,13 @@ def _texts(before: str, *values: State | Cause) -> str:
     return f"{{{listed}}}"
 
 
-def _of_core(layout: Layout) -> str:
+def _of_core(layout: PacketLayout) -> str:
     """Return the initialisers of the fields that the core's memory has."""
     codes = ((name, code) for name, code in layout.fields if name in OF_CORE)
     return ", ".join(f".{name} = ({C_TYPES[code]})floaty_{OF_CORE[name]}" for name, code in codes)
 
 
-def _struct(layout: Layout) -> str:
+def _struct(layout: PacketLayout) -> str:
     lines = [f"  {_member(name, code)};" for name, code in layout.fields]
     return "\n".join(("typedef struct {", *lines, f"}} __attribute__((packed)) FloatyWire{layout.name};"))
 

@@ -20,7 +20,7 @@ from firmware_py.export.errors import ExportError
 from firmware_py.export.functions import C_TYPES, FunctionPrinter, block_comment, constant_definition
 from firmware_py.export.locals import find_writes
 from firmware_py.export.reading import read_modules
-from firmware_py.export.syntax import SHARED, Constant, Kernel, Module, StructType
+from firmware_py.export.syntax import SHARED, Constant, Module, Signature, StructType
 
 NO_PATHS: Mapping[str, str] = {}
 WORD = 4  # bytes of every number
@@ -69,7 +69,7 @@ def translate(texts: Mapping[str, str] | None = None, own: Mapping[str, str] = N
     """
     texts = core_texts() if texts is None else texts
     modules = read_modules(texts, own)
-    kernels = [thing for module in modules for thing in module.defined if isinstance(thing, Kernel)]
+    kernels = [thing for module in modules for thing in module.defined if isinstance(thing, Signature)]
     _rename_equal_constants(modules)
     for kernel in kernels:
         find_writes(kernel)
@@ -147,7 +147,7 @@ def _source(modules: list[Module], printed: Mapping[str, str], used: set[int]) -
         functions = [
             printed[thing.c_name]
             for thing in module.defined
-            if isinstance(thing, Kernel) and thing.c_name in printed
+            if isinstance(thing, Signature) and thing.c_name in printed
         ]
         if own or functions:
             path = Path(module.path).name if module.own else module.path

@@ -17,9 +17,9 @@ from firmware_py.export.syntax import (
     F32,
     I32,
     Constant,
-    Kernel,
-    Kind,
     Module,
+    Signature,
+    ValueType,
 )
 
 PRIMARY, UNARY, PRODUCT, SUM, COMPARISON, AND, OR = 9, 8, 7, 6, 5, 3, 2
@@ -47,7 +47,7 @@ class Value:
     """A printed expression with its type; `strength` says how tightly its outermost operator binds."""
 
     text: str
-    kind: Kind
+    kind: ValueType
     strength: int = PRIMARY
 
     def within(self, strength: int) -> str:
@@ -58,10 +58,10 @@ class Value:
 class Expressions:
     """Prints the expressions of one kernel; `names` holds the types of what is in scope."""
 
-    def __init__(self, kernel: Kernel) -> None:
+    def __init__(self, kernel: Signature) -> None:
         self.kernel = kernel
         self.module: Module = kernel.scope
-        self.names: dict[str, Kind] = dict(kernel.arguments)
+        self.names: dict[str, ValueType] = dict(kernel.arguments)
         self.constants: list[Constant] = []  # those that the kernel uses
         self.read: set[str] = set()
         self.loops: dict[str, tuple[int, int]] = {}  # the values of loop variables, where they are known
@@ -70,7 +70,7 @@ class Expressions:
         """Return the error for a construct of this kernel."""
         return refusal(self.kernel.path, node, f"{reason} (in {self.kernel.node.name})")
 
-    def scalar(self, node: ast.expr, kind: Kind, what: str, alone: bool = False) -> Value:
+    def scalar(self, node: ast.expr, kind: ValueType, what: str, alone: bool = False) -> Value:
         """Return an expression that has to be of this type."""
         value = self.value(node, alone)
         if value.kind != kind:
@@ -153,7 +153,7 @@ class Expressions:
                     f"index {ast.unparse(index)}{which}: {describe(array.kind)} of {size} has 0..{size - 1}"
                 )
                 raise self.refuse(index, text_of_range)
-        return Value(text, Kind(array.kind.base))
+        return Value(text, ValueType(array.kind.base))
 
     def _reach(self, node: ast.expr) -> tuple[int, int] | None:
         """Return the least and the greatest value of an index made of numbers, constants and loop variables, else None."""
@@ -241,7 +241,7 @@ class Expressions:
             difference = f"(uint32_t){later.within(UNARY)} - (uint32_t){earlier.within(UNARY)}"
             return Value(f"(int32_t)({difference})", I32, UNARY)
         kernel = self.module.names.get(name)
-        if not isinstance(kernel, Kernel):
+        if not isinstance(kernel, Signature):
             raise self.refuse(node, f"call of {name}, which is no kernel{instead(FUNCTIONS, name)}")
         if kernel.writes and not alone:
             raise self.refuse(
@@ -253,7 +253,7 @@ class Expressions:
         texts = [self._argument(argument, kernel, wanted) for argument, wanted in pairs]
         return Value(f"{kernel.c_name}({', '.join(texts)})", kernel.result)
 
-    def _cast(self, node: ast.Call, target: Kind, alone: bool) -> Value:
+    def _cast(self, node: ast.Call, target: ValueType, alone: bool) -> Value:
         literal = constant_literal(node)
         if literal is not None:
             return Value(literal[1], literal[0], UNARY if literal[1].startswith("-") else PRIMARY)
@@ -269,7 +269,7 @@ class Expressions:
         c_type = "float" if target == F32 else "int32_t"
         return Value(f"({c_type}){value.within(UNARY)}", target, UNARY)
 
-    def _argument(self, node: ast.expr, kernel: Kernel, wanted: str) -> str:
+    def _argument(self, node: ast.expr, kernel: Signature, wanted: str) -> str:
         """Return an argument of a call; array arguments take their shape from here."""
         value, kind = self.value(node), kernel.arguments[wanted]
         if kind.rank and value.kind.rank and kind.base == value.kind.base:
@@ -284,11 +284,11 @@ class Expressions:
         return value.text
 
 
-def mixed(left: Kind, right: Kind) -> str:
+def mixed(left: ValueType, right: ValueType) -> str:
     """Return what to write when a float meets an integer, else nothing."""
     return instead(CONSTRUCTS, "f32 and i32") if {left, right} == {F32, I32} else ""
 
 
-def describe(kind: Kind) -> str:
+def describe(kind: ValueType) -> str:
     """Return a type in words."""
     return kind.base + ("", " array", " matrix")[kind.rank]

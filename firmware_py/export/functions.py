@@ -6,7 +6,7 @@ import textwrap
 from firmware_py.export.expressions import Expressions, describe
 from firmware_py.export.hints import CONSTRUCTS, instead
 from firmware_py.export.locals import find_locals
-from firmware_py.export.syntax import BOOL, I32, VOID, Constant, Kernel, Kind
+from firmware_py.export.syntax import BOOL, I32, VOID, Constant, Signature, ValueType
 
 C_TYPES = {"f32": "float", "i32": "int32_t", "bool": "bool", "void": "void"}
 WIDTH = 110
@@ -15,7 +15,7 @@ WIDTH = 110
 class FunctionPrinter:
     """Prints one kernel; afterwards `constants` are those that it uses."""
 
-    def __init__(self, kernel: Kernel) -> None:
+    def __init__(self, kernel: Signature) -> None:
         self.kernel = kernel
         self._print = Expressions(kernel)
         self._locals, self._loops = find_locals(kernel)
@@ -193,7 +193,7 @@ class FunctionPrinter:
         return True
 
 
-def declare(name: str, kind: Kind, written: bool) -> str:
+def declare(name: str, kind: ValueType, written: bool) -> str:
     """Return the declaration of an argument or local; what is reached through a pointer is const unless written."""
     const = "" if written else "const "
     if kind.base not in C_TYPES:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from firmware_py.export.errors import refusal
-from firmware_py.export.syntax import F32, I32, Kind
+from firmware_py.export.syntax import F32, I32, ValueType
 
 
-def constant_literal(node: ast.expr) -> tuple[Kind, str] | None:
+def constant_literal(node: ast.expr) -> tuple[ValueType, str] | None:
     """Return type and C literal of `f32(number)`, `i32(integer)` or an integer; None for anything else."""
     match node:
         case ast.Call(func=ast.Name(id="f32"), args=[argument], keywords=[]):
@@ -23,7 +23,7 @@ def constant_literal(node: ast.expr) -> tuple[Kind, str] | None:
     return None
 
 
-def array_literal(path: str, node: ast.Call, name: str, rows: Sequence[ast.expr]) -> tuple[Kind, str]:
+def array_literal(path: str, node: ast.Call, name: str, rows: Sequence[ast.expr]) -> tuple[ValueType, str]:
     """Return type and C literal of `constant(number, ..)` or `constant((number, ..), ..)`, one tuple for each row.
 
     Raises `ExportError` with the line of what is no finite number, or of a row of another length.
@@ -37,9 +37,9 @@ def array_literal(path: str, node: ast.Call, name: str, rows: Sequence[ast.expr]
         raise refusal(path, node, f"{name}: an array without numbers")
     texts = [[_float_element(path, name, element) for element in line] for line in lines]
     if not matrix:
-        return Kind("f32", 1, (len(lines),)), f"{{{', '.join(line[0] for line in texts)}}}"
+        return ValueType("f32", 1, (len(lines),)), f"{{{', '.join(line[0] for line in texts)}}}"
     text = ", ".join(f"{{{', '.join(line)}}}" for line in texts)
-    return Kind("f32", 2, (len(lines), len(lines[0]))), f"{{{text}}}"
+    return ValueType("f32", 2, (len(lines), len(lines[0]))), f"{{{text}}}"
 
 
 def _float_element(path: str, name: str, node: ast.expr) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from firmware_py.export.errors import refusal
-from firmware_py.export.syntax import C_KEYWORDS, Constant, Kernel
+from firmware_py.export.syntax import C_KEYWORDS, Constant, Signature
 
 Block = tuple[int, ...]
 
@@ -24,7 +24,7 @@ class Local:
     assignments: int
 
 
-def find_locals(kernel: Kernel) -> tuple[dict[str, Local], set[str]]:
+def find_locals(kernel: Signature) -> tuple[dict[str, Local], set[str]]:
     """Return the locals by name, and the names of the loop variables."""
     found: dict[str, Local] = {}
     targets = [node.target for node in ast.walk(kernel.node) if isinstance(node, ast.For)]
@@ -55,7 +55,7 @@ def find_locals(kernel: Kernel) -> tuple[dict[str, Local], set[str]]:
     return found, loops
 
 
-def find_writes(kernel: Kernel) -> None:
+def find_writes(kernel: Signature) -> None:
     """Find the kernels that a kernel calls, and the names through which it writes; those called come first."""
     aliases: dict[str, str] = {}
     for node in ast.walk(kernel.node):
@@ -71,7 +71,7 @@ def find_writes(kernel: Kernel) -> None:
             roots[_root(node)] = node
         elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
             callee = kernel.scope.names.get(node.func.id)
-            if isinstance(callee, Kernel):
+            if isinstance(callee, Signature):
                 _check_above(kernel, callee, node)
                 kernel.calls |= {callee.c_name} | callee.calls
                 pairs = zip(node.args, callee.arguments, strict=False)
@@ -83,7 +83,7 @@ def find_writes(kernel: Kernel) -> None:
     kernel.writes = set(roots)
 
 
-def _check_above(kernel: Kernel, callee: Kernel, node: ast.Call) -> None:
+def _check_above(kernel: Signature, callee: Signature, node: ast.Call) -> None:
     if callee is kernel:
         raise refusal(kernel.path, node, f"{kernel.node.name} calls itself: recursion")
     if callee.path == kernel.path and callee.node.lineno > kernel.node.lineno:

@@ -25,13 +25,13 @@ from firmware_py.export.syntax import (
     SUBSET,
     VOID,
     Constant,
-    Kernel,
-    Kind,
     Mark,
     Module,
     Named,
+    Signature,
     StructField,
     StructType,
+    ValueType,
 )
 
 MARKS: Mapping[str, type[Any]] = {"Tunable": Tunable, "Logged": Logged, "Settable": Settable}
@@ -125,7 +125,7 @@ class _Reader:
 
     def _take(self, name: str, thing: "Named | Module", node: ast.stmt) -> None:
         """Take a name from another module."""
-        if self.module.own and isinstance(thing, Kernel) and thing.c_name in hints.GUARDED:
+        if self.module.own and isinstance(thing, Signature) and thing.c_name in hints.GUARDED:
             text = f"{thing.node.name} of {thing.scope.path}{hints.instead(hints.GUARDED, thing.c_name)}"
             raise refusal(self.module.path, node, text)
         self.module.names[name] = thing
@@ -161,7 +161,7 @@ class _Reader:
         c_name = f"FLOATY_{name}" if shared else name
         self._define(name, Constant(c_name, kind, text, self.module.comment(node), shared), node)
 
-    def _array(self, name: str, node: ast.expr) -> tuple[Kind, str] | None:
+    def _array(self, name: str, node: ast.expr) -> tuple[ValueType, str] | None:
         """Return type and C literal of `constant(..)`; None for anything else."""
         match node:
             case ast.Call(func=ast.Name(id="constant"), args=rows, keywords=[]):
@@ -195,10 +195,10 @@ class _Reader:
         prefix = self.module.name.removeprefix("own_").capitalize() if self.module.own else ""
         return StructType(prefix + node.name, ast.get_docstring(node) or "", fields)
 
-    def _field_kind(self, annotation: ast.expr, node: ast.stmt) -> tuple[Kind, tuple[Mark, ...]]:
+    def _field_kind(self, annotation: ast.expr, node: ast.stmt) -> tuple[ValueType, tuple[Mark, ...]]:
         match annotation:
             case ast.Name(id="f32" | "i32" as base):
-                return Kind(base), ()
+                return ValueType(base), ()
             case ast.Subscript(
                 value=ast.Name(id="Annotated"), slice=ast.Tuple(elts=[ast.Name(id=name), *rest])
             ):
@@ -210,9 +210,9 @@ class _Reader:
                 if self.module.own and len(marks) > 1:
                     raise refusal(self.module.path, node, f"field with {len(marks)} marks")
                 if name in ARRAYS and len(shape) == sizes in (1, 2):
-                    return Kind(ARRAYS[name], len(shape), shape), marks
+                    return ValueType(ARRAYS[name], len(shape), shape), marks
                 if name in ("f32", "i32") and not sizes:
-                    return Kind(name), marks
+                    return ValueType(name), marks
         raise refusal(self.module.path, node, f"field type {ast.unparse(annotation)}")
 
     def _mark(self, call: ast.Call, node: ast.stmt) -> Mark:
@@ -235,7 +235,7 @@ class _Reader:
         constant = self.module.names.get(node.id) if isinstance(node, ast.Name) else None
         return int(constant.text) if isinstance(constant, Constant) else ast.literal_eval(node)
 
-    def _kernel(self, node: ast.FunctionDef) -> Kernel:
+    def _kernel(self, node: ast.FunctionDef) -> Signature:
         if [ast.unparse(decorator) for decorator in node.decorator_list] != ["kernel"]:
             raise refusal(self.module.path, node, f"function {node.name} is not marked @kernel alone")
         listed = node.args
@@ -254,20 +254,20 @@ class _Reader:
             raise refusal(self.module.path, outside[0], f"{outside[1]} (in {node.name})")
         public = self.module.name == ENTRY
         c_name = f"floaty_core_{node.name}" if public else f"{self.module.name}_{node.name}"
-        return Kernel(c_name, self.module.path, node, arguments, result, public, self.module)
+        return Signature(c_name, self.module.path, node, arguments, result, public, self.module)
 
-    def _argument_kind(self, argument: ast.arg, node: ast.FunctionDef) -> Kind:
+    def _argument_kind(self, argument: ast.arg, node: ast.FunctionDef) -> ValueType:
         match argument.annotation:
             case ast.Name(id=name) if name in SCALARS:
                 return SCALARS[name]
             case ast.Name(id=name) if name in ARRAYS:
-                return Kind(ARRAYS[name], 1)
+                return ValueType(ARRAYS[name], 1)
             case ast.Name(id=name) if isinstance(struct := self.module.names.get(name), StructType):
-                return Kind(struct.name, struct=struct)
+                return ValueType(struct.name, struct=struct)
             case ast.Subscript(value=ast.Name(id="Memory"), slice=ast.Name(id=name)) if isinstance(
                 struct := self.module.names.get(name), StructType
             ):
-                return Kind(struct.name, memory=True, struct=struct)
+                return ValueType(struct.name, memory=True, struct=struct)
         raise refusal(
             self.module.path, argument, f"argument {argument.arg} of {node.name} has no type of the subset"
         )

@@ -23,7 +23,7 @@ C_KEYWORDS = frozenset(
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class ValueType:
     """A type: f32, i32, bool, void or a struct's name; an array of `rank` 1 or 2 when that is not 0.
 
     `shape` is empty for an array argument until a caller shows it; a `memory` argument is a struct that is passed on.
@@ -36,7 +36,7 @@ class Kind:
     struct: Union["StructType", None] = field(default=None, compare=False)
 
 
-F32, I32, BOOL, VOID = Kind("f32"), Kind("i32"), Kind("bool"), Kind("void")
+F32, I32, BOOL, VOID = ValueType("f32"), ValueType("i32"), ValueType("bool"), ValueType("void")
 SCALARS = {"f32": F32, "i32": I32, "Integer": I32, "bool": BOOL}
 ARRAYS = {"F32s": "f32", "I32s": "i32"}
 
@@ -46,7 +46,7 @@ class Constant:
     """A module constant, a number or an array; `text` is its C literal, of which the values are exact."""
 
     c_name: str
-    kind: Kind
+    kind: ValueType
     text: str
     comment: str
     shared: bool
@@ -60,7 +60,7 @@ class StructField:
     """A field of a struct, with the comments above and beside it, and what makes it a parameter or a log variable."""
 
     name: str
-    kind: Kind
+    kind: ValueType
     above: str
     comment: str
     line: int
@@ -82,21 +82,21 @@ class StructType:
 
 
 @dataclass(slots=True)
-class Kernel:
+class Signature:
     """A kernel's signature; `writes` and the shapes of array arguments are found later."""
 
     c_name: str
     path: str
     node: ast.FunctionDef
-    arguments: dict[str, Kind]
-    result: Kind
+    arguments: dict[str, ValueType]
+    result: ValueType
     public: bool
     scope: "Module"
     writes: set[str] = field(default_factory=set)  # arguments and array names through which it writes
     calls: set[str] = field(default_factory=set)  # C names
 
 
-Named = Constant | StructType | Kernel
+Named = Constant | StructType | Signature
 
 
 @dataclass(slots=True)

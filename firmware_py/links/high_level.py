@@ -19,14 +19,14 @@ from firmware_py.core.structs import SETPOINT_OF_CORRECTIONS, SETPOINT_OUTSIDE, 
 from firmware_py.links.console import Notices
 from firmware_py.links.crtp_stack import CrtpStack, Task
 from firmware_py.pilot import Pilot
-from firmware_py.planner import Motion, Path, Phase, Piece, bezier, go_to, straight_up
-from firmware_py.supervisor import Supervisor
+from firmware_py.planner import Path, PathPoint, Phase, Piece, bezier, go_to, straight_up
+from firmware_py.supervisor import CoreSupervisor
 from firmware_py.wire import WireError, check_size, high_level, setpoints
 from firmware_py.wire.crtp import PORT_COMMANDER, PORT_GENERIC_SETPOINT, Packet
 from firmware_py.wire.high_level import (
-    Command,
     Define,
     GoTo,
+    PathCommand,
     Start,
     Vertical,
     VerticalWithVelocity,
@@ -34,7 +34,7 @@ from firmware_py.wire.high_level import (
 )
 
 OK, REFUSED, ENOEXEC, EBUSY = 0, 1, 8, 16
-COMMANDS = {int(command) for command in Command}
+COMMANDS = {int(command) for command in PathCommand}
 
 
 @dataclass(slots=True)
@@ -53,7 +53,7 @@ class HighLevelService:
         self,
         stack: CrtpStack,
         pilot: Pilot,
-        supervisor: Supervisor,
+        supervisor: CoreSupervisor,
         memory: bytearray,
         notices: Notices,
     ) -> None:
@@ -78,22 +78,22 @@ class HighLevelService:
             status = ENOEXEC
         return (packet.data[:3].ljust(3, b"\0") + bytes((status,)),)
 
-    def _obey(self, command: Command, fields: tuple[float, ...]) -> int:
-        if command is Command.DEFINE:
+    def _obey(self, command: PathCommand, fields: tuple[float, ...]) -> int:
+        if command is PathCommand.DEFINE:
             definition = Define(*map(int, fields))
             if definition.trajectory >= high_level.MAX_TRAJECTORIES:
                 return ENOEXEC
             self._definitions[definition.trajectory] = definition
             return OK
-        if command is Command.SET_GROUP_MASK:
+        if command is PathCommand.SET_GROUP_MASK:
             self.defaults.groups = int(fields[0])
             return OK
         groups = int(fields[0])
-        if command is not Command.STOP and not self._supervisor.can_fly:
+        if command is not PathCommand.STOP and not self._supervisor.can_fly:
             return EBUSY
         if groups and not groups & self.defaults.groups:
             return OK  # for others
-        if command is Command.STOP:
+        if command is PathCommand.STOP:
             self._pilot.abort()
             return OK
         begin = self._pilot.begin(self._stack.kernel.now_us)
@@ -102,29 +102,31 @@ class HighLevelService:
             return EBUSY
         return self._plan(command, fields, begin)
 
-    def _plan(self, command: Command, fields: tuple[float, ...], begin: Motion) -> int:
+    def _plan(self, command: PathCommand, fields: tuple[float, ...], begin: PathPoint) -> int:
         """Turn a command to fly into a path."""
-        if command is Command.GO_TO:
+        if command is PathCommand.GO_TO:
             return self._go_to(GoTo._make(fields), begin)
-        if command is Command.GO_TO_1:
+        if command is PathCommand.GO_TO_1:
             groups, relative, *rest = fields
             return self._go_to(GoTo(groups, relative, False, *rest), begin)  # type: ignore[arg-type]
-        if command is Command.START:
+        if command is PathCommand.START:
             return self._start(Start._make(fields), begin)
-        if command is Command.START_1:
+        if command is PathCommand.START_1:
             groups, relative, reverse, number, timescale = fields
             return self._start(Start(groups, relative, False, reverse, number, timescale), begin)  # type: ignore[arg-type]
-        if command is Command.SPIRAL:
+        if command is PathCommand.SPIRAL:
             self._refuse("spiral", "a spiral is not flown")
             return ENOEXEC
-        lands = command in (Command.LAND, Command.LAND_1, Command.LAND_WITH_VELOCITY)
+        lands = command in (PathCommand.LAND, PathCommand.LAND_1, PathCommand.LAND_WITH_VELOCITY)
         return self._climb(self._vertical(command, fields, begin, lands), begin, lands)
 
-    def _vertical(self, command: Command, fields: tuple[float, ...], begin: Motion, lands: bool) -> Vertical:
+    def _vertical(
+        self, command: PathCommand, fields: tuple[float, ...], begin: PathPoint, lands: bool
+    ) -> Vertical:
         """Reduce the three kinds of commands to take off or to land to one."""
-        if command in (Command.TAKE_OFF, Command.LAND):
+        if command in (PathCommand.TAKE_OFF, PathCommand.LAND):
             return Vertical._make(fields)
-        if command in (Command.TAKE_OFF_1, Command.LAND_1):
+        if command in (PathCommand.TAKE_OFF_1, PathCommand.LAND_1):
             groups, height, duration = fields
             return Vertical(int(groups), height, 0.0, False, duration)
         wish = VerticalWithVelocity._make(fields)
@@ -136,7 +138,7 @@ class HighLevelService:
         velocity = wish.velocity if wish.velocity > 0.0 else default
         return Vertical(wish.groups, height, wish.yaw, wish.current_yaw, abs(height - z) / velocity)
 
-    def _climb(self, wish: Vertical, begin: Motion, lands: bool) -> int:
+    def _climb(self, wish: Vertical, begin: PathPoint, lands: bool) -> int:
         now_us = self._stack.kernel.now_us
         phase = self._pilot.planner.phase(now_us)
         if phase is Phase.LANDING if lands else phase is not Phase.IDLE:
@@ -144,13 +146,13 @@ class HighLevelService:
         yaw = begin.yaw if wish.current_yaw else wish.yaw
         return self._follow(straight_up(begin, wish.height, yaw, wish.duration), lands)
 
-    def _go_to(self, wish: GoTo, begin: Motion) -> int:
+    def _go_to(self, wish: GoTo, begin: PathPoint) -> int:
         path = go_to(
             begin, (wish.x, wish.y, wish.z), wish.yaw, wish.duration, bool(wish.relative), bool(wish.linear)
         )
         return self._follow(path)
 
-    def _start(self, wish: Start, begin: Motion) -> int:
+    def _start(self, wish: Start, begin: PathPoint) -> int:
         definition = self._definitions.get(wish.trajectory)
         if definition is None:
             raise WireError(f"trajectory {wish.trajectory} is not defined")

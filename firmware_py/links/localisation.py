@@ -7,7 +7,7 @@ carry the last byte of the board's radio address. The pilot adds the goal from w
 from firmware_py.links.crtp_stack import CrtpStack, Task
 from firmware_py.pilot import Arrived, Pilot
 from firmware_py.rtos import Queue
-from firmware_py.supervisor import Supervisor
+from firmware_py.supervisor import CoreSupervisor
 from firmware_py.wire import WireError, crtp, localisation
 from firmware_py.wire.crtp import Correction, Packet
 
@@ -21,7 +21,7 @@ class LocalisationService:
         self,
         stack: CrtpStack,
         measurements: Queue[Arrived],
-        supervisor: Supervisor,
+        supervisor: CoreSupervisor,
         pilot: Pilot,
         address: int,
     ) -> None:

@@ -12,12 +12,12 @@ from firmware_py.links.crtp_stack import CrtpStack, Task
 from firmware_py.rtos import FOREVER
 from firmware_py.wire import WireError, log, toc
 from firmware_py.wire.crtp import PORT_LOG, Packet
-from firmware_py.wire.log import E2BIG, EEXIST, ENOENT, ENOEXEC, ENOMEM, ITEM, OK, Command
+from firmware_py.wire.log import E2BIG, EEXIST, ENOENT, ENOEXEC, ENOMEM, ITEM, OK, LogCommand
 from firmware_py.wire.scalars import LOG_SCALARS, Scalar
 
 MAX_BLOCKS = 16
 MAX_VARIABLES = 128  # in all blocks together
-COMMANDS = frozenset(Command)
+COMMANDS = frozenset(LogCommand)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ Item = tuple[Scalar, Callable[[], int | float]]  # compiled code would make a fl
 
 
 @dataclass(slots=True)
-class Block:
+class LogBlock:
     """Variables that travel together. `due_tick` is None while the block is stopped."""
 
     items: list[Item] = field(default_factory=list)
@@ -61,7 +61,7 @@ class LogService:
 
     def __init__(self, stack: CrtpStack, variables: Sequence[LogVariable]) -> None:
         self.toc = toc.Toc.of(PORT_LOG, ((item.scalar.log_number, item.name) for item in variables))
-        self.blocks: dict[int, Block] = {}
+        self.blocks: dict[int, LogBlock] = {}
         self._variables = variables
         self._stack = stack
         self._requests = stack.open_port(PORT_LOG)
@@ -79,21 +79,21 @@ class LogService:
 
     def _control(self, command: int, number: int, rest: bytes) -> int:
         """Do what the command says; return the status."""
-        if command == Command.RESET:
+        if command == LogCommand.RESET:
             self.blocks.clear()
             return OK
-        if command == Command.CREATE:
+        if command == LogCommand.CREATE:
             return self._create(number, rest)
         if command not in COMMANDS:
             return ENOEXEC
         block = self.blocks.get(number)
         if block is None:
             return ENOENT
-        if command == Command.APPEND:
+        if command == LogCommand.APPEND:
             return self._append(block, rest)
-        if command == Command.DELETE:
+        if command == LogCommand.DELETE:
             del self.blocks[number]
-        elif command == Command.STOP:
+        elif command == LogCommand.STOP:
             block.due_tick = None
         else:
             self._start(block, command, rest)
@@ -104,13 +104,13 @@ class LogService:
             return EEXIST
         if len(self.blocks) >= MAX_BLOCKS:
             return ENOMEM
-        block = Block()
+        block = LogBlock()
         status = self._append(block, rest)
         if status == OK:
             self.blocks[number] = block
         return status
 
-    def _append(self, block: Block, rest: bytes) -> int:
+    def _append(self, block: LogBlock, rest: bytes) -> int:
         """Add the complete items in `rest`: a full packet of cflib's ends with the type byte of one more."""
         items: list[Item] = []
         for offset in range(0, len(rest) - ITEM.size + 1, ITEM.size):
@@ -128,12 +128,12 @@ class LogService:
         block.layout = layout
         return OK
 
-    def _start(self, block: Block, command: int, rest: bytes) -> None:
-        width = 2 if command == Command.START_MS else 1
+    def _start(self, block: LogBlock, command: int, rest: bytes) -> None:
+        width = 2 if command == LogCommand.START_MS else 1
         if len(rest) < width:
             raise WireError("a log block started without a period")
         period = int.from_bytes(rest[:width], "little")
-        block.period_ms = period if command == Command.START_MS else period * log.PERIOD_UNIT_MS
+        block.period_ms = period if command == LogCommand.START_MS else period * log.PERIOD_UNIT_MS
         block.due_tick = self._stack.kernel.tick_count + block.period_ms
 
     def _task(self) -> Task:
@@ -154,7 +154,7 @@ class LogService:
                     break
                 yield from self._send(number, block, kernel.tick_count)
 
-    def _send(self, number: int, block: Block, tick: int) -> Task:
+    def _send(self, number: int, block: LogBlock, tick: int) -> Task:
         """Send a block that is due; the next time is planned from this one, missed ones are left out."""
         yield from self._stack.kernel.work(self._stack.cost.log_us)
         yield from self._stack.offer(log.encode_data(number, tick, block.values()))

@@ -13,11 +13,11 @@ from firmware_py.links.mavlink_setpoints import SetpointService
 from firmware_py.links.mavlink_stack import WARNING, MavlinkStack, Task
 from firmware_py.links.mavlink_streams import StreamService
 from firmware_py.links.parameters import Parameter, ParameterStorage
-from firmware_py.supervisor import Supervisor
+from firmware_py.supervisor import CoreSupervisor
 from firmware_py.wire import mavlink
 from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_layouts import NUMBERS, Message
-from firmware_py.wire.mavlink_numbers import WRITE_ALL, Command, Mode, Result
+from firmware_py.wire.mavlink_numbers import WRITE_ALL, Command, CommandResult, Mode
 
 FORCE = 21196  # MAVLink's magic number for disarming in flight
 REBOOT = 1  # PREFLIGHT_REBOOT_SHUTDOWN
@@ -26,9 +26,9 @@ STOP = "floaty.stop"  # a parameter
 REBOOT_TICKS = 200  # before the reset: time to send what is queued, 1 kB even at 57600 baud
 
 
-Outcome = tuple[Result, Sequence[Message]]  # and what is sent after the acknowledgement
-DONE: Outcome = (Result.ACCEPTED, ())
-DENIED: Outcome = (Result.DENIED, ())
+Outcome = tuple[CommandResult, Sequence[Message]]  # and what is sent after the acknowledgement
+DONE: Outcome = (CommandResult.ACCEPTED, ())
+DENIED: Outcome = (CommandResult.DENIED, ())
 
 
 class CommandService:
@@ -38,7 +38,7 @@ class CommandService:
         self,
         stack: MavlinkStack,
         board: Board,
-        supervisor: Supervisor,
+        supervisor: CoreSupervisor,
         streams: StreamService,
         setpoints: SetpointService,
         parameters: Sequence[Parameter],
@@ -72,8 +72,8 @@ class CommandService:
 
     def _obey(self, command: Message) -> None:
         obey = self._commands.get(command.command)
-        result, answers = (Result.UNSUPPORTED, ()) if obey is None else obey(command)
-        self._stack.refused += result is not Result.ACCEPTED
+        result, answers = (CommandResult.UNSUPPORTED, ()) if obey is None else obey(command)
+        self._stack.refused += result is not CommandResult.ACCEPTED
         source = command.get_srcSystem(), command.get_srcComponent()
         self._stack.reply(services.command_ack(command.command, result, *source))
         for answer in answers:
@@ -99,7 +99,7 @@ class CommandService:
         return self._not_now(f"not armed: {obstacle}")
 
     def _not_now(self, why: str) -> Outcome:
-        return Result.TEMPORARILY_REJECTED, services.status_text(WARNING, why)
+        return CommandResult.TEMPORARILY_REJECTED, services.status_text(WARNING, why)
 
     def _reboot(self, command: Message) -> Outcome:
         if command.param1 != REBOOT:
@@ -133,7 +133,7 @@ class CommandService:
         if command.param1 != WRITE_ALL:
             return DENIED
         values = {parameter.name: parameter.value() for parameter in self._parameters if parameter.persistent}
-        return DONE if self._storage.store_all(values) else (Result.FAILED, ())
+        return DONE if self._storage.store_all(values) else (CommandResult.FAILED, ())
 
     def _set_interval(self, command: Message) -> Outcome:
         done = self._streams.set_interval(_whole(command.param1), _whole(command.param2))
@@ -143,7 +143,7 @@ class CommandService:
         number = _whole(command.param1)
         if not 0 <= number <= 0xFFFF:
             return DENIED
-        return Result.ACCEPTED, (services.message_interval(number, self._streams.interval_us(number)),)
+        return CommandResult.ACCEPTED, (services.message_interval(number, self._streams.interval_us(number)),)
 
     def _request(self, command: Message) -> Outcome:
         number, index = _whole(command.param1), _whole(command.param2)
@@ -151,13 +151,13 @@ class CommandService:
             return self._once(number)
         modes = tuple(services.available_mode(mode) for mode in Mode)
         if index == 0:
-            return Result.ACCEPTED, modes
-        return (Result.ACCEPTED, modes[index - 1 : index]) if 1 <= index <= len(modes) else DENIED
+            return CommandResult.ACCEPTED, modes
+        return (CommandResult.ACCEPTED, modes[index - 1 : index]) if 1 <= index <= len(modes) else DENIED
 
     def _once(self, number: int) -> Outcome:
         """Send a message once."""
         messages = self._streams.make(number)
-        return (Result.ACCEPTED, messages) if messages else DENIED
+        return (CommandResult.ACCEPTED, messages) if messages else DENIED
 
 
 def _sixth(command: Message) -> float:

@@ -33,7 +33,7 @@ SLACK_US = 1000  # some take their time stamps in whole milliseconds
 
 
 @dataclass(frozen=True, slots=True)
-class Exchange:
+class TimeExchange:
     t_us: int  # when it arrived, our clock
     offset_us: int  # remote clock less ours
     half_us: int  # half of the round trip
@@ -50,8 +50,8 @@ class RemoteClock:
         self.requests = 0
         self.exchanges = 0
         self._pending: deque[int] = deque(maxlen=PENDING)
-        self._window: deque[Exchange] = deque(maxlen=WINDOW)
-        self._best: Exchange | None = None
+        self._window: deque[TimeExchange] = deque(maxlen=WINDOW)
+        self._best: TimeExchange | None = None
 
     def request(self, now_us: int) -> None:
         """Note that a request leaves now."""
@@ -66,7 +66,7 @@ class RemoteClock:
         round_trip_us = now_us - sent_us
         if round_trip_us > LONGEST_US:
             return False
-        exchange = Exchange(now_us, remote_us - (sent_us + now_us) // 2, round_trip_us // 2)
+        exchange = TimeExchange(now_us, remote_us - (sent_us + now_us) // 2, round_trip_us // 2)
         if any(_contradict(old, exchange) for old in self._window):
             self._window.clear()
         self._window.append(exchange)
@@ -80,7 +80,7 @@ class RemoteClock:
         return None if best is None or best.uncertainty_us(now_us) > UNKNOWN_US else best.offset_us
 
 
-def _contradict(old: Exchange, new: Exchange) -> bool:
+def _contradict(old: TimeExchange, new: TimeExchange) -> bool:
     """Whether no clock that was left alone can explain both."""
     reach_us = new.half_us + old.uncertainty_us(new.t_us) + SLACK_US
     return abs(new.offset_us - old.offset_us) > reach_us

@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from firmware_py.geometry import Vector
 from firmware_py.links.mavlink_stack import INFO, WARNING, MavlinkStack, Task
 from firmware_py.pilot import Pilot
-from firmware_py.planner import Motion, stay
+from firmware_py.planner import PathPoint, stay
 from firmware_py.rtos import FOREVER, TICK_US
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_layouts import Message
-from firmware_py.wire.mavlink_numbers import Command, Mode, Result
+from firmware_py.wire.mavlink_numbers import Command, CommandResult, Mode
 
 SILENCE_US = 500_000  # of set-points, which ends offboard; PX4: COM_OF_LOSS_T is 1 s
 
@@ -44,7 +44,7 @@ class SetpointService:
         stack.handle("SET_MODE", self._take_mode)
         stack.kernel.create_task("MAV-MODE", 1, self._watch)
 
-    def choose(self, command: Message) -> tuple[Result, Sequence[Message]]:
+    def choose(self, command: Message) -> tuple[CommandResult, Sequence[Message]]:
         """Obey MAV_CMD_DO_SET_MODE: the custom mode as one number or, as for PX4, as main and sub-mode.
 
         A mode that the board lacks is a wrong parameter of a command that it serves.
@@ -52,13 +52,13 @@ class SetpointService:
         main, sub = command.param2, command.param3
         for mode in Mode:
             if main == mode or (main, sub) == (mode >> 16 & 0xFF, mode >> 24):
-                return Result.ACCEPTED, self._enter(mode, _source(command))
-        return Result.DENIED, ()
+                return CommandResult.ACCEPTED, self._enter(mode, _source(command))
+        return CommandResult.DENIED, ()
 
-    def see_pose(self) -> Motion:
+    def see_pose(self) -> PathPoint:
         """Return the goal that a pose from MAVLink, which has just arrived, is to be seen from."""
         self._seen_from, self._seen_us = self._goal, self._stack.kernel.now_us
-        return Motion(*self._goal)
+        return PathPoint(*self._goal)
 
     @property
     def goal(self) -> Goal:
@@ -114,7 +114,7 @@ class SetpointService:
         """SET_MODE, which MAV_CMD_DO_SET_MODE has replaced."""
         number, source = message.custom_mode, _source(message)
         known = number in tuple(Mode)
-        result = Result.ACCEPTED if known else Result.DENIED
+        result = CommandResult.ACCEPTED if known else CommandResult.DENIED
         self._stack.reply(services.command_ack(Command.DO_SET_MODE, result, *source))
         for answer in self._enter(Mode(number), source) if known else ():
             self._stack.reply(answer)

@@ -1,8 +1,8 @@
 """What the streams carry: the running board's values as messages, with the tick as time stamp.
 
 Our own ground station takes the flight array: the telemetry blocks as the board knows them, relative to the goal that the
-last pose was seen from. For other stations the standard's messages are absolute in W (`World`); those of rate 0 are sent
-only on SET_MESSAGE_INTERVAL or REQUEST_MESSAGE.
+last pose was seen from. For other stations the standard's messages are absolute in W (`PoseInWorld`); those of rate 0 are
+sent only on SET_MESSAGE_INTERVAL or REQUEST_MESSAGE.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,14 +26,14 @@ from firmware_py.links.mavlink_setpoints import SetpointService
 from firmware_py.links.mavlink_stack import MavlinkStack
 from firmware_py.links.mavlink_streams import Stream, interval_of
 from firmware_py.rtos.statistics import ProcessorLoad
-from firmware_py.supervisor import Supervisor
+from firmware_py.supervisor import CoreSupervisor
 from firmware_py.wire import mavlink, telemetry
 from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_layouts import Message
 
 
 @dataclass(frozen=True, slots=True)
-class World:
+class PoseInWorld:
     """Where the robot is in W now; the estimator only has the error from the goal against which the last pose was taken."""
 
     estimator: Estimator
@@ -79,8 +79,8 @@ class FlightMessages:
     def __init__(
         self,
         stack: MavlinkStack,
-        supervisor: Supervisor,
-        world: World,
+        supervisor: CoreSupervisor,
+        world: PoseInWorld,
         poses: PoseService,
         variables: Sequence[LogVariable],
         read_imu: ReadImu,

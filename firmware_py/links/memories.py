@@ -24,7 +24,7 @@ _NO_SERIAL = bytes(8)
 _DECK_SERIAL = bytes((0x0D, 0xF1, 0x0A, 0x7B, 0, 0, 0, 1))  # of the one-wire chip
 
 
-class Memory:
+class ClientMemory:
     """A memory of real bytes as clients see it; addresses are checked by the service."""
 
     def __init__(self, type: int, content: bytearray, serial: bytes = _NO_SERIAL) -> None:
@@ -42,7 +42,7 @@ class Memory:
         self._content[address : address + len(data)] = data
 
 
-class Tester(Memory):
+class Tester(ClientMemory):
     """The memory tester; `errors` counts wrong bytes."""
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ class Tester(Memory):
 class MemoryService:
     """Serves memories; their number is their index."""
 
-    def __init__(self, stack: CrtpStack, memories: Sequence[Memory]) -> None:
+    def __init__(self, stack: CrtpStack, memories: Sequence[ClientMemory]) -> None:
         self._memories = memories
         stack.serve("MEM", 1, PORT_MEMORIES, self.answer)
 
@@ -97,11 +97,11 @@ class MemoryService:
 
 def memories(
     eeprom: bytearray, deck_memory: bytearray, tester: Tester, trajectories: bytearray
-) -> tuple[Memory, ...]:
+) -> tuple[ClientMemory, ...]:
     """Return the memories of a Floaty board."""
     return (
-        Memory(TYPE_EEPROM, eeprom),
-        Memory(TYPE_ONE_WIRE, deck_memory, _DECK_SERIAL),
+        ClientMemory(TYPE_EEPROM, eeprom),
+        ClientMemory(TYPE_ONE_WIRE, deck_memory, _DECK_SERIAL),
         tester,
-        Memory(TYPE_TRAJECTORIES, trajectories),
+        ClientMemory(TYPE_TRAJECTORIES, trajectories),
     )

@@ -4,7 +4,7 @@ from firmware_py.links.crtp_stack import CrtpStack, Task
 from firmware_py.pilot import Pilot
 from firmware_py.planner import Phase
 from firmware_py.rtos import Queue
-from firmware_py.supervisor import Supervisor
+from firmware_py.supervisor import CoreSupervisor
 from firmware_py.wire import WireError, check_size
 from firmware_py.wire.crtp import (
     MAX_DATA,
@@ -47,7 +47,7 @@ SOURCE_TEXT = b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0")  # by which clients k
 class PlatformService:
     """Answers on the ports of link, platform and supervisor. The application echoes what it receives on its channel."""
 
-    def __init__(self, stack: CrtpStack, supervisor: Supervisor, pilot: Pilot) -> None:
+    def __init__(self, stack: CrtpStack, supervisor: CoreSupervisor, pilot: Pilot) -> None:
         self._stack = stack
         self._supervisor = supervisor
         self._pilot = pilot
@@ -135,7 +135,7 @@ def answer_link(packet: Packet) -> tuple[bytes, ...]:
     return (SOURCE_TEXT,) if packet.channel == LINK_SOURCE else ()
 
 
-def supervisor_bits(supervisor: Supervisor) -> int:
+def supervisor_bits(supervisor: CoreSupervisor) -> int:
     """Return the Crazyflie's bit field: can be armed, armed, arms itself, can fly, flies, tumbled, locked."""
     flags = (
         not supervisor.armed and supervisor.calibrated and supervisor.can_be_armed,

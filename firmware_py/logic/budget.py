@@ -14,7 +14,7 @@ from firmware_py.core.budget import CALL_CYCLES
 from firmware_py.export.errors import refusal
 from firmware_py.export.expressions import Expressions
 from firmware_py.export.locals import find_locals
-from firmware_py.export.syntax import I32, PACKAGE, SUBSET, Kernel, Module
+from firmware_py.export.syntax import I32, PACKAGE, SUBSET, Module, Signature
 
 CLOCK_MHZ = 168
 SLOW, STEP, CALL = 14, 4, 4  # cycles
@@ -29,7 +29,7 @@ Edit = tuple[tuple[int, int], tuple[int, int], str]  # begin, end, text there; (
 class Counted:
     """The cycles of a kernel, without those that are charged while it runs, and how its text changes."""
 
-    kernel: Kernel
+    kernel: Signature
     cycles: int = 0
     charged: bool = False  # it has loops whose length depends on data, or calls a kernel that has some
     edits: list[Edit] = field(default_factory=list)
@@ -49,7 +49,7 @@ def budgeted(text: str, modules: Sequence[Module]) -> Budgeted:
     Raises `ExportError` for a kernel that exceeds the budget in any case.
     """
     counted: dict[str, Counted] = {}
-    kernels = [thing for module in modules for thing in module.defined if isinstance(thing, Kernel)]
+    kernels = [thing for module in modules for thing in module.defined if isinstance(thing, Signature)]
     for kernel in kernels:
         counted[kernel.c_name] = _Counter(kernel, counted).count()
     own = [one for one in counted.values() if one.kernel.scope is modules[-1]]
@@ -63,7 +63,7 @@ def budgeted(text: str, modules: Sequence[Module]) -> Budgeted:
 class _Counter:
     """Counts one kernel; those that it calls have been counted."""
 
-    def __init__(self, kernel: Kernel, counted: Mapping[str, Counted]) -> None:
+    def __init__(self, kernel: Signature, counted: Mapping[str, Counted]) -> None:
         self._found = Counted(kernel)
         self._others = counted
         self._own = kernel.scope.own
@@ -136,7 +136,7 @@ class _Counter:
 
     def _call(self, node: ast.Call, name: str, alone: bool) -> int:
         kernel = self._found.kernel.scope.names.get(name)
-        if not isinstance(kernel, Kernel):
+        if not isinstance(kernel, Signature):
             return SLOW if name == "sqrt" else 1
         callee = self._others[kernel.c_name]
         if callee.charged:

@@ -41,14 +41,14 @@ DRIVE = "    _drive_servos(parameters[0], control[0])\n"
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class EntryText:
     """The text, and by call the names of the blocks that it takes."""
 
     text: str
     calls: Mapping[str, tuple[str, ...]]
 
 
-def compose(plugs: Sequence[Plug], package: str) -> Entry:
+def compose(plugs: Sequence[Plug], package: str) -> EntryText:
     """Return the entry module that finds the user's modules in a package."""
     by_name = {plug.point.name: plug for plug in plugs}
     modules = {plug.point.name: f"own_{plug.point.name}" for plug in plugs}
@@ -78,7 +78,7 @@ def compose(plugs: Sequence[Plug], package: str) -> Entry:
         listed = "".join(f"    {block}: Memory[{types[block]}],\n" for block in calls[name])
         result, doc = ast.unparse(PARTS[name].returns or ast.Constant(None)), ast.get_docstring(PARTS[name])
         lines.append(f'\n\n@kernel\ndef {name}(\n{listed}) -> {result}:\n    """{doc}"""\n{body}')
-    return Entry("".join(lines), calls)
+    return EntryText("".join(lines), calls)
 
 
 def _body(node: ast.FunctionDef) -> str:

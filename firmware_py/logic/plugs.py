@@ -17,7 +17,7 @@ from firmware_py.core import entry
 from firmware_py.core.subset import Logged, Tunable
 from firmware_py.export.errors import ExportError
 from firmware_py.export.locals import find_writes
-from firmware_py.export.syntax import I32, VOID, Kernel, Kind, Module, StructType
+from firmware_py.export.syntax import I32, VOID, Module, Signature, StructType, ValueType
 from firmware_py.table import SCALARS, CoreParameter, CoreVariable, Place
 from firmware_py.wire.toc import MAX_NAME
 
@@ -46,7 +46,7 @@ class PlugPoint:
     """A place for a user's module: its hooks with their results, and which arguments they may write."""
 
     name: str  # the key of the profile
-    hooks: Mapping[str, Kind]
+    hooks: Mapping[str, ValueType]
     writes: frozenset[str]
 
 
@@ -77,7 +77,7 @@ def read_plug(point: PlugPoint, module: Module) -> Plug:
     """Return what a module provides. Raises `ExportError` with file, line and what is expected."""
     hooks: dict[str, tuple[str, ...]] = {}
     structs: dict[str, StructType] = {}
-    kernels = [thing for thing in module.defined if isinstance(thing, Kernel)]
+    kernels = [thing for thing in module.defined if isinstance(thing, Signature)]
     for kernel in kernels:
         find_writes(kernel)
         if kernel.node.name in point.hooks:
@@ -95,7 +95,7 @@ def _refusal(module: Module, line: int, reason: str) -> ExportError:
     return ExportError(f"{module.path}:{line}: {reason}")
 
 
-def _check_signature(point: PlugPoint, kernel: Kernel, structs: dict[str, StructType]) -> None:
+def _check_signature(point: PlugPoint, kernel: Signature, structs: dict[str, StructType]) -> None:
     """Check what a hook takes and writes, and note the module's own structs."""
     name, module, line = kernel.node.name, kernel.scope, kernel.node.lineno
     for argument, kind in kernel.arguments.items():

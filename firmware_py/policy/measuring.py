@@ -29,7 +29,7 @@ LINE_BYTES, WAIT_STATES = 16, 5  # of the flash of an STM32F405 at 168 MHz
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
+class LawFigures:
     """What the law takes of the board, and its largest difference from the policy's actions."""
 
     cycles: int  # of the longest call
@@ -48,7 +48,7 @@ class Figures:
         return f"{time}, {slot}; flash {self.flash_bytes} B, RAM {self.ram_bytes} B"
 
 
-def measure(config: FirmwareConfig, policy: Policy, build: Path) -> Figures:
+def measure(config: FirmwareConfig, policy: Policy, build: Path) -> LawFigures:
     """Call the law of a profile on states all over the flight envelope; `build` keeps what is compiled.
 
     Raises `ExportError` when the emulator or the compiler is missing.
@@ -74,7 +74,7 @@ def measure(config: FirmwareConfig, policy: Policy, build: Path) -> Figures:
     own = [
         block.memory.nbytes for name, block in blocks.named.items() if name in ("controller_memory", "guard")
     ]
-    return Figures(
+    return LawFigures(
         blocks.run.load["control"].worst_cycles + WAIT_STATES * lines,
         len(image.code) - len(default.code),
         sum(own),

@@ -33,7 +33,7 @@ class PolicyError(FirmwareError):
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class NetworkStep:
     """A step of a network, on the outputs of the last dense one: WEIGHTS and BIASES, FACTORS and SUMMANDS, or LIMIT."""
 
     kind: str
@@ -48,7 +48,7 @@ class Step:
 class Policy:
     """The steps from the observation to the action, and the answers of the framework."""
 
-    steps: tuple[Step, ...]
+    steps: tuple[NetworkStep, ...]
     answer: Answer
 
     @property
@@ -75,7 +75,7 @@ def read_policy(path: Path) -> Policy:
         raise PolicyError(error.strerror or str(error)) from None
 
 
-def _checked(steps: Iterable[Step]) -> tuple[Step, ...]:
+def _checked(steps: Iterable[NetworkStep]) -> tuple[NetworkStep, ...]:
     """Return the steps with the numbers of their inputs and outputs, as float32."""
     done, width, layer = [], OBSERVATIONS, 0
     for step in steps:
@@ -100,7 +100,7 @@ def _checked(steps: Iterable[Step]) -> tuple[Step, ...]:
     return tuple(done)
 
 
-def answer_of(steps: Iterable[Step], observations: NDArray[np.float32]) -> NDArray[np.float64]:
+def answer_of(steps: Iterable[NetworkStep], observations: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return the outputs (n, 4) to observations (n, 20), computed in float64."""
     x = observations.astype(float)
     for step in steps:
@@ -169,29 +169,29 @@ def _nodes_to(output: str, graph: Any, constants: Mapping[str, Any]) -> list[Any
     return nodes
 
 
-def _step(node: Any, given: list[NDArray[Any] | None], attributes: Mapping[str, Any]) -> Step:
+def _step(node: Any, given: list[NDArray[Any] | None], attributes: Mapping[str, Any]) -> NetworkStep:
     """Return the step that a node stands for; `given` are its inputs that are constant."""
     kind, name = str(node.op_type), f"{node.op_type} {node.name}".strip()
     known = [np.asarray(one, float) for one in given if one is not None]
     forward = given[0] is None  # the first input is the observation's
     if kind in ("Tanh", "Relu"):
-        return Step(kind.lower(), name)
+        return NetworkStep(kind.lower(), name)
     if kind in ("Add", "Mul") or (kind in ("Sub", "Div") and forward):
         value = np.ravel(known[0])
         factors = value if kind == "Mul" else 1.0 / value if kind == "Div" else np.ones(1)
         summands = value if kind == "Add" else -value if kind == "Sub" else np.zeros(1)
-        return Step(SCALE, name, {"FACTORS": factors, "SUMMANDS": summands})
+        return NetworkStep(SCALE, name, {"FACTORS": factors, "SUMMANDS": summands})
     if kind == "Clip":
         ends = [*known, *(np.asarray(attributes[key]) for key in ("min", "max") if key in attributes)]
         if len(ends) == 2 and ends[0] == -ends[1] < 0:
-            return Step(LIMIT, name, {"LIMIT": ends[1]})
+            return NetworkStep(LIMIT, name, {"LIMIT": ends[1]})
     plain = attributes.get("alpha", 1.0) == attributes.get("beta", 1.0) == 1.0 and not attributes.get(
         "transA"
     )
     if kind in ("Gemm", "MatMul") and forward and plain:
         weights = known[0] if attributes.get("transB") else known[0].T
         biases = np.ravel(known[1]) if len(known) > 1 else np.zeros(weights.shape[:1])
-        return Step(DENSE, name, {"WEIGHTS": weights, "BIASES": biases})
+        return NetworkStep(DENSE, name, {"WEIGHTS": weights, "BIASES": biases})
     raise PolicyError(f"{name}: a policy consists of {NODES}")
 
 
@@ -208,7 +208,7 @@ def _read_safetensors(path: Path) -> Policy:
     return Policy(steps, lambda observations: answer_of(steps, observations))
 
 
-def _steps_of(tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]) -> Iterator[Step]:
+def _steps_of(tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]) -> Iterator[NetworkStep]:
     names, activation, output = _layers_of(tensors, metadata)
     for kind in (activation, output):
         if kind not in (TANH, RELU, "none"):
@@ -217,19 +217,21 @@ def _steps_of(tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]) 
         mean, std = (
             tensors.get(name, np.array(default)) for name, default in zip(OBSERVED, (0, 1), strict=True)
         )
-        yield Step(SCALE, "observation.mean", {"FACTORS": np.ones(1), "SUMMANDS": -mean})
-        yield Step(SCALE, "observation.std", {"FACTORS": 1 / std, "SUMMANDS": np.zeros(1)})
+        yield NetworkStep(SCALE, "observation.mean", {"FACTORS": np.ones(1), "SUMMANDS": -mean})
+        yield NetworkStep(SCALE, "observation.std", {"FACTORS": 1 / std, "SUMMANDS": np.zeros(1)})
     if "limit" in metadata:
         if not re.fullmatch(r"\d+(\.\d*)?", metadata["limit"]):
             raise PolicyError(f"metadata limit = {metadata['limit']}: expected a positive number")
-        yield Step(LIMIT, "metadata limit", {"LIMIT": np.array([float(metadata["limit"])])})
+        yield NetworkStep(LIMIT, "metadata limit", {"LIMIT": np.array([float(metadata["limit"])])})
     for name in names:
         if f"{name}.bias" not in tensors:
             raise PolicyError(f"{name}.weight has no {name}.bias")
-        yield Step(DENSE, name, {"WEIGHTS": tensors[f"{name}.weight"], "BIASES": tensors[f"{name}.bias"]})
+        yield NetworkStep(
+            DENSE, name, {"WEIGHTS": tensors[f"{name}.weight"], "BIASES": tensors[f"{name}.bias"]}
+        )
         kind = output if name == names[-1] else activation
         if kind != "none":
-            yield Step(kind, name)
+            yield NetworkStep(kind, name)
 
 
 def _layers_of(tensors: Mapping[str, Any], metadata: Mapping[str, str]) -> tuple[list[str], str, str]:

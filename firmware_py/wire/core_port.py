@@ -55,7 +55,7 @@ NARROW, WIDE = 4, 6  # bytes of a difference between two samples
 NARROW_BITS = 10  # of an axis
 
 
-class Kind(IntEnum):
+class Message(IntEnum):
     """What a request asks for, and the kind of its answer."""
 
     HELLO = 0
@@ -102,7 +102,7 @@ class Hil(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class PacketLayout:
     """A piece of a packet: its fields in their order, each with its code of `struct`."""
 
     name: str
@@ -114,8 +114,8 @@ class Layout:
         return struct.Struct("<" + "".join(code for _, code in self.fields))
 
 
-HEAD = Layout("Head", (("kind", "B"), ("session", "B"), ("number", "H")))
-ABOUT = Layout("About", (
+HEAD = PacketLayout("Head", (("kind", "B"), ("session", "B"), ("number", "H")))
+ABOUT = PacketLayout("About", (
     ("version", "B"),  # VERSION
     ("state", "B"),  # of the supervisor: firmware_py.wire.supervisor.State
     ("size", "H"),  # [B] of the memory
@@ -124,29 +124,29 @@ ABOUT = Layout("About", (
     ("core", f"{NAME_SIZE}s"),  # how the hash of the core's sources begins
     ("profile", f"{NAME_SIZE}s"),  # and that of the parameters in the app
 ))  # fmt: skip
-PLACE = Layout("Place", (("offset", "H"),))
-PLACE_SIZE = Layout("PlaceSize", (("offset", "H"), ("size", "B")))
-CALL = Layout("Call", (("call", "B"),))
-CALLED = Layout("Called", (
+PLACE = PacketLayout("Place", (("offset", "H"),))
+PLACE_SIZE = PacketLayout("PlaceSize", (("offset", "H"), ("size", "B")))
+CALL = PacketLayout("Call", (("call", "B"),))
+CALLED = PacketLayout("Called", (
     ("answer", "b"),  # 0 of calls that have none
     ("cycles", "I"),  # that the call took, with the interrupts in it; no other task runs meanwhile
     ("digest", "I"),  # CRC-32 of the whole memory afterwards, as zlib.crc32
 ))  # fmt: skip
-WHY = Layout("Why", (("reason", "B"),))
-HEALTH = Layout("Health", (
+WHY = PacketLayout("Why", (("reason", "B"),))
+HEALTH = PacketLayout("Health", (
     ("gyro_x", "h"), ("gyro_y", "h"), ("gyro_z", "h"),  # [counts] now, of the board's own gyro
     ("calibrated", "B"),  # 1: the gyro's zero is known
     ("battery_mv", "H"),
     ("heap_free", "I"),  # [B] of RAM
     ("m1", "H"), ("m2", "H"), ("m3", "H"), ("m4", "H"),  # timer counts of the servos
 ))  # fmt: skip
-MODE = Layout("Mode", (("mode", "B"),))
-SAMPLES = Layout("Samples", (
+MODE = PacketLayout("Mode", (("mode", "B"),))
+SAMPLES = PacketLayout("Samples", (
     ("number", "H"),  # of the first sample
     ("width", "B"),  # [B] of a difference: NARROW or WIDE
     ("x", "h"), ("y", "h"), ("z", "h"),  # [counts] of the gyro, sensor frame
 ))  # fmt: skip
-LOOP = Layout("Loop", (
+LOOP = PacketLayout("Loop", (
     ("used", "H"),  # number of the next sample, when the controller ran
     ("waiting", "B"),  # samples in the buffer then
     ("state", "B"),  # of the supervisor
@@ -233,33 +233,33 @@ class CoreAnswer:
         return int(_unpack(_WHY, self.body)[0])
 
 
-def hello() -> tuple[Kind, bytes]:
+def hello() -> tuple[Message, bytes]:
     """Begin a session."""
-    return Kind.HELLO, b""
+    return Message.HELLO, b""
 
 
-def write(offset: int, data: bytes) -> tuple[Kind, bytes]:
+def write(offset: int, data: bytes) -> tuple[Message, bytes]:
     """Write up to `WRITE_MAX` bytes."""
-    return Kind.WRITE, _PLACE.pack(offset) + data
+    return Message.WRITE, _PLACE.pack(offset) + data
 
 
-def call(entry: Call) -> tuple[Kind, bytes]:
+def call(entry: Call) -> tuple[Message, bytes]:
     """Execute an entry point."""
-    return Kind.CALL, _CALL.pack(entry)
+    return Message.CALL, _CALL.pack(entry)
 
 
-def read(offset: int, size: int) -> tuple[Kind, bytes]:
+def read(offset: int, size: int) -> tuple[Message, bytes]:
     """Read up to `READ_MAX` bytes."""
-    return Kind.READ, _PLACE_SIZE.pack(offset, size)
+    return Message.READ, _PLACE_SIZE.pack(offset, size)
 
 
-def health() -> tuple[Kind, bytes]:
-    return Kind.HEALTH, b""
+def health() -> tuple[Message, bytes]:
+    return Message.HEALTH, b""
 
 
-def loop(mode: Hil) -> tuple[Kind, bytes]:
+def loop(mode: Hil) -> tuple[Message, bytes]:
     """Switch hardware in the loop."""
-    return Kind.LOOP, _MODE.pack(mode)
+    return Message.LOOP, _MODE.pack(mode)
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,7 +324,7 @@ def decode_looped(data: bytes) -> Looped:
     )  # fmt: skip
 
 
-def encode_request(kind: Kind, body: bytes, session: int, number: int) -> bytes:
+def encode_request(kind: Message, body: bytes, session: int, number: int) -> bytes:
     """Return the data of the packet."""
     return _HEAD.pack(kind, session, number & 0xFFFF) + body
 

@@ -16,7 +16,7 @@ PORT = 8
 MAX_TRAJECTORIES = 10
 
 
-class Command(IntEnum):
+class PathCommand(IntEnum):
     """The first byte. Those that end in 1 are older than cflib's."""
 
     SET_GROUP_MASK = 0
@@ -87,27 +87,27 @@ class Define(NamedTuple):
 
 
 _LAYOUTS = {
-    Command.SET_GROUP_MASK: struct.Struct("<B"),
-    Command.TAKE_OFF_1: struct.Struct("<Bff"),
-    Command.LAND_1: struct.Struct("<Bff"),
-    Command.STOP: struct.Struct("<B"),
-    Command.GO_TO_1: struct.Struct("<BBfffff"),
-    Command.START_1: struct.Struct("<BBBBf"),
-    Command.DEFINE: struct.Struct("<BBBIB"),
-    Command.TAKE_OFF: struct.Struct("<Bff?f"),
-    Command.LAND: struct.Struct("<Bff?f"),
-    Command.TAKE_OFF_WITH_VELOCITY: struct.Struct("<Bf?f?f"),
-    Command.LAND_WITH_VELOCITY: struct.Struct("<Bf?f?f"),
-    Command.SPIRAL: struct.Struct("<BBBfffff"),
-    Command.GO_TO: struct.Struct("<B??fffff"),
-    Command.START: struct.Struct("<B???Bf"),
+    PathCommand.SET_GROUP_MASK: struct.Struct("<B"),
+    PathCommand.TAKE_OFF_1: struct.Struct("<Bff"),
+    PathCommand.LAND_1: struct.Struct("<Bff"),
+    PathCommand.STOP: struct.Struct("<B"),
+    PathCommand.GO_TO_1: struct.Struct("<BBfffff"),
+    PathCommand.START_1: struct.Struct("<BBBBf"),
+    PathCommand.DEFINE: struct.Struct("<BBBIB"),
+    PathCommand.TAKE_OFF: struct.Struct("<Bff?f"),
+    PathCommand.LAND: struct.Struct("<Bff?f"),
+    PathCommand.TAKE_OFF_WITH_VELOCITY: struct.Struct("<Bf?f?f"),
+    PathCommand.LAND_WITH_VELOCITY: struct.Struct("<Bf?f?f"),
+    PathCommand.SPIRAL: struct.Struct("<BBBfffff"),
+    PathCommand.GO_TO: struct.Struct("<B??fffff"),
+    PathCommand.START: struct.Struct("<B???Bf"),
 }
 
 
-def decode(data: bytes) -> tuple[Command, tuple[float, ...]]:
+def decode(data: bytes) -> tuple[PathCommand, tuple[float, ...]]:
     """The command and its fields as they travel; `WireError` for an unknown one or a number that is not finite."""
     try:
-        command = Command(data[0])
+        command = PathCommand(data[0])
     except (IndexError, ValueError):
         raise WireError(f"high-level command {data.hex()}: unknown") from None
     layout = _LAYOUTS[command]
@@ -118,6 +118,6 @@ def decode(data: bytes) -> tuple[Command, tuple[float, ...]]:
     return command, fields
 
 
-def encode(command: Command, *fields: float) -> bytes:
+def encode(command: PathCommand, *fields: float) -> bytes:
     """The complete packet of a command with its fields, in the order in which they travel."""
     return bytes((header(PORT, 0), command)) + _LAYOUTS[command].pack(*fields)

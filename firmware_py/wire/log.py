@@ -24,7 +24,7 @@ _HEAD = struct.Struct("<BBHB")
 _HEADER = header(PORT_LOG, CHANNEL_DATA)
 
 
-class Command(IntEnum):
+class LogCommand(IntEnum):
     """The first byte on channel 1; versions 0 and 1 of the protocol are not spoken."""
 
     DELETE = 2
@@ -36,7 +36,7 @@ class Command(IntEnum):
     START_MS = 8
 
 
-def request(command: Command, *rest: int) -> Packet:
+def request(command: LogCommand, *rest: int) -> Packet:
     """A request on channel 1; the number of a block comes first."""
     return Packet(PORT_LOG, CHANNEL_CONTROL, bytes((command, *rest)))
 
@@ -46,7 +46,9 @@ def creation(block: int, items: Sequence[tuple[Scalar, int]]) -> list[Packet]:
     packed = [ITEM.pack(scalar.log_number, number) for scalar, number in items]
     return [
         request(
-            Command.APPEND if first else Command.CREATE, block, *b"".join(packed[first : first + MAX_ITEMS])
+            LogCommand.APPEND if first else LogCommand.CREATE,
+            block,
+            *b"".join(packed[first : first + MAX_ITEMS]),
         )
         for first in range(0, len(packed), MAX_ITEMS)
     ]

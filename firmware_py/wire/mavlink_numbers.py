@@ -29,7 +29,7 @@ class Mode(IntEnum):
     OFFBOARD = 6 << 16  # one client's stream of set-points leads
 
 
-class Result(IntEnum):
+class CommandResult(IntEnum):
     """MAV_RESULT: the outcome of a command."""
 
     ACCEPTED = 0

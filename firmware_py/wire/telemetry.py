@@ -36,7 +36,7 @@ class Variable:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
+class TelemetryBlock:
     """Variables that travel together in one packet; at most 26 bytes. There is one object per block: the tables below."""
 
     id: int
@@ -72,7 +72,7 @@ class Block:
 class Sample:
     """The values of one block at one instant of the board's clock."""
 
-    block: Block
+    block: TelemetryBlock
     timestamp_ms: int  # in the bits of TIMESTAMP_MASK
     values: tuple[Number, ...]  # in the order of block.variables
 
@@ -82,13 +82,13 @@ def _variables(group: str, names: str, type: Scalar, unit: str) -> tuple[Variabl
 
 
 # Position and yaw are those of the goal frame: what the board knows is its error.
-MOTION = Block(
+MOTION = TelemetryBlock(
     0,
     PERIOD_MS,
     _variables("stateEstimate", "x y z", Scalar.F32, "m")
     + _variables("stateEstimate", "vx vy vz", Scalar.F32, "m/s"),
 )
-ATTITUDE = Block(
+ATTITUDE = TelemetryBlock(
     1,
     PERIOD_MS,
     tuple(
@@ -98,13 +98,13 @@ ATTITUDE = Block(
     + _variables("locSrv", "age", Scalar.U16, "0.1 ms")  # of the last pose when it arrived
     + _variables("locSrv", "poses rejected", Scalar.U16, ""),  # received, refused; modulo 65536
 )
-FLAPS = Block(
+FLAPS = TelemetryBlock(
     2,
     PERIOD_MS,
     _variables("stateEstimate", "flap_1 flap_2 flap_3 flap_4", Scalar.F32, "rad")
     + _variables("motor", "m1 m2 m3 m4", Scalar.U16, "counts"),
 )
-CONTROL = Block(
+CONTROL = TelemetryBlock(
     3,
     PERIOD_MS,
     _variables("supervisor", "state", Scalar.U8, "")
@@ -114,12 +114,12 @@ CONTROL = Block(
 )
 BLOCKS = (MOTION, ATTITUDE, FLAPS, CONTROL)
 # Apart, because a Crazyflie has no load variable. MAVLink: SYS_STATUS.
-BATTERY = Block(4, SLOW_PERIOD_MS, _variables("pm", "vbat", Scalar.F32, "V"))
-LOAD = Block(5, SLOW_PERIOD_MS, _variables("system", "load", Scalar.F32, "%"))  # of the processor
+BATTERY = TelemetryBlock(4, SLOW_PERIOD_MS, _variables("pm", "vbat", Scalar.F32, "V"))
+LOAD = TelemetryBlock(5, SLOW_PERIOD_MS, _variables("system", "load", Scalar.F32, "%"))  # of the processor
 SLOW_BLOCKS = (BATTERY, LOAD)
 ALL_BLOCKS = (*BLOCKS, *SLOW_BLOCKS)
 # Of a Crazyflie with its own firmware; MOTION and BATTERY it has as well. Roll, pitch and yaw are in its degrees.
-CRAZYFLIE_STATE = Block(
+CRAZYFLIE_STATE = TelemetryBlock(
     6,
     PERIOD_MS,
     tuple(variable for variable in ATTITUDE.variables if variable.scale is not None)

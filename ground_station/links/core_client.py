@@ -13,7 +13,7 @@ from firmware_py.wire.core_port import (
     VERSION,
     About,
     CoreAnswer,
-    Kind,
+    Message,
     Refusal,
     decode_answer,
     encode_request,
@@ -23,7 +23,7 @@ from firmware_py.wire.core_port import (
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
 
-Request = tuple[Kind, bytes]
+Request = tuple[Message, bytes]
 
 WINDOW = 4  # requests in flight at once: a board's queue has room for 5 packets, and it reboots when that overflows
 FIRST_WAIT_S = 0.1  # for an answer, before requests are repeated
@@ -145,7 +145,7 @@ class CoreClient:
             except WireError:
                 continue
             if answer.session == self._session and answer.number - self._number & 0xFFFF < count:
-                if answer.kind == Kind.REFUSED:
+                if answer.kind == Message.REFUSED:
                     raise LinkError(f"{self.name}: {TEXTS.get(answer.refusal(), 'it refuses a request')}")
                 return answer
         return None

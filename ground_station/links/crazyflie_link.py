@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from math import dist
 
 from firmware_py.wire.crtp import PORT_LOG, decode, encode_ext_pose
-from firmware_py.wire.high_level import Command, encode
+from firmware_py.wire.high_level import PathCommand, encode
 from firmware_py.wire.setpoints import encode_end, encode_place
 from firmware_py.wire.telemetry import CRAZYFLIE_BLOCKS, Sample
 from ground_station.config import PilotConfig
-from ground_station.controls import Action, Request
+from ground_station.controls import ControlAction, ControlRequest
 from ground_station.latency import LinkLatency
-from ground_station.links.crtp_controls import PORTS, CrtpControls, Entry
+from ground_station.links.crtp_controls import PORTS, CrtpControls, TocEntry
 from ground_station.links.log_blocks import LogBlocks
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal, Trajectory
@@ -86,7 +86,7 @@ class CrazyflieLink:
         transmit: Callable[[int, bytes], object],
         latency_us: int,
         log_table: Callable[[], Mapping[str, int]],
-        parameters: Mapping[str, Entry],
+        parameters: Mapping[str, TocEntry],
         config: PilotConfig,
         home: Goal,
         times: FlightTimes,
@@ -129,25 +129,25 @@ class CrazyflieLink:
         yield 0
         for group, values in config.parameters.items():
             for name, value in values.items():
-                self._ask(Request(Action.WRITE, f"{group}.{name}", value))
+                self._ask(ControlRequest(ControlAction.WRITE, f"{group}.{name}", value))
                 yield 0
         for value in (1.0, 0.0):
-            self._ask(Request(Action.WRITE, ESTIMATOR, value))
+            self._ask(ControlRequest(ControlAction.WRITE, ESTIMATOR, value))
             yield 0
         yield times.take_off_us - ARM_US
-        self._ask(Request(Action.ARM))
+        self._ask(ControlRequest(ControlAction.ARM))
         yield times.take_off_us
         height, yaw = self._home.p_WG[2], self._home.yaw
-        self._command(Command.TAKE_OFF, NO_GROUPS, height, yaw, False, config.take_off_s)
+        self._command(PathCommand.TAKE_OFF, NO_GROUPS, height, yaw, False, config.take_off_s)
         yield times.begin_us
         while self._now_us < times.land_us:
             self._follow()
             yield self._now_us + 1
         if self._streams:  # the high-level commander takes over again
             self._transmit(self._now_us, encode_end())
-        self._command(Command.LAND, NO_GROUPS, 0.0, self._goal.yaw, False, config.land_s)
+        self._command(PathCommand.LAND, NO_GROUPS, 0.0, self._goal.yaw, False, config.land_s)
         yield times.landed_us + STOP_US
-        self._command(Command.STOP, NO_GROUPS)
+        self._command(PathCommand.STOP, NO_GROUPS)
         yield 1 << 62
 
     def _follow(self) -> None:
@@ -157,10 +157,10 @@ class CrazyflieLink:
         if self._streams:
             self._transmit(self._now_us, encode_place(goal.p_WG, goal.yaw))
 
-    def _command(self, command: Command, *fields: float) -> None:
+    def _command(self, command: PathCommand, *fields: float) -> None:
         self._transmit(self._now_us, encode(command, *fields))
 
-    def _ask(self, request: Request) -> None:
+    def _ask(self, request: ControlRequest) -> None:
         self._asked = True
         self._controls.ask(self._now_us, request)
 

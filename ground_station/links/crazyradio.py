@@ -30,11 +30,11 @@ from firmware_py.wire.parameters import ABSOLUTE
 from firmware_py.wire.scalars import PARAMETER_SCALARS
 from firmware_py.wire.telemetry import Sample, state_in
 from ground_station.clock import clock_us
-from ground_station.controls import Answer, Request
+from ground_station.controls import Answer, ControlRequest
 from ground_station.corrections import correct
 from ground_station.errors import LinkError
 from ground_station.latency import LinkLatency
-from ground_station.links.crtp_controls import PORTS, CrtpControls, Entry
+from ground_station.links.crtp_controls import PORTS, CrtpControls, TocEntry
 from ground_station.links.live_link import (
     ANSWER_TIMEOUT_US,
     POLL_S,
@@ -158,12 +158,12 @@ class CrazyradioLink(LiveLink):
             for name, element in elements.items()
         }
 
-    def _parameters(self) -> dict[str, Entry]:
+    def _parameters(self) -> dict[str, TocEntry]:
         """Return the board's table of parameters, as cflib has fetched it, without those of types that Floaty lacks."""
         groups = {} if self._crazyflie is None else self._crazyflie.param.toc.toc
         scalars = {ParamTocElement.types[number][0]: scalar for number, scalar in PARAMETER_SCALARS.items()}
         return {
-            f"{group}.{name}": Entry(
+            f"{group}.{name}": TocEntry(
                 element.ident,
                 scalars[element.ctype],
                 element.access == ParamTocElement.RW_ACCESS,
@@ -174,7 +174,7 @@ class CrazyradioLink(LiveLink):
             if element.ctype in scalars
         }
 
-    def ask(self, now_us: int, request: Request) -> None:
+    def ask(self, now_us: int, request: ControlRequest) -> None:
         self._controls.ask(now_us, request)
 
     def answer(self, now_us: int) -> Answer | None:

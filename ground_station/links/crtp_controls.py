@@ -34,13 +34,21 @@ from firmware_py.wire.supervisor import (
     REPLY,
     SUPERVISOR_INFO,
 )
-from ground_station.controls import Action, ControlsError, Dialogue, Exchange, Request, Script, Settings
+from ground_station.controls import (
+    ControlAction,
+    ControlRequest,
+    ControlsError,
+    Dialogue,
+    Exchange,
+    Script,
+    Settings,
+)
 
 PORTS = (PORT_PARAMETERS, PORT_PLATFORM, PORT_SUPERVISOR)  # whose packets `hear` takes
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class TocEntry:
     """A parameter in the board's table of contents."""
 
     number: int
@@ -52,19 +60,21 @@ class Entry:
 class CrtpControls(Dialogue[Packet]):
     """`transmit` takes packets' bytes; `table` is the board's table of contents, which is known when it is connected."""
 
-    def __init__(self, transmit: Callable[[bytes], object], table: Callable[[], Mapping[str, Entry]]) -> None:
+    def __init__(
+        self, transmit: Callable[[bytes], object], table: Callable[[], Mapping[str, TocEntry]]
+    ) -> None:
         super().__init__()
         self._transmit = transmit
         self._table = table
 
-    def ask(self, now_us: int, request: Request) -> None:
-        scripts: dict[Action, Callable[[], Script[Packet]]] = {
-            Action.LIST: lambda: self._list(request.name),
-            Action.READ: lambda: self._read(request.name),
-            Action.WRITE: lambda: self._write(request.name, request.value),
-            Action.SAVE: self._save,
-            Action.ARM: self._arm,
-            Action.STOP: self._stop,
+    def ask(self, now_us: int, request: ControlRequest) -> None:
+        scripts: dict[ControlAction, Callable[[], Script[Packet]]] = {
+            ControlAction.LIST: lambda: self._list(request.name),
+            ControlAction.READ: lambda: self._read(request.name),
+            ControlAction.WRITE: lambda: self._write(request.name, request.value),
+            ControlAction.SAVE: self._save,
+            ControlAction.ARM: self._arm,
+            ControlAction.STOP: self._stop,
         }
         self.begin(now_us, scripts[request.action]())
 
@@ -135,13 +145,13 @@ class CrtpControls(Dialogue[Packet]):
         yield Exchange(send, take)
         return ()
 
-    def _find(self, name: str) -> Entry:
+    def _find(self, name: str) -> TocEntry:
         table = self._table()
         if name not in table:
             raise ControlsError(unknown(name, tuple(table)))
         return table[name]
 
-    def _exchange_for(self, channel: int, entry: Entry, value: bytes = b"") -> Exchange[Packet]:
+    def _exchange_for(self, channel: int, entry: TocEntry, value: bytes = b"") -> Exchange[Packet]:
         """Return the exchange whose reply has the channel and the number of the request, and a value behind it."""
         size = 1 if channel == CHANNEL_READ else entry.scalar.size  # a status, and a value if that is good
         packet = Packet(PORT_PARAMETERS, channel, encode_ident(entry.number) + value)

@@ -14,7 +14,7 @@ from math import nan
 
 from firmware_py.wire.telemetry import Sample
 from ground_station.clock import clock_us
-from ground_station.controls import Answer, Request
+from ground_station.controls import Answer, ControlRequest
 from ground_station.errors import LinkError
 from ground_station.latency import LinkLatency
 from ground_station.mocap import MocapFrame
@@ -117,7 +117,7 @@ class LiveLink(ABC):
         """Return the telemetry in what arrived at `now_us`; `WireError` if it is malformed."""
 
     @abstractmethod
-    def ask(self, now_us: int, request: Request) -> None:
+    def ask(self, now_us: int, request: ControlRequest) -> None:
         """Begin an operator's request, in place of the one before it."""
 
     @abstractmethod

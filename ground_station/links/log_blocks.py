@@ -9,14 +9,14 @@ from collections.abc import Callable, Mapping, Sequence
 
 from firmware_py.wire import WireError, log
 from firmware_py.wire.crtp import Packet, encode
-from firmware_py.wire.log import Command
+from firmware_py.wire.log import LogCommand
 from firmware_py.wire.telemetry import (
     ALL_BLOCKS,
     CONTROL,
     PERIOD_MS,
     TIMESTAMP_MASK,
-    Block,
     Sample,
+    TelemetryBlock,
 )
 from ground_station.controls import ControlsError, Dialogue, Exchange, Script
 
@@ -33,14 +33,14 @@ class LogBlocks:
         self,
         transmit: Callable[[int, bytes], object],
         table: Callable[[], Mapping[str, int]],
-        blocks: Sequence[Block] = START_ORDER,
+        blocks: Sequence[TelemetryBlock] = START_ORDER,
     ) -> None:
         self.notices: list[str] = []  # lines for the user: blocks that the board cannot send
         self._transmit = transmit
         self._table = table
         self._wanted = blocks
         self._dialogue: Dialogue[Packet] = Dialogue()
-        self._blocks: dict[int, Block] = {}  # those that the board can send
+        self._blocks: dict[int, TelemetryBlock] = {}  # those that the board can send
         self._controlled_ms = 0  # the last time stamp of CONTROL
 
     @property
@@ -84,13 +84,15 @@ class LogBlocks:
         self._blocks = {block.id: block for block in blocks}
         if not blocks:
             return ()
-        yield from self._do(log.request(Command.RESET))
+        yield from self._do(log.request(LogCommand.RESET))
         for block in blocks:
             items = [(variable.type, table[variable.name]) for variable in block.variables]
             for packet in log.creation(block.id, items):
                 yield from self._do(packet)
         for block in blocks:
-            yield from self._do(log.request(Command.START, block.id, block.period_ms // log.PERIOD_UNIT_MS))
+            yield from self._do(
+                log.request(LogCommand.START, block.id, block.period_ms // log.PERIOD_UNIT_MS)
+            )
         return ()
 
     def _do(self, request: Packet) -> Script[Packet]:

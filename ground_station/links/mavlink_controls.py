@@ -8,9 +8,9 @@ from typing import Any
 
 from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_layouts import Message
-from firmware_py.wire.mavlink_numbers import WRITE_ALL, Command, Result
+from firmware_py.wire.mavlink_numbers import WRITE_ALL, Command, CommandResult
 from firmware_py.wire.scalars import Scalar
-from ground_station.controls import Action, ControlsError, Dialogue, Exchange, Request, Script
+from ground_station.controls import ControlAction, ControlRequest, ControlsError, Dialogue, Exchange, Script
 from ground_station.links.crtp_controls import unknown
 
 BOARD_COMPONENT = 1  # autopilot
@@ -29,14 +29,14 @@ class MavlinkControls(Dialogue[Message]):
         self._board = board
         self._names: tuple[str, ...] = ()  # of the board's parameters, once they were listed
 
-    def ask(self, now_us: int, request: Request) -> None:
-        scripts: dict[Action, Callable[[], Script[Message]]] = {
-            Action.LIST: self._list,
-            Action.READ: lambda: self._read(request.name),
-            Action.WRITE: lambda: self._write(request.name, request.value),
-            Action.SAVE: lambda: self._command(Command.PREFLIGHT_STORAGE, WRITE_ALL),
-            Action.ARM: self._arm,
-            Action.STOP: lambda: self._command(Command.DO_FLIGHTTERMINATION, TERMINATE),
+    def ask(self, now_us: int, request: ControlRequest) -> None:
+        scripts: dict[ControlAction, Callable[[], Script[Message]]] = {
+            ControlAction.LIST: self._list,
+            ControlAction.READ: lambda: self._read(request.name),
+            ControlAction.WRITE: lambda: self._write(request.name, request.value),
+            ControlAction.SAVE: lambda: self._command(Command.PREFLIGHT_STORAGE, WRITE_ALL),
+            ControlAction.ARM: self._arm,
+            ControlAction.STOP: lambda: self._command(Command.DO_FLIGHTTERMINATION, TERMINATE),
         }
         self.begin(now_us, scripts[request.action]())
 
@@ -93,7 +93,7 @@ class MavlinkControls(Dialogue[Message]):
         reply = yield self._until(
             message, lambda got: got.get_type() == "COMMAND_ACK" and got.command == number
         )
-        if reply.result != Result.ACCEPTED:
+        if reply.result != CommandResult.ACCEPTED:
             refusal = services.refusal(reply)
             reason = yield Exchange(
                 lambda now_us: None, _warning, waits=True, patience_us=REASON_US, missing=refusal

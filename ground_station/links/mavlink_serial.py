@@ -17,7 +17,7 @@ import serial
 
 from firmware_py.wire.telemetry import Sample
 from ground_station.clock import clock_us, signing_start
-from ground_station.controls import Answer, Request
+from ground_station.controls import Answer, ControlRequest
 from ground_station.errors import LinkError
 from ground_station.links.live_link import CLOSE_TIMEOUT_S, POLL_S, LiveLink
 from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
@@ -178,7 +178,7 @@ class MavlinkSerialLink(LiveLink):
         with self._link_lock:
             self._link.send(now_us, frame, goal)
 
-    def ask(self, now_us: int, request: Request) -> None:
+    def ask(self, now_us: int, request: ControlRequest) -> None:
         with self._link_lock:
             self._link.controls.ask(now_us, request)
 

@@ -137,7 +137,7 @@ class Worst:
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class ProfileCell:
     """An experiment on a profile."""
 
     experiment: str
@@ -150,7 +150,7 @@ class Findings:
     """All that is in the report."""
 
     rate: Rate
-    cells: tuple[Cell, ...]
+    cells: tuple[ProfileCell, ...]
     errors: tuple[str, ...]  # of flights that did not end, each text once with its count
     limits: tuple[Limited, ...]
     influences: tuple[Influence, ...]
@@ -184,13 +184,13 @@ def _rate(flights: pa.Table, column: str, size: int, cluster: int) -> Rate:
     return tally.rate
 
 
-def _cells(spec: Spec, flights: pa.Table) -> Iterator[Cell]:
+def _cells(spec: Spec, flights: pa.Table) -> Iterator[ProfileCell]:
     size = cluster_of(spec)
     for experiment in spec.experiments:
         for profile in spec.profiles:
             rows = _of_cell(flights, experiment, profile)
             own = size // len(spec.experiments) // len(spec.profiles)
-            yield Cell(experiment, profile, _rate(rows, "passed", own, size))
+            yield ProfileCell(experiment, profile, _rate(rows, "passed", own, size))
 
 
 def _of_cell(flights: pa.Table, experiment: str, profile: str) -> pa.Table:

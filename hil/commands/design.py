@@ -27,7 +27,7 @@ SPEED_MAX = 60.0  # [m/s] the greatest that a profile allows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Robot:
+class DesignOptions:
     """The options of `floaty design`."""
 
     profile: str
@@ -41,7 +41,7 @@ class Robot:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Search(Robot):
+class Search(DesignOptions):
     """The options of `floaty design optimise`."""
 
     seed: int
@@ -76,8 +76,8 @@ out_option = click.option(
 )
 @write_option
 @out_option
-@asked_as(Robot)
-def design(context: click.Context, robot: Robot) -> None:
+@asked_as(DesignOptions)
+def design(context: click.Context, robot: DesignOptions) -> None:
     """Trim, constants, poles, authority and sweeps of a profile's robot, beside the paper's claims of its design."""
     require("floaty design", "design", "scipy", "control")
     if context.invoked_subcommand is not None:
@@ -163,7 +163,7 @@ def write_profile(point: "Point", path: Path, about: str, length: float = 1.0) -
     console.print(f"profile {path}", soft_wrap=True)
 
 
-def point_of(robot: Robot) -> "Point":
+def point_of(robot: DesignOptions) -> "Point":
     """Return a profile's robot, or a similar one, at its design hover or at the hover of another speed or angle."""
     from hil.config import load_config
     from hil.design.sweeps import point_of as own_point_of

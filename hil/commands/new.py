@@ -56,7 +56,7 @@ def policy(file: Path, folder: Path) -> None:
     Its input is the observation and its output the action of firmware_py/core/observation.py. The law is called as machine
     code of the Cortex-M4, compared with FILE, and refused when a call exceeds its control slot.
     """
-    from firmware_py.policy.measuring import Figures, measure
+    from firmware_py.policy.measuring import LawFigures, measure
     from firmware_py.policy.reading import LIBRARIES, read_policy
     from hil.config import load_config
     from hil.laboratory.lockstep import BUILD
@@ -72,7 +72,9 @@ def policy(file: Path, folder: Path) -> None:
     with TemporaryDirectory() as scratch:
         try:
             values["policy"] = network = read_policy(file)
-            write_project("policy", POLICY_TEMPLATES, Path(scratch), **values, figures=Figures(0, 0, 0, 0.0))
+            write_project(
+                "policy", POLICY_TEMPLATES, Path(scratch), **values, figures=LawFigures(0, 0, 0, 0.0)
+            )
             figures = measure(load_config(f"{scratch}/profile.toml"), network, BUILD)
         except (FirmwareError, LabError) as error:
             raise LabError(f"policy {file}: {str(error).replace(f'{scratch}/', '')}") from None

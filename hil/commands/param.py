@@ -2,7 +2,7 @@
 
 import click
 
-from ground_station.controls import Action, Request, Settings
+from ground_station.controls import ControlAction, ControlRequest, Settings
 from ground_station.errors import LinkError
 from ground_station.links.schemes import find_link
 from hil.commands.options import profile_option, say, set_option
@@ -27,7 +27,7 @@ def param() -> None:
 @set_option
 def list_all(group: str, uri: str, profile: str, overrides: tuple[str, ...]) -> None:
     """Show all parameters, or those whose names begin with GROUP."""
-    (values,) = _ask(uri, profile, overrides, [Request(Action.LIST, group)])
+    (values,) = _ask(uri, profile, overrides, [ControlRequest(ControlAction.LIST, group)])
     chosen = [(name, value) for name, value in values if name.lower().startswith(group.lower())]
     if not chosen:
         raise LabError(f"{group}: no parameter of the board begins with that")
@@ -44,7 +44,7 @@ def get(names: tuple[str, ...], uri: str, profile: str, overrides: tuple[str, ..
     """Show the values of parameters."""
     from firmware_py.table import on_board
 
-    requests = [Request(Action.READ, on_board(name)[0]) for name in names]
+    requests = [ControlRequest(ControlAction.READ, on_board(name)[0]) for name in names]
     for typed, ((_, value),) in zip(names, _ask(uri, profile, overrides, requests), strict=True):
         say(f"{typed} {value / on_board(typed)[1]:.7g}")
 
@@ -59,7 +59,10 @@ def set_values(settings: tuple[str, ...], uri: str, profile: str, overrides: tup
     from firmware_py.table import on_board
 
     wanted = [_setting(text) for text in settings]
-    requests = [Request(Action.WRITE, on_board(name)[0], on_board(name)[1] * value) for name, value in wanted]
+    requests = [
+        ControlRequest(ControlAction.WRITE, on_board(name)[0], on_board(name)[1] * value)
+        for name, value in wanted
+    ]
     for (typed, _), ((_, value),) in zip(wanted, _ask(uri, profile, overrides, requests), strict=True):
         say(f"{typed} {value / on_board(typed)[1]:.7g}")
 
@@ -70,7 +73,7 @@ def set_values(settings: tuple[str, ...], uri: str, profile: str, overrides: tup
 @set_option
 def save(uri: str, profile: str, overrides: tuple[str, ...]) -> None:
     """Keep the parameters for the board's next boot."""
-    _ask(uri, profile, overrides, [Request(Action.SAVE)])
+    _ask(uri, profile, overrides, [ControlRequest(ControlAction.SAVE)])
     say("saved")
 
 
@@ -84,7 +87,9 @@ def _setting(text: str) -> tuple[str, float]:
     raise LabError(f"{text}: expected NAME=VALUE with a number, like controller.gain_y=-2.0")
 
 
-def _ask(uri: str, profile: str, overrides: tuple[str, ...], requests: list[Request]) -> list[Settings]:
+def _ask(
+    uri: str, profile: str, overrides: tuple[str, ...], requests: list[ControlRequest]
+) -> list[Settings]:
     """Send requests over a link; return the values of each answer. Raises `LabError` for the first one refused."""
     from ground_station.program import ask, link_settings, why
     from hil.config import load_config

@@ -42,7 +42,7 @@ BOARDS_MAX = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class ServeOptions:
     """The options of `floaty serve`."""
 
     udp: int | None
@@ -101,8 +101,8 @@ class Asked:
 @seed_option
 @profile_option
 @set_option
-@asked_as(Asked)
-def serve(asked: Asked) -> int:
+@asked_as(ServeOptions)
+def serve(asked: ServeOptions) -> int:
     """Serve robots in virtual tunnels, in real time, until Ctrl-C.
 
     Without --udp, --radio or --mavlink the first board is on UDP. A robot is held until it flies: corrections come from
@@ -127,7 +127,7 @@ def serve(asked: Asked) -> int:
     from hil.servers.live_faults import LiveFaults
     from hil.servers.motive import streaming_of
     from hil.servers.serial_server import parse_addresses
-    from hil.servers.server import Plan, Server
+    from hil.servers.server import Server, Service
 
     markers = (MARKERS_ON,) if asked.motive else ()
     poses = (
@@ -143,7 +143,7 @@ def serve(asked: Asked) -> int:
     port = debugger(asked.gdb, Path(asked.board or ""), stack)
     executor = PYTHON_BOARD if asked.board is None else image_at(asked.board, None, port)
     view = open_live(asked.target)
-    plan = Plan(config, asked.boards, asked.seed, bool(ends), planned, asked.state, executor)
+    plan = Service(config, asked.boards, asked.seed, bool(ends), planned, asked.state, executor)
     server = Server(plan, say, view)
     try:
         streaming = streaming_of(config.capture) if asked.motive else None
@@ -171,7 +171,7 @@ def serve(asked: Asked) -> int:
     return 0
 
 
-def _station_of(asked: Asked, config: LabConfig) -> str | None:
+def _station_of(asked: ServeOptions, config: LabConfig) -> str | None:
     """Return what the built-in ground station sends. Raises `LabError` where the robot and its board do not fit."""
     if not config.pilot.enabled:
         return asked.station
@@ -193,7 +193,7 @@ def _answer(view: LiveView, server: Server, text: str) -> None:
     view.answer(server.lab.now_us, text)
 
 
-def _check_options(asked: Asked) -> None:
+def _check_options(asked: ServeOptions) -> None:
     """Raise `LabError` for options that contradict each other."""
     udp, board, gdb, boards = asked.udp, asked.board, asked.gdb, asked.boards
     if udp is not None and udp + boards - 1 > 65535:

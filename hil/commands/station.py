@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class StationOptions:
     """The options of `floaty station`."""
 
     uri: str
@@ -88,8 +88,8 @@ class Asked:
 @view_option
 @profile_option
 @set_option
-@asked_as(Asked)
-def station(asked: Asked) -> int:
+@asked_as(StationOptions)
+def station(asked: StationOptions) -> int:
     """Fly EXPERIMENT, by default hover, with a board, real or virtual: poses in, poses or corrections out at 50 Hz.
 
     `floaty list` names the experiments. Telemetry is shown and logged.
@@ -169,7 +169,7 @@ def station(asked: Asked) -> int:
     return INTERRUPTED if result.outcome == "interrupted" else 1
 
 
-def _check_files(asked: Asked) -> None:
+def _check_files(asked: StationOptions) -> None:
     """Raise `LabError` for files that cannot be written, or not with these options."""
     if asked.out is not None and asked.log is not None:
         raise LabError(f"--log {asked.log}: --out {asked.out} has a telemetry.csv of its own")

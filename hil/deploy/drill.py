@@ -27,9 +27,11 @@ if TYPE_CHECKING:
 
 FEED = encode(Packet(PORT_LOCALISATION, CHANNEL_GENERIC, bytes((EMERGENCY_STOP_WATCHDOG,))))
 GO_TO = encode(
-    Packet(high_level.PORT, 0, bytes((high_level.Command.GO_TO, 0, 1)) + bytes(17) + struct.pack("<f", 1.0))
+    Packet(
+        high_level.PORT, 0, bytes((high_level.PathCommand.GO_TO, 0, 1)) + bytes(17) + struct.pack("<f", 1.0)
+    )
 )
-STOP = encode(Packet(high_level.PORT, 0, bytes((high_level.Command.STOP, 0))))
+STOP = encode(Packet(high_level.PORT, 0, bytes((high_level.PathCommand.STOP, 0))))
 THRUST = encode(Packet(PORT_COMMANDER, 0, bytes(12) + b"\1\0"))  # an attitude set-point: it is refused
 FAILING = Path(firmware_py.logic.__path__[0]) / "failing.py"
 RECOVERY = ((0.0, "floaty.stop", Scalar.U8, 1), (0.2, "floaty.stop", Scalar.U8, 0))

@@ -17,8 +17,8 @@ from hil.design.sweeps import (
     OPENINGS,
     RESERVE,
     HoverAngles,
-    Law,
     Point,
+    PowerLaw,
     Stability,
     flat_high,
     reynolds,
@@ -81,7 +81,7 @@ def text_of(poles: list[complex]) -> str:
 
 
 def claims(
-    point: Point, stability: Stability, angles: HoverAngles, laws: tuple[Law, ...], model_error: float
+    point: Point, stability: Stability, angles: HoverAngles, laws: tuple[PowerLaw, ...], model_error: float
 ) -> list[Claim]:
     """Return every claim of the design sections, with the figures of one robot."""
     return [
@@ -180,7 +180,7 @@ def _sign_change(angles: HoverAngles) -> str:
     )
 
 
-def _scale(point: Point, laws: tuple[Law, ...]) -> Iterator[Claim]:
+def _scale(point: Point, laws: tuple[PowerLaw, ...]) -> Iterator[Claim]:
     for law in laws:
         yield Claim(
             f"{law.quantity} over {law.cause}", SCALING, f"exponent {law.paper:g}", f"{round(law.exponent, 6) + 0.0:.4f}",

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from hil.design.authority import QUANTITIES, Attainable
-from hil.design.sweeps import FACTORS, HEIGHTS, KINKS, OPENINGS, HoverAngles, Law, Point, Stability
+from hil.design.sweeps import FACTORS, HEIGHTS, KINKS, OPENINGS, HoverAngles, Point, PowerLaw, Stability
 from hil.floaty.drawing import look_of
 from hil.floaty.geometry import weigh
 from hil.floaty.shape import SIGNS
@@ -27,7 +27,7 @@ from hil.pictures.curves import (
     SERIES_COLOURS,
 )
 from hil.pictures.drawing import WIDTH
-from hil.world.config import GroundConfig
+from hil.world.config import NetConfig
 
 COLOURS = dict(zip(QUANTITIES, (*AXIS_COLOURS, ORANGE), strict=True))
 PAPER_BAND_DEG = (20.0, 25.0)
@@ -39,7 +39,7 @@ def shape(point: Point) -> Figure:
     figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
     height = weigh(point.geometry).axis_height
     parts = []
-    for part in look_of(point.geometry, GroundConfig()).parts:
+    for part in look_of(point.geometry, NetConfig()).parts:
         opening = SIGNS[int(part.label) - 1] * point.opening if part.label else 0.0
         q = scene.turn_quaternion(np.array(part.axis), np.array([opening]))
         turned = scene.rotated(q, part.triangles.reshape(-1, 3)) + np.array(part.place)
@@ -157,7 +157,7 @@ def _outline(axes: Axes, points: Points, colour: str, label: str) -> None:
         axes.fill(*corners.T, facecolor=colour, alpha=0.25, edgecolor=colour, label=label)
 
 
-def scale(laws: tuple[Law, ...]) -> Figure:
+def scale(laws: tuple[PowerLaw, ...]) -> Figure:
     """Draw every law on logarithmic axes, relative to the robot itself."""
     figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
     causes = ("l", "m", "m / l²")

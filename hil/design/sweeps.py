@@ -121,7 +121,7 @@ def hover_angles(point: Point) -> HoverAngles:
 
 
 @dataclass(frozen=True, slots=True)
-class Law:
+class PowerLaw:
     """A power law: fitted on a sweep, and the paper's."""
 
     quantity: str
@@ -132,17 +132,17 @@ class Law:
     paper: float
 
 
-def scaling(point: Point) -> tuple[Law, ...]:
+def scaling(point: Point) -> tuple[PowerLaw, ...]:
     """Return the effect of size and mass at the same hover angle."""
     sizes = [replace(point, geometry=scaled(point.geometry, factor, 1.0)) for factor in FACTORS.tolist()]
     masses = [replace(point, geometry=scaled(point.geometry, 1.0, factor)) for factor in FACTORS.tolist()]
 
     def law(
         quantity: str, cause: str, points: list[Point], of: Callable[[Point], float], paper: float
-    ) -> Law:
+    ) -> PowerLaw:
         x = np.array([_CAUSES[cause](one) for one in points])
         y = np.array([abs(of(one)) for one in points])
-        return Law(quantity, cause, x, y, float(np.polyfit(np.log(x), np.log(y), 1)[0]), paper)
+        return PowerLaw(quantity, cause, x, y, float(np.polyfit(np.log(x), np.log(y), 1)[0]), paper)
 
     return (
         law("roll acceleration per input", "l", sizes, lambda p: p.linear.constants.roll_u1, -1.0),

@@ -6,13 +6,13 @@ from typing import Protocol
 
 from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
 from firmware_py.rtos import TICK_US
-from firmware_py.wire.mavlink_numbers import Result
+from firmware_py.wire.mavlink_numbers import CommandResult
 from hil.devices.board_firmware import Processor
 from hil.events import EventQueue
 
 STILL: ImuCounts = (0, 0, 0, 0, 0, 0)
 
-InjectFailure = Callable[[int, int, int, int], Result]  # (now_us, unit, failing, instance)
+InjectFailure = Callable[[int, int, int, int], CommandResult]  # (now_us, unit, failing, instance)
 
 
 class Uart(Protocol):
@@ -30,7 +30,7 @@ class Uart(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
+class KeptMemory:
     """What a board keeps without power."""
 
     eeprom: bytearray = field(default_factory=lambda: bytearray(b"\xff" * EEPROM_SIZE))
@@ -41,9 +41,9 @@ def stay_on(now_us: int) -> None:
     """Ignore a reset."""
 
 
-def unsupported(now_us: int, unit: int, failing: int, instance: int) -> Result:
+def unsupported(now_us: int, unit: int, failing: int, instance: int) -> CommandResult:
     """Let nothing fail."""
-    return Result.UNSUPPORTED
+    return CommandResult.UNSUPPORTED
 
 
 class VirtualBoard:
@@ -61,11 +61,11 @@ class VirtualBoard:
         uart: Uart | None = None,
         reset: Callable[[int], None] = stay_on,
         fail: InjectFailure = unsupported,
-        memory: Memory | None = None,
+        memory: KeptMemory | None = None,
     ) -> None:
         self.imu: ImuCounts = STILL
         self.battery_mv = 3900
-        memory = memory or Memory()
+        memory = memory or KeptMemory()
         self.eeprom, self.deck_memory = memory.eeprom, memory.deck
         self._reset = reset
         self._fail = fail
@@ -144,7 +144,7 @@ class VirtualBoard:
         self._reset(self.now_us)
         self._let_hardware_go_first()
 
-    def inject_failure(self, unit: int, failing: int, instance: int) -> Result:
+    def inject_failure(self, unit: int, failing: int, instance: int) -> CommandResult:
         """Pass a request for a failure to the world."""
         result = self._fail(self.now_us, unit, failing, instance)
         self._let_hardware_go_first()

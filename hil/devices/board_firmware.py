@@ -30,7 +30,7 @@ Trace = Callable[
 ]  # (us, event, who, a, b), in the words of tests/vectors/README.md
 
 
-class Variable(Protocol):
+class BoardVariable(Protocol):
     @property
     def name(self) -> str:
         """Its group and name."""
@@ -48,7 +48,7 @@ class Variable(Protocol):
         """Reads it now."""
 
 
-class Task(Protocol):
+class BoardTask(Protocol):
     """A task of the board's scheduler."""
 
     name: str
@@ -86,11 +86,11 @@ class Processor(Protocol):
         """Limit the run to the instants before this one."""
 
 
-class Scheduler(Protocol):
+class BoardScheduler(Protocol):
     """The tasks of a board."""
 
     @property
-    def tasks(self) -> Sequence[Task]:
+    def tasks(self) -> Sequence[BoardTask]:
         """All tasks, in the order in which they were created or first ran."""
 
     @property
@@ -98,7 +98,7 @@ class Scheduler(Protocol):
         """All queues."""
 
     @property
-    def current(self) -> Task:
+    def current(self) -> BoardTask:
         """The task that has the processor."""
 
     def run_times_us(self) -> list[int]:
@@ -115,7 +115,7 @@ class Scheduler(Protocol):
         """Report every switch of tasks from now on, or no more."""
 
 
-class Statistics(Protocol):
+class BoardStatistics(Protocol):
     """Timing of the tasks."""
 
     def reports(self) -> Sequence[TaskReport]:
@@ -184,7 +184,7 @@ class BoardFirmware(Protocol):
         """Its time."""
 
     @property
-    def scheduler(self) -> Scheduler | None:
+    def scheduler(self) -> BoardScheduler | None:
         """Its tasks, where they can be watched."""
 
     @property
@@ -192,7 +192,7 @@ class BoardFirmware(Protocol):
         """Views on its estimate, counters, inputs, counts and supervisor; NaN where it does not report a number."""
 
     @property
-    def variables(self) -> Sequence[Variable]:
+    def variables(self) -> Sequence[BoardVariable]:
         """Its log variables, as far as they can be read at any time."""
 
     @property
@@ -200,7 +200,7 @@ class BoardFirmware(Protocol):
         """The numbers of its log variables in its table of contents, by name; empty where no log service answers."""
 
     @property
-    def statistics(self) -> Statistics:
+    def statistics(self) -> BoardStatistics:
         """Timing of its tasks."""
 
     @property

@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from firmware_py.config import FirmwareConfig
 from firmware_py.table import OF_PROFILE, value_in
 from firmware_py.wire.crtp import decode
-from ground_station.controls import Action, Request
-from ground_station.links.crtp_controls import PORTS, CrtpControls, Entry
+from ground_station.controls import ControlAction, ControlRequest
+from ground_station.links.crtp_controls import PORTS, CrtpControls, TocEntry
 from hil.crazyflie.log_table import ImageParameter
 from hil.events import EventQueue
 
@@ -47,7 +47,7 @@ class ImageSettings:
         say: Callable[[str], None],
     ) -> None:
         self._differences, self._config, self._events, self._say = differences, config, events, say
-        entries = {name: Entry(one.number, one.scalar, one.writable, False) for name, one in table.items()}
+        entries = {name: TocEntry(one.number, one.scalar, one.writable, False) for name, one in table.items()}
         self._controls = CrtpControls(lambda data: uplink(events.now_us, data), lambda: entries)
         self._left = to_set(table, config)
         self._set: list[str] = []
@@ -74,7 +74,7 @@ class ImageSettings:
 
     def _ask(self, now_us: int) -> None:
         name, value = self._left[0]
-        self._controls.ask(now_us, Request(Action.WRITE, name, value))
+        self._controls.ask(now_us, ControlRequest(ControlAction.WRITE, name, value))
 
     def _go_on(self, now_us: int) -> None:
         answer = self._controls.answer(now_us)

@@ -23,7 +23,7 @@ GHOST_REACH = 0.3  # [m] from the body, along each axis; chosen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class BodyFit:
     """The body fitted to points."""
 
     p_WB: Vector  # [m]
@@ -31,7 +31,7 @@ class Fit:
     points: Points  # (8, 3) [m] in W: the places of its markers
 
 
-class RigidBody:
+class MarkerBody:
     """A body that is known by its markers' places, (8, 3) [m] in B."""
 
     def __init__(self, places: Points) -> None:
@@ -39,7 +39,7 @@ class RigidBody:
         # By the markers seen: centre (3,) and the places around it; None where these are collinear.
         self._parts: dict[bytes, tuple[Points, Points] | None] = {}
 
-    def fit(self, points: Points, seen: Mask) -> Fit | None:
+    def fit(self, points: Points, seen: Mask) -> BodyFit | None:
         """Return the best fit to the points (8, 3) [m, W] that are seen; None when they are collinear."""
         part = self._part(seen)
         if part is None:
@@ -51,7 +51,7 @@ class RigidBody:
         R_WB = rotation_matrix(q_WB)
         p_WB = centre_W - product(R_WB, centre_B[:, None])[:, 0]
         x, y, z = p_WB.tolist()
-        return Fit((x, y, z), q_WB, product(self._places, R_WB.T) + p_WB)
+        return BodyFit((x, y, z), q_WB, product(self._places, R_WB.T) + p_WB)
 
     def _part(self, seen: Mask) -> tuple[Points, Points] | None:
         key = seen.tobytes()
@@ -100,7 +100,7 @@ class VirtualMarkers:
         self._config = config
         self._cameras = Cameras(config, markers)
         self._places = markers.places
-        self._body = RigidBody(self._places)
+        self._body = MarkerBody(self._places)
         self._rng = rng
         self._rng_labels, self._rng_ghosts = rng.spawn(2)
         self._draws = NO_POINTS.reshape(0, COUNT, 3)

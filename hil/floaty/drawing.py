@@ -15,7 +15,7 @@ import numpy as np
 from hil.floaty.geometry import axis_of, surfaces, triangles, weigh
 from hil.floaty.shape import MIRRORS
 from hil.scene import PALE, Look, Markers, Part, Points
-from hil.world.config import GeometryConfig, GroundConfig
+from hil.world.config import GeometryConfig, NetConfig
 
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7")  # of flaps 1 to 4, as of their curves
 TURN = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)], float)
@@ -45,7 +45,7 @@ def outline(geometry: GeometryConfig) -> tuple[Points, ...]:
     return (*squares, np.array([(0.0, 0.0, 0.0), (0.0, 0.0, height)]))
 
 
-def stand_lines(geometry: GeometryConfig, ground: GroundConfig) -> tuple[Points, ...]:
+def stand_lines(geometry: GeometryConfig, ground: NetConfig) -> tuple[Points, ...]:
     """Return the stand in B: from each corner of the base plate to a foot, and around the feet."""
     corner, foot, height = geometry.base_side / 2, ground.foot_spread, weigh(geometry).axis_height
     feet = np.column_stack((foot * TURN, np.full(5, -ground.foot_below)))
@@ -53,7 +53,7 @@ def stand_lines(geometry: GeometryConfig, ground: GroundConfig) -> tuple[Points,
     return (feet, *np.stack((corners[:4], feet[:4]), axis=1))
 
 
-def marker_places(geometry: GeometryConfig, ground: GroundConfig) -> Points:
+def marker_places(geometry: GeometryConfig, ground: NetConfig) -> Points:
     """Return the markers' places in B, (8, 3) [m]."""
     corner, base, axis = geometry.footprint / 2, geometry.base_side, weigh(geometry).axis_height
     spread, below = ground.foot_spread, ground.foot_below
@@ -71,12 +71,12 @@ def marker_places(geometry: GeometryConfig, ground: GroundConfig) -> Points:
     )
 
 
-def markers_of(geometry: GeometryConfig, ground: GroundConfig) -> Markers:
+def markers_of(geometry: GeometryConfig, ground: NetConfig) -> Markers:
     """Return the markers; base plate and flaps hide them as one flat square, whatever the flap angles."""
     return Markers(marker_places(geometry, ground), weigh(geometry).axis_height, geometry.footprint / 2)
 
 
-def look_of(geometry: GeometryConfig, ground: GroundConfig) -> Look:
+def look_of(geometry: GeometryConfig, ground: NetConfig) -> Look:
     """Return the whole robot."""
     height, axes = weigh(geometry).axis_height, flap_axes(geometry).tolist()
     place = (0.0, 0.0, height)

@@ -14,7 +14,7 @@ from hil.floaty.shape import SIGNS, place_plates
 from hil.scene import Look, Markers
 from hil.world import layout as at
 from hil.world.body import Channel, Quantity, Setting, Vector, View
-from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 from hil.world.in_tunnel import UPRIGHT, InTunnel
 from hil.world.motion import advance, evaluate
 from hil.world.plates import State
@@ -58,7 +58,7 @@ class Plant(InTunnel):
         geometry: GeometryConfig,
         config: PlantConfig,
         tunnel: TunnelConfig,
-        servos: ServoConfig,
+        servos: PlantServoConfig,
         rng_gust: np.random.Generator,
         p_WB: Vector | None = None,
         loads: BatteryConfig = LOADS,

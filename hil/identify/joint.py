@@ -163,7 +163,7 @@ def _regress(
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class JointFit:
     """The least-squares problem of all excited axes; parameters are in units of `scale`, the poses' lateness last."""
 
     excited: Sequence[Excited]
@@ -236,7 +236,7 @@ def joint(
     starts += [starts[0] | {LAG: lag * (1 + LAG_SPREAD)}, starts[0] | {LAG: lag * (1 - LAG_SPREAD)}]
     size = np.abs([starts[0][name] for name in names])
     scale = np.concatenate([np.maximum(size, 1e-3), np.full(len(records), LATE_SPREAD_S)])
-    fit = Fit(excited, names, records, scale, lag, known)
+    fit = JointFit(excited, names, records, scale, lag, known)
     solutions = [fit.solved(np.array([*(one[name] for name in names), *late]) / scale) for one in starts]
     found = min(solutions, key=lambda result: float(result.cost))
     misfit = 2 * found.cost / max(1, len(found.fun) - len(found.x))

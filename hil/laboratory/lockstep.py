@@ -11,7 +11,7 @@ from firmware_py.export.boards import runner_of
 from firmware_py.wire.telemetry import ALL_BLOCKS, CRAZYFLIE_BLOCKS
 from ground_station.errors import LinkError
 from ground_station.links.crazyflie_link import CrazyflieLink, FlightTimes
-from ground_station.links.crtp_controls import Entry
+from ground_station.links.crtp_controls import TocEntry
 from ground_station.links.frame_log import FRAME_LOG, FrameLog
 from ground_station.links.loopback import LoopbackLink
 from ground_station.station import GroundStation, Link
@@ -125,7 +125,7 @@ class ModelledLine:
             self.radio.uplink,
             latency_us,
             lambda: self.robot.firmware.log_numbers,
-            {name: Entry(one.number, one.scalar, one.writable, False) for name, one in table.items()},
+            {name: TocEntry(one.number, one.scalar, one.writable, False) for name, one in table.items()},
             config.pilot,
             Goal(config.flight.home, 0.0),
             times,

@@ -20,7 +20,7 @@ from ground_station.mocap import MocapFrame
 from hil.bodies import make_body
 from hil.config import LabConfig, load_config
 from hil.crazyflie.shockburst import Air
-from hil.devices.board import InjectFailure, Memory, Thief, VirtualBoard, unsupported
+from hil.devices.board import InjectFailure, KeptMemory, Thief, VirtualBoard, unsupported
 from hil.devices.board_firmware import Executor, PowerOn, PythonBoard
 from hil.devices.cameras import VirtualMocap
 from hil.devices.imu import GYRO_COUNTS, VirtualImu
@@ -87,7 +87,7 @@ class Ports:
     polled: bool = False
     restart: Callable[[int], None] | None = None
     fail: InjectFailure = unsupported
-    memory: Memory = field(default_factory=Memory)
+    memory: KeptMemory = field(default_factory=KeptMemory)
 
 
 class Robot:

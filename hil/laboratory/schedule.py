@@ -11,7 +11,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet
 
-from hil.devices.board_firmware import Scheduler
+from hil.devices.board_firmware import BoardScheduler
 
 FILE = "schedule.parquet"
 WINDOW_US = 50_000
@@ -32,7 +32,7 @@ class Turn:
 class ScheduleTrace:
     """Collects the scheduler's trace between `begin` and `end`; the flight plans both as events."""
 
-    def __init__(self, scheduler: Scheduler | None) -> None:
+    def __init__(self, scheduler: BoardScheduler | None) -> None:
         self._scheduler = scheduler
         self._rows: list[tuple[int, str, str, int, int]] = []
 

@@ -46,7 +46,7 @@ from hil.learn.batch import (
     reward_of,
     tilt_of,
 )
-from hil.learn.tasks import AXES, PUSH_KINDS, PUSH_S, Episode, Task, draw_episode, find_task
+from hil.learn.tasks import AXES, PUSH_KINDS, PUSH_S, Episode, EpisodeTask, draw_episode, find_task
 
 Fidelity = Literal["fast", "firmware"]
 JUST_BEFORE_US = 1  # a step ends so long before the controller acts, after the estimator
@@ -125,7 +125,7 @@ def _setup(values: dict[str, Any]) -> Setup:
 class FastVectorEnv(VectorEnv[Actions, Actions, NDArray[Any]]):
     """Many robots at once; an episode that ends is replaced in the same step (`info["final_obs"]` has its last one)."""
 
-    def __init__(self, task: Task, num_envs: int, setup: Setup) -> None:
+    def __init__(self, task: EpisodeTask, num_envs: int, setup: Setup) -> None:
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
         self.num_envs = num_envs
         self.single_observation_space, self.single_action_space = OBSERVATION_SPACE, ACTION_SPACE
@@ -176,7 +176,7 @@ class FastVectorEnv(VectorEnv[Actions, Actions, NDArray[Any]]):
 class FastEnv(gymnasium.Env[Actions, Actions]):
     """One robot in the fast model."""
 
-    def __init__(self, task: Task, setup: Setup) -> None:
+    def __init__(self, task: EpisodeTask, setup: Setup) -> None:
         self.observation_space, self.action_space = OBSERVATION_SPACE, ACTION_SPACE
         self._task, self._setup = task, setup
         self._fleet = fleet_of(setup, 1)
@@ -218,7 +218,7 @@ class FirmwareEnv(gymnasium.Env[Actions, Actions]):
     `flight` is that of the present episode.
     """
 
-    def __init__(self, task: Task, setup: Setup) -> None:
+    def __init__(self, task: EpisodeTask, setup: Setup) -> None:
         self.observation_space, self.action_space = OBSERVATION_SPACE, ACTION_SPACE
         self._task, self._setup = task, setup
         self._robots = setup.settings()

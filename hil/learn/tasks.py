@@ -28,7 +28,7 @@ PUSH_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class EpisodeTask:
     """What an episode draws, each uniformly within ± these bounds."""
 
     name: str
@@ -39,12 +39,12 @@ class Task:
     pushes: tuple[float, ...] = (0.0,) * 6  # largest size of each of `PUSH_KINDS`; all 0: none
 
 
-TASKS: Mapping[str, Task] = {
+TASKS: Mapping[str, EpisodeTask] = {
     task.name: task
     for task in (
-        Task("Hover", "hold the home goal", (0.05, 0.08, 0.08)),
-        Task("Track", "follow a goal on sines in x, y, z and yaw", (0.03, 0.03, 0.03), (0.08, 0.12, 0.12, 0.5)),
-        Task(
+        EpisodeTask("Hover", "hold the home goal", (0.05, 0.08, 0.08)),
+        EpisodeTask("Track", "follow a goal on sines in x, y, z and yaw", (0.03, 0.03, 0.03), (0.08, 0.12, 0.12, 0.5)),
+        EpisodeTask(
             "Push", "hold the home goal against three pushes of 0.1 s", (0.03, 0.03, 0.03),
             pushes=(0.6, 1.5, 1.5, 0.15, 0.15, 0.15),
         ),
@@ -65,14 +65,14 @@ class Episode:
     robot: float  # 0..1: which of the robots
 
 
-def find_task(name: str) -> Task:
+def find_task(name: str) -> EpisodeTask:
     """Return the task of a name. Raises `LabError` for an unknown one."""
     if name not in TASKS:
         raise LabError(f"task {name!r}: unknown; {hint(name, list(TASKS))}")
     return TASKS[name]
 
 
-def draw_episode(task: Task, rng: np.random.Generator, duration_s: float) -> Episode:
+def draw_episode(task: EpisodeTask, rng: np.random.Generator, duration_s: float) -> Episode:
     """Draw an episode; every task takes as many numbers of the generator."""
     share = rng.random(3 + 8 + 3 * PUSHES + 1)
     low, high = task.frequency_hz

@@ -32,7 +32,7 @@ from hil.live.rerun_screen import RerunScreen
 from hil.live.window import LOOPBACK, free_port
 from hil.pictures import curves
 from hil.pictures.pages import data_uri, library
-from hil.pictures.video import GOAL_COLUMNS, Scene
+from hil.pictures.video import GOAL_COLUMNS, VideoScene
 
 PORT = 9095
 PAGE = Path(__file__).with_name("panel.html")
@@ -54,7 +54,7 @@ class PanelScreen:
     def __init__(self, program: str, typed: Callable[[str], None]) -> None:
         self._viewer: RerunScreen | None = None  # rerun's, once somebody wants it
         self.wants_viewer = False
-        self._scene: Scene | None = None
+        self._scene: VideoScene | None = None
         self._past: list[pa.Table] = []  # the rows of the last seconds
         self.typed, self.token = typed, os.urandom(16).hex()
         self.pages: set[_Socket] = set()
@@ -96,7 +96,7 @@ class PanelScreen:
         message: dict[str, Any] = {"state": _state(row), **_curves(rows)}
         if np.isfinite(body(row, "x", "qw")).all():
             past = pa.concat_tables(self._past)
-            self._scene = self._scene or Scene(row)
+            self._scene = self._scene or VideoScene(row)
             path, course = body(past, "x", "y", "z")[::3], column(past, *GOAL_COLUMNS)[::3]
             file = io.BytesIO()
             self._scene.at(row, path[np.isfinite(path).all(axis=1)], course).save(

@@ -19,7 +19,7 @@ from hil.laboratory.schedule import runs
 from hil.pictures import curves, monitor
 from hil.pictures.curves import since_release
 from hil.pictures.panels import INK, Bar, Panel, Plot, Series, Still, lanes, panel
-from hil.pictures.path import Course, path_of
+from hil.pictures.path import FlownPath, path_of
 from hil.pictures.picture import KNOWN, LINK, PROCESSOR, WHAT, Picture
 
 TENTH, SECOND = 10, 100  # rows
@@ -28,7 +28,7 @@ SCHEDULE_US = 20_000  # of the scheduler's picture
 LANE_INCH = 0.25  # a task's row there
 
 
-def course_of(rows: pa.Table) -> Course:
+def course_of(rows: pa.Table) -> FlownPath:
     """Return the path of the body and of its goal after the release [cm], from the first goal in W."""
     flight = free_flight(rows)
     goal = 100 * column(flight, "goal.x", "goal.y", "goal.z")
@@ -36,7 +36,7 @@ def course_of(rows: pa.Table) -> Course:
     troubled = np.zeros(len(times), np.bool_)
     for span in spans_of(rows.schema.metadata):
         troubled |= (times >= span.begin_us) & (times <= span.end_us)
-    return Course(100 * body(flight, "x", "y", "z") - goal[:1], goal - goal[:1], troubled, 100 * BOX)
+    return FlownPath(100 * body(flight, "x", "y", "z") - goal[:1], goal - goal[:1], troubled, 100 * BOX)
 
 
 def track(rows: pa.Table) -> Still:

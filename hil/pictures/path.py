@@ -44,7 +44,7 @@ class _Wall:
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class FlownPath:
     """What a flight did against what it had to do; a goal that never moved gets a cross and a box around it."""
 
     flown: Points  # (N, 3)
@@ -58,7 +58,7 @@ class Course:
         return not bool(np.ptp(self.goal, axis=0).any()) if len(self.goal) else True
 
 
-def path_of(course: Course) -> Still:
+def path_of(course: FlownPath) -> Still:
     """Draw the path of the body, red while a fault is in force, and the dashed one of its goal."""
     step = len(course.flown) // POINTS + 1
     marks = (*scene.box_lines(course.box),) if course.holds else ()
@@ -96,7 +96,7 @@ def spans(acts: NDArray[np.bool_]) -> list[list[int]]:
     return edges
 
 
-def _ends(view: Points, course: Course) -> Iterator[str]:
+def _ends(view: Points, course: FlownPath) -> Iterator[str]:
     """Yield the marks of the first goal, a cross, and of the path's begin, a ring, and end, a dot."""
     yield '<path d="M-6 0h12M0-6v12" stroke="black" stroke-width="1.5"/>'
     for place, look in ((0, f'stroke="{BLUE}" fill="white"'), (-1, f'fill="{BLUE}" stroke="white"')):

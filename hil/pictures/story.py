@@ -93,7 +93,7 @@ def _passed(flight: pa.Table, result: Result) -> Iterator[tuple[str, NDArray[np.
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
+class FailedLimit:
     """A limit that failed."""
 
     text: str  # the verdict
@@ -104,7 +104,7 @@ class Failure:
 RECENT_S = 3.0  # a fault that ended longer ago is not named as the cause
 
 
-def failures_of(log: pa.Table, result: Result) -> list[Failure]:
+def failures_of(log: pa.Table, result: Result) -> list[FailedLimit]:
     """Return the limits that failed, those with an instant first and in the order of time."""
     free = free_flight(log)
     times = since_release(free)
@@ -114,7 +114,7 @@ def failures_of(log: pa.Table, result: Result) -> list[Failure]:
     if result.outcome == "lost" and len(times):
         passed["lost"] = float(times[-1])
     found = [
-        Failure(str(one), at_s := passed.get(one.metric), "" if at_s is None else _before(log, at_s))
+        FailedLimit(str(one), at_s := passed.get(one.metric), "" if at_s is None else _before(log, at_s))
         for one in result.failed
     ]
     return sorted(found, key=lambda failure: math.inf if failure.at_s is None else failure.at_s)

@@ -85,7 +85,7 @@ def _instants(log: pa.Table) -> NDArray[np.float64]:
 def frames(log: pa.Table) -> Iterator[Image.Image]:
     """Yield a picture of the flight for each thirtieth of a second after its release."""
     flight = known(free_flight(log))
-    instants, view, graph = _instants(log), Scene(flight), _Graph(log, flight)
+    instants, view, graph = _instants(log), VideoScene(flight), _Graph(log, flight)
     times, path, course = since_release(flight), body(flight, "x", "y", "z"), column(flight, *GOAL_COLUMNS)
     rows = np.searchsorted(times, instants)
     for row, at_s in zip(rows.tolist(), instants.tolist(), strict=True):
@@ -108,7 +108,7 @@ def faces(
     return shown
 
 
-class Scene:
+class VideoScene:
     """Draws the robot at a row of a flight, its path, its goal with the box, and the goal's path."""
 
     def __init__(self, flight: pa.Table) -> None:

@@ -9,7 +9,7 @@ import math
 from fnmatch import fnmatchcase
 from functools import partial
 
-from firmware_py.wire.mavlink_numbers import Failing, Result, Unit
+from firmware_py.wire.mavlink_numbers import CommandResult, Failing, Unit
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Fault, Switchboard, why_not
 from hil.laboratory.robot import Robot
@@ -57,24 +57,24 @@ class Failures:
         self._robot = robot
         self._switchboard = switchboard
 
-    def inject(self, now_us: int, unit: int, failing: int, instance: int) -> Result:
+    def inject(self, now_us: int, unit: int, failing: int, instance: int) -> CommandResult:
         """Plan the fault of these numbers for the present instant."""
         if unit not in TABLE or failing not in (Failing.OK, *TABLE[Unit(unit)]):
-            return Result.UNSUPPORTED
+            return CommandResult.UNSUPPORTED
         kinds = TABLE[Unit(unit)]
         count = len(self._robot.body.outputs) if kinds is _ACTUATOR else 1
         if not 0 <= instance <= count:
-            return Result.DENIED
+            return CommandResult.DENIED
         instances = (instance,) if instance else tuple(range(1, count + 1))
         size = SIZES.get((Unit(unit), Failing(failing)))
         begin = [_fault(name, size) for name in self._names(kinds.get(Failing(failing), ()), instances)]
         none = failing != Failing.OK and not begin
         if none or any(why_not(KINDS[fault.kind], self._robot) for fault in begin):
-            return Result.UNSUPPORTED
+            return CommandResult.UNSUPPORTED
         end = {name for names in kinds.values() for name in self._names(names, instances)}
         delay_us = ANSWER_US if any(fault.kind == CUT for fault in begin) else 0
         self._robot.events.at(now_us + delay_us, partial(self._switch, end, begin))
-        return Result.ACCEPTED
+        return CommandResult.ACCEPTED
 
     def _names(self, patterns: tuple[str, ...], instances: tuple[int, ...]) -> list[str]:
         own = [name for name, kind in KINDS.items() if kind.acts_on(self._robot.config.robot.body)]

@@ -20,7 +20,7 @@ from hil.config import LabConfig
 from hil.crazyflie.crazyflie import POLL_PERIOD_US
 from hil.crazyflie.nrf51 import RATES, AirSettings, Nrf51
 from hil.crazyflie.shockburst import Air
-from hil.devices.board import InjectFailure, Memory, unsupported
+from hil.devices.board import InjectFailure, KeptMemory, unsupported
 from hil.devices.board_firmware import BoardFirmware
 from hil.devices.radio import VirtualRadio
 from hil.devices.uart import VirtualSerial
@@ -33,7 +33,7 @@ from hil.servers.udp_server import UdpServer
 class BoardFiles:
     """`board-N.eeprom` and `board-N.deck` are the bare bytes; `load` before the board boots, `keep` now and then."""
 
-    def __init__(self, folder: Path, number: int, memory: Memory) -> None:
+    def __init__(self, folder: Path, number: int, memory: KeptMemory) -> None:
         self._memories = {
             folder / f"board-{number}.eeprom": memory.eeprom,
             folder / f"board-{number}.deck": memory.deck,
@@ -117,7 +117,7 @@ class ServedRobot:
         fail: InjectFailure = unsupported,
     ) -> None:
         config, events, rng = site.config, site.events, site.streams.radio
-        memory = self._memory = Memory()
+        memory = self._memory = KeptMemory()
         air, wire_us = Air.of(config.radio), site.executor.wire_us
         uart = VirtualSerial(config.serial, events, site.streams.serial) if mavlink else None
         self.number = number

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from firmware_py.rtos import WatchdogError
-from firmware_py.wire.mavlink_numbers import Result
+from firmware_py.wire.mavlink_numbers import CommandResult
 from ground_station.trajectory import Goal, Hold
 from hil.clock import Paced, Readers
 from hil.config import LabConfig
@@ -143,7 +143,7 @@ class Shown:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class Service:
     """What is served: `count` robots of a profile, and what happens to them.
 
     `faults` act from the first release of each robot on. EEPROM and deck memories are kept in the folder `state`;
@@ -165,7 +165,7 @@ class Server:
     `say` gets lines for the user, `onlooker` sees the first robot.
     """
 
-    def __init__(self, plan: Plan, say: Callable[[str], None], onlooker: Onlooker | None = None) -> None:
+    def __init__(self, plan: Service, say: Callable[[str], None], onlooker: Onlooker | None = None) -> None:
         config = plan.config
         self.clock = Paced()
         self.lab = Laboratory(self.clock)
@@ -183,7 +183,7 @@ class Server:
             if number == 1 and self._onlooker is not None:
                 self._onlooker.note(self.lab.now_us, source, text)
 
-        def fail(now_us: int, unit: int, failing: int, instance: int) -> Result:
+        def fail(now_us: int, unit: int, failing: int, instance: int) -> CommandResult:
             return Failures(robot, switchboard).inject(now_us, unit, failing, instance)
 
         site = Site(config, self.lab.events, streams, say, self._plan.executor)

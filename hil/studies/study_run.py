@@ -15,7 +15,7 @@ HOLDS, FAILSAFE, LOST = (OUTCOMES.index(name) for name in ("holds", "failsafe", 
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class VariantOutcome:
     """The outcome of one variant at one size, seed by seed."""
 
     size: float
@@ -43,7 +43,7 @@ class Curve:
     """A variant over the sizes that were flown."""
 
     variant: Variant
-    cells: tuple[Cell, ...]
+    cells: tuple[VariantOutcome, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class StudyResult:
                 found.append(f"{cell.size:g} {self.study.unit}".strip() + f": {cell.text}")
         return found
 
-    def _bounds(self, expected: Expected, cell: Cell) -> Iterator[bool]:
+    def _bounds(self, expected: Expected, cell: VariantOutcome) -> Iterator[bool]:
         """Yield whether a cell keeps each bound that concerns it."""
         sizes, best, worst = self.study.sizes, cell.ranks[0], cell.ranks[-1]
         place = sizes.index(cell.size)
@@ -112,7 +112,7 @@ def summarise(study: Study, flown: Iterable[tuple[Job, Row]]) -> StudyResult:
     curves = []
     for variant in study.variants:
         cells = tuple(
-            Cell(
+            VariantOutcome(
                 size, tuple(map(outcome_of, rows)),
                 tuple(distance(row.metrics) for row in rows if row.outcome == "completed"),
             )

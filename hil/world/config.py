@@ -37,7 +37,7 @@ class TetherConfig(Section):
     damping: float = number(5.0, "[0, 50]", "[N s/m]; chosen: about critical with the counter-weight")
 
 
-class GroundConfig(Section):
+class NetConfig(Section):
     """The net over the tunnel's exit and the robot's four feet on it; the paper names neither: all chosen."""
 
     height: float = number(0.0, "[-2, 2]", "z of the net in W [m]; the tunnel's exit; chosen")
@@ -142,7 +142,7 @@ class PlantConfig(Section):
         {}, description="true over tabulated value of single constants of a corrected variant"
     )
     tether: TetherConfig = Field(default_factory=TetherConfig)
-    ground: GroundConfig = Field(default_factory=GroundConfig)
+    ground: NetConfig = Field(default_factory=NetConfig)
     limits: LimitsConfig = Field(default_factory=LimitsConfig)
 
     @model_validator(mode="after")
@@ -152,7 +152,7 @@ class PlantConfig(Section):
         return self
 
 
-class ServoConfig(Section):
+class PlantServoConfig(Section):
     """The four servos of the world, as the board was trimmed for them."""
 
     zero_offset: Four = Field(

@@ -11,7 +11,7 @@ from firmware_py import table
 from firmware_py.firmware import Firmware
 from firmware_py.wire import crtp
 from firmware_py.wire.supervisor import Cause, State
-from ground_station.controls import PATIENCE_US, REPEAT_US, Action, Answer, Request
+from ground_station.controls import PATIENCE_US, REPEAT_US, Answer, ControlAction, ControlRequest
 from ground_station.links.crtp_controls import CrtpControls
 from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
 from ground_station.links.mavlink_controls import MavlinkControls
@@ -113,8 +113,8 @@ def answer(bench: Bench) -> Answer:
     raise AssertionError("no answer")
 
 
-def ask(bench: Bench, action: Action, name: str = "", value: float = 0.0) -> Answer:
-    bench.controls.ask(bench.now_us, Request(action, name, value))
+def ask(bench: Bench, action: ControlAction, name: str = "", value: float = 0.0) -> Answer:
+    bench.controls.ask(bench.now_us, ControlRequest(action, name, value))
     return answer(bench)
 
 
@@ -125,28 +125,28 @@ def on_board(bench: Bench, name: str) -> float:
 def test_what_is_written_is_in_force_and_is_read_back(bench: Bench) -> None:
     before = on_board(bench, "extCtrl.y_P")
     name = bench.name("extCtrl.y_P")
-    assert ask(bench, Action.READ, "extCtrl.y_P") == Answer(((name, before),))
-    assert ask(bench, Action.WRITE, "extCtrl.y_P", -1.25) == Answer(((name, -1.25),))
+    assert ask(bench, ControlAction.READ, "extCtrl.y_P") == Answer(((name, before),))
+    assert ask(bench, ControlAction.WRITE, "extCtrl.y_P", -1.25) == Answer(((name, -1.25),))
     assert on_board(bench, "extCtrl.y_P") == -1.25
-    assert ask(bench, Action.READ, "extCtrl.y_P") == Answer(((name, -1.25),))
-    assert ask(bench, Action.WRITE, "extCtrl.y_P", 0.1 - 1).error == ""  # as float32
+    assert ask(bench, ControlAction.READ, "extCtrl.y_P") == Answer(((name, -1.25),))
+    assert ask(bench, ControlAction.WRITE, "extCtrl.y_P", 0.1 - 1).error == ""  # as float32
 
 
 def test_a_value_that_is_not_allowed_changes_nothing_and_is_one_line(bench: Bench) -> None:
     before = on_board(bench, "extCtrl.y_P")
-    told = ask(bench, Action.WRITE, "extCtrl.y_P", 1e9)
+    told = ask(bench, ControlAction.WRITE, "extCtrl.y_P", 1e9)
     assert told.values == ()
     assert "refused, it stays" in told.error
     assert f"{before:g}" in told.error
     assert on_board(bench, "extCtrl.y_P") == before
-    assert ask(bench, Action.WRITE, "supervisor.poseTimeout", 300.5).error
-    assert ask(bench, Action.WRITE, "supervisor.poseTimeout", -1.0).error
+    assert ask(bench, ControlAction.WRITE, "supervisor.poseTimeout", 300.5).error
+    assert ask(bench, ControlAction.WRITE, "supervisor.poseTimeout", -1.0).error
     assert on_board(bench, "supervisor.poseTimeout") == 500
 
 
 def test_an_unknown_name_is_told_with_the_nearest_one(bench: Bench) -> None:
     near = bench.name("extCtrl.y_P")
-    for action in (Action.READ, Action.WRITE):
+    for action in (ControlAction.READ, ControlAction.WRITE):
         told = ask(bench, action, near[:-1] + "Q", 1.0)
         assert told.values == ()
         assert f"{near[:-1]}Q" in told.error
@@ -154,8 +154,8 @@ def test_an_unknown_name_is_told_with_the_nearest_one(bench: Bench) -> None:
 
 
 def test_all_that_can_be_set_is_listed_with_the_value_that_is_in_force(bench: Bench) -> None:
-    ask(bench, Action.WRITE, "extCtrl.y_P", -0.75)
-    values = dict(ask(bench, Action.LIST).values)
+    ask(bench, ControlAction.WRITE, "extCtrl.y_P", -0.75)
+    values = dict(ask(bench, ControlAction.LIST).values)
     assert len(values) == bench.listed
     assert values[bench.name("extCtrl.y_P")] == -0.75
     assert values[bench.name("supervisor.poseTimeout")] == 500
@@ -163,15 +163,17 @@ def test_all_that_can_be_set_is_listed_with_the_value_that_is_in_force(bench: Be
 
 def test_a_group_is_listed_whole(bench: Bench) -> None:
     group = bench.name("extCtrl.y_P")[:3].upper()
-    told = [name for name, _ in ask(bench, Action.LIST, group).values if name.upper().startswith(group)]
+    told = [
+        name for name, _ in ask(bench, ControlAction.LIST, group).values if name.upper().startswith(group)
+    ]
     assert bench.name("extCtrl.y_P") in told
-    everything = [name for name, _ in ask(bench, Action.LIST).values]
+    everything = [name for name, _ in ask(bench, ControlAction.LIST).values]
     assert told == [name for name in everything if name.upper().startswith(group)]
 
 
 def test_what_is_saved_is_there_after_the_next_boot(bench: Bench) -> None:
-    ask(bench, Action.WRITE, "extCtrl.y_P", -1.75)
-    assert ask(bench, Action.SAVE) == Answer(())
+    ask(bench, ControlAction.WRITE, "extCtrl.y_P", -1.75)
+    assert ask(bench, ControlAction.SAVE) == Answer(())
     booted = Firmware(load_config(), bench)  # type: ignore[arg-type]
     assert next(item for item in booted.parameters if item.name == "extCtrl.y_P").read() == -1.75
 
@@ -179,11 +181,11 @@ def test_what_is_saved_is_there_after_the_next_boot(bench: Bench) -> None:
 def test_a_stop_lasts_until_a_reboot(bench: Bench) -> None:
     bench.run(GYRO_ZERO_US)  # type: ignore[attr-defined]
     supervisor = bench.firmware.signals.supervisor
-    assert ask(bench, Action.STOP) == Answer(())
+    assert ask(bench, ControlAction.STOP) == Answer(())
     bench.turn()
     bench.turn()
     assert (supervisor.state, supervisor.cause) == (State.FAILSAFE, Cause.EMERGENCY_STOP)
-    assert "refuses" in ask(bench, Action.ARM).error
+    assert "refuses" in ask(bench, ControlAction.ARM).error
     bench.turn()
     assert (supervisor.state, supervisor.cause) == (State.FAILSAFE, Cause.EMERGENCY_STOP)
 
@@ -193,7 +195,7 @@ def test_arming_leaves_what_can_be_left(bench: Bench) -> None:
     supervisor = bench.firmware.signals.supervisor
     supervisor.arm(False)
     supervisor.stop()
-    assert ask(bench, Action.ARM) == Answer(())
+    assert ask(bench, ControlAction.ARM) == Answer(())
     for _ in range(4):
         bench.turn()
     assert supervisor.state is State.WAITING
@@ -202,25 +204,25 @@ def test_arming_leaves_what_can_be_left(bench: Bench) -> None:
 def test_a_stop_of_which_only_the_question_arrives_is_sent_again(bench: Bench) -> None:
     losses = iter([True])
     bench.lossy = lambda: next(losses, False)
-    assert ask(bench, Action.STOP) == Answer(())
+    assert ask(bench, ControlAction.STOP) == Answer(())
     assert bench.firmware.signals.supervisor.stopped
 
 
 def test_what_the_board_cannot_do_is_refused_in_one_line(bench: Bench) -> None:
     bench.battery_mv = 2_000  # type: ignore[attr-defined]
     bench.run(8_000_000)  # type: ignore[attr-defined]
-    told = ask(bench, Action.ARM)
+    told = ask(bench, ControlAction.ARM)
     assert "refuses" in told.error
     assert "\n" not in told.error
 
 
 def test_over_mavlink_a_refusal_and_its_reason_are_one_line() -> None:
     bench = MavlinkBench()
-    assert ask(bench, Action.STOP) == Answer(())
+    assert ask(bench, ControlAction.STOP) == Answer(())
     bench.run(GYRO_ZERO_US)
     bench.turn()
     bench.link.texts.clear()
-    assert ask(bench, Action.ARM).error == (
+    assert ask(bench, ControlAction.ARM).error == (
         "the board refuses COMPONENT_ARM_DISARM: temporarily rejected: not armed: emergency stop; reboot first"
     )
     assert list(bench.link.texts) == []
@@ -229,18 +231,18 @@ def test_over_mavlink_a_refusal_and_its_reason_are_one_line() -> None:
 def test_a_line_that_loses_much_delays_and_spoils_nothing(bench: Bench) -> None:
     rng = np.random.default_rng(1)
     bench.lossy = lambda: bool(rng.random() < 0.15)
-    assert ask(bench, Action.WRITE, "extCtrl.y_P", -1.5).error == ""
+    assert ask(bench, ControlAction.WRITE, "extCtrl.y_P", -1.5).error == ""
     assert on_board(bench, "extCtrl.y_P") == -1.5
-    values = dict(ask(bench, Action.LIST).values)
+    values = dict(ask(bench, ControlAction.LIST).values)
     assert values[bench.name("extCtrl.y_P")] == -1.5
     assert len(values) == bench.listed
-    assert ask(bench, Action.STOP).error == ""
+    assert ask(bench, ControlAction.STOP).error == ""
 
 
 def test_a_board_that_is_not_there_is_an_error_after_two_seconds(bench: Bench) -> None:
     bench.lossy = lambda: True
     begin_us = bench.now_us
-    for action in Action:
+    for action in ControlAction:
         begin_us = bench.now_us
         assert ask(bench, action, "extCtrl.y_P", 1.0).error == "no answer within 2 s"
         assert PATIENCE_US <= bench.now_us - begin_us <= PATIENCE_US + REPEAT_US + 2 * TURN_US
@@ -248,9 +250,9 @@ def test_a_board_that_is_not_there_is_an_error_after_two_seconds(bench: Bench) -
 
 def test_a_new_request_replaces_the_one_before(bench: Bench) -> None:
     """A stop does not wait until a long list is there."""
-    bench.controls.ask(bench.now_us, Request(Action.LIST))
+    bench.controls.ask(bench.now_us, ControlRequest(ControlAction.LIST))
     bench.turn()
-    assert ask(bench, Action.STOP) == Answer(())
+    assert ask(bench, ControlAction.STOP) == Answer(())
     assert bench.firmware.signals.supervisor.stopped
     for _ in range(100):
         bench.turn()
@@ -267,7 +269,7 @@ def test_a_profile_s_value_is_the_board_s_times_the_factor(key: str) -> None:
     before = before[int(element)] if element else before
     value = (not before) if isinstance(before, bool) else type(before)(0.8 * before or 0.01)
     bench = CrtpBench()
-    assert ask(bench, Action.WRITE, name, factor * value).error == ""
+    assert ask(bench, ControlAction.WRITE, name, factor * value).error == ""
     flashed = CrtpBench()
     flashed.firmware = Firmware(load_config("floaty", [f"{key}={str(value).lower()}"]), flashed)
     assert on_board(bench, name) == pytest.approx(on_board(flashed, name), rel=1e-6)
@@ -276,7 +278,7 @@ def test_a_profile_s_value_is_the_board_s_times_the_factor(key: str) -> None:
 
 def test_a_parameter_that_can_only_be_read_is_not_written() -> None:
     bench = CrtpBench()
-    assert ask(bench, Action.WRITE, "cpu.flash", 1.0).error == "cpu.flash: can only be read"
-    assert dict(ask(bench, Action.READ, "cpu.flash").values) == {"cpu.flash": 1024}
+    assert ask(bench, ControlAction.WRITE, "cpu.flash", 1.0).error == "cpu.flash: can only be read"
+    assert dict(ask(bench, ControlAction.READ, "cpu.flash").values) == {"cpu.flash": 1024}
     bench.known["cpu.id1"] = replace(bench.known["cpu.id1"], number=9999)
-    assert "does not report it" in ask(bench, Action.READ, "cpu.id1").error
+    assert "does not report it" in ask(bench, ControlAction.READ, "cpu.id1").error

@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 from scipy.interpolate import BPoly
 
-from firmware_py.planner import Motion, Path, Phase, Piece, Planner, between, bezier, go_to, straight_up
+from firmware_py.planner import Path, PathPoint, Phase, Piece, Planner, between, bezier, go_to, straight_up
 
 NUMBERS = st.floats(-2.0, 2.0)
 VECTORS = st.tuples(NUMBERS, NUMBERS, NUMBERS)
-MOTIONS = st.builds(Motion, VECTORS, NUMBERS, VECTORS, VECTORS, NUMBERS)
+MOTIONS = st.builds(PathPoint, VECTORS, NUMBERS, VECTORS, VECTORS, NUMBERS)
 DURATIONS = st.floats(0.3, 8.0)
 POINTS = st.lists(NUMBERS, min_size=1, max_size=8)
-REST = Motion((0.1, -0.2, 0.3), 0.4)
+REST = PathPoint((0.1, -0.2, 0.3), 0.4)
 
 
 def coefficients(
@@ -33,7 +33,7 @@ def coefficients(
 @given(MOTIONS, MOTIONS, DURATIONS)
 @settings(max_examples=15, deadline=None)
 def test_between_two_motions_lies_the_polynomial_without_jerk_at_its_ends(
-    begin: Motion, end: Motion, duration: float
+    begin: PathPoint, end: PathPoint, duration: float
 ) -> None:
     path = between(begin, end, duration)
     for axis in range(3):
@@ -73,7 +73,7 @@ def test_pieces_follow_one_another_and_the_end_is_held_at_rest() -> None:
     x = Polynomial(path.pieces[1].axes[0])
     assert path.at(0.5 + 0.3).position[0] == pytest.approx(x(0.3))
     assert path.at(0.5 + 0.3).velocity[0] == pytest.approx(x.deriv()(0.3))
-    end = Motion(
+    end = PathPoint(
         tuple(Polynomial(axis)(1.0) for axis in path.pieces[2].axes[:3]),
         Polynomial(path.pieces[2].axes[3])(1.0),
     )  # type: ignore[arg-type]
@@ -116,7 +116,7 @@ def test_a_relative_path_begins_where_the_robot_is_and_turns_with_it(reverse: bo
 
 
 def test_up_and_down_keep_the_place_and_turn_on_the_shorter_side() -> None:
-    path = straight_up(Motion((0.1, 0.2, 0.3), 3.0), 1.5, -3.0, 2.0)
+    path = straight_up(PathPoint((0.1, 0.2, 0.3), 3.0), 1.5, -3.0, 2.0)
     assert path.at(2.0).position == pytest.approx((0.1, 0.2, 1.5))
     assert path.at(1.0).position == pytest.approx((0.1, 0.2, 0.9))
     assert path.at(2.0).yaw == pytest.approx(2 * pi - 3.0)

@@ -15,7 +15,7 @@ from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.telemetry import CRAZYFLIE_BLOCKS
 from ground_station.config import PilotConfig
 from ground_station.links.crazyflie_link import CrazyflieLink, FlightTimes, FromFloor, smooth
-from ground_station.links.crtp_controls import Entry
+from ground_station.links.crtp_controls import TocEntry
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal, Hold, Offsets, Step
 
@@ -23,9 +23,9 @@ PERIOD_US = 10_000
 HOME = Goal((0.0, 0.0, 1.0), 0.0)
 CONFIG = PilotConfig(parameters={"stabilizer": {"estimator": 2.0, "controller": 3.0}})
 TABLE = {
-    "stabilizer.estimator": Entry(3, Scalar.U8, True, False),
-    "stabilizer.controller": Entry(4, Scalar.U8, True, False),
-    "kalman.resetEstimation": Entry(9, Scalar.U8, True, False),
+    "stabilizer.estimator": TocEntry(3, Scalar.U8, True, False),
+    "stabilizer.controller": TocEntry(4, Scalar.U8, True, False),
+    "kalman.resetEstimation": TocEntry(9, Scalar.U8, True, False),
 }
 TIMES = FlightTimes.of(CONFIG, 3_000_000, 12_000_000)
 
@@ -57,9 +57,9 @@ def test_commands_and_set_points_are_cflibs_bytes() -> None:
     cflib.low_level.send_position_setpoint(0.1, -0.2, 0.3, 45.0)
     cflib.low_level.send_notify_setpoint_stop()
     ours = [
-        high_level.encode(high_level.Command.TAKE_OFF, 0, 1.25, 0.5, False, 2.5),
-        high_level.encode(high_level.Command.LAND, 0, 0.1, -0.5, False, 3.0),
-        high_level.encode(high_level.Command.STOP, 0),
+        high_level.encode(high_level.PathCommand.TAKE_OFF, 0, 1.25, 0.5, False, 2.5),
+        high_level.encode(high_level.PathCommand.LAND, 0, 0.1, -0.5, False, 3.0),
+        high_level.encode(high_level.PathCommand.STOP, 0),
         setpoints.encode_place((0.1, -0.2, 0.3), pi / 4),
         setpoints.encode_end(),
     ]

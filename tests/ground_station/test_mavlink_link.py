@@ -16,7 +16,7 @@ from firmware_py.geometry import from_euler_zyx
 from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.telemetry import BLOCKS
 from ground_station.config import StationConfig
-from ground_station.controls import REPEAT_US, Action, Request
+from ground_station.controls import REPEAT_US, ControlAction, ControlRequest
 from ground_station.errors import LinkError
 from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
 from ground_station.links.mavlink_budget import TELEMETRY_HZ, link_budget
@@ -256,7 +256,7 @@ def test_a_text_in_pieces_is_one_line_unless_its_beginning_was_lost():
 def test_a_refusal_without_a_reason_is_told_in_the_standard_s_words(result, word):
     bench = LinkWithCodec()
     controls, told = bench.link.controls, dialect.MAVLink_statustext_message(6, b"written by somebody")
-    controls.ask(0, Request(Action.SAVE))
+    controls.ask(0, ControlRequest(ControlAction.SAVE))
     bench.hear(1_000, dialect.MAVLink_command_ack_message(245, result), told)
     assert controls.answer(1_000 + REPEAT_US) is None
     assert controls.answer(1_000 + REASON_US).error == f"the board refuses PREFLIGHT_STORAGE: {word}"

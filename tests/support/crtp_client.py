@@ -6,7 +6,7 @@ from firmware_py.firmware import Firmware
 from firmware_py.wire import crtp
 from firmware_py.wire.parameters import TYPE_EXTENDED, TYPE_READ_ONLY
 from firmware_py.wire.scalars import LOG_SCALARS, PARAMETER_SCALARS
-from ground_station.links.crtp_controls import Entry
+from ground_station.links.crtp_controls import TocEntry
 from hil.config import load_config
 from hil.events import EventQueue
 from support.firmware_bench import FirmwareBench
@@ -62,10 +62,10 @@ class CrtpClient(FirmwareBench):
             table[f"{group.decode()}.{name.decode()}"] = (number, reply[3])
         return table
 
-    def entries(self) -> dict[str, Entry]:
+    def entries(self) -> dict[str, TocEntry]:
         """What a client makes of the table of parameters."""
         return {
-            name: Entry(
+            name: TocEntry(
                 number, PARAMETER_SCALARS[kind & 0x0F], not kind & TYPE_READ_ONLY, bool(kind & TYPE_EXTENDED)
             )
             for name, (number, kind) in self.toc(PARAM).items()

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from firmware_py.wire import log
 from firmware_py.wire.crtp import PORT_LOG, Packet, decode, encode
-from firmware_py.wire.telemetry import ALL_BLOCKS, Block
+from firmware_py.wire.telemetry import ALL_BLOCKS, TelemetryBlock
 
 NAMES = [variable.name for block in ALL_BLOCKS for variable in block.variables]
 TABLE = {name: number for number, name in enumerate(NAMES)}  # of contents
@@ -24,16 +24,16 @@ class LogBoard:
             return None
         self.requests.append(packet.data)
         command, number, rest = packet.data[0], packet.data[1] if len(packet.data) > 1 else 0, packet.data[2:]
-        if command == log.Command.RESET:
+        if command == log.LogCommand.RESET:
             self.blocks, self.periods = {}, {}
-        elif command in (log.Command.CREATE, log.Command.APPEND):
+        elif command in (log.LogCommand.CREATE, log.LogCommand.APPEND):
             items = [log.ITEM.unpack_from(rest, offset) for offset in range(0, len(rest), log.ITEM.size)]
             self.blocks.setdefault(number, []).extend((kind, NAMES[index]) for kind, index in items)
-        elif command == log.Command.START:
+        elif command == log.LogCommand.START:
             self.periods[number] = rest[0]
         return encode(Packet(PORT_LOG, log.CHANNEL_CONTROL, bytes((command, number, 0))))
 
 
-def data_packet(block: Block, timestamp_ms: int, values: Sequence[float]) -> bytes:
+def data_packet(block: TelemetryBlock, timestamp_ms: int, values: Sequence[float]) -> bytes:
     """The whole packet with the values of a block's log variables."""
     return log.encode_data(block.id, timestamp_ms, block.layout.pack(*values))

@@ -6,7 +6,7 @@ from typing import Any
 from hil.clock import FreeRunning, Readers
 from hil.config import load_config
 from hil.laboratory.robot import Robot
-from hil.servers.server import Plan, Server
+from hil.servers.server import Server, Service
 from support.mavlink_client import STATION, codec, lines
 
 
@@ -19,7 +19,7 @@ class MavlinkLab:
         self.said: list[str] = []
         self.messages: list[tuple[int, Any]] = []
         self._codec, self._parser = codec(*STATION), codec(0, 0)
-        self.server = Server(Plan(load_config("floaty", settings), mavlink=True), self.said.append)
+        self.server = Server(Service(load_config("floaty", settings), mavlink=True), self.said.append)
         self.server.lab.clock = FreeRunning()
         (self.served,) = self.server.ends.robots
         self.robot: Robot = self.served.robot

@@ -15,13 +15,13 @@ from hil.devices.markers import NO_POINTS, Sighting
 from hil.floaty.drawing import marker_places
 from hil.servers.dongle_server import Readers
 from hil.servers.motive import Streaming, Up, VirtualMotive
-from hil.world.config import GeometryConfig, GroundConfig
+from hil.world.config import GeometryConfig, NetConfig
 from support.serving import PATIENCE_S
 
 FROM_MOTIVE = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # columns: Motive's axes in the world
 PERIOD_S = 0.005
 LATENCY_US = 38_000
-PLACES = marker_places(GeometryConfig(), GroundConfig())
+PLACES = marker_places(GeometryConfig(), NetConfig())
 NO_POSE = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))  # Motive looks at the frame's
 
 

@@ -22,7 +22,7 @@ from firmware_py.wire.core_port import (
     Call,
     CoreAnswer,
     Hil,
-    Kind,
+    Message,
     Refusal,
     call,
     decode_answer,
@@ -61,7 +61,7 @@ def app(library: Path, tmp_path: Path) -> App:
     return app
 
 
-def ask(app: App, number: int, request: tuple[Kind, bytes], session: int = 7) -> CoreAnswer | None:
+def ask(app: App, number: int, request: tuple[Message, bytes], session: int = 7) -> CoreAnswer | None:
     """Send one packet; None: it is not answered."""
     app.radio(encode_request(*request, session, number), PORT_CORE, 0)
     packet = app.sent()
@@ -121,7 +121,7 @@ def test_a_write_that_was_long_on_its_way_writes_nothing(app: App) -> None:
     late = write(TICK, struct.pack("<i", 77))
     ask(app, BEGUN, write(TICK, struct.pack("<i", 5)))
     ask(app, BEGUN + 1, call(Call.ESTIMATE))
-    assert ask(app, BEGUN, late).kind == Kind.WRITE
+    assert ask(app, BEGUN, late).kind == Message.WRITE
     assert ticks(app, BEGUN + 2) == 6
 
 
@@ -165,11 +165,11 @@ def test_a_new_session_ends_the_old_one(app: App) -> None:
     "request_",
     [
         read(MEMORY - 3, 4), read(0, READ_MAX + 1), write(MEMORY - 3, bytes(4)),
-        (Kind.CALL, bytes((len(Call),))), (Kind.CALL, b""),
-        (Kind.WRITE, b"\0"), (Kind.READ, b"\0\0"), (9, b""),
+        (Message.CALL, bytes((len(Call),))), (Message.CALL, b""),
+        (Message.WRITE, b"\0"), (Message.READ, b"\0\0"), (9, b""),
     ],
 )  # fmt: skip
-def test_what_lies_outside_is_refused_and_takes_no_number(app: App, request_: tuple[Kind, bytes]) -> None:
+def test_what_lies_outside_is_refused_and_takes_no_number(app: App, request_: tuple[Message, bytes]) -> None:
     begun(app)
     assert ask(app, BEGUN, request_).refusal() == Refusal.OUTSIDE
     assert ticks(app, BEGUN) == 0
@@ -204,7 +204,7 @@ def test_a_call_touches_nothing_that_flies(app: App) -> None:
 def test_what_fell_into_its_failsafe_in_the_air_executes_nothing(flown: App) -> None:
     for request in (call(Call.ESTIMATE), loop(Hil.STILL), read(0, 4), write(0, b"\0")):
         assert ask(flown, BEGUN, request).refusal() == Refusal.FLYING
-    assert ask(flown, BEGUN, health()).kind == Kind.HEALTH
+    assert ask(flown, BEGUN, health()).kind == Message.HEALTH
 
 
 @pytest.mark.parametrize("parameter", ["armed", "stop"])
@@ -213,7 +213,7 @@ def test_disarmed_or_stopped_for_five_seconds_a_board_serves_again(flown: App, p
     step(flown, range(2001, 7000))
     assert ask(flown, BEGUN, read(0, 4)).refusal() == Refusal.FLYING
     step(flown, range(7000, 7011))
-    assert ask(flown, BEGUN, read(0, 4)).kind == Kind.READ
+    assert ask(flown, BEGUN, read(0, 4)).kind == Message.READ
     flown.set(f"floaty.{parameter}", parameter != "stop")
     step(flown, range(7011, 7021))
     assert ask(flown, BEGUN + 1, read(0, 4)).refusal() == Refusal.FLYING
@@ -226,7 +226,7 @@ def test_while_flaps_are_moved_by_hand_nothing_is_executed(app: App) -> None:
     assert ask(app, BEGUN, read(0, 4)).refusal() == Refusal.FLYING
     app.set("extCtrl.manual", 0)
     step(app, range(21, 41))
-    assert ask(app, BEGUN, read(0, 4)).kind == Kind.READ
+    assert ask(app, BEGUN, read(0, 4)).kind == Message.READ
 
 
 def test_a_board_that_restarted_by_itself_may_be_in_the_air(library: Path, tmp_path: Path) -> None:
@@ -240,7 +240,7 @@ def test_a_board_that_restarted_by_itself_may_be_in_the_air(library: Path, tmp_p
 
 def test_with_hardware_in_the_loop_no_call_stops_the_scheduler(app: App) -> None:
     begun(app)
-    assert ask(app, BEGUN, loop(Hil.STILL)).kind == Kind.LOOP
+    assert ask(app, BEGUN, loop(Hil.STILL)).kind == Message.LOOP
     step(app, range(1, 3))
     while app.sent():
         pass

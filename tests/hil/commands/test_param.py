@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from firmware_py.table import on_board
-from ground_station.controls import Action, Request
+from ground_station.controls import ControlAction, ControlRequest
 from hil.commands import param
 from support.command import Cli
 
@@ -13,22 +13,22 @@ LINK = ("--link", "udp://127.0.0.1:1")
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[Request]:
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[ControlRequest]:
     """The requests that reach the board, whose parameters are 1.5 until they are set."""
-    requests: list[Request] = []
+    requests: list[ControlRequest] = []
 
-    def ask(uri: str, profile: str, overrides: Any, wanted: list[Request]) -> list[Any]:
+    def ask(uri: str, profile: str, overrides: Any, wanted: list[ControlRequest]) -> list[Any]:
         requests.extend(wanted)
-        if wanted[0].action is Action.LIST:
+        if wanted[0].action is ControlAction.LIST:
             return [[("extCtrl.y_P", 1.5), ("extCtrl.z_P", 2.0), ("motorShifts.m1", 3.0)]]
-        return [[(one.name, one.value if one.action is Action.WRITE else 1.5)] for one in wanted]
+        return [[(one.name, one.value if one.action is ControlAction.WRITE else 1.5)] for one in wanted]
 
     monkeypatch.setattr(param, "_ask", ask)
     return requests
 
 
 def test_a_profile_s_name_has_the_profile_s_sign_and_a_board_s_the_board_s(
-    cli: Cli, asked: list[Request]
+    cli: Cli, asked: list[ControlRequest]
 ) -> None:
     name, factor = on_board("controller.gain_y")
     assert (name, factor) == ("extCtrl.y_P", -1.0)
@@ -40,14 +40,14 @@ def test_a_profile_s_name_has_the_profile_s_sign_and_a_board_s_the_board_s(
 
 
 @pytest.mark.parametrize("group", ["extctrl", "extCtrl.", "EXTCTRL"])
-def test_a_group_is_found_however_it_is_written(cli: Cli, asked: list[Request], group: str) -> None:
+def test_a_group_is_found_however_it_is_written(cli: Cli, asked: list[ControlRequest], group: str) -> None:
     assert cli("param", "list", group, *LINK) == 0
     assert cli.out == "extCtrl.y_P 1.5\nextCtrl.z_P 2\n"
 
 
 @pytest.mark.parametrize("setting", ["extCtrl.y_P", "=1", "extCtrl.y_P=", "extCtrl.y_P=two"])
 def test_what_is_no_setting_is_one_line_and_nothing_is_asked(
-    cli: Cli, asked: list[Request], setting: str
+    cli: Cli, asked: list[ControlRequest], setting: str
 ) -> None:
     assert cli("param", "set", setting, *LINK) == 2
     assert f"{setting}: expected NAME=VALUE with a number" in cli.err

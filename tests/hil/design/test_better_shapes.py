@@ -23,7 +23,7 @@ from hil.floaty.geometry import weigh
 from hil.floaty.plant import Plant
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
-from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import PlantConfig, PlantServoConfig, TunnelConfig
 from support.command import Cli
 
 CONFIG = load_config()
@@ -92,7 +92,7 @@ def test_the_flat_robot_falls_over_in_the_time_that_its_pole_says() -> None:
     tunnel = TunnelConfig(turbulence="none", profile_radius=5.0, height_slope=0.0, speed=point.speed)
     plant = Plant(
         point.geometry, PlantConfig(variant="plate", airspeed=point.speed, hover_angle=point.opening), tunnel,
-        ServoConfig(), np.random.default_rng(1),
+        PlantServoConfig(), np.random.default_rng(1),
     )  # fmt: skip
     values, vectors = np.linalg.eig(point.linear.A[np.ix_((1, 3, 6), (1, 3, 6))])
     mode = (vectors[:, values.real.argmax()] / vectors[1, values.real.argmax()]).real * 0.002  # [rad] of roll

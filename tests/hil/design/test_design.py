@@ -21,7 +21,7 @@ from hil.errors import LabError
 from hil.floaty.geometry import weigh
 from hil.floaty.paper_table import PAPER_TABLE
 from hil.floaty.plant import Plant
-from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 from support.command import Cli
 from support.geometries import geometries
 
@@ -45,7 +45,7 @@ INSIDE = {"roll_u1", "roll_roll", "yaw_u3", "z_vz"}  # of the Table's uncertaint
 def flown(geometry: GeometryConfig, speed: float, opening: float) -> Plant:
     config = PlantConfig(variant="plate", airspeed=speed, hover_angle=opening)
     tunnel = UNIFORM.model_copy(update={"speed": speed})
-    return Plant(geometry, config, tunnel, ServoConfig(), np.random.default_rng(1))
+    return Plant(geometry, config, tunnel, PlantServoConfig(), np.random.default_rng(1))
 
 
 def by_differences(plant: Plant, opening: float) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from hil.config import load_config
 from hil.devices.cameras import VirtualMocap
 from hil.devices.config import MarkersConfig, MocapConfig
 from hil.devices.markers import COUNT, TRUNK_RADIUS, Cameras, Sighting
-from hil.devices.rigid_body import GHOST_REACH, NOISE_ROWS, WORST_PAIR, RigidBody, VirtualMarkers
+from hil.devices.rigid_body import GHOST_REACH, NOISE_ROWS, WORST_PAIR, MarkerBody, VirtualMarkers
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
 from hil.floaty.drawing import marker_places, markers_of
@@ -25,7 +25,7 @@ from hil.floaty.shape import MIRRORS
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
-from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 
 ON = MarkersConfig(enabled=True)
 EXACT = MarkersConfig(enabled=True, noise=0.0)
@@ -99,7 +99,7 @@ def test_noisy_points_give_the_pose_of_scipys_kabsch(
 ) -> None:
     seen = np.isin(np.arange(COUNT), list(rows))
     points = turn.apply(PLACES) + p_WB + 0.002 * np.random.default_rng(seed).standard_normal((COUNT, 3))
-    fit = RigidBody(PLACES).fit(points, seen)
+    fit = MarkerBody(PLACES).fit(points, seen)
     assert fit is not None
     p, R = kabsch(points[seen], PLACES[seen])
     assert fit.p_WB == pytest.approx(p, abs=1e-9)
@@ -137,8 +137,8 @@ def test_markers_on_a_line_give_no_pose() -> None:
     line = PLACES.copy()
     line[:4] = np.outer([0.0, 0.1, 0.2, 0.35], [0.6, 0.0, 0.8])
     for count in (0, 1, 2, 3, 4):
-        assert RigidBody(line).fit(line, np.arange(COUNT) < count) is None
-    assert RigidBody(line).fit(line, np.arange(COUNT) < 5) is not None
+        assert MarkerBody(line).fit(line, np.arange(COUNT) < count) is None
+    assert MarkerBody(line).fit(line, np.arange(COUNT) < 5) is not None
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_two_exchanged_labels_leave_the_pose_or_turn_it_over_and_show(
 ) -> None:
     points = turn.apply(PLACES)
     points[list(pair)] = points[list(pair[::-1])]
-    fit = RigidBody(PLACES).fit(points, ALL)
+    fit = MarkerBody(PLACES).fit(points, ALL)
     assert fit is not None
     wrong = (turn.inv() * Rotation.from_quat(fit.q_WB, scalar_first=True)).magnitude()
     assert min(wrong, math.pi - wrong) < 1e-6
@@ -200,7 +200,7 @@ def test_the_pair_of_the_fault_is_the_one_that_turns_the_body_over_at_the_smalle
     for pair in itertools.combinations(range(COUNT), 2):
         points = PLACES.copy()
         points[list(pair)] = points[list(pair[::-1])]
-        fit = RigidBody(PLACES).fit(points, ALL)
+        fit = MarkerBody(PLACES).fit(points, ALL)
         assert fit is not None
         if Rotation.from_quat(fit.q_WB, scalar_first=True).magnitude() > 3:
             found[pair] = np.linalg.norm(points - fit.points, axis=1).mean()
@@ -312,7 +312,7 @@ def test_ghosts_lie_near_the_body_have_no_label_and_do_not_change_its_pose() -> 
 
 def frames(count: int, seed: int = 1, **knobs: float) -> list[tuple[MocapFrame, Sighting | None]]:
     plant = Plant(
-        GEOMETRY, PlantConfig(), TunnelConfig(turbulence="none"), ServoConfig(), np.random.default_rng(1)
+        GEOMETRY, PlantConfig(), TunnelConfig(turbulence="none"), PlantServoConfig(), np.random.default_rng(1)
     )
     plant.hold()
     mocap = VirtualMocap(MocapConfig(), np.random.default_rng(seed), markers(seed=seed))

@@ -13,7 +13,7 @@ from hil.devices.config import ImuConfig
 from hil.devices.imu import VirtualImu
 from hil.errors import LabError
 from hil.floaty.plant import Plant
-from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 
 GYRO_LSB = math.radians(2000 / 32768)  # [rad/s] data sheet
 ACCEL_LSB = 24 * 9.81 / 32768  # [m/s2] data sheet
@@ -27,7 +27,7 @@ def make_plant() -> Plant:
         GeometryConfig(),
         PlantConfig(),
         TunnelConfig(turbulence="none"),
-        ServoConfig(),
+        PlantServoConfig(),
         np.random.default_rng(1),
     )
     plant.hold()

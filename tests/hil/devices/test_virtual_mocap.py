@@ -10,7 +10,7 @@ from ground_station.mocap import MocapFrame
 from hil.devices.cameras import VirtualMocap
 from hil.devices.config import MocapConfig
 from hil.floaty.plant import Plant
-from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 
 TURN = Rotation.from_euler("ZYX", [1.0, 0.2, -0.3])
 PLACE = (0.1, 0.2, 0.3)
@@ -21,7 +21,7 @@ def make_plant() -> Plant:
         GeometryConfig(),
         PlantConfig(),
         TunnelConfig(turbulence="none"),
-        ServoConfig(),
+        PlantServoConfig(),
         np.random.default_rng(1),
     )
     plant.place(PLACE, TURN.as_quat(scalar_first=True))

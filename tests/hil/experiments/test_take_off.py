@@ -11,7 +11,7 @@ from hil.experiments.take_off import CONTROLLER_ON, FANS_OFF, LANDING_FROM, STAN
 from hil.floaty.plant import Plant
 from hil.laboratory.metrics import column, free_flight
 from hil.laboratory.recorder import load_events, load_log
-from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 from support.flights import flown
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -26,7 +26,7 @@ def standing(**changes: float) -> Plant:
         {"tether": {"length": 5.0}, "limits": {"below": 1.2}, "ground": changes}
     )
     calm = TunnelConfig(turbulence="none")
-    plant = Plant(GeometryConfig(), config, calm, ServoConfig(), np.random.default_rng(1))
+    plant = Plant(GeometryConfig(), config, calm, PlantServoConfig(), np.random.default_rng(1))
     plant.tunnel.set_fan_factor(0.0)
     return plant
 

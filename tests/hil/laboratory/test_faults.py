@@ -31,7 +31,7 @@ from hil.laboratory.request import MAVLINK, RADIO, Request
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.run import fly
 from hil.pictures.report import write_report
-from hil.world.config import GeometryConfig, PlantConfig, ServoConfig
+from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig
 from hil.world.tunnel import TunnelConfig
 from support.command import Cli
 from support.flights import hover
@@ -384,7 +384,9 @@ def test_faults_on_one_knob_add_up_and_leave_it_as_it_was() -> None:
 def test_side_wind_blows_either_way_up_to_20_metres_per_second(
     kind: str, axis: int, wind: float, more: float
 ) -> None:
-    plant = Plant(GeometryConfig(), PlantConfig(), TunnelConfig(), ServoConfig(), np.random.default_rng(1))
+    plant = Plant(
+        GeometryConfig(), PlantConfig(), TunnelConfig(), PlantServoConfig(), np.random.default_rng(1)
+    )
     before = [1.0, -2.0, 3.0]
     before[axis] = wind
     plant.tunnel.set_side_wind(*before)

@@ -16,7 +16,7 @@ from hil.laboratory.robot import Ports, Robot, Site, Streams, nobody_listens
 from hil.servers.holder import Holder
 from hil.servers.live_faults import LiveFaults
 from hil.servers.served_robot import ServedRobot
-from hil.servers.server import Plan, Server
+from hil.servers.server import Server, Service
 
 SECOND_US = 1_000_000
 
@@ -27,7 +27,7 @@ class Bench:
     def __init__(self, count: int = 1, seed: int = 1, faults: tuple[Fault, ...] = (), *settings: str) -> None:
         self.said: list[str] = []
         self.server = Server(
-            Plan(load_config("floaty", settings), count, seed, faults=faults), self.said.append
+            Service(load_config("floaty", settings), count, seed, faults=faults), self.said.append
         )
         self.server.lab.clock = FreeRunning()
         for robot in self.server.ends.robots:

@@ -17,7 +17,7 @@ from hil.experiments.hover import HOVER
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.lockstep import image_at
 from hil.laboratory.request import why_left
-from hil.servers.server import Plan, Server
+from hil.servers.server import Server, Service
 
 ELF = os.environ.get("FLOATY_STOCK_ELF", "")
 needs_image = pytest.mark.skipif(
@@ -154,7 +154,7 @@ def test_same_seed_has_the_same_hash_and_an_unknown_parameter_one_line(tmp_path:
 
 @needs_image
 def test_served_robot_stands_on_the_floor_with_the_profiles_parameters_and_feels_its_height() -> None:
-    server = Server(Plan(load_config(PROFILE), executor=image_at(ELF, None)), lambda text: None)
+    server = Server(Service(load_config(PROFILE), executor=image_at(ELF, None)), lambda text: None)
     try:
         served = server.ends.robots[0]
         served.fly(absolute=True)

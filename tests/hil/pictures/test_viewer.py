@@ -45,7 +45,7 @@ from hil.pictures.viewer.scene import HIDDEN, METRES_PER_NEWTON, PUSH_SHOWN_US, 
 from hil.pictures.viewer.track import FROM_RELEASE, FROM_START, timeline_of
 from hil.scene import Look, Part, ball, box
 from hil.world import layout as at
-from hil.world.config import GeometryConfig, GroundConfig
+from hil.world.config import GeometryConfig, NetConfig
 
 RELEASE_US = load_config().flight.release_us
 angles = st.floats(-1.5, 1.5)
@@ -127,7 +127,7 @@ def test_markers_change_colour_where_they_come_into_sight_or_go(tmp_path: Path) 
     (places,) = [batch for batch in still if "Points3D:positions" in batch.schema.names]
     np.testing.assert_allclose(
         places.column("Points3D:positions").to_pylist()[0],
-        marker_places(GeometryConfig(), GroundConfig()),
+        marker_places(GeometryConfig(), NetConfig()),
         atol=1e-7,
     )
     split = tmp_path / "split.rrd"
@@ -213,7 +213,7 @@ SHAPES: tuple[dict[str, object], ...] = (
 def test_a_drawn_flap_lies_where_the_plant_has_it(shape: dict[str, object], angle: float, flap: int) -> None:
     geometry, s = GeometryConfig.model_validate(shape), np.zeros(at.SIZE)
     place_plates(s, geometry, 0.4)
-    part = look_of(geometry, GroundConfig()).parts[1 + flap]
+    part = look_of(geometry, NetConfig()).parts[1 + flap]
     turn = Rotation.from_quat(scene.turn_of(part, pa.table({part.angle: [angle]}))[0], scalar_first=True)
     turned = np.add(turn.apply(part.triangles.reshape(-1, 3)), part.place).reshape(-1, 3, 3)
     strip = len(surfaces(geometry)[-1].corners) - 2  # triangles, the last ones
@@ -233,7 +233,7 @@ def _area(triangles: NDArray[np.float64]) -> float:
 
 
 def test_the_lowest_marker_sits_on_the_drawn_stand() -> None:
-    geometry, ground = GeometryConfig(), GroundConfig()
+    geometry, ground = GeometryConfig(), NetConfig()
     lowest = min(marker_places(geometry, ground), key=lambda place: place[2])
     foot = stand_lines(geometry, ground)[0]
     along = [
@@ -244,7 +244,7 @@ def test_the_lowest_marker_sits_on_the_drawn_stand() -> None:
 
 
 def test_the_drawn_areas_are_the_papers() -> None:
-    areas = [_area(part.triangles) for part in look_of(GeometryConfig(), GroundConfig()).parts]
+    areas = [_area(part.triangles) for part in look_of(GeometryConfig(), NetConfig()).parts]
     assert areas == pytest.approx([0.0064, 0.0116, 0.0116, 0.0116, 0.0116], abs=5e-5)
     assert sum(areas) == pytest.approx(0.23**2)
 
@@ -252,7 +252,7 @@ def test_the_drawn_areas_are_the_papers() -> None:
 def test_drag_acts_on_the_turned_flaps(folder: Path) -> None:
     log = load_log(folder)
     flaps = column(log, *(f"truth.flap_{number}" for number in (1, 2, 3, 4)))
-    base, *parts = look_of(GeometryConfig(), GroundConfig()).parts
+    base, *parts = look_of(GeometryConfig(), NetConfig()).parts
     origins = scene.force_origin(base, scene.turn_of(base, log))
     np.testing.assert_allclose(origins, np.broadcast_to([0, 0, 0.07], origins.shape), atol=1e-12)
     for flap, part in enumerate(parts):
@@ -262,7 +262,7 @@ def test_drag_acts_on_the_turned_flaps(folder: Path) -> None:
 
 
 def test_a_look_is_stored_and_read_back_equal() -> None:
-    look = look_of(GeometryConfig(), GroundConfig())
+    look = look_of(GeometryConfig(), NetConfig())
     again = Look.read(json.loads(json.dumps(look.stored())))
     assert json.dumps(again.stored()) == json.dumps(look.stored())
     assert Look.read({}).parts == ()
@@ -335,7 +335,7 @@ def real_log(rows: int = 30) -> pa.Table:
     }
     columns |= {"estimator.rejected": np.where(silent, np.nan, np.arange(rows) // 20)}
     request = json.dumps({"link": "udp://127.0.0.1:19850", "experiment": "hover"})
-    look = json.dumps(look_of(GeometryConfig(), GroundConfig()).stored())
+    look = json.dumps(look_of(GeometryConfig(), NetConfig()).stored())
     return pa.table(columns).replace_schema_metadata({"request": request, "look": look})
 
 

@@ -7,11 +7,11 @@ import pytest
 from firmware_py.links.parameters import ParameterStorage
 from hil.config import load_config
 from hil.errors import LabError
-from hil.servers.server import Plan, Server
+from hil.servers.server import Server, Service
 
 
 def serve(state: Path | None, boards: int = 1) -> Server:
-    return Server(Plan(load_config(), boards, state=state), lambda line: None)
+    return Server(Service(load_config(), boards, state=state), lambda line: None)
 
 
 def test_eeprom_and_deck_memory_of_each_board_are_kept_over_a_restart(tmp_path: Path) -> None:

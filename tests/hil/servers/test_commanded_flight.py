@@ -24,7 +24,7 @@ from firmware_py.wire.crtp import PORT_MEMORIES, Packet, encode, encode_ext_pose
 from ground_station.mocap import MocapFrame
 from hil.clock import FreeRunning
 from hil.config import load_config
-from hil.servers.server import Plan, Server
+from hil.servers.server import Server, Service
 
 POSE_PERIOD_US = 20_000
 LOOK_PERIOD_US = 10_000
@@ -37,7 +37,7 @@ class Script:
 
     def __init__(self, station: bool = False) -> None:
         self.said: list[str] = []
-        self.server = Server(Plan(load_config()), self.said.append)
+        self.server = Server(Service(load_config()), self.said.append)
         self.server.lab.clock = FreeRunning()
         self.robot = self.server.lab.robots[0]
         self._next_us = 0

@@ -12,7 +12,7 @@ import pytest
 from firmware_py.wire import crtp, high_level
 from hil.clock import FreeRunning
 from hil.config import load_config
-from hil.servers.server import Plan, Server
+from hil.servers.server import Server, Service
 from support.mavlink_client import STATION, codec
 from support.mavlink_lab import MavlinkLab
 from support.random_requests import harmless_message, random_packet, spoilt
@@ -26,7 +26,7 @@ class Fuzzed:
     def __init__(self, seed: int, absolute: bool) -> None:
         self.said: list[str] = []
         config = load_config("floaty", [f"predictor.absolute={absolute}"])
-        self.server = Server(Plan(config), self.said.append)
+        self.server = Server(Service(config), self.said.append)
         self.server.lab.clock = FreeRunning()
         (self.served,) = self.server.ends.robots
         self.served.fly(absolute)
@@ -52,7 +52,7 @@ class Fuzzed:
 
 def go_to(place: tuple[float, float, float]) -> bytes:
     """cflib's command, to be there within a second."""
-    fields = struct.pack("<BB2?5f", high_level.Command.GO_TO, 0, False, False, *place, 0.0, 1.0)
+    fields = struct.pack("<BB2?5f", high_level.PathCommand.GO_TO, 0, False, False, *place, 0.0, 1.0)
     return crtp.encode(crtp.Packet(high_level.PORT, 0, fields))
 
 

@@ -18,7 +18,7 @@ from hil.config import load_config
 from hil.design.authority import pressure_at, wrenches
 from hil.floaty.plant import Plant
 from hil.studies.drag_model import ANGLES_DEG, QUANTITIES, ROWS, SWEEPS, measure
-from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 
 AZIMUTHS = np.radians((-45.0, 45.0, 135.0, -135.0))  # of the flap axes, outwards
 AXES = np.array([0.0, 0.0, 0.07])  # above the centre of mass
@@ -70,7 +70,7 @@ def test_model_and_plant_are_the_papers_equations(kink: float, flaps: NDArray[np
         geometry, np.array([1, -1, 1, -1]) * flaps[None], pressure_at(geometry, body.hover_angle)
     )
     assert np.allclose(found[0], expected, rtol=1e-9, atol=1e-9)
-    plant = Plant(*robot(kink), TunnelConfig(), ServoConfig(), np.random.default_rng(1))
+    plant = Plant(*robot(kink), TunnelConfig(), PlantServoConfig(), np.random.default_rng(1))
     assert np.allclose(np.concatenate(plant.mounted_wrench(flaps)), expected, rtol=1e-9, atol=1e-9)
 
 

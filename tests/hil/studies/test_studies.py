@@ -14,7 +14,15 @@ from hil.laboratory.request import Options
 from hil.studies.catalogue import STUDIES
 from hil.studies.study import Change, Expected, Study, Variant
 from hil.studies.study_figures import picture
-from hil.studies.study_run import OUTCOMES, Cell, Curve, StudyResult, flights_of, outcome_of, summarise
+from hil.studies.study_run import (
+    OUTCOMES,
+    Curve,
+    StudyResult,
+    VariantOutcome,
+    flights_of,
+    outcome_of,
+    summarise,
+)
 
 
 def flight(settings: tuple[str, ...], fault: str, seconds: float) -> Row:
@@ -90,7 +98,7 @@ def judged(expected: Expected, *cells: str) -> list[str]:
     variant = Variant("a", unchanged, expected)
     study = Study("s", "?", "size", "m", (1.0, 2.0, 3.0), (variant,))
     flown = [
-        Cell(size, tuple(words[letter] for letter in seeds), ())
+        VariantOutcome(size, tuple(words[letter] for letter in seeds), ())
         for size, seeds in zip(study.sizes, cells, strict=False)
     ]
     result = StudyResult(study, (Curve(variant, tuple(flown)),))
@@ -121,9 +129,9 @@ def test_what_is_not_expected_is_told(
 
 
 def test_the_typical_outcome_is_the_median_and_the_worse_of_two() -> None:
-    assert Cell(1.0, ("lost", "holds", "holds"), ()).typical == "holds"
-    assert Cell(1.0, ("lost", "holds"), ()).typical == "lost"
-    assert Cell(1.0, ("failsafe", "degrades", "lost"), ()).typical == "failsafe"
+    assert VariantOutcome(1.0, ("lost", "holds", "holds"), ()).typical == "holds"
+    assert VariantOutcome(1.0, ("lost", "holds"), ()).typical == "lost"
+    assert VariantOutcome(1.0, ("failsafe", "degrades", "lost"), ()).typical == "failsafe"
 
 
 @pytest.mark.long

@@ -17,7 +17,7 @@ from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.world.battery import Battery, endurance, open_circuit_voltage
-from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 from support.flights import flown
 
 CONFIG = BatteryConfig()
@@ -78,7 +78,12 @@ def test_endurance_is_that_of_the_differential_equation(power: float) -> None:
 
 def test_draw_is_the_power_model_of_the_paper_and_the_servos() -> None:
     plant = Plant(
-        GeometryConfig(), PlantConfig(), TunnelConfig(), ServoConfig(), np.random.default_rng(1), loads=CONFIG
+        GeometryConfig(),
+        PlantConfig(),
+        TunnelConfig(),
+        PlantServoConfig(),
+        np.random.default_rng(1),
+        loads=CONFIG,
     )
     plant.hold()
     assert Battery(CONFIG, plant.draw(0, 4.0)).power == pytest.approx(0.3 + 4 * 0.50)

@@ -12,7 +12,7 @@ from hil.errors import LabError
 from hil.floaty.geometry import area_and_centre, surfaces, weigh
 from hil.floaty.plant import Plant
 from hil.floaty.shape import flap_plates
-from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 from support.geometries import geometries
 
 MIRRORS = {"x": np.diag([-1.0, 1.0, 1.0]), "y": np.diag([1.0, -1.0, 1.0])}
@@ -21,7 +21,7 @@ CALM = TunnelConfig(turbulence="none", profile_radius=5.0, height_slope=0.0)
 
 
 def plant_of(geometry: GeometryConfig) -> Plant:
-    return Plant(geometry, PlantConfig(variant="plate"), CALM, ServoConfig(), np.random.default_rng(1))
+    return Plant(geometry, PlantConfig(variant="plate"), CALM, PlantServoConfig(), np.random.default_rng(1))
 
 
 def test_g0_weighs_what_the_specification_prints() -> None:

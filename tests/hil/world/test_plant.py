@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from hil.errors import LabError
 from hil.floaty.plant import Plant
-from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 from support.paths import VECTORS
 
 VECTORS = json.loads((VECTORS / "plant.json").read_text())
@@ -40,7 +40,7 @@ def make(tunnel: TunnelConfig = CALM, seed: int = 1, **config: object) -> Plant:
         GeometryConfig(),
         PlantConfig.model_validate(config),
         tunnel,
-        ServoConfig(),
+        PlantServoConfig(),
         np.random.default_rng(seed),
     )
 
@@ -162,7 +162,7 @@ def test_motion_follows_newton_and_euler(variant: str) -> None:
 
     plant = Plant(
         GeometryConfig(), PlantConfig.model_validate({"variant": variant}), CALM,
-        ServoConfig.model_validate({"speed": (0, 0, 0, 0)}), np.random.default_rng(1),
+        PlantServoConfig.model_validate({"speed": (0, 0, 0, 0)}), np.random.default_rng(1),
     )  # fmt: skip
     plant.place(start[:3], start[6:10], start[3:6], start[10:], flaps)
     plant.advance(300_000)

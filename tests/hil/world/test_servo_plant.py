@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from hil.floaty.plant import Plant
-from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 from hil.world.servos import commanded_angles, next_period_us
 from support.paths import VECTORS
 
@@ -21,7 +21,7 @@ TAU, RATE = 0.05, 10.5
 
 
 def make(**servos: object) -> Plant:
-    config = ServoConfig.model_validate({"dead_band": 0.0} | servos)
+    config = PlantServoConfig.model_validate({"dead_band": 0.0} | servos)
     plant = Plant(
         GeometryConfig(), PlantConfig(), TunnelConfig(turbulence="none"), config, np.random.default_rng(1)
     )
@@ -38,7 +38,7 @@ def counts_for(angles: np.ndarray) -> tuple[int, ...]:
 def test_counts_of_the_original_board_give_its_angles() -> None:
     checked = 0
     for row in ROWS:
-        for i, angle in enumerate(commanded_angles(row["counts"], ServoConfig().zero_offset, 4 * [9.0])):
+        for i, angle in enumerate(commanded_angles(row["counts"], PlantServoConfig().zero_offset, 4 * [9.0])):
             if 0 < row["words"][i] < 65535:
                 # The board cuts one word and one count.
                 assert angle == pytest.approx(row["flaps_rad"][i], abs=1.5e-4)
@@ -115,7 +115,7 @@ def test_every_change_of_counts_acts_from_its_period_on(changes: list[tuple[int,
     for now_us, offset in changes:
         counts = counts_for(HOVER + offset)
         plant.set_counts(now_us, counts)
-        latches[next_period_us(now_us)] = commanded_angles(counts, ServoConfig().zero_offset, HOVER)[0]
+        latches[next_period_us(now_us)] = commanded_angles(counts, PlantServoConfig().zero_offset, HOVER)[0]
     plant.advance(30_000)
     angle, command, since_us = float(HOVER[0]), float(HOVER[0]), 0
     for latch_us, target in [*latches.items(), (30_000, 0.0)]:

@@ -9,14 +9,14 @@ from pydantic import ValidationError
 from hil.errors import LabError
 from hil.floaty.plant import Plant
 from hil.world import layout as at
-from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 
 def make(**tunnel: object) -> Plant:
     config = TunnelConfig.model_validate({"turbulence": "none", "hover_height": 1.0} | tunnel)
-    return Plant(GeometryConfig(), PlantConfig(), config, ServoConfig(), np.random.default_rng(5))
+    return Plant(GeometryConfig(), PlantConfig(), config, PlantServoConfig(), np.random.default_rng(5))
 
 
 def flow(plant: Plant, x: float, y: float, z: float) -> list[float]:

@@ -133,28 +133,28 @@ static int serve(const FloatyWireHead *head, const uint8_t *data, uint32_t lengt
   const int16_t ahead = (int16_t)(head->number - done);
   const bool is_new = ahead == 0;
   int size;
-  if (head->kind == FLOATY_KIND_HELLO && head->session != 0) {
+  if (head->kind == FLOATY_MESSAGE_HELLO && head->session != 0) {
     return hello(head->session, body);
   }
   if (head->session != session || session == 0) {
     return REFUSED(NO_SESSION);
   }
   const bool in_the_loop = floaty_hil_mode != FLOATY_HIL_OFF;
-  if (!in_the_loop && floaty_supervisor.aloft && head->kind != FLOATY_KIND_HEALTH) {
+  if (!in_the_loop && floaty_supervisor.aloft && head->kind != FLOATY_MESSAGE_HEALTH) {
     return REFUSED(FLYING);
   }
-  if (in_the_loop && head->kind == FLOATY_KIND_CALL) {
+  if (in_the_loop && head->kind == FLOATY_MESSAGE_CALL) {
     return REFUSED(LOOP);
   }
   if (ahead > 0) {
     return NO_ANSWER; /* one before it was lost: the host sends both again */
   }
   switch (head->kind) {
-    case FLOATY_KIND_WRITE: size = write_memory(data, length, is_new); break;
-    case FLOATY_KIND_READ: size = read_memory(data, length, body); break;
-    case FLOATY_KIND_HEALTH: size = health(body); break;
-    case FLOATY_KIND_LOOP: size = loop(data, length, is_new); break;
-    case FLOATY_KIND_CALL: size = call(data, length, head->number, is_new, body); break;
+    case FLOATY_MESSAGE_WRITE: size = write_memory(data, length, is_new); break;
+    case FLOATY_MESSAGE_READ: size = read_memory(data, length, body); break;
+    case FLOATY_MESSAGE_HEALTH: size = health(body); break;
+    case FLOATY_MESSAGE_LOOP: size = loop(data, length, is_new); break;
+    case FLOATY_MESSAGE_CALL: size = call(data, length, head->number, is_new, body); break;
     default: return REFUSED(OUTSIDE);
   }
   if (is_new && size >= 0) {
@@ -181,7 +181,7 @@ static void receive(CRTPPacket *packet) {
   }
   if (size < 0) {
     const FloatyWireWhy why = {(uint8_t)(NO_ANSWER - size)};
-    head.kind = FLOATY_KIND_REFUSED;
+    head.kind = FLOATY_MESSAGE_REFUSED;
     memcpy(body, &why, sizeof why);
     size = sizeof why;
   }
