@@ -141,10 +141,12 @@ def _of_robot(robot: Robot) -> VirtualMarkers:
     return robot.mocap.markers
 
 
+@cache
 def _markers(name: str, blend: Blend) -> tuple[Knob, ...]:
     return (_attribute(_of_robot, name, blend),)
 
 
+@cache
 def _mocap(name: str, blend: Blend) -> Knob:
     return _attribute(lambda robot: robot.mocap, name, blend)
 
@@ -154,6 +156,7 @@ def _air(robot: Robot) -> Air:
     return robot.air
 
 
+@cache
 def _radio(name: str, blend: Blend = either) -> Knob:
     return _attribute(_air, name, blend)
 
