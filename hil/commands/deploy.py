@@ -116,6 +116,8 @@ def check(
     _print_sum(checked)
     seen, missed = reached(checked)
     console.print(f"supervisor: reached {seen}{f'; not {missed}' if missed else ''}", soft_wrap=True)
+    if not fresh and "not finite" in missed:
+        console.print("            only a core with own logic has the guard that finds what is not finite")
     if toolbox.machine_code is not None:
         _print_machine_code(toolbox.machine_code)
     counted = {} if toolbox.machine_code is None else toolbox.machine_code.entries

@@ -214,6 +214,7 @@ def test_one_changed_operator_in_the_c_is_exit_one_and_found_in_its_tick(
     assert tick > 100
     assert f"tick {tick}, after file_pose: Estimator.too_old: 1 00000001 | -1 ffffffff (31 bits)" in shown
     assert f"{target} DIFFERS" in shown
+    assert "only a core with own logic has the guard" in shown
 
 
 @pytest.mark.long
