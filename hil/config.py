@@ -60,6 +60,13 @@ class RobotConfig(Section):
         """Whether it is a Floaty: four flaps in mirror symmetry, of flat plates, whose geometry the profile gives."""
         return self.body == "floaty"
 
+    def need_plates(self, profile: str, command: str) -> None:
+        """Raise `LabError` for a command that computes with flat plates when the profile's robot has none."""
+        if not self.has_plates:
+            raise LabError(
+                f"profile {profile}: {command} takes robots of flat plates; this one's body is {self.body}"
+            )
+
 
 class LabConfig(FirmwareConfig):
     """What is flashed, and the world around it."""

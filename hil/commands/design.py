@@ -171,10 +171,7 @@ def point_of(robot: DesignOptions) -> "Point":
 
     speed, angle = robot.speed, robot.angle
     config = load_config(robot.profile, robot.overrides)
-    if not config.robot.has_plates:
-        raise LabError(
-            f"profile {robot.profile}: floaty design takes robots of flat plates; this one's body is {config.robot.body}"
-        )
+    config.robot.need_plates(robot.profile, "floaty design")
     point = own_point_of(config)
     geometry, opening = scaled(point.geometry, robot.length, robot.mass), point.opening
     if speed is not None and angle is not None:

@@ -194,6 +194,7 @@ def drag_model(seed: int, profile: str, overrides: tuple[str, ...], out: Path) -
     from hil.studies import drag_model, drag_model_report
 
     config = load_config(profile, overrides)
+    config.robot.need_plates(profile, "floaty drag-model")
     with writing("--out", out):
         out.mkdir(parents=True, exist_ok=True)
     announce_compilation()

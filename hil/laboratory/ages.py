@@ -57,7 +57,8 @@ def ages_in_time_of(log: Iterator[pa.Table], folder: Path) -> pa.Table:
 
     Empty for a real flight whose log lacks the station's clock at its start, as older logs do.
     """
-    table, begin = reported_ages(folder), next(log)
+    begin = next(log)  # first: it refuses what is not a run folder
+    table = reported_ages(folder)
     metadata = begin.schema.metadata or {}
     if STATION_START in metadata:
         start_us = int(metadata[STATION_START])

@@ -53,6 +53,10 @@ def test_a_failed_limit_is_exit_code_one(cli: Cli) -> None:
         (["fly", "hover", "--out", "/proc/floaty/run"], "--out /proc/floaty/run: cannot be written"),
         (["fly", "hover", "--seeds", "2", "--view"], "--seeds 2"),
         (["design", "--profile", "crazyflie"], "takes robots of flat plates; this one's body is crazyflie"),
+        (
+            ["drag-model", "--profile", "crazyflie"],
+            "takes robots of flat plates; this one's body is crazyflie",
+        ),
         (["deploy", "write", "app", "--profile", "crazyflie"], "own firmware, not with the app"),
         (
             ["station", "--link", "udp://127.0.0.1:1", "--tlog", "t.tlog"],
@@ -77,6 +81,7 @@ def test_a_failed_limit_is_exit_code_one(cli: Cli) -> None:
         (["fly"], "Missing argument"),
         (["report", "nowhere"], "nowhere"),
         (["view", "nowhere"], "nowhere"),
+        (["view", __file__], "expected a run folder"),
         (["flyy"], "No such command"),
         (["study", "latensy"], "study 'latensy': unknown; did you mean latency?"),
     ],
