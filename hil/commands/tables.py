@@ -63,6 +63,7 @@ def print_result(result: Result) -> None:
     """Print the verdicts of one flight and the files."""
 
     from hil.laboratory.metrics import METRICS, short_of
+    from hil.laboratory.recorder import SETTINGS, load_events
 
     table = Table(title=f"{result.request.title}, profile {result.request.profile}")
     table.add_column("metric")
@@ -85,6 +86,9 @@ def print_result(result: Result) -> None:
     taken_s = process_age_s()
     taken = "" if math.isnan(taken_s) else f"{taken_s:.1f} s from start to end; "
     console.print(f"{result.outcome}{cause}; {speed}{taken}hash {result.hash[:16]}", soft_wrap=True)
+    for event in load_events(result.folder):
+        if event["source"] == SETTINGS:
+            console.print(f"  {event['text']}", soft_wrap=True)
     if result.ages:
         console.print(budget_line(result.ages), soft_wrap=True)
     if result.usage is not None:

@@ -30,12 +30,19 @@ from hil.errors import LabError, hint
 from hil.laboratory.channels import radio_channel, serial_channel, tracker_channel
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import Laboratory
+from hil.laboratory.recorder import SETTINGS
 from hil.laboratory.request import MAVLINK, Request, check_image
 from hil.laboratory.robot import PYTHON_BOARD, Ports, Robot, Site
 from hil.stm32f405.gdb import GdbServer
 from hil.world.body import Channel
 
 BUILD = Path("runs/build")
+
+APP_PARAMETER = "floaty.armed"  # which every image with Floaty's app has
+NO_APP = (
+    "the image lacks Floaty's app: the servos move only if its own code moves them; Bitcraze's firmware flies with "
+    "--profile crazyflie"
+)
 
 
 class ModelledLine:
@@ -76,14 +83,16 @@ class ModelledLine:
             receive(now_us, data)
 
     def _set_up(self, site: Site, flashed: Flashed) -> None:
-        """Let the settings of the flight reach the board."""
+        """Let the settings of the flight reach the board; mention firmware that may not drive this robot."""
+        if APP_PARAMETER not in flashed.parameters:
+            site.say(SETTINGS, NO_APP)
         settings = ImageSettings(
             flashed.parameters,
             flashed.differences,
             site.config,
             site.events,
             self.radio.uplink,
-            partial(site.say, "lab"),
+            partial(site.say, SETTINGS),
         )
         site.events.at(0, settings.begin)
         self._hearing.append(settings.hear)
@@ -109,7 +118,7 @@ class ModelledLine:
         """Return the link that flies the stock firmware. Raises `LabError` for a parameter that the image lacks."""
         config, flashed = request.config, self.robot.firmware.flashed
         table = {} if flashed is None else flashed.parameters
-        if "floaty.armed" in table:
+        if APP_PARAMETER in table:
             raise LabError(
                 f"--board {request.bench.board}: it has Floaty's app, which drives servos; the robot of profile "
                 f"{request.profile} takes Bitcraze's firmware as it is"

@@ -41,6 +41,7 @@ ROWS_PER_BATCH, BATCH_US = 100, 1_000_000  # whichever is full first goes to dis
 BATCHES_PER_PIECE = 160  # of a long flight's log, written and read at once
 PIECES_IN_MEMORY = 5  # of a log that is read as a whole: some ten minutes
 ROWS_SHOWN = 20  # given to the onlooker together: five times a second
+SETTINGS = "settings"  # source of the events about what an image took over and what it lacks
 OPERATOR = "operator"  # source of the events that an operator caused at the terminal
 RELEASE_US = b"release_us"  # in the metadata of a log whose flight was released
 PARQUET, STREAM, EVENTS = "log.parquet", "log.arrows", "events.jsonl"

@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
+from hil.commands.tables import print_result
 from hil.errors import LabError
 from hil.experiments import find_experiment
 from hil.laboratory.recorder import load_events, load_log
@@ -103,8 +104,8 @@ def test_an_experiments_settings_reach_the_image_before_its_release(tmp_path: Pa
     assert not any("keeps its own" in event["text"] for event in events)
 
 
-def test_an_image_without_the_app_is_flown_and_recorded_with_its_tasks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_an_image_without_the_app_is_flown_and_recorded_with_its_tasks_and_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from hil.devices import image_firmware
     from hil.laboratory import lockstep
@@ -116,6 +117,11 @@ def test_an_image_without_the_app_is_flown_and_recorded_with_its_tasks(
     request = Request.of(HOVER, duration_s=0.1, board=str(elf), overrides=("flight.release_us=50000",))
     result = fly(request, tmp_path / "run")
     assert (result.outcome, result.cause) == ("completed", None)
+    print_result(result)
+    assert (
+        "the image lacks Floaty's app: the servos move only if its own code moves them"
+        in capsys.readouterr().out
+    )
     assert len(result.tasks) > 1
     names = [f"cpu.{task.name}" for task in result.tasks]
     log = load_log(tmp_path / "run")
