@@ -14,6 +14,7 @@ from hil.floaty.failures import SERVO_FAILURES
 from hil.floaty.paper_table import PAPER_TABLE
 from hil.floaty.plant import Plant
 from hil.own_files import load_file
+from hil.world.battery import open_circuit_voltage
 from hil.world.body import Body, Failure, Vector
 
 Make = Callable[[LabConfig, np.random.Generator, Vector], Body]
@@ -84,7 +85,7 @@ def digest_of_body(config: LabConfig) -> str:
 
 
 def _check(body: Any) -> None:
-    """Raise `LabError` for what lacks a part of a body, or has arrays of other sizes."""
+    """Raise `LabError` for what lacks a part of a body, has arrays of other sizes, or fails at rest."""
     kind = type(body).__name__
     missing = [name for name in (*SIZES, *PARTS) if not hasattr(body, name)]
     if missing:
@@ -93,3 +94,8 @@ def _check(body: Any) -> None:
         value = getattr(body, name)
         if not (isinstance(value, np.ndarray) and value.shape == (size,) and value.dtype == np.float64):
             raise LabError(f"{kind}.{name} = {value!r}: expected an array of {size} float64")
+    body.draw(0, open_circuit_voltage(1.0))
+    for channel in body.channels():
+        channel.read()
+    if body.lost is not None:
+        raise LabError(body.lost)

@@ -6,7 +6,7 @@ as Floaty's on the same grid. Elementary functions have the same bits everywhere
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar, Protocol
 
@@ -98,7 +98,7 @@ class RigidBody(InTunnel):
         return tuple(
             Channel(
                 "float64",
-                partial(getattr, self, name),
+                partial(self._given, name, partial(getattr, self, name), len(names.split())),
                 (Quantity(tuple(f"robot.{one}" for one in names.split()), unit),),
             )
             for name, (names, unit) in self.logged.items()
@@ -129,12 +129,30 @@ class RigidBody(InTunnel):
 
     def draw(self, now_us: int, cell_V: float) -> float:
         """Return the power [W] of electronics and actuators."""
-        return self._electronics + self.power()
+        (power,) = self._given("power", self.power, 1)
+        if not math.isfinite(power):
+            self._fail(f"{type(self).__name__}.power returned {power}: expected watts")
+            power = 0.0
+        return self._electronics + power
 
     @property
     def lost(self) -> str | None:
         """The first reason why the flight is over, also what its own code did wrong; None while it flies."""
         return self._failed or super().lost
+
+    def _given(self, name: str, ask: Callable[[], Any], count: int) -> list[float]:
+        """Return the numbers that the subclass gives; where they are not that many, end the flight and return zeros."""
+        try:
+            given = ask()
+        except Exception as error:
+            self._fail(blame(error))
+            return [0.0] * count
+        numbers = list(_numbers(given if isinstance(given, Sequence | np.ndarray) else (given,)))
+        if len(numbers) != count:
+            what = "a number" if count == 1 else f"{count} numbers"
+            self._fail(f"{type(self).__name__}.{name} is {given!r}: expected {what}")
+            return [0.0] * count
+        return numbers
 
     def _check_masses(self) -> None:
         for name, count in (("mass", 1), ("inertia", 3)):
@@ -166,7 +184,8 @@ class RigidBody(InTunnel):
         return None
 
     def _fail(self, why: str) -> None:
-        self._failed = f"{why} at {self.time_s:.2f} s" if self._s[at.TIME_US] else why
+        if self._failed is None:
+            self._failed = f"{why} at {self.time_s:.2f} s" if self._s[at.TIME_US] else why
         self._s[at.DRAG : at.DRAG + 6] = 0.0
         self._s[at.HELD] = 1.0
         self._accelerate()

@@ -130,6 +130,18 @@ def test_a_torque_turns_it_and_a_push_moves_it(tmp_path: Path) -> None:
         ),
         (FLOATING.replace("0.981", "1 / 0"), "robot.body = robot.py: robot.py:5: ZeroDivisionError: division by zero"),
         (HEAD, "robot.body = robot.py: Robot has no method wrench"),
+        (
+            FLOATING + "\n    def power(self):\n        return 'much'\n",
+            "robot.body = robot.py: Robot.power is 'much': expected a number",
+        ),
+        (
+            FLOATING + "\n    logged = {'mass': ('a b', '')}\n",
+            "robot.body = robot.py: Robot.mass is 0.1: expected 2 numbers",
+        ),
+        (
+            FLOATING + "\n    logged = {'spin': ('a', '')}\n",
+            "robot.body = robot.py: 'Robot' object has no attribute 'spin'",
+        ),
     ],
 )  # fmt: skip
 def test_a_mistake_in_the_file_is_one_line(robot: str, line: str, tmp_path: Path) -> None:
@@ -161,6 +173,14 @@ def test_a_body_that_fails_in_flight_is_lost_with_the_cause(value: str, cause: s
     result = hover(tmp_path / "run", profile=project(tmp_path, robot), duration_s=1.0)
     assert result.outcome == "lost"
     assert result.cause == f"{cause} at 1.20 s"
+
+
+def test_power_that_is_no_number_in_flight_ends_it(tmp_path: Path) -> None:
+    power = "\n    def power(self):\n        return 1.0 if self.time_s < 1.2 else float('nan')\n"
+    result = hover(tmp_path / "run", profile=project(tmp_path, FLOATING + power), duration_s=1.0)
+    assert result.outcome == "lost"
+    assert result.cause is not None
+    assert result.cause.startswith("Robot.power returned nan: expected watts at 1.2")
 
 
 def test_the_tutorial_shows_the_robot_that_a_new_project_has() -> None:
