@@ -1,36 +1,36 @@
-"""The processor time of a call of the user's own logic: a loop whose length depends on data is charged before it begins.
+"""Processor time of the user's own logic: a loop whose length depends on data is charged before it starts.
 
-Only logic that has such loops takes this in; `firmware_py/logic/budget.py` writes the calls. A loop for which too little is
-left does not begin, and the call has no result: the guard behind it finds NaN, with all that follows from it.
+Only logic with such loops uses this; `firmware_py/logic/budget.py` inserts the calls. A loop that exceeds the remaining
+budget does not start and the call has no result: the guard behind it finds NaN and reacts.
 """
 
 from firmware_py.core.maths import ZERO
 from firmware_py.core.structs import Control, Estimator
 from firmware_py.core.subset import Integer, Struct, i32, kernel
 
-# Of the 10 ms between two steps of the controller the tasks take up to 2 ms; half of the rest is the controller's, half the
-# estimator's: 4 ms of a Cortex-M4 at 168 MHz.
+# Tasks take up to 2 ms of the controller's 10 ms period; controller and estimator get half of the rest each: 4 ms of a
+# Cortex-M4 at 168 MHz.
 CALL_CYCLES = 672000
 
 
 class LoopBudget(Struct):
-    """What is known of the calls of one module."""
+    """The loop budget of one module's calls."""
 
     cycles: i32  # counted in the present call
-    exceeded: i32  # whether a loop has not begun since the last result
-    line: i32  # of the first loop ever that did not begin, 0: none
+    exceeded: i32  # 1: a loop was skipped since the last result
+    line: i32  # of the first loop ever skipped, 0: none
     end: i32  # of that loop's range
 
 
 @kernel
 def begin_call(budget: LoopBudget, cycles: Integer) -> None:
-    """Begin a call, with the cycles that it takes besides the loops that are charged."""
+    """Begin a call; `cycles` is its cost without the charged loops."""
     budget.cycles = i32(cycles)
 
 
 @kernel
 def charged_end(budget: LoopBudget, start: Integer, end: Integer, cycles: Integer, line: Integer) -> i32:
-    """Return the end of a range, each step of which takes some cycles; its start when the budget does not suffice."""
+    """Charge a range, each step of which takes `cycles`; return its end, or its start when the budget is too small."""
     if end <= start:
         return i32(start)
     room = (CALL_CYCLES - budget.cycles) // cycles
@@ -51,7 +51,7 @@ def charged_end(budget: LoopBudget, start: Integer, end: Integer, cycles: Intege
 
 @kernel
 def spoil_control(budget: LoopBudget, control: Control) -> None:
-    """Put NaN in place of the result of a law that exceeded its budget."""
+    """Replace the result of a law that exceeded its budget by NaN."""
     if budget.exceeded != 0:
         budget.exceeded = i32(0)
         control.u[0] = ZERO / ZERO
@@ -59,7 +59,7 @@ def spoil_control(budget: LoopBudget, control: Control) -> None:
 
 @kernel
 def spoil_estimate(budget: LoopBudget, estimator: Estimator) -> None:
-    """Put NaN in place of the result of an estimator that exceeded its budget."""
+    """Replace the result of an estimator that exceeded its budget by NaN."""
     if budget.exceeded != 0:
         budget.exceeded = i32(0)
         estimator.now[0] = ZERO / ZERO

@@ -22,7 +22,7 @@ from firmware_py.core.structs import (
 from firmware_py.core.subset import Integer, f32, i32, kernel
 
 DT = f32(0.01)
-FLAP_LIMIT = f32(1.5707963)  # [rad] of a flap angle that comes from outside
+FLAP_LIMIT = f32(1.5707963)  # [rad] for flap angles from outside
 
 
 @kernel
@@ -114,7 +114,7 @@ def allocate(parameters: Parameters, control: Control) -> None:
 
 @kernel
 def release(control: Control) -> None:
-    """Leave the loop open: no compound inputs, no integral, no excitation."""
+    """Open the loop: clear compound inputs, integral and excitation."""
     control.integral_z = ZERO
     control.excite_tick = i32(0)
     for i in range(4):
@@ -124,7 +124,7 @@ def release(control: Control) -> None:
 
 @kernel
 def manual_angle(parameters: Parameters, data: Input, flap: Integer) -> f32:
-    """Return the flap angle from outside [rad]; of a servo word that which the mapping, which truncates, turns into it."""
+    """Return the flap angle from outside [rad]; for a servo word, an angle that the truncating mapping turns into it."""
     if data.by_words == 0:
         return f32(data.manual[flap])
     untrimmed = f32(data.words[flap]) + HALF - WORD_CENTRE - parameters.trim[flap]

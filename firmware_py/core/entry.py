@@ -1,4 +1,4 @@
-"""The calls by which the firmware enters the core; every argument is the memory of one struct."""
+"""The firmware's calls into the core; every argument is the memory of one struct."""
 
 from firmware_py.core import controller, goal, poses, predictor, sampling, servo, supervisor
 from firmware_py.core.structs import (
@@ -42,13 +42,13 @@ def reset(parameters: Memory[Parameters], estimator: Memory[Estimator]) -> None:
 
 @kernel
 def begin_step(data: Memory[Input], sampling: Memory[Sampling]) -> i32:
-    """Begin a step of 1 ms; returns whether the controller runs in it."""
+    """Begin a step of 1 ms; return whether the controller runs in it."""
     return _begin_step(data[0], sampling[0])
 
 
 @kernel
 def take_sample(data: Memory[Input], sampling: Memory[Sampling]) -> i32:
-    """Take a sample of the gyro; returns whether the gyro's zero has been found with it."""
+    """Take a gyro sample; return whether it completes the search for the gyro's zero."""
     return _take_sample(data[0], sampling[0])
 
 
@@ -60,7 +60,7 @@ def file_pose(
     sampling: Memory[Sampling],
     supervisor: Memory[Supervisor],
 ) -> i32:
-    """File the pose in the input, as it looks from the goal, under the instant at which it was true."""
+    """Turn the input's pose into the goal frame and file it under the instant when it was measured."""
     seen = _see_from_goal(data[0], estimator[0])
     if seen != POSE_ON_TIME:
         return seen
@@ -94,7 +94,7 @@ def supervise(
     sampling: Memory[Sampling],
     supervisor: Memory[Supervisor],
 ) -> i32:
-    """Decide the controller's mode; returns whether state or cause has changed."""
+    """Decide the controller's mode; return whether state or cause has changed."""
     return _supervise(parameters[0], data[0], estimator[0], sampling[0], supervisor[0])
 
 
@@ -117,30 +117,30 @@ def request(
     sampling: Memory[Sampling],
     supervisor: Memory[Supervisor],
 ) -> i32:
-    """Serve a request; returns whether it was obeyed."""
+    """Serve a request; return whether it was executed."""
     return _serve(parameters[0], data[0], sampling[0], supervisor[0])
 
 
 @kernel
 def admits(parameters: Memory[Parameters], data: Memory[Input]) -> i32:
-    """Return whether the set-point is in the box, or no further outside than the goal is."""
+    """Return whether the set-point is in the box, or at most as far outside as the goal."""
     return _admits(parameters[0], data[0])
 
 
 @kernel
 def follow(parameters: Memory[Parameters], data: Memory[Input]) -> i32:
-    """Take the commander's set-point as the goal; returns what became of it."""
+    """Make the commander's set-point the goal; return the result, `SETPOINT_...`."""
     return _follow(parameters[0], data[0])
 
 
 @kernel
 def watch_control(data: Memory[Input], supervisor: Memory[Supervisor]) -> i32:
-    """Notice that nobody asks for the mode any more; returns whether that is new. The next look says otherwise."""
+    """Detect that no controller has asked for the mode lately; return whether that is new. `supervise` clears it."""
     return _watch_control(data[0], supervisor[0])
 
 
 @kernel
 def begin_afresh(data: Memory[Input], sampling: Memory[Sampling], supervisor: Memory[Supervisor]) -> None:
-    """Seek the gyro's zero anew and forget the last flight."""
+    """Search for the gyro's zero again and forget the last flight."""
     _forget_zero(data[0], sampling[0])
     _begin_flight(supervisor[0])

@@ -1,6 +1,6 @@
-"""The Kalman filter: 16 states, scalar updates, full covariance; every pose is fused at the instant it was true.
+"""The Kalman filter: 16 states, scalar updates, full covariance; each pose is fused at the instant when it was measured.
 
-The filter runs `horizon` ticks behind the present. `predictor.py` moves it forward and brings its state to now.
+The filter runs `horizon` ticks behind the present. `predictor.py` advances it and predicts its state to the present.
 """
 
 from firmware_py.core.maths import ONE, PI, TWO, ZERO, asin, atan2, clamp, cos, finite, sin, wrap
@@ -26,12 +26,12 @@ START_FLAP = f32(0.0001)
 VARIANCE_MIN = f32(1e-9)
 VARIANCE_MAX = f32(100.0)
 FLAP_BOUND = f32(1.6)  # [rad] deviation from hover
-JUMP_VARIANCE = f32(4.0)  # a pose that the state jumped to counts as this many times less certain
+JUMP_VARIANCE = f32(4.0)  # factor on the variance of a pose that the state jumped to
 
 
 @kernel
 def start_variance(state: Integer) -> f32:
-    """Return the variance that a state starts with."""
+    """Return a state's initial variance."""
     if state < VELOCITY:
         return START_POSITION
     if state < ATTITUDE:
@@ -45,7 +45,7 @@ def start_variance(state: Integer) -> f32:
 
 @kernel
 def open_covariance(estimator: Estimator) -> None:
-    """Forget how certain the state is, not the state."""
+    """Reset the covariance but not the state."""
     for i in range(STATES):
         for j in range(STATES):
             estimator.P[i, j] = ZERO
@@ -105,7 +105,7 @@ def update(estimator: Estimator, state: Integer, innovation: f32, variance: f32)
 
 @kernel
 def update_gyro(parameters: Parameters, estimator: Estimator, row: Integer) -> None:
-    """Fuse the body rates in that row of the history; through the covariance they carry the attitude along."""
+    """Fuse the body rates in that row of the history; through the covariance they correct the attitude."""
     for axis in range(3):
         innovation = estimator.gyro[row, axis] - estimator.x[RATE + axis]
         update(estimator, RATE + axis, innovation, parameters.measured_rate)
@@ -126,7 +126,7 @@ def attitude_of(q: F32s, attitude: F32s, offset: Integer) -> None:
 
 @kernel
 def pose_at_tick(estimator: Estimator, row: Integer, pose: F32s) -> None:
-    """Write the pose of that row, moved from its own instant to the tick by the estimated velocities."""
+    """Write the pose of that row, extrapolated to the tick with the estimated velocities."""
     lag = estimator.pose_lag[row]
     for axis in range(3):
         pose[axis] = estimator.pose[row, axis] + lag * estimator.x[VELOCITY + axis]
@@ -151,7 +151,7 @@ def surprising(parameters: Parameters, estimator: Estimator, pose: F32s) -> bool
 
 @kernel
 def confirms_suspect(parameters: Parameters, estimator: Estimator, pose: F32s) -> bool:
-    """Return whether a refused pose agrees with the refused one before it: then the goal jumped, not the camera."""
+    """Return whether a refused pose agrees with the previous refused one: then the goal jumped, not the camera."""
     if estimator.suspect_waiting == 0 or estimator.filtered_tick - estimator.suspect_tick > 4:
         return False
     for axis in range(3):
@@ -164,7 +164,7 @@ def confirms_suspect(parameters: Parameters, estimator: Estimator, pose: F32s) -
 
 @kernel
 def jump(parameters: Parameters, estimator: Estimator, pose: F32s) -> None:
-    """Take position and attitude from a pose at once and turn the velocity into the new goal frame."""
+    """Set position and attitude to those of a pose and turn the velocity into the new goal frame."""
     turn = wrap(pose[5] - estimator.x[ATTITUDE + 2])
     sine = sin(turn)
     cosine = cos(turn)
@@ -187,7 +187,7 @@ def jump(parameters: Parameters, estimator: Estimator, pose: F32s) -> None:
 
 @kernel
 def update_pose(parameters: Parameters, estimator: Estimator, row: Integer) -> None:
-    """Fuse the pose that waits in that row of the history, unless the gate refuses it."""
+    """Fuse the pose in that row of the history, unless the gate refuses it."""
     pose = estimator.work_2
     pose_at_tick(estimator, row, pose)
     if estimator.started == 0:
@@ -218,7 +218,7 @@ def update_pose(parameters: Parameters, estimator: Estimator, row: Integer) -> N
 
 @kernel
 def bound(estimator: Estimator, state: Integer, limit: f32) -> None:
-    """Hold one state inside its bound."""
+    """Limit one state to its bound."""
     value = clamp(estimator.x[state], -limit, limit)
     if value != estimator.x[state]:
         estimator.x[state] = value
@@ -227,7 +227,7 @@ def bound(estimator: Estimator, state: Integer, limit: f32) -> None:
 
 @kernel
 def keep_sane(parameters: Parameters, estimator: Estimator) -> None:
-    """Bound state and covariance; a state that is no number any more starts afresh from the next pose."""
+    """Bound state and covariance; a state that is NaN or infinite restarts from the next pose."""
     broken = False
     for i in range(STATES):
         if not finite(estimator.x[i]):
@@ -261,7 +261,7 @@ def keep_sane(parameters: Parameters, estimator: Estimator) -> None:
 
 @kernel
 def filter_tick(parameters: Parameters, estimator: Estimator) -> None:
-    """Advance the filter by one tick: predict, gyro, and the pose that was true at that instant if there is one."""
+    """Advance the filter by one tick: predict, fuse the gyro and the pose measured at that instant, if there is one."""
     predict(parameters, estimator, estimator.filtered_tick % HISTORY)
     estimator.filtered_tick = i32(estimator.filtered_tick + 1)
     row = estimator.filtered_tick % HISTORY

@@ -1,11 +1,11 @@
 """The excitation: a known signal on top of the inputs, for identification; off unless a parameter switches it on.
 
-The multisine's lines are the odd multiples of 0.05 Hz from the lower to the upper frequency. They go round the four inputs:
-u1 has the first, u2 the second, and so on, so that no two inputs share a line and all can be excited at once. What squares
-and products of inputs do lies on even multiples, where nothing is looked for. Its phases are as good as random and change
-every 22 s: each realisation lasts 2 s, in which the response settles, and a period of 20 s, so that what is not linear in
-the response scatters from one realisation to the next. After 16 realisations the first follows again. The chirp sweeps the
-band every 20 s and is for one input at a time.
+The multisine's lines are the odd multiples of 0.05 Hz from the lower to the upper frequency. The four inputs take turns: u1
+gets the first, u2 the second, and so on. So no two inputs share a line, and all can be excited at once. The effects of
+squares and products of inputs fall on even multiples, which are not evaluated. The phases are pseudo-random and change
+every 22 s: a realisation has 2 s in which the response settles and a period of 20 s, so that the nonlinear part of
+the response varies between realisations. After 16 realisations the first one follows again. The chirp sweeps the
+band every 20 s and excites one input at a time.
 """
 
 from firmware_py.core.maths import HALF, TWO_PI, ZERO, clamp, cos, sin
@@ -13,20 +13,20 @@ from firmware_py.core.structs import EXCITE_CHIRP, EXCITE_OFF, Control, Paramete
 from firmware_py.core.subset import Integer, f32, i32, kernel, sqrt
 
 PERIOD = 2000  # ticks
-REALISATION = 2200  # ticks: 2 s that settle, and a period
+REALISATION = 2200  # ticks: 2 s to settle, and a period
 REALISATIONS = 16
 PHASES = 8191  # a prime: squares of the remainders are well mixed
 ODD_LINES_PER_HZ = f32(10.0)
 INPUTS = 4
 TICK = f32(0.01)
-SWEEP = f32(0.025)  # half a frequency's rise over the period [1/s]
-NYQUIST = f32(50.0)  # [Hz]; whatever the parameters say, a tick's work is bounded
+SWEEP = f32(0.025)  # half of 1 / period [1/s]
+NYQUIST = f32(50.0)  # [Hz]; bounds the work of a tick for any parameters
 ROOT_2 = f32(1.41421356)
 
 
 @kernel
 def phase(line: Integer, realisation: Integer) -> f32:
-    """Return the phase [rad] of a line in a realisation: the same on every machine, and as good as random."""
+    """Return the phase [rad] of a line in a realisation: pseudo-random, and the same on every machine."""
     mixed = (37 * line + 101 * realisation + 17) % PHASES
     mixed = (mixed * mixed + line) % PHASES
     mixed = (mixed * mixed + realisation) % PHASES

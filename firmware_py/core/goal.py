@@ -1,8 +1,8 @@
-"""Where to fly, how poses look from there, and the state in the frame of the poses.
+"""The goal, poses relative to it, and the state in the frame of the poses.
 
-Poses are absolute, in the world frame W, or corrections, in the frame of the ground station's goal; X is whichever it is.
-G stands upright at the goal in X, turned by its yaw: p_GB = Rz(-yaw) (p_XB - p_XG). While no goal is known, corrections
-are errors already, and an absolute pose becomes the goal, so that the robot holds where it is.
+Poses are absolute, in the world frame W, or corrections, in the frame of the ground station's goal; X is that frame.
+G is upright at the goal in X, turned by its yaw: p_GB = Rz(-yaw) (p_XB - p_XG). While no goal is known, a correction
+is used as the error, and an absolute pose becomes the goal, so that the robot stays where it is.
 """
 
 from firmware_py.core.maths import HALF, TWO, ZERO, atan2, cos, finite, sin, wrap
@@ -30,7 +30,7 @@ from firmware_py.core.structs import (
 )
 from firmware_py.core.subset import F32s, f32, i32, kernel, sqrt
 
-# A correction has the robot no further from its goal than this [m]: the flow is 0.9 m wide, the cameras see 0.85 m above
+# Largest distance from the goal in a correction [m]: the flow is 0.9 m wide, the cameras see 0.85 m above
 # the hover point and goals are at most 0.65 m below it; a take-off begins 1.1 m below the goal.
 SIDEWAYS = f32(0.9)
 BELOW = f32(2.0)
@@ -64,7 +64,7 @@ def excess(parameters: Parameters, data: Input, place: F32s) -> f32:
 
 @kernel
 def admits(parameters: Parameters, data: Input) -> i32:
-    """Return whether the set-point is in the box, or no further outside than the goal is."""
+    """Return whether the set-point is in the box, or at most as far outside as the goal."""
     for axis in range(3):
         if not finite(data.setpoint[axis]):
             return i32(0)
@@ -78,7 +78,7 @@ def admits(parameters: Parameters, data: Input) -> i32:
 
 @kernel
 def follow(parameters: Parameters, data: Input) -> i32:
-    """Take the commander's set-point as the goal; returns what became of it, SETPOINT_POSITION when it is the goal now."""
+    """Make the commander's set-point the goal; return SETPOINT_POSITION, or why it is not the goal."""
     if data.setpoint_kind == SETPOINT_NONE:
         return i32(SETPOINT_NONE)
     if data.poses_absolute == 0:
@@ -101,7 +101,7 @@ def follow(parameters: Parameters, data: Input) -> i32:
 
 @kernel
 def valid_pose(data: Input) -> bool:
-    """Return whether the pose is made of sane numbers."""
+    """Return whether the pose's numbers are plausible."""
     length = ZERO
     for i in range(4):
         length = length + data.pose_quaternion[i] * data.pose_quaternion[i]
@@ -115,7 +115,7 @@ def valid_pose(data: Input) -> bool:
 
 @kernel
 def is_correction(data: Input) -> bool:
-    """Return whether the robot can be there from its goal."""
+    """Return whether the robot can be that far from its goal."""
     x = data.pose_position[0]
     y = data.pose_position[1]
     z = data.pose_position[2]
@@ -124,7 +124,7 @@ def is_correction(data: Input) -> bool:
 
 @kernel
 def become_goal(data: Input) -> None:
-    """Hold where the robot is."""
+    """Make the robot's pose the goal."""
     w = data.pose_quaternion[0]
     x = data.pose_quaternion[1]
     y = data.pose_quaternion[2]
@@ -138,7 +138,7 @@ def become_goal(data: Input) -> None:
 
 @kernel
 def turn_into_goal_frame(data: Input) -> None:
-    """Write the pose as it looks from the goal."""
+    """Turn the pose into the goal frame."""
     dx = data.pose_position[0] - data.goal[0]
     dy = data.pose_position[1] - data.goal[1]
     sine = sin(data.goal[3])
@@ -160,7 +160,7 @@ def turn_into_goal_frame(data: Input) -> None:
 
 @kernel
 def see_from_goal(data: Input, estimator: Estimator) -> i32:
-    """Turn the pose into the error that is left to the goal; returns POSE_ON_TIME, or what refuses it."""
+    """Turn the pose into the error to the goal; return POSE_ON_TIME, or why it is refused."""
     if not valid_pose(data):
         estimator.invalid = i32(estimator.invalid + 1)
         return i32(POSE_INVALID)
@@ -220,7 +220,7 @@ def report_quaternion(report: Report) -> None:
 
 @kernel
 def report_state(data: Input, estimator: Estimator, control: Control, report: Report) -> None:
-    """Write what the board reports of itself."""
+    """Write the board's report of its state."""
     report_motion(data, estimator, report)
     report_quaternion(report)
     for flap in range(4):

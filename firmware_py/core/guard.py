@@ -1,6 +1,6 @@
-"""The guard behind the user's own logic: only finite numbers get past it, and NaN or infinity is counted.
+"""The guard after the user's own logic: it passes finite numbers only, and counts NaN and infinity.
 
-The default core has no such logic and does without.
+The default core has no such logic and no guard.
 """
 
 from firmware_py.core import controller
@@ -37,7 +37,7 @@ def closed(data: Input) -> bool:
 
 @kernel
 def allocate(parameters: Parameters, control: Control) -> None:
-    """Write flap angles as the built-in law does, height last; an input u4 that is no number stays so, to be noticed."""
+    """Write flap angles as the built-in law does, height last; an input u4 that is not finite is kept, to be detected."""
     u4 = control.u[3]
     _allocate(parameters, control)
     if not finite(u4):
@@ -46,7 +46,7 @@ def allocate(parameters: Parameters, control: Control) -> None:
 
 @kernel
 def guard_control(parameters: Parameters, control: Control, guard: Guard) -> None:
-    """Let the law's flap angles pass, limited; when an angle or an input is no number, the flaps go to hover."""
+    """Limit the law's flap angles; when an angle or an input is not finite, set the flaps to hover."""
     sound = True
     for i in range(4):
         if not finite(control.flap[i]) or not finite(control.u[i]):
@@ -63,7 +63,7 @@ def guard_control(parameters: Parameters, control: Control, guard: Guard) -> Non
 
 @kernel
 def guard_estimate(estimator: Estimator, guard: Guard) -> None:
-    """Put zeros in place of an estimate that is no number: the controller sees none."""
+    """Replace an estimate that is not finite by zeros before the controller reads it."""
     sound = True
     for i in range(STATES):
         if not finite(estimator.now[i]):
@@ -75,7 +75,7 @@ def guard_estimate(estimator: Estimator, guard: Guard) -> None:
 
 @kernel
 def see_logic(supervisor: Supervisor, guard: Guard) -> None:
-    """Note which of the user's modules has returned NaN or infinity since the last look."""
+    """Note which of the user's modules has returned NaN or infinity since the last call."""
     if guard.estimator_faults > supervisor.estimator_faults:
         supervisor.not_finite = i32(CAUSE_ESTIMATOR_NOT_FINITE)
     elif guard.controller_faults > supervisor.controller_faults:

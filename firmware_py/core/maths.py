@@ -2,7 +2,7 @@
 
 The sin, cos and atan kernels are the classic single-precision minimax polynomials (degree 7, 8 and 9 on a quarter or
 eighth turn) after Cody-Waite reduction; no libm is used because no two libms agree on all points. tanh is a rational
-function of degree 4 over 4 in the square, whose largest relative error on 0..9.02 linear programming has minimised.
+function of degree 4 over 4 in the square, fitted by linear programming for the least maximum relative error on 0..9.02.
 """
 
 from firmware_py.core.subset import Integer, f32, i32, kernel, sqrt
@@ -71,14 +71,14 @@ def quarter_turns(x: f32) -> i32:
 
 @kernel
 def sin_quarter(x: f32) -> f32:
-    """Sine for |x| <= pi/4."""
+    """Return sin x for |x| <= pi/4."""
     square = x * x
     return x + x * square * (SIN_3 + square * (SIN_5 + square * SIN_7))
 
 
 @kernel
 def cos_quarter(x: f32) -> f32:
-    """Cosine for |x| <= pi/4."""
+    """Return cos x for |x| <= pi/4."""
     square = x * x
     return ONE - HALF * square + square * square * (COS_4 + square * (COS_6 + square * COS_8))
 
@@ -92,7 +92,7 @@ def reduced(x: f32, turns: Integer) -> f32:
 
 @kernel
 def sine_ahead(angle: f32, quarters: Integer) -> f32:
-    """Sine of an angle [rad] plus that many quarter turns, 0 or 1."""
+    """Return the sine of an angle [rad] plus that many quarter turns, 0 or 1."""
     x = clamp(angle, -ANGLE_LIMIT, ANGLE_LIMIT)
     turns = quarter_turns(x)
     rest = reduced(x, turns)
@@ -108,19 +108,19 @@ def sine_ahead(angle: f32, quarters: Integer) -> f32:
 
 @kernel
 def sin(angle: f32) -> f32:
-    """Sine of an angle [rad]; angles beyond +-1000 rad saturate, NaN counts as -1000."""
+    """Return the sine of an angle [rad]; beyond +-1000 rad it saturates, NaN counts as -1000."""
     return sine_ahead(angle, 0)
 
 
 @kernel
 def cos(angle: f32) -> f32:
-    """Cosine of an angle [rad]; angles beyond +-1000 rad saturate, NaN counts as -1000."""
+    """Return the cosine of an angle [rad]; beyond +-1000 rad it saturates, NaN counts as -1000."""
     return sine_ahead(angle, 1)
 
 
 @kernel
 def atan_unit(x: f32) -> f32:
-    """Arc tangent for 0 <= x <= 1."""
+    """Return the arc tangent for 0 <= x <= 1."""
     base = ZERO
     y = x
     if x > TAN_EIGHTH:
@@ -132,7 +132,7 @@ def atan_unit(x: f32) -> f32:
 
 @kernel
 def atan2(y: f32, x: f32) -> f32:
-    """Angle of the vector (x, y) [rad] in [-pi, pi]; 0 for the zero vector and for NaN."""
+    """Return the angle of (x, y) [rad] in [-pi, pi]; 0 for the zero vector and for NaN."""
     high = abs(x)
     low = abs(y)
     steep = low > high
@@ -153,7 +153,7 @@ def atan2(y: f32, x: f32) -> f32:
 
 @kernel
 def asin(x: f32) -> f32:
-    """Arc sine [rad]; arguments outside [-1, 1] saturate."""
+    """Return the arc sine [rad]; arguments outside [-1, 1] saturate."""
     y = clamp(x, -ONE, ONE)
     return atan2(y, sqrt((ONE - y) * (ONE + y)))
 
@@ -168,7 +168,7 @@ def wrap(angle: f32) -> f32:
 
 @kernel
 def tanh(x: f32) -> f32:
-    """Hyperbolic tangent, within 4e-7 of the exact one and inside [-1, 1]; NaN stays NaN."""
+    """Return tanh x, within 4e-7 of the exact one and inside [-1, 1]; NaN stays NaN."""
     if x > TANH_LIMIT:
         return ONE
     if x < -TANH_LIMIT:

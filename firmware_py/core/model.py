@@ -17,7 +17,7 @@ QUARTER = f32(0.25)
 
 @kernel
 def derivative(parameters: Parameters, sine: f32, cosine: f32, x: F32s, dx: F32s) -> None:
-    """Write A x into dx; sine and cosine are those of the yaw at which the model is taken."""
+    """Write A x into dx; sine and cosine are of the yaw at which the model is taken."""
     vx = cosine * x[VELOCITY] + sine * x[VELOCITY + 1]
     vy = cosine * x[VELOCITY + 1] - sine * x[VELOCITY]
     roll = x[ATTITUDE]
@@ -58,7 +58,7 @@ def derivative(parameters: Parameters, sine: f32, cosine: f32, x: F32s, dx: F32s
 
 @kernel
 def add_series(parameters: Parameters, sine: f32, cosine: f32, x: F32s, first: F32s, other: F32s) -> None:
-    """Add dt f + dt^2/2 A f + dt^3/6 A^2 f to x, where f is given in `first`; both work arrays are used up."""
+    """Add dt f + dt^2/2 A f + dt^3/6 A^2 f to x, where f is given in `first`; both work arrays are overwritten."""
     for i in range(STATES):
         x[i] = x[i] + DT * first[i]
     derivative(parameters, sine, cosine, first, other)
@@ -80,7 +80,7 @@ def advance_state(
     first: F32s,
     other: F32s,
 ) -> None:
-    """Bring a state vector one tick further under the flap command in that row of the history."""
+    """Advance a state vector by one tick under the flap command in that row of the history."""
     derivative(parameters, sine, cosine, x, first)
     for i in range(4):
         first[FLAP + i] = first[FLAP + i] + parameters.flap_rate * command[row, i]

@@ -1,6 +1,6 @@
-"""What a learned law sees and what its answer means: the one definition for training, laboratory and board.
+"""The observations and actions of a learned law, defined once for training, laboratory and board.
 
-An observation holds 20 numbers, in the heading frame (z up, x along the estimated yaw) where a direction is meant:
+An observation holds 20 numbers; directions are in the heading frame (z up, x along the estimated yaw):
 
     0..2    position error, goal minus estimate [m]; x and y limited to `limit_xy`, as in `controller.feedback`
     3..5    velocity [m/s]
@@ -50,7 +50,7 @@ def observe(parameters: Parameters, estimator: Estimator, previous: F32s, out: F
 
 @kernel
 def limited(x: f32, limit: f32) -> f32:
-    """Return x inside +-limit; NaN stays NaN, which the guard notices."""
+    """Return x inside +-limit; NaN stays NaN, which the guard detects."""
     if x > limit:
         return limit
     if x < -limit:
@@ -60,7 +60,7 @@ def limited(x: f32, limit: f32) -> f32:
 
 @kernel
 def act(parameters: Parameters, action: F32s, control: Control) -> None:
-    """Limit the action (4,) in place, and write the inputs u1..u4 [rad] that it means; the allocation follows."""
+    """Limit the action (4,) in place and write its inputs u1..u4 [rad]; the allocation follows."""
     for i in range(ACTIONS):
         action[i] = limited(action[i], ONE)
     control.u[0] = parameters.limit_u * action[0]

@@ -1,15 +1,15 @@
-"""A pose on its way to the estimator: how old it will be at the tick that takes it."""
+"""The age of a pose at the estimator tick that takes it."""
 
 from firmware_py.core.sampling import until_estimate_us
 from firmware_py.core.structs import Input, Sampling
 from firmware_py.core.subset import i32, kernel
 
-LONG_US = 1000000000  # longer than any limit: times are counted up to here
+LONG_US = 1000000000  # times saturate here, above every limit
 
 
 @kernel
 def waited_us(data: Input) -> i32:
-    """Return how long the pose has waited; a clock that was set back in between does not make it younger."""
+    """Return how long the pose has waited, 0 when the clock was set back meanwhile."""
     if data.pose_waited_us < 0:
         return i32(0)
     if data.pose_waited_us > LONG_US:
@@ -19,7 +19,7 @@ def waited_us(data: Input) -> i32:
 
 @kernel
 def age_at_tick(data: Input, sampling: Sampling) -> None:
-    """Put the age at the estimator's next tick in place of that at arrival; an unknown one stays unknown."""
+    """Replace the age at arrival by the age at the estimator's next tick; an unknown age stays unknown."""
     if data.pose_age_us < 0:
         return
     if data.pose_age_us > LONG_US:

@@ -1,9 +1,9 @@
-"""The delay predictor: poses wait for their instant, and the delayed state is brought to now.
+"""The delay predictor: it fuses poses at their own instant and predicts the delayed state to the present.
 
-A pose states its age. It is filed under the tick at which it was true and fused when the filter, which runs a horizon
-behind, arrives there. From the filter's state the linear model then steps to the present through the buffered commands,
-with the body rates replaced by the buffered gyro samples. When ages are measured, the horizon follows them: at once when
-a pose comes too late, one tick at a time when poses have been younger for a second. With the predictor off, every pose
+A pose carries its age. It is filed under the tick when it was measured and fused when the filter, which runs one horizon
+behind, reaches that tick. From the filter's state the linear model steps to the present with the buffered commands;
+the buffered gyro samples replace the body rates. When ages are measured, the horizon follows them: at once when
+a pose arrives too late, one tick at a time when poses have been younger for a second. With the predictor off, every pose
 counts as current and the filter runs without delay.
 """
 
@@ -45,7 +45,7 @@ def clamp_horizon(ticks: Integer) -> i32:
 
 @kernel
 def reset(parameters: Parameters, estimator: Estimator) -> None:
-    """Start the estimator: no pose yet, certain of nothing, history empty, counters kept."""
+    """Start the estimator: no pose, initial covariance, empty history; the counters are kept."""
     for i in range(STATES):
         estimator.x[i] = ZERO
         estimator.now[i] = ZERO
@@ -66,7 +66,7 @@ def reset(parameters: Parameters, estimator: Estimator) -> None:
 
 @kernel
 def pose_into_history(parameters: Parameters, data: Input, estimator: Estimator) -> i32:
-    """File a valid pose under the coming tick minus its age; returns POSE_ON_TIME or POSE_TOO_OLD.
+    """File a valid pose under the coming tick minus its age; return POSE_ON_TIME or POSE_TOO_OLD.
 
     Call it before `estimate` of the tick that `pose_age_us` refers to.
     """
@@ -142,7 +142,7 @@ def follow_age(parameters: Parameters, estimator: Estimator) -> i32:
 
 @kernel
 def predict_now(parameters: Parameters, estimator: Estimator) -> None:
-    """Bring the filter's state to the present in `now`."""
+    """Predict the filter's state to the present, in `now`."""
     for i in range(STATES):
         estimator.now[i] = estimator.x[i]
     for step in range(estimator.tick - estimator.filtered_tick):

@@ -1,4 +1,4 @@
-"""The step of 1 kHz: which step runs estimator and controller, the samples of the gyro, the watch over it, and its zero."""
+"""The 1 kHz step: which steps run estimator and controller, the gyro's samples, its monitoring and its zero."""
 
 from firmware_py.core.maths import ZERO
 from firmware_py.core.structs import Input, Sampling
@@ -7,12 +7,12 @@ from firmware_py.core.subset import elapsed, f32, i32, kernel
 STEPS = 10  # of 1 ms in a tick: the controller runs in steps 0, 10, 20 ...
 BEFORE_ESTIMATOR = 1  # and the estimator in the steps before: 9, 19 ...
 STEP_US = 1000
-# Steps in which all three axes of the gyro stay the same, so that it counts as stale. A BMI088 at rest has the least
+# The gyro is stale after this many steps without a change on any axis. A BMI088 at rest has the least
 # noise: 0.014 deg/s/sqrt(Hz) (data sheet) over its 116 Hz, 0.16 deg/s rms, 2.6 counts of 16.4 per deg/s. Samples 3 ms apart
 # are independent; their difference of 3.7 counts rms rounds to 0 with a chance of 0.11, on three axes at once with
 # 0.0013. In 20 ms that has to happen six times in a row: 5e-18, once in 10 million years of samples at 1 kHz.
 STALE_STEPS = 20
-RECOVERY_STEPS = 100  # with new counts; the estimator has five poses in that time
+RECOVERY_STEPS = 100  # with new counts; the estimator gets five poses in that time
 WINDOW = 512  # samples, original firmware
 # [counts^2] 0.1 rad/s rms: more than sensor noise in the flow, less than a moving robot.
 VARIANCE_LIMIT = f32(10000.0)
@@ -20,7 +20,7 @@ VARIANCE_LIMIT = f32(10000.0)
 
 @kernel
 def watch_gyro(data: Input, sampling: Sampling) -> None:
-    """Notice a gyro whose counts stay the same: it is frozen, or its samples do not arrive."""
+    """Detect a gyro whose counts stay the same: it is frozen, or its samples do not arrive."""
     same = True
     for axis in range(3):
         if data.gyro[axis] != sampling.before[axis]:
@@ -39,7 +39,7 @@ def watch_gyro(data: Input, sampling: Sampling) -> None:
 
 @kernel
 def begin_step(data: Input, sampling: Sampling) -> i32:
-    """Begin a step; returns whether the controller runs in it. A step that is late does not move the next one."""
+    """Begin a step; return whether the controller runs in it. A late step does not delay the next one."""
     if data.gyro_again == 0:
         watch_gyro(data, sampling)
     passed = elapsed(data.tick, sampling.tick)
@@ -63,7 +63,7 @@ def until_estimate_us(sampling: Sampling) -> i32:
 
 @kernel
 def clear_samples(data: Input, sampling: Sampling) -> None:
-    """Begin a sum of samples behind the estimator's tick."""
+    """Start a new sum of samples after the estimator's tick."""
     sampling.estimate_due = i32(0)
     data.gyro_samples = i32(0)
     for axis in range(3):
@@ -72,10 +72,10 @@ def clear_samples(data: Input, sampling: Sampling) -> None:
 
 @kernel
 def seek_zero(data: Input, sampling: Sampling) -> i32:
-    """Take a sample into the window in which the gyro's zero is sought; returns whether it has been found.
+    """Add a sample to the window that measures the gyro's zero; return whether the zero is found.
 
-    A window in which the robot moved is thrown away and the next one begins. Squares are of differences from the window's
-    first sample, so that those of a still one are exact.
+    A window in which the robot moved is dropped and the next one begins. Squares are of differences from the window's
+    first sample, so they are exact while the robot is still.
     """
     for axis in range(3):
         if sampling.samples == 0:
@@ -106,7 +106,7 @@ def seek_zero(data: Input, sampling: Sampling) -> i32:
 
 @kernel
 def take_sample(data: Input, sampling: Sampling) -> i32:
-    """Take a sample of the gyro; returns whether the gyro's zero has been found with it."""
+    """Take a gyro sample; return whether it completes the search for the gyro's zero."""
     for axis in range(3):
         data.gyro_sum[axis] = i32(data.gyro_sum[axis] + data.gyro[axis])
     data.gyro_samples = i32(data.gyro_samples + 1)
@@ -117,7 +117,7 @@ def take_sample(data: Input, sampling: Sampling) -> i32:
 
 @kernel
 def forget_zero(data: Input, sampling: Sampling) -> None:
-    """Seek the gyro's zero anew: another one measures from now on."""
+    """Search for the gyro's zero again: another gyro measures from now on."""
     clear_samples(data, sampling)
     sampling.samples = i32(0)
     sampling.calibrated = i32(0)

@@ -21,18 +21,18 @@ HORIZON_LIMIT = 12  # ticks, 120 ms
 
 MODE_HOVER = 0  # flaps at the hover angles
 MODE_FLY = 1  # closed loop
-MODE_MANUAL = 2  # flap angles come from outside
+MODE_MANUAL = 2  # flap angles from outside
 
 EXCITE_OFF = 0
 EXCITE_MULTISINE = 1
 EXCITE_CHIRP = 2
 
 MANUAL_OFF = 0  # the controller moves the flaps, when the state allows it
-MANUAL_ANGLES = 1  # angles from outside, with or without poses, while a client is there to take them back
+MANUAL_ANGLES = 1  # angles from outside, with or without poses, while a client is connected
 MANUAL_HOVER = 2
 
 STATE_CALIBRATING = 0  # the gyro's zero is unknown: flaps at hover
-STATE_WAITING = 1  # no pose has come yet, or there is nothing to fly to: flaps at hover
+STATE_WAITING = 1  # no pose yet, or no target: flaps at hover
 STATE_FLYING = 2  # loop closed
 STATE_FAILSAFE = 3  # flaps at hover, see the cause
 
@@ -42,10 +42,10 @@ CAUSE_OUT_OF_BOUNDS = 2
 CAUSE_EMERGENCY_STOP = 3
 CAUSE_LOW_BATTERY = 4
 CAUSE_DISARMED = 5
-CAUSE_NO_CONTROL = 6  # no controller step came, or another controller runs
+CAUSE_NO_CONTROL = 6  # no controller step ran, or another controller runs
 CAUSE_CONTROLLER_NOT_FINITE = 7  # own logic returned NaN or infinity
 CAUSE_ESTIMATOR_NOT_FINITE = 8
-CAUSE_IMU_STALE = 9  # the gyro delivers nothing new
+CAUSE_IMU_STALE = 9  # the gyro's counts do not change
 
 REQUEST_STOP = 1  # until a request to recover
 REQUEST_LOCK = 2  # stop until the board reboots
@@ -57,22 +57,22 @@ REQUEST_FEED = 6  # the watchdog of the emergency stop
 POSE_ON_TIME = 0
 POSE_TOO_OLD = 1
 POSE_INVALID = 2
-POSE_NO_CORRECTION = 3  # the robot cannot be there from its goal
+POSE_NO_CORRECTION = 3  # too far from the goal
 
 GOAL_NONE = 0
-GOAL_OF_CORRECTIONS = 1  # in the frame that corrections are in
+GOAL_OF_CORRECTIONS = 1  # in the frame of the corrections
 GOAL_ABSOLUTE = 2  # in W
 
-SETPOINT_NONE = 0  # nothing is commanded, the goal stays
+SETPOINT_NONE = 0  # no command, the goal stays
 SETPOINT_POSITION = 1  # a position, perhaps with a yaw
 SETPOINT_OTHER = 2  # attitude, rates, velocity, thrust: not flown
 SETPOINT_OUTSIDE = 3  # a position outside the box
-SETPOINT_OF_CORRECTIONS = 4  # poses are corrections: who sends them has the goal
+SETPOINT_OF_CORRECTIONS = 4  # poses are corrections, whose sender has the goal
 
 
 # fmt: off
 class Parameters(Struct):
-    """What may be tuned: set at start from the profile, in flight by parameter messages."""
+    """Tunable parameters: set at start from the profile, in flight by parameter messages."""
 
     hover_angle: Annotated[f32, Settable(
         "allocation", "RandConsts.flapHoverAng", "rad", 0, 1.2, "opening at hover, theta_H")]
@@ -135,8 +135,8 @@ class Parameters(Struct):
         "predictor", "delayComp.horizon", "10 ms", 1, HORIZON_LIMIT, "first or fixed horizon, in ticks", type="U8")]
     default_age_us: Annotated[i32, Settable(
         "predictor", "delayComp.defaultAge", "us", 0, 120_000, "age of a pose that does not state it")]
-    # controller: proportional, integrator on z only; clients see the gains with the signs of the original, which counted the
-    # inputs of roll and pitch the other way (u1 = -c1, u2 = -c0)
+    # controller: proportional, integrator on z only; clients see the gains with the signs of the original, whose inputs of
+    # roll and pitch have the opposite signs (u1 = -c1, u2 = -c0)
     gain_y: Annotated[f32, Settable("controller", "extCtrl.y_P", "rad/m", -20, 20, "u1 per y error", scale=-1)]
     gain_vy: Annotated[f32, Settable("controller", "extCtrl.vy_P", "rad s/m", -20, 20, "u1 per -vy", scale=-1)]
     gain_roll: Annotated[f32, Settable("controller", "extCtrl.roll_P", "", -20, 20, "u1 per -roll", scale=-1)]
@@ -160,7 +160,7 @@ class Parameters(Struct):
     direction: Annotated[F32s, 4]  # +1 or -1
     # IMU
     gyro_scale: f32  # [rad/s per count]
-    # set-point in G, normally zero: the correction that arrives is already relative to the goal
+    # set-point in G, normally zero: a received correction is already relative to the goal
     target: Annotated[  # x, y, z, yaw
         F32s, 4,
         Settable("", "extCtrl.target_yaw", "rad", -3.141592653589793, 3.141592653589793, first=3, persistent=False),
@@ -191,16 +191,16 @@ class Parameters(Struct):
 
 
 class Input(Struct):
-    """What the tasks hand to the core; instants wrap."""
+    """The tasks' inputs to the core; instants wrap."""
 
     tick: i32  # [ms]
     now_us: i32
     gyro: Annotated[I32s, 3]  # [counts] the newest sample, sensor frame
-    gyro_again: i32  # 1: it is the last one again, because the next is late on a link
+    gyro_again: i32  # 1: repeats the last sample, because the next is late on a link
     gyro_sum: Annotated[I32s, 3]  # [counts] sum over the samples since the last tick, sensor frame
     gyro_samples: i32
     gyro_bias: Annotated[F32s, 3]  # [counts] the gyro's zero
-    # what poses over CRTP are
+    # the kind of poses over CRTP
     absolute: Annotated[
         i32,
         Settable(
@@ -215,17 +215,17 @@ class Input(Struct):
     ]
     poses_absolute: i32  # 1: the pose and the set-point are in W; 0: the pose is a correction
     pose_waited_us: i32  # since the pose's arrival
-    pose_position: Annotated[F32s, 3]  # [m] of B; as seen from the goal once it is filed
+    pose_position: Annotated[F32s, 3]  # [m] of B; in G once it is filed
     pose_quaternion: Annotated[F32s, 4]  # likewise, w x y z
     pose_age_us: i32  # at its arrival, then at the next tick; negative: unknown
     battery_mv: i32
-    connected: i32  # a client is there
-    idle: i32  # there is nothing to fly to
+    connected: i32  # a client is connected
+    idle: i32  # there is no target
     goal_kind: i32  # GOAL_...
     goal: Annotated[F32s, 4]  # x, y, z [m] and yaw [rad]
     goal_velocity: Annotated[F32s, 3]  # [m/s]
     setpoint_kind: i32  # SETPOINT_..., of the commander
-    setpoint: Annotated[F32s, 4]  # as the goal; a yaw of NaN leaves the goal's
+    setpoint: Annotated[F32s, 4]  # as the goal; a yaw of NaN keeps the goal's
     setpoint_velocity: Annotated[F32s, 3]
     request: i32  # REQUEST_...
     # MANUAL_...
@@ -239,7 +239,7 @@ class Input(Struct):
         4,
         Settable("", "extCtrl.m1 m2 m3 m4", "rad", -1.5707963267948966, 1.5707963267948966, persistent=False),
     ]
-    # or servo words, which win
+    # or servo words, which have priority
     by_words: Annotated[
         i32, Settable("", "", "", 0, 1, stock="motorPowerSet.enable", type="U8", persistent=False)
     ]
@@ -251,7 +251,7 @@ class Input(Struct):
 
 
 class Estimator(Struct):
-    """The delayed Kalman filter, its history, and the state that was brought to now."""
+    """The delayed Kalman filter, its history, and the state predicted to the present."""
 
     x: Annotated[F32s, 16]  # at `filtered_tick`
     P: Annotated[
@@ -278,13 +278,13 @@ class Estimator(Struct):
     gyro: Annotated[F32s, 32, 3]  # [rad/s] body rates
     command: Annotated[F32s, 32, 4]  # [rad] commanded deviation from hover that held from this tick on
     pose: Annotated[F32s, 32, 6]  # position [m] and attitude [rad] in G
-    pose_lag: Annotated[F32s, 32]  # [s] the pose was true this long before its tick
+    pose_lag: Annotated[F32s, 32]  # [s] the pose was measured this long before its tick
     pose_waiting: Annotated[I32s, 32]
     # a refused pose, kept to distinguish a jump of the goal from an outlier
     suspect: Annotated[F32s, 6]
     suspect_tick: i32
     suspect_waiting: i32
-    # counters, and what an observer wants to see with them
+    # counters and values for observers
     fused: Annotated[i32, Logged("", "kalman.fused", type="U32")]
     refused: Annotated[i32, Logged("", "kalman.refused", type="U32")]
     jumps: Annotated[i32, Logged("", "kalman.jumps", type="U32")]
@@ -295,7 +295,7 @@ class Estimator(Struct):
     # ticks by which the filter runs behind
     horizon: Annotated[i32, Logged("10 ms", "delayComp.horizon", type="U8")]
     pose_age_us: i32  # of the last pose that was accepted for fusion, at its tick
-    no_corrections: i32  # of the invalid poses, those that the robot cannot have from its goal
+    no_corrections: i32  # of the invalid poses, those too far from the goal
     # work space, no meaning between ticks
     work_1: Annotated[F32s, 16]
     work_2: Annotated[F32s, 16]
@@ -304,7 +304,7 @@ class Estimator(Struct):
 
 
 class Control(Struct):
-    """The controller's memory and what it put out last."""
+    """The controller's memory and its last output."""
 
     # u1 roll, u2 pitch, u3 yaw, u4 height
     u: Annotated[F32s, 4, Logged("rad", "controller.u1 u2 u3 u4")]
@@ -319,17 +319,17 @@ class Control(Struct):
 
 
 class Sampling(Struct):
-    """What the step of 1 kHz remembers: which step it is, the watch over the gyro, and the search for its zero."""
+    """The state of the 1 kHz step: its number, the gyro's monitoring, and the search for its zero."""
 
     tick: i32  # [ms] of the last step
     phase: i32  # its number, modulo the steps of a tick
-    estimate_due: i32  # the estimator's tick has come
+    estimate_due: i32  # the estimator's tick is due
     before: Annotated[I32s, 3]  # [counts] of the step before
     unchanged: i32  # steps
     recovering: i32  # steps until the gyro counts as alive again
-    first: Annotated[I32s, 3]  # [counts] of the window in which the zero is sought
+    first: Annotated[I32s, 3]  # [counts] of the window that measures the zero
     sums: Annotated[I32s, 3]  # [counts] of its samples
-    squares: Annotated[F32s, 3]  # [counts^2] of what its samples differ from the first
+    squares: Annotated[F32s, 3]  # [counts^2] of its samples' differences from the first
     samples: i32
     # of the last window
     variance: Annotated[F32s, 3, Logged("counts^2", stock="gyro.xVariance yVariance zVariance")]
@@ -338,7 +338,7 @@ class Sampling(Struct):
 
 
 class Supervisor(Struct):
-    """What decides whether the loop may be closed; times are as of the last look."""
+    """The supervisor's state; times are as of the last call of `supervise`."""
 
     state: Annotated[i32, Logged("", "supervisor.state", type="U8")]
     cause: Annotated[i32, Logged("", "supervisor.cause", type="U8")]
@@ -348,13 +348,13 @@ class Supervisor(Struct):
     locked: i32  # until a reboot
     battery_empty: i32
     not_finite: i32  # the cause, when own logic failed
-    lasting: i32  # the cause that neither poses nor arming end
-    ready: i32  # it would fly with poses and an IMU, whose failures end by themselves
-    flown: i32  # since the gyro's zero was last sought
+    lasting: i32  # the cause that neither poses nor arming clear
+    ready: i32  # would fly with poses and an IMU, whose failures clear by themselves
+    flown: i32  # since the last search for the gyro's zero
     aloft: i32  # the robot may be in the air, or its flaps are moved
-    led: i32  # it flies with absolute poses, to where a commander leads it
+    led: i32  # it flies with absolute poses to a commander's set-points
     begun: i32
-    now_us: i32  # of the last look
+    now_us: i32  # of the last call
     pose_seen: i32
     silent_us: i32  # since the last accepted pose
     low_us: i32  # since the battery's voltage was good
@@ -362,7 +362,7 @@ class Supervisor(Struct):
     watchdog_on: i32
     watchdog_us: i32  # since it was fed
     bounded: i32  # the estimator's counter
-    gap_us: i32  # in which a bounded step still belongs to the episode
+    gap_us: i32  # until a bounded step begins a new episode
     episode_us: i32  # since it began
     outside_us: i32  # until the state counts as inside its bounds again
     controller_faults: i32  # of own logic
@@ -370,7 +370,7 @@ class Supervisor(Struct):
 
 
 class Report(Struct):
-    """What the board reports of itself: the state in the frame of the poses, and how many of them it has taken."""
+    """The board's report: the state in the frame of the poses, and how many poses were received."""
 
     position: Annotated[
         F32s,

@@ -68,11 +68,11 @@ class Tunable:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Served:
-    """How clients see a field: under which names, from which of its elements on, and as which type on the wire."""
+    """How clients see a field: its names, its first element and its type on the wire."""
 
-    stock: str = ""  # names that the Crazyflie firmware has, too: an app in that firmware leaves them to it
+    stock: str = ""  # names that the Crazyflie firmware has, too: an app in that firmware omits them
     type: str = ""  # a name in `Scalar`; empty: F32 or I32, as in memory
-    first: int = 0  # the element of an array that the first name stands for, counted in memory
+    first: int = 0  # the array element of the first name, counted in memory
     step: int = 1  # from one name to the next
 
 
@@ -86,9 +86,9 @@ class Logged(Served):
 
 @dataclass(frozen=True, slots=True)
 class Settable(Served):
-    """Marks a field of the core as a parameter, within inclusive bounds: a profile states it, clients may set it.
+    """Marks a field of the core as a parameter, within inclusive bounds: a profile sets it, clients may change it.
 
-    `section` is the profile's, empty for what is zero at boot. In memory is `scale` times what a client sees.
+    `section` is the profile's, empty for fields that are zero at boot. Memory holds `scale` times the client's value.
     """
 
     section: str
@@ -99,12 +99,12 @@ class Settable(Served):
     meaning: str = ""
     key: str = ""  # in the section, for elements "one two three"; empty: the field's name
     scale: int = 1
-    shown: str = ""  # the unit that a client sees, where it is not the profile's
+    shown: str = ""  # the unit for clients, where it is not the profile's
     persistent: bool = True
 
 
 class Block(Generic[S_co]):
-    """The memory of one struct instance, of which `kind` is the class.
+    """The memory of one instance of the struct class `kind`.
 
     `memory` is a structured array of shape (1,), `fields` gives attribute access to it from outside the core, as if it
     were the struct (array fields are views), `arg` is what an entry kernel takes: the memory, or the fields when nothing
@@ -120,11 +120,11 @@ class Block(Generic[S_co]):
         self.arg = cast(Memory[S_co], [self.fields] if compiling.PLAIN else self.memory)
 
     def cell(self, name: str) -> memoryview:
-        """Return the memory of a number: `cell[0]` is it, in a fifth of the time that `fields` take."""
+        """Return the memory of a number: `cell[0]` reads it in a fifth of the time of `fields`."""
         return self.memory[name].data
 
     def bytes(self) -> bytes:
-        """Return the struct as the bytes that lie in memory."""
+        """Return the struct's bytes in memory."""
         return self.memory.tobytes()
 
 

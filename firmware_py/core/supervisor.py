@@ -1,6 +1,6 @@
 """The supervisor decides, before every step of the controller, whether the loop may be closed.
 
-Whatever forbids it leads to the same defined flap state, the hover angles. How it ends depends on the cause:
+Every cause against it sets the flaps to the hover angles. How it ends depends on the cause:
 
     imu stale       no new counts of the gyro for 20 ms: ends after 100 ms with new ones
     silence         no accepted pose for 500 ms (parameter): the next accepted pose ends it
@@ -10,10 +10,10 @@ Whatever forbids it leads to the same defined flap state, the hover angles. How 
     emergency stop  by request, or because a started emergency stop watchdog was not fed for 1 s: ends only with a reboot.
                     A stop that is not locked ends with a request to recover, too
     low battery     below the limit for 5 s: ends only with a request to recover when the voltage is back above it
-    no control      nobody has asked for the mode for 50 ms: ends when somebody does
+    no control      no controller asked for the mode for 50 ms: ends when one does
 
-Before the first pose, and while there is nothing to fly to, it waits. One outlier pose is refused by the estimator's gate
-and has no effect here. Times are counted from look to look, so that a clock that wraps does no harm.
+The supervisor waits before the first pose and while there is no target. The estimator's gate refuses a single outlier
+pose, which has no effect here. Times are summed from call to call, so that a clock that wraps does no harm.
 """
 
 from firmware_py.core.poses import LONG_US, waited_us
@@ -51,16 +51,16 @@ from firmware_py.core.subset import Integer, elapsed, i32, kernel
 
 WATCHDOG_US = 1000000  # Crazyflie firmware
 BATTERY_LOW_US = 5000000  # original firmware
-CONTROL_US = 50000  # without a look the controller stands still, or another one runs in its place
+CONTROL_US = 50000  # without a call the controller has stopped, or another one runs in its place
 EPISODE_GAP_US = 50000  # two bounded steps no further apart belong to one episode
 EPISODE_LIMIT_US = 200000
 BOUNDS_RECOVERY_US = 500000
-DOWN_US = 5000000  # disarmed or stopped for so long, the robot lies in the net or is held
+DOWN_US = 5000000  # a robot disarmed or stopped for so long lies in the net or is held
 
 
 @kernel
 def longer(time_us: Integer, by_us: Integer) -> i32:
-    """Return a time that has grown, up to the longest."""
+    """Return the sum of both times, saturated at `LONG_US`."""
     if time_us + by_us > LONG_US:
         return i32(LONG_US)
     return i32(time_us + by_us)
@@ -68,7 +68,7 @@ def longer(time_us: Integer, by_us: Integer) -> i32:
 
 @kernel
 def shorter(time_us: Integer, by_us: Integer) -> i32:
-    """Return a time that runs out; below 0 it is over."""
+    """Return the remaining time; below 0 it is over."""
     if time_us < by_us:
         return i32(-1)
     return i32(time_us - by_us)
@@ -76,7 +76,7 @@ def shorter(time_us: Integer, by_us: Integer) -> i32:
 
 @kernel
 def since_last_look(data: Input, supervisor: Supervisor) -> i32:
-    """Return by how much an instant is behind the last look, negative when it is before it."""
+    """Return the time since the last `supervise`, negative when the instant is before it."""
     if supervisor.begun == 0:
         return i32(0)
     time_us = elapsed(data.now_us, supervisor.now_us)
@@ -89,7 +89,7 @@ def since_last_look(data: Input, supervisor: Supervisor) -> i32:
 
 @kernel
 def pass_time(data: Input, supervisor: Supervisor) -> None:
-    """Let the time since the last look pass."""
+    """Advance all times to this instant."""
     by_us = since_last_look(data, supervisor)
     if by_us < 0:
         by_us = i32(0)
@@ -106,7 +106,7 @@ def pass_time(data: Input, supervisor: Supervisor) -> None:
 
 @kernel
 def watch_bounds(estimator: Estimator, supervisor: Supervisor) -> None:
-    """Notice when the estimator has been held at its bounds for too long."""
+    """Detect that the estimator has been held at its bounds for too long."""
     if estimator.bounded == supervisor.bounded:
         return
     supervisor.bounded = estimator.bounded
@@ -119,7 +119,7 @@ def watch_bounds(estimator: Estimator, supervisor: Supervisor) -> None:
 
 @kernel
 def watch_battery(parameters: Parameters, data: Input, supervisor: Supervisor) -> None:
-    """Notice a voltage that has been too low for too long."""
+    """Detect a voltage that has been too low for too long."""
     if data.battery_mv >= parameters.low_battery_mv:
         supervisor.low_us = i32(0)
     elif supervisor.low_us >= BATTERY_LOW_US:
@@ -128,7 +128,7 @@ def watch_battery(parameters: Parameters, data: Input, supervisor: Supervisor) -
 
 @kernel
 def lasting_cause(supervisor: Supervisor) -> i32:
-    """Return what neither poses nor arming end."""
+    """Return the cause that neither poses nor arming clear."""
     if supervisor.stopped != 0:
         return i32(CAUSE_EMERGENCY_STOP)
     if supervisor.not_finite != CAUSE_NONE:
@@ -140,7 +140,7 @@ def lasting_cause(supervisor: Supervisor) -> i32:
 
 @kernel
 def look_whether_ready(sampling: Sampling, supervisor: Supervisor) -> None:
-    """Note what lasts, and whether the robot would fly with poses and an IMU."""
+    """Note the lasting cause, and whether the robot would fly with poses and an IMU."""
     supervisor.lasting = lasting_cause(supervisor)
     supervisor.ready = i32(0)
     if sampling.calibrated != 0 and supervisor.armed != 0 and supervisor.lasting == CAUSE_NONE:
@@ -149,13 +149,13 @@ def look_whether_ready(sampling: Sampling, supervisor: Supervisor) -> None:
 
 @kernel
 def is_waiting(data: Input, supervisor: Supervisor) -> bool:
-    """Return whether there is no pose yet, or nothing to fly to."""
+    """Return whether there is no pose yet, or no target."""
     return bool(supervisor.pose_seen == 0 or data.idle != 0)
 
 
 @kernel
 def cause_of_failsafe(parameters: Parameters, data: Input, sampling: Sampling, supervisor: Supervisor) -> i32:
-    """Return what forbids to close the loop, `CAUSE_NONE` while that is only what the robot waits for."""
+    """Return the cause against closing the loop, `CAUSE_NONE` if the robot only waits."""
     if supervisor.lasting != CAUSE_NONE:
         return i32(supervisor.lasting)
     if supervisor.armed == 0:
@@ -185,7 +185,7 @@ def state_of(data: Input, sampling: Sampling, supervisor: Supervisor, cause: Int
 
 @kernel
 def mode_of(data: Input, supervisor: Supervisor) -> i32:
-    """Return the mode that follows from state, cause and who moves the flaps."""
+    """Return the mode for the state, the cause and the requested manual mode."""
     manual = data.manual_mode
     if data.by_words != 0:
         manual = i32(MANUAL_ANGLES)
@@ -194,7 +194,7 @@ def mode_of(data: Input, supervisor: Supervisor) -> i32:
     if manual == MANUAL_ANGLES:
         if data.connected != 0:
             return i32(MODE_MANUAL)
-        return i32(MODE_HOVER)  # nobody is there who could take the angles back
+        return i32(MODE_HOVER)  # no client could take the angles back
     if supervisor.state == STATE_FLYING:
         return i32(MODE_FLY)
     return i32(MODE_HOVER)
@@ -202,7 +202,7 @@ def mode_of(data: Input, supervisor: Supervisor) -> i32:
 
 @kernel
 def watch_rest(data: Input, supervisor: Supervisor) -> None:
-    """Notice who leads, and rest: the robot has not flown, or was taken out of the flight long enough to be down."""
+    """Note whether a commander leads, and whether the robot is down: it has not flown, or was stopped long enough."""
     if supervisor.state == STATE_FLYING:
         supervisor.flown = i32(1)
     if supervisor.armed != 0 and supervisor.stopped == 0:
@@ -219,7 +219,7 @@ def watch_rest(data: Input, supervisor: Supervisor) -> None:
 def supervise(
     parameters: Parameters, data: Input, estimator: Estimator, sampling: Sampling, supervisor: Supervisor
 ) -> i32:
-    """Decide the controller's mode at this instant; returns whether state or cause has changed. Call it every tick."""
+    """Decide the controller's mode at this instant; return whether state or cause has changed. Call it every tick."""
     pass_time(data, supervisor)
     watch_bounds(estimator, supervisor)
     watch_battery(parameters, data, supervisor)
@@ -241,14 +241,14 @@ def supervise(
 
 @kernel
 def see_pose(data: Input, supervisor: Supervisor) -> None:
-    """Note that a pose was accepted."""
+    """Note an accepted pose."""
     supervisor.pose_seen = i32(1)
     supervisor.silent_us = i32(waited_us(data) - since_last_look(data, supervisor))
 
 
 @kernel
 def recover(parameters: Parameters, data: Input, supervisor: Supervisor) -> i32:
-    """Leave what lasts: a stop that is not locked, logic that failed, and with a good voltage the low battery."""
+    """Clear what lasts: a stop that is not locked, logic that failed and, at a good voltage, the low battery."""
     supervisor.stopped = supervisor.locked
     supervisor.not_finite = i32(CAUSE_NONE)
     if data.battery_mv >= parameters.low_battery_mv:
@@ -261,7 +261,7 @@ def recover(parameters: Parameters, data: Input, supervisor: Supervisor) -> i32:
 
 @kernel
 def obey(parameters: Parameters, data: Input, supervisor: Supervisor) -> i32:
-    """Do what is requested; returns whether that was possible."""
+    """Execute a request; return whether that was possible."""
     if data.request == REQUEST_RECOVER:
         return recover(parameters, data, supervisor)
     if data.request == REQUEST_ARM and lasting_cause(supervisor) != CAUSE_NONE:
@@ -283,7 +283,7 @@ def obey(parameters: Parameters, data: Input, supervisor: Supervisor) -> i32:
 
 @kernel
 def serve(parameters: Parameters, data: Input, sampling: Sampling, supervisor: Supervisor) -> i32:
-    """Serve a request; returns whether it was obeyed."""
+    """Serve a request; return whether it was executed."""
     obeyed = obey(parameters, data, supervisor)
     look_whether_ready(sampling, supervisor)
     return obeyed
@@ -291,7 +291,7 @@ def serve(parameters: Parameters, data: Input, sampling: Sampling, supervisor: S
 
 @kernel
 def watch_control(data: Input, supervisor: Supervisor) -> i32:
-    """Notice that nobody asks for the mode any more; returns whether that is new. The next look says otherwise."""
+    """Detect that no controller has asked for the mode lately; return whether that is new. `supervise` clears it."""
     if supervisor.cause == CAUSE_NO_CONTROL or since_last_look(data, supervisor) < CONTROL_US:
         return i32(0)
     supervisor.state = i32(STATE_FAILSAFE)
@@ -301,6 +301,6 @@ def watch_control(data: Input, supervisor: Supervisor) -> i32:
 
 @kernel
 def begin_flight(supervisor: Supervisor) -> None:
-    """Forget the last flight: its poses, and that there was one."""
+    """Forget the last flight and its poses."""
     supervisor.pose_seen = i32(0)
     supervisor.flown = i32(0)
