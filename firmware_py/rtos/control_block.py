@@ -1,4 +1,4 @@
-"""What the scheduler knows of one task: its control block, data only."""
+"""The control block of a task: the scheduler's data about it."""
 
 from collections.abc import Generator
 from typing import Any, Final

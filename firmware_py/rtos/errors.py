@@ -8,7 +8,7 @@ class KernelError(FirmwareError):
 
 
 class TaskError(KernelError):
-    """A task raised; `task` and `time_us` say which and when, `__cause__` says what."""
+    """A task raised; `task` and `time_us` are which and when, `__cause__` is what."""
 
     def __init__(self, task: str, time_us: int, what: str) -> None:
         super().__init__(f"task {task} at {time_us / 1000:.3f} ms: {what}")

@@ -48,7 +48,7 @@ class Kernel(Scheduler):
         return task
 
     def occupy(self, name: str, taken_us: Callable[[], int]) -> None:
-        """Lets something outside take the processor at every tick, before all tasks, for as long as it says then."""
+        """Let something outside take the processor at every tick, before all tasks, for `taken_us()`."""
         self.create_task(name, MAX_PRIORITIES - 1, self._occupied, taken_us)
 
     def create_queue(self, length: int, name: str) -> Queue[T]:
@@ -97,7 +97,7 @@ class Kernel(Scheduler):
             self.record("IN", self.current.priority)
 
     def run_time_us(self, task: Task) -> int:
-        """Processor time that the task consumed up to now, between two runs; of the idle task what all others left."""
+        """Return the task's processor time so far, between two runs; for the idle task, what all others left."""
         return self.run_times_us()[self.tasks.index(task)]
 
     def run_times_us(self) -> list[int]:
@@ -125,11 +125,11 @@ class Kernel(Scheduler):
         return GO_ON
 
     def task_yield(self) -> Iterable[int]:
-        """Lets the next task of the same priority run."""
+        """Let the next task of the same priority run."""
         return SWITCH
 
     def yield_if_pending(self) -> Iterable[int]:
-        """Lets a task of higher priority run that a plain call woke: after callbacks, which cannot yield themselves."""
+        """Let a task of higher priority run that a plain call woke; use it after callbacks, which cannot yield."""
         return SWITCH if self._switch_pending and not self.suspended else GO_ON
 
     def delay(self, ticks: int) -> Iterable[int]:
@@ -176,25 +176,25 @@ class Kernel(Scheduler):
         return value
 
     def enter_critical(self) -> None:
-        """Keep the running task running and, until `exit_critical`, interrupts waiting.
+        """Block task switches and interrupts until `exit_critical`.
 
-        Hardware looks at `interrupts_off`. Ticks are caught up afterwards, where a real processor loses all but one.
+        Hardware checks `interrupts_off`. Ticks are caught up afterwards, where a real processor loses all but one.
         """
         self.suspend_all()
         self.interrupts_off = True
 
     def exit_critical(self) -> Iterable[int]:
-        """End `enter_critical`, which must not be nested; what pended happens now."""
+        """End `enter_critical`, which must not be nested; pending events happen now."""
         self.interrupts_off = False
         return self.resume_all()
 
     def suspend_all(self) -> None:
-        """Keep the running task running, ticks pend, until as many calls of `resume_all`."""
+        """Block task switches and defer ticks until as many calls of `resume_all`."""
         self.count_call()
         self.suspended += 1
 
     def resume_all(self) -> Iterable[int]:
-        """End the innermost `suspend_all`; after the outermost what pended happens now."""
+        """End the innermost `suspend_all`; after the outermost, pending events happen now."""
         if self.suspended == 0:
             raise KernelError("resume_all without suspend_all")
         self.suspended -= 1

@@ -1,7 +1,7 @@
 """Bounded queues: tasks send and receive with a timeout, interrupts send at once or not at all.
 
 A full queue drops the newest item once its timeout is over and counts it in `dropped`. Items are any object but None,
-which stands for "nothing came". Waiting tasks are served by priority, first come first served among equals.
+which means "nothing came". Waiting tasks are served by priority, first come first served among equals.
 """
 
 from collections import deque
@@ -147,7 +147,7 @@ class Queue(Generic[T]):
         return kernel.wake_first(self._senders) if self._senders else GO_ON
 
     def wait_for_item(self, wake_tick: int) -> None:
-        """Blocks the running task until an item comes or, unless negative, `wake_tick`; for the timer service."""
+        """Block the running task until an item comes or, unless negative, `wake_tick`; for the timer service."""
         self._kernel.check_may_wait()
         self._kernel.block(self._receivers, wake_tick)
 

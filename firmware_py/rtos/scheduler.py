@@ -23,7 +23,7 @@ GO_ON: Final[tuple[int, ...]] = ()  # ... and when the caller just continues
 FOREVER: Final = -1
 
 TICK_US: Final = 1000
-MAX_PRIORITIES: Final = 7  # the Crazyflie's six, 0 to 5, and one above them for what stands for interrupts
+MAX_PRIORITIES: Final = 7  # the Crazyflie's six, 0 to 5, and one above them for simulated interrupts
 # Calls of the kernel, or switches, at one instant after which the running task counts as stuck. The most that a task
 # of the firmware needs is 25.
 STUCK_CALLS: Final = 10_000
@@ -72,9 +72,9 @@ class Scheduler:
         self._until_us = 0  # how far `run` goes
 
     def run(self, now_us: int, until_us: int = 0) -> None:
-        """Do all that falls due up to and including `now_us`, until every task waits or works.
+        """Do all that is due up to and including `now_us`, until every task waits or works.
 
-        Then it goes on by itself up to and including `until_us`, where that is later. Hardware that a task sets going may
+        Then it goes on by itself up to and including `until_us`, where that is later. Hardware that a task starts may
         `stop_before` an instant meanwhile: then the run ends there.
         """
         if not self._started:
@@ -102,18 +102,18 @@ class Scheduler:
             self.now_us = self._until_us
 
     def stop_before(self, now_us: int) -> None:
-        """Lets the present run go no further than to just before an instant, at which hardware acts first."""
+        """End the present run just before an instant at which hardware acts first."""
         if now_us <= self._until_us:
             self._until_us = now_us - 1
 
     def set_trace(self, trace: Trace | None) -> None:
-        """Begins or ends tracing, between two runs; the tasks notice nothing of it."""
+        """Begin or end tracing, between two runs; the tasks are not affected."""
         self.trace = trace
 
     def advance(self, now_us: int) -> None:
         """Set the clock before the interrupts of `now_us` are raised, so that they are recorded at the right time.
 
-        Without it their traces and the tasks' response times are too early. Nothing may fall due before `now_us`.
+        Without it their traces and the tasks' response times are too early. Nothing may be due before `now_us`.
         """
         if now_us < self.now_us or (self.next_wake_us is not None and now_us > self.next_wake_us):
             raise KernelError(f"advance({now_us}): outside {self.now_us}..{self.next_wake_us}")
@@ -157,7 +157,7 @@ class Scheduler:
         return FOREVER if timeout < 0 else self.tick_count + timeout
 
     def wait_in(self, waiters: list[ControlBlock], deadline: int, call: str, number: int) -> bool:
-        """Blocks the running task among `waiters` of an object; False when the `deadline` of its `call` has come."""
+        """Block the running task among `waiters` of an object; False when the `deadline` of its `call` has come."""
         if 0 <= deadline <= self.tick_count:
             self.failed(call + "_FAIL", number)
             return False
@@ -235,7 +235,7 @@ class Scheduler:
             self._ready_bits ^= task.ready_bit
 
     def wake_first(self, waiters: list[ControlBlock]) -> Iterable[int]:
-        """Wakes the first of them; returns what the plain call that did it returns."""
+        """Wake the first waiter; return the plain call's result."""
         if self.wake(waiters.pop(0)) and self.preemption:
             self._switch_pending = True
             return SWITCH
@@ -262,17 +262,17 @@ class Scheduler:
             self._switch_pending = True
 
     def leave_tasks(self) -> None:
-        """From here on interrupts may come, and calls of tasks may not."""
+        """Allow interrupts and no calls of tasks from here on."""
         self.context = IN_INTERRUPT
         self._calls = STUCK_CALLS
 
     def record(self, event: str, a: int = 0, b: int = 0) -> None:
-        """Traces what the running task does; only with a trace."""
+        """Trace what the running task does; only with a trace."""
         assert self.trace is not None
         self.trace(self.now_us, event, self.current.name, a, b)
 
     def failed(self, event: str, a: int) -> None:
-        """Traces a call that came to nothing, and counts it."""
+        """Trace and count a call that failed."""
         if self.trace is not None:
             self.record(event, a)
         self.count_call()
@@ -395,7 +395,7 @@ class Scheduler:
         return task
 
     def _set_next_wake(self, task: ControlBlock) -> None:
-        """Works out when the running task's work ends or a tick may let another one run."""
+        """Work out when the running task's work ends or a tick may let another one run."""
         wake_us: int | None = None
         if self.trace is not None or (len(task.ring) > 2 and self.preemption):
             wake_us = self._next_tick_us
@@ -416,7 +416,7 @@ class Scheduler:
         return 0
 
     def _idle_task(self) -> Generator[int, None, None]:
-        """Lets others of priority 0 run, then sleeps until the next interrupt, like the Crazyflie's idle hook."""
+        """Let others of priority 0 run, then sleep until the next interrupt, like the Crazyflie's idle hook."""
         while True:
             if not self.preemption or len(self.rings[0]) > 2:
                 self._idle_slept = False

@@ -29,7 +29,7 @@ class Semaphore:
         self.number = 0  # how the trace calls it
 
     def take(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
-        """Lowers the count by one, waiting up to `timeout` ticks until it is above zero; False when it never was."""
+        """Lower the count by one, waiting up to `timeout` ticks until it is above zero; False when it never was."""
         kernel = self._kernel
         if timeout and kernel.suspended:
             kernel.check_may_wait()
@@ -114,7 +114,7 @@ class Mutex:
             kernel.record("Q_SEND", self.number)
 
     def take(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
-        """Becomes the holder, waiting up to `timeout` ticks while another task is; False when time ran out."""
+        """Become the holder, waiting up to `timeout` ticks while another task is; False when time ran out."""
         kernel = self._kernel
         if timeout and kernel.suspended:
             kernel.check_may_wait()
@@ -188,7 +188,7 @@ class Mutex:
         return True
 
     def _lower_after_timeout(self, holder: ControlBlock) -> None:
-        """Take back what a waiter lent that gave up; a holder of several mutexes keeps it until it gives them."""
+        """Take back a timed-out waiter's priority; a holder of several mutexes keeps it until it gives them."""
         priority = holder.base_priority
         if self._takers and self._takers[0].event_priority > priority:
             priority = self._takers[0].event_priority

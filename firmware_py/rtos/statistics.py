@@ -22,11 +22,11 @@ class ProcessorLoad:
     def __init__(self, kernel: Kernel, least_us: int = 1) -> None:
         self._kernel = kernel
         self._least_us = least_us
-        self._us = self._work_us = 0  # instant and processor time when it was looked at last
+        self._us = self._work_us = 0  # instant and processor time of the last reading
         self._share = 0.0
 
     def __call__(self) -> float:
-        """Return it."""
+        """Return the share."""
         passed_us = self._kernel.now_us - self._us
         if passed_us >= self._least_us:
             busy = (task for task in self._kernel.tasks if task.name != "IDLE")
@@ -43,7 +43,7 @@ class TaskReport:
     name: str
     priority: int
     run_time_us: int
-    activations: int  # those that are over
+    activations: int  # those that have ended
     worst_response_us: int
     worst_latency_us: int
     # (12,) activations by start latency, class i is below LATENCY_BOUNDS_US[i].
@@ -53,7 +53,7 @@ class TaskReport:
 
 
 class Statistics:
-    """Looks at all tasks that exist when it is made."""
+    """Reports on all tasks that exist when it is made."""
 
     def __init__(self, kernel: Kernel, deadlines_us: Mapping[str, int]) -> None:
         """`deadlines_us` holds the deadlines by name of the task [us]; raises KernelError for an unknown name."""

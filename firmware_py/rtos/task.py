@@ -70,7 +70,7 @@ class Task(ControlBlock):
         return SWITCH if self is kernel.current else GO_ON
 
     def resume(self) -> Iterable[int]:
-        """Lets a suspended task go on; a task that waits, and is not suspended, keeps waiting.
+        """Resume a suspended task; a task that waits, and is not suspended, keeps waiting.
 
         As in V10.4.1 a task that waits for a notification without timeout counts as suspended.
         """

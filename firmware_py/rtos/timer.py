@@ -1,7 +1,7 @@
-"""Software timers: a service task runs their callbacks and obeys the commands in its queue.
+"""Software timers: a service task runs their callbacks and executes the commands in its queue.
 
-Starting, stopping or resetting a timer sends a command; it takes effect when the service task gets to it. The tick at
-which a command was given counts, not the tick at which it was obeyed.
+Starting, stopping or resetting a timer sends a command; it takes effect when the service task gets to it. The tick of
+the command counts, not the tick of its execution.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Timer:
         self.active = False  # whether the service task waits for it
 
     def start(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
-        """Expires one period from now, also when it was running already."""
+        """Expire one period from now, also when it was running already."""
         return self._service.send(START, self, self._service.kernel.tick_count, timeout)
 
     def reset(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
@@ -55,7 +55,7 @@ class Timer:
         return self._service.send(STOP, self, 0, timeout)
 
     def change_period(self, period_ticks: int, timeout: int = FOREVER) -> Generator[int, None, bool]:
-        """Expires one new period after the service task obeys, also when the timer was dormant."""
+        """Expire one new period after the service task executes this, also when the timer was dormant."""
         _check_period(self.name, period_ticks)
         return self._service.send(CHANGE_PERIOD, self, period_ticks, timeout)
 
@@ -81,7 +81,7 @@ class TimerService:
         self._running: list[Timer] = []
 
     def send(self, number: int, timer: Timer, value: int, timeout: int) -> Generator[int, None, bool]:
-        """Queues a command from the running task, without waiting while the scheduler is suspended."""
+        """Queue a command from the running task, without waiting while the scheduler is suspended."""
         if self.kernel.suspended:
             timeout = 0
         sent = yield from self.commands.send(_Command(number, timer, value), timeout)
@@ -139,14 +139,14 @@ class TimerService:
             yield from self._reload(timer, command.value + timer.period_ticks)
 
     def _reload(self, timer: Timer, start_tick: int) -> Generator[int, None, None]:
-        """Catches up with a period that is over already."""
+        """Catch up with a period that is over already."""
         if not (yield from self.send(RELOAD, timer, start_tick, 0)):
             raise KernelError(
                 f"timer {timer.name}: no place to reload it, {COMMAND_QUEUE_LENGTH} commands are waiting"
             )
 
     def _run_from(self, timer: Timer, start_tick: int, now: int) -> bool:
-        """Lets the timer run for one period from `start_tick`; False when that is already over."""
+        """Run the timer for one period from `start_tick`; False when that is already over."""
         expiry_tick = start_tick + timer.period_ticks
         if expiry_tick <= now:
             return False
