@@ -1,12 +1,12 @@
-"""What the pins of the board offer to the firmware: raw counts and bytes, nothing in SI."""
+"""The board's pins as the firmware sees them: raw counts and bytes, nothing in SI."""
 
 from collections.abc import Sequence
 from typing import Protocol
 
 from firmware_py.wire.mavlink_numbers import CommandResult
 
-# Gyro x y z, accelerometer x y z, int16, sensor frame. The six are passed on and not unpacked: code compiled by mypyc would
-# take a tuple of known length apart and put it together again at every hand.
+# Gyro x y z, accelerometer x y z, int16, sensor frame. The six stay packed: code compiled by mypyc would unpack and repack
+# a tuple of known length at every call.
 ImuCounts = tuple[int, ...]
 
 EEPROM_SIZE = 8192
@@ -45,7 +45,7 @@ class Board(Protocol):
         """Write a line to the debug console."""
 
     def reset(self) -> None:
-        """Reset the processor, as its own instruction does; EEPROM and deck memory keep what they have."""
+        """Reset the processor, as its own instruction does; EEPROM and deck memory keep their content."""
 
     def inject_failure(self, unit: int, failing: int, instance: int) -> CommandResult:
-        """Let a part of the robot fail, by MAVLink's numbers; hardware that cannot do that answers UNSUPPORTED."""
+        """Make a part of the robot fail, by MAVLink's numbers; hardware that cannot do that answers UNSUPPORTED."""

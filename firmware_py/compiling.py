@@ -1,8 +1,8 @@
-"""Compilation by numba: IEEE arithmetic as it is written, kept on disk, and never older than its sources.
+"""Compilation by numba: strict IEEE arithmetic, kept on disk, never older than its sources.
 
-Without fast maths LLVM neither reorders nor fuses, so every processor computes the same bits. A call on memory that stays
-where it is (`bound`) is kept as machine code, which a later process loads without numba: that alone takes longer than a
-short flight. Every other call goes through numba's dispatcher and its own cache. Kept code counts for the content of all
+Without fast maths LLVM neither reorders nor fuses, so every processor computes the same bits. A call on memory that does not
+move (`bound`) is kept as machine code, which a later process loads without numba: loading numba takes longer than a
+short flight. Every other call goes through numba's dispatcher and its own cache. Kept code is valid for the content of all
 sources, wherever it lies (`__pycache__`, `NUMBA_CACHE_DIR`). Stale code is overwritten.
 """
 
@@ -37,7 +37,7 @@ ctypes.pythonapi.PyCFunction_NewEx.argtypes = (ctypes.c_void_p, ctypes.py_object
 
 
 def compiler(*sources: Path) -> Callable[[Function], Function]:
-    """Return the decorator of functions that depend on nothing but `sources`, files or folders, and their own file."""
+    """Return the decorator for functions that depend only on `sources`, files or folders, and on their own file."""
     shared = hashlib.sha256(f"{np.__version__} {sys.version}".encode())
     for source in (Path(__file__), *sources, *_version_of_numba()):
         for path in sorted(source.glob("*.py")) if source.is_dir() else (source,):
@@ -49,7 +49,7 @@ def compiler(*sources: Path) -> Callable[[Function], Function]:
         stamp = shared.copy()
         stamp.update(
             function.__module__.encode()
-        )  # kept code names it: that of own logic has a hash of all its modules
+        )  # the kept code contains this name; own logic's has a hash of all its modules
         stamp.update(Path(inspect.getfile(function)).read_bytes())
         return cast(Function, Compiled(function, stamp.hexdigest()))
 
@@ -74,7 +74,7 @@ class Compiled:
 
     @cached_property
     def dispatcher(self) -> Any:
-        """Numba's dispatcher, whose cache follows all sources; numba itself looks at the function's file alone."""
+        """Numba's dispatcher, whose cache follows all sources; numba itself checks the function's file only."""
         dispatcher = _numba().njit(cache=True, error_model="numpy", fastmath=False)(self.__wrapped__)
         dispatcher._cache._cache_file._source_stamp = self.stamp
         return dispatcher
@@ -94,7 +94,7 @@ class Compiled:
 
 
 def bound(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-    """Return the call of a function on these arguments; where all are arrays, on their memory as it is then."""
+    """Return the call of a function on these arguments; where all are arrays, on their present memory."""
     if not isinstance(function, Compiled):
         return partial(function, *arguments)
     if not function.whole or not all(map(_stays, arguments)):
@@ -103,7 +103,7 @@ def bound(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
     if method is None:
         return partial(function.dispatcher, *arguments)
     places = struct.pack(f"{len(arguments)}P", *(one.ctypes.data for one in arguments))
-    # the last argument, which nothing reads, keeps the memory as long as the call
+    # the unused last argument keeps the memory alive as long as the call
     return cast(
         Callable[[], Any], ctypes.pythonapi.PyCFunction_NewEx(ctypes.byref(method), places, arguments)
     )
@@ -142,7 +142,7 @@ _LOADED: dict[tuple[str, str, str], tuple[_Method, Any]] = {}  # with what holds
 
 
 def _kept(function: Compiled, arguments: tuple[NDArray[Any], ...]) -> _Method | None:
-    """Return the machine code of a function on arrays of the kinds of these; None where it needs numba."""
+    """Return a function's machine code for arrays of these kinds; None where it needs numba."""
     kinds = [(one.dtype.str, one.shape) for one in arguments]
     digest = hashlib.sha256(f"{kinds} {_processor()}".encode()).hexdigest()[:16]
     key = (function.__wrapped__.__module__, function.__name__, digest)
@@ -159,7 +159,7 @@ def _kept(function: Compiled, arguments: tuple[NDArray[Any], ...]) -> _Method | 
 
 
 def _keep(files: list[Path], content: bytes) -> None:
-    """Write kept code into the first folder that allows it, and remove what it replaces."""
+    """Write kept code into the first folder that allows it, and remove the code that it replaces."""
     for path in files:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -176,7 +176,7 @@ def _keep(files: list[Path], content: bytes) -> None:
 
 @cache
 def _processor() -> str:
-    """Return for which processor numba compiles: this one, unless the environment names another."""
+    """Return the processor that numba compiles for: this one, unless the environment names another."""
     from llvmlite import binding
 
     features = sorted(name for name, there in binding.get_host_cpu_features().items() if there)
@@ -219,7 +219,7 @@ def _machine_code(function: Compiled, arguments: tuple[NDArray[Any], ...]) -> by
 
 
 def _method_text(name: str, count: int) -> str:
-    """Return a method as LLVM's text; numba's function returns 0 unless it fails, and its answer through a pointer."""
+    """Return a method as LLVM's text; numba's function returns 0 unless it fails, and its result through a pointer."""
     lines = [
         f"declare i32 @{name}(ptr, ptr{', ptr' * count})",
         "declare ptr @PyBytes_AsString(ptr)",
@@ -251,7 +251,7 @@ def _method_text(name: str, count: int) -> str:
 
 
 def _load(function: str, content: bytes) -> tuple[_Method, Any]:
-    """Return the method in an object file, and what holds its machine code in memory."""
+    """Return the method in an object file, and the owner of its machine code."""
     from llvmlite import binding
 
     binding.initialize_native_target()

@@ -1,7 +1,7 @@
 """The constants that are flashed: one section per part of the flight core, filled from a profile.
 
-No value has a default here: a profile states them all, with their reasons. Units are SI, angles in radians. The keys of
-what clients may set, too, are declared at the fields of the core.
+No value has a default here: a profile sets them all, with their reasons. Units are SI, angles in radians. Keys that
+clients may set, too, are declared at the fields of the core.
 """
 
 from collections.abc import Callable
@@ -88,7 +88,7 @@ class AllocationConfig(Declared):
 
 @_declared("excitation")
 class ExcitationConfig(Declared):
-    """What is added to the inputs for identification, once `excite.signal` on board switches it on."""
+    """The signal added to the inputs for identification, once `excite.signal` on board switches it on."""
 
     signal: Literal["multisine", "chirp"] = Field(
         description="multisine: all inputs at once, each with lines of its own; chirp: one input"
@@ -96,7 +96,7 @@ class ExcitationConfig(Declared):
 
     @property
     def rms(self) -> tuple[float, float, float, float]:
-        """Of u1 to u4 [rad]."""
+        """The rms of u1 to u4 [rad]."""
         return (self.u1, self.u2, self.u3, self.u4)
 
 
@@ -116,7 +116,7 @@ class SupervisorConfig(Declared):
 
 @_declared("box")
 class BoxConfig(Declared):
-    """Where goals may be, an upright cylinder around home: further out a hover is not held."""
+    """Where goals may be, an upright cylinder around home: outside it the robot cannot hover."""
 
 
 Cost = Annotated[int, Field(ge=0, le=100_000)]
@@ -167,7 +167,7 @@ class StreamRates(Section):
 
 
 class MavlinkConfig(Section):
-    """The serial line: who the board is on it, and what it says there."""
+    """The serial line: the board's identity on it, and what it sends."""
 
     system: int = Field(ge=1, le=255, description="system id")
     component: int = Field(ge=1, le=255, description="component id")
@@ -208,7 +208,7 @@ class FirmwareConfig(Section):
     box: BoxConfig
     cpu: CpuConfig
     mavlink: MavlinkConfig
-    # The profile states only what it has of this section.
+    # A profile may set only a part of this section.
     logic: LogicConfig = Field(default_factory=LogicConfig)
 
 

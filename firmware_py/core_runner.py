@@ -23,7 +23,7 @@ class CoreRunner(Protocol):
     """Executes the core on the memory of `CoreBlocks`."""
 
     def call(self, name: str) -> int:
-        """Execute an entry point of `firmware_py.core.entry`; returns its answer, 0 when it has none."""
+        """Execute an entry point of `firmware_py.core.entry`; return its result, 0 when it has none."""
 
 
 @runtime_checkable
@@ -32,7 +32,7 @@ class CoreCosts(Protocol):
 
     @property
     def usage(self) -> Usage | None:
-        """What the core has taken so far."""
+        """The core's use of the board so far."""
 
     def estimate_us(self) -> int:
         """Return the processor time of the estimator's tick."""
@@ -45,9 +45,9 @@ RunnerFactory = Callable[["CoreBlocks"], CoreRunner]
 
 
 class CoreBlocks:
-    """The memory of the flight core, as the tasks share it: each block has one writer but the parameters.
+    """The flight core's memory, shared by the tasks: each block but the parameters has one writer.
 
-    `named` has all blocks in their order, those of own logic last; `calls` says which of them each entry point takes.
+    `named` has all blocks in their order, those of own logic last; `calls` lists the blocks of each entry point.
     """
 
     __slots__ = (
@@ -88,7 +88,7 @@ class CoreBlocks:
 
     @property
     def inputs(self) -> frozenset[str]:
-        """The blocks that others than the core write, too."""
+        """The blocks that code outside the core writes, too."""
         return frozenset(
             name for name in self.named if name in ("parameters", "data") or name.endswith("_own")
         )
@@ -121,7 +121,7 @@ class _Calls(dict[str, Callable[[], Any]]):
 
 
 class ConfiguredCosts:
-    """What the profile states."""
+    """The costs in the profile."""
 
     __slots__ = ("_cpu",)
     usage: ClassVar[None] = None

@@ -2,7 +2,7 @@
 
 The C library has separate code for processors with fused multiply-add, and the last bits differ; so has numpy. These power
 series come within 5 units in the last place. `sine_ahead`, `exp` and `atan2` can be compiled, with the same bits: they call
-nothing of ours. The flight core has float32 functions of its own.
+none of our functions. The flight core has its own float32 functions.
 """
 
 from math import copysign, factorial, floor, frexp, inf, ldexp, pi, sqrt
@@ -17,7 +17,7 @@ LOG_2_LOW = float.fromhex("0x1.a39ef35793c76p-33")
 EXP_MIN, EXP_MAX = -746.0, 710.0  # beyond, the result is 0 or infinite
 SQRT_HALF = sqrt(0.5)
 
-# Taylor coefficients, those of the highest powers first, as many as change anything where the series are used
+# Taylor coefficients, the highest powers first, as many as affect the result where the series are used
 SIN = tuple((-1.0) ** k / factorial(2 * k + 1) for k in range(8, 0, -1))  # x^17 to x^3
 COS = tuple((-1.0) ** k / factorial(2 * k) for k in range(8, 1, -1))  # x^16 to x^4
 EXP = tuple(1.0 / factorial(k) for k in range(14, 1, -1))  # x^14 to x^2
@@ -26,7 +26,7 @@ ATANH = tuple(1.0 / (2 * k + 1) for k in range(11, 0, -1))  # x^23 to x^3
 
 
 def sine_ahead(angle: float, quarters: int) -> float:
-    """Sine of an angle [rad], exact up to a million, plus that many quarter turns."""
+    """Return the sine of an angle [rad], exact up to a million, plus that many quarter turns."""
     turns = floor(angle * QUARTERS_PER_RADIAN + 0.5)
     x = ((angle - turns * QUARTER_1) - turns * QUARTER_2) - turns * QUARTER_3
     square = x * x
@@ -44,22 +44,22 @@ def sine_ahead(angle: float, quarters: int) -> float:
 
 
 def sin(angle: float) -> float:
-    """Sine of an angle [rad]."""
+    """Return the sine of an angle [rad]."""
     return sine_ahead(angle, 0)
 
 
 def cos(angle: float) -> float:
-    """Cosine of an angle [rad]."""
+    """Return the cosine of an angle [rad]."""
     return sine_ahead(angle, 1)
 
 
 def tan(angle: float) -> float:
-    """Tangent of an angle [rad]."""
+    """Return the tangent of an angle [rad]."""
     return sin(angle) / cos(angle)
 
 
 def exp(x: float) -> float:
-    """Exponential function; 0 or infinity beyond the range of a double."""
+    """Return e^x; 0 or infinity beyond the range of a double."""
     if x < EXP_MIN:
         return 0.0
     if x > EXP_MAX:
@@ -73,7 +73,7 @@ def exp(x: float) -> float:
 
 
 def log_1p(x: float) -> float:
-    """Logarithm of 1 + x, also for x near 0; x > -1."""
+    """Return the logarithm of 1 + x, also for x near 0; x > -1."""
     if abs(x) < 0.25:
         doublings, s = 0, x / (2.0 + x)
     else:
@@ -88,7 +88,7 @@ def log_1p(x: float) -> float:
 
 
 def atan2(y: float, x: float) -> float:
-    """Angle of the vector (x, y) [rad] in -pi..pi, with the sign of y; 0 for the zero vector."""
+    """Return the angle of (x, y) [rad] in -pi..pi, with the sign of y; 0 for the zero vector."""
     high, low = max(abs(x), abs(y)), min(abs(x), abs(y))
     if high == 0.0:
         return 0.0
@@ -107,12 +107,12 @@ def atan2(y: float, x: float) -> float:
 
 
 def asin(x: float) -> float:
-    """Arc sine [rad] of x in -1..1."""
+    """Return the arc sine [rad] of x in -1..1."""
     return atan2(x, sqrt((1.0 - x) * (1.0 + x)))
 
 
 def power(base: float, exponent: int) -> float:
-    """`base` to the power of a non-negative integer."""
+    """Return `base` to the power of a non-negative integer."""
     result = 1.0
     while exponent:
         if exponent & 1:

@@ -1,4 +1,4 @@
-"""What to say when a package of one of the project's extras is missing."""
+"""The message for a missing package of one of the project's extras."""
 
 import shlex
 import sys

@@ -1,9 +1,9 @@
-"""Compiled modules: what `make fast` has built is imported in place of the sources, as long as they have not changed since.
+"""Compiled modules: imports use what `make fast` has built instead of the sources, until a source changes.
 
-`tools/fast.py` compiles the modules of the lockstep loop with mypyc. The results lie in `firmware_py/compiled/`, where
+`tools/fast.py` compiles the modules of the lockstep loop with mypyc. The results are in `firmware_py/compiled/`, where
 Python itself does not look, beside a record of their sources. A finder ahead of all others returns them
-while the record matches the present sources; when it does not, all modules are pure Python and `STALE` says why.
-They also are with FLOATY_PURE in the environment: under a debugger, and in tests that replace parts of a class.
+while the record matches the present sources; otherwise all modules are pure Python and `STALE` is the reason.
+FLOATY_PURE in the environment does the same: under a debugger, and in tests that replace parts of a class.
 """
 
 import hashlib
@@ -24,7 +24,7 @@ SWITCH = "FLOATY_PURE"
 
 
 class CompiledModules(MetaPathFinder):
-    """Finds modules by their full names in the files that were made of them."""
+    """Finds compiled modules by their full names."""
 
     def __init__(self, files: Mapping[str, Path]) -> None:
         self._files = files
@@ -45,7 +45,7 @@ def digest(source: Path) -> str:
 
 
 def usable(folder: Path = FOLDER, root: Path = ROOT) -> tuple[dict[str, Path], str]:
-    """Return the compiled modules by name, and, if there are some that cannot be used, why."""
+    """Return the compiled modules by name, and why they cannot be used, if they cannot."""
     if SWITCH in os.environ or not (folder / RECORD).is_file():
         return {}, ""
     record = json.loads((folder / RECORD).read_text(encoding="utf-8"))

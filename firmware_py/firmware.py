@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from firmware_py.links.mavlink_stack import MavlinkStack
 
 MEASUREMENT_QUEUE = 20  # original firmware
-# Of each activation: the work of the flight path in a tick is done before the next one.
+# Of each activation: a tick's work of the flight path ends before the next tick.
 DEADLINES_US = {
     "SENSORS": 1000,
     "STABILIZER": 1000,
@@ -59,8 +59,8 @@ DECK = (0xBC, 0xF1, "bcFloaty", "A")  # vendor, product, name, revision of the d
 class Firmware:
     """A booted board. `kernel`, `pilot`, `variables` and `parameters` may be read; `signals` are views on the core.
 
-    With `mavlink` the UART speaks MAVLink, which needs pymavlink. `runner` executes the flight core. Its clock is that of
-    who runs it, and it has its profile's constants: there is nothing to tell of either.
+    With `mavlink` the UART speaks MAVLink, which needs pymavlink. `runner` executes the flight core. The clock is the
+    caller's and the constants are the profile's, so both class variables are None.
     """
 
     clock_us: ClassVar[None] = None
@@ -184,7 +184,7 @@ class Firmware:
 
     @property
     def usage(self) -> Usage | None:
-        """What the flight core takes of the processor, where that is measured."""
+        """The flight core's use of the processor, where it is measured."""
         return self._core.run.usage if isinstance(self._core.run, CoreCosts) else None
 
     @property
@@ -197,27 +197,27 @@ class Firmware:
         return self.kernel.next_wake_us
 
     def imu_ready(self) -> None:
-        """Interrupt: the IMU has a new sample. While interrupts are off, samples pass unnoticed."""
+        """Signal a new sample of the IMU (interrupt). While interrupts are off, samples are missed."""
         if not self.kernel.interrupts_off:
             self._imu_ready.give_from_isr()
 
     def radio_received(self, data: bytes, broadcast: bool = False) -> None:
-        """Interrupt: the radio chip has a packet. While interrupts are off, packets are lost."""
+        """Take a packet from the radio chip (interrupt). While interrupts are off, packets are lost."""
         if not self.kernel.interrupts_off:
             self.link.received(data, broadcast)
 
     def radio_polled(self) -> None:
-        """Interrupt: the radio chip has an empty packet."""
+        """Note an empty packet at the radio chip (interrupt)."""
         if not self.kernel.interrupts_off:
             self.link.polled()
 
     def uart_ready(self) -> None:
-        """Interrupt: the UART has bytes. While interrupts are off, they stay where they are."""
+        """Signal bytes at the UART (interrupt). While interrupts are off, they stay in the UART."""
         if self.mavlink is not None and not self.kernel.interrupts_off:
             self.mavlink.uart_ready()
 
     def check_watchdog(self) -> None:
-        """Raise `WatchdogError` when the stabilizer has not run for too long; called by the hardware now and then."""
+        """Raise `WatchdogError` when the stabilizer has not run for too long; the hardware calls this now and then."""
         late_us = self.kernel.now_us - self._core.watchdog_fed_us
         if late_us > WATCHDOG_US:
             text = f"watchdog reset, STABILIZER has not run for {late_us / 1000:.0f} ms and this task has the processor"
@@ -228,7 +228,7 @@ class Firmware:
         self.kernel.run(now_us)
 
     def _measured(self) -> tuple[Vector, Vector]:
-        """Return what the IMU measures now: rates [rad/s, B] and acceleration [g, B]."""
+        """Return the IMU's present measurement: rates [rad/s, B] and acceleration [g, B]."""
         counts = self._board.read_imu()
         return rates(counts, self._core.data.fields.gyro_bias.tolist()), acceleration(counts)
 
@@ -247,7 +247,7 @@ class Firmware:
 
 
 def _radio_settings(board: Board) -> RadioSettings:
-    """Return what the EEPROM says; a new or spoilt EEPROM gets the defaults first."""
+    """Return the settings in the EEPROM; a new or corrupt EEPROM gets the defaults first."""
     try:
         return decode_config(bytes(board.eeprom[:CONFIG_SIZE]))
     except WireError:

@@ -20,7 +20,7 @@ IDENTITY: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
 
 def multiply(q_AB: Quaternion, q_BC: Quaternion) -> Quaternion:
-    """`q_AC`: the rotation `q_BC` followed by `q_AB`."""
+    """Return `q_AC`: the rotation `q_BC` followed by `q_AB`."""
     aw, ax, ay, az = q_AB
     bw, bx, by, bz = q_BC
     return (
@@ -32,13 +32,13 @@ def multiply(q_AB: Quaternion, q_BC: Quaternion) -> Quaternion:
 
 
 def conjugate(q_AB: Quaternion) -> Quaternion:
-    """`q_BA`, the opposite rotation."""
+    """Return `q_BA`, the opposite rotation."""
     w, x, y, z = q_AB
     return (w, -x, -y, -z)
 
 
 def rotate(q_AB: Quaternion, v_B: Vector) -> Vector:
-    """`v_A`, the coordinates in A of the vector `v_B`."""
+    """Return `v_A`, the coordinates in A of the vector `v_B`."""
     w, x, y, z = q_AB
     a, b, c = v_B
     # v + 2 w (u x v) + 2 u x (u x v), u = (x, y, z)
@@ -49,17 +49,17 @@ def rotate(q_AB: Quaternion, v_B: Vector) -> Vector:
 
 
 def rotation_matrix(q_AB: Quaternion) -> NDArray[np.float64]:
-    """`R_AB`, (3, 3), with `v_A = R_AB @ v_B`."""
+    """Return `R_AB`, (3, 3), with `v_A = R_AB @ v_B`."""
     return np.array([rotate(q_AB, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]).T
 
 
 def yaw_quaternion(yaw: float) -> Quaternion:
-    """The rotation by `yaw` about z."""
+    """Return the rotation by `yaw` about z."""
     return (cos(0.5 * yaw), 0.0, 0.0, sin(0.5 * yaw))
 
 
 def from_euler_zyx(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """The attitude with these zyx angles."""
+    """Return the attitude with these zyx angles."""
     cr, sr = cos(0.5 * roll), sin(0.5 * roll)
     cp, sp = cos(0.5 * pitch), sin(0.5 * pitch)
     cy, sy = cos(0.5 * yaw), sin(0.5 * yaw)
@@ -72,7 +72,7 @@ def from_euler_zyx(roll: float, pitch: float, yaw: float) -> Quaternion:
 
 
 def to_euler_zyx(q: Quaternion) -> Vector:
-    """`(roll, pitch, yaw)`: roll and yaw in -pi..pi, pitch in -pi/2..pi/2 (where roll and yaw merge)."""
+    """Return `(roll, pitch, yaw)`: roll and yaw in -pi..pi, pitch in -pi/2..pi/2 (where roll and yaw merge)."""
     w, x, y, z = q
     return (
         atan2(2.0 * (w * x + y * z), w * w - x * x - y * y + z * z),
@@ -82,7 +82,7 @@ def to_euler_zyx(q: Quaternion) -> Vector:
 
 
 def in_goal_frame(p_WB: Vector, q_WB: Quaternion, p_WG: Vector, yaw: float) -> tuple[Vector, Quaternion]:
-    """`(p_GB, q_GB)`: a pose seen from the goal frame, which stands upright at `p_WG`, turned by `yaw` about z."""
+    """Return `(p_GB, q_GB)`: a pose in the goal frame, which is upright at `p_WG`, turned by `yaw` about z."""
     dx = p_WB[0] - p_WG[0]
     dy = p_WB[1] - p_WG[1]
     dz = p_WB[2] - p_WG[2]
@@ -92,7 +92,7 @@ def in_goal_frame(p_WB: Vector, q_WB: Quaternion, p_WG: Vector, yaw: float) -> t
 
 
 def euler_zyx_of(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`to_euler_zyx` for a whole flight: quaternions (N, 4) to roll, pitch, yaw (N, 3) [rad]."""
+    """Do `to_euler_zyx` for a whole flight: quaternions (N, 4) to roll, pitch, yaw (N, 3) [rad]."""
     w, x, y, z = q.T
     roll = np.arctan2(2.0 * (w * x + y * z), w * w - x * x - y * y + z * z)
     pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
@@ -101,6 +101,6 @@ def euler_zyx_of(q: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def wrap_angle(angle: float) -> float:
-    """The same direction in -pi..pi, pi itself included and -pi not."""
+    """Return the same direction in -pi..pi, pi itself included and -pi not."""
     wrapped = remainder(angle, tau)
     return pi if wrapped == -pi else wrapped

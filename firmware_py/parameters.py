@@ -1,4 +1,4 @@
-"""The parameters of the firmware: those of the table of variables, and what a running board has besides.
+"""The parameters of the firmware: those of the table of variables, and those of a running board only.
 
 Names are the Crazyflie's and the original Floaty's.
 """
@@ -44,7 +44,7 @@ def _declared(running: Running, declared: CoreParameter) -> Parameter:
 
 
 def _kalman(running: Running) -> Iterator[Parameter]:
-    """Noise of the estimator as deviations, and its reset, which reads 0 again at once."""
+    """Yield the estimator's noise as deviations, and its reset, which reads 0 again at once."""
     core = running.core
 
     def reset(value: float) -> None:
@@ -66,7 +66,7 @@ def _kalman(running: Running) -> Iterator[Parameter]:
 
 
 def _supervision(running: Running) -> Iterator[Parameter]:
-    """Failsafe. The stop of the Crazyflie firmware holds until a reboot, Floaty's own can be undone."""
+    """Yield the stops. That of the Crazyflie firmware holds until a reboot, Floaty's own can be undone."""
     supervisor = running.supervisor
 
     def lock(value: float) -> None:
@@ -95,7 +95,7 @@ ABSENT_DECKS = (
 
 
 def _identity() -> Iterator[Parameter]:
-    """What the board is; read only."""
+    """Yield the board's identity; read only."""
     for name, scalar, value in (
         ("system.selftestPassed", I8, 1),
         ("deck.bcFloaty", U8, 1),

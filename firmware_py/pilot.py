@@ -1,8 +1,8 @@
-"""Where to fly, as the high-level commander has it: the goal from which a pose is seen, and set-points for the core.
+"""The target of the high-level commander: the goal that a pose is compared with, and set-points for the core.
 
-Poses come in a frame X: corrections are in the goal frame of the ground station, absolute ones in that of the cameras.
-A pose is seen from the goal, which the planner moves in X, at the instant at which the pose was true. While the planner is
-idle, corrections are errors already (the goal is X's origin); with absolute poses there is nothing to fly to: the goal stays
+Poses are in a frame X: corrections in the goal frame of the ground station, absolute poses in that of the cameras.
+The planner moves the goal in X; a pose is compared with the goal at the instant when it was measured. While the planner
+is idle, corrections are errors already (the goal is X's origin); with absolute poses there is no target: the goal stays
 under the robot, and the supervisor keeps the flaps at hover.
 
 A pose travels as `Arrived` through the measurement queue, from the radio or the UART to the estimator.
@@ -22,7 +22,7 @@ from firmware_py.geometry import Vector, to_euler_zyx
 from firmware_py.planner import Path, PathPoint, Phase, Planner, stay
 from firmware_py.wire.crtp import Correction
 
-# When a pose arrived on board [us], the pose, whether it is absolute, and the goal at the instant at which it was true, in
+# Arrival of a pose on board [us], the pose, whether it is absolute, and the goal at the instant when it was measured, in
 # the frame of the pose; None: the goal is not known.
 Arrived = tuple[int, Correction, bool, PathPoint | None]
 
@@ -31,14 +31,14 @@ SETPOINT_SILENCE_US = 2_000_000  # Crazyflie firmware: COMMANDER_WDT_TIMEOUT_SHU
 
 
 class Pilot:
-    """`goal` is what the last pose was seen from, None for an unchanged correction."""
+    """`goal` is the one for the last pose, None for an unchanged correction."""
 
     def __init__(self, core: CoreBlocks) -> None:
         self.planner = Planner()
         self.goal: PathPoint | None = None
         self.here: PathPoint | None = None  # the last absolute pose
-        self.seen_us = -1  # when the last pose came
-        self._setpoint_us: int | None = None  # when the last set-point came, while they lead
+        self.seen_us = -1  # arrival of the last pose
+        self._setpoint_us: int | None = None  # arrival of the last set-point, while they lead
         self._core = core
 
     @property
@@ -47,7 +47,7 @@ class Pilot:
         return bool(self._core.data.fields.absolute)
 
     def flies(self, now_us: int) -> bool:
-        """Whether there is something to fly to; poses from links other than CRTP do not pass the pilot."""
+        """Return whether there is a target; poses from links other than CRTP do not pass the pilot."""
         idle = self.planner.phase(now_us) is Phase.IDLE
         return not (idle and self.here is not None and self.absolute)
 
@@ -57,11 +57,11 @@ class Pilot:
         return self._setpoint_us is not None
 
     def forsaken(self, now_us: int) -> bool:
-        """Whether set-points lead and have stopped arriving."""
+        """Return whether set-points lead and have stopped arriving."""
         return self._setpoint_us is not None and now_us - self._setpoint_us >= SETPOINT_SILENCE_US
 
     def judged(self, setpoint: tuple[Vector, float] | None, now_us: int) -> int:
-        """Return what becomes of a set-point, `SETPOINT_...`; None: it gives no position."""
+        """Return the outcome for a set-point, `SETPOINT_...`; None: it gives no position."""
         data = self._core.data.fields
         data.poses_absolute = i32(self.absolute)
         data.setpoint_kind = i32(SETPOINT_OTHER)
@@ -79,7 +79,7 @@ class Pilot:
         )
 
     def admits_place(self, place: Vector, goal: Vector | None, absolute: bool) -> bool:
-        """Return whether a place is in the box, or no further outside than a goal."""
+        """Return whether a place is in the box, or at most as far outside as a goal."""
         data = self._core.data.fields
         data.poses_absolute = i32(absolute)
         data.setpoint[:3] = place
@@ -97,7 +97,7 @@ class Pilot:
         self._setpoint_us = now_us
 
     def release(self) -> None:
-        """Note that no further set-points are promised; the last one stays in force."""
+        """Note that no further set-points will come; the last one stays in force."""
         self._setpoint_us = None
 
     def abort(self) -> None:
@@ -106,17 +106,17 @@ class Pilot:
         self._setpoint_us = None
 
     def begin(self, now_us: int) -> PathPoint | None:
-        """Where a new path begins: where the present one is, else where the robot is; None when that is not known."""
+        """Return the start of a new path: a point of the present path, else the robot's place; None when unknown."""
         if self.planner.phase(now_us) is not Phase.IDLE:
             return self.planner.at(now_us)
         return self.here if self.absolute else ORIGIN
 
     def frame(self, now_us: int) -> PathPoint | None:
-        """Where the origin of the estimate is in X now; None while they are the same."""
+        """Return the origin of the estimate in X now; None while they are the same."""
         return self.planner.at(now_us) if self.planner.phase(now_us) is not Phase.IDLE else self.goal
 
     def measured(self, pose: Correction, now_us: int) -> Arrived:
-        """Return a pose over CRTP that has just arrived with the goal from which it is seen."""
+        """Return a pose that has just arrived over CRTP, with its goal."""
         self.seen_us = now_us
         age_us = int(self._core.parameters.fields.default_age_us) if pose.age_us is None else pose.age_us
         if self.absolute:

@@ -1,7 +1,7 @@
 """The planner behind the high-level commander: from "take off", "go to" or a stored trajectory to goals over time.
 
-A path is a row of pieces, each a polynomial of 7th degree in time for x, y, z and yaw. Between two states of motion it is
-the one whose jerk vanishes at both ends. Positions in the frame of the external poses [m], angles in rad, times in seconds
+A path is a sequence of pieces, each a polynomial of 7th degree in time for x, y, z and yaw. Between two states of motion it
+is the one whose jerk is zero at both ends. Positions in the frame of the external poses [m], angles in rad, times in seconds
 from the beginning of the path. Only + - * / in a fixed order, and the functions of `elementary`: the same bits everywhere.
 Meaning of the commands: crazyflie-firmware 2a18fc29 (crtp_commander_high_level.c, planner.c).
 """
@@ -20,7 +20,7 @@ Coefficients = tuple[float, ...]  # ascending powers of the time in a piece
 
 @dataclass(frozen=True, slots=True)
 class PathPoint:
-    """Where the path is at an instant, and how it moves."""
+    """The position and motion of a path at an instant."""
 
     position: Vector
     yaw: float
@@ -31,7 +31,7 @@ class PathPoint:
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """Four polynomials that hold for a while."""
+    """Four polynomials and their duration."""
 
     duration: float
     axes: tuple[Coefficients, Coefficients, Coefficients, Coefficients]
@@ -49,11 +49,11 @@ class Path:
 
     @property
     def duration(self) -> float:
-        """How long it takes."""
+        """How long the path takes."""
         return sum(piece.duration for piece in self.pieces) * self.timescale
 
     def at(self, t: float) -> PathPoint:
-        """The motion at a time; before the beginning and after the end it rests there."""
+        """Return the motion at a time; the path rests before its beginning and after its end."""
         stands = not 0.0 <= t < self.duration
         t = min(max(t, 0.0), self.duration) / self.timescale
         if self.reverse:
@@ -99,12 +99,12 @@ class Path:
         )
 
     def _first(self) -> Vector:
-        """Where the pieces begin, or end when they are flown backwards."""
+        """Return where the pieces begin, or end when they are flown backwards."""
         t = sum(piece.duration for piece in self.pieces) if self.reverse else 0.0
         return _evaluate(*_find(self.pieces, t)).position
 
     def begun_at(self, position: Vector, yaw: float | None) -> "Path":
-        """The same path, moved so that it begins at a position and, if that is given, with a yaw."""
+        """Return the same path, moved to begin at a position and, if it is given, with a yaw."""
         begin = self.at(0.0)
         turn = 0.0 if yaw is None else wrap_angle(yaw - begin.yaw)
         shift = _sum(position, _scaled(begin.position, -1.0))
@@ -112,7 +112,7 @@ class Path:
 
 
 class Phase(IntEnum):
-    """What the planner does."""
+    """The planner's activity."""
 
     IDLE = auto()
     FLYING = auto()
@@ -128,17 +128,17 @@ class Planner:
         self._begin_us = 0
 
     def phase(self, now_us: int) -> Phase:
-        """The present phase; the end of a landing is the end of the flight."""
+        """Return the present phase; the end of a landing is the end of the flight."""
         if self._phase is Phase.LANDING and self._time(now_us) >= self._path.duration:
             self._phase = Phase.IDLE
         return self._phase
 
     def finished(self, now_us: int) -> bool:
-        """Whether nothing of the path is left."""
+        """Return whether the path is over."""
         return self.phase(now_us) is Phase.IDLE or self._time(now_us) >= self._path.duration
 
     def at(self, t_us: int) -> PathPoint:
-        """Where to be at an instant; only while it is not idle."""
+        """Return the goal at an instant; call it only while not idle."""
         return self._path.at(self._time(t_us))
 
     def stop(self) -> None:
@@ -155,13 +155,13 @@ class Planner:
 
 
 def stay(position: Vector, yaw: float) -> Path:
-    """At a position, without an end."""
+    """Return the endless path at a position."""
     x, y, z = position
     return Path((Piece(0.0, ((x,), (y,), (z,), (yaw,))),))
 
 
 def straight_up(begin: PathPoint, height: float, yaw: float, duration: float) -> Path:
-    """To a height above or below, from rest to rest, turning to a yaw on the shorter side."""
+    """Return the path to a height above or below, from rest to rest, turning the shorter way to a yaw."""
     x, y, _ = begin.position
     return between(
         PathPoint(begin.position, begin.yaw),
@@ -173,7 +173,7 @@ def straight_up(begin: PathPoint, height: float, yaw: float, duration: float) ->
 def go_to(
     begin: PathPoint, position: Vector, yaw: float, duration: float, relative: bool, linear: bool
 ) -> Path:
-    """From a motion to a position and a yaw: to rest, or in a straight line at constant speed."""
+    """Return the path from a motion to a position and a yaw: to rest, or straight at constant speed."""
     if relative:
         position, yaw = _sum(begin.position, position), begin.yaw + yaw
     turn = wrap_angle(yaw - begin.yaw)
@@ -187,7 +187,7 @@ def go_to(
 
 
 def between(begin: PathPoint, end: PathPoint, duration: float) -> Path:
-    """The one piece from one motion to another without jerk at its ends; without time for it, the end at once."""
+    """Return the piece between two motions with zero jerk at its ends; without time for it, the end at once."""
     if duration <= 0.0:
         axes = ((end.position[0],), (end.position[1],), (end.position[2],), (end.yaw,))
         return Path((Piece(0.0, axes),))
@@ -204,7 +204,7 @@ def between(begin: PathPoint, end: PathPoint, duration: float) -> Path:
 
 
 def bezier(points: Sequence[float], duration: float) -> Coefficients:
-    """The polynomial whose Bezier curve over a duration has these control points (1 to 8)."""
+    """Return the polynomial whose Bezier curve over a duration has these control points (1 to 8)."""
     n = len(points) - 1
     powers = []
     scale = 1.0
@@ -220,8 +220,8 @@ def bezier(points: Sequence[float], duration: float) -> Coefficients:
 def _connect(begin: Vector, end: Vector, duration: float) -> Coefficients:
     """Solve for the powers 4 to 7: value, first and second derivative at both ends are given, the third is 0 there.
 
-    In the share s of the duration: what is missing at s = 1 after the powers 0 to 2 is d; the inverse of the four
-    equations for position, velocity, acceleration and jerk at s = 1 stands here as numbers.
+    In the share s of the duration: d0 to d2 are the errors at s = 1 after the powers 0 to 2; the numbers are the
+    inverse of the four equations for position, velocity, acceleration and jerk at s = 1.
     """
     x0, v0, a0 = begin[0], begin[1] * duration, begin[2] * duration * duration
     x1, v1, a1 = end[0], end[1] * duration, end[2] * duration * duration
@@ -247,7 +247,7 @@ def _connect(begin: Vector, end: Vector, duration: float) -> Coefficients:
 
 
 def _find(pieces: Sequence[Piece], t: float) -> tuple[Piece, float]:
-    """The piece at a time, and the time in it."""
+    """Return the piece at a time, and the time in it."""
     for piece in pieces[:-1]:
         if t < piece.duration:
             return piece, t
@@ -261,7 +261,7 @@ def _evaluate(piece: Piece, t: float) -> PathPoint:
 
 
 def _derivatives(powers: Coefficients, t: float) -> Vector:
-    """Value, first and second derivative, by Horner's scheme."""
+    """Return value, first and second derivative, by Horner's scheme."""
     value = first = second = 0.0
     for coefficient in reversed(powers):
         second = second * t + 2.0 * first

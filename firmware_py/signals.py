@@ -14,11 +14,11 @@ COUNTERS = ("fused", "refused", "jumps", "too_old", "invalid", "bounded", "reset
 
 
 class SupervisorState(Protocol):
-    """What the supervisor shows."""
+    """The supervisor's output."""
 
     @property
     def state(self) -> State:
-        """What it does."""
+        """The present state."""
 
     @property
     def cause(self) -> Cause:
@@ -29,7 +29,7 @@ class SupervisorState(Protocol):
 class Signals:
     """Views that follow the flight core while it runs."""
 
-    estimate: NDArray[np.float32]  # (16,) state brought to now: p [m], v [m/s] in G; roll, pitch, yaw [rad];
+    estimate: NDArray[np.float32]  # (16,) present state: p [m], v [m/s] in G; roll, pitch, yaw [rad];
     #                                rates [rad/s]; flap deviations from hover [rad]
     counters: NDArray[np.int32]  # (9,) of the estimator, named by COUNTERS
     u: NDArray[np.float32]  # (4,) [rad] compound inputs

@@ -100,11 +100,11 @@ def stock_variables(running: Running) -> Iterator[LogVariable]:
     parameters = core.parameters.fields
 
     def along(axis: int) -> float:
-        """The target in the axes of the poses."""
+        """Return the target in the axes of the poses."""
         return _target(running)[0][axis]
 
     def across(axis: int) -> float:
-        """The target in axes that turn with the body's yaw."""
+        """Return the target in axes that turn with the body's yaw."""
         return rotate(yaw_quaternion(-running.core.report.fields.attitude.item(2)), _target(running)[0])[axis]
 
     for axis, name in enumerate("xyz"):
@@ -125,7 +125,7 @@ def stock_variables(running: Running) -> Iterator[LogVariable]:
 
 
 def _target(running: Running) -> tuple[Vector, float]:
-    """Where to fly in the frame of the poses, position and yaw."""
+    """Return the target in the frame of the poses, position and yaw."""
     frame = running.pilot.frame(running.stack.kernel.now_us)
     if frame is not None:
         return frame.position, frame.yaw
@@ -173,7 +173,7 @@ def stock_parameters(running: Running) -> Iterator[Parameter]:
 
 
 def _button(running: Running, name: str, lines: Callable[[Running], Iterable[str]]) -> Parameter:
-    """A parameter that prints lines on the console when it is set, and reads 0 again at once."""
+    """Return a parameter that prints lines on the console when it is set, and reads 0 again at once."""
 
     def press(value: float) -> None:
         if value:
@@ -184,7 +184,7 @@ def _button(running: Running, name: str, lines: Callable[[Running], Iterable[str
 
 
 def _task_lines(running: Running) -> Iterator[str]:
-    """The share of the processor's time that each task has used since boot."""
+    """Yield each task's share of the processor's time since boot."""
     kernel = running.stack.kernel
     yield "Task dump"
     yield "Load\tName"
@@ -193,7 +193,7 @@ def _task_lines(running: Running) -> Iterator[str]:
 
 
 def _storage_lines(running: Running) -> Iterator[str]:
-    """How full the parameters' memory is."""
+    """Yield how full the parameters' memory is."""
     used, size, items = running.storage.used, running.storage.size, len(running.storage.load())
     yield f"Used storage: {items} items stored, {used} of {size} bytes ({100 * used // size} %)"
 

@@ -1,7 +1,7 @@
 """The supervisor of the flight core, as the rest of the firmware sees it: requests go in, state and cause come out.
 
 The rules are in `firmware_py/core/supervisor.py`. A change of state or cause is announced once on the console; both
-are log variables (`supervisor.state`, `supervisor.cause`). Set-points that fall silent for 2 s stop the robot until a
+are log variables (`supervisor.state`, `supervisor.cause`). Set-points that stop for 2 s stop the robot until a
 reboot, as on the Crazyflie. The board arms itself at boot.
 """
 
@@ -31,7 +31,7 @@ class CoreSupervisor:
         self._sampling, self._parameters = core.sampling.fields, core.parameters.fields
         self._announce = announce
         self._goals = goals
-        self._connected = connected  # whether a client is there
+        self._connected = connected  # whether a client is connected
         self.arm(True)
 
     @property
@@ -59,27 +59,27 @@ class CoreSupervisor:
 
     @property
     def can_be_armed(self) -> bool:
-        """Whether a request to arm is obeyed."""
+        """Whether a request to arm would be accepted."""
         return bool(self._fields.lasting == structs.CAUSE_NONE)
 
     @property
     def can_fly(self) -> bool:
-        """Whether nothing but poses is needed."""
+        """Whether only poses are missing."""
         return bool(self._fields.ready) and not self.imu_is_stale
 
     @property
     def imu_is_stale(self) -> bool:
-        """Whether the gyro delivers nothing new."""
+        """Whether the gyro's counts do not change."""
         return bool(self._sampling.recovering > 0)
 
     @property
     def has_recent_pose(self) -> bool:
-        """Whether an accepted pose is no older than silence allows."""
+        """Whether the last accepted pose is recent enough."""
         return bool(self._fields.pose_seen and self._fields.silent_us < self._parameters.pose_timeout_us)
 
     @property
     def controlling(self) -> bool:
-        """Whether the flaps obey controller or manual angles."""
+        """Whether the controller or manual angles move the flaps."""
         return bool(self._data.mode != structs.MODE_HOVER)
 
     @property
@@ -87,7 +87,7 @@ class CoreSupervisor:
         return int(self._data.battery_mv)
 
     def look(self, now_us: int) -> None:
-        """Have the controller's mode decided at this instant and announce a change of state; called every 10 ms."""
+        """Update the controller's mode and announce a change of state; called every 10 ms."""
         data, goals = self._data, self._goals
         data.now_us, data.connected = wrapped(now_us), i32(self._connected())
         if goals.forsaken(now_us):
@@ -119,9 +119,9 @@ class CoreSupervisor:
         return self._request(structs.REQUEST_ARM if armed else structs.REQUEST_DISARM)
 
     def recover(self) -> bool:
-        """Leave a lasting failsafe: a stop, logic that failed, and with a good voltage the low battery.
+        """Clear a lasting failsafe: a stop, logic that failed and, at a good voltage, the low battery.
 
-        False while the battery is low. The emergency stop cannot be left.
+        False while the battery is low. The emergency stop cannot be cleared.
         """
         return self._request(structs.REQUEST_RECOVER)
 
@@ -131,5 +131,5 @@ class CoreSupervisor:
 
 
 def wrapped(time_us: int) -> i32:
-    """Return an instant as the core's clock of 32 bits shows it."""
+    """Return an instant on the core's 32-bit clock."""
     return i32(((time_us + 0x8000_0000) & 0xFFFF_FFFF) - 0x8000_0000)

@@ -1,7 +1,7 @@
 """The table of variables: every parameter and log variable of the flight core, as its fields declare them.
 
-Whatever serves, writes, stores, exports or documents a variable reads it here: the tables of contents, MAVLink's
-parameters, the exported app, the keys of a profile, and what a profile's key is called on the board.
+All code that serves, writes, stores, exports or documents a variable reads it here: the tables of contents, MAVLink's
+parameters, the exported app, the keys of a profile, and the board's names for these keys.
 """
 
 from collections.abc import Iterator, Mapping
@@ -46,9 +46,9 @@ class CoreVariable:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoreParameter(CoreVariable):
-    """One that clients may set from `low` to `high`; in memory is `scale` times that.
+    """A variable that clients may set from `low` to `high`; memory holds `scale` times that.
 
-    `key` is what a profile calls that number, "section.key" or "section.key[element]"; empty: no profile states it.
+    `key` is its name in a profile, "section.key" or "section.key[element]"; empty: it is not in a profile.
     """
 
     low: float
@@ -56,11 +56,11 @@ class CoreParameter(CoreVariable):
     key: str = ""
     scale: int = 1
     persistent: bool = True
-    default: float = 0.0  # of own logic, where a profile states none
+    default: float = 0.0  # of own logic, where a profile has none
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """The lowest and highest allowed value, as a profile states it."""
+        """The lowest and highest allowed value in a profile's unit."""
         low, high = sorted((self.low * self.scale, self.high * self.scale))
         return low, high
 
@@ -90,7 +90,7 @@ class _Field:
     marks: tuple[Logged | Settable, ...]
 
     def named(self, mark: Logged | Settable) -> Iterator[tuple[int, CoreVariable]]:
-        """Yield the numbers that a mark names, each with its place among the names."""
+        """Yield the numbers that a mark names, each with its index among the names."""
         scalar = Scalar[mark.type] if mark.type else SCALARS[self.base]
         unit = getattr(mark, "shown", "") or mark.unit
         names = (
@@ -165,7 +165,7 @@ def on_board(name: str) -> tuple[str, float]:
 
 
 def value_in(config: object, key: str) -> float:
-    """Return what a configuration says for a key of `OF_PROFILE`."""
+    """Return a configuration's value for a key of `OF_PROFILE`."""
     section, _, rest = key.partition(".")
     name, _, element = rest.rstrip("]").partition("[")
     value = getattr(getattr(config, section), name)

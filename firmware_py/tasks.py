@@ -1,7 +1,7 @@
 """The tasks of the flight path, each reading like its specification. Ticks are 1 ms.
 
 The IMU interrupt wakes SENSORS, which reads it and lets STABILIZER run on the next tick edge; STABILIZER lets the
-estimator run, closes the loop in every tenth tick and leaves servo counts in the timers. The estimator works one tick
+estimator run, closes the loop in every tenth tick and writes servo counts to the timers. The estimator works one tick
 before the controller, so that a pose reaches the flaps in 1 to 11 ms.
 """
 
@@ -117,7 +117,7 @@ def hand_pose_to_core(
     absolute: bool,
     goal: PathPoint | None,
 ) -> int:
-    """Hand a pose to the core; returns what became of it, `POSE_...`."""
+    """Hand a pose to the core; return the result, `POSE_...`."""
     data = core.data.fields
     data.poses_absolute = i32(absolute)
     put_goal(data, goal)

@@ -1,8 +1,8 @@
 """The log variables of the firmware: names as on the Crazyflie and on the original Floaty, values from the running core.
 
-Units are Floaty's (angles in rad) except where Crazyflie's own programs look: attitudes in `stateEstimate` and `stabilizer`
+Units are Floaty's (angles in rad) except where Crazyflie's own programs read: attitudes in `stateEstimate` and `stabilizer`
 are in degrees with the nose up positive, `gyro` and `acc` in deg/s and g. Position, velocity and yaw are in the frame
-of the poses: for corrections the goal frame, because the board knows only its error; for absolute poses the cameras'.
+of the poses: the goal frame for corrections, because the board knows only its error; the cameras' for absolute poses.
 """
 
 from collections.abc import Callable, Iterator
@@ -71,7 +71,7 @@ def _legacy_angle(running: Running, axis: int) -> float:
 
 
 def _crazyflie(running: Running) -> Iterator[LogVariable]:
-    """Variables that only the Crazyflie's own programs read."""
+    """Yield variables that only the Crazyflie's own programs read."""
     board, bias = running.board, running.core.data.fields.gyro_bias
     parameters = running.core.parameters.fields
 
@@ -103,7 +103,7 @@ def _localisation(service: LocalisationService) -> Iterator[LogVariable]:
 
 
 def _counters(running: Running) -> Iterator[LogVariable]:
-    """What was lost, and where; the load of the processor."""
+    """Yield counts of losses, and the load of the processor."""
     yield from _fields("crtp", "malformed unserved dropped", U32, "", running.stack)
     if running.mavlink is not None:
         yield from _fields("mavlink", "frames lost bad refused dropped overruns", U32, "", running.mavlink)

@@ -1,1 +1,1 @@
-"""Drivers: raw counts of the board to what the core takes."""
+"""Drivers: they convert the board's raw counts for the core."""

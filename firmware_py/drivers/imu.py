@@ -1,7 +1,7 @@
-"""The BMI088: how it is mounted, and what a count is.
+"""The BMI088: its mounting, and the scale of a count.
 
-Counts come in the sensor frame S, which lies at -45 deg about z in the body B. The flight core turns the gyro's counts
-itself, because it is what is flashed; the tests hold it to `body_of`.
+Counts are in the sensor frame S, which is turned by -45 deg about z in the body B. The flight core, which is flashed,
+turns the gyro's counts itself; the tests compare it with `body_of`.
 """
 
 from collections.abc import Sequence
