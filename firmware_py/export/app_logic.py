@@ -1,4 +1,4 @@
-"""The user's own logic in the exported app: memory, and how the app enters the core.
+"""The user's own logic in the exported app: memory, and the app's calls into the core.
 
 The default core has none; then only the calls remain.
 """
@@ -57,7 +57,7 @@ def own_types(logic: Logic | None) -> dict[str, str]:
 
 
 def calls_header(config: LogicConfig) -> str:
-    """Return the header by which the app enters the core."""
+    """Return the header with the app's calls into the core."""
     logic = load_logic(config)
     types = own_types(logic)
     places = {"data": "&floaty_input"} | {

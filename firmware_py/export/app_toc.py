@@ -1,7 +1,7 @@
 """The app's tables of contents in C: the table of variables, with the values of a profile.
 
-A client writes into a variable of that file; only a value inside the limits goes on to the core, any other is put back.
-Names that the Crazyflie firmware has already are left to it; Floaty's own are then in the group `floaty` or `FloatyKalm`.
+A client writes a variable of that file; a value inside the limits is passed to the core, any other is put back.
+Names that the Crazyflie firmware already has are left out; Floaty's own are then in the group `floaty` or `FloatyKalm`.
 """
 
 from collections.abc import Iterable, Iterator
@@ -23,7 +23,7 @@ TYPES = {  # in C, and what the macros of both tables call them
     Scalar.U16: ("uint16_t", "UINT16"),
     Scalar.U8: ("uint8_t", "UINT8"),
 }
-OBSERVED = (  # what the app counts itself
+OBSERVED = (  # counted by the app itself
     ("floaty.malformed", Scalar.U32, "floaty_observed.malformed"),
     ("floaty.overflows", Scalar.U32, "floaty_observed.overflows"),
     ("floaty.staleHovers", Scalar.U32, "floaty_observed.stale_hovers"),
@@ -191,7 +191,7 @@ PARAM_GROUP_STOP(floaty)
 
 
 def app_parameters(config: FirmwareConfig) -> tuple[AppParameter, ...]:
-    """Return the parameters of the app with a profile's values; names of the Crazyflie firmware are its own."""
+    """Return the parameters of the app with a profile's values, without names of the Crazyflie firmware."""
     logic = load_logic(config.logic)
     own = (
         {} if logic is None else {one.name: logic.values[one.place.field] for one in logic.loaded.parameters}

@@ -55,7 +55,7 @@ def _enumeration(kind: type[IntEnum]) -> str:
 
 
 def _texts(before: str, *values: State | Cause) -> str:
-    """Return the initialiser of the words that the console has for a state or a cause, none for no cause."""
+    """Return the initialiser of the console's words for states or causes, empty for no cause."""
     words = (before + one.name.lower().replace("_", " ") if one is not Cause.NONE else "" for one in values)
     listed = ", ".join(f'"{word}"' for word in words)
     return f"{{{listed}}}"

@@ -23,16 +23,16 @@ TARGET_FLAGS = (
 
 @dataclass(frozen=True, slots=True)
 class CoreImage:
-    """What lies in flash."""
+    """The content of flash."""
 
     path: Path
     code: bytes  # from FLASH on
-    entries: dict[str, int]  # address of each entry point, bit 0 set as Thumb wants it
+    entries: dict[str, int]  # address of each entry point, bit 0 set for Thumb
     constants: frozenset[int]  # half words of `code` that are not instructions
 
 
 def build_image(source: str, header: str, folder: Path, optimisation: str = "-Os") -> CoreImage:
-    """Compile and link the core, as small as the Crazyflie's firmware is; `folder` keeps it. Raises `ExportError`."""
+    """Compile and link the core for size, like the Crazyflie's firmware; `folder` keeps it. Raises `ExportError`."""
     texts = {"floaty_core.c": source, "floaty_core.h": header}
     texts.update({name: (SOURCES / name).read_text(encoding="utf-8") for name in ("rt.c", "flash.ld")})
     flags = (*TARGET_FLAGS, optimisation, "-fno-builtin", "-T", "flash.ld")

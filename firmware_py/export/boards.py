@@ -15,7 +15,7 @@ BOARDS = (PYTHON, C, CORTEX_M4)
 
 
 def runner_of(board: str, folder: Path, logic: LogicConfig) -> RunnerFactory:
-    """Return what executes the core on a board; `folder` keeps what is compiled.
+    """Return the runner of the core on a board; `folder` keeps compiled files.
 
     Raises `ExportError`, and `LogicError` as `load_logic` does.
     """

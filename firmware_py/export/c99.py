@@ -63,7 +63,7 @@ def core_texts() -> dict[str, str]:
 
 
 def translate(texts: Mapping[str, str] | None = None, own: Mapping[str, str] = NO_PATHS) -> Translation:
-    """Return the core as C; `texts` replaces its sources, `own` has the files of those that are the user's.
+    """Return the core as C; `texts` replaces its sources, `own` has the files of the user's modules.
 
     Raises `ExportError` for anything outside the subset.
     """

@@ -18,7 +18,7 @@ WORD = np.dtype(np.uint32)
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One word of a struct that is not the same in two memories."""
+    """One word of a struct that differs between two memories."""
 
     field: str  # with its element, like P[3,4]
     values: tuple[float, float]

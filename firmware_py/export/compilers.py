@@ -1,4 +1,4 @@
-"""The C compilers of this machine, and what they make of texts, which is kept by a hash of all that it was made from."""
+"""The C compilers of this machine, and their outputs, which are kept by a hash of all inputs."""
 
 import hashlib
 import importlib.util
@@ -25,7 +25,7 @@ HOST_FLAGS = (
 
 @dataclass(frozen=True, slots=True)
 class Compiler:
-    """A C compiler: its short name, the words of its command, and what it says about its version."""
+    """A C compiler: its short name, the words of its command, and its version text."""
 
     name: str
     command: tuple[str, ...]
@@ -68,7 +68,7 @@ def compile_texts(
     folder: Path,
     compiler: Compiler,
 ) -> Path:
-    """Compile texts in a folder of their own, unless that was done before; returns the path of the output.
+    """Compile texts in a separate folder, unless that was done before; return the path of the output.
 
     Raises `ExportError` with the compiler's first complaint.
     """
@@ -78,7 +78,7 @@ def compile_texts(
     result = place / output
     if result.is_file():
         return result
-    partial = f"{output}.{os.getpid()}"  # another process may be at it
+    partial = f"{output}.{os.getpid()}"  # another process may write it, too
     try:
         place.mkdir(parents=True, exist_ok=True)
         for name, text in texts.items():

@@ -44,7 +44,7 @@ def find_emulator() -> Any:
 
 
 class CortexM4Runner:
-    """A `CoreRunner` and a `CoreCosts`; `load` counts by entry point, `instructions` is that of the last call.
+    """A `CoreRunner` and a `CoreCosts`; `load` counts by entry point, `instructions` those of the last call.
 
     `blocks` must have the layout for which the image was exported; `meter` is what `build_meter` returned.
     Raises `ExportError` when unicorn is missing, or the blocks are too large for the RAM.
@@ -88,7 +88,7 @@ class CortexM4Runner:
         addresses = dict(zip(blocks.named, (RAM + place for place in places), strict=False))
         r0, sp, lr = self._result, arm_const.UC_ARM_REG_SP, arm_const.UC_ARM_REG_LR
         self._registers = {}
-        self._stacked: dict[str, NDArray[np.uint32]] = {}  # the arguments behind the fourth
+        self._stacked: dict[str, NDArray[np.uint32]] = {}  # the arguments after the fourth
         for name, listed in blocks.calls.items():
             given = [addresses[block] for block in listed]
             self._stacked[name] = np.array(given[REGISTERS:], np.uint32)
@@ -97,7 +97,7 @@ class CortexM4Runner:
             self._registers[name] = ((sp, top), (lr, LANDING | 1), *registers)
         self._meter = Meter(image, meter, self._cpu)
         self._filed_cycles = 0  # for poses since the last step of the estimator
-        self._ahead: tuple[str, bytes] | None = None  # the call that RAM holds the results of, and its inputs
+        self._ahead: tuple[str, bytes] | None = None  # the call whose results RAM holds, and its inputs
 
     def call(self, name: str) -> int:
         """Execute an entry point; results computed ahead from the same inputs are reused."""
@@ -137,7 +137,7 @@ class CortexM4Runner:
         return Usage(len(self.image.code), self.ram_bytes, self.stack_bytes, self.load)
 
     def _look_ahead(self, name: str) -> int:
-        """Run an entry point without copying its results out; returns its cycles."""
+        """Run an entry point without copying its results out; return its cycles."""
         self._execute(name)
         self._ahead = name, self._inputs(name)
         return self._meter.cycles

@@ -1,7 +1,7 @@
 """The Crazyflie app around the flight core: a folder that an unmodified crazyflie-firmware checkout builds.
 
 `app/` beside this file holds the sources that are the same for every profile; the core, the profile's constants and the
-table of parameters are written into their places here. `app/README.md` says how the app is built and how it behaves.
+table of parameters are written into their places here. `app/README.md` describes the app's build and behaviour.
 """
 
 from pathlib import Path

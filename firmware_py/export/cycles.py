@@ -47,7 +47,7 @@ def count(code: bytes, constants: frozenset[int] = frozenset()) -> Cycles:
 
 
 def is_wide(half_word: int) -> bool:
-    """Whether an instruction that begins with this half word has a second one."""
+    """Return whether an instruction that begins with this half word has a second one."""
     return half_word >> 11 in (0b11101, 0b11110, 0b11111)
 
 

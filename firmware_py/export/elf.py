@@ -1,6 +1,6 @@
-"""ELF files for an STM32F405: what is loaded where, what its addresses are called, and the compiler's notes (DWARF).
+"""ELF files for an STM32F405: segments, symbols and the compiler's debug information (DWARF).
 
-The headers are checked by hand, so that every file that cannot be for this processor is refused in one line that says why.
+The headers are checked here, so that every file that does not fit this processor is refused with a reason of one line.
 """
 
 import struct
@@ -19,7 +19,7 @@ from firmware_py.extras import install_command
 FLASH, FLASH_SIZE = 0x0800_0000, 0x10_0000
 RAM, RAM_SIZE = 0x2000_0000, 0x2_0000
 CCM, CCM_SIZE = 0x1000_0000, 0x1_0000  # core-coupled memory, RM0090 section 2.3
-MEMORIES = (("RAM", RAM, RAM_SIZE), ("CCM", CCM, CCM_SIZE))  # which forget
+MEMORIES = (("RAM", RAM, RAM_SIZE), ("CCM", CCM, CCM_SIZE))  # volatile
 MAGIC = b"\x7fELF"
 ERASED = b"\xff"
 HEADER_SIZE, PROGRAM_SIZE, ARM, BITS_32, LITTLE_ENDIAN = 52, 32, 40, 1, 1
@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """What is loaded in one piece; where it runs it has `size` bytes, those behind `data` begin as zeros."""
+    """A piece that is loaded as one; in memory it has `size` bytes, those behind `data` begin as zeros."""
 
     load: int
     address: int
@@ -68,14 +68,14 @@ class Elf:
 
     @cached_property
     def dwarf(self) -> Any:
-        """Return what the compiler wrote down, as pyelftools reads it; None when it is stripped of that."""
+        """Return the debug information, as pyelftools reads it; None when it is stripped."""
         return self._parsed(
             lambda file: file.get_dwarf_info() if file.get_section_by_name(".debug_info") else None
         )
 
     @cached_property
     def in_flash(self) -> list[Segment]:
-        """Return what a programmer writes into flash. Raises `ExportError` for what lies elsewhere, and for nothing."""
+        """Return the segments in flash. Raises `ExportError` for segments elsewhere, and when there are none."""
         segments = [one for one in self.segments if one.data and not _is_in_ram(one.load)]
         for segment in segments:
             if segment.load < FLASH:
@@ -96,12 +96,12 @@ class Elf:
 
     @property
     def base(self) -> int:
-        """Return the lowest address in flash that is written: of the vector table."""
+        """Return the lowest address that is written in flash: that of the vector table."""
         return min(segment.load for segment in self.in_flash)
 
     @cached_property
     def code(self) -> bytes:
-        """Return the content of flash from `base` on; what lies between segments is erased."""
+        """Return the content of flash from `base` on; gaps between segments are erased."""
         base = self.base
         code = bytearray(ERASED * (max(one.load + len(one.data) for one in self.in_flash) - base))
         for segment in self.in_flash:
@@ -109,7 +109,7 @@ class Elf:
         return bytes(code)
 
     def constants(self, base: int, size: int) -> frozenset[int]:
-        """Return the half words from `base` on that are no instructions: those between the symbols $d and $t."""
+        """Return the half words from `base` on that are not instructions: those between the symbols $d and $t."""
         marks = sorted(
             (symbol.address, symbol.name[:2])
             for symbol in self.symbols

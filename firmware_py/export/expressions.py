@@ -1,7 +1,7 @@
 """Types and prints the expressions of a kernel; whatever is not in the subset is refused.
 
 An expression keeps its order of evaluation: C's precedences of the operators used are Python's, and parentheses go where
-the tree needs them. A call that writes through an argument stands alone in its statement, because C leaves the order of
+the tree needs them. A call that writes through an argument is alone in its statement, because C leaves the order of
 calls inside an expression open.
 """
 
@@ -44,7 +44,7 @@ FLOAT_FUNCTIONS = {"abs": "__builtin_fabsf", "sqrt": "__builtin_sqrtf"}
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A printed expression with its type; `strength` says how tightly its outermost operator binds."""
+    """A printed expression with its type; `strength`: how tightly its outermost operator binds."""
 
     text: str
     kind: ValueType
@@ -285,7 +285,7 @@ class Expressions:
 
 
 def mixed(left: ValueType, right: ValueType) -> str:
-    """Return what to write when a float meets an integer, else nothing."""
+    """Return the hint for a float that meets an integer, else nothing."""
     return instead(CONSTRUCTS, "f32 and i32") if {left, right} == {F32, I32} else ""
 
 

@@ -171,7 +171,7 @@ class FunctionPrinter:
             limits[-1], I32, "the end of a range", alone=True
         ).text  # evaluated once, and last
         limit = ""
-        if not self._fixed(limits[-1]):  # Python looks at the end of a range once
+        if not self._fixed(limits[-1]):  # Python evaluates the end of a range once
             limit, end = f", {name}_end = {end}", f"{name}_end"
         self._say(node, depth, f"for (int32_t {name} = {start}{limit}; {name} < {end}; {name}++) {{")
         reach = self._print.loop(limits[0] if len(limits) == 2 else None, limits[-1])
@@ -194,7 +194,7 @@ class FunctionPrinter:
 
 
 def declare(name: str, kind: ValueType, written: bool) -> str:
-    """Return the declaration of an argument or local; what is reached through a pointer is const unless written."""
+    """Return the declaration of an argument or local; a pointer's target is const unless written."""
     const = "" if written else "const "
     if kind.base not in C_TYPES:
         return f"{const}Floaty{kind.base} *{name}"

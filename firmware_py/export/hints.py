@@ -1,4 +1,4 @@
-"""What to write in the flight core instead of what its subset of Python does not have."""
+"""Replacements for what the flight core's subset of Python does not have."""
 
 import ast
 from collections.abc import Mapping
@@ -28,8 +28,8 @@ FUNCTIONS: Mapping[str, str] = {  # of numpy and math, and of Python itself
     **dict.fromkeys(("exp", "log", "tan", "hypot"), _NONE),
     "print": "a field of the memory struct marked Logged(unit)",
 }
-OUTSIDE = ("numpy", "math")  # modules whose functions have their like in the core
-GUARDED: Mapping[str, str] = {  # what logic of the user's own may not call, by its name in C
+OUTSIDE = ("numpy", "math")  # modules whose functions have equivalents in the core
+GUARDED: Mapping[str, str] = {  # what the user's own logic may not call, by its name in C
     "controller_allocate": "allocate, from firmware_py.core.guard: it does not make a number of NaN",
 }
 _OWN_LINE = "an assignment on a line of its own"
@@ -63,7 +63,7 @@ CONSTRUCTS: Mapping[str, str] = {
     "f32 for bool": "a comparison, as x != ZERO",
     "keywords": "the arguments in their order, without names",
 }
-WORDS: Mapping[str, str] = {  # where Python's name of a construct is not what people call it
+WORDS: Mapping[str, str] = {  # constructs whose usual name differs from Python's
     "ListComp": "list comprehension",
     "SetComp": "set comprehension",
     "DictComp": "dict comprehension",
@@ -78,7 +78,7 @@ WORDS: Mapping[str, str] = {  # where Python's name of a construct is not what p
     **dict.fromkeys(("Yield", "YieldFrom"), "yield"),
     "Await": "await",
 }
-# What a kernel is made of; of these, the printer looks at how they are used.
+# The constructs of a kernel; the printer checks how they are used.
 KNOWN = (
     ast.Assign, ast.Expr, ast.Return, ast.If, ast.For,
     ast.Name, ast.Constant, ast.Attribute, ast.Subscript, ast.Slice, ast.Tuple,
@@ -113,7 +113,7 @@ def first_use(tree: ast.Module | ast.FunctionDef, node: ast.Import | ast.ImportF
 
 
 def outside_subset(function: ast.FunctionDef) -> tuple[ast.AST, str] | None:
-    """Return the first construct of a kernel's body that no kernel has, and what to write instead."""
+    """Return the first construct of a kernel's body that the subset lacks, and its replacement."""
     parts = [
         part for line in function.body for part in ast.walk(line) if isinstance(part, ast.stmt | ast.expr)
     ]

@@ -1,4 +1,4 @@
-"""Numbers and constant arrays of the core's source as C literals, of which the values are exact."""
+"""Numbers and constant arrays of the core's source as C literals with exact values."""
 
 import ast
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ def constant_literal(node: ast.expr) -> tuple[ValueType, str] | None:
 def array_literal(path: str, node: ast.Call, name: str, rows: Sequence[ast.expr]) -> tuple[ValueType, str]:
     """Return type and C literal of `constant(number, ..)` or `constant((number, ..), ..)`, one tuple for each row.
 
-    Raises `ExportError` with the line of what is no finite number, or of a row of another length.
+    Raises `ExportError` with the line of a number that is not finite, or of a row of another length.
     """
     matrix = bool(rows) and all(isinstance(row, ast.Tuple) for row in rows)
     lines = [row.elts if isinstance(row, ast.Tuple) and matrix else [row] for row in rows]
@@ -52,7 +52,7 @@ def _float_element(path: str, name: str, node: ast.expr) -> str:
 
 
 def float_literal(value: np.float32) -> str:
-    """Return the shortest decimal that every correct compiler reads as this very float."""
+    """Return the shortest decimal that every correct compiler reads as exactly this float."""
     text = str(value)
     return f"{text if '.' in text or 'e' in text else text + '.0'}f"
 
@@ -63,7 +63,7 @@ def literal(value: np.float32 | np.int32) -> str:
 
 
 def _float(number: float | None) -> np.float32 | None:
-    """Return a number as float32, None for no finite one."""
+    """Return a number as float32, None if it is not finite."""
     if number is None:
         return None
     with np.errstate(over="ignore"):

@@ -1,7 +1,7 @@
-"""Looks at a kernel's statements before they are printed: where each local lives, and through what it writes.
+"""Analyses a kernel's statements before they are printed: the block of each local, and the names it writes through.
 
 A local of Python belongs to the function, one of C to a block. A local may be declared at its first assignment when that
-assignment stands in the innermost block that holds all uses; everything else is refused.
+assignment is in the innermost block that holds all uses; everything else is refused.
 """
 
 import ast

@@ -1,8 +1,8 @@
-"""The flight core as plain Python, in a process of its own: numba is switched on or off for a whole process.
+"""The flight core as plain Python, in a separate process: numba is switched on or off for a whole process.
 
 `PlainRunner` is the parent's end, `serve` the child's. A call goes over the pipe as one byte, its index among the calls, and
-the memory of the blocks that it takes; the result, an int32, and the memory come back. The child's arguments say which
-own logic flies.
+the memory of the blocks that it takes; the result, an int32, and the memory come back. The child's arguments name
+the own logic that flies.
 """
 
 import json

@@ -42,7 +42,7 @@ MARK_FORM = 'Tunable(default, "unit", low=.., high=..) of a parameter, or Logged
 def read_modules(texts: Mapping[str, str], own: Mapping[str, str], first: str = ENTRY) -> list[Module]:
     """Return the modules that the `first` one needs, each after those that it imports; texts by module name.
 
-    `own` has the files of those that are the user's, for whom errors say what to write instead.
+    `own` has the files of the user's modules, whose errors include a replacement.
     """
     done: dict[str, Module] = {}
     _read_after_imports(first, texts, own, done, ())
@@ -216,7 +216,7 @@ class _Reader:
         raise refusal(self.module.path, node, f"field type {ast.unparse(annotation)}")
 
     def _mark(self, call: ast.Call, node: ast.stmt) -> Mark:
-        """Return what makes a field a parameter or a log variable."""
+        """Return a field's mark as a parameter or a log variable."""
         name = ast.unparse(call.func)
         try:
             given = [self._value(argument) for argument in call.args]

@@ -1,8 +1,8 @@
 """Several implementations of the flight core in one flight: the same inputs, the whole memory compared after every call.
 
-The reference flies; the other targets run on memory of their own, which starts equal to the reference's and then receives
+The reference flies; the other targets run on separate memory, which starts equal to the reference's and then receives
 only what the tasks write: parameters and inputs. A target that has differed once is not run again, because
-everything that follows would differ too.
+everything after that would differ too.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ class Divergence:
     """The first difference between the reference and a target."""
 
     tick: int  # of the estimator; 0: before its first
-    call: str  # the entry point after which it showed
+    call: str  # the entry point after which it appeared
     where: str  # struct, `answer`, or the error that stopped the target
     differences: tuple[Difference, ...]  # all of that struct; none when the target was stopped
 

@@ -1,4 +1,4 @@
-"""What the exporter knows of the core's source: types, constants, structs, kernels and modules."""
+"""The exporter's model of the core's source: types, constants, structs, kernels and modules."""
 
 import ast
 from collections.abc import Mapping
@@ -9,9 +9,9 @@ from firmware_py.core.subset import Logged, Settable, Tunable
 
 PACKAGE = "firmware_py.core"
 SUBSET = f"{PACKAGE}.subset"
-OWN = "own_logic"  # the package in which the entry module finds modules of the user's
+OWN = "own_logic"  # the package in which the entry module finds the user's modules
 ENTRY = "entry"  # the module whose kernels are the C API
-SHARED = "structs"  # the module whose constants and structs stand in the header
+SHARED = "structs"  # the module whose constants and structs are in the header
 C_KEYWORDS = frozenset(
     {
         "auto", "bool", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern",
@@ -26,7 +26,7 @@ C_KEYWORDS = frozenset(
 class ValueType:
     """A type: f32, i32, bool, void or a struct's name; an array of `rank` 1 or 2 when that is not 0.
 
-    `shape` is empty for an array argument until a caller shows it; a `memory` argument is a struct that is passed on.
+    `shape` is empty for an array argument until a call determines it; a `memory` argument is a struct that is passed on.
     """
 
     base: str
@@ -43,7 +43,7 @@ ARRAYS = {"F32s": "f32", "I32s": "i32"}
 
 @dataclass(slots=True)
 class Constant:
-    """A module constant, a number or an array; `text` is its C literal, of which the values are exact."""
+    """A module constant, a number or an array; `text` is its C literal with exact values."""
 
     c_name: str
     kind: ValueType
@@ -57,7 +57,7 @@ Mark = Tunable | Logged | Settable
 
 @dataclass(frozen=True, slots=True)
 class StructField:
-    """A field of a struct, with the comments above and beside it, and what makes it a parameter or a log variable."""
+    """A field of a struct, with the comments above and beside it, and its marks as a parameter or a log variable."""
 
     name: str
     kind: ValueType
@@ -111,10 +111,10 @@ class Module:
     builtins: set[str] = field(default_factory=set)  # names imported from the subset
     defined: list[Named] = field(default_factory=list)  # here, in order
     trailing: dict[int, str] = field(default_factory=dict)
-    standing: dict[int, str] = field(default_factory=dict)  # comments that have a line of their own
+    standing: dict[int, str] = field(default_factory=dict)  # comments on separate lines
 
     def comment(self, node: ast.stmt) -> str:
-        """Return the comments that stand behind a statement."""
+        """Return the comments behind a statement."""
         lines = range(node.lineno, (node.end_lineno or node.lineno) + 1)
         return " ".join(self.trailing[line] for line in lines if line in self.trailing)
 

@@ -1,4 +1,4 @@
-"""What a flight core takes of its processor, where that is measured: memory, instructions, cycles."""
+"""A flight core's use of its processor, where it is measured: memory, instructions, cycles."""
 
 from dataclasses import dataclass
 
@@ -33,7 +33,7 @@ class EntryLoad:
 
     @property
     def mean_us(self) -> float:
-        """Processor time of a mean call."""
+        """Processor time of an average call."""
         return self.cycles / max(self.calls, 1) / CLOCK_MHZ
 
     @property
