@@ -1,9 +1,9 @@
-"""The budget of a call of the user's own logic, in cycles of the board's Cortex-M4, and what holds a loop to it.
+"""The budget of a call of the user's own logic, in cycles of the board's Cortex-M4, and how loops are held to it.
 
-Cycles are counted in the text along its longest path, rather too few than too many: 1 for an operation or an element of an
+Cycles are counted in the text along its longest path, too few rather than too many: 1 for an operation or an element of an
 array, 14 for a division or root of floats, 4 for a step of a loop and for a call. A loop of known length that exceeds the
-budget is refused. Before one whose length depends on data, the text that flies gets a call of
-`firmware_py/core/budget.py`: on every target the same, and in the same line.
+budget is refused. Before a loop whose length depends on data, a call of `firmware_py/core/budget.py` is inserted into the
+text: the same on every target, in the same line.
 """
 
 import ast
@@ -27,7 +27,7 @@ Edit = tuple[tuple[int, int], tuple[int, int], str]  # begin, end, text there; (
 
 @dataclass(slots=True)
 class Counted:
-    """The cycles of a kernel, without those that are charged while it runs, and how its text changes."""
+    """The cycles of a kernel, without those that are charged while it runs, and the edits of its text."""
 
     kernel: Signature
     cycles: int = 0
@@ -37,7 +37,7 @@ class Counted:
 
 @dataclass(frozen=True, slots=True)
 class Budgeted:
-    """A module of the user's as it flies, and the cycles of its charged kernels by their names."""
+    """A user's module as it flies, and the cycles of its charged kernels by their names."""
 
     text: str
     charged: Mapping[str, int]
@@ -71,7 +71,7 @@ class _Counter:
         self._print.names |= dict.fromkeys(find_locals(kernel)[0], I32)
 
     def count(self) -> Counted:
-        """Return what was found."""
+        """Return the cycles and edits."""
         found, node = self._found, self._found.kernel.node
         found.cycles = self._block(node.body)
         self._check(found.cycles, node, node.name)

@@ -1,7 +1,7 @@
 """The entry module of a core with the user's own logic, as text: it replaces `firmware_py/core/entry.py` of the default
 core.
 
-Each call takes the memory that it needs and no more; `Entry.calls` names it, in the order of the arguments.
+Each call takes only the memory that it needs; `EntryText.calls` names it, in the order of the arguments.
 """
 
 import ast
@@ -42,7 +42,7 @@ DRIVE = "    _drive_servos(parameters[0], control[0])\n"
 
 @dataclass(frozen=True, slots=True)
 class EntryText:
-    """The text, and by call the names of the blocks that it takes."""
+    """The text, and the names of the blocks that each call takes."""
 
     text: str
     calls: Mapping[str, tuple[str, ...]]
@@ -94,7 +94,7 @@ def _begin(plug: Plug, hook: str, indent: str) -> str:
 
 
 def _spoil(plug: Plug, result: str, block: str, indent: str) -> str:
-    """Return the line that takes a result away from calls over their budget; empty when no loop is charged."""
+    """Return the line that spoils the result of calls over their budget; empty when no loop is charged."""
     return f"{indent}_spoil_{result}({plug.block(ARGUMENT)}[0], {block}[0])\n" if plug.charged else ""
 
 

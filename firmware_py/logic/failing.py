@@ -15,20 +15,20 @@ _estimate = predictor.estimate
 
 
 class Law(Struct):
-    """What the law is to do."""
+    """Whether the law fails."""
 
     law_fails: Annotated[f32, Tunable(0.0, "", low=0.0, high=1.0)]
 
 
 class Filter(Struct):
-    """What the estimator is to do."""
+    """Whether the estimator fails."""
 
     filter_fails: Annotated[f32, Tunable(0.0, "", low=0.0, high=1.0)]
 
 
 @kernel
 def control_law(parameters: Parameters, estimator: Estimator, control: Control, own: Law) -> None:
-    """Run the core's law, or divide nothing by nothing."""
+    """Run the core's law, or divide zero by zero."""
     feedback(parameters, estimator, control)
     if own.law_fails != ZERO:
         control.u[3] = ZERO / ZERO
@@ -51,7 +51,7 @@ def file_pose(parameters: Parameters, data: Input, estimator: Estimator) -> i32:
 def estimate(
     parameters: Parameters, data: Input, estimator: Estimator, control: Control, own: Filter
 ) -> None:
-    """Run the core's estimator, or divide nothing by nothing."""
+    """Run the core's estimator, or divide zero by zero."""
     _estimate(parameters, data, estimator, control)
     if own.filter_fails != ZERO:
         estimator.now[0] = ZERO / ZERO

@@ -1,6 +1,6 @@
 """From the profile's `[logic]` to code that flies: the modules are read, checked, joined with the core and loaded.
 
-What is loaded is named by a hash of the text. So an edited module is never mistaken for its earlier version, neither in
+Loaded modules are named by a hash of the text. So an edited module is never mistaken for its earlier version, neither in
 one process nor in numba's cache on disk.
 """
 
@@ -31,7 +31,7 @@ from firmware_py.table import CoreParameter, CoreVariable
 
 @dataclass(frozen=True, slots=True)
 class Loaded:
-    """Logic that is ready to fly, with what its modules declare as the defaults."""
+    """Logic that is ready to fly, with the defaults that its modules declare."""
 
     plugs: tuple[Plug, ...]
     digest: str  # of the modules' texts
@@ -52,13 +52,13 @@ class Loaded:
 
 @dataclass(frozen=True, slots=True)
 class Logic:
-    """What flies beside the core: the modules, and the profile's values of their parameters."""
+    """The user's logic in a flight: the modules, and the profile's values of their parameters."""
 
     loaded: Loaded
     values: Mapping[str, float]  # of every parameter
 
     def overrun(self, blocks: Mapping[str, Block[Struct]]) -> str:
-        """Return which loop first exceeded the budget of its call, as one line; empty: none."""
+        """Return the first loop that exceeded the budget of its call, as one line; empty: none."""
         for plug in self.loaded.plugs:
             if plug.charged:
                 budget: Any = blocks[plug.block(ARGUMENT)].fields
@@ -181,14 +181,14 @@ def _check_names(plugs: tuple[Plug, ...], shown: Mapping[str, str]) -> None:
             path = shown[f"own_{plug.point.name}"]
             for thing in getattr(plug, kind):
                 name = thing.name.removeprefix(f"{GROUP}.")
-                key = name.upper()  # MAVLink knows no small letters
+                key = name.upper()  # MAVLink has no small letters
                 if key in seen:
                     raise LogicError(f"{path}: {name}: this name exists already: {seen[key]}")
                 seen[key] = f"{name} in {path}"
 
 
 def _execute(modules: tuple[tuple[str, str, str], ...], entry: str, package: str) -> ModuleType:
-    """Run the modules' texts and the entry module's; each in a Python module of its own, below `package`."""
+    """Run the modules' texts and the entry module's; each in a separate Python module, below `package`."""
     parent = sys.modules[package] = ModuleType(package)
     for name, file, text in modules:
         try:

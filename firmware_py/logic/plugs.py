@@ -4,7 +4,7 @@ A hook is a kernel with a fixed name. It takes those of these arguments that it 
 
     parameters: Parameters, data: Input, estimator: Estimator, control: Control     of the core
     own: a struct whose fields are all Tunable                                      the module's parameters
-    memory: a struct                                                                what it remembers; fields may be Logged
+        memory: a struct                                                                its state; fields may be Logged
 """
 
 from collections.abc import Iterator, Mapping
@@ -43,7 +43,7 @@ ANSWERING = frozenset(name for name, one in _SIGNATURES.items() if one.return_an
 
 @dataclass(frozen=True, slots=True)
 class PlugPoint:
-    """A place for a user's module: its hooks with their results, and which arguments they may write."""
+    """A place for a user's module: its hooks with their results, and the arguments that they may write."""
 
     name: str  # the key of the profile
     hooks: Mapping[str, ValueType]
@@ -69,7 +69,7 @@ class Plug:
     charged: Mapping[str, int]  # cycles of the hooks in which loops are charged
 
     def block(self, argument: str) -> str:
-        """Return the name of the memory that an argument of a hook stands for."""
+        """Return the name of the memory behind an argument of a hook."""
         return argument if argument in CORE_STRUCTS else f"{self.point.name}_{argument}"
 
 

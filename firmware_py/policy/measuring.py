@@ -1,4 +1,4 @@
-"""Measures a learned law as machine code of the Cortex-M4: processor time, memory, and how far it is from its policy.
+"""Measures a learned law as machine code of the Cortex-M4: processor time, memory, and the error from its policy.
 
 Cycles are those of `firmware_py/export/cortex_m4.py` for one step of the controller. The weights are read from flash, for
 which five cycles are added per line of 16 bytes: the emulator counts the waits for instructions only.
@@ -30,7 +30,7 @@ LINE_BYTES, WAIT_STATES = 16, 5  # of the flash of an STM32F405 at 168 MHz
 
 @dataclass(frozen=True, slots=True)
 class LawFigures:
-    """What the law takes of the board, and its largest difference from the policy's actions."""
+    """The law's use of the board, and its largest difference from the policy's actions."""
 
     cycles: int  # of the longest call
     flash_bytes: int  # more than the default core
@@ -49,7 +49,7 @@ class LawFigures:
 
 
 def measure(config: FirmwareConfig, policy: Policy, build: Path) -> LawFigures:
-    """Call the law of a profile on states all over the flight envelope; `build` keeps what is compiled.
+    """Call the law of a profile on states all over the flight envelope; `build` keeps compiled files.
 
     Raises `ExportError` when the emulator or the compiler is missing.
     """

@@ -1,6 +1,6 @@
 """Reads a trained policy, a multilayer perceptron, from an ONNX or a safetensors file.
 
-Of an ONNX graph the nodes that lead from its input to its first output are the policy; other outputs are left out. The names
+The policy is the nodes of an ONNX graph that lead from its input to its first output; other outputs are ignored. The names
 in a safetensors file are those of a `torch.nn.Sequential` or of a stable-baselines3 policy (docs/howto/learned-policy.md).
 """
 
@@ -29,7 +29,7 @@ OBSERVED = ("observation.mean", "observation.std")
 
 
 class PolicyError(FirmwareError):
-    """A policy cannot become a law; the text says what of it, and what is allowed."""
+    """A policy cannot become a law; the text names the part, and what is allowed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ def read_policy(path: Path) -> Policy:
     if path.suffix not in LIBRARIES:
         raise PolicyError(f"{path.suffix or 'no suffix'}: expected a file {' or '.join(LIBRARIES)}")
     try:
-        with np.errstate(all="ignore"):  # what is not finite is refused
+        with np.errstate(all="ignore"):  # values that are not finite are refused
             return _read_onnx(path) if path.suffix == ".onnx" else _read_safetensors(path)
     except OSError as error:
         raise PolicyError(error.strerror or str(error)) from None
@@ -170,7 +170,7 @@ def _nodes_to(output: str, graph: Any, constants: Mapping[str, Any]) -> list[Any
 
 
 def _step(node: Any, given: list[NDArray[Any] | None], attributes: Mapping[str, Any]) -> NetworkStep:
-    """Return the step that a node stands for; `given` are its inputs that are constant."""
+    """Return the step of a node; `given` are its constant inputs."""
     kind, name = str(node.op_type), f"{node.op_type} {node.name}".strip()
     known = [np.asarray(one, float) for one in given if one is not None]
     forward = given[0] is None  # the first input is the observation's
