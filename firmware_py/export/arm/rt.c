@@ -1,4 +1,4 @@
-/* What compilers call without being asked; there is no C library around the core. */
+/* Functions that compilers call implicitly; there is no C library around the core. */
 #include <stddef.h>
 
 void *memset(void *to, int value, size_t size);

@@ -1,15 +1,15 @@
 /* Floaty as out-of-tree estimator and controller of the Crazyflie firmware.
  *
- * The stabilizer task calls both 1000 times per second, after each IMU sample, and all of the core from there. What is decided
- * in flight the core decides; here it gets samples, poses, requests and the time, and its counts go to the timers.
+ * The stabilizer task calls both 1000 times per second, after each IMU sample, and all of the core from there. The core
+ * makes all decisions in flight; it gets samples, poses, requests and the time here, and its counts go to the timers.
  *
- * Gyro: the core takes raw counts. The BMI088 driver shows them as the log variables gyro.xRaw, yRaw, zRaw, of which
- * there is a new one in each step; neither the firmware's low-pass nor its bias is in between, so that the core computes
- * what it computes in the laboratory, bit for bit, from the same counts, poses and instants.
+ * Gyro: the core takes raw counts. The BMI088 driver shows them as the log variables gyro.xRaw, yRaw, zRaw, which are
+ * new in each step; neither the firmware's low-pass nor its bias is in between. So the same counts, poses and instants
+ * give the same results as in the laboratory, bit for bit.
  *
- * Time: what is decided by time counts ticks, which nobody can set. How long a pose waited is measured in microseconds,
- * by a clock that the parameter usec.reset sets to zero. Both are handed on as 32 bits, which wrap. With hardware in the
- * loop, neither counts while a sample of the host is missing: floaty_hil.c.
+ * Time: timeouts count ticks, which nobody can set. The wait of a pose is measured in microseconds,
+ * by a clock that the parameter usec.reset sets to zero. Both are passed as 32 bits, which wrap. With hardware in the
+ * loop, both stop while a sample of the host is missing: floaty_hil.c.
  */
 #define DEBUG_MODULE "FLOATY"
 
@@ -55,7 +55,7 @@ volatile bool floaty_requests[FLOATY_REQUEST_FEED];
 
 static logVarId_t gyro_raw[3];
 static bool gyro_found;
-static bool controlled; /* in this step the controller runs */
+static bool controlled; /* the controller runs in this step */
 
 /* In ordinary memory: the macros of static_mem.h would put it into CCM, which is full. */
 static StaticQueue_t pose_queue_buffer;
@@ -132,7 +132,7 @@ static void take_measurements(stabilizerStep_t step) {
   controlled = call_begin_step() != 0;
   call_take_sample();
   if (controlled) {
-    return; /* poses wait until the controller has run, as they do in the laboratory: it may see them in 1 to 11 ms */
+    return; /* poses wait until the controller has run, as in the laboratory: they take effect in 1 to 11 ms */
   }
   while (xQueueReceive(pose_queue, &pose, 0) == pdTRUE) {
     hand_pose_to_core(&pose);
@@ -153,13 +153,13 @@ static bool find_gyro(void) {
   gyro_raw[0] = logGetVarId("gyro", "xRaw");
   gyro_raw[1] = logGetVarId("gyro", "yRaw");
   gyro_raw[2] = logGetVarId("gyro", "zRaw");
-  /* The variables are there with another sensor on board, too, and then stay at zero. */
+  /* With another sensor on board the variables exist, too, but stay zero. */
   return platformConfigGetSensorImplementation() == SensorImplementation_bmi088_bmp3xx && logVarIdIsValid(gyro_raw[0]) &&
          logVarIdIsValid(gyro_raw[1]) && logVarIdIsValid(gyro_raw[2]);
 }
 
 /* The firmware calls this at start, when the EEPROM has been read, and whenever a client writes stabilizer.estimator,
- * although the build forces this estimator: then it flies on. */
+ * although the build forces this estimator: the flight goes on. */
 void estimatorOutOfTreeInit(void) {
   if (stateEstimatorGetType() == StateEstimatorTypeOutOfTree) {
     return;
@@ -170,7 +170,7 @@ void estimatorOutOfTreeInit(void) {
   floaty_hover(); /* with the trims of the EEPROM */
 }
 
-/* When this fails the firmware starts neither the stabilizer nor the app: the console has to hear of it here. */
+/* When this fails the firmware starts neither the stabilizer nor the app: so it is reported here. */
 bool estimatorOutOfTreeTest(void) {
   if (!gyro_found) {
     DEBUG_PRINT("no raw counts of a BMI088: flaps stay at hover\n");
@@ -178,7 +178,7 @@ bool estimatorOutOfTreeTest(void) {
   return gyro_found;
 }
 
-/* Another gyro measures from now on, and what was flown before is over. */
+/* Start again for another gyro, and forget the last flight. */
 static void begin_afresh(void) {
   xQueueReset(pose_queue);
   call_begin_afresh();
@@ -189,7 +189,7 @@ static void begin_afresh(void) {
 void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
   measurement_t measurement;
   while (estimatorDequeue(&measurement)) {
-    /* Gyro and accelerometer as the firmware filters them, and whatever a deck measures: not needed here. */
+    /* Drop them: the firmware's filtered gyro and accelerometer, and measurements of decks. */
   }
   if (!gyro_found) {
     return; /* without a gyro Floaty stays calibrating, flaps at hover */
@@ -205,7 +205,7 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
     call_reset();
   }
   floaty_input.poses_absolute = floaty_input.absolute && floaty_hil_mode == FLOATY_HIL_OFF; /* a host sends corrections */
-  /* The firmware's supervisor, which looks at this next, takes more than the idle thrust for a flight; else it would
+  /* The firmware's supervisor reads this next and counts more than the idle thrust as a flight; otherwise it would
    * disarm and stop its commander 30 s after arming. One more is less than a step of the motors' PWM: no pulse. */
   motorsSetRatio(MOTOR_M4, (uint16_t)(floaty_supervisor.led ? powerDistributionGetIdleThrust() + 1 : 0));
   take_measurements(stabilizerStep - floaty_hil_held);

@@ -1,18 +1,18 @@
 /* Hardware in the loop: see floaty_app.h.
  *
  * Samples wait in a buffer that one task fills and another empties. Each variable is written by one task only: the
- * receiving task begins a new stream when it sees that the stabilizer task has begun another mode, and the stabilizer task
- * looks at no stream but that of its mode. The first sample is taken when enough of them wait for the link's jitter; the
- * host keeps its clock so that about as many go on waiting.
+ * receiving task begins a new stream when the stabilizer task has begun another mode, and the stabilizer task reads
+ * only the stream of its mode. The first sample is taken when enough of them wait to cover the link's jitter; the
+ * host paces its clock to keep about as many waiting.
  */
 #include "floaty_calls.h"
 
 #include <string.h>
 
 #define AXES 3
-#define BUFFER 64         /* samples; a power of two, of which 65536 is a multiple, and more than a host lets be under way */
+#define BUFFER 64         /* samples; a power of two, so that it divides 65536, and more than a host has in flight */
 #define SILENT_STEPS 1000 /* without a sample the mode ends */
-#define TELL_STEPS 10     /* while the flight stands still */
+#define TELL_STEPS 10     /* while the flight is held */
 
 typedef struct {
   int16_t counts[AXES];
@@ -25,8 +25,8 @@ static Sample buffer[BUFFER];
 static uint16_t first;             /* number of the stream's first sample */
 static volatile uint16_t received; /* samples of the stream */
 static volatile uint16_t lost, doubled;
-static uint16_t gap;               /* `received` when the last sample came that was not the next one */
-static volatile uint8_t stream;    /* the modes that had begun when the stream did; the last to be written */
+static uint16_t gap;               /* `received` when the last sample out of sequence arrived */
+static volatile uint8_t stream;    /* value of `modes` at the stream's start; written last */
 
 /* Of the stabilizer task */
 volatile uint8_t floaty_hil_mode;
@@ -44,7 +44,7 @@ void floaty_hil_ask(uint8_t asked) {
   wanted = asked;
 }
 
-/* What is not the next sample is not taken: the host sends what is missing, and all behind it, again. */
+/* Take only the next sample: the host repeats a missing one and all after it. */
 static bool put(uint16_t number, const Sample *sample) {
   const int16_t ahead = (int16_t)(number - first - received);
   if (ahead < 0) {
@@ -63,7 +63,7 @@ static bool put(uint16_t number, const Sample *sample) {
   return true;
 }
 
-/* From a sample to the next one. */
+/* Advance a sample to the next one. */
 static void go_on(Sample *sample, const uint8_t *step, uint8_t width) {
   Sample difference;
   if (width == FLOATY_WIDE) {

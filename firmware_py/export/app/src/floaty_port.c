@@ -1,8 +1,8 @@
 /* The core, call by call for a host: see floaty_app.h.
  *
- * Requests arrive in the task CRTP-RX, and are executed there. What flies is not touched, and nothing is executed unless the
- * robot is at rest. A call is measured with the scheduler suspended, 1.2 ms at most: no other task runs in it, interrupts
- * do. So none is executed with hardware in the loop, whose flight would be late.
+ * The task CRTP-RX receives requests and executes them, on separate memory, and only while the robot
+ * is at rest. A call is measured with the scheduler suspended, 1.2 ms at most: no other task runs meanwhile, interrupts
+ * do. So no call is executed with hardware in the loop, whose flight it would delay.
  */
 #include "floaty_calls.h"
 
@@ -23,7 +23,7 @@ _Static_assert(sizeof(FloatyMemory) <= UINT16_MAX, "offsets have 16 bits");
 
 static FloatyMemory memory;
 static uint8_t session;           /* 0: none */
-static uint16_t done;             /* its requests that were executed */
+static uint16_t done;             /* requests of the session that were executed */
 static uint16_t last_call;        /* number of the last call */
 static FloatyWireCalled called;   /* and its answer */
 
@@ -52,11 +52,11 @@ static void execute(uint8_t entry) {
   called.digest = crc32CalculateBuffer(&memory, sizeof memory);
 }
 
-/* What serves a request returns the size of its answer, NO_ANSWER, or what refuses it. */
+/* Handlers of requests return the size of the answer, NO_ANSWER, or the refusal. */
 #define NO_ANSWER (-1)
 #define REFUSED(REASON) (-1 - FLOATY_REFUSAL_##REASON)
 
-/* Whether a piece lies in the memory. */
+/* Return whether a piece is inside the memory. */
 static bool inside(uint32_t offset, uint32_t size) {
   return offset + size <= sizeof memory;
 }
@@ -98,7 +98,7 @@ static int call(const uint8_t *data, uint32_t length, uint16_t number, bool is_n
     execute(data[0]);
     last_call = number;
   } else if (number != last_call) {
-    return NO_ANSWER; /* it was long on its way */
+    return NO_ANSWER; /* an old duplicate */
   }
   memcpy(body, &called, sizeof called);
   return sizeof called;
@@ -147,7 +147,7 @@ static int serve(const FloatyWireHead *head, const uint8_t *data, uint32_t lengt
     return REFUSED(LOOP);
   }
   if (ahead > 0) {
-    return NO_ANSWER; /* one before it was lost: the host sends both again */
+    return NO_ANSWER; /* an earlier one was lost: the host repeats both */
   }
   switch (head->kind) {
     case FLOATY_MESSAGE_WRITE: size = write_memory(data, length, is_new); break;
@@ -189,7 +189,7 @@ static void receive(CRTPPacket *packet) {
   answer.port = FLOATY_PORT_CORE;
   answer.channel = FLOATY_CHANNEL_CALLS;
   answer.size = (uint8_t)(sizeof head + (uint32_t)size);
-  crtpSendPacket(&answer); /* when the queue is full it is lost: the host asks again */
+  crtpSendPacket(&answer); /* lost when the queue is full: the host asks again */
 }
 
 void floaty_port_init(void) {

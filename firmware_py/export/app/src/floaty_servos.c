@@ -1,6 +1,6 @@
 /* The servo outputs: see floaty_app.h.
  *
- * The pins are the original's (BigQuad map): M1 PA2, M2 PB4, M3 PB5, M4 PA3. PA2 and PA3 hang on TIM5 (channels 3 and 4)
+ * The pins are the original's (BigQuad map): M1 PA2, M2 PB4, M3 PB5, M4 PA3. PA2 and PA3 use TIM5 (channels 3 and 4)
  * instead of TIM2, whose time base and channel 4 belong to the firmware's own motor driver: both timers run at 84 MHz,
  * the signal is the same. PB4 and PB5 are channels 1 and 2 of TIM3. Of the firmware, only the drivers of some decks use these
  * two timers: buzzer, rpm and lighthouse tester TIM5, LED ring, rpm and CPPM receiver TIM3.

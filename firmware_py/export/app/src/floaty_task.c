@@ -1,10 +1,10 @@
-/* The app beside the stabilizer task: the start, poses and requests that arrive, the console, a loop that stands still.
+/* The app beside the stabilizer task: start, received poses and requests, the console, detection of a stopped loop.
  *
- * appInit is the firmware's weak hook for a task of its own. It comes some 0.1 s after a reset, before decks, sensors and
- * self-test: the servos have pulses from there on, and what made the board start again is taken from the self-test.
+ * appInit is the firmware's weak hook for an app's task. It runs some 0.1 s after a reset, before decks, sensors and
+ * self-test: from then on the servos get pulses, and the self-test no longer sees the cause of a restart.
  *
- * Poses: packets of port 6 come here instead of to the firmware's own localisation service, because that does not look
- * at the age behind an external pose. The same bytes are taken from the app channel.
+ * Poses: packets of port 6 come here instead of to the firmware's own localisation service, because that ignores
+ * the age behind an external pose. The app channel takes the same bytes.
  */
 #define DEBUG_MODULE "FLOATY"
 
@@ -30,8 +30,8 @@
 #include "floaty_settings.h"
 
 #define POSE_SIZE (1 + 7 * sizeof(float))
-#define LOOK_MS 20 /* how often the task looks whether the controller runs */
-#define POSE_LINE_MS 10000 /* between lines about poses that are refused */
+#define LOOK_MS 20 /* between two checks that the controller runs */
+#define POSE_LINE_MS 10000 /* between lines about refused poses */
 #define SELF_TEST_MS 100
 #define SELF_TEST_LOOKS 50 /* 5 s; the self-test ends 2.4 s after a reset, later with decks */
 
@@ -105,7 +105,7 @@ static void announce_poses(void) {
   refused = count;
 }
 
-/* A loop that stands still, or a controller that is not Floaty's: this task alone would notice. */
+/* Detect a stopped loop, or a controller that is not Floaty's, which no other task would. */
 static void watch_control(void) {
   floaty_input.now_us = floaty_loop_us();
   if (call_watch_control()) {
@@ -115,7 +115,7 @@ static void watch_control(void) {
 }
 
 static void wait_for_self_test(void) {
-  while (!paramTest()) { /* the table of parameters is not there yet */
+  while (!paramTest()) { /* the table of parameters is not ready yet */
     vTaskDelay(M2T(2));
   }
   const paramVarId_t passed = paramGetVarId("system", "selftestPassed");
@@ -154,7 +154,7 @@ static void app_task(void *unused) {
 
 void appInit(void) {
   floaty_begin();
-  /* Each prints its warning and forgets: the self-test asks again, would fail, and Floaty would never fly. */
+  /* Each prints its warning and clears it; else the self-test would fail, and Floaty would never fly. */
   const bool after_watchdog = !watchdogNormalStartTest();
   const bool after_assert = !cfAssertNormalStartTest();
   restarted = after_watchdog || after_assert;
