@@ -1,6 +1,6 @@
 """The console: lines of text on port 0, in pieces of at most 30 bytes, to other links and to the debug pins.
 
-Refused requests are reported there: each kind at once, and while it goes on one line per period with a count.
+Refused requests are reported there: each kind at once, and repetitions as one line per period with a count.
 """
 
 from collections.abc import Callable, Iterator
@@ -26,9 +26,9 @@ class Console:
         stack.kernel.create_task("CONSOLE", 0, self._task)
 
     def write(self, line: str) -> None:
-        """Take a line without its end. A plain call, so that code that cannot wait can use it.
+        """Queue a line without its end. A plain call, so that code that cannot wait can use it.
 
-        After it a task lets others run with `yield_if_pending`.
+        A task calls `yield_if_pending` after it.
         """
         self._board.debug_write(line)
         self._lines.send_nowait(line)
@@ -59,7 +59,7 @@ PERIOD_US: Final = 10_000_000
 
 
 class Notices:
-    """Limits the lines per kind. The caller keeps the number of kinds small: what a client sends is not part of it."""
+    """Limits the lines per kind. The caller keeps the number of kinds small: clients' input is not part of a kind."""
 
     def __init__(self, kernel: Kernel, say: Callable[[str], None]) -> None:
         self._kernel = kernel
@@ -68,7 +68,7 @@ class Notices:
         self._withheld: dict[str, int] = {}
 
     def refuse(self, kind: str, line: str) -> None:
-        """Report a refused request, or count it when one of its kind was reported less than a period ago."""
+        """Report a refused request, or count it when its kind was reported less than a period ago."""
         now_us = self._kernel.now_us
         if now_us - self._said_us.get(kind, -PERIOD_US) < PERIOD_US:
             self._withheld[kind] = self._withheld.get(kind, 0) + 1

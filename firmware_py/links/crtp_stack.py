@@ -2,10 +2,10 @@
 
 Uplink: radio interrupt -> SYSLINK (queue 8) -> CRTP-RX (delivery queue 5) -> a handler, or the queue of a port.
 Downlink: services -> transmit queue (120) -> CRTP-TX -> radio chip.
-Replies of the services' own tasks wait for space in the transmit queue. What is sent unasked, and what the receiving
-task answers itself, is dropped when the queue is full: a deaf partner must not keep poses from coming in.
+Replies of the services' own tasks wait for space in the transmit queue. Unrequested packets, and answers of the receiving
+task itself, are dropped when the queue is full: a deaf partner must not keep poses from coming in.
 When the radio chip has received nothing for a second, not even an empty poll, the partner is gone, as in the Crazyflie
-firmware: services that send unasked then stop and discard what is queued (`hang_up`), so that the next partner gets no old
+firmware: services that send unasked then stop and discard their queue (`hang_up`), so that the next partner gets no old
 rows.
 """
 
@@ -75,11 +75,11 @@ class CrtpStack:
         self._heard_us = self.kernel.now_us
 
     def hang_up(self) -> Task:
-        """Discard what is queued for sending."""
+        """Discard the packets queued for sending."""
         yield from self._transmit.reset()
 
     def handle(self, port: int, handler: Handler) -> None:
-        """Let the receiving task run `handler` for each packet of the port; it must not wait."""
+        """Have the receiving task run `handler` for each packet of the port; it must not wait."""
         self._handlers[port] = handler
 
     def open_port(self, port: int) -> Queue[Packet]:
@@ -88,7 +88,7 @@ class CrtpStack:
         return self._ports[port]
 
     def serve(self, name: str, priority: int, port: int, answer: Answer) -> None:
-        """Create a task that answers each packet of a port; `answer` raises `WireError` for what it cannot read."""
+        """Create a task that answers each packet of a port; `answer` raises `WireError` for malformed ones."""
         self.kernel.create_task(name, priority, self._service_task, self.open_port(port), answer)
 
     def answer(self, packet: Packet, answer: Answer, timeout: int = FOREVER) -> Task:

@@ -3,7 +3,7 @@
 With absolute poses, set-points that give a position are flown, each a step of the goal; the others are refused.
 
 Commands are few and are planned at once, in the receiving task. Each is answered with its own head and a status in the
-fourth byte, as the stock firmware answers.
+fourth byte, as by the stock firmware.
 
 Trajectories of type 0 are pieces of four polynomials (x, y, z, yaw, eight float32 each, ascending powers) and a duration
 [s]; those of type 1 are compressed: a start and pieces of Bezier points in mm and tenths of a degree, the last one with the
@@ -69,7 +69,7 @@ class HighLevelService:
         stack.handle(PORT_GENERIC_SETPOINT, self._see_setpoint)
 
     def answer(self, packet: Packet) -> tuple[bytes, ...]:
-        """Obey a command and return the reply."""
+        """Execute a command and return the reply."""
         try:
             status = self._obey(*decode(packet.data))
         except WireError as error:
@@ -103,7 +103,7 @@ class HighLevelService:
         return self._plan(command, fields, begin)
 
     def _plan(self, command: PathCommand, fields: tuple[float, ...], begin: PathPoint) -> int:
-        """Turn a command to fly into a path."""
+        """Turn a flight command into a path."""
         if command is PathCommand.GO_TO:
             return self._go_to(GoTo._make(fields), begin)
         if command is PathCommand.GO_TO_1:
@@ -123,7 +123,7 @@ class HighLevelService:
     def _vertical(
         self, command: PathCommand, fields: tuple[float, ...], begin: PathPoint, lands: bool
     ) -> Vertical:
-        """Reduce the three kinds of commands to take off or to land to one."""
+        """Convert the three kinds of take-off and landing commands to one."""
         if command in (PathCommand.TAKE_OFF, PathCommand.LAND):
             return Vertical._make(fields)
         if command in (PathCommand.TAKE_OFF_1, PathCommand.LAND_1):
@@ -173,14 +173,14 @@ class HighLevelService:
         return OK
 
     def _see_attitude(self, packet: Packet) -> Task:
-        """Port 3: roll, pitch, yaw rate and thrust. Clients send it without thrust when they disconnect."""
+        """Refuse roll, pitch, yaw rate and thrust (port 3). Without thrust clients send them to disconnect."""
         check_size("an attitude set-point", packet.data, setpoints.ATTITUDE_SIZE)
         if any(packet.data[12:14]):
             self._refuse_setpoint("attitude", self._pilot.judged(None, self._stack.kernel.now_us))
         yield from self._stack.kernel.yield_if_pending()
 
     def _see_setpoint(self, packet: Packet) -> Task:
-        """Port 7: set-points, and the notice that no more will come."""
+        """Take set-points (port 7), and the notice that no more will come."""
         kind = packet.data[0] if packet.data else None
         if packet.channel == setpoints.CHANNEL_NOTICE:
             check_size("a notice", packet.data, setpoints.NOTICE_SIZE)
@@ -232,7 +232,7 @@ _HEAD = struct.Struct("<BH")
 
 
 def decode_trajectory(memory: bytes | bytearray, definition: Define) -> Path:
-    """The path that a definition stands for; `WireError` when the memory does not hold one."""
+    """Return the path of a definition; `WireError` when the memory does not hold one."""
     if definition.location != LOCATION_MEMORY:
         raise WireError(f"trajectory {definition.trajectory} is not defined")
     pieces: tuple[Piece, ...]

@@ -1,7 +1,7 @@
 """Poses from outside into the measurement queue, and the emergency stop; runs in the receiving task.
 
 A position without attitude is counted and logged but not fused, as in the original. Packed items are taken when they
-carry the last byte of the board's radio address. The pilot adds the goal from which a pose is seen.
+carry the last byte of the board's radio address. The pilot adds the goal of each pose.
 """
 
 from firmware_py.links.crtp_stack import CrtpStack, Task

@@ -1,7 +1,7 @@
 """The log service: clients group variables into blocks, the board sends each block at its period.
 
 Periods count in 10 ms, or with the newer command in 1 ms; 0 sends a block once. A refused request changes nothing. When the
-partner is gone, the first block that falls due deletes them all, as in the Crazyflie firmware.
+partner is gone, the next block that is due deletes them all, as in the Crazyflie firmware.
 """
 
 import struct
@@ -22,7 +22,7 @@ COMMANDS = frozenset(LogCommand)
 
 @dataclass(frozen=True, slots=True)
 class LogVariable:
-    """What can be logged: `group.name`, type and unit (empty for a pure number), and how to read it now."""
+    """A variable for the log: `group.name`, type and unit (empty for a pure number), and a function that reads it."""
 
     name: str
     scalar: Scalar
@@ -30,12 +30,12 @@ class LogVariable:
     read: Callable[[], int | float]
 
 
-Item = tuple[Scalar, Callable[[], int | float]]  # compiled code would make a float of what may be whole
+Item = tuple[Scalar, Callable[[], int | float]]  # compiled code would turn an integer into a float
 
 
 @dataclass(slots=True)
 class LogBlock:
-    """Variables that travel together. `due_tick` is None while the block is stopped."""
+    """Variables that are sent together. `due_tick` is None while the block is stopped."""
 
     items: list[Item] = field(default_factory=list)
     layout: struct.Struct = field(default_factory=lambda: struct.Struct("<"))
@@ -43,21 +43,21 @@ class LogBlock:
     due_tick: int | None = None
 
     def values(self) -> bytes:
-        """Return the present values as they travel."""
+        """Return the present values as bytes."""
         values = [read() for _, read in self.items]
         try:
             return self.layout.pack(*values)
         except (
             struct.error,
             OverflowError,
-        ):  # one does not fit its type, or is no integer where it travels as one
+        ):  # one does not fit its type, or is no integer where its type is one
             return self.layout.pack(
                 *(item[0].cast(value) for item, value in zip(self.items, values, strict=True))
             )
 
 
 class LogService:
-    """Owns the blocks; its task waits for requests and for the next block that falls due."""
+    """Owns the blocks; its task waits for requests and for the next block that is due."""
 
     def __init__(self, stack: CrtpStack, variables: Sequence[LogVariable]) -> None:
         self.toc = toc.Toc.of(PORT_LOG, ((item.scalar.log_number, item.name) for item in variables))
@@ -78,7 +78,7 @@ class LogService:
         return (bytes((data[0], number, self._control(data[0], number, data[2:]))),)
 
     def _control(self, command: int, number: int, rest: bytes) -> int:
-        """Do what the command says; return the status."""
+        """Execute a command; return the status."""
         if command == LogCommand.RESET:
             self.blocks.clear()
             return OK
@@ -155,7 +155,7 @@ class LogService:
                 yield from self._send(number, block, kernel.tick_count)
 
     def _send(self, number: int, block: LogBlock, tick: int) -> Task:
-        """Send a block that is due; the next time is planned from this one, missed ones are left out."""
+        """Send a block that is due; the next time is planned from this one, missed ones are skipped."""
         yield from self._stack.kernel.work(self._stack.cost.log_us)
         yield from self._stack.offer(log.encode_data(number, tick, block.values()))
         assert block.due_tick is not None

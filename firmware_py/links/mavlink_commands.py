@@ -1,7 +1,7 @@
 """Commands, each acknowledged to its sender, and the small services that clients expect to be answered.
 
-A command that is repeated because its acknowledgement was lost is executed and acknowledged again. Requests for what a
-Floaty does not have (missions, fences, rally points, logs, sole control) are answered with "none", because a client that
+A command that is repeated because its acknowledgement was lost is executed and acknowledged again. Requests for services
+that Floaty lacks (missions, fences, rally points, logs, sole control) are answered with "none", because a client that
 gets no answer asks again and again. The end of a transaction, MISSION_ACK or LOG_REQUEST_END, is not answered.
 """
 
@@ -26,7 +26,7 @@ STOP = "floaty.stop"  # a parameter
 REBOOT_TICKS = 200  # before the reset: time to send what is queued, 1 kB even at 57600 baud
 
 
-Outcome = tuple[CommandResult, Sequence[Message]]  # and what is sent after the acknowledgement
+Outcome = tuple[CommandResult, Sequence[Message]]  # and the messages after the acknowledgement
 DONE: Outcome = (CommandResult.ACCEPTED, ())
 DENIED: Outcome = (CommandResult.DENIED, ())
 
@@ -117,7 +117,7 @@ class CommandService:
             self._board.reset()
 
     def _fail(self, command: Message) -> Outcome:
-        """Let the simulated hardware fail; real hardware cannot."""
+        """Make the simulated hardware fail; real hardware cannot."""
         unit, failing, instance = (
             _whole(value) for value in (command.param1, command.param2, command.param3)
         )
@@ -161,13 +161,13 @@ class CommandService:
 
 
 def _sixth(command: Message) -> float:
-    """A command's sixth parameter, which COMMAND_INT calls y."""
+    """Return a command's sixth parameter, which COMMAND_INT calls y."""
     value: float = command.param6 if command.get_type() == "COMMAND_LONG" else command.y
     return value
 
 
 def _whole(value: float) -> int:
-    """A parameter that is a whole number; -2, which none of them may be, for anything else."""
+    """Return a parameter as a whole number, or -2, which none of them may be, for anything else."""
     return int(value) if isfinite(value) and value == int(value) else -2
 
 

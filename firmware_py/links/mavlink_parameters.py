@@ -1,8 +1,8 @@
 """The parameter protocol: list, read by index or by name, set. The list has only writable parameters.
 
-Every value travels as REAL32, the one encoding that all ground stations agree on. Whether a request to set succeeds or
-not, the answer carries the value that is in force. A failure is answered with PARAM_ERROR each time, and with a text for
-the operator once. The list is sent one parameter at a time, each when the line has taken the one before; a
+Every value is sent as REAL32, the one encoding that all ground stations agree on. Whether a request to set succeeds or
+not, the answer carries the value in force. A failure is answered with PARAM_ERROR each time, and with a text for
+the operator once. The list is sent one parameter at a time, each after the line has taken the previous one; a
 request for the list while it is being sent starts it again.
 """
 
@@ -90,7 +90,7 @@ class MavlinkParameters:
         return services.parameter(self._names[number], value, number, len(self._parameters))
 
     def _hash(self) -> Message:
-        """A number that changes with the names and with any value, by which clients recognise their cached copy."""
+        """Return a number that changes with the names and with any value, by which clients recognise their cached copy."""
         content = b"".join(
             name.encode() + parameter.value()
             for name, parameter in zip(self._names, self._parameters, strict=True)

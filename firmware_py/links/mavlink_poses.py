@@ -1,12 +1,12 @@
 """Absolute poses from the serial line into the measurement queue; runs in the receiving task.
 
-A pose is seen from the goal that is in force when it arrives. How old a pose is follows from its time stamp and from the
-sender's clock, which is asked twice a second, faster at first. Whoever sends poses is the partner; before the first pose,
-whoever sends heartbeats.
+A pose is compared with the goal that is in force when it arrives. Its age follows from its time stamp and from the
+sender's clock, which is requested twice a second, faster at first. The sender of poses is the partner; before the first
+pose, the sender of heartbeats.
 
-How far the partner's clock is ahead of ours follows from exchanges of time stamps, in whole microseconds. We send our
-time, the other side returns it with its own. The remote instant lies somewhere in the round trip, so an exchange
-knows the offset to plus or minus half of its round trip, and less well as it grows old, because clocks drift. Of the
+The offset of the partner's clock from ours follows from exchanges of time stamps, in whole microseconds. We send our
+time, the other side returns it with its own. The remote instant is somewhere in the round trip, so an exchange
+gives the offset to plus or minus half of its round trip, and less well as it grows old, because clocks drift. Of the
 last exchanges the most certain one counts. When two exchanges contradict each other, the remote clock was set
 again, and only the newer one counts.
 """
@@ -28,8 +28,8 @@ WINDOW = 16  # exchanges
 DRIFT_PPM = 100  # of both clocks together: two crystals of 50 ppm
 PENDING = 4  # requests that may be unanswered
 LONGEST_US = 200_000  # round trip; a longer one is too uncertain
-UNKNOWN_US = 100_000  # an offset that is known no better counts as unknown
-SLACK_US = 1000  # some take their time stamps in whole milliseconds
+UNKNOWN_US = 100_000  # an offset that is less certain counts as unknown
+SLACK_US = 1000  # some senders stamp in whole milliseconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +39,12 @@ class TimeExchange:
     half_us: int  # half of the round trip
 
     def uncertainty_us(self, now_us: int) -> int:
-        """How wrong the offset may be by now; all exchanges age alike."""
+        """Return how wrong the offset may be by now; all exchanges age alike."""
         return self.half_us + (now_us - self.t_us) * DRIFT_PPM // 1_000_000
 
 
 class RemoteClock:
-    """The clock of one partner. `exchanges` counts the answers that were of use."""
+    """The clock of one partner. `exchanges` counts the useful answers."""
 
     def __init__(self) -> None:
         self.requests = 0
@@ -54,7 +54,7 @@ class RemoteClock:
         self._best: TimeExchange | None = None
 
     def request(self, now_us: int) -> None:
-        """Note that a request leaves now."""
+        """Note that a request is sent now."""
         self.requests += 1
         self._pending.append(now_us)
 
@@ -75,20 +75,20 @@ class RemoteClock:
         return True
 
     def offset_us(self, now_us: int) -> int | None:
-        """Return how far the remote clock is ahead; None when it is not known."""
+        """Return how far the remote clock is ahead; None when unknown."""
         best = self._best
         return None if best is None or best.uncertainty_us(now_us) > UNKNOWN_US else best.offset_us
 
 
 def _contradict(old: TimeExchange, new: TimeExchange) -> bool:
-    """Whether no clock that was left alone can explain both."""
+    """Return whether no clock that ran undisturbed explains both."""
     reach_us = new.half_us + old.uncertainty_us(new.t_us) + SLACK_US
     return abs(new.offset_us - old.offset_us) > reach_us
 
 
-# An older pose is of no use, so a greater age is taken as unknown.
+# An older pose is useless, so a greater age counts as unknown.
 OLDEST_US = 500_000
-EARLIEST_US = -5_000  # the clocks' offset is known no better than this
+EARLIEST_US = -5_000  # the clocks' offset is no more certain than this
 # In ticks; prime, so that requests do not always collide with the frames of poses and telemetry.
 SYNC_PERIOD = 487
 FIRST_SYNC_PERIOD = 97
@@ -129,7 +129,7 @@ class PoseService:
         self._measurements.send_nowait((now_us, self._localisation.last, True, goal))
 
     def _age_us(self, now_us: int, t_us: int) -> int | None:
-        """How long ago the sender's clock showed `t_us`; None when that is not known."""
+        """Return how long ago the sender's clock showed `t_us`; None when unknown."""
         offset_us = self._clock.offset_us(now_us)
         if offset_us is None:
             return None
@@ -141,7 +141,7 @@ class PoseService:
             self._meet(message)
 
     def _meet(self, message: Message) -> None:
-        """Let the sender of the message be the partner."""
+        """Make the sender of the message the partner."""
         source = (message.get_srcSystem(), message.get_srcComponent())
         if source != self._partner:
             self._partner, self._clock = source, RemoteClock()

@@ -1,11 +1,11 @@
 """Goals from MAVLink clients, and the board's two modes; runs in the receiving task.
 
 Hold: the robot flies at the last goal; a target of any client moves it.
-Offboard: started by a client, whose targets alone are then obeyed. When none has arrived for 0.5 s, the board returns to
+Offboard: started by a client, whose targets alone are then accepted. When none has arrived for 0.5 s, the board returns to
 Hold and stays at the last goal.
 
-Goals are in W. Poses from MAVLink are compared with `goal` itself. Poses from CRTP pass the pilot, which is led then; its
-origin is home while they are corrections.
+Goals are in W. Poses from MAVLink are compared with `goal` itself. Poses from CRTP pass the pilot, which then gets the
+goal; its origin is home while they are corrections.
 """
 
 from collections.abc import Sequence
@@ -32,22 +32,22 @@ class SetpointService:
     def __init__(self, stack: MavlinkStack, pilot: Pilot, home: Vector) -> None:
         self.mode = Mode.HOLD
         self._goal: Goal = (home, 0.0)
-        self._seen_from = self._goal  # by the last pose from MAVLink
-        self._seen_us = -1  # when that came
+        self._seen_from = self._goal  # for the last pose from MAVLink
+        self._seen_us = -1  # arrival of that pose
         self._stack = stack
         self._pilot = pilot
         self.home = home
         self._leader: Source | None = None  # in offboard
-        self._led_us = 0  # when its last set-point came
+        self._led_us = 0  # arrival of its last set-point
         self._started = stack.kernel.create_binary_semaphore("mavOffboard")
         stack.handle("SET_POSITION_TARGET_LOCAL_NED", self._take_target)
         stack.handle("SET_MODE", self._take_mode)
         stack.kernel.create_task("MAV-MODE", 1, self._watch)
 
     def choose(self, command: Message) -> tuple[CommandResult, Sequence[Message]]:
-        """Obey MAV_CMD_DO_SET_MODE: the custom mode as one number or, as for PX4, as main and sub-mode.
+        """Execute MAV_CMD_DO_SET_MODE: the custom mode as one number or, as for PX4, as main and sub-mode.
 
-        A mode that the board lacks is a wrong parameter of a command that it serves.
+        A mode that the board lacks is a wrong parameter of a known command.
         """
         main, sub = command.param2, command.param3
         for mode in Mode:
@@ -56,18 +56,18 @@ class SetpointService:
         return CommandResult.DENIED, ()
 
     def see_pose(self) -> PathPoint:
-        """Return the goal that a pose from MAVLink, which has just arrived, is to be seen from."""
+        """Return the goal for a pose from MAVLink that has just arrived."""
         self._seen_from, self._seen_us = self._goal, self._stack.kernel.now_us
         return PathPoint(*self._goal)
 
     @property
     def goal(self) -> Goal:
-        """Where to fly."""
+        """The goal in force."""
         return self.frame if self._piloted else self._goal
 
     @property
     def frame(self) -> Goal:
-        """The origin of the estimate: the goal that the last pose was seen from."""
+        """The origin of the estimate: the goal of the last pose."""
         if not self._piloted:
             return self._seen_from
         motion = self._pilot.frame(self._stack.kernel.now_us)
@@ -100,18 +100,18 @@ class SetpointService:
             self._stack.notice(message, "only position and yaw of targets are flown")
 
     def _lead(self, now_us: int) -> None:
-        """Let the pilot fly to the goal."""
+        """Have the pilot fly to the goal."""
         (x, y, z), yaw = self._goal
         ox, oy, oz = self._origin
         self._pilot.follow(stay((x - ox, y - oy, z - oz), yaw), now_us)
 
     @property
     def _origin(self) -> Vector:
-        """Where the origin of the pilot's frame is in W."""
+        """The origin of the pilot's frame in W."""
         return (0.0, 0.0, 0.0) if self._pilot.absolute else self.home
 
     def _take_mode(self, message: Message) -> None:
-        """SET_MODE, which MAV_CMD_DO_SET_MODE has replaced."""
+        """Take SET_MODE, which MAV_CMD_DO_SET_MODE has replaced."""
         number, source = message.custom_mode, _source(message)
         known = number in tuple(Mode)
         result = CommandResult.ACCEPTED if known else CommandResult.DENIED
@@ -128,7 +128,7 @@ class SetpointService:
         return self._change(mode, INFO, f"mode: {mode.name.lower()}")
 
     def _change(self, mode: Mode, severity: int, text: str) -> Sequence[Message]:
-        """Change the mode; returns the news for all clients."""
+        """Change the mode; return the messages for all clients."""
         texts = () if mode is self.mode else services.status_text(severity, text)
         self.mode = mode
         return (*texts, services.current_mode(mode))

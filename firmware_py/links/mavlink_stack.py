@@ -1,11 +1,11 @@
 """MAVLink on board: from the UART interrupt to the services and back.
 
 Uplink: UART interrupt -> MAV-RX, which finds the frames and runs a handler for each message.
-Downlink: services -> transmit queue (32) -> MAV-TX -> UART. Replies may fill the queue; what is sent unasked leaves
-room for them and is dropped and counted when the line does not keep up. MAV-TX alone makes frames, so that their
-sequence numbers leave in order.
+Downlink: services -> transmit queue (32) -> MAV-TX -> UART. Replies may fill the queue; unrequested messages leave
+room for them and are dropped and counted when the line is too slow. MAV-TX alone makes frames, so that their
+sequence numbers are sent in order.
 
-No request is ignored silently: what is refused, and what no service reads, is reported in a STATUSTEXT per kind and sender.
+No request is ignored silently: refused and unserved messages are reported in a STATUSTEXT per kind and sender.
 """
 
 from collections.abc import Callable, Generator, Iterable
@@ -26,11 +26,11 @@ Handler = Callable[[Message], object]
 TRANSMIT_QUEUE = 32
 UNASKED_LIMIT = 24  # messages in the queue beyond which nothing is sent unasked
 BACKLOG = 4  # messages in the queue at which streams wait for their turn
-SILENCE_TICKS = 50  # after which MAV-RX lets the receiver search half a frame again
+SILENCE_TICKS = 50  # after which MAV-RX has the receiver search half a frame again
 
 SILENCE_US = 3_000_000  # three heartbeats of a ground station
 INFO, WARNING = 6, 4  # MAV_SEVERITY
-NOTICES = 64  # kinds and senders that are told apart
+NOTICES = 64  # kinds and senders that are distinguished
 
 
 class MavlinkStack:
@@ -43,7 +43,7 @@ class MavlinkStack:
         self.refused = 0  # messages that a service refused
         self.unserved = 0  # messages that no service reads, or that are for other systems
         self._heard_us = 0  # when a message was last received
-        # Unrequested messages for which the line had no time, and messages that fit no frame.
+        # Unrequested messages that the line was too slow for, and messages that fit no frame.
         self.unsent = 0
         self._cost_us = cost.mavlink_us
         self._board = board
@@ -76,7 +76,7 @@ class MavlinkStack:
 
     @property
     def dropped(self) -> int:
-        """Messages for which the line had no time, or that fit no frame."""
+        """Messages that the line was too slow for, or that fit no frame."""
         return self.unsent + self._transmit.dropped
 
     @property
@@ -93,7 +93,7 @@ class MavlinkStack:
         self._received.give_from_isr()
 
     def handle(self, name: str, handler: Handler) -> None:
-        """Let the receiving task call `handler` for each message of this name; `WireError` refuses it."""
+        """Have the receiving task call `handler` for each message of this name; `WireError` refuses it."""
         self._handlers[NUMBERS[name]] = handler
 
     def reply(self, message: Message) -> None:
@@ -102,7 +102,7 @@ class MavlinkStack:
 
     @property
     def room(self) -> int:
-        """How many messages of streams the queue takes: none before it is nearly empty, so that no answer waits long."""
+        """Return how many messages of streams the queue takes: none until it is nearly empty, so that answers are fast."""
         waiting = len(self._transmit)
         return UNASKED_LIMIT - waiting if waiting < BACKLOG else 0
 
@@ -114,7 +114,7 @@ class MavlinkStack:
         return self._transmit.send_nowait(message)
 
     def notice(self, message: Message, text: str) -> None:
-        """Report what became of a message that was not obeyed: once per kind and sender, then now and then with a count."""
+        """Report why a message was refused: once per kind and sender, then now and then with a count."""
         source = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
         kind = f"{source} {''.join(filter(str.isalpha, text))}"  # without its numbers
         if kind not in self._noticed:
@@ -170,13 +170,13 @@ class MavlinkStack:
             self.notice(message, str(error))
 
     def _is_ours(self, message: Message) -> bool:
-        """Whether this board is addressed; 0 stands for all."""
+        """Return whether this board is addressed; 0 means all."""
         system = getattr(message, "target_system", 0)
         component = getattr(message, "target_component", 0)
         return system in (0, self.system) and component in (0, self.component)
 
     def _is_request(self, message: Message) -> bool:
-        """Whether a message that no service reads has an address, and it is this board's."""
+        """Return whether a message without a service is addressed to this board."""
         if hasattr(message, "target"):  # MANUAL_CONTROL
             return message.target in (0, self.system)
         return hasattr(message, "target_system") and self._is_ours(message)

@@ -1,8 +1,8 @@
 """Messages that the board sends by itself, each at its own interval, which clients may change.
 
 Intervals are whole ticks and count from boot: messages of one interval are made in the same tick and carry the same time
-stamp, and a missed tick shifts nothing. On a full line the stream that has waited longest is next, so that all have their
-turn; what is due again before its turn is dropped and counted.
+stamp, and a missed tick shifts nothing. On a full line the stream that has waited longest is next, so that each gets its
+turn; a message that is due again before its turn is dropped and counted.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,7 +43,7 @@ class Stream:
     waits_since: int | None = None  # tick; None: nothing is waiting for the line
 
     def start(self, interval_ticks: int | None, tick: int) -> None:
-        """Go on at this interval."""
+        """Send at this interval from now on."""
         self.interval_ticks = interval_ticks
         self.waits_since = None
         if interval_ticks is not None:

@@ -1,7 +1,7 @@
-"""What the streams carry: the running board's values as messages, with the tick as time stamp.
+"""The content of the streams: the running board's values as messages, with the tick as time stamp.
 
-Our own ground station takes the flight array: the telemetry blocks as the board knows them, relative to the goal that the
-last pose was seen from. For other stations the standard's messages are absolute in W (`PoseInWorld`); those of rate 0 are
+Our own ground station takes the flight array: the telemetry blocks as on board, relative to the goal of the
+last pose. For other stations the standard's messages are absolute in W (`PoseInWorld`); those of rate 0 are
 sent only on SET_MESSAGE_INTERVAL or REQUEST_MESSAGE.
 """
 
@@ -34,28 +34,28 @@ from firmware_py.wire.mavlink_layouts import Message
 
 @dataclass(frozen=True, slots=True)
 class PoseInWorld:
-    """Where the robot is in W now; the estimator only has the error from the goal against which the last pose was taken."""
+    """The robot's present pose in W; the estimator has only the error from the goal of the last pose."""
 
     estimator: Estimator
     control: Control
     setpoints: SetpointService
 
     def angles(self) -> Vector:
-        """Roll, pitch, yaw of B in W."""
+        """Return roll, pitch, yaw of B in W."""
         roll, pitch, yaw = self.estimator.now[ATTITUDE : ATTITUDE + 3].tolist()
         return roll, pitch, wrap_angle(yaw + self.setpoints.frame[1])
 
     def q_WB(self) -> Quaternion:
-        """The attitude."""
+        """Return the attitude."""
         return from_euler_zyx(*self.angles())
 
     def rates(self) -> Vector:
-        """Body rates p, q, r [rad/s]."""
+        """Return the body rates p, q, r [rad/s]."""
         p, q, r = self.estimator.now[RATE : RATE + 3].tolist()
         return p, q, r
 
     def motion(self) -> tuple[Vector, Vector]:
-        """p_WB [m] and v_W [m/s]."""
+        """Return p_WB [m] and v_W [m/s]."""
         p_WG, yaw = self.setpoints.frame
         q_WG = yaw_quaternion(yaw)
         now = self.estimator.now

@@ -25,7 +25,7 @@ _DECK_SERIAL = bytes((0x0D, 0xF1, 0x0A, 0x7B, 0, 0, 0, 1))  # of the one-wire ch
 
 
 class ClientMemory:
-    """A memory of real bytes as clients see it; addresses are checked by the service."""
+    """A memory of real bytes as clients see it; the service checks addresses."""
 
     def __init__(self, type: int, content: bytearray, serial: bytes = _NO_SERIAL) -> None:
         self.type = type

@@ -1,7 +1,7 @@
 """The parameter service: read, write and keep the values that may be changed while the board runs.
 
-A write is refused when the value is not a number or out of range: the console names the range. Either way the reply carries
-the value that is in force. Persistent parameters can be stored in the upper part of the EEPROM and are applied at the next
+A write is refused when the value is not a number or out of range: the console reports the range. Either way the reply has
+the value in force. Persistent parameters can be stored in the upper part of the EEPROM and are applied at the next
 boot. Layout from address 1024: `FPS1`, length of the list u16, CRC-32 of the list u32, then for each parameter the length of
 its name, the name, the length of its value, the value. A list that fails these checks counts as empty.
 """
@@ -34,7 +34,7 @@ from firmware_py.wire.parameters import (
 )
 from firmware_py.wire.scalars import Scalar
 
-START = 1024  # below lies the configuration block
+START = 1024  # the configuration block is below
 _HEAD = struct.Struct("<4sHI")
 _MAGIC = b"FPS1"
 
@@ -92,7 +92,7 @@ class ParameterStorage:
 
 
 def _records(values: Mapping[str, bytes]) -> bytes:
-    """The list without its head."""
+    """Return the list without its head."""
     return b"".join(
         bytes((len(name),)) + name.encode("latin-1") + bytes((len(value),)) + value
         for name, value in values.items()
@@ -107,7 +107,7 @@ def _split(records: bytes) -> tuple[bytes, bytes]:
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """What can be set: `group.name`, type and unit, how to read and write it, and its limits.
+    """A parameter: `group.name`, type and unit, how to read and write it, and its limits.
 
     Without `write` it is read only. `minimum` and `maximum` are inclusive.
     """
@@ -123,7 +123,7 @@ class Parameter:
 
     @property
     def type_byte(self) -> int:
-        """The type with its flags as the TOC reports it."""
+        """Return the type with its flags, as in the TOC."""
         flags = TYPE_READ_ONLY if self.write is None else 0
         return self.scalar.parameter_number | flags | (TYPE_EXTENDED if self.persistent else 0)
 

@@ -1,4 +1,4 @@
-"""Who the board is, and what it may do: link, platform and supervisor services, and the application channel."""
+"""The board's identity and rights: link, platform and supervisor services, and the application channel."""
 
 from firmware_py.links.crtp_stack import CrtpStack, Task
 from firmware_py.pilot import Pilot
@@ -65,11 +65,11 @@ class PlatformService:
         return self._app.dropped
 
     def bits(self) -> int:
-        """Return the Crazyflie's bit field of what the board and its commander do."""
+        """Return the Crazyflie's bit field for the state of the board and its commander."""
         return supervisor_bits(self._supervisor) | commander_bits(self._pilot, self._stack.kernel.now_us)
 
     def answer_platform(self, packet: Packet) -> tuple[bytes, ...]:
-        """Return the reply to a platform command (answered with itself) or to a question for a version."""
+        """Return the reply to a platform command (the command itself) or to a request for a version."""
         data = packet.data
         if not data:
             raise WireError("an empty platform request")
@@ -83,7 +83,7 @@ class PlatformService:
         raise WireError(f"platform channel {packet.channel}: {data.hex()} is unknown")
 
     def answer_supervisor(self, packet: Packet) -> tuple[bytes, ...]:
-        """Return the state, or the outcome of a command; the emergency stops are not answered."""
+        """Return the state, or the result of a command; the emergency stops are not answered."""
         supervisor, data = self._supervisor, packet.data
         command = data[0] if data else 0
         # A request for all bits, or for the one with this number.
@@ -150,7 +150,7 @@ def supervisor_bits(supervisor: CoreSupervisor) -> int:
 
 
 def commander_bits(pilot: Pilot, now_us: int) -> int:
-    """Return the rest of it: the high-level commander flies, has reached its path's end, is overruled by set-points."""
+    """Return the other bits: the high-level commander flies, has reached its path's end, is overruled by set-points."""
     flies = pilot.planner.phase(now_us) is not Phase.IDLE
     overruled = flies and pilot.led
     flags = flies and not overruled, pilot.planner.finished(now_us), overruled
