@@ -102,7 +102,7 @@ class MavlinkStack:
 
     @property
     def room(self) -> int:
-        """Return how many messages of streams the queue takes: none until it is nearly empty, so that answers are fast."""
+        """How many messages of streams the queue takes: none until it is nearly empty, so that answers are fast."""
         waiting = len(self._transmit)
         return UNASKED_LIMIT - waiting if waiting < BACKLOG else 0
 

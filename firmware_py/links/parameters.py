@@ -123,7 +123,7 @@ class Parameter:
 
     @property
     def type_byte(self) -> int:
-        """Return the type with its flags, as in the TOC."""
+        """The type with its flags, as in the TOC."""
         flags = TYPE_READ_ONLY if self.write is None else 0
         return self.scalar.parameter_number | flags | (TYPE_EXTENDED if self.persistent else 0)
 

@@ -1,11 +1,11 @@
 """The CRTP port on which a real board executes the flight core call by call; `floaty_wire.h` of the app is made from this.
 
-The board keeps memory of its own for it, beside that which flies: the structs of the core, and of own logic, one behind
+The board keeps separate memory for it, apart from that in flight: the structs of the core, and of own logic, one after
 the other in the order of `CoreBlocks.named`. A packet is one request of the host or one answer of the board, little-endian.
-Each begins with HEAD: the kind, the session, and the number of the request in it. An answer has the head of its request.
+Each begins with HEAD: the kind, the session, and the request's number in it. An answer has the head of its request.
 
-    HELLO   ->                       a session begins, memory is zero; a repeated request is only answered
-            <- ABOUT                 what answers
+        HELLO   ->                       a session begins, memory is zero; a repeated request is only answered
+                <- ABOUT                 the board's data
     WRITE   -> PLACE, bytes          into the memory
             <-
     CALL    -> CALL                  execute an entry point
@@ -14,23 +14,23 @@ Each begins with HEAD: the kind, the session, and the number of the request in i
             <- bytes
     LOOP    -> MODE                  hardware in the loop: a mode from the next millisecond on
             <-
-    HEALTH  ->
-            <- HEALTH                how the board is; in flight as well
+        HEALTH  ->
+                <- HEALTH                the board's state; in flight as well
     (any)   <- REFUSED               with a reason
 
 A board executes the requests of a session in the order of their numbers, from 0 on, and each once. A number above the next
-one is not answered: one before it was lost. A request that comes again is answered again and not executed again, READ
-with the memory as it is then; of calls only the last one. So the host may send many at once and repeats those without an
-answer; it goes on behind a call when everything up to it has been answered.
+one is not answered: an earlier one was lost. A repeated request is answered again but not executed again, READ
+with the present memory; of calls only the last one. So the host may send many at once and repeats those without an
+answer; it continues after a call when everything up to it has been answered.
 
-Hardware in the loop, on a channel of its own, without sessions. The board flies as always, but each millisecond with the
-gyro sample of the host that is next. SAMPLES begins a packet, with the first sample; behind it stand the differences of
-each further one to that before, in `width` bytes: 6, x y z as int16, modulo 65536, or 4, a word with ten bits each, x in
-the lowest ones, where all differences of the packet fit. The board takes the first sample when `HIL_WAITING` wait. Where
-the next one is not there, its flight stands still for up to `HIL_HOLD` steps (held), as it would without the interrupt of
-its own gyro; then it goes on with the last sample (late). Behind a gap in the numbers nothing is taken (lost) until the
-host repeats what is missing; what it has already is left out (doubled). After each controller step, and every ten steps of
-standing still, it sends LOOP to the host, in which `used` plus `waiting` is the number that it expects. A second without
+Hardware in the loop has its own channel, without sessions. The board flies as always, but each millisecond with the
+host's next gyro sample. A packet begins with SAMPLES, which has the first sample; after it come the differences of
+each further one to its predecessor, in `width` bytes: 6, x y z as int16, modulo 65536, or 4, a word with ten bits each, x in
+the lowest ones, where all differences of the packet fit. The board takes the first sample when `HIL_WAITING` wait. If
+the next one is missing, its flight stops for up to `HIL_HOLD` steps (held), as it would without the interrupt of
+its own gyro; then it goes on with the last sample (late). After a gap in the numbers nothing is taken (lost) until the
+host repeats the missing samples; samples that arrive again are dropped (doubled). After each controller step, and every ten
+held steps, it sends LOOP to the host, in which `used` plus `waiting` is the number that it expects. A second without
 samples ends the mode. With every change of the mode the gyro's zero is determined again and the estimator restarted.
 """
 
@@ -56,7 +56,7 @@ NARROW_BITS = 10  # of an axis
 
 
 class Message(IntEnum):
-    """What a request asks for, and the kind of its answer."""
+    """The kind of a request and of its answer."""
 
     HELLO = 0
     WRITE = 1
@@ -128,7 +128,7 @@ PLACE = PacketLayout("Place", (("offset", "H"),))
 PLACE_SIZE = PacketLayout("PlaceSize", (("offset", "H"), ("size", "B")))
 CALL = PacketLayout("Call", (("call", "B"),))
 CALLED = PacketLayout("Called", (
-    ("answer", "b"),  # 0 of calls that have none
+    ("answer", "b"),  # 0 of calls without an answer
     ("cycles", "I"),  # that the call took, with the interrupts in it; no other task runs meanwhile
     ("digest", "I"),  # CRC-32 of the whole memory afterwards, as zlib.crc32
 ))  # fmt: skip
@@ -151,7 +151,7 @@ LOOP = PacketLayout("Loop", (
     ("waiting", "B"),  # samples in the buffer then
     ("state", "B"),  # of the supervisor
     ("cause", "B"),
-    ("fresh", "B"),  # 1: the controller has just run; 0: told while the flight stands still
+    ("fresh", "B"),  # 1: the controller has just run; 0: the flight is held
     ("held", "H"), ("late", "H"), ("lost", "H"), ("doubled", "H"),
     ("m1", "H"), ("m2", "H"), ("m3", "H"), ("m4", "H"),  # timer counts that the controller puts out
     ("fused", "H"), ("refused", "H"),  # poses
@@ -173,7 +173,7 @@ SAMPLES_MAX = 1 + _BEHIND_FIRST[NARROW]  # in a packet, when the rate changes li
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What answers on the port."""
+    """The board on the port."""
 
     version: int
     state: int
@@ -195,7 +195,7 @@ class Called:
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """How a board is."""
+    """The state of a board."""
 
     gyro: tuple[int, ...]  # [counts] sensor frame
     calibrated: bool
@@ -264,7 +264,7 @@ def loop(mode: Hil) -> tuple[Message, bytes]:
 
 @dataclass(frozen=True, slots=True)
 class Looped:
-    """What the board reports about itself in the loop."""
+    """The board's report in the loop."""
 
     used: int
     waiting: int
@@ -282,14 +282,14 @@ class Looped:
 
     @property
     def received(self) -> int:
-        """Number of the sample that the board expects, modulo 65536."""
+        """Number of the next sample for the board, modulo 65536."""
         return (self.used + self.waiting) & 0xFFFF
 
 
 def encode_samples(number: int, samples: Sequence[Sequence[int]]) -> tuple[bytes, int]:
     """Return the data of a packet with the first of these gyro samples, and how many of them it holds.
 
-    `samples`: (n, 3) [counts], n > 0; the first one has this number. All are in it where the rate changes little.
+    `samples`: (n, 3) [counts], n > 0; the first one has this number. All fit where the rate changes little.
     """
     differences = [
         [(b - a + 0x8000 & 0xFFFF) - 0x8000 for a, b in zip(one, other, strict=True)]

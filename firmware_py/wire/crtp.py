@@ -2,7 +2,7 @@
 
 A packet is one header byte and up to 30 bytes of data, little-endian. Here the quaternion changes its order
 (x y z w on the wire, w x y z inside) and time its unit; everything inside is SI. Malformed bytes raise
-`WireError`; who receives them counts it. Sources: Bitcraze's CRTP documentation, cflib 0.1.34; the tests
+`WireError`; the receiver counts it. Sources: Bitcraze's CRTP documentation, cflib 0.1.34; the tests
 compare with cflib's own bytes.
 """
 
@@ -27,7 +27,7 @@ PORT_SUPERVISOR = 9
 PORT_PLATFORM = 13
 PORT_LINK = 15
 
-FAR = 1000.0  # [m] no tunnel is that large
+FAR = 1000.0  # [m] larger than any tunnel
 AGE_UNIT_US = 500
 AGE_MAX_CODE = 254  # and everything older: 127 ms
 AGE_UNKNOWN_CODE = 255
@@ -48,7 +48,7 @@ class Packet:
 
 
 class Correction(NamedTuple):
-    """The body's pose in the goal frame, at both ends of a link: it was true `age_us` before it arrived.
+    """The body's pose in the goal frame, at both ends of a link: measured `age_us` before it arrived.
 
     An absolute pose is the correction with respect to the origin of the world.
     """
@@ -59,19 +59,19 @@ class Correction(NamedTuple):
 
 
 def header(port: int, channel: int) -> int:
-    """The header byte as cflib sends it."""
+    """Return the header byte as cflib sends it."""
     return port << 4 | _RESERVED_BITS | channel
 
 
 def encode(packet: Packet) -> bytes:
-    """The bytes of any packet."""
+    """Return the bytes of any packet."""
     if len(packet.data) > MAX_DATA:
         raise WireError(f"{len(packet.data)} bytes of data: at most {MAX_DATA} fit a CRTP packet")
     return bytes((header(packet.port, packet.channel),)) + packet.data
 
 
 def decode(raw: bytes) -> Packet:
-    """The packet in `raw`; its reserved header bits are ignored."""
+    """Return the packet in `raw`; its reserved header bits are ignored."""
     if not 1 <= len(raw) <= 1 + MAX_DATA:
         raise WireError(f"a CRTP packet of {len(raw)} bytes: 1..{1 + MAX_DATA} are possible")
     return Packet(raw[0] >> 4, raw[0] & 3, raw[1:])
@@ -83,9 +83,9 @@ _POSE_HEADER = header(PORT_LOCALISATION, CHANNEL_GENERIC)
 def encode_ext_pose(
     p_GB: tuple[float, float, float], q_GB: tuple[float, float, float, float], age_us: int | None
 ) -> bytes:
-    """The complete packet of cflib's `send_extpose` and one more byte, the age.
+    """Return the complete packet of cflib's `send_extpose` and one more byte, the age.
 
-    Stock firmware reads the pose and ignores the byte behind it. The sender judges its poses before.
+    Stock firmware reads the pose and ignores the byte behind it. The sender checks its poses before.
     """
     x, y, z = p_GB
     qw, qx, qy, qz = q_GB
@@ -93,7 +93,7 @@ def encode_ext_pose(
 
 
 def decode_ext_pose(data: bytes) -> Correction:
-    """The pose in the data of a generic localisation packet; without an age byte the age is unknown."""
+    """Return the pose in the data of a generic localisation packet; without an age byte the age is unknown."""
     check_size("an external pose", data, _POSE.size, _POSE.size + 1)
     if data[0] != EXT_POSE:
         raise WireError(f"not an external pose: {data.hex()}")
@@ -105,7 +105,7 @@ def decode_ext_pose(data: bytes) -> Correction:
 
 
 def _age_code(age_us: int | None) -> int:
-    """Half milliseconds, rounded, held at 0 and 254."""
+    """Return half milliseconds, rounded, limited to 0..254."""
     if age_us is None:
         return AGE_UNKNOWN_CODE
     return max(0, min(AGE_MAX_CODE, (age_us + AGE_UNIT_US // 2) // AGE_UNIT_US))

@@ -17,7 +17,7 @@ MAX_TRAJECTORIES = 10
 
 
 class PathCommand(IntEnum):
-    """The first byte. Those that end in 1 are older than cflib's."""
+    """The first byte. Commands that end in 1 are older than cflib's."""
 
     SET_GROUP_MASK = 0
     TAKE_OFF_1 = 1
@@ -68,7 +68,7 @@ class GoTo(NamedTuple):
 
 
 class Start(NamedTuple):
-    """START, of a trajectory that was defined."""
+    """START, of a defined trajectory."""
 
     groups: int
     relative: bool
@@ -105,7 +105,7 @@ _LAYOUTS = {
 
 
 def decode(data: bytes) -> tuple[PathCommand, tuple[float, ...]]:
-    """The command and its fields as they travel; `WireError` for an unknown one or a number that is not finite."""
+    """Return the command and its fields as on the wire; `WireError` for an unknown one or a number that is not finite."""
     try:
         command = PathCommand(data[0])
     except (IndexError, ValueError):
@@ -119,5 +119,5 @@ def decode(data: bytes) -> tuple[PathCommand, tuple[float, ...]]:
 
 
 def encode(command: PathCommand, *fields: float) -> bytes:
-    """The complete packet of a command with its fields, in the order in which they travel."""
+    """Return the complete packet of a command with its fields, in the order on the wire."""
     return bytes((header(PORT, 0), command)) + _LAYOUTS[command].pack(*fields)

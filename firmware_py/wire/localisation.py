@@ -1,7 +1,7 @@
 """The other messages with a position or a pose: plain position, packed positions, packed poses.
 
-Packed items carry the last byte of the address of the robot that they are for; positions are int16 millimetres, the
-quaternion is "smallest three": the largest component is left out, the others take a sign and nine bits each.
+Packed items carry the last byte of the receiving robot's address; positions are int16 millimetres, the
+quaternion is "smallest three": the largest component is omitted, the others take a sign and nine bits each.
 """
 
 import struct
@@ -25,7 +25,7 @@ _SHARE = 1 / (511 * sqrt(2))  # of one step in a quaternion's component
 
 
 def decode_position(data: bytes) -> Vector:
-    """The position [m] in the data of a channel 0 packet."""
+    """Return the position [m] in the data of a channel 0 packet."""
     check_size("a position", data, _POSITION.size)
     x, y, z = _POSITION.unpack(data)
     check_place((x, y, z))
@@ -33,7 +33,7 @@ def decode_position(data: bytes) -> Vector:
 
 
 def decode_packed_positions(data: bytes) -> list[tuple[int, Vector]]:
-    """Pairs of address byte and position [m] in the data of a channel 2 packet."""
+    """Return pairs of address byte and position [m] in the data of a channel 2 packet."""
     if not data or len(data) % _PACKED_POSITION.size:
         raise WireError(f"packed positions of {len(data)} bytes: items have {_PACKED_POSITION.size}")
     return [
@@ -43,7 +43,7 @@ def decode_packed_positions(data: bytes) -> list[tuple[int, Vector]]:
 
 
 def decode_packed_poses(data: bytes) -> list[tuple[int, Correction]]:
-    """Pairs of address byte and pose in the data of a generic packet of type 9; the age is unknown."""
+    """Return pairs of address byte and pose in the data of a generic packet of type 9; the age is unknown."""
     items = data[1:]
     if data[:1] != bytes((EXT_POSE_PACKED,)) or not items or len(items) % _PACKED_POSE.size:
         raise WireError(f"packed poses of {len(items)} bytes: items have {_PACKED_POSE.size}")
@@ -57,7 +57,7 @@ def decode_packed_poses(data: bytes) -> list[tuple[int, Correction]]:
 
 
 def unpack_quaternion(packed: int) -> tuple[float, float, float, float]:
-    """The quaternion, w x y z, of 32 bits; not of unit length when they never came from one."""
+    """Return the quaternion, w x y z, of 32 bits; not of unit length when they are not from one."""
     largest = packed >> 30
     xyzw = [0.0] * 4
     squares = 0.0

@@ -1,4 +1,4 @@
-"""The log service on the wire (version 2): requests for blocks of variables, and the packets that carry their values.
+"""The log service on the wire (version 2): requests for blocks of variables, and packets with their values.
 
 Port 5: channel 0 is the table of contents, 1 creates, starts and stops blocks, 2 carries the data.
 """
@@ -25,7 +25,7 @@ _HEADER = header(PORT_LOG, CHANNEL_DATA)
 
 
 class LogCommand(IntEnum):
-    """The first byte on channel 1; versions 0 and 1 of the protocol are not spoken."""
+    """The first byte on channel 1; versions 0 and 1 of the protocol are not supported."""
 
     DELETE = 2
     START = 3
@@ -37,12 +37,12 @@ class LogCommand(IntEnum):
 
 
 def request(command: LogCommand, *rest: int) -> Packet:
-    """A request on channel 1; the number of a block comes first."""
+    """Return a request on channel 1; the number of a block comes first."""
     return Packet(PORT_LOG, CHANNEL_CONTROL, bytes((command, *rest)))
 
 
 def creation(block: int, items: Sequence[tuple[Scalar, int]]) -> list[Packet]:
-    """The requests that make a block of variables, each with its type and its number in the table of contents."""
+    """Return the requests that create a block of variables, each with its type and its number in the table of contents."""
     packed = [ITEM.pack(scalar.log_number, number) for scalar, number in items]
     return [
         request(
@@ -55,14 +55,14 @@ def creation(block: int, items: Sequence[tuple[Scalar, int]]) -> list[Packet]:
 
 
 def encode_data(block: int, timestamp_ms: int, values: bytes) -> bytes:
-    """The complete packet with a block's values, at most 26 bytes; the time stamp wraps after 2^24 ms."""
+    """Return the complete packet with a block's values, at most 26 bytes; the time stamp wraps after 2^24 ms."""
     if len(values) > MAX_VALUES:
         raise WireError(f"log block {block}: {len(values)} bytes of values, at most {MAX_VALUES} fit")
     return _HEAD.pack(_HEADER, block, timestamp_ms & 0xFFFF, timestamp_ms >> 16 & 0xFF) + values
 
 
 def decode_data(data: bytes) -> tuple[int, int, bytes]:
-    """`(block, time stamp [ms], values)` from the data of a log data packet."""
+    """Return `(block, time stamp [ms], values)` from the data of a log data packet."""
     if len(data) < 4:
         raise WireError(f"log data of {len(data)} bytes: at least 4 are needed")
     return data[0], int.from_bytes(data[1:4], "little"), data[4:]

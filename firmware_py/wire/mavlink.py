@@ -1,4 +1,4 @@
-"""MAVLink messages and our values: the only place that knows the standard's units and frames.
+"""MAVLink messages and our values: the only file with the standard's units and frames.
 
 Outside: north-east-down (NED) for the world, forward-right-down (FRD) for the body, whatever units the standard has.
 Inside: SI, W with z up, B forward-left-up. W and B turn into NED and FRD by half a turn about x, so a vector (x, y, z)
@@ -28,7 +28,7 @@ POSES = (
     "VICON_POSITION_ESTIMATE",
     "ODOMETRY",
 )
-# They end a transaction, or answer: nothing is left to say.
+# They end a transaction, or answer: no answer is due.
 ENDS = ("MISSION_ACK", "COMMAND_ACK", "LOG_REQUEST_END")
 # All messages about missions except the request for the list and its end.
 MISSION_MESSAGES = (
@@ -90,20 +90,20 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Where to fly; what is None stays as it was."""
+    """The goal for a client's target; None stays unchanged."""
 
     p_WG: Vector | None  # [m]
     yaw: float | None  # [rad] about z up
-    moves: bool = False  # whether a velocity, acceleration or yaw rate stands beside them, which is not flown
+    moves: bool = False  # whether it has a velocity, acceleration or yaw rate, which is not flown
 
 
 def turn(v: Vector) -> Vector:
-    """A vector of W or B in NED or FRD, and back."""
+    """Convert a vector of W or B to NED or FRD, and back."""
     return (v[0], -v[1], -v[2])
 
 
 def turn_quaternion(q: Quaternion) -> Quaternion:
-    """`q_WB` as FRD to NED, and back."""
+    """Convert `q_WB` to FRD in NED, and back."""
     return (q[0], q[1], -q[2], -q[3])
 
 
@@ -111,12 +111,12 @@ def turn_quaternion(q: Quaternion) -> Quaternion:
 
 
 def pose(t_us: int, p_WB: Vector, q_WB: Quaternion) -> Message:
-    """The pose of a motion capture frame taken at `t_us` of the sender's clock; the covariance is not stated."""
+    """Return the pose of a motion capture frame taken at `t_us` of the sender's clock; the covariance is not stated."""
     return dialect.MAVLink_att_pos_mocap_message(max(0, t_us), turn_quaternion(q_WB), *turn(p_WB))
 
 
 def read_pose(message: Message) -> Pose:
-    """The pose in one of `POSES`; `WireError` also for one in other frames, or that its sender declares unreliable."""
+    """Return the pose in one of `POSES`; `WireError` also for other frames, or a pose declared unreliable."""
     kind = message.get_type()
     if kind == "ODOMETRY":
         _check_odometry(message)
@@ -148,7 +148,7 @@ def _check_odometry(message: Message) -> None:
 
 
 def _check_covariance(covariance: Sequence[float]) -> None:
-    """Raise `WireError` for a pose whose stated variances are greater than the estimator may neglect.
+    """Raise `WireError` for a pose whose stated variances are too large for the estimator to neglect.
 
     NaN first, or zeros, which MAVLink 2 omits: nothing is stated.
     """
@@ -160,7 +160,7 @@ def _check_covariance(covariance: Sequence[float]) -> None:
 
 
 def target(t_ms: int, p_WG: Vector | None, yaw: float | None, system: int = 1, component: int = 1) -> Message:
-    """The goal for the board; what is None is masked out."""
+    """Return the goal for the board; None is masked out."""
     mask = _IGNORE_REST | (_IGNORE_POSITION if p_WG is None else 0) | (_IGNORE_YAW if yaw is None else 0)
     x, y, z = turn(p_WG or (0.0, 0.0, 0.0))
     return dialect.MAVLink_set_position_target_local_ned_message(
@@ -169,7 +169,7 @@ def target(t_ms: int, p_WG: Vector | None, yaw: float | None, system: int = 1, c
 
 
 def read_target(message: Message) -> Target:
-    """The goal in a SET_POSITION_TARGET_LOCAL_NED."""
+    """Return the goal in a SET_POSITION_TARGET_LOCAL_NED."""
     mask = message.type_mask
     if message.coordinate_frame != _FRAME_LOCAL_NED:
         raise WireError(f"target in frame {message.coordinate_frame}: LOCAL_NED is flown")
@@ -204,7 +204,7 @@ def read_target(message: Message) -> Target:
 def sys_status(
     battery_mV: int, drop_rate: float, errors: int, load: float, imu_alive: bool = True
 ) -> Message:
-    """The supply, the share of received frames that were lost, receive errors, and the processor's load, 0..1."""
+    """Return the supply, the share of received frames that were lost, receive errors, and the load, 0..1."""
     healthy = _HEALTHY if imu_alive else _HEALTHY & ~_IMU
     return dialect.MAVLink_sys_status_message(
         _SENSORS, _SENSORS, healthy, round(1000 * min(1.0, max(0.0, load))), u16(battery_mV), -1, -1,
@@ -213,40 +213,40 @@ def sys_status(
 
 
 def attitude(t_ms: int, roll: float, pitch: float, yaw: float, p: float, q: float, r: float) -> Message:
-    """zyx angles [rad] of B in W, and body rates [rad/s]."""
+    """Return zyx angles [rad] of B in W, and body rates [rad/s]."""
     return dialect.MAVLink_attitude_message(u32(t_ms), roll, -pitch, -yaw, p, -q, -r)
 
 
 def attitude_quaternion(t_ms: int, q_WB: Quaternion, p: float, q: float, r: float) -> Message:
-    """The attitude as a quaternion, and body rates [rad/s]."""
+    """Return the attitude as a quaternion, and body rates [rad/s]."""
     return dialect.MAVLink_attitude_quaternion_message(u32(t_ms), *turn_quaternion(q_WB), p, -q, -r)
 
 
 def local_position(t_ms: int, p_WB: Vector, v_W: Vector) -> Message:
-    """Position [m] and velocity [m/s] in the world."""
+    """Return position [m] and velocity [m/s] in the world."""
     return dialect.MAVLink_local_position_ned_message(u32(t_ms), *turn(p_WB), *turn(v_W))
 
 
 def position_target(t_ms: int, p_WG: Vector, yaw: float) -> Message:
-    """The goal in force."""
+    """Return the goal in force."""
     return dialect.MAVLink_position_target_local_ned_message(
         u32(t_ms), _FRAME_LOCAL_NED, _IGNORE_REST, *turn(p_WG), 0, 0, 0, 0, 0, 0, -yaw, 0
     )
 
 
 def hud(p_WB: Vector, v_W: Vector, yaw: float) -> Message:
-    """Speed over ground, heading, height and climb; the speed in the air is not known, and there is no throttle."""
+    """Return speed over ground, heading, height and climb; the air speed is not known, and there is no throttle."""
     heading = round(degrees(-yaw)) % 360
     return dialect.MAVLink_vfr_hud_message(nan, hypot(v_W[0], v_W[1]), heading, 0, p_WB[2], v_W[2])
 
 
 def servo_outputs(t_us: int, counts: Sequence[int]) -> Message:
-    """Pulse lengths of the four servos [us], from timer counts."""
+    """Return the pulse lengths of the four servos [us], from timer counts."""
     return dialect.MAVLink_servo_output_raw_message(u32(t_us), 0, *_pulses_us(counts), 0, 0, 0, 0)
 
 
 def actuator_outputs(t_us: int, counts: Sequence[int]) -> Message:
-    """The same in the newer message."""
+    """Return the same in the newer message."""
     pulses = _pulses_us(counts)
     return dialect.MAVLink_actuator_output_status_message(
         max(0, t_us), (1 << len(pulses)) - 1, (*map(float, pulses), *(0.0,) * (32 - len(pulses)))
@@ -258,27 +258,27 @@ def _pulses_us(counts: Sequence[int]) -> tuple[int, ...]:
 
 
 def battery(battery_mV: int) -> Message:
-    """The supply as one cell; current and charge are not measured."""
+    """Return the supply as one cell; current and charge are not measured."""
     voltages = [u16(battery_mV)] + [_U16_MAX] * 9
     return dialect.MAVLink_battery_status_message(0, 0, 0, 0x7FFF, voltages, -1, -1, -1, -1)
 
 
 def estimator_status(t_us: int, healthy: bool, std_xy: float, std_z: float) -> Message:
-    """Whether the estimates may be used, and the standard deviations of the position [m]."""
+    """Return whether the estimates may be used, and the standard deviations of the position [m]."""
     return dialect.MAVLink_estimator_status_message(
         max(0, t_us), _ESTIMATES if healthy else 0, 0, 0, 0, 0, 0, 0, std_xy, std_z
     )
 
 
 def home_position(t_us: int, p_WG: Vector) -> Message:
-    """The goal as home; there is no geographic position."""
+    """Return the goal as home; there is no geographic position."""
     return dialect.MAVLink_home_position_message(
         0, 0, 0, *turn(p_WG), (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, max(0, t_us)
     )
 
 
 def global_position(t_ms: int, p_WB: Vector, v_W: Vector, yaw: float, home_z: float) -> Message:
-    """Height, velocity and heading; latitude and longitude stay 0, because they are not known."""
+    """Return height, velocity and heading; latitude and longitude stay 0, because they are not known."""
     vx, vy, vz = (_i16(100 * speed) for speed in turn(v_W))
     heading = round(100 * degrees(-yaw)) % 36_000
     return dialect.MAVLink_global_position_int_message(
@@ -287,7 +287,7 @@ def global_position(t_ms: int, p_WB: Vector, v_W: Vector, yaw: float, home_z: fl
 
 
 def odometry(t_us: int, p_WB: Vector, q_WB: Quaternion, v_B: Vector, rates: Vector) -> Message:
-    """Pose in the world, velocity [m/s] and rates [rad/s] in the body; the covariances are not stated."""
+    """Return pose in the world, velocity [m/s] and rates [rad/s] in the body; the covariances are not stated."""
     return dialect.MAVLink_odometry_message(
         max(0, t_us), _FRAME_LOCAL_NED, _BODY_FRAME, *turn(p_WB), turn_quaternion(q_WB), *turn(v_B), *turn(rates),
         _UNKNOWN, _UNKNOWN, 0, dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT, 0,
@@ -295,7 +295,7 @@ def odometry(t_us: int, p_WB: Vector, q_WB: Quaternion, v_B: Vector, rates: Vect
 
 
 def imu(t_us: int, rates: Vector, acceleration: Vector) -> Message:
-    """What the gyro [rad/s, B] and the accelerometer [g, B] measure; there are no other sensors."""
+    """Return the measured rates [rad/s, B] and acceleration [g, B]; there are no other sensors."""
     force = turn(
         (
             acceleration[0] * _STANDARD_GRAVITY,
@@ -309,7 +309,7 @@ def imu(t_us: int, rates: Vector, acceleration: Vector) -> Message:
 
 
 def flight_array(t_us: int, values: Sequence[float]) -> Message:
-    """The samples of `telemetry.BLOCKS` in their order, relative to the goal as the board knows them, in SI.
+    """Return the samples of `telemetry.BLOCKS` in their order, relative to the goal as the board knows them, in SI.
 
     The excitation comes last: zeros at the end are not sent.
     """
@@ -328,11 +328,11 @@ def read_flight_array(message: Message) -> tuple[Sample, ...]:
 
 
 def read_sys_status(message: Message, timestamp_ms: int) -> tuple[Sample, ...]:
-    """The samples in a SYS_STATUS, which has no time of its own; NaN for a voltage that the board does not know."""
+    """Return the samples in a SYS_STATUS, which has no own time; NaN for an unknown voltage."""
     voltage = nan if message.voltage_battery == _U16_MAX else 1e-3 * message.voltage_battery
     return Sample(BATTERY, timestamp_ms, (voltage,)), Sample(LOAD, timestamp_ms, (0.1 * message.load,))
 
 
 def _i16(value: float) -> int:
-    """The nearest number that 16 bits with a sign can hold."""
+    """Return the nearest number that signed 16 bits can hold."""
     return round(max(-0x8000, min(0x7FFF, value)))

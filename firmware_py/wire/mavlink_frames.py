@@ -4,13 +4,13 @@ The dialect is pymavlink's `common`: its classes hold the fields, their layout a
 because pymavlink's parser drops whole supposed frames after a bad byte, lets one forged time stamp lock the true sender
 out, and counts a reordered pair as 256 lost frames. Here
 
-- bytes that are no frame are skipped one at a time, so that no good frame behind them is lost;
+- bytes that are no frame are skipped one at a time, so that no good frame after them is lost;
 - half a frame waits for its rest until 100 ms of silence have passed (call `feed` with no data to let time pass); then its
   bytes are searched for other frames;
-- a signature is checked before anything is learnt from the frame; with a key, nothing unsigned is accepted. It is the
-  sender's link id, a time stamp that only goes up, and six bytes of SHA-256 over key, frame, link id and stamp.
+- a signature is checked before the frame is used; with a key, unsigned frames are refused. It is the
+  sender's link id, a time stamp that only increases, and six bytes of SHA-256 over key, frame, link id and stamp.
 
-Frames of MAVLink 1 are read, never written. The reader checks to whom a message is addressed.
+Frames of MAVLink 1 are read, never written. The reader checks the addressee of a message.
 """
 
 import re
@@ -34,7 +34,7 @@ class Signing:
     """The key and the time stamps of both directions; one object for all senders and receivers that use the key.
 
     `start` is the time stamp at `now_us` = 0, in 10 us since 2015-01-01: the present if there is a calendar, else the
-    last one known. With 0 and no frame heard yet, a recorded frame passes for a new one. Raises `WireError` for a key
+    last one known. With 0 and no frame received yet, a recorded frame passes for a new one. Raises `WireError` for a key
     that has not 32 bytes.
     """
 
@@ -44,21 +44,21 @@ class Signing:
         self._key = key
         self._link_id = bytes((link_id,))
         self._start = start
-        self._newest = 0  # of all stamps, sent and heard
+        self._newest = 0  # of all stamps, sent and received
         self._streams: dict[tuple[int, int, int], int] = {}  # (system, component, link id): newest stamp
 
     def sign(self, now_us: int, frame: bytes) -> bytes:
-        """The signature to send behind `frame`, which ends with its CRC."""
+        """Return the signature to send behind `frame`, which ends with its CRC."""
         self._newest = min(_STAMP_MAX, max(self._start + now_us // 10, self._newest + 1))
         head = self._link_id + self._newest.to_bytes(6, "little")
         return head + self._digest(frame + head)
 
     def is_genuine(self, frame: bytes) -> bool:
-        """Whether `frame`, its signature included, was made with the key."""
+        """Return whether `frame`, its signature included, was made with the key."""
         return self._digest(frame[:-_DIGEST_SIZE]) == frame[-_DIGEST_SIZE:]
 
     def is_new(self, now_us: int, system: int, component: int, frame: bytes) -> bool:
-        """Whether a genuine frame is newer than the last of its stream, and is its last from now on.
+        """Return whether a genuine frame is newer than the last of its stream, and note it as the last.
 
         The first frame of a stream may be up to a minute behind the newest stamp of all.
         """
@@ -76,7 +76,7 @@ class Signing:
         return sha256(self._key + data).digest()[:_DIGEST_SIZE]
 
 
-HALF_FRAME_US = 100_000  # silence after which half a frame is given up; 280 bytes last 49 ms at 57600 baud
+HALF_FRAME_US = 100_000  # silence after which half a frame is dropped; 280 bytes last 49 ms at 57600 baud
 RESTART = 4  # so many late frames in sequence: their sender has restarted
 
 _START_2 = b"\xfd"
@@ -91,7 +91,7 @@ _INCOMPLETE, _NO_FRAME = 0, 1
 
 @dataclass(slots=True)
 class FrameCounters:
-    """What a receiver has seen."""
+    """The counters of a receiver."""
 
     frames: int = 0  # delivered
     skipped_bytes: int = 0  # that belong to no frame
@@ -99,7 +99,7 @@ class FrameCounters:
     unknown: int = 0  # next in sequence, but the dialect does not have the message (or its number is damaged)
     unsigned: int = 0  # refused because a key is set
     bad_signature: int = 0
-    replayed: int = 0  # rightly signed, but not newer than the last one of their stream
+    replayed: int = 0  # correctly signed, but not newer than the last one of their stream
     lost: int = 0  # gaps in the sequence numbers
     late: int = 0  # behind the newest of their sender: reordered (and counted as lost before) or repeated
 
@@ -119,7 +119,7 @@ class FrameSender:
         self._sequence = 0
 
     def encode(self, now_us: int, message: Message) -> bytes:
-        """The frame of `message`, which is not changed; `WireError` when a field does not fit its type."""
+        """Return the frame of `message`, which is not changed; `WireError` when a field does not fit its type."""
         number = message.get_msgId()
         layout = LAYOUTS.get(number)
         if layout is None:
@@ -171,7 +171,7 @@ class _Sequence:
 
 
 class _Head(NamedTuple):
-    """What the first bytes of a frame say."""
+    """The first bytes of a frame."""
 
     length: int  # of the payload
     flags: int  # that must be understood
@@ -191,7 +191,7 @@ def _read_head(buffer: bytes, start: int) -> _Head:
 
 
 def _mark(message: Message, head: _Head, frame: bytes, crc: int) -> None:
-    """Note in the message where it came from, as pymavlink's own decoder does."""
+    """Note the origin in the message, as pymavlink's own decoder does."""
     header = message.get_header()
     header.mlen, header.seq, header.srcSystem, header.srcComponent = (
         head.length,
@@ -214,9 +214,9 @@ class FrameReceiver:
         self._senders: dict[tuple[int, int], _Sequence] = {}
 
     def feed(self, now_us: int, data: bytes) -> list[Message]:
-        """The messages that `data` completes, in order; empty data lets time pass."""
+        """Return the messages that `data` completes, in order; empty data lets time pass."""
         silent = now_us - self._last_us > HALF_FRAME_US
-        stale = len(self._held) if silent else 0  # half frames that start before this byte are given up
+        stale = len(self._held) if silent else 0  # half frames that start before this byte are dropped
         buffer = self._held + data
         if data:
             self._last_us = now_us
@@ -278,7 +278,7 @@ class FrameReceiver:
         return end - start
 
     def _refuse(self, signing: Signing, now_us: int, head: _Head, frame: bytes) -> int:
-        """How many bytes to skip of a frame that is not signed, not genuine or not new; 0 to accept it."""
+        """Return how many bytes to skip of a frame that is not signed, not genuine or not new; 0 to accept it."""
         if not head.flags:
             self.counters.unsigned += 1
             return len(frame)

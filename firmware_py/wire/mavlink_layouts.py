@@ -1,4 +1,4 @@
-"""How MAVLink's messages lie in their payloads, from pymavlink's dialect `common`, and those that this dialect lacks.
+"""The layouts of MAVLink's messages, from pymavlink's dialect `common`, and messages that this dialect lacks.
 
 pymavlink's own encoder and decoder take about twice as long, and the encoder writes into the message.
 """
@@ -18,7 +18,7 @@ Message: TypeAlias = MAVLink_message
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How a kind of message lies in its payload."""
+    """The layout of a kind of message in its payload."""
 
     create: Any  # pymavlink's class of the message
     payload: struct.Struct
@@ -28,7 +28,7 @@ class Layout:
     order: tuple[int, ...]  # which of the wire's fields is the constructor's first, second, ...
 
     def pack(self, message: Message) -> bytes:
-        """The payload, its trailing zeros included."""
+        """Return the payload, its trailing zeros included."""
         fields = self.read(message)
         if not self.arrays:
             return self.payload.pack(*fields)
@@ -41,7 +41,7 @@ class Layout:
         return self.payload.pack(*flat)
 
     def unpack(self, payload: bytes) -> Message:
-        """The message; missing bytes of the payload are zero, and surplus ones belong to a newer dialect."""
+        """Return the message; missing bytes of the payload are zero, and surplus ones belong to a newer dialect."""
         size = self.payload.size
         flat = self.payload.unpack(payload[:size].ljust(size, b"\0"))
         fields: tuple[Any, ...] | list[Any] = flat
@@ -54,12 +54,12 @@ class Layout:
 
 
 def _stored(name: str, kind: str) -> str:
-    """The attribute in which pymavlink's classes keep a field's bytes or number."""
+    """Return the attribute in which pymavlink's classes keep a field's bytes or number."""
     return f"_{name}_raw" if kind == "char" else name
 
 
 def _layout(kind: Any) -> Layout:
-    """The layout of one of pymavlink's message classes."""
+    """Return the layout of one of pymavlink's message classes."""
     types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
     names = [_stored(name, types[name]) for name in kind.ordered_fieldnames]
     get = attrgetter(*names)

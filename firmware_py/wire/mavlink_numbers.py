@@ -1,4 +1,4 @@
-"""Numbers of the MAVLink standard that both ends of a line, or both sides of the board's pins, know; without pymavlink."""
+"""Numbers of the MAVLink standard for both ends of a line, and both sides of the board's pins; without pymavlink."""
 
 from enum import IntEnum
 
@@ -23,7 +23,7 @@ class Command(IntEnum):
 
 
 class Mode(IntEnum):
-    """The board's modes, as custom modes. The numbers are PX4's: MAVSDK reads those of every autopilot but ArduPilot so."""
+    """The board's modes, as custom modes. The numbers are PX4's, which MAVSDK expects of all but ArduPilot."""
 
     HOLD = 4 << 16 | 3 << 24  # main mode 4, sub-mode 3: fly at the last goal
     OFFBOARD = 6 << 16  # one client's stream of set-points leads

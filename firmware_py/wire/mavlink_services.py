@@ -1,6 +1,6 @@
 """The messages of the standard's services: heartbeats, commands, parameters, clocks, texts, files.
 
-Nothing here has an axis; what flies is in `mavlink`.
+Nothing here has an axis; flight data is in `mavlink`.
 """
 
 import pymavlink.dialects.v20.common as dialect
@@ -32,7 +32,7 @@ PREFIXES = {  # of parameters, by group
 }
 
 
-_VERSION = 3  # the heartbeat's field; MAVLink 1 and 2 both say 3
+_VERSION = 3  # the heartbeat's field, 3 in MAVLink 1 and 2
 _U16_MAX, _U32_MAX, _I32_MAX = 0xFFFF, 0xFFFFFFFF, 0x7FFFFFFF
 # MISSION_INT because the board answers these messages, though with "unsupported": clients ask only if it is set.
 _CAPABILITIES = (
@@ -60,36 +60,36 @@ _MODE_FLYING = dialect.MAV_MODE_FLAG_STABILIZE_ENABLED | dialect.MAV_MODE_FLAG_G
 
 
 def u16(value: int) -> int:
-    """The nearest number that 16 bits can hold."""
+    """Return the nearest number that 16 bits can hold."""
     return max(0, min(_U16_MAX, value))
 
 
 def u32(value: int) -> int:
-    """The lower 32 bits: clocks wrap."""
+    """Return the lower 32 bits: clocks wrap."""
     return value & _U32_MAX
 
 
 def mavlink_name(name: str) -> str:
-    """The MAVLink name of parameter `group.name`; a group that is not in the table keeps its own name."""
+    """Return the MAVLink name of parameter `group.name`; a group that is not in the table keeps its own name."""
     group, _, own = name.partition(".")
     return f"{PREFIXES.get(group, group)}_{own}".upper()[:NAME_SIZE]
 
 
 def station_heartbeat() -> Message:
-    """The heartbeat of a ground station."""
+    """Return the heartbeat of a ground station."""
     return dialect.MAVLink_heartbeat_message(
         dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, _VERSION
     )
 
 
 def command(system: int, component: int, number: int, *params: float) -> Message:
-    """A COMMAND_LONG with at most seven parameters; those left out are zero."""
+    """Return a COMMAND_LONG with at most seven parameters; those left out are zero."""
     padded = (*params, *(0.0,) * (7 - len(params)))
     return dialect.MAVLink_command_long_message(system, component, number, 0, *padded)
 
 
 def timesync(tc1_ns: int, ts1_ns: int) -> Message:
-    """A request (`tc1_ns` = 0) with the sender's clock, or the answer: own clock, and that of the request returned."""
+    """Return a request (`tc1_ns` = 0) with the sender's clock, or the answer: own clock, and that of the request."""
     return dialect.MAVLink_timesync_message(tc1_ns, ts1_ns)
 
 
@@ -100,7 +100,7 @@ def ping_answer(request: Message) -> Message:
 
 
 def heartbeat(armed: bool, state: int, mode: int = Mode.HOLD) -> Message:
-    """The board's heartbeat; `armed`: flaps under control. `state` is that of the supervisor, 0..3."""
+    """Return the board's heartbeat; `armed`: flaps under control. `state` is that of the supervisor, 0..3."""
     base_mode = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
     if armed:
         base_mode |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
@@ -117,13 +117,13 @@ def heartbeat(armed: bool, state: int, mode: int = Mode.HOLD) -> Message:
 
 
 def read_heartbeat(message: Message) -> int | None:
-    """Return the supervisor's state that a board's heartbeat reports, 0..3; None for a status that no board sends."""
+    """Return the supervisor's state in a board's heartbeat, 0..3; None for a status that no board sends."""
     status = message.system_status
     return _STATUS_OF_STATE.index(status) if status in _STATUS_OF_STATE else None
 
 
 def available_mode(mode: Mode) -> Message:
-    """One of the board's modes; their indices begin at 1."""
+    """Return one of the board's modes; their indices begin at 1."""
     modes = tuple(Mode)
     return AvailableModes(
         len(modes),
@@ -136,31 +136,31 @@ def available_mode(mode: Mode) -> Message:
 
 
 def current_mode(mode: Mode) -> Message:
-    """The mode in force, which is the one that was chosen last or took its place."""
+    """Return the mode in force: the one that was chosen last, or its replacement."""
     return CurrentMode(dialect.MAV_STANDARD_MODE_NON_STANDARD, mode, mode)
 
 
 def no_control(request: Message) -> Message:
-    """The answer to CHANGE_OPERATOR_CONTROL: nobody gets control for himself. The nearest code that there is: 2, passkey."""
+    """Return the answer to CHANGE_OPERATOR_CONTROL: no control for anybody. The nearest code is 2, passkey."""
     return dialect.MAVLink_change_operator_control_ack_message(
         request.get_srcSystem(), request.control_request, 2
     )
 
 
 def system_time(unix_us: int, t_ms: int) -> Message:
-    """The time of day, 0 while it is not known, and the time since boot."""
+    """Return the time of day, 0 while it is not known, and the time since boot."""
     return dialect.MAVLink_system_time_message(unix_us, u32(t_ms))
 
 
 def named_value(t_ms: int, name: str, value: float) -> Message:
-    """A named number; the name is cut at 10 characters."""
+    """Return a named number; the name is cut at 10 characters."""
     return dialect.MAVLink_named_value_float_message(u32(t_ms), _text(name, 10), value)
 
 
 def status_text(severity: int, text: str, number: int = 0) -> tuple[Message, ...]:
-    """A line for the operator; severity as in syslog, 0 emergency .. 7 debug.
+    """Return a line for the operator; severity as in syslog, 0 emergency .. 7 debug.
 
-    A line of more than 50 characters travels in pieces that carry its number, 1..65535; the last is shorter.
+    A line of more than 50 characters is sent in pieces that carry its number, 1..65535; the last is shorter.
     """
     size = dialect.MAVLink_statustext_message.array_lengths[1]
     if len(text) <= size:
@@ -172,49 +172,49 @@ def status_text(severity: int, text: str, number: int = 0) -> tuple[Message, ...
 
 
 def parameter(name: str, value: float, index: int, count: int) -> Message:
-    """A parameter's value; the type is always REAL32, the only one that all ground stations read alike."""
+    """Return a parameter's value; the type is always REAL32, the only one that all ground stations read alike."""
     return dialect.MAVLink_param_value_message(
         _text(name, NAME_SIZE), value, dialect.MAV_PARAM_TYPE_REAL32, u16(count), u16(index)
     )
 
 
 def parameter_list(system: int, component: int) -> Message:
-    """A request for all parameters."""
+    """Return a request for all parameters."""
     return dialect.MAVLink_param_request_list_message(system, component)
 
 
 def parameter_read(system: int, component: int, which: str | int) -> Message:
-    """A request for one parameter, by name or by its index."""
+    """Return a request for one parameter, by name or by its index."""
     name, index = (which, -1) if isinstance(which, str) else ("", which)
     return dialect.MAVLink_param_request_read_message(system, component, _text(name, NAME_SIZE), index)
 
 
 def parameter_set(system: int, component: int, name: str, value: float) -> Message:
-    """A request to change a parameter, as REAL32."""
+    """Return a request to change a parameter, as REAL32."""
     return dialect.MAVLink_param_set_message(
         system, component, _text(name, NAME_SIZE), value, dialect.MAV_PARAM_TYPE_REAL32
     )
 
 
 def command_ack(number: int, result: int, to_system: int, to_component: int) -> Message:
-    """The answer to a command: MAV_RESULT 0 accepted, 1 temporarily rejected, 2 denied, 3 unsupported, 4 failed."""
+    """Return the answer to a command: MAV_RESULT 0 accepted, 1 temporarily rejected, 2 denied, 3 unsupported, 4 failed."""
     return dialect.MAVLink_command_ack_message(number, result, 0, 0, to_system, to_component)
 
 
 def refusal(ack: Message) -> str:
-    """Return what a COMMAND_ACK that does not accept says, in the standard's words."""
+    """Return the result in a COMMAND_ACK that does not accept, in the standard's words."""
     result = _word("MAV_RESULT", ack.result).replace("_", " ").lower()
     return f"the board refuses {_word('MAV_CMD', ack.command)}: {result}"
 
 
 def _word(enumeration: str, number: int) -> str:
-    """Return what the standard calls a number; the number where it does not."""
+    """Return the standard's word for a number; the number where there is none."""
     known = dialect.enums[enumeration].get(number)
     return str(number) if known is None else known.name.removeprefix(f"{enumeration}_")
 
 
 def autopilot_version(version: tuple[int, int, int], revision: bytes, uid: int) -> Message:
-    """What the board runs: version, up to 8 bytes of the source's revision, the board's serial number."""
+    """Return the board's version, up to 8 bytes of the source's revision, and its serial number."""
     major, minor, patch = version
     packed = major << 24 | minor << 16 | patch << 8
     own, none = list(revision[:8].ljust(8, b"\0")), [0] * 8
@@ -224,31 +224,31 @@ def autopilot_version(version: tuple[int, int, int], revision: bytes, uid: int) 
 
 
 def protocol_version() -> Message:
-    """MAVLink 2, and the versions that are read: 1 as well; the revisions of the standard are not stated."""
+    """Return MAVLink 2, and the versions that are read: 1 as well; the revisions of the standard are not stated."""
     return ProtocolVersion(200, 100, 200, [0] * 8, [0] * 8)
 
 
 def message_interval(number: int, interval_us: int) -> Message:
-    """How often a message is sent; -1: not at all, 0: there is no such message."""
+    """Return how often a message is sent; -1: not at all, 0: there is no such message."""
     return dialect.MAVLink_message_interval_message(u16(number), max(-1, min(_I32_MAX, interval_us)))
 
 
 def parameter_error(request: Message, name: str, index: int, error: int) -> Message:
-    """Why a request about a parameter fails: MAV_PARAM_ERROR 1 does not exist, 2 value out of range."""
+    """Return why a parameter request fails: MAV_PARAM_ERROR 1 does not exist, 2 value out of range."""
     return dialect.MAVLink_param_error_message(
         request.get_srcSystem(), request.get_srcComponent(), _text(name, NAME_SIZE), index, error
     )
 
 
 def no_mission(request: Message) -> Message:
-    """The answer to MISSION_REQUEST_LIST, for every type of mission."""
+    """Return the answer to MISSION_REQUEST_LIST, for every type of mission."""
     return dialect.MAVLink_mission_count_message(
         request.get_srcSystem(), request.get_srcComponent(), 0, request.mission_type
     )
 
 
 def refused_mission(request: Message) -> Message:
-    """The answer to every other message about missions."""
+    """Return the answer to every other message about missions."""
     return dialect.MAVLink_mission_ack_message(
         request.get_srcSystem(),
         request.get_srcComponent(),
@@ -258,24 +258,24 @@ def refused_mission(request: Message) -> Message:
 
 
 def no_logs() -> Message:
-    """The answer to LOG_REQUEST_LIST."""
+    """Return the answer to LOG_REQUEST_LIST."""
     return dialect.MAVLink_log_entry_message(0, 0, 0, 0, 0)
 
 
 def no_log_data(request: Message) -> Message:
-    """The answer to LOG_REQUEST_DATA: the log ends there."""
+    """Return the answer to LOG_REQUEST_DATA: the log ends there."""
     return dialect.MAVLink_log_data_message(request.id, request.ofs, 0, (0,) * 90)
 
 
 def extended_state(state: int) -> Message:
-    """Whether the robot is in the air, as far as the supervisor's state says: in failsafe that is not known on board."""
+    """Return whether the robot is in the air, by the supervisor's state: in failsafe that is not known on board."""
     return dialect.MAVLink_extended_sys_state_message(
         dialect.MAV_VTOL_STATE_UNDEFINED, _LANDED_OF_STATE[state]
     )
 
 
 def ftp_nak(request: Message) -> Message:
-    """The answer to any file transfer: unknown command."""
+    """Return the answer to any file transfer: unknown command."""
     asked = bytes(request.payload)
     sequence = (int.from_bytes(asked[:2], "little") + 1) & 0xFFFF
     session, opcode = asked[2], asked[3]

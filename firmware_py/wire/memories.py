@@ -1,4 +1,4 @@
-"""What lies in the memories that every Crazyflie has: the EEPROM's configuration block and a deck's one-wire memory."""
+"""The contents of the memories of every Crazyflie: the EEPROM's configuration block and a deck's one-wire memory."""
 
 import struct
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class RadioSettings:
 
 
 def encode_config(settings: RadioSettings) -> bytes:
-    """The configuration block, version 1."""
+    """Return the configuration block, version 1."""
     address = settings.address
     block = _CONFIG.pack(
         _CONFIG_MAGIC, _CONFIG_VERSION, settings.channel, settings.data_rate, 0.0, 0.0,
@@ -43,7 +43,7 @@ def encode_config(settings: RadioSettings) -> bytes:
 
 
 def decode_config(block: bytes) -> RadioSettings:
-    """The settings in a configuration block; `WireError` when it is malformed or its checksum is wrong."""
+    """Return the settings in a configuration block; `WireError` when it is malformed or its checksum is wrong."""
     if len(block) < CONFIG_SIZE or sum(block[: CONFIG_SIZE - 1]) & 0xFF != block[CONFIG_SIZE - 1]:
         raise WireError(f"configuration block {block[:CONFIG_SIZE].hex()}: wrong length or sum")
     magic, version, channel, data_rate, _, _, upper, lower = _CONFIG.unpack_from(block)
@@ -53,7 +53,7 @@ def decode_config(block: bytes) -> RadioSettings:
 
 
 def encode_one_wire(vendor: int, product: int, name: str, revision: str) -> bytes:
-    """The 112 bytes of a deck's memory."""
+    """Return the 112 bytes of a deck's memory."""
     header = _ONE_WIRE.pack(_ONE_WIRE_MAGIC, 0, vendor, product)
     elements = b"".join(
         bytes((kind, len(text))) + text.encode("latin-1")

@@ -19,7 +19,7 @@ TYPE_EXTENDED = 0x10  # bits of the type byte in the TOC
 TYPE_READ_ONLY = 0x40
 EXTENDED_PERSISTENT = 1
 
-ABSOLUTE = "extPose.absolute"  # what poses over CRTP are, a uint8
+ABSOLUTE = "extPose.absolute"  # the kind of poses over CRTP, a uint8
 
 OK, ENOENT, EACCES, EINVAL = 0, 2, 13, 22  # status bytes are errno's
 
@@ -50,18 +50,18 @@ class SetByName:
 
 
 def encode_set_by_name(request: SetByName) -> bytes:
-    """The complete packet; `WireError` when the name is too long."""
+    """Return the complete packet; `WireError` when the name is too long."""
     data = _name_bytes(request.name) + bytes((request.scalar.parameter_number,))
     return encode(Packet(PORT_PARAMETERS, CHANNEL_MISC, data + request.scalar.pack(request.value)))
 
 
 def encode_pose_kind(absolute: bool) -> bytes:
-    """The complete packet that says what the poses are that follow."""
+    """Return the complete packet that sets the kind of the poses that follow."""
     return encode_set_by_name(SetByName(ABSOLUTE, Scalar.U8, int(absolute)))
 
 
 def decode_set_by_name(data: bytes) -> SetByName:
-    """The request in the data of a channel 3 packet."""
+    """Return the request in the data of a channel 3 packet."""
     parts = data[1:].split(b"\0", 2)
     if data[:1] != bytes((Misc.SET_BY_NAME,)) or len(parts) < 3 or not parts[2]:
         raise WireError(f"not a set by name: {data.hex()}")
@@ -76,17 +76,17 @@ def decode_set_by_name(data: bytes) -> SetByName:
 
 
 def encode_set_by_name_reply(name: str, status: int) -> bytes:
-    """The data of the reply: the names again and a status."""
+    """Return the data of the reply: the names again and a status."""
     return _name_bytes(name) + bytes((status,))
 
 
 def encode_ident(number: int) -> bytes:
-    """A parameter's number."""
+    """Return a parameter's number."""
     return _IDENT.pack(number)
 
 
 def decode_ident(data: bytes, offset: int = 0) -> int:
-    """The parameter's number at `offset`."""
+    """Return the parameter's number at `offset`."""
     if len(data) < offset + _IDENT.size:
         raise WireError(f"a parameter request of {len(data)} bytes has no number")
     number: int = _IDENT.unpack_from(data, offset)[0]

@@ -1,7 +1,7 @@
 """The number types that log variables and parameters have on the wire, with their numbers in both tables of contents.
 
-Numbers are little-endian. A value that does not fit becomes what a cast in C makes of it: integers wrap, floats become
-infinite; only what C leaves undefined, NaN or infinity as an integer, is fixed here to be 0.
+Numbers are little-endian. A value that does not fit is cast as in C: integers wrap, floats become
+infinite; where C leaves the result undefined, for NaN or infinity as an integer, it is 0.
 """
 
 import struct
@@ -32,7 +32,7 @@ class Scalar(Enum):
         self.is_float = format in "fe"
 
     def cast(self, value: float) -> int | float:
-        """The value that this type holds in place of `value`."""
+        """Return the value that this type holds in place of `value`."""
         if self.is_float:
             try:
                 return float(self.layout.unpack(self.layout.pack(float(value)))[0])
@@ -45,11 +45,11 @@ class Scalar(Enum):
         return wrapped - (1 << bits) if self.format.islower() and wrapped >> (bits - 1) else wrapped
 
     def pack(self, value: float) -> bytes:
-        """The bytes of `cast(value)`."""
+        """Return the bytes of `cast(value)`."""
         return self.layout.pack(self.cast(value))
 
     def unpack(self, data: bytes) -> float:
-        """The value of exactly `size` bytes; `WireError` for any other number of them."""
+        """Return the value of exactly `size` bytes; `WireError` for any other number of them."""
         if len(data) != self.size:
             raise WireError(f"{self.name}: {len(data)} bytes instead of {self.size}")
         value: float = self.layout.unpack(data)[0]

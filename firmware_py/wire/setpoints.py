@@ -1,4 +1,4 @@
-"""Set-points on port 7 that give a position: a position with a yaw, and the full state, whose motion is ignored.
+"""Set-points on port 7 with a position: a position with a yaw, and the full state, whose motion is ignored.
 
 Facts: crazyflie-firmware 2a18fc29 (crtp_commander_generic.c), cflib 0.1.34.
 """
@@ -26,7 +26,7 @@ _MILLIMETRE = 1e-3
 
 
 def decode_place(data: bytes) -> tuple[Vector, float]:
-    """Position [m] and yaw [rad] of a set-point that is `POSITION` or `FULL_STATE`."""
+    """Return position [m] and yaw [rad] of a set-point that is `POSITION` or `FULL_STATE`."""
     layout = _POSITION if data[0] == POSITION else _FULL_STATE
     check_size(f"a {NAMES[data[0]]} set-point", data, layout.size)
     fields = layout.unpack(data)
@@ -42,11 +42,11 @@ def decode_place(data: bytes) -> tuple[Vector, float]:
 
 
 def encode_place(p: Vector, yaw: float) -> bytes:
-    """The complete packet of a position set-point [m, rad]."""
+    """Return the complete packet of a position set-point [m, rad]."""
     place = _POSITION.pack(*p, degrees(yaw))[1:]
     return bytes((header(PORT_GENERIC_SETPOINT, CHANNEL_SETPOINT), POSITION)) + place
 
 
 def encode_end() -> bytes:
-    """The complete packet after the last set-point: the high-level commander takes over at once."""
+    """Return the complete packet after the last set-point: the high-level commander takes over at once."""
     return bytes((header(PORT_GENERIC_SETPOINT, CHANNEL_NOTICE),)) + bytes(NOTICE_SIZE)

@@ -6,10 +6,10 @@ from enum import IntEnum
 
 
 class State(IntEnum):
-    """What the robot is allowed to do."""
+    """The robot's permissions."""
 
     CALIBRATING = 0  # the gyro's zero is unknown: flaps at hover
-    WAITING = 1  # no pose has come yet, or there is nothing to fly to: flaps at hover
+    WAITING = 1  # no pose yet, or no target: flaps at hover
     FLYING = 2  # loop closed
     FAILSAFE = 3  # flaps at hover, see the cause
 
@@ -23,10 +23,10 @@ class Cause(IntEnum):
     EMERGENCY_STOP = 3
     LOW_BATTERY = 4
     DISARMED = 5
-    NO_CONTROL = 6  # of a real board: no controller step came, or another controller runs
+    NO_CONTROL = 6  # of a real board: no controller step ran, or another controller runs
     CONTROLLER_NOT_FINITE = 7  # own logic returned NaN or infinity
     ESTIMATOR_NOT_FINITE = 8
-    IMU_STALE = 9  # the gyro delivers nothing new
+    IMU_STALE = 9  # the gyro's counts do not change
 
 
 PLATFORM_COMMAND, PLATFORM_VERSION, PLATFORM_APP = 0, 1, 2

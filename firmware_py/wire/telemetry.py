@@ -1,9 +1,9 @@
-"""The telemetry of a flight: which log variables travel in which log block, as one table for all links.
+"""The telemetry of a flight: the log variables of each log block, as one table for all links.
 
 Names and types are the Crazyflie's log variables and log types. On the wire the attitude is in the Crazyflie's degrees; a
 `Sample` has SI units and Floaty's signs only, converted here.
 
-Over CRTP each block is sampled and sent by itself. What identification compares, inputs and what they cause, is therefore in
+Over CRTP each block is sampled and sent separately. Identification compares inputs and their effects, which are therefore in
 one block, as half floats: their steps, 2^-11 of the value, are below the noise of the gyro and of the flaps.
 """
 
@@ -17,11 +17,11 @@ from firmware_py.wire.scalars import Scalar
 
 PERIOD_MS = 20  # of the original ground station's log blocks
 SLOW_PERIOD_MS = 500
-TIMESTAMP_MASK = 0xFFFFFF  # of a sample: what a log data packet has room for
+TIMESTAMP_MASK = 0xFFFFFF  # of a sample: the bits in a log data packet
 
 Number = int | float  # the value of a log variable: an integer where its type on the wire is one
 
-# What the Crazyflie's log variables of roll, pitch and yaw show per radian: its legacy pitch is positive with the nose up.
+# The Crazyflie's log variables of roll, pitch and yaw per radian: its legacy pitch is positive with the nose up.
 LEGACY_DEGREES = (degrees(1), -degrees(1), degrees(1))
 
 
@@ -37,7 +37,7 @@ class Variable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TelemetryBlock:
-    """Variables that travel together in one packet; at most 26 bytes. There is one object per block: the tables below."""
+    """Variables that are sent in one packet; at most 26 bytes. There is one object per block: the tables below."""
 
     id: int
     period_ms: int
@@ -51,7 +51,7 @@ class TelemetryBlock:
         object.__setattr__(self, "is_scaled", any(item.scale is not None for item in self.variables))
 
     def unpack(self, packed: bytes) -> tuple[Number, ...]:
-        """The values of a sample; `WireError` for a wrong length."""
+        """Return the values of a sample; `WireError` for a wrong length."""
         if len(packed) != self.layout.size:
             raise WireError(
                 f"log block {self.id}: {len(packed)} bytes of values instead of {self.layout.size}"
@@ -59,7 +59,7 @@ class TelemetryBlock:
         return self.si_of(self.layout.unpack(packed))
 
     def si_of(self, values: Sequence[Number]) -> tuple[Number, ...]:
-        """The values of a sample from those of the log variables."""
+        """Return the values of a sample from those of the log variables."""
         if not self.is_scaled:
             return tuple(values)
         return tuple(
@@ -81,7 +81,7 @@ def _variables(group: str, names: str, type: Scalar, unit: str) -> tuple[Variabl
     return tuple(Variable(f"{group}.{name}", type, unit) for name in names.split())
 
 
-# Position and yaw are those of the goal frame: what the board knows is its error.
+# Position and yaw are those of the goal frame: the board knows only its error.
 MOTION = TelemetryBlock(
     0,
     PERIOD_MS,
@@ -113,7 +113,7 @@ CONTROL = TelemetryBlock(
     + _variables("excite", "u1 u2 u3 u4", Scalar.F16, "rad"),
 )
 BLOCKS = (MOTION, ATTITUDE, FLAPS, CONTROL)
-# Apart, because a Crazyflie has no load variable. MAVLink: SYS_STATUS.
+# Separate, because a Crazyflie has no load variable. MAVLink: SYS_STATUS.
 BATTERY = TelemetryBlock(4, SLOW_PERIOD_MS, _variables("pm", "vbat", Scalar.F32, "V"))
 LOAD = TelemetryBlock(5, SLOW_PERIOD_MS, _variables("system", "load", Scalar.F32, "%"))  # of the processor
 SLOW_BLOCKS = (BATTERY, LOAD)
@@ -130,5 +130,5 @@ CRAZYFLIE_BLOCKS = (MOTION, CRAZYFLIE_STATE, BATTERY)
 
 
 def state_in(samples: Sequence[Sample]) -> int | None:
-    """The supervisor's state, None where no sample has it."""
+    """Return the supervisor's state, None where no sample has it."""
     return next((int(sample.values[0]) for sample in samples if sample.block is CONTROL), None)

@@ -1,7 +1,7 @@
 """Tables of contents: how a client learns the names and types of log variables and parameters (version 2).
 
-Requests `03` (how many, which checksum) and `02 id` (one entry) on channel 0 of the log and the parameter port. A client
-keeps tables by checksum alone, in one place for both ports: equal tables on two ports must not have equal checksums.
+Requests `03` (count and checksum) and `02 id` (one entry) on channel 0 of the log and the parameter port. A client
+caches tables by checksum alone, in one place for both ports: equal tables on two ports must not have equal checksums.
 """
 
 import struct
@@ -34,7 +34,7 @@ class Toc:
         return cls(entries, crc32(b"".join(entries), port))
 
     def answer(self, request: bytes, limits: bytes = b"") -> bytes:
-        """The reply to a request; `limits` ends the reply to `03`. An unknown id gets the bare command back."""
+        """Return the reply to a request; `limits` ends the reply to `03`. An unknown id gets the bare command back."""
         if request[:1] == bytes((INFO,)):
             return _INFO.pack(INFO, len(self.entries), self.crc) + limits
         if request[:1] != bytes((ITEM,)) or len(request) < _ITEM_REQUEST.size:
