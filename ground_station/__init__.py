@@ -1,3 +1,3 @@
-"""The computer beside the tunnel: a mocap frame arrives, a correction leaves, telemetry comes back."""
+"""The computer beside the tunnel: it receives mocap frames and telemetry, and sends corrections."""
 
 from firmware_py import fast as fast  # lets compiled modules be found

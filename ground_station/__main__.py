@@ -1,6 +1,6 @@
 """The ground station alone: `python -m ground_station --link URI` holds the robot at home.
 
-It needs nothing of the laboratory. `floaty station` flies the same session and adds experiments, run folders and pictures.
+It needs nothing of the laboratory. `floaty station` runs the same session and adds experiments, run folders and pictures.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from ground_station.trajectory import Goal, Hold, Trajectory
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Fly until Ctrl-C; return the exit code: 0, or 2 with one line for what cannot be flown."""
+    """Fly until Ctrl-C; return the exit code: 0, or 2 with one line on the error."""
     parser = argparse.ArgumentParser(
         "ground_station", description="Send poses to a board that hovers at home."
     )

@@ -8,7 +8,7 @@ from firmware_py.section import Section, number
 
 
 class StationConfig(Section):
-    """What the ground station does with frames."""
+    """How the ground station uses frames."""
 
     corrections_hz: float = number(
         50.0, "[1, 200]", "corrections per second [Hz], if there are that many frames; original"
@@ -21,7 +21,7 @@ class StationConfig(Section):
 
 
 class PilotConfig(Section):
-    """How a robot with the Crazyflie's own firmware is flown: from the floor to the floor, by the Crazyflie's services."""
+    """The flight of a robot with the Crazyflie's own firmware: from the floor to the floor, by the Crazyflie's services."""
 
     enabled: bool = Field(False, description="true: the board has the Crazyflie's own firmware, an image")
     parameters: dict[str, dict[str, float]] = Field(
@@ -35,7 +35,7 @@ class PilotConfig(Section):
 
 
 class TrackerConfig(Section):
-    """What the ground station accepts as a pose of the robot."""
+    """Which poses of the robot the ground station accepts."""
 
     enabled: bool = Field(True, description="false: frames go to the link as they come, as in the original")
     position_noise: float = number(0.0005, "(0, 0.1]", "of poses, per axis [m]; that of [mocap]")
@@ -71,7 +71,7 @@ Axes = Literal["z-up", "y-up"]
 
 
 class CaptureConfig(Section):
-    """The real motion capture system; the virtual cameras are `[mocap]`, and `mocap.period_us` is for both."""
+    """The real motion capture system; the virtual cameras are `[mocap]`, and `mocap.period_us` applies to both."""
 
     system: System = Field("optitrack", description="optitrack: Motive, also that of `floaty serve`")
     host: str = Field("127.0.0.1", min_length=1, description="where the system's computer is")
@@ -112,7 +112,7 @@ class CaptureConfig(Section):
 
 
 class GroundConfig(Section):
-    """All that a ground station needs to know, from a profile or a file of its own."""
+    """All settings of a ground station, from a profile or a separate file."""
 
     station: StationConfig = Field(default_factory=StationConfig)
     tracker: TrackerConfig = Field(default_factory=TrackerConfig)

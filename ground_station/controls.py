@@ -1,8 +1,8 @@
-"""What an operator may do with a board beside flying it: its parameters, arming, the emergency stop.
+"""An operator's requests to a board besides flying it: its parameters, arming, the emergency stop.
 
-A request begins with `ask`; whoever runs the link calls `answer` until there is one. Nothing blocks here, so that
-poses are still sent. `Dialogue` is what all protocols have in common: a script of exchanges, each repeated until its reply
-comes.
+A request begins with `ask`; the code that runs the link calls `answer` until there is one. Nothing blocks here, so
+poses are still sent. `Dialogue` is common to all protocols: a script of exchanges, each repeated until its reply
+arrives.
 """
 
 from collections.abc import Callable, Generator
@@ -11,8 +11,8 @@ from enum import Enum
 from math import nan
 from typing import Any, Generic, TypeVar
 
-REPEAT_US = 100_000  # without a reply, until the request is sent again
-PATIENCE_US = 2_000_000  # without a reply, until it is given up
+REPEAT_US = 100_000  # without a reply, before the request is repeated
+PATIENCE_US = 2_000_000  # without a reply, before the request is given up
 
 
 class ControlsError(Exception):
@@ -20,13 +20,13 @@ class ControlsError(Exception):
 
 
 class ControlAction(Enum):
-    """What may be requested."""
+    """The kinds of requests."""
 
     LIST = "list"  # parameters and their values: all, or at least those whose names begin with a name
     READ = "read"
     WRITE = "write"
     SAVE = "save"  # the persistent parameters, for the next boot
-    ARM = "arm"  # and leave every state that ends without a reboot
+    ARM = "arm"  # and clear every state that ends without a reboot
     STOP = "stop"  # at once: flaps at hover until the board reboots
 
 
@@ -41,7 +41,7 @@ class ControlRequest:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The result: the requested parameters, by the names of the link; `error` is empty if all is well."""
+    """The result: the requested parameters, by the names of the link; `error` is empty on success."""
 
     values: tuple[tuple[str, float], ...]
     error: str = ""
@@ -52,11 +52,11 @@ M = TypeVar("M")  # a message of the protocol
 
 @dataclass(frozen=True, slots=True)
 class Exchange(Generic[M]):
-    """One message and its reply; `take` returns None for a message that is something else."""
+    """One message and its reply; `take` returns None for any other message."""
 
     send: Callable[[int], object]
     take: Callable[[M], Any]
-    waits: bool = False  # the reply comes by itself: send only when it does not
+    waits: bool = False  # the reply comes unasked: send only when it does not
     patience_us: int = PATIENCE_US
     missing: str = f"no answer within {PATIENCE_US * 1e-6:.0f} s"  # the error without a reply
 

@@ -2,7 +2,7 @@
 
 
 class LinkError(Exception):
-    """The board cannot be reached, or no longer, or not with this address; the text is one line."""
+    """The board cannot be reached, the link is lost, or the address is wrong; the text is one line."""
 
 
 class MocapError(Exception):

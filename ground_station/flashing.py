@@ -1,7 +1,7 @@
-"""A firmware image into the board's flash, by radio, through the bootloader that every Crazyflie carries.
+"""Flashing of a firmware image by radio, through the bootloader that every Crazyflie carries.
 
-The board restarts into its bootloader, takes the image in pages, is read back, and starts only what is there byte for
-byte. The bootloader listens to radio alone: neither USB nor UDP can flash. Besides the link the only file that knows cflib.
+The board restarts into its bootloader, takes the image in pages, is read back, and starts it only if every byte
+matches. The bootloader works by radio alone: neither USB nor UDP can flash. The only file besides the link that uses cflib.
 """
 
 import re
@@ -21,12 +21,12 @@ URI = r"radio://\w+/\d{1,3}/(250K|1M|2M)(/[0-9A-Fa-f]{10})?"
 START = 0x0800_4000  # of the firmware in the flash of the STM32F405; the bootloader lies below
 FLASH_END = 0x0810_0000
 MEMORIES = ((0x2000_0000, 0x2002_0000), (0x1000_0000, 0x1001_0000))  # where the stack may begin
-QUIET_S = 0.2  # without an answer nothing is in flight any more
+QUIET_S = 0.2  # without an answer no packet is in flight any more
 READ_TRIES = 3
 
 
 def check_image(image: bytes) -> None:
-    """Raise `LinkError` for what cannot be firmware for the board: its first words are the stack and the start."""
+    """Raise `LinkError` for an image that is no firmware for the board: its first words are the stack and the start."""
     if len(image) > FLASH_END - START:
         raise LinkError(f"an image of {len(image)} bytes: {FLASH_END - START} fit")
     if len(image) >= 8:
@@ -38,7 +38,7 @@ def check_image(image: bytes) -> None:
 
 
 def flash(uri: str, image: bytes, progress: Progress) -> None:
-    """Write an image, compare what is there, and start it; `LinkError` says in one line why not.
+    """Write an image, compare it, and start it; `LinkError` has the reason for a failure in one line.
 
     When that happens after the first page was written, the board stays in its bootloader until it is flashed again or
     its button is pressed.
@@ -108,7 +108,7 @@ def _verify(loader: Cloader, image: bytes, progress: Progress) -> None:
 
 
 def _read(loader: Cloader, page: int) -> bytes:
-    """Return a page, empty when it cannot be read; a late answer to an earlier request confuses cflib."""
+    """Return a page, empty when it cannot be read; late answers to earlier requests confuse cflib."""
     while loader.link.receive_packet(0) is not None:
         pass
     try:

@@ -1,9 +1,9 @@
-"""Whether motion capture delivers frames as often as the profile says, and often enough for the corrections."""
+"""Checks that motion capture delivers frames at the profile's rate, and often enough for the corrections."""
 
 from itertools import pairwise
 from statistics import median
 
-WINDOW_US = 4_000_000  # in which it is measured: longer than a stall and the burst behind it
+WINDOW_US = 4_000_000  # of the measurement: longer than a stall and the burst after it
 TOLERANCE = 0.1
 
 
@@ -17,7 +17,7 @@ class FrameRate:
         self._measured = False
 
     def on_frame(self, t_us: int) -> str:
-        """Take an exposure; returns a line for the user, which is almost always empty."""
+        """Take an exposure; return a line for the user, nearly always empty."""
         if self._measured:
             return ""
         exposures_us = self._exposures_us

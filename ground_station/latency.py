@@ -1,7 +1,7 @@
-"""Where the age of a pose comes from: camera, processing, network, station and link, from the exposure to the board.
+"""The parts of a pose's age: camera, processing, network, station and link, from the exposure to the board.
 
 Camera: until the motion capture computer has the images. Processing: until the pose leaves it. Network: until the
-station has it. Station: until the link gets it. Link: until the board has it. "mocap" is the first three in one, for
+station has it. Station: until the link gets it. Link: until the board has it. "mocap" is the sum of the first three, for
 sources that do not report them separately. Times in microseconds.
 """
 
@@ -13,14 +13,14 @@ from math import ceil, isnan, nan
 from ground_station.mocap import MocapFrame
 
 STAGES = ("camera", "processing", "network", "mocap", "station", "link")
-SENT_POSES = 250  # that the budget is made of: 5 s at 50 Hz
+SENT_POSES = 250  # in the budget: 5 s at 50 Hz
 
-Row = tuple[float, ...]  # the time in each of `STAGES` of one pose; nan: not reported
+Row = tuple[float, ...]  # the time of one pose in each of `STAGES`; nan: not reported
 
 
 @dataclass(frozen=True, slots=True)
 class LinkLatency:
-    """How long a link takes to bring a pose to the board."""
+    """The latency of a pose on a link to the board."""
 
     medium: str
     us: int
@@ -32,7 +32,7 @@ class LinkLatency:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """The time that many poses spent in a stage."""
+    """The time of many poses in a stage."""
 
     name: str
     mean_us: float
@@ -40,7 +40,7 @@ class Stage:
 
 
 def row_of(frame: MocapFrame, sent_us: int, link_us: int) -> Row:
-    """The latency of a pose that the link got at `sent_us`, by stages."""
+    """Return the latency by stages of a pose that the link got at `sent_us`."""
     arrived_us = sent_us if frame.arrived_us is None else frame.arrived_us
     rest = (arrived_us - frame.t_us, sent_us - arrived_us, link_us)
     if frame.received_us is None or frame.transmitted_us is None:
@@ -50,7 +50,7 @@ def row_of(frame: MocapFrame, sent_us: int, link_us: int) -> Row:
 
 
 def budget_of(rows: Sequence[Row], medium: str) -> tuple[Stage, ...]:
-    """The reported stages, and the age on board as "pose" ahead of them; empty without poses."""
+    """Return the reported stages, and the age on board as "pose" ahead of them; empty without poses."""
     if not rows:
         return ()
     columns = dict(zip(STAGES, zip(*rows, strict=True), strict=True))
@@ -60,7 +60,7 @@ def budget_of(rows: Sequence[Row], medium: str) -> tuple[Stage, ...]:
 
 
 def reported_stages(columns: Mapping[str, Sequence[float]]) -> tuple[str, ...]:
-    """The stages that add up to the age: "mocap" only where one of those before it is not reported."""
+    """Return the stages that add up to the age: "mocap" only where one of its parts is not reported."""
     apart = [name for name in STAGES[:3] if not isnan(sum(columns[name]))]
     return (*(apart if len(apart) == 3 else ("mocap",)), *STAGES[4:])
 
@@ -78,19 +78,19 @@ def budget_line(budget: Sequence[Stage]) -> str:
 
 
 class LatencyBudget:
-    """The latencies of the poses that were sent last."""
+    """The latencies of the last poses sent."""
 
     def __init__(self) -> None:
         self._link: LinkLatency | None = None  # of the last pose
         self._sent: deque[tuple[MocapFrame, int, int]] = deque(maxlen=SENT_POSES)
 
     def add(self, frame: MocapFrame, sent_us: int, link: LinkLatency) -> None:
-        """The link got this pose at `sent_us`."""
+        """Add a pose that the link got at `sent_us`."""
         self._link = link
         self._sent.append((frame, sent_us, link.us))
 
     def last(self) -> Row:
-        """The latency of the last pose by stages, all nan before the first."""
+        """Return the latency of the last pose by stages, all nan before the first."""
         return row_of(*self._sent[-1]) if self._sent else (nan,) * len(STAGES)
 
     def __str__(self) -> str:

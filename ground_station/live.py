@@ -1,7 +1,7 @@
-"""The ground station with real hardware: poses from a source, a link to a board, until stopped.
+"""The ground station with real hardware: poses from a source, a link to a board, until it is stopped.
 
-It connects again when the link is lost, shows the state of the link and the age of poses, and leaves the board with its
-flaps at hover: the corrections stop first, and the link is closed when the board is in failsafe.
+It reconnects when the link is lost, shows the state of the link and the age of poses, and leaves the board with its
+flaps at hover: it stops the corrections first, and closes the link when the board is in failsafe.
 """
 
 from collections.abc import Callable
@@ -54,17 +54,17 @@ class LiveStation:
         self._report()
 
     def _serve_source(self) -> bool:
-        """Keep the source going while the link connects; return whether to give up."""
+        """Serve the source while the link connects; return whether to give up."""
         self._drop_waiting()
         return self.stopping()
 
     def _drop_waiting(self) -> None:
-        """Discard the frames that are waiting."""
+        """Drop the waiting frames."""
         while self.source.receive(0.0) is not None:
             pass
 
     def _reconnect(self, cause: LinkError) -> None:
-        """Try until it succeeds or takes too long."""
+        """Retry until it succeeds or takes too long."""
         deadline_us = clock_us() + RECONNECT_TIMEOUT_US
         self.link.close()
         while not self.stopping():

@@ -1,4 +1,4 @@
-"""What a motion capture system reports about the robot."""
+"""A motion capture system's reports on the robot."""
 
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -10,20 +10,20 @@ from firmware_py.wire.crtp import FAR
 class MocapFrame:
     """The body's pose in the world at one exposure of the cameras, and the instants of its stages; None: not reported.
 
-    All instants are of the ground station's clock.
+    All instants are on the ground station's clock.
     """
 
     t_us: int  # the exposure
     p_WB: tuple[float, float, float]  # [m]
     q_WB: tuple[float, float, float, float]  # w x y z
-    valid: bool  # False: the body was not tracked and the pose has no meaning; True is only the system's word until `judged`
-    received_us: int | None = None  # the motion capture computer has the images
-    transmitted_us: int | None = None  # the pose leaves it
-    arrived_us: int | None = None  # the ground station has it
+    valid: bool  # False: not tracked, the pose is meaningless; True is unchecked until `judged`
+    received_us: int | None = None  # arrival of the images at the motion capture computer
+    transmitted_us: int | None = None  # departure of the pose from it
+    arrived_us: int | None = None  # arrival at the ground station
 
 
 def judged(frame: MocapFrame) -> MocapFrame:
-    """A frame from any source, valid only if its numbers are a position and a rotation.
+    """Return a frame from any source, valid only if its numbers are a position and a rotation.
 
     The comparisons are false for NaN and infinity, too.
     """
@@ -40,13 +40,13 @@ class MocapSource(Protocol):
         """Connect; raises `MocapError`."""
 
     def receive(self, timeout_s: float) -> MocapFrame | None:
-        """The next frame, None when none comes in time."""
+        """Return the next frame, None when none comes in time."""
 
     def notices(self) -> list[str]:
-        """Lines for the user since the last call."""
+        """Return lines for the user since the last call."""
 
     def summary(self) -> str:
-        """A few words on its state."""
+        """Return a few words on the state."""
 
     def close(self) -> None:
         """Disconnect."""

@@ -1,7 +1,7 @@
-"""What an operator types while a board flies: a line, an act, an event.
+"""The operator's input while a board flies: a line, an act, an event.
 
-A request to the board is answered while poses are sent; the next line waits for the answer, but `stop` waits for nothing. A
-refused request is one line and changes nothing. `say` answers at the terminal, `note` records what was done.
+A request to the board is answered while poses are sent; the next line waits for the answer, but `stop` does not wait. A
+refused request is one line and changes nothing. `say` prints answers at the terminal, `note` records actions.
 """
 
 import shlex
@@ -29,12 +29,12 @@ stop                 emergency stop: flaps at hover, until the board reboots
 mark TEXT            add a note to the record
 help                 show this list"""
 COMMANDS = tuple(line.split()[0] for line in HELP.splitlines())
-LINES = 100  # that wait to be executed
+LINES = 100  # waiting for execution
 REACH = 1.0  # [m] from home, beyond which a goal is refused as a mistake: the tunnel is 1.2 m wide
-# Values count as good when the robot has kept within this distance [m] of its goal for this long with them.
+# Values count as good after the robot has kept within this distance [m] of its goal for this long with them.
 WELL, WELL_US = 0.10, 5_000_000
 
-# A dialogue with the board; returns what was done, empty if there is nothing to note.
+# A dialogue with the board; returns the action, empty if there is nothing to note.
 Talk = Generator[ControlRequest, Settings, str]
 FindTrajectory = Callable[[str], Callable[[Goal, int], Trajectory]]
 
@@ -42,8 +42,8 @@ FindTrajectory = Callable[[str], Callable[[Goal, int], Trajectory]]
 class Operator:
     """Call `take` for each line and `turn` in every turn of the station's loop.
 
-    `find` returns the trajectory of a name, or raises `ControlsError`. `know`, if there is one, is called with every value
-    of a parameter that becomes known, all of them at first.
+    `find` returns the trajectory of a name, or raises `ControlsError`. `know`, if given, is called with every known value
+    of a parameter, all of them at first.
     """
 
     def __init__(
@@ -60,8 +60,8 @@ class Operator:
         self._is_learning = know is not None  # all parameters are still to be requested
         self._lines: deque[str] = deque()
         self._talk: Talk | None = None
-        self._line = ""  # that is being executed
-        self._set: dict[str, float] = {}  # values that were changed, by the names of the link
+        self._line = ""  # being executed
+        self._set: dict[str, float] = {}  # changed values, by the names of the link
         self._good: dict[str, float] = {}  # those of them that last flew well
         self._well_since_us: int | None = None
         self.known: Sequence[str] = tuple(OF_PROFILE)  # names of parameters, for completion
@@ -102,7 +102,7 @@ class Operator:
             self._refuse(str(error))
 
     def _execute(self, command: str, words: list[str], cockpit: Cockpit, now_us: int) -> None:
-        """Do what a line says at once, or begin its dialogue with the board."""
+        """Execute a line at once, or begin its dialogue with the board."""
         at_once: dict[str, Callable[[], str]] = {
             "goal": lambda: self._goal(words, cockpit, now_us),
             "fly": lambda: self._fly(words, cockpit, now_us),
@@ -151,7 +151,7 @@ class Operator:
             cockpit.link.ask(now_us, request)
 
     def _finish(self, done: str) -> None:
-        """Record and show what was done, if there is something to note."""
+        """Record and show an action, if there is something to note."""
         if done:
             self._note(done)
             self._say(done)
@@ -212,7 +212,7 @@ class Operator:
     def _ask(self, command: str, words: list[str]) -> Talk:
         _words(words, command, 0)
         if command == "stop":
-            self._note("stop")  # whether it was acknowledged or not
+            self._note("stop")  # acknowledged or not
         yield ControlRequest(ControlAction(command))
         done = {"save": "saved", "arm": "armed", "stop": "stopped"}
         return done[command]
@@ -224,7 +224,7 @@ class Operator:
             raise ControlsError("nothing to reset: the values that are set are those that last flew well")
         for name, value in changed.items():
             ((_, self._set[name]),) = yield ControlRequest(ControlAction.WRITE, name, value)
-            self._well_since_us = None  # the others have not flown beside it
+            self._well_since_us = None  # the others have not flown with it
         return "reset " + ", ".join(f"{name} {value:.6g}" for name, value in changed.items())
 
     def _help(self) -> str:
@@ -233,7 +233,7 @@ class Operator:
         return ""
 
     def _watch(self, cockpit: Cockpit, now_us: int) -> None:
-        """Remember values after they have flown well for a while."""
+        """Remember values that have flown well for a while."""
         frame, flying = cockpit.ground.frame, cockpit.link.supervisor_state == State.FLYING
         goal = cockpit.plan.at(now_us).p_WG
         near = frame is not None and hypot(*(a - b for a, b in zip(frame.p_WB, goal, strict=True))) <= WELL

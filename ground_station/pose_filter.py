@@ -1,8 +1,8 @@
-"""The state behind a stream of poses: a linear Kalman filter with position, velocity, attitude, rate.
+"""The state estimate from a stream of poses: a linear Kalman filter with position, velocity, attitude, rate.
 
-All axes are alike: how uncertain position and velocity are, and with which gains a pose counts, is computed for one axis,
-and likewise for angle and rate. The attitude lives in a reference quaternion; the filter's angle is the small rotation that
-it deviates by, which is moved into the reference after every step.
+All axes are alike: the uncertainty of position and velocity, and the gains for a pose, are computed for one axis,
+and likewise for angle and rate. The attitude is a reference quaternion; the filter's angle is the small rotation
+from it, which is moved into the reference after every step.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from firmware_py.geometry import IDENTITY, Quaternion, Vector
 
-SPEED = 1.0  # [m/s] of a robot that is seen for the first time, one standard deviation per axis; chosen
+SPEED = 1.0  # [m/s] of a robot seen for the first time, one standard deviation per axis; chosen
 RATE = 5.0  # [rad/s] likewise
 NOTHING: Vector = (0.0, 0.0, 0.0)
 
@@ -25,14 +25,14 @@ class Noise:
 
 
 class Covariance(NamedTuple):
-    """Of a value and its slope: the variances and what both share. A tuple: each frame makes four of them."""
+    """The variances and the covariance of a value and its slope. A tuple: each frame makes four of them."""
 
     value: float
     both: float
     slope: float
 
     def predicted(self, t: float, noise: Noise) -> "Covariance":
-        """A step of `t` [s] later: F P F' + Q with F = (1 t; 0 1), Q = a^2 (t^4/4 t^3/2; t^3/2 t^2)."""
+        """Return the covariance after `t` [s]: F P F' + Q with F = (1 t; 0 1), Q = a^2 (t^4/4 t^3/2; t^3/2 t^2)."""
         change, shift = t * noise.acceleration, 0.5 * t * t * noise.acceleration  # of slope and value
         both = self.both + t * self.slope
         return Covariance(
@@ -42,12 +42,12 @@ class Covariance(NamedTuple):
         )
 
     def gains(self, noise: Noise) -> tuple[float, float]:
-        """The weights of a measurement for the value and for the slope [1, 1/s]: P H' / (H P H' + R)."""
+        """Return the weights of a measurement for value and slope [1, 1/s]: P H' / (H P H' + R)."""
         total = self.value + noise.value * noise.value
         return self.value / total, self.both / total
 
     def updated(self, k_value: float, k_slope: float) -> "Covariance":
-        """After a measurement with these gains: (I - K H) P."""
+        """Return the covariance after a measurement with these gains: (I - K H) P."""
         return Covariance(
             self.value - k_value * self.value,
             self.both - k_value * self.both,
@@ -90,7 +90,7 @@ class PoseFilter:
         self._q = (n * w, n * x, n * y, n * z)
 
     def predict(self, steps: int, widen: bool) -> None:
-        """Predict `steps` ahead; without `widen` the uncertainty stays as it is."""
+        """Predict `steps` ahead; without `widen` the uncertainty stays unchanged."""
         for _ in range(steps - 1):
             self._move()
             self._turn()
@@ -105,15 +105,15 @@ class PoseFilter:
 
     @property
     def variances(self) -> tuple[float, float]:
-        """Of the next pose's distance and of its rotation from the prediction, per axis [m^2, rad^2]."""
+        """The variances of the next pose's distance and rotation from the prediction, per axis [m^2, rad^2]."""
         (position, rotation), (p, r) = self._covariances, self._noises
         return position.value + p.value * p.value, rotation.value + r.value * r.value
 
     def deviation(self, p_WB: Vector, q_WB: Quaternion) -> tuple[float, float, Vector]:
-        """How far a pose is from the prediction, squared [m^2, rad^2], and its rotation from the reference.
+        """Return the squared distance from the prediction [m^2, rad^2], and the rotation from the reference.
 
         Rotations are twice Gibbs's vector, 2 tan(angle / 2) about the axis [rad]: the angle itself where it is small, and
-        far beyond every gate where it is not small.
+        far beyond every gate where it is not.
         """
         x, y, z = self._p
         a, b, c = self._theta
@@ -131,7 +131,7 @@ class PoseFilter:
         return dx * dx + dy * dy + dz * dz, da * da + db * db + dc * dc, theta
 
     def update(self, p_WB: Vector, theta: Vector) -> tuple[Vector, Vector]:
-        """Take a pose, as position and rotation from the reference; returns velocity in W and rate in B."""
+        """Take a pose, as position and rotation from the reference; return velocity in W and rate in B."""
         (position, rotation), (of_position, of_rotation) = self._covariances, self._noises
         k_p, k_v = position.gains(of_position)
         k_theta, k_w = rotation.gains(of_rotation)
@@ -142,7 +142,7 @@ class PoseFilter:
         return self._v, self._w
 
     def leave_out(self) -> tuple[Vector, Vector]:
-        """Skip the pose of this frame; returns velocity and rate as predicted."""
+        """Skip this frame's pose; return velocity and rate as predicted."""
         self._turn()
         return self._v, self._w
 
@@ -172,7 +172,7 @@ class PoseFilter:
 def _corrected(
     value: Vector, slope: Vector, measured: Vector, gain: float, slope_gain: float
 ) -> tuple[Vector, Vector]:
-    """Three values and their slopes, after a measurement."""
+    """Return three values and their slopes after a measurement."""
     x, y, z = value
     a, b, c = slope
     dx, dy, dz = measured[0] - x, measured[1] - y, measured[2] - z

@@ -1,6 +1,6 @@
-"""The ground station as a program: cameras, link, tracker, trajectory and records wired together, until stopped.
+"""The ground station as a program: it connects cameras, link, tracker, trajectory and records, until stopped.
 
-It does not depend on the laboratory: its part of a profile arrives as `GroundConfig`.
+It is independent of the laboratory: its part of a profile arrives as `GroundConfig`.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,7 +33,7 @@ ASK_PERIOD_S = 0.002  # between two polls for an answer
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """What is flown. `start_s`: when the trajectory's clock begins, after the board first flies."""
+    """The flight. `start_s`: start of the trajectory's clock, after the board first flies."""
 
     uri: str
     mocap: str | None  # overrides the settings' capture
@@ -46,14 +46,14 @@ class Session:
 
 @dataclass(frozen=True, slots=True)
 class Cockpit:
-    """What a recorder or an operator of a flight sees."""
+    """The view of a recorder or an operator on a flight."""
 
     link: LiveLink
     ground: GroundStation
     plan: FlightPlan
 
 
-Hand = Callable[[Cockpit, int], None]  # called in every turn of the station's loop with its instant
+Hand = Callable[[Cockpit, int], None]  # called with the instant in every turn of the station's loop
 
 
 def fly(
@@ -113,13 +113,13 @@ def ask(link: LiveLink, request: ControlRequest) -> Answer:
 
 
 def run_until(stopping: Callable[[], bool], duration_s: float | None) -> Callable[[], bool]:
-    """Return the function that says when to end: when stopped, or after a duration from now on."""
+    """Return the function that returns whether to end: when stopped, or after a duration from now on."""
     start_us = clock_us()
     return lambda: stopping() or (duration_s is not None and clock_us() - start_us > duration_s * 1e6)
 
 
 def link_settings(settings: GroundConfig) -> LinkSettings:
-    """Return what the links need; a link never sends more poses than the cameras deliver."""
+    """Return the links' settings; a link never sends more poses than the cameras deliver."""
     return LinkSettings(
         corrections_hz=min(settings.station.corrections_hz, 1e6 / settings.frame_period_us),
         latency_us=settings.station.link_latency_us,
@@ -129,7 +129,7 @@ def link_settings(settings: GroundConfig) -> LinkSettings:
 
 
 def why(error: Exception, uri: str) -> str:
-    """Return the line with the reason why a session on this link ended."""
+    """Return the reason why a session on this link ended, as one line."""
     if isinstance(error, LinkError):
         return f"--link {error}"
     if isinstance(error, OSError):

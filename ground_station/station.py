@@ -1,7 +1,7 @@
 """The ground station: frames in, poses and goals out, telemetry into the log. It never reads a clock: callers
 pass the time.
 
-The tracker, if there is one, decides which frames are used. A tracked pose leaves with the goal of the moment, as in
+The tracker, if there is one, decides which frames are used. A tracked pose is sent with the present goal, as in
 the original: a new goal counts at once, not after the camera's latency.
 """
 
@@ -31,11 +31,11 @@ class Link(Protocol):
         """Send a tracked pose and the goal in the form that the board needs."""
 
     def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
-        """The telemetry in `data`, empty if it is something else; `WireError` if it is malformed."""
+        """Return the telemetry in `data`, empty if it is something else; `WireError` if it is malformed."""
 
     @property
     def latency(self) -> LinkLatency:
-        """From `send` to the board."""
+        """The latency from `send` to the board."""
 
 
 @dataclass(slots=True)
@@ -49,7 +49,7 @@ class StationCounters:
 
 
 class Slots:
-    """When corrections are due: evenly, by the exposures' clock, whatever the rate of the frames.
+    """When corrections are due: evenly, on the exposures' clock, at any rate of the frames.
 
     A frame up to an eighth of the period early takes its slot, so that cameras about as fast as the corrections lose
     none to jitter. The slots keep their phase: a late frame does not delay the next one.
@@ -61,20 +61,20 @@ class Slots:
         self._next_us: int | None = None  # None until the first frame sets the phase
 
     def due(self, t_us: int) -> bool:
-        """Whether the frame exposed at `t_us` belongs to a slot that is free; the first one does."""
+        """Return whether the frame exposed at `t_us` belongs to a free slot; the first one does."""
         if self._next_us is None or t_us < self._next_us - self._period_us - self._early_us:  # clock set back
             self._next_us = t_us
         return t_us >= self._next_us - self._early_us
 
     def take(self, t_us: int) -> None:
-        """Fill the slot of the frame exposed at `t_us`, and those that passed unused."""
+        """Fill the slot of the frame exposed at `t_us`, and unused earlier ones."""
         assert self._next_us is not None
         passed = (t_us + self._early_us - self._next_us) // self._period_us
         self._next_us += (passed + 1) * self._period_us
 
 
 class GroundStation:
-    """Passive: `on_frame` for each frame of motion capture, `on_packet` for whatever arrives from the board."""
+    """Passive: call `on_frame` for each frame of motion capture, `on_packet` for all data from the board."""
 
     def __init__(
         self,
@@ -120,11 +120,11 @@ class GroundStation:
         self._slots.take(frame.t_us)
 
     def notices(self) -> list[str]:
-        """Lines for the user since the last call."""
+        """Return lines for the user since the last call."""
         return self.tracker.notices() if self.tracker is not None else []
 
     def on_packet(self, now_us: int, data: bytes) -> None:
-        """Take bytes of the board: telemetry goes to the log, what cannot be read is counted."""
+        """Take bytes from the board: telemetry is logged, unreadable bytes are counted."""
         self.counters.received += 1
         try:
             samples = self._link.receive(now_us, data)

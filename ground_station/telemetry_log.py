@@ -1,8 +1,8 @@
-"""The ground station's own record of a flight: a CSV file with one row per telemetry time stamp.
+"""The ground station's record of a flight: a CSV file with one row per telemetry time stamp.
 
-A row joins the blocks that carry the same time stamp with what the ground station itself knew when the first
-of them arrived: its clock, the goal, the last usable pose, the tracker's result and where the age of the last sent
-pose came from. Missing values are `nan`. The header names each column's unit: `stateEstimate.x [m]`. The file is
+A row joins the blocks that carry the same time stamp with the ground station's own data when the first
+of them arrived: its clock, the goal, the last usable pose, the tracker's result and the age of the last sent
+pose by stages. Missing values are `nan`. The header names each column's unit: `stateEstimate.x [m]`. The file is
 complete to about a second when the process dies; memory holds one row.
 """
 
@@ -42,7 +42,7 @@ _GROUND_COLUMNS = (
 
 
 def _columns_of(blocks: tuple[TelemetryBlock, ...]) -> tuple[list[str], dict[int, int]]:
-    """The telemetry columns' titles, and where each block begins among them."""
+    """Return the telemetry columns' titles, and where each block begins among them."""
     titles: list[str] = []
     first: dict[int, int] = {}
     for block in blocks:

@@ -1,6 +1,6 @@
-"""Lines that are typed while a station flies: with history and completion at a terminal, line by line from a pipe.
+"""Lines typed while a station flies: with history and completion at a terminal, line by line from a pipe.
 
-A thread reads, so that the flight never waits. The only file that knows prompt_toolkit.
+A thread reads, so that the flight never waits. The only file that uses prompt_toolkit.
 """
 
 import os
@@ -15,13 +15,13 @@ from prompt_toolkit import PromptSession
 from prompt_toolkit.completion import WordCompleter
 from prompt_toolkit.patch_stdout import patch_stdout
 
-LINES = 1000  # that wait to be fetched
+LINES = 1000  # waiting to be fetched
 READ_SIZE = 4096
 CLOSE_TIMEOUT_S = 1.0
 
 
 class Terminal:
-    """Reads standard input from now on; `words` returns what can be completed to."""
+    """Reads standard input from now on; `words` returns the possible completions."""
 
     def __init__(self, words: Callable[[], Sequence[str]]) -> None:
         self._lines: queue.Queue[str] = queue.Queue(LINES)
@@ -45,7 +45,7 @@ class Terminal:
         self._thread.start()
 
     def lines(self) -> list[str]:
-        """Return what was typed since the last call."""
+        """Return the lines typed since the last call."""
         lines: list[str] = []
         with suppress(queue.Empty):
             while True:
@@ -71,7 +71,7 @@ class Terminal:
             self._lines.put_nowait(line)
 
     def _read(self, descriptor: int) -> None:
-        """Read a pipe until its end; not through `sys.stdin`, whose lock a thread that waits would keep for ever."""
+        """Read a pipe until its end; not through `sys.stdin`, because a waiting thread would keep its lock for ever."""
         rest = b""
         while data := os.read(descriptor, READ_SIZE):
             *lines, rest = (rest + data).split(b"\n")

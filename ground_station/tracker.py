@@ -1,8 +1,8 @@
-"""The tracker between motion capture and link: refuses wrong poses, knows the velocity.
+"""The tracker between motion capture and link: it refuses wrong poses and estimates the velocity.
 
-Good frames pass unchanged: smoothing would be a delay that the board's filter does not know. A pose is refused when it is
+Good frames pass unchanged: smoothing would add a delay unknown to the board's filter. A pose is refused when it is
 further from the prediction than noise and pushes explain. Without a good pose for `reacquire_us` the track is lost, and it
-begins again when three poses fit one another, which wrong ones rarely do. The first track begins so, too.
+restarts when three poses fit one another, which wrong ones rarely do. The first track starts the same way.
 """
 
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ GATHER_US = 500_000
 
 @dataclass(slots=True)
 class TrackNotices:
-    """Collects events until a line is due; times are those of frames."""
+    """Collects events until a line is due; times are from frames."""
 
     _refused: int = 0
     _distance: float = 0.0  # the largest [m]
@@ -30,24 +30,24 @@ class TrackNotices:
     _due_us: int | None = None
 
     def refused(self, t_us: int, distance: float, angle: float) -> None:
-        """A pose was refused at this distance from the prediction [m, rad]."""
+        """Note a pose refused at this distance from the prediction [m, rad]."""
         self._refused += 1
         self._distance = max(self._distance, distance)
         self._angle = max(self._angle, angle)
         self._happened(t_us)
 
     def lost(self, t_us: int) -> None:
-        """The track was lost."""
+        """Note a lost track."""
         self._lost = True
         self._happened(t_us)
 
     def begun_again(self, t_us: int, gap_us: int) -> None:
-        """A new track began `gap_us` after the last good pose."""
+        """Note a new track, `gap_us` after the last good pose."""
         self._gap_us = gap_us
         self._happened(t_us)
 
     def due(self, t_us: int) -> list[str]:
-        """At most one line, by a clock that may jump."""
+        """Return at most one line, by a clock that may jump."""
         if self._due_us is None or 0 < self._due_us - t_us <= GATHER_US:
             return []
         notices = []
@@ -71,21 +71,21 @@ class TrackNotices:
 
 POSES = 3  # that begin a track
 FIT_US = 50_000  # between them; a later one does not confirm the others
-WIDEN_US = 60_000  # refused poses widen the gate until then only, else they would open it to themselves
+WIDEN_US = 60_000  # refused poses widen the gate only until then, else it would accept them
 UNKNOWN: Vector = (nan, nan, nan)
 
 
 class Quality(IntEnum):
-    """What the tracker decided about a frame."""
+    """The tracker's decision about a frame."""
 
-    NONE = 0  # there is no track, or the body was not seen
+    NONE = 0  # no track, or the body was not seen
     REFUSED = 1  # it fits neither the track nor the time
     TRACKED = 3  # good; records of earlier versions have 2 for a predicted pose
 
 
 @dataclass(slots=True)
 class Track:
-    """The frame to be used, and how the robot moves; NaN without a track."""
+    """The frame to be used, and the robot's motion; NaN without a track."""
 
     frame: MocapFrame
     v_WB: Vector  # [m/s]
@@ -100,7 +100,7 @@ class TrackerCounters:
 
 
 class Tracker:
-    """`take` every frame, judged before; they come `period_us` apart."""
+    """`take` every frame, after `judged`; they come `period_us` apart."""
 
     def __init__(self, config: TrackerConfig, period_us: int) -> None:
         self.counters = TrackerCounters()
@@ -120,7 +120,7 @@ class Tracker:
         self._tracking = False  # there are `POSES` of them
         self._patience_us = FIT_US  # how old the last good frame may be
         self._t_us = 0  # of the newest frame
-        self._good_us = 0  # of the newest that the filter has taken
+        self._good_us = 0  # of the newest frame accepted by the filter
         self._lost_us: int | None = None  # of the last good frame before a track was lost
         self._refused_in_a_row = 0
         self._widening = max(1, WIDEN_US // period_us)
@@ -132,11 +132,11 @@ class Tracker:
         return track
 
     def notices(self) -> list[str]:
-        """Lines for the user since the last call, half a second late so that one line has all of them."""
+        """Return lines for the user since the last call, half a second late so that one line has all of them."""
         return self._notices.due(self._t_us)
 
     def summary(self) -> str:
-        """A few words on its state."""
+        """Return a few words on the state."""
         counters = self.counters
         return f"{self.quality.name.lower()} ({counters.refused} refused, {counters.restarts} restarts)"
 
@@ -161,7 +161,7 @@ class Tracker:
         distance2, angle2, theta = self._filter.deviation(frame.p_WB, frame.q_WB)
         position2, rotation2 = self._filter.variances
         if distance2 > self._gate2 * position2 or angle2 > self._gate2 * rotation2:
-            if not self._tracking:  # one of them is wrong: the newest is tried
+            if not self._tracking:  # one of them is wrong: start again with the newest
                 self._begin(frame)
                 return _without(frame, Quality.NONE)
             self.counters.refused += 1
@@ -178,14 +178,14 @@ class Tracker:
         return Track(frame, v_WB, w_B, Quality.TRACKED)
 
     def _begin(self, frame: MocapFrame) -> None:
-        """Take a pose for the first of a track."""
+        """Take the first pose of a track."""
         self._filter.begin(frame.p_WB, frame.q_WB)
         self._poses = 1
         self._good_us = frame.t_us
         self._refused_in_a_row = 0
 
     def _fit(self, t_us: int) -> None:
-        """One more pose fits those before it."""
+        """Count one more pose that fits those before it."""
         self._poses += 1
         if self._poses < POSES:
             return
@@ -202,7 +202,7 @@ class Tracker:
         self._tracking, self._patience_us = False, FIT_US
 
     def _without_pose(self, frame: MocapFrame, quality: Quality) -> Track:
-        """A pose is missing or wrong: the velocity is predicted, and no pose is sent."""
+        """Predict the velocity without a pose: it is missing or wrong, and none is sent."""
         v_WB, w_B = self._filter.leave_out()
         if not self._tracking:
             return _without(frame, quality)
@@ -210,10 +210,10 @@ class Tracker:
 
 
 def tracker_of(config: TrackerConfig, period_us: int) -> Tracker | None:
-    """The tracker that a profile asks for."""
+    """Return a profile's tracker, None if it has none."""
     return Tracker(config, period_us) if config.enabled else None
 
 
 def _without(frame: MocapFrame, quality: Quality) -> Track:
-    """There is no pose to be used, and nothing is known."""
+    """Return a track without pose and motion."""
     return Track(replace(frame, valid=False), UNKNOWN, UNKNOWN, quality)

@@ -1,4 +1,4 @@
-"""Where the robot has to be: goals as functions of time.
+"""The robot's goal as a function of time.
 
 `Hold` stays; `Offsets` adds one signal per axis to a home goal. The experiments of the paper are one line
 each, for example `Offsets(home, start_us, yaw=Sine(pi / 2, 0.15))`. Signals count time from the start of the
@@ -25,7 +25,7 @@ class Trajectory(Protocol):
     """A goal for every instant."""
 
     def at(self, t_us: int) -> Goal:
-        """The goal at `t_us`."""
+        """Return the goal at `t_us`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,27 +39,27 @@ class Hold:
 
 
 class FlightPlan:
-    """What a station flies: `home` until `start` is called, then the trajectory that `make(home, start_us)` returns.
+    """The station's flight: `home` until `start` is called, then the trajectory that `make(home, start_us)` returns.
 
     An operator's `steer` overrides it.
     """
 
     def __init__(self, home: Goal, make: Callable[[Goal, int], Trajectory]) -> None:
         self.home = home
-        self.start_us: int | None = None  # when the trajectory's clock begins, once that is known
+        self.start_us: int | None = None  # start of the trajectory's clock, once known
         self._make = make
         self._flown: Trajectory = Hold(home)
         self._steered = False
 
     def start(self, start_us: int) -> None:
-        """Let the trajectory's clock begin at an instant; only the first call counts."""
+        """Start the trajectory's clock at an instant; only the first call counts."""
         if self.start_us is None:
             self.start_us = start_us
             if not self._steered:
                 self._flown = self._make(self.home, start_us)
 
     def steer(self, trajectory: Trajectory) -> None:
-        """Fly something else from now on."""
+        """Fly another trajectory from now on."""
         self._flown, self._steered = trajectory, True
 
     def at(self, t_us: int) -> Goal:

@@ -1,4 +1,4 @@
-"""The host's end of the core's port: sends the requests of a batch, repeats those that are not answered, whatever is lost.
+"""The host's end of the core's port: it sends the requests of a batch and repeats unanswered ones, whatever is lost.
 
 `firmware_py.wire.core_port` has the rules by which a board executes each request once. It knows no link: `packets` carries
 them.
@@ -25,7 +25,7 @@ from ground_station.errors import LinkError
 
 Request = tuple[Message, bytes]
 
-WINDOW = 4  # requests in flight at once: a board's queue has room for 5 packets, and it reboots when that overflows
+WINDOW = 4  # requests in flight; a board's queue has room for 5 packets, and it reboots when that overflows
 FIRST_WAIT_S = 0.1  # for an answer, before requests are repeated
 LONGEST_WAIT_S = 0.4
 SILENCE_S = 3.0  # after which the board is given up
@@ -69,7 +69,7 @@ class SilenceError(LinkError):
 
 
 class CoreClient:
-    """A board's core; `begin` first. `name` is what the user calls the board. Every method raises `LinkError`."""
+    """A board's core; `begin` first. `name` is the user's name of the board. Every method raises `LinkError`."""
 
     def __init__(self, packets: Packets, name: str) -> None:
         self.name = name
@@ -91,12 +91,12 @@ class CoreClient:
                 raise LinkError(
                     f"{self.name}: its app speaks version {about.version}, expected {VERSION}: export and flash it again"
                 )
-            if about.done == 0:  # otherwise an earlier program's session had that number
+            if about.done == 0:  # otherwise that number was an earlier program's
                 return about
         raise LinkError(f"{self.name}: it begins no session")
 
     def execute(self, requests: Sequence[Request]) -> list[CoreAnswer]:
-        """Have requests executed in their order, at most one of them a call; returns their answers."""
+        """Execute requests in their order, at most one of them a call; return their answers."""
         answers = self._exchange(requests)
         self._number = (self._number + len(requests)) & 0xFFFF
         return answers
@@ -110,7 +110,7 @@ class CoreClient:
 
     def _exchange(self, requests: Sequence[Request]) -> list[CoreAnswer]:
         answers: dict[int, CoreAnswer] = {}
-        sent = begin = 0  # requests sent, and those of them answered without a gap
+        sent = begin = 0  # requests sent, and those answered without a gap
         wait_s, silent_s = FIRST_WAIT_S, 0.0
         while begin < len(requests):
             for index in range(sent, min(begin + WINDOW, len(requests))):

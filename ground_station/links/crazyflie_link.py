@@ -1,7 +1,7 @@
-"""The link to a Crazyflie that flies with its own firmware, inside one process: poses, a whole flight, and its log.
+"""The link to a Crazyflie with its own firmware, inside one process: poses, a whole flight, and its log.
 
-The flight: parameters are written, the estimator begins anew on poses, the robot is armed, takes off with the high-level
-commander, follows the goal, lands and stops. A goal that stays at home needs no packets; one that moves is sent as a
+The flight: parameters are written, the estimator restarts on poses, the robot is armed, takes off with the high-level
+commander, follows the goal, lands and stops. A goal that stays at home needs no packets; a moving one is sent as a
 position set-point with every pose, as cflib's position commander does. Facts: crazyflie-firmware 2a18fc29, cflib 0.1.34.
 """
 
@@ -22,22 +22,22 @@ from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal, Trajectory
 
 ARM_US = 500_000  # before the take-off
-STOP_US = 1_000_000  # after the landing, behind which a robot may lag
+STOP_US = 1_000_000  # after the landing, which a robot may finish late
 END_US = 300_000  # of the flight, after that
-AWAY = 1e-3  # [m] a goal so far from home is sent
+AWAY = 1e-3  # [m] a goal at this distance from home is sent
 NO_GROUPS = 0  # all robots are addressed
 ESTIMATOR = "kalman.resetEstimation"
 
 
 def smooth(share: float) -> float:
-    """Return the share of the way from rest to rest after a share of the time, by the firmware's polynomial."""
+    """Return the share of the distance after a share of the time, from rest to rest, by the firmware's polynomial."""
     s = min(max(share, 0.0), 1.0)
     return s * s * s * s * (35.0 - s * (84.0 - s * (70.0 - s * 20.0)))
 
 
 @dataclass(frozen=True, slots=True)
 class FlightTimes:
-    """Instants of a flight [us]: take-off, begin of the trajectory, landing, and the end of that."""
+    """Instants of a flight [us]: take-off, start of the trajectory, landing, and its end."""
 
     take_off_us: int
     begin_us: int
@@ -46,7 +46,7 @@ class FlightTimes:
 
     @staticmethod
     def of(config: PilotConfig, take_off_us: int, duration_us: int) -> "FlightTimes":
-        """Return those of a flight that takes off at an instant and is over after a duration."""
+        """Return the instants of a flight with this take-off and duration."""
         begin_us = take_off_us + round((config.take_off_s + config.settle_s) * 1e6)
         landed_us = take_off_us + duration_us - STOP_US - END_US
         return FlightTimes(take_off_us, begin_us, landed_us - round(config.land_s * 1e6), landed_us)
@@ -54,10 +54,10 @@ class FlightTimes:
 
 @dataclass(frozen=True, slots=True)
 class FromFloor:
-    """Take-off, a trajectory and landing as goals: those that the board computes for itself."""
+    """Take-off, a trajectory and landing as goals, as the board computes them."""
 
     flown: Trajectory
-    floor: float  # z of the robot where it stands [m], W
+    floor: float  # z of the robot on the floor [m], W
     home: Goal
     config: PilotConfig
     times: FlightTimes
@@ -108,7 +108,7 @@ class CrazyflieLink:
         self._logs.request(now_us)
 
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
-        """Send the pose as it is, and what the flight needs at this instant."""
+        """Send the unchanged pose, and the packets of the flight that are due."""
         self._now_us, self._goal = now_us, goal
         self._transmit(now_us, encode_ext_pose(frame.p_WB, frame.q_WB, None))
         self._logs.tend(now_us)
@@ -117,14 +117,14 @@ class CrazyflieLink:
             self._next_us = next(self._steps)
 
     def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
-        """The telemetry in a packet from the board, empty for a packet of another service."""
+        """Return the telemetry in a packet from the board, empty for a packet of another service."""
         packet = decode(data)
         if packet.port in PORTS:
             self._controls.hear(now_us, packet)
         return self._logs.hear(now_us, packet) if packet.port == PORT_LOG else ()
 
     def _fly(self) -> Iterator[int]:
-        """Do what is due, and yield when the next thing is [us]; the board's answers are awaited in between."""
+        """Do what is due, and yield the next due instant [us]; the board's answers are awaited in between."""
         times, config = self._times, self._config
         yield 0
         for group, values in config.parameters.items():
@@ -151,7 +151,7 @@ class CrazyflieLink:
         yield 1 << 62
 
     def _follow(self) -> None:
-        """Send the goal, once it has left home."""
+        """Send the goal, once it is away from home."""
         goal, home = self._goal, self._home
         self._streams = self._streams or dist(goal.p_WG, home.p_WG) > AWAY or goal.yaw != home.yaw
         if self._streams:

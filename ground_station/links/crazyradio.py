@@ -1,6 +1,6 @@
 """The back end for a real Crazyflie-class board over cflib: `radio://…` with a Crazyradio, or `udp://…`.
 
-Telemetry comes through log blocks that are created on connecting. The only link that knows cflib.
+Telemetry comes through log blocks that are created on connecting. The only link that uses cflib.
 """
 
 import logging
@@ -46,11 +46,11 @@ from ground_station.links.log_blocks import LogBlocks
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
-CFLIB_CLOSES_S = 3.0  # it may stay behind when the dongle was pulled
-CONSOLE_BYTES = 1000  # that are kept of an unfinished line
+CFLIB_CLOSES_S = 3.0  # it may hang when the dongle was pulled
+CONSOLE_BYTES = 1000  # kept of an unfinished line
 ECHO_PERIOD_US = 100_000  # between packets that the board sends back
 ECHO_APART_US = 3_000  # from the last correction, which they would delay
-ECHOES = 30  # of which the median counts
+ECHOES = 30  # for the median
 ECHO_HEADER = 0xF0  # port 15, channel 0
 ECHO = struct.Struct("<BQ")  # kind, own clock [us]; as long as cflib's own packets, which have kind 0
 OWN_ECHO = 1
@@ -60,13 +60,13 @@ URIS = (r"radio://\w+/\d{1,3}/(250K|1M|2M)(/[0-9A-Fa-f]{10})?", r"udp://[\w.-]+:
 
 
 class CrazyradioLink(LiveLink):
-    """One board; `latency_us` is assumed for the link until half the round trip of echoed packets is known."""
+    """One board; `latency_us` is the link's assumed latency until half the round trip of echoed packets is known."""
 
     def __init__(self, uri: str, latency_us: int) -> None:
         self._medium = uri.partition(":")[0]
         super().__init__(uri, LinkLatency(self._medium, latency_us, measured=False))
         self._round_trips_us: deque[int] = deque(maxlen=ECHOES)
-        self._echo_us = 0  # when to ask for the next one
+        self._echo_us = 0  # when to request the next one
         self._sent_us = 0  # the last correction
         self._cache = tempfile.mkdtemp(prefix="floaty-toc-")  # of the TOC, for reconnecting
         weakref.finalize(self, shutil.rmtree, self._cache, ignore_errors=True)
@@ -75,7 +75,7 @@ class CrazyradioLink(LiveLink):
         self._lost = ""  # cflib's reason for it
         self._console = b""  # the unfinished line that the board has printed
         self._logs = LogBlocks(self._queue, self._log_table)
-        self._telemetry_us = 0  # when the last packet of a log block arrived
+        self._telemetry_us = 0  # arrival of the last packet of a log block
         self._rate = 0.0  # of exchanges [1/s], 0 over UDP
         self._controls = CrtpControls(partial(self._queue, 0), self._parameters)
         quiet_cflib()
@@ -150,7 +150,7 @@ class CrazyradioLink(LiveLink):
             closing.join(CFLIB_CLOSES_S)
 
     def _log_table(self) -> dict[str, int]:
-        """Return the numbers of the board's log variables, as cflib has fetched them."""
+        """Return the numbers of the board's log variables, as fetched by cflib."""
         groups = {} if self._crazyflie is None else self._crazyflie.log.toc.toc
         return {
             f"{group}.{name}": element.ident
@@ -159,7 +159,7 @@ class CrazyradioLink(LiveLink):
         }
 
     def _parameters(self) -> dict[str, TocEntry]:
-        """Return the board's table of parameters, as cflib has fetched it, without those of types that Floaty lacks."""
+        """Return the board's table of parameters, as fetched by cflib, without those of types that Floaty lacks."""
         groups = {} if self._crazyflie is None else self._crazyflie.param.toc.toc
         scalars = {ParamTocElement.types[number][0]: scalar for number, scalar in PARAMETER_SCALARS.items()}
         return {
@@ -181,7 +181,7 @@ class CrazyradioLink(LiveLink):
         return self._controls.answer(now_us)
 
     def start_telemetry(self, now_us: int) -> None:
-        """Nothing: the log blocks run since `open`."""
+        """Do nothing: the log blocks run since `open`."""
 
     # Uplink
 
@@ -202,7 +202,7 @@ class CrazyradioLink(LiveLink):
     # Downlink
 
     def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
-        """The telemetry in a packet from the board, empty for a packet of another service."""
+        """Return the telemetry in a packet from the board, empty for a packet of another service."""
         packet = decode(data)
         if packet.port in PORTS:
             self._controls.hear(now_us, packet)
@@ -221,14 +221,14 @@ class CrazyradioLink(LiveLink):
         return samples
 
     def _on_any_packet(self, packet: CRTPPacket) -> None:
-        if packet.header & NULL_MASK != NULL_HEADER:  # the radio chip answers even when no board is behind it
+        if packet.header & NULL_MASK != NULL_HEADER:  # the radio chip answers even without a board behind it
             self.heard_us = clock_us()
 
     def _on_packet(self, packet: CRTPPacket) -> None:
         self._hear(bytes((packet.header,)) + bytes(packet.data))
 
     def _ask_for_echo(self, now_us: int) -> None:
-        """Have the board echo a packet, well apart from corrections, which would delay both."""
+        """Request an echo from the board, well apart from corrections, which would delay both."""
         if now_us < self._echo_us or now_us - self._sent_us < ECHO_APART_US:
             return
         self._echo_us = now_us + ECHO_PERIOD_US
@@ -257,7 +257,7 @@ class CrazyradioLink(LiveLink):
 
 
 def quiet_cflib() -> None:
-    """Keep cflib's own messages off the terminal: whatever matters becomes a `LinkError`."""
+    """Keep cflib's own messages off the terminal: important ones become a `LinkError`."""
     logger = logging.getLogger("cflib")
     logger.propagate = False
     if not logger.handlers:
@@ -265,6 +265,6 @@ def quiet_cflib() -> None:
 
 
 def first_line(text: str) -> str:
-    """The first line of one of cflib's messages, which may carry a traceback."""
+    """Return the first line of one of cflib's messages, which may carry a traceback."""
     lines = text.strip().splitlines() or ["no reason given"]
     return lines[0].removeprefix("Couldn't load link driver: ")

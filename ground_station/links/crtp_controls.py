@@ -58,7 +58,7 @@ class TocEntry:
 
 
 class CrtpControls(Dialogue[Packet]):
-    """`transmit` takes packets' bytes; `table` is the board's table of contents, which is known when it is connected."""
+    """`transmit` takes packets' bytes; `table` is the board's table of contents, known once connected."""
 
     def __init__(
         self, transmit: Callable[[bytes], object], table: Callable[[], Mapping[str, TocEntry]]
@@ -117,7 +117,7 @@ class CrtpControls(Dialogue[Packet]):
         return ()
 
     def _arm(self) -> Script[Packet]:
-        """Use Floaty's own parameters where they exist: the Crazyflie firmware's arming does not concern the flaps."""
+        """Use Floaty's own parameters where they exist: the Crazyflie firmware's arming does not affect the flaps."""
         for name, value in (("floaty.stop", 0.0), ("floaty.armed", 1.0)):
             if name in self._table():
                 yield from self._write(name, value)
@@ -130,7 +130,7 @@ class CrtpControls(Dialogue[Packet]):
         return ()
 
     def _stop(self) -> Script[Packet]:
-        """Every Crazyflie knows the stop of the localisation port; newer ones report that they are locked."""
+        """Send the stop of the localisation port, which every Crazyflie has; newer ones report that they are locked."""
         stop = Packet(PORT_LOCALISATION, CHANNEL_GENERIC, bytes((EMERGENCY_STOP,)))
         ask = Packet(PORT_SUPERVISOR, SUPERVISOR_INFO, bytes((GET_BITS,)))
 
@@ -152,7 +152,7 @@ class CrtpControls(Dialogue[Packet]):
         return table[name]
 
     def _exchange_for(self, channel: int, entry: TocEntry, value: bytes = b"") -> Exchange[Packet]:
-        """Return the exchange whose reply has the channel and the number of the request, and a value behind it."""
+        """Return the exchange whose reply has the request's channel and number, followed by a value."""
         size = 1 if channel == CHANNEL_READ else entry.scalar.size  # a status, and a value if that is good
         packet = Packet(PORT_PARAMETERS, channel, encode_ident(entry.number) + value)
 

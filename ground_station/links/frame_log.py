@@ -1,7 +1,7 @@
 """The MAVLink frames of a link in both directions, as a telemetry log of ground stations: each after its time.
 
-A record is eight bytes, microseconds, big-endian, and one whole frame as it was on the line; bytes that were no good frame
-when they arrived are left out. The file is complete to about a second when the process dies.
+A record is eight bytes, microseconds, big-endian, and one whole frame as received or sent; damaged received
+frames are omitted. The file is complete to about a second when the process dies.
 """
 
 from pathlib import Path
@@ -11,7 +11,7 @@ FLUSH_PERIOD_US = 1_000_000
 
 
 class FrameLog:
-    """`epoch_us`: the time that is written for the instant 0, since 1970 where that is known. Raises `OSError`."""
+    """`epoch_us`: the time written for the instant 0, since 1970 where that is known. Raises `OSError`."""
 
     def __init__(self, path: Path, epoch_us: int = 0) -> None:
         self._file = path.open("wb")
@@ -19,7 +19,7 @@ class FrameLog:
         self._flushed_us = 0
 
     def note(self, t_us: int, frame: bytes) -> None:
-        """Write a frame that was sent or received at `t_us`; after `close` nothing."""
+        """Write a frame that was sent or received at `t_us`; does nothing after `close`."""
         if self._file.closed:
             return
         self._file.write((self._epoch_us + t_us).to_bytes(8, "big") + frame)

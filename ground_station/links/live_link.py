@@ -1,7 +1,7 @@
-"""What all links to a real board have in common; `crazyradio` and `mavlink_serial` are the back ends.
+"""The common part of all links to a real board; `crazyradio` and `mavlink_serial` are the back ends.
 
-The newest pose waits in a mailbox; one thread sends, so that nothing else waits for the line, and a pose that is too old by
-then is dropped. Every wait has a limit, and every failure is a `LinkError` of one line. A back end opens, sends
+The newest pose waits in a mailbox; one thread sends, so that nothing else waits for the line, and a pose that has become
+too old is dropped. Every wait has a limit, and every failure is a `LinkError` of one line. A back end opens, sends
 and reads.
 """
 
@@ -22,17 +22,17 @@ from ground_station.trajectory import Goal
 
 ANSWER_TIMEOUT_US = 4_000_000  # without any answer while connecting
 CONNECT_TIMEOUT_US = 60_000_000  # in total; tables of contents are long and slow with losses
-SILENCE_TIMEOUT_US = 2_000_000  # connected: the slowest board is heard once per second
-MAX_AGE_US = 120_000  # of a pose on board, which could not use an older one
-POLL_S = 0.05  # between two looks at a board that connects
+SILENCE_TIMEOUT_US = 2_000_000  # connected: the slowest board is received once per second
+MAX_AGE_US = 120_000  # of a pose on board, which cannot use an older one
+POLL_S = 0.05  # between two checks of a board that connects
 CLOSE_TIMEOUT_S = 1.5
-PIECES = 2000  # that were read and wait in `received`
+PIECES = 2000  # read and waiting in `received`
 
 Job = Callable[[], None]
 
 
 class Sender:
-    """A thread that does one job after the other."""
+    """A thread that does one job after another."""
 
     def __init__(self) -> None:
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()  # only a few; at most one pose
@@ -61,7 +61,7 @@ class Sender:
 class LiveLink(ABC):
     """One board. `open` before use; it may be opened again after `close`.
 
-    The back end keeps `heard_us`, `latency` and `supervisor_state` up to date, and hands what it reads to `_hear`.
+    The back end keeps `heard_us`, `latency` and `supervisor_state` up to date, and passes what it reads to `_hear`.
     """
 
     def __init__(self, uri: str, latency: LinkLatency) -> None:
@@ -72,7 +72,7 @@ class LiveLink(ABC):
         self.sent = 0  # poses
         # Poses that a newer one replaced, or that were too old when they were to be sent.
         self.late = 0
-        self.heard_us = 0  # when the board was last heard; 0: not yet
+        self.heard_us = 0  # when the board was last received; 0: not yet
         # Of a radio: link quality, 100 % without retries, and signal strength at the board [-dBm].
         self.quality = self.rssi = nan
         self._notices: list[str] = []
@@ -82,7 +82,7 @@ class LiveLink(ABC):
         self._lock = threading.Lock()  # around mailbox, mute and counters
         self._sender: Sender | None = None
 
-    # What a back end implements
+    # Methods of a back end
 
     @abstractmethod
     def _open(self) -> None:
@@ -90,7 +90,7 @@ class LiveLink(ABC):
 
     @abstractmethod
     def _connect(self) -> bool:
-        """Wait `POLL_S` for the board's next step towards a connection; whether that was the last one."""
+        """Wait `POLL_S` for the board's next step towards a connection; return whether that was the last one."""
 
     @abstractmethod
     def _why_no_connection(self, now_us: int, within: str) -> str:
@@ -102,7 +102,7 @@ class LiveLink(ABC):
 
     @abstractmethod
     def _failure(self) -> str:
-        """Return why the device does not work any more, empty while it does."""
+        """Return why the device has failed, empty while it works."""
 
     @abstractmethod
     def _close(self) -> None:
@@ -118,11 +118,11 @@ class LiveLink(ABC):
 
     @abstractmethod
     def ask(self, now_us: int, request: ControlRequest) -> None:
-        """Begin an operator's request, in place of the one before it."""
+        """Begin an operator's request, in place of the previous one."""
 
     @abstractmethod
     def answer(self, now_us: int) -> Answer | None:
-        """Return the answer once, when it is there."""
+        """Return the answer once, when it has arrived."""
 
     @abstractmethod
     def summary(self) -> str:
@@ -196,7 +196,7 @@ class LiveLink(ABC):
             self._do(self._send_newest)
 
     def _send_newest(self) -> None:
-        """Send what lies in the mailbox, when its turn has come."""
+        """Send the pose in the mailbox, unless it is too old."""
         with self._lock:
             mail, self._mailbox = self._mailbox, None
         if mail is None:
@@ -210,14 +210,14 @@ class LiveLink(ABC):
             self.sent += not late
 
     def _do(self, job: Job) -> None:
-        """Hand a job to the sender's thread."""
+        """Pass a job to the sender's thread."""
         if (sender := self._sender) is not None:
             sender.put(job)
 
     # Downlink
 
     def _hear(self, data: bytes) -> None:
-        """Queue what has just been read; the back end's reader calls this."""
+        """Queue bytes that were just read; the back end's reader calls this."""
         with suppress(queue.Full):  # the user no longer reads
             self._received.put_nowait((clock_us(), data))
 
@@ -236,5 +236,5 @@ class LiveLink(ABC):
 
 
 def seconds(duration_us: int) -> str:
-    """A time limit as text for the user."""
+    """Return a time limit as text for the user."""
     return f"{duration_us * 1e-6:.0f} s"

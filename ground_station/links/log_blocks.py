@@ -1,7 +1,7 @@
 """Telemetry over CRTP, sans I/O: the log blocks of a flight, requested from the board's log service as cflib does it.
 
-Forget all blocks, create each, start each: one request after the other, repeated until it is answered. Each block is sampled
-at instants of its own. Here they share a time stamp, the instant at which the block of the controller was sampled last; that
+Delete all blocks, create each, start each: one request after the other, repeated until it is answered. Each block is sampled
+at its own instants. Here they share a time stamp, the instant at which the block of the controller was sampled last; that
 one is started first, so that the others of its period follow it.
 """
 
@@ -45,23 +45,23 @@ class LogBlocks:
 
     @property
     def requested(self) -> bool:
-        """Whether there is telemetry that the board can send, and was asked for."""
+        """Whether telemetry that the board can send was requested."""
         return bool(self._blocks)
 
     def request(self, now_us: int) -> None:
-        """Ask for all blocks, or go on asking."""
+        """Request all blocks, or go on requesting them."""
         if not self._dialogue.busy:
             self._dialogue.begin(now_us, self._script())
         self.tend(now_us)
 
     def tend(self, now_us: int) -> None:
-        """Repeat what was not answered; to be called again and again."""
+        """Repeat unanswered requests; call it again and again."""
         answer = self._dialogue.answer(now_us)
         if answer is not None and answer.error:
             self.notices.append(f"telemetry: {answer.error}")
 
     def hear(self, now_us: int, packet: Packet) -> Sequence[Sample]:
-        """The telemetry in a packet of the log port, empty for an answer; `WireError` if it is malformed."""
+        """Return the telemetry in a packet of the log port, empty for an answer; `WireError` if it is malformed."""
         if packet.channel != log.CHANNEL_DATA:
             self._dialogue.hear(now_us, packet)
             return ()
@@ -96,7 +96,7 @@ class LogBlocks:
         return ()
 
     def _do(self, request: Packet) -> Script[Packet]:
-        """Send a request until it is answered; the answer begins as it does."""
+        """Send a request until it is answered; the answer begins with the same bytes."""
         head = request.data[:2]
 
         def take(got: Packet) -> Packet | None:

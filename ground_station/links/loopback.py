@@ -1,4 +1,4 @@
-"""The link inside one process: the CRTP bytes of a real flight, handed to whatever carries them."""
+"""The link inside one process: the CRTP bytes of a real flight, passed to any carrier."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -14,7 +14,7 @@ from ground_station.trajectory import Goal
 class LoopbackLink:
     """CRTP to a carrier in the same process. `latency_us` is the latency expected of the carrier.
 
-    `log_table` returns the numbers of the board's log variables, as a station knows them that has met the board before.
+    `log_table` returns the numbers of the board's log variables, as a station knows them from an earlier connection.
     """
 
     def __init__(
@@ -31,11 +31,11 @@ class LoopbackLink:
         self._logs.request(now_us)
 
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
-        """Hand the correction to the carrier."""
+        """Pass the correction to the carrier."""
         self._transmit(now_us, encode_ext_pose(*correct(frame, goal, now_us + self.latency.us)))
         self._logs.tend(now_us)
 
     def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
-        """The telemetry in a packet from the board, empty for a packet of another service."""
+        """Return the telemetry in a packet from the board, empty for a packet of another service."""
         packet = decode(data)
         return self._logs.hear(now_us, packet) if packet.port == PORT_LOG else ()

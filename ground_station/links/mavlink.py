@@ -1,12 +1,12 @@
-"""A board over MAVLink, sans I/O: poses and goals go up, telemetry comes down, and the two clocks are compared.
+"""A board over MAVLink, sans I/O: it sends poses and goals, receives telemetry and compares the two clocks.
 
-The pose is sent as measured, absolute and with its own time stamp; the goal is sent separately, when it has changed
+The pose is sent as measured, absolute and with its own time stamp; the goal is sent separately, on changes
 and every half second, and the board forms the error. For its true age the board needs the station's clock, so its
-TIMESYNC requests are answered. Telemetry comes down in one array, relative to the goal as the board knows it; what the
-board sends in the standard's messages is for other ground stations.
+TIMESYNC requests are answered. Telemetry comes in one array, relative to the goal as the board knows it; the board's
+standard messages are for other ground stations.
 
-Telemetry that arrives at less than half of the requested rate is requested again: the request, or the board's memory
-of it, was lost.
+Telemetry that arrives at less than half of the requested rate is requested again: the request was lost, or the board has
+forgotten it.
 """
 
 from collections import deque
@@ -26,17 +26,17 @@ from ground_station.trajectory import Goal
 
 SYSTEM, COMPONENT = 255, 190  # a ground station, as the standard numbers them
 NO_AUTOPILOT = 8  # in a heartbeat: a ground station's, or a camera's
-EVERYBODY = 0  # system to talk to until the board is known
+EVERYBODY = 0  # the addressee until the board is known
 LOOK_PERIOD_US = 1_000_000
 REPEAT_GOAL_US = round(1e6 / STANDING_GOAL_HZ)
-TEXTS = 100  # that wait to be read
-TEXT_PIECE = 50  # characters; a longer line comes in pieces
+TEXTS = 100  # waiting to be read
+TEXT_PIECE = 50  # characters; a longer line is sent in pieces
 SET_MESSAGE_INTERVAL, ACCEPTED = 511, 0  # a command and its best result
 
 
 @dataclass(frozen=True, slots=True)
 class MavlinkLinkConfig:
-    """The line and how it is used. `signing_start`: the time stamp of MAVLink's signatures when the clock is 0."""
+    """The line and its settings. `signing_start`: the time stamp of MAVLink's signatures when the clock is 0."""
 
     baud: int
     pose_hz: float
@@ -59,13 +59,13 @@ class MavlinkLink:
     ) -> None:
         signing = Signing(config.signing_key, start=config.signing_start) if config.signing_key else None
         self.budget = link_budget(config.baud, config.pose_hz, signing is not None)
-        self.texts: deque[str] = deque(maxlen=TEXTS)  # the board's, and what it refused
-        self._text = ""  # of which pieces may be missing
+        self.texts: deque[str] = deque(maxlen=TEXTS)  # the board's, and its refusals
+        self._text = ""  # incomplete text
         self.supervisor_state: int | None = None  # as last received
         self._note_frame = note_frame
         self.board: int | None = None  # its system id, None before the first heartbeat
         self.answered = False  # it has acknowledged a command
-        self.heard_us = 0  # when its last frame came
+        self.heard_us = 0  # arrival of its last frame
         self.latency = LinkLatency("serial", config.latency_us, measured=False)
         self._carry = transmit
         self._sender = FrameSender(SYSTEM, COMPONENT, signing)
@@ -76,11 +76,11 @@ class MavlinkLink:
         self._goal_us = 0
         self._asked = False
         self._samples = 0  # of telemetry since the last check
-        self._timestamp_ms: int | None = None  # of the last
-        self._look_us = 0  # when to check the link next
+        self._timestamp_ms: int | None = None  # of the last sample
+        self._look_us = 0  # of the next check of the link
         self.controls = MavlinkControls(self._send, lambda: self._addressee)
-        self._time_request_ns = 0  # own clock in the last one
-        self._read_us = 0  # when the bytes that are being decoded were read
+        self._time_request_ns = 0  # own clock in the last request
+        self._read_us = 0  # when the bytes now being decoded were read
         self._handlers: dict[str, Callable[[int, Message], Sequence[Sample]]] = {
             "HEARTBEAT": self._on_heartbeat,
             "TIMESYNC": self._on_timesync,
@@ -99,7 +99,7 @@ class MavlinkLink:
         self._look_after(now_us)
 
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
-        """Send the pose, after a goal that has changed; less urgent messages follow."""
+        """Send the pose, after a changed goal; less urgent messages follow."""
         pose = mavlink.pose(frame.t_us, frame.p_WB, frame.q_WB)
         since_us = now_us - self._goal_us
         if self._goal is None or (goal != self._goal and since_us >= self.budget.goal_period_us):
@@ -129,7 +129,7 @@ class MavlinkLink:
         self.supervisor_state = None
 
     def _look_after(self, now_us: int) -> None:
-        """Send a time request and a heartbeat, and request telemetry that is too slow."""
+        """Send a time request and a heartbeat, and request telemetry again that is too slow."""
         self._look_us = now_us + LOOK_PERIOD_US
         self._time_request_ns = now_us * 1000
         self._send(now_us, services.timesync(0, self._time_request_ns))
@@ -143,9 +143,9 @@ class MavlinkLink:
     # Downlink
 
     def receive(self, now_us: int, data: bytes, read_us: int | None = None) -> Sequence[Sample]:
-        """The telemetry in a piece of the stream of bytes that arrived at `now_us`, which may be empty; never raises.
+        """Return the telemetry in a piece of the byte stream that arrived at `now_us`, perhaps empty; never raises.
 
-        `read_us` is the present instant where it is a later one.
+        `read_us` is the present instant where that is later.
         """
         self._read_us = now_us if read_us is None else read_us
         samples: list[Sample] = []
@@ -173,8 +173,8 @@ class MavlinkLink:
 
     def _on_timesync(self, now_us: int, message: Message) -> Sequence[Sample]:
         if message.tc1 == 0:
-            # The board takes our answer's time for the middle between its request and its receipt. So the middle
-            # between arrival and answer is stated, as in NTP: a late answer is less precise, but not wrong.
+            # The board takes our answer's time for the middle between its request and its receipt. So it gets the middle
+            # between arrival and answer, as in NTP: a late answer is less precise, but not wrong.
             middle_us = (now_us + self._read_us) // 2
             self._send(self._read_us, services.timesync(middle_us * 1000, message.ts1))
         elif message.ts1 == self._time_request_ns:

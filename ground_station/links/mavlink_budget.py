@@ -1,6 +1,6 @@
-"""What a serial line can carry of a flight over MAVLink: whether it can fly at all, and how often telemetry comes.
+"""The capacity of a serial line for a flight over MAVLink: whether it can fly at all, and the rate of telemetry.
 
-The sizes are those of real frames, made by the wire module. A byte takes 10 bits on the line.
+The sizes are those of real frames, from the wire module. A byte takes 10 bits on the line.
 """
 
 from collections.abc import Iterable
@@ -17,7 +17,7 @@ BYTE_BITS = 10  # start, 8 data, stop
 UP_LIMIT = 0.9  # of the line, so that poses do not wait
 DOWN_LIMIT = 0.8  # of the line; the rest is for parameters, texts and answers
 TELEMETRY_HZ = (50, 25, 20, 10, 4)
-STANDING_GOAL_HZ = 2.0  # how often an unchanged goal is repeated
+STANDING_GOAL_HZ = 2.0  # rate of repetitions of an unchanged goal
 HOUSEKEEPING_HZ = 1.0  # of the station: heartbeat, time request
 BOARD_TIME_HZ = 2.0  # time requests of the board
 
@@ -27,17 +27,17 @@ _Q = (0.5, 0.5, 0.5, 0.5)
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """How a line is used."""
+    """The use of a line."""
 
     up_load: float  # share of the line while the goal does not move, 0..1
     down_load: float
     telemetry_hz: int
-    goal_period_us: int  # between goals while the goal moves; 0: every pose may bring one
+    goal_period_us: int  # between goals while the goal moves; 0: every pose may have one
     text: str  # one line
 
 
 def link_budget(baud: int, pose_hz: float, signed: bool = False) -> Budget:
-    """The use of a line at `baud` with `pose_hz` poses per second; `LinkError` when it cannot carry a flight."""
+    """Return the use of a line at `baud` with `pose_hz` poses per second; `LinkError` if it cannot carry a flight."""
     line = baud / BYTE_BITS  # [bytes/s]
     pose, goal, house = (_bytes(messages, signed) for messages in (_POSE, _GOAL, _HOUSEKEEPING))
     time = _bytes(_TIME, signed)
@@ -69,7 +69,7 @@ def link_budget(baud: int, pose_hz: float, signed: bool = False) -> Budget:
 
 
 def _bytes(messages: Iterable[Message], signed: bool) -> int:
-    """Bytes of one frame each."""
+    """Return the bytes of one frame of each."""
     sender = FrameSender(1, 1)
     return sum(len(sender.encode(0, message)) + SIGNATURE_SIZE * signed for message in messages)
 

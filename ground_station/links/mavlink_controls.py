@@ -1,6 +1,6 @@
 """An operator's requests over MAVLink, sans I/O: the parameter protocol, and commands with their acknowledgements.
 
-What the board calls `extCtrl.y_P` is `EXT_Y_P` here; a request may have either name.
+The board's `extCtrl.y_P` is `EXT_Y_P` here; a request may use either name.
 """
 
 from collections.abc import Callable, Generator
@@ -16,7 +16,7 @@ from ground_station.links.crtp_controls import unknown
 BOARD_COMPONENT = 1  # autopilot
 ARM, TERMINATE = 1, 1
 WARNING = 4  # MAV_SEVERITY
-REASON_US = 200_000  # after a refusal, in which the board may state the reason
+REASON_US = 200_000  # after a refusal, for the board's reason
 STOPPED = services.mavlink_name("floaty.stop")  # a latch, which arming alone does not reset
 
 
@@ -27,7 +27,7 @@ class MavlinkControls(Dialogue[Message]):
         super().__init__()
         self._send = send
         self._board = board
-        self._names: tuple[str, ...] = ()  # of the board's parameters, once they were listed
+        self._names: tuple[str, ...] = ()  # of the board's parameters, once they are listed
 
     def ask(self, now_us: int, request: ControlRequest) -> None:
         scripts: dict[ControlAction, Callable[[], Script[Message]]] = {
@@ -41,7 +41,7 @@ class MavlinkControls(Dialogue[Message]):
         self.begin(now_us, scripts[request.action]())
 
     def _list(self) -> Script[Message]:
-        """Request all, then one by one those that do not arrive."""
+        """Request all, then one by one the missing ones."""
         found: dict[int, Message] = {}
 
         def take(message: Message) -> Message | None:

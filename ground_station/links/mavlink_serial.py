@@ -1,6 +1,6 @@
-"""The back end for a board on a serial line: `mavlink:DEVICE[,BAUD]` with whatever pyserial can open, MAVLink on it.
+"""The back end for a board on a serial line: MAVLink over `mavlink:DEVICE[,BAUD]`, any device that pyserial can open.
 
-A thread reads and notes the time; whoever calls `receive` decodes. The only file that knows pyserial.
+A thread reads and notes the time; the caller of `receive` decodes. The only file that uses pyserial.
 """
 
 import os
@@ -27,13 +27,13 @@ from ground_station.trajectory import Goal
 PREFIX = "mavlink:"
 BAUD_MIN, BAUD_MAX = 9600, 3_000_000
 READ_SIZE = 4096
-GATHER_S = 0.005  # how long bytes are gathered where a port cannot be polled
+GATHER_S = 0.005  # how long bytes are collected where a port cannot be polled
 WRITE_TIMEOUT_S = 1.0
 _DEVICE = re.compile(r"(?:socket|rfc2217)://[^,]+:(\d{1,5})(?:[/?][^,]*)?|(?!.*://)[^,]+")
 
 
 def parse_uri(uri: str, default_baud: int) -> tuple[str, int]:
-    """`(device, baud)` of `mavlink:DEVICE[,BAUD]`; `LinkError` for a malformed one."""
+    """Return `(device, baud)` of `mavlink:DEVICE[,BAUD]`; `LinkError` for a malformed one."""
     device, comma, digits = uri.removeprefix(PREFIX).partition(",")
     match = _DEVICE.fullmatch(device) if uri.startswith(PREFIX) else None
     if match is None or int(match[1] or 1) not in range(1, 65536):
@@ -47,14 +47,14 @@ def parse_uri(uri: str, default_baud: int) -> tuple[str, int]:
 
 
 class _Port:
-    """An open port, until reading or writing fails or it is closed; `hear` is called with what is read, in the reader's
-    thread.
+    """An open port, until reading or writing fails or it is closed; the reader's thread calls `hear` with
+    the bytes read.
 
     Raises `OSError` or `ValueError` like pyserial.
     """
 
     def __init__(self, device: str, baud: int, hear: Callable[[bytes], None]) -> None:
-        self.failure = ""  # why it no longer works
+        self.failure = ""  # why it has failed
         self.bytes = 0  # received
         self._hear = hear
         self._closing = False
@@ -71,7 +71,7 @@ class _Port:
         self._reader.start()
 
     def write(self, data: bytes) -> None:
-        """Write, or note why that is not possible."""
+        """Write, or note why that failed."""
         if not self.failure:
             self._guard(partial(self._serial.write, data))
 
@@ -129,7 +129,7 @@ class MavlinkSerialLink(LiveLink):
         self._asked = False
 
     def _connect(self) -> bool:
-        """Wait for a heartbeat, ask for telemetry, wait until the board has acknowledged that."""
+        """Wait for a heartbeat, request telemetry, wait until the board has acknowledged that."""
         with suppress(queue.Empty):
             self.receive(*self._received.get(timeout=POLL_S))
         self.receive(clock_us(), b"")
@@ -213,7 +213,7 @@ class MavlinkSerialLink(LiveLink):
 
 
 def reason(error: Exception) -> str:
-    """The reason in one of pyserial's messages."""
+    """Return the reason in one of pyserial's messages."""
     if isinstance(error, OSError) and error.errno:
         return os.strerror(error.errno)
     text = str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -1,6 +1,6 @@
-"""Single packets to and from a board, over whatever link cflib knows: radio, USB or UDP.
+"""Single packets to and from a board, over any link of cflib: radio, USB or UDP.
 
-No table of contents is fetched and no other service of the board is used, so that it is ready at once.
+It fetches no table of contents and uses no other service of the board, so that it is ready at once.
 """
 
 import re
@@ -53,7 +53,7 @@ class CflibPackets:
 
     @property
     def ready(self) -> bool:
-        """Whether the radio has taken what was sent before; UDP and USB take everything at once."""
+        """Whether the radio has taken all earlier packets; UDP and USB take everything at once."""
         waiting = getattr(self._driver, "out_queue", None)
         return waiting is None or waiting.empty()
 

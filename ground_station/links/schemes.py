@@ -1,4 +1,4 @@
-"""Which back end serves a link's URI: one table; each is imported on demand, because its package is an extra."""
+"""The back end for each link's URI, as one table; each is imported on demand, because its package is an extra."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,11 +9,11 @@ from ground_station.links.live_link import LiveLink
 
 @dataclass(frozen=True, slots=True)
 class LinkSettings:
-    """A profile's settings of links; each back end takes those that concern it."""
+    """A profile's settings of links; each back end uses its own."""
 
     corrections_hz: float
     latency_us: int  # to the board, until it is measured
-    baud: int  # for URIs that name none
+    baud: int  # for URIs without one
     signing_key: bytes  # 32 bytes; empty: nothing is signed
     # Receives every MAVLink frame, in both directions.
     note_frame: Callable[[int, bytes], object] | None = None

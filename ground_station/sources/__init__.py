@@ -1,1 +1,1 @@
-"""Where poses come from, one file per system; each is a `ground_station.mocap.MocapSource`."""
+"""The sources of poses, one file per system; each is a `ground_station.mocap.MocapSource`."""

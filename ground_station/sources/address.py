@@ -18,7 +18,7 @@ REPLAY = "replay:"
 
 
 def find_source(text: str | None, capture: CaptureConfig) -> MocapSource:
-    """The source that `text` names, else the profile's, not open yet; `MocapError` for a malformed one."""
+    """Return the source that `text` names, else the profile's, not open yet; `MocapError` for a malformed one."""
     if text is not None and text.startswith(REPLAY):
         return ReplaySource(Path(text.removeprefix(REPLAY)))
     chosen = capture if text is None else override(text, capture)
@@ -30,7 +30,7 @@ def find_source(text: str | None, capture: CaptureConfig) -> MocapSource:
 
 
 def override(text: str, capture: CaptureConfig) -> CaptureConfig:
-    """`capture` with what `text` names; another system comes with its own host, port, multicast and axes."""
+    """Return `capture` with the values in `text`; another system has its own host, port, multicast and axes."""
     place, *options = text.split(",")
     system, colon, where = place.partition(":")
     if system not in get_args(System):

@@ -1,8 +1,8 @@
 """From a motion capture system's frames to ours: the one place where its poses become p_WB and q_WB.
 
-Frames: M as the system streams, C the same with z up, W the tunnel; D the rigid body as it was defined in the system,
+Frames: M as the system streams, C the same with z up, W the tunnel; D the rigid body as defined in the system,
 its axes turned z up like those of M, B the robot. C is W turned by `yaw` and moved by `origin`, B likewise in D.
-Also here: which of the bodies that a system sees is the robot.
+This file also chooses the body that is the robot.
 """
 
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ from ground_station.errors import MocapError
 
 
 def with_z_up(p: Vector, q: Quaternion) -> tuple[Vector, Quaternion]:
-    """A pose in axes with y up, for world and body alike, after a quarter turn about x."""
+    """Turn a pose to z up from axes with y up, for world and body alike, by a quarter turn about x."""
     return (p[0], -p[2], p[1]), (q[0], q[1], -q[3], q[2])
 
 
 class Alignment:
-    """Where the tunnel lies in the system's frame, and the robot in the rigid body's."""
+    """The pose of the tunnel in the system's frame, and of the robot in the rigid body's."""
 
     def __init__(self, capture: CaptureConfig) -> None:
         self.axes: Axes = capture.axes or ("y-up" if capture.system == "optitrack" else "z-up")
@@ -28,7 +28,7 @@ class Alignment:
         self._q_DB = yaw_quaternion(capture.body_yaw)
 
     def to_world(self, p_MD: Vector, q_MD: Quaternion) -> tuple[Vector, Quaternion]:
-        """p_WB and q_WB of a pose that the system streamed."""
+        """Return p_WB and q_WB of a pose from the system."""
         p_CD, q_CD = with_z_up(p_MD, q_MD) if self.axes == "y-up" else (p_MD, q_MD)
         x, y, z = rotate(q_CD, self._p_DB)
         a, b, c = self._p_CW
@@ -37,7 +37,7 @@ class Alignment:
 
 
 def choose_body(wanted: str, names: Sequence[str]) -> str:
-    """The name of the body to follow, out of those there are; `MocapError` when it is not clear which."""
+    """Return the name of the body to follow; `MocapError` when it is ambiguous."""
     if wanted in names:
         return wanted
     if not wanted and len(names) == 1:

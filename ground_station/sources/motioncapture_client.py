@@ -1,8 +1,8 @@
-"""Vicon, Qualisys and VRPN, through the package `motioncapture` in a process of its own (`motioncapture_process`).
+"""Vicon, Qualisys and VRPN, through the package `motioncapture` in a separate process (`motioncapture_process`).
 
-That package hides the cameras' time stamps: the exposure is the arrival less `capture.latency_us`. From VRPN it takes no
-more than 100 poses a second. A process that has ended, because no frame arrived or it was killed, is started again until
-frames come.
+That package hides the cameras' time stamps: the exposure is the arrival less `capture.latency_us`. From VRPN it takes at
+most 100 poses a second. A process that has ended, because no frame arrived or it was killed, is restarted until
+frames arrive.
 """
 
 import math
@@ -20,16 +20,16 @@ from ground_station.sources.motioncapture_process import Arrival, Body, decode_l
 from ground_station.sources.silence import Silence
 
 CONNECT_TIMEOUT_US = 5_500_000  # the process gives up after 5 s without a frame
-SETTLE_US = 1_000_000  # from the first frame on, in which all bodies should have been seen
-RESTART_US = 2_000_000  # starting one takes 0.2 s of a processor
-OLDEST_US = 1_000_000  # an arrival longer ago waited in the pipe
+SETTLE_US = 1_000_000  # after the first frame, in which all bodies should have been seen
+RESTART_US = 2_000_000  # a start takes 0.2 s of a processor
+OLDEST_US = 1_000_000  # an older arrival waited in the pipe
 LINE_MAX = 65_536
 
 _MODULE = "ground_station.sources.motioncapture_process"
 
 
 def settings_of(capture: CaptureConfig) -> dict[str, str]:
-    """The arguments of `motioncapture.connect`."""
+    """Return the arguments of `motioncapture.connect`."""
     return {"hostname": capture.host if capture.port is None else f"{capture.host}:{capture.port}"}
 
 
@@ -67,7 +67,7 @@ class MotioncaptureSource:
         )
 
     def _find(self) -> str:
-        """The name of the body; of several the wanted one is taken as soon as it is seen, a single one after a while."""
+        """Return the body's name; of several the wanted one is taken as soon as it is seen, a single one after a while."""
         names: dict[str, None] = {}
         self._start()
         now_us = clock_us()
@@ -119,7 +119,7 @@ class MotioncaptureSource:
         self._buffer, self._lines = b"", []
 
     def _on_arrival(self, arrival: Arrival, now_us: int) -> MocapFrame | None:
-        """The frame, None if it does not contain the body."""
+        """Return the frame, None if it does not contain the body."""
         body = arrival.bodies.get(self._body)
         if (body is None and self._system == "vrpn") or now_us - arrival.t_us > OLDEST_US:
             return None  # VRPN reports each body separately
@@ -135,18 +135,18 @@ class MotioncaptureSource:
         return MocapFrame(t_us, p_WB, q_WB, valid=True, arrived_us=arrived_us)
 
     def _usable(self, body: Body) -> bool:
-        """Whether it differs from the last pose, as every measured pose does."""
+        """Return whether a body differs from its last pose, as every measured pose does."""
         last, self._pose = self._pose, body
         return body != last
 
     def _start(self) -> None:
-        # In a session of its own, because Ctrl-C is for the station.
+        # In a separate session, because Ctrl-C is for the station.
         self._process = subprocess.Popen(
             self._command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, start_new_session=True
         )
 
     def _next(self, timeout_s: float) -> Arrival | str | None:
-        """The next line of the process, None when none arrives in time, it has ended, or the line cannot be read."""
+        """Return the process's next line, None when none arrives in time, it has ended, or the line is unreadable."""
         if not self._lines:
             self._read(timeout_s)
         if not self._lines:
@@ -158,7 +158,7 @@ class MotioncaptureSource:
             return None
 
     def _read(self, timeout_s: float) -> None:
-        """Wait for bytes and cut them into lines."""
+        """Wait for bytes and split them into lines."""
         pipe = self._process.stdout if self._process is not None else None
         ready = select.select([pipe] if pipe is not None else [], (), (), timeout_s)[0]
         if pipe is None or not ready:

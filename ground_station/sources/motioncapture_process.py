@@ -1,8 +1,8 @@
-"""A process of its own for the package `motioncapture`: `python -m` this module SYSTEM KEY=VALUE...
+"""A separate process for the package `motioncapture`: `python -m` this module SYSTEM KEY=VALUE...
 
-Its connect() holds the interpreter, neither that nor waitForNextFrame() ends without a server, and it prints to standard
-output. Here that does no harm: frames go as lines of JSON to what was standard output, and the kernel ends the process when
-nothing has come for `LIFE_S`, also when the station is no more. A line has the bodies of a frame, or why the process ends:
+Its connect() blocks the interpreter, neither that nor waitForNextFrame() ends without a server, and it prints to standard
+output. Here that is harmless: frames are sent as lines of JSON to the former standard output, and the kernel ends the
+process after `LIFE_S` without frames, also when the station has ended. A line has a frame's bodies, or why the process ends:
 
 [123456789, {"floaty": [x, y, z, qw, qx, qy, qz]}]      arrival [us, `clock_us`]; [m], axes of the system
 "no such computer"
@@ -25,24 +25,24 @@ Body = tuple[float, ...]  # p x y z, q w x y z
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """What the system saw in one frame."""
+    """The system's report of one frame."""
 
-    t_us: int  # when it arrived
+    t_us: int  # its arrival
     bodies: dict[str, Body]
 
 
 def encode_arrival(arrival: Arrival) -> str:
-    """The line of a frame."""
+    """Return the line of a frame."""
     return json.dumps([arrival.t_us, arrival.bodies]) + "\n"
 
 
 def encode_error(text: str) -> str:
-    """The line that says why the stream ends."""
+    """Return the line on why the stream ends."""
     return json.dumps(text) + "\n"
 
 
 def decode_line(line: bytes) -> Arrival | str:
-    """The content of a line, a text if it is an error's; `MocapError` for a malformed one."""
+    """Return the content of a line, a text if it is an error's; `MocapError` for a malformed one."""
     try:
         said = json.loads(line)
     except (ValueError, RecursionError):
@@ -63,7 +63,7 @@ LIFE_S = 5
 
 
 def main(system: str, *settings: str) -> None:
-    """Stream the bodies of `system` until the reader is gone, or no frame arrives."""
+    """Stream the bodies of `system` until the reader ends, or no frame arrives."""
     lines = os.fdopen(os.dup(1), "w", buffering=1, encoding="utf-8")
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
@@ -82,7 +82,7 @@ def _stream(lines: TextIO, system: str, settings: dict[str, str]) -> None:
 
     signal.alarm(LIFE_S)
     host, colon, port = settings["hostname"].partition(":")
-    settings["hostname"] = socket.gethostbyname(host) + colon + port  # it cannot resolve names
+    settings["hostname"] = socket.gethostbyname(host) + colon + port  # the package cannot resolve names
     capture = motioncapture.connect(system, settings)
     while True:
         capture.waitForNextFrame()
@@ -91,7 +91,7 @@ def _stream(lines: TextIO, system: str, settings: dict[str, str]) -> None:
         for name, body in capture.rigidBodies.items():
             q = body.rotation
             bodies[name] = (*body.position.tolist(), q.w, q.x, q.y, q.z)
-        if system == "vrpn" and not bodies:  # it has no frames: this was a poll without result
+        if system == "vrpn" and not bodies:  # it has no frames: this poll had no result
             continue
         signal.alarm(LIFE_S)
         lines.write(encode_arrival(Arrival(arrival_us, bodies)))

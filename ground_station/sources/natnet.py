@@ -1,8 +1,8 @@
 """NatNet, the protocol of OptiTrack's Motive: its packets, versions 3.0 to 4.1, little endian.
 
-A packet is u16 message, u16 length of what follows, payload. Sans I/O; positions and rotations are those of Motive's
+A packet is u16 message, u16 length of the rest, payload. Sans I/O; positions and rotations are in Motive's
 axes, and a quaternion's order is x y z w on the wire, w x y z here. Skeletons, assets, force plates, devices and
-cameras are checked and skipped. `hil.servers.motive` writes what is read here. Layouts: OptiTrack's
+cameras are checked and skipped. `hil.servers.motive` writes these packets. Layouts: OptiTrack's
 NatNet SDK, PacketClient.
 """
 
@@ -44,7 +44,7 @@ class MessageId(IntEnum):
     MESSAGE = 8
     DISCONNECT = 9
     KEEPALIVE = 10
-    ECHO_REQUEST = 12  # u64 of the client's choice
+    ECHO_REQUEST = 12  # u64 chosen by the client
     ECHO_RESPONSE = 13  # the same u64, u64 the server's clock [ticks]
     UNRECOGNIZED = 100
 
@@ -73,7 +73,7 @@ class MarkerDescription:
 
 @dataclass(frozen=True, slots=True)
 class BodyDescription:
-    """A rigid body that the server knows; the frames carry its id only."""
+    """A rigid body of the server; the frames carry its id only."""
 
     name: str
     id: int
@@ -113,7 +113,7 @@ class LabelledMarker:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One exposure of the cameras; ticks are of the server's clock."""
+    """One exposure of the cameras; ticks are on the server's clock."""
 
     number: int
     bodies: tuple[BodyPose, ...]
@@ -130,13 +130,13 @@ class Frame:
 class Echo:
     """The answer to ECHO_REQUEST."""
 
-    asked: int  # what the client sent
+    asked: int  # the u64 from the client
     server: int  # [ticks]
 
 
 @dataclass(frozen=True, slots=True)
 class Other:
-    """A packet that carries nothing of use here."""
+    """A packet without useful content."""
 
     message: int
 
@@ -157,7 +157,7 @@ def packet(message: MessageId, payload: bytes = b"") -> bytes:
 
 
 def decode(data: bytes, version: Version) -> Message:
-    """The content of a packet, in the layout of `version`; `MocapError` for a malformed one."""
+    """Return the content of a packet, in the layout of `version`; `MocapError` for a malformed one."""
     if version not in VERSIONS:
         raise MocapError(f"NatNet {version[0]}.{version[1]}: only 3.0, 3.1, 4.0 and 4.1 can be read")
     reader = Reader(data, version)
@@ -269,7 +269,7 @@ def _asset_markers(reader: Reader) -> None:
         reader.take(22)  # id, position, size, parameters
 
 
-# The parts of descriptions of no use, by kind; a number is that many bytes.
+# The useless parts of descriptions, by kind; a number is that many bytes.
 PASSED_OVER: dict[int, tuple[Callable[[Reader], object] | int, ...]] = {
     0: (Reader.text, Reader.texts),  # marker set
     2: (Reader.text, Reader.u32, _descriptions),  # skeleton

@@ -1,4 +1,4 @@
-"""The pieces that NatNet packets are made of, every length checked, so that no bytes can do harm."""
+"""The pieces of NatNet packets; every length is checked, so that no bytes can do harm."""
 
 import struct
 from typing import Any
@@ -13,7 +13,7 @@ _VECTOR = struct.Struct("<3f")
 
 
 class Reader:
-    """Goes through a packet of `version`; reading beyond its end raises `MocapError`."""
+    """Reads a packet of `version`; reading beyond its end raises `MocapError`."""
 
     def __init__(self, data: bytes, version: Version) -> None:
         self.version = version
@@ -26,7 +26,7 @@ class Reader:
         return len(self._data) - self._at
 
     def take(self, size: int) -> bytes:
-        """The next bytes."""
+        """Return the next bytes."""
         at = self._advance(size)
         return self._data[at : at + size]
 
@@ -45,7 +45,7 @@ class Reader:
         return x, y, z
 
     def text(self) -> str:
-        """The next text, which ends with a zero."""
+        """Return the next text, which ends with a zero."""
         end = self._data.find(b"\0", self._at)
         if end < 0:
             raise MocapError(f"NatNet packet of {len(self._data)} bytes: text at {self._at} does not end")
@@ -59,7 +59,7 @@ class Reader:
             self.text()
 
     def count(self, size: int) -> int:
-        """The next count, of items of at least `size` bytes each."""
+        """Return the next count, of items of at least `size` bytes each."""
         count = self.u32()
         if count * size > self.left:
             raise MocapError(
@@ -68,7 +68,7 @@ class Reader:
         return count
 
     def section(self, size: int) -> int:
-        """The count at the start of a section of a frame; from 4.1 on its bytes stand behind it."""
+        """Return the count at the start of a section of a frame; from 4.1 on its bytes follow it."""
         count = self.count(size)
         if self.version >= (4, 1):
             self.u32()

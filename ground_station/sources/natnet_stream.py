@@ -1,9 +1,9 @@
-"""One rigid body out of a NatNet stream: packets and the time in, poses in the world and notices out. Sans I/O.
+"""One rigid body from a NatNet stream: packets and the time in, poses in the world and notices out. Sans I/O.
 
-A server with a newer NatNet than can be read here is asked for the newest readable version.
+A server with a newer NatNet than this can read is asked for the newest readable version.
 
-The server's clock is seen through messages. One that the server sent at s and that arrived at t says that its offset to
-ours is at most t - s; one that was asked for at a and answered at s says that it is at least a - s. The limits widen with
+Messages bound the offset of the server's clock. One sent by the server at s that arrived at t shows that the offset to
+ours is at most t - s; a request sent at a and answered at s shows that it is at least a - s. The limits widen with
 time because clocks drift; the middle is the estimate.
 """
 
@@ -42,15 +42,15 @@ class ServerClock:
         self._at_us = 0
 
     def sent(self, ticks: int, now_us: int) -> None:
-        """A message that the server sent at `ticks` has arrived."""
+        """Note a message that the server sent at `ticks`."""
         self._limit(-math.inf, now_us - self._us(ticks), now_us)
 
     def answered(self, asked_us: int, ticks: int, now_us: int) -> None:
-        """The request of `asked_us` has been answered at `ticks`."""
+        """Note that the request of `asked_us` was answered at `ticks`."""
         self._limit(asked_us - self._us(ticks), now_us - self._us(ticks), now_us)
 
     def to_station_us(self, ticks: int) -> int:
-        """The instant by our clock; without answers, late by the least latency of a message; call `sent` before."""
+        """Return the instant on our clock; without answers, late by a message's least latency; call `sent` before."""
         offset = self._upper if self._lower == -math.inf else 0.5 * (self._lower + self._upper)
         return round(self._us(ticks) + offset)
 
@@ -66,11 +66,11 @@ class ServerClock:
             self._lower, self._upper = lower, upper
 
 
-LATE_FRAMES = 100  # a number that lies further back is that of a server that has restarted
-FROZEN_FRAMES = 3  # with the very same pose: the server repeats what it saw last
+LATE_FRAMES = 100  # an older number is from a server that has restarted
+FROZEN_FRAMES = 3  # with exactly the same pose: the server repeats the last one
 # So many in sequence mean that the server's clock was set; a socket's backlog is shorter.
 MISTIMED_FRAMES = 1000
-OLDEST_US = 1_000_000  # an exposure longer ago is of no use, or its time stamp is wrong
+OLDEST_US = 1_000_000  # an older exposure is useless, or its time stamp is wrong
 CALL_PERIOD_US = 500_000
 MODELS_CHANGED = 2  # bit of a frame's parameters
 # The command that changes the protocol version of the stream.
@@ -82,24 +82,24 @@ NOWHERE: tuple[Vector, Quaternion] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 class StreamCounters:
     frames: int = 0  # passed on
     lost: int = 0  # of these, without a pose
-    dropped: int = 0  # twice, or after a newer one
+    dropped: int = 0  # repeated, or after a newer one
     malformed: int = 0  # packets that cannot be read
-    mistimed: int = 0  # of the lost, for their time stamp
+    mistimed: int = 0  # lost for their time stamp
 
 
 class NatnetStream:
-    """Follows body `name`, the only one there is when empty; `outgoing` are packets for the server's command port."""
+    """Follows body `name`, or the only one when empty; `outgoing` are packets for the server's command port."""
 
     def __init__(self, name: str, alignment: Alignment) -> None:
         self.counters = StreamCounters()
         self.server: ServerInfo | None = None
-        self.version = VERSIONS[0]  # of what the server sends
+        self.version = VERSIONS[0]  # of the server's packets
         self.models: ModelDefinition | None = None
         self.outgoing: list[bytes] = []
         self.notices: list[str] = []
         self._name = name
         self._alignment = alignment
-        self._newer: ServerInfo | None = None  # which was asked for an older version
+        self._newer: ServerInfo | None = None  # it was asked for an older version
         self._clock = ServerClock(1)
         self._id: int | None = None
         self._number: int | None = None
@@ -112,7 +112,7 @@ class NatnetStream:
     def on_packet(self, data: bytes, now_us: int) -> MocapFrame | None:
         """Take a packet; return the pose if it is a new frame.
 
-        `MocapError` when the server or its bodies are not those wanted; later, when they change, it is a notice.
+        `MocapError` when the server or its bodies are not the wanted ones; later changes become notices.
         """
         try:
             message = decode(data, self.version)
@@ -135,9 +135,9 @@ class NatnetStream:
         return None
 
     def call(self, now_us: int, packets_wait: bool) -> None:
-        """Keep the connection alive; to be called often. A silent server is asked to identify itself.
+        """Keep the connection alive; call it often. A silent server is asked to identify itself.
 
-        Not while packets wait: then it was this program that did not read.
+        Not while packets wait: then this program did not read.
         """
         if now_us < self._call_us:
             return
@@ -151,7 +151,7 @@ class NatnetStream:
         self.outgoing.append(packet(MessageId.ECHO_REQUEST, now_us.to_bytes(8, "little")))
 
     def missing(self) -> str:
-        """What the server has not answered yet, before there are models."""
+        """Return what the server has not answered yet, before there are models."""
         if self._newer is not None:
             return str(_unreadable(self._newer))
         return "no NatNet server answers" if self.server is None else "the server names no bodies"
@@ -177,7 +177,7 @@ class NatnetStream:
             raise _unreadable(server)
 
     def _on_response(self, response: Response) -> None:
-        """The answer to `BITSTREAM`, the only request."""
+        """Take the answer to `BITSTREAM`, the only request."""
         server, self._newer = self._newer, None
         if server is None:
             return
@@ -210,14 +210,14 @@ class NatnetStream:
             return MocapFrame(now_us, *NOWHERE, valid=False)
         received_us, sent_us = map(self._clock.to_station_us, (frame.received, frame.transmitted))
         p, q = self._alignment.to_world(pose.p, pose.q) if usable and pose is not None else NOWHERE
-        received_us = max(t_us, min(received_us, now_us))  # the clocks' offset is not known that well
+        received_us = max(t_us, min(received_us, now_us))  # the clocks' offset is less certain
         sent_us = max(received_us, min(sent_us, now_us))
         return MocapFrame(t_us, p, q, usable, received_us, sent_us, now_us)
 
     def _exposed_us(self, frame: Frame, now_us: int) -> int | None:
-        """The exposure by our clock, None if the server's time stamps make no sense."""
+        """Return the exposure on our clock, None if the server's time stamps make no sense."""
         self._clock.sent(frame.transmitted, now_us)
-        # Cameras without a clock of their own have no exposure, only an arrival.
+        # Cameras without a clock have no exposure, only an arrival.
         t_us = min(now_us, self._clock.to_station_us(frame.mid_exposure or frame.received))
         if now_us - t_us <= OLDEST_US:
             self._mistimed = 0
@@ -230,7 +230,7 @@ class NatnetStream:
         return None
 
     def _usable(self, pose: BodyPose) -> bool:
-        """Whether it is tracked, and not a repetition of the last pose."""
+        """Return whether a pose is tracked, and no repetition of the last."""
         last, self._pose = self._pose, pose
         same = last is not None and (last.p, last.q) == (pose.p, pose.q)
         self._repeated = self._repeated + 1 if same else 0

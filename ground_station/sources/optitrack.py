@@ -1,4 +1,4 @@
-"""OptiTrack: the sockets of a NatNet client. Frames come to the socket of the commands or, by multicast, to one more."""
+"""OptiTrack: the sockets of a NatNet client. Frames arrive at the command socket or, by multicast, at another one."""
 
 import select
 import socket
@@ -101,7 +101,7 @@ class OptitrackSource:
                 self._sockets[0].sendto(data, (self._address, self._port))
 
     def _next_packet(self, timeout_s: float) -> bytes | None:
-        """The next packet of the server, None when none comes in time."""
+        """Return the next packet of the server, None when none comes in time."""
         if not self._waiting:
             self._waiting = select.select(self._sockets, (), (), timeout_s)[0]
         while self._waiting:
@@ -124,7 +124,7 @@ class OptitrackSource:
         return added
 
     def _join(self, group: str, port: int) -> None:
-        """Receive what is sent to the group, on the interface that leads to the server."""
+        """Receive the group's packets on the interface that leads to the server."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.connect((self._address, self._port))
             interface = probe.getsockname()[0]

@@ -1,7 +1,7 @@
-"""Frames from a file, at the pace at which they arrived: a record of `floaty station --record`, or a flight's telemetry.
+"""Frames from a file, at their original pace: a record of `floaty station --record`, or a flight's telemetry.
 
-Telemetry has only the frames that were the last ones when a row began, which arrived then at the latest. A record has a row
-for every frame, without loss, and is complete to about a second when the process dies. A disk that is full ends the record,
+Telemetry has only the latest frame at the start of each row, which arrived then at the latest. A record has a row
+for every frame, without loss, and is complete to about a second when the process dies. A full disk ends the record,
 not the flight.
 """
 
@@ -27,7 +27,7 @@ COLUMNS = (
 
 
 class RecordingSource:
-    """A source, open already, whose frames are written to `path` as they are handed on; raises `OSError`."""
+    """A source, open already, whose frames are also written to `path`; raises `OSError`."""
 
     def __init__(self, source: MocapSource, path: Path) -> None:
         self._source = source
@@ -67,7 +67,7 @@ class RecordingSource:
                 file.close()
 
     def _write(self, file: TextIO, frame: MocapFrame, now_us: int) -> None:
-        numbers = (repr(value) for value in (*frame.p_WB, *frame.q_WB))  # the shortest that reads back alike
+        numbers = (repr(value) for value in (*frame.p_WB, *frame.q_WB))  # the shortest that reads back equal
         file.write(f"{now_us},{frame.t_us},{','.join(numbers)},{int(frame.valid)}\n")
         if now_us >= self._flush_us:
             file.flush()
@@ -133,11 +133,11 @@ class ReplaySource:
         return f"mocap {self._next} of {len(self._frames)} replayed"
 
     def close(self) -> None:
-        """There is nothing to close."""
+        """Do nothing."""
 
 
 def read_frames(path: Path) -> list[Arrived]:
-    """The frames of a record or a telemetry log, at least one; `MocapError` for other files."""
+    """Return the frames of a record or a telemetry log, at least one; `MocapError` for other files."""
     try:
         with path.open(encoding="utf-8", newline="") as file:
             frames = list(_frames(csv.DictReader(_whole_lines(file), strict=True)))
@@ -154,7 +154,7 @@ def read_frames(path: Path) -> list[Arrived]:
 
 
 def _whole_lines(lines: Iterator[str]) -> Iterator[str]:
-    """All but a last one that was cut short with its writer's life."""
+    """Yield all lines but a last one that was cut off."""
     return (line for line in lines if line.endswith("\n"))
 
 
@@ -181,7 +181,7 @@ def _recorded(row: dict[str, str]) -> Arrived:
 
 
 def _telemetry(row: dict[str, str]) -> Arrived | None:
-    """None before the first frame."""
+    """Return a row's frame, None before the first."""
     arrival_s, t_s, x, y, z, roll, pitch, yaw = (float(row[title]) for title in TELEMETRY_COLUMNS)
     if math.isnan(t_s):
         return None

@@ -1,10 +1,10 @@
-"""Notices for the user when frames stop and when they arrive again, alike for every system."""
+"""Notices for the user when frames stop and when they arrive again, for all systems."""
 
-SILENCE_US = 500_000  # without frames, after which a server is called again
+SILENCE_US = 500_000  # without frames, after which a server is contacted again
 
 
 class Silence:
-    """Is notified of every frame and polled often; its lines go into `notices`. Sans I/O."""
+    """Is notified of every frame and polled often; writes its lines to `notices`. Sans I/O."""
 
     def __init__(self, notices: list[str]) -> None:
         self._notices = notices
@@ -12,7 +12,7 @@ class Silence:
         self._lasts = False
 
     def on_frame(self, now_us: int) -> None:
-        """A frame has arrived."""
+        """Note the arrival of a frame."""
         if self._lasts and self._heard_us is not None:
             gap_s = (now_us - self._heard_us) * 1e-6
             self._notices.append(f"motion capture: frames again after {gap_s:.1f} s")
@@ -20,7 +20,7 @@ class Silence:
         self._heard_us = now_us
 
     def lasts(self, now_us: int) -> bool:
-        """Whether frames have arrived before, but not lately."""
+        """Return whether frames have arrived before, but not lately."""
         silent = self._heard_us is not None and now_us - self._heard_us > SILENCE_US
         if silent and not self._lasts:
             self._notices.append("motion capture: no frames; calling the server again")
