@@ -1,1 +1,1 @@
-"""Hardware at the board's pins, in the air and on the ceiling."""
+"""The hardware around the board: its pins, the radio and serial links, the cameras."""

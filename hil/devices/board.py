@@ -1,4 +1,4 @@
-"""The board's pins, joined to the virtual world: IMU registers, servo timers, radio chip, UART, debug console."""
+"""The board's pins, connected to the virtual world: IMU registers, servo timers, radio chip, UART, debug console."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -20,10 +20,10 @@ class Uart(Protocol):
 
     @property
     def overruns(self) -> int:
-        """Bytes that found the receive buffer full."""
+        """Bytes lost because the receive buffer was full."""
 
     def read(self) -> bytes:
-        """Return what has been received since the last time."""
+        """Return the bytes received since the last call."""
 
     def write(self, now_us: int, data: bytes) -> bool:
         """Send bytes; False when they do not fit into the transmit buffer."""
@@ -31,7 +31,7 @@ class Uart(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class KeptMemory:
-    """What a board keeps without power."""
+    """The memory that a board keeps without power."""
 
     eeprom: bytearray = field(default_factory=lambda: bytearray(b"\xff" * EEPROM_SIZE))
     deck: bytearray = field(default_factory=lambda: bytearray(b"\xff" * DECK_MEMORY_SIZE))
@@ -42,15 +42,15 @@ def stay_on(now_us: int) -> None:
 
 
 def unsupported(now_us: int, unit: int, failing: int, instance: int) -> CommandResult:
-    """Let nothing fail."""
+    """Refuse every failure."""
     return CommandResult.UNSUPPORTED
 
 
 class VirtualBoard:
-    """Implements `firmware_py.board.Board`; `servo`, `radio`, `console` and `uart` are where the pins lead to.
+    """Implements `firmware_py.board.Board`; the pins lead to `servo`, `radio`, `console` and `uart`.
 
-    They get instants by the clock of the hardware. `run_on` sets the processor whose time counts, and the hardware that pins
-    may trigger. `reset` is called when the processor resets itself, `fail` when a client lets a part of the robot fail.
+    These get times of the hardware's clock. `run_on` sets the processor that keeps time and the queue of hardware events.
+    `reset` is called when the processor resets itself, `fail` when a client makes a part of the robot fail.
     """
 
     def __init__(
@@ -82,20 +82,20 @@ class VirtualBoard:
         self.imu = counts
 
     def supply(self, millivolts: int) -> None:
-        """Let the supply voltage be that."""
+        """Set the supply voltage."""
         self.battery_mv = millivolts
 
     def boot(self, now_us: int) -> None:
-        """Start a processor's time at an instant of the hardware's; `run_on` follows when it has booted."""
+        """Start a processor's clock at a hardware time; call `run_on` when it has booted."""
         self._kernel, self._booted_us = None, now_us
 
     def run_on(self, kernel: Processor, events: EventQueue) -> None:
-        """Join the pins to a booted processor and to the queue of hardware events."""
+        """Connect the pins to a booted processor and to the queue of hardware events."""
         self._kernel, self._events = kernel, events
 
     @property
     def now_us(self) -> int:
-        """The processor's present instant, by the hardware's clock."""
+        """The processor's current time, by the hardware's clock."""
         return self._booted_us + (self._kernel.now_us if self._kernel else 0)
 
     def read_imu(self) -> ImuCounts:
@@ -109,7 +109,7 @@ class VirtualBoard:
         self._servo(self.now_us, counts)
 
     def radio_send(self, data: bytes) -> bool:
-        """Hand a packet to the radio chip; while the processor boots nobody listens."""
+        """Hand a packet to the radio chip; it is lost while the processor boots."""
         if self._kernel is None:
             return True
         accepted = self._radio(self.now_us, data)
@@ -124,7 +124,7 @@ class VirtualBoard:
         return self._uart.read() if self._uart else b""
 
     def uart_write(self, data: bytes) -> bool:
-        """Hand bytes to the UART; where nothing is connected they are lost."""
+        """Hand bytes to the UART; they are lost when nothing is connected."""
         if self._uart is None:
             return True
         accepted = self._uart.write(self.now_us, data)
@@ -132,7 +132,7 @@ class VirtualBoard:
         return accepted
 
     def _let_hardware_go_first(self) -> None:
-        """Limit the tasks' run to the instants before the hardware's next event."""
+        """Stop the tasks before the hardware's next event."""
         if self._kernel and self._events and self._events.next_us is not None:
             self._kernel.stop_before(self._events.next_us - self._booted_us)
 
@@ -152,7 +152,7 @@ class VirtualBoard:
 
 
 class Thief:
-    """How much of every tick it takes, 0..1; may change at any time."""
+    """The share of every tick that it takes, 0..1; may change at any time."""
 
     __slots__ = ("share",)
 
@@ -160,5 +160,5 @@ class Thief:
         self.share = 0.0
 
     def taken_us(self) -> int:
-        """Return what it takes of the present tick."""
+        """Return the time it takes from this tick."""
         return round(self.share * TICK_US)

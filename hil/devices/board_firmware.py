@@ -1,7 +1,7 @@
-"""A board as the laboratory knows it: how it boots, what interrupts it, what it shows and counts.
+"""The laboratory's interface to a board: boot, interrupts, signals and counters.
 
-The firmware in Python, an image on the emulated chip and a real board in the loop are such boards. What one of them cannot
-report is None or empty. All its instants count from its boot.
+The firmware in Python, an image on the emulated chip and a real board in the loop implement it. What a board cannot
+report is None or empty. All its times count from its boot.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class BoardVariable(Protocol):
 
     @property
     def read(self) -> Callable[[], float]:
-        """Reads it now."""
+        """Read its current value."""
 
 
 class BoardTask(Protocol):
@@ -66,24 +66,24 @@ class TaskQueue(Protocol):
 
 
 class Processor(Protocol):
-    """The time of a booted processor."""
+    """The clock of a booted processor."""
 
     @property
     def now_us(self) -> int:
-        """The present instant."""
+        """The current time."""
 
     @property
     def next_wake_us(self) -> int | None:
-        """The next instant at which it acts without an interrupt."""
+        """The next time at which it acts without an interrupt."""
 
     def advance(self, now_us: int) -> None:
-        """Bring its clock to an instant before which nothing is due."""
+        """Advance its clock to a time before which nothing is due."""
 
     def run(self, now_us: int, until_us: int = 0) -> None:
-        """Run up to an instant until all is blocked or busy, and on to a later one, if given."""
+        """Run to a time until all tasks are blocked or busy, then on to a later one, if given."""
 
     def stop_before(self, us: int) -> None:
-        """Limit the run to the instants before this one."""
+        """Stop the run before this time."""
 
 
 class BoardScheduler(Protocol):
@@ -105,38 +105,38 @@ class BoardScheduler(Protocol):
         """Return how long each task has had the processor."""
 
     def occupy(self, name: str, taken_us: Callable[[], int]) -> None:
-        """Let something outside take the processor at every tick. Raises `LabError` where it cannot be taken."""
+        """Take processor time at every tick. Raises `LabError` on a board that does not allow it."""
 
     @property
     def trace(self) -> Trace | None:
-        """Who gets every switch of tasks."""
+        """The receiver of every task switch."""
 
     def set_trace(self, trace: Trace | None) -> None:
-        """Report every switch of tasks from now on, or no more."""
+        """Start or stop reporting every task switch."""
 
 
 class BoardStatistics(Protocol):
     """Timing of the tasks."""
 
     def reports(self) -> Sequence[TaskReport]:
-        """Return it so far, task by task."""
+        """Return the timing so far, task by task."""
 
 
 class FrameCounts(Protocol):
-    """What the board counts of the frames on its serial line."""
+    """The board's counters of frames on its serial line."""
 
     @property
     def bad(self) -> int:
-        """Frames that were refused."""
+        """Rejected frames."""
 
     @property
     def lost(self) -> int:
-        """Frames that were missing between others."""
+        """Missing frames, by gaps in the sequence."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImageReport:
-    """What an image left unused at the end of its flight, and how often it began anew."""
+    """The memory that an image never used in its flight, and its restarts."""
 
     sha256: str  # of what is in flash
     stack_free_bytes: Mapping[str, int]  # of each task, never used since its creation
@@ -147,57 +147,57 @@ class ImageReport:
 
 
 class Flashed(Protocol):
-    """A board whose constants were compiled long before; a profile reaches it over the radio."""
+    """A board with compiled constants; a profile reaches it over the radio."""
 
     @property
     def parameters(self) -> Mapping[str, ImageParameter]:
-        """What can be set, by name."""
+        """Its parameters, by name."""
 
     @property
     def resets(self) -> int:
-        """How often it has begun anew by itself since power-on."""
+        """How often it has restarted by itself since power-on."""
 
     def differences(self, config: FirmwareConfig) -> str:
-        """Return in one line in what its core differs from a profile; empty if in nothing."""
+        """Return the differences between its core and a profile in one line; empty if none."""
 
     def report(self) -> ImageReport:
-        """Return what it has used so far."""
+        """Return its memory use so far."""
 
 
 class BoardFirmware(Protocol):
     """A booted board."""
 
     def imu_ready(self) -> None:
-        """The IMU has a new sample."""
+        """Interrupt: the IMU has a new sample."""
 
     def radio_received(self, data: bytes, broadcast: bool = False) -> None:
-        """The radio chip has a packet."""
+        """Interrupt: the radio chip has a packet."""
 
     def radio_polled(self) -> None:
-        """The radio chip has an empty packet."""
+        """Interrupt: the radio chip has an empty packet."""
 
     def uart_ready(self) -> None:
-        """The UART has bytes."""
+        """Interrupt: the UART has bytes."""
 
     @property
     def kernel(self) -> Processor:
-        """Its time."""
+        """Its clock."""
 
     @property
     def scheduler(self) -> BoardScheduler | None:
-        """Its tasks, where they can be watched."""
+        """Its tasks, if they can be observed."""
 
     @property
     def signals(self) -> Signals:
-        """Views on its estimate, counters, inputs, counts and supervisor; NaN where it does not report a number."""
+        """Views on its estimate, counters, inputs, counts and supervisor; NaN for numbers it does not report."""
 
     @property
     def variables(self) -> Sequence[BoardVariable]:
-        """Its log variables, as far as they can be read at any time."""
+        """The log variables that can be read at any time."""
 
     @property
     def log_numbers(self) -> Mapping[str, int]:
-        """The numbers of its log variables in its table of contents, by name; empty where no log service answers."""
+        """The numbers of its log variables in its table of contents, by name; empty without a log service."""
 
     @property
     def statistics(self) -> BoardStatistics:
@@ -205,11 +205,11 @@ class BoardFirmware(Protocol):
 
     @property
     def overrun(self) -> str:
-        """Which loop of own logic first exceeded the budget of its call, as one line; empty: none, or not reported."""
+        """The first loop of user logic that exceeded the budget of its call, in one line; empty: none or not reported."""
 
     @property
     def usage(self) -> Usage | None:
-        """What the core takes of the processor, where it is measured."""
+        """The core's processor load, if it is measured."""
 
     @property
     def clock_us(self) -> int | None:
@@ -217,23 +217,23 @@ class BoardFirmware(Protocol):
 
     @property
     def mavlink(self) -> FrameCounts | None:
-        """The counters of its serial line, if one leads to it."""
+        """The counters of its serial line, if it has one."""
 
     @property
     def flashed(self) -> Flashed | None:
-        """What is in its flash, where that was compiled before the profile was known."""
+        """What is in its flash, if that was compiled without the profile."""
 
     def check_watchdog(self) -> None:
-        """Raise `WatchdogError` or `LinkError` when nothing has been heard of its tasks for too long."""
+        """Raise `WatchdogError` or `LinkError` when its tasks have been silent for too long."""
 
 
 @dataclass(frozen=True, slots=True)
 class PowerOn:
-    """What a board is powered on with: its pins and its profile.
+    """The inputs of a power-on: the board's pins and profile.
 
-    `serial`: its UART leads somewhere. `polled`: a host polls its radio chip, also when it has nothing to send. `rest` gives
+    `serial`: its UART is connected. `polled`: a host polls its radio chip, also when it has nothing to send. `rest` gives
     the IMU's counts while the robot is at rest, before the laboratory's time begins; None for a reboot. `outputs` are
-    timer and channel, counted from 0, of what drives the robot. `carrier` is what its other sensors measure.
+    timer and channel, from 0, of the robot's actuators. `carrier` is what its other sensors measure.
     """
 
     board: Board
@@ -250,10 +250,10 @@ class Executor(Protocol):
 
     @property
     def needs_polls(self) -> bool:
-        """Whether its packets leave only when something polls its radio chip."""
+        """Whether its packets leave only when its radio chip is polled."""
 
     def wire_us(self, data: bytes) -> int:
-        """Return how long a packet takes from its radio chip to it, or back, where it does not simulate that itself."""
+        """Return a packet's time between its radio chip and it, unless it simulates that itself."""
 
     def boot(self, start: PowerOn) -> BoardFirmware:
         """Return the firmware of a new boot."""
@@ -261,13 +261,13 @@ class Executor(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PythonBoard:
-    """Executes the firmware in Python; `runner` its flight core."""
+    """Executes the firmware in Python; `runner` executes its flight core."""
 
     runner: RunnerFactory = PythonRunner
     needs_polls: ClassVar[bool] = False
 
     def wire_us(self, data: bytes) -> int:
-        """Return what the serial line between the two chips takes."""
+        """Return the time on the serial line between the two chips."""
         return syslink_us(data)
 
     def boot(self, start: PowerOn) -> Firmware:

@@ -1,7 +1,7 @@
-"""The motion capture cameras: noisy poses of the body, late, sometimes missing or wrong.
+"""The motion capture cameras: noisy, delayed poses of the body, sometimes missing or wrong.
 
 A pose is the truth with noise or, with `markers.enabled`, the fit to eight markers (`hil.devices.rigid_body`).
-It computes frames and their arrival; the harness exposes at `period_us` and delivers.
+This file computes frames and arrival times; the harness exposes at `period_us` and delivers.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ class VirtualMocap:
     """The cameras. Plain attributes that may change in flight:
 
     `dropout`, `outlier` (0..1) share of frames; `wrong_by` [m] error of every position, in random directions;
-    `swapped_by` [m] markers are swapped: poses turned by 180 degrees about z of B and shifted along its x; 0: they are not;
-    `more_latency_us` on top of the configured one. `sighting` is the last exposure's view of the markers, None without
+    `swapped_by` [m] swapped markers turn poses by 180 degrees about z of B and shift them along its x; 0: none;
+    `more_latency_us` is added to the configured one. `sighting` is the last exposure's view of the markers, None without
     markers.
     """
 
     def __init__(
         self, config: MocapConfig, rng: np.random.Generator, markers: VirtualMarkers | None = None
     ) -> None:
-        """With `markers`, poses come from them."""
+        """With `markers`, fit the poses to them."""
         self._config = config
         self._camera_us = max(0, config.latency_us - config.processing_us)
         self._rng = rng
-        # Streams of their own, so that a fault changes neither the noise of the other frames nor the other faults.
+        # Separate streams: a fault changes neither the noise of the other frames nor the other faults.
         self._rng_outlier, self._rng_dropout, self._rng_wrong = rng.spawn(3)
         self._draws: list[list[float]] = []
         self.dropout = config.dropout
@@ -60,7 +60,7 @@ class VirtualMocap:
     def expose(self, now_us: int, body: Motion) -> tuple[MocapFrame, int]:
         """Return the frame of the body as it is now, and its arrival at the ground station.
 
-        Frames do not overtake one another. All delay arises in the cameras' computer; the network takes no time.
+        Frames keep their order. The cameras' computer causes all delay; the network takes no time.
         """
         latency_us = self._config.latency_us + round(self.more_latency_us)
         self._arrival_us = arrival_us = max(self._arrival_us, now_us + latency_us)

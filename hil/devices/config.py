@@ -60,7 +60,7 @@ class MocapConfig(Section):
 
 
 class MarkersConfig(Section):
-    """Markers one by one, instead of the pose-level noise of `[mocap]`: slower, but losses follow from geometry."""
+    """Individual markers instead of the pose noise of `[mocap]`: slower, but geometry determines the losses."""
 
     enabled: bool = Field(
         False,
@@ -94,7 +94,7 @@ class MarkersConfig(Section):
 
 
 class SerialConfig(Section):
-    """The serial line. Wrong bits and the cable can be changed in flight: see `VirtualSerial`."""
+    """The serial line. Bit errors and the cable can change in flight: see `VirtualSerial`."""
 
     baud: int = number(
         921_600, "[9600, 3_000_000]", "bits on the line, 10 per byte [1/s]; as on PX4's companion ports"

@@ -1,6 +1,6 @@
-"""What an observer reads of an image without our app: the stock firmware's own estimate, motors and supervisor.
+"""The signals of an image without our app: the stock firmware's own estimate, motors and supervisor.
 
-Its log variables are read in the chip's memory. Its estimate is in W; what it has not is empty.
+They are log variables, read from the chip's memory. The estimate is in W; missing values are empty.
 """
 
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ class StockSupervisor:
 
     @property
     def state(self) -> State:
-        """Its state in our words: failsafe once it lets no motor turn any more."""
+        """Our name for its state: failsafe once it stops all motors."""
         if self.bits & (LOCKED | TUMBLED | CRASHED):
             return State.FAILSAFE
         return State.FLYING if self.bits & FLYING else State.WAITING
@@ -45,7 +45,7 @@ class StockSupervisor:
 
 
 def stock_signals(table: Mapping[str, ImageVariable]) -> Signals:
-    """Return the present values; NaN for a variable that the image lacks."""
+    """Return the current values; NaN for a variable that the image lacks."""
 
     def read(name: str, missing: float) -> float:
         return table[name].read() if name in table else missing

@@ -1,8 +1,8 @@
 """A Crazyradio dongle: vendor requests in, one packet and its acknowledgement per exchange, boards within reach.
 
-Here the host is real software, so every exchange happens, empty polls included. Losses on the air are in
-`hil.crazyflie.shockburst`. With acknowledgements switched off a packet is sent once and the host reads nothing. A packet to
-the address of all boards reaches every board on that channel, and none of them answers.
+The host is real software, so every exchange is simulated, including empty polls. `hil.crazyflie.shockburst` models radio
+loss. With acknowledgements off, a packet is sent once and the host reads nothing. A broadcast packet reaches every board
+on that channel, and none answers.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,7 +37,7 @@ class VirtualDongle:
         self._acks = True
 
     def control(self, request: int, value: int, data: bytes) -> None:
-        """Execute a vendor request; those that change nothing here (power, retry delay, carrier) are accepted."""
+        """Execute a vendor request; accept those without effect here (power, retry delay, carrier)."""
         old = self._settings
         if request == SET_CHANNEL:
             self._settings = AirSettings(value, old.bits_per_second, old.address)
@@ -51,7 +51,7 @@ class VirtualDongle:
             self._acks = bool(value)
 
     def transmit(self, now_us: int, packet: bytes, answer: Answer) -> None:
-        """Send a packet of 1..32 bytes; `answer` is called once, unless acknowledgements are switched off."""
+        """Send a packet of 1..32 bytes; call `answer` once, unless acknowledgements are switched off."""
         if not self._acks and len(packet) > MAX_PACKET:  # two packets in one transfer
             half = len(packet) // 2
             self.transmit(now_us, packet[:half], answer)

@@ -1,9 +1,9 @@
-"""An image that flies: a Crazyflie that executes it, and what is read of the exported app in its memory.
+"""A firmware image in flight: the Crazyflie that executes it, and the exported app's values in its memory.
 
-Power comes on `WARM_UP_US` before the laboratory's time begins, because an image needs seconds to start;
-the robot rests in its holder meanwhile. A reset in flight takes as long as it takes.
+Power comes on `WARM_UP_US` before the laboratory's time begins, because an image needs seconds to start; the robot rests
+in its holder meanwhile. A reset in flight takes its real time.
 
-Of the robot's state there is what the exported app has, found by symbols; of an image without it, what that itself logs.
+The robot's state is read from the exported app by symbols, or from the log variables of an image without it.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from hil.stm32f405.processor import ChipProcessor
 from hil.world.body import Carrier
 from hil.world.servos import OUTPUTS
 
-# The stock firmware's self-test and gyro calibration take 3.06 s. The rest lets the app's estimator step at the phase of the
-# cameras' frames at which ours does, 2 to 3 ms after a pose: in reality it is any.
+# The stock firmware's self-test and gyro calibration take 3.06 s. The rest gives the app's estimator the phase that ours
+# has, 2 to 3 ms after a camera pose: a real one has any phase.
 WARM_UP_US = 3_104_000
 IMU_PERIOD_US = 1_000
-OWN_LOGIC = "floaty_guard"  # there is one in images with logic of the user's own
+OWN_LOGIC = "floaty_guard"  # exists in images with the user's own logic
 
 
 class ChipSupervisor:
-    """State and cause of the app's supervisor, calibrating for ever without the app."""
+    """State and cause of the app's supervisor; without the app it calibrates for ever."""
 
     def __init__(self, variables: dict[str, ImageVariable]) -> None:
         self._state, self._cause = (variables.get(f"supervisor.{name}") for name in ("state", "cause"))
@@ -63,7 +63,7 @@ class ChipSupervisor:
 
 
 class ImageStatistics:
-    """How long the image's tasks have run."""
+    """The run times of the image's tasks."""
 
     def __init__(self, kernel: ChipProcessor) -> None:
         self._kernel = kernel
@@ -83,7 +83,7 @@ class ImageStatistics:
 
 @dataclass(frozen=True, slots=True)
 class ChipImage:
-    """What is flashed, and the compiled machine that executes it."""
+    """The flashed image and the compiled machine that executes it."""
 
     image: Image
     library: Path
@@ -96,7 +96,7 @@ class ChipImage:
         return cls(Image(path, elf), build_machine(folder), debugger)
 
     def wire_us(self, data: bytes) -> int:
-        """Take no time: the chip's own serial line does."""
+        """Return 0: the chip simulates its serial line itself."""
         return 0
 
     def boot(self, start: PowerOn) -> ImageFirmware:
@@ -106,8 +106,8 @@ class ChipImage:
 class ImageFirmware:
     """An image at power-on. `rest` gives the IMU's counts while the robot is at rest, before the laboratory's time begins.
 
-    `polls`: whether radio packets without contents come by themselves, as with a host that only listens. `outputs`: those of
-    the timers that drive the robot, by default the servos'.
+    `polls`: whether empty radio packets arrive by themselves, as from a host that only listens. `outputs`: the timer
+    outputs that drive the robot, by default the servos'.
     """
 
     usage: ClassVar[None] = None
@@ -172,10 +172,10 @@ class ImageFirmware:
         self.radio_received(syslink.EMPTY)
 
     def uart_ready(self) -> None:
-        """Nothing: no serial line leads to the image."""
+        """Do nothing: the image has no serial line."""
 
     def check_watchdog(self) -> None:
-        """Say which peripherals the image has used that are not there; the watchdog acts by itself."""
+        """Report the missing peripherals that the image has used; its watchdog acts by itself."""
         self._crazyflie.report_unknown()
 
     @property
@@ -185,7 +185,7 @@ class ImageFirmware:
 
     @property
     def flashed(self) -> ImageFirmware:
-        """Itself: its constants were compiled."""
+        """This image: its constants were compiled."""
         return self
 
     @property
@@ -204,11 +204,11 @@ class ImageFirmware:
         resets = self._crazyflie.resets
         return ImageReport(code, stacks, free, least, resets[WATCHDOG], resets[SOFTWARE])
 
-    # What is read of the app
+    # Values read from the app
 
     @property
     def signals(self) -> Signals:
-        """Views on the app's core; of an image without the app, the stock firmware's present values."""
+        """Views on the app's core; without the app, the stock firmware's current values."""
         return self._app or stock_signals(self._table)
 
     def _signals_of_app(self, table: dict[str, ImageVariable]) -> Signals:
@@ -220,7 +220,7 @@ class ImageFirmware:
         return Signals.of(estimator, control, supervisor)
 
     def _struct(self, name: str, layout: np.dtype[Any]) -> NDArray[Any]:
-        """Return a view on a struct of the core, (1,); one of zeros for an image without the app."""
+        """Return a view on a struct of the core, (1,); zeros for an image without the app."""
         if not self.image.has(name):
             return np.zeros(1, layout)
         symbol = self.image.symbol(name)

@@ -1,7 +1,7 @@
-"""What a profile and an experiment say reaches an image as it reaches a real board: as parameters, over the radio.
+"""Sends the values of a profile and an experiment to an image as to a real board: as parameters, over the radio.
 
-An image has the constants of the profile that it was exported with. Before the release those that differ are written one by
-one, as an operator writes them. Constants that differ are reported first, those without a parameter again when they stay.
+An image has the constants of the profile that it was exported with. Before the release those that differ are reported,
+then written one by one, as an operator does; those without a parameter remain and are reported again.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,16 +14,16 @@ from ground_station.links.crtp_controls import PORTS, CrtpControls, TocEntry
 from hil.crazyflie.log_table import ImageParameter
 from hil.events import EventQueue
 
-TURN_US = 10_000  # between looks whether an answer is overdue
+TURN_US = 10_000  # between checks for an overdue answer
 
 
 def board_values(config: FirmwareConfig) -> dict[str, float]:
-    """Return what a profile says as values of a board's parameters, by their names there."""
+    """Return a profile's values for a board's parameters, by the board's names."""
     return {one.name: value_in(config, key) / one.scale for key, one in OF_PROFILE.items()}
 
 
 def to_set(table: Mapping[str, ImageParameter], config: FirmwareConfig) -> list[tuple[str, float]]:
-    """Return what an image has to be told, by its own names: what it can be told and does not have yet."""
+    """Return the parameters to write, by the image's names: those it has with another value."""
     return [
         (name, value)
         for name, value in board_values(config).items()
@@ -32,9 +32,9 @@ def to_set(table: Mapping[str, ImageParameter], config: FirmwareConfig) -> list[
 
 
 class ImageSettings:
-    """`begin` at an instant of the laboratory, `hear` what the board sends; `say` tells what was set, and what not.
+    """`begin` at a laboratory time, `hear` what the board sends; `say` reports what was set and what was not.
 
-    `table` has the image's parameters by name; `differences` says in one line in what it is not as a configuration is.
+    `table` has the image's parameters by name; `differences` describes in one line how it differs from a configuration.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class ImageSettings:
         self._set: list[str] = []
 
     def begin(self, now_us: int) -> None:
-        """Report the constants that differ from the profile, and write the first parameter that does."""
+        """Report the constants that differ from the profile, and write the first such parameter."""
         if differs := self._differences(self._config):
             self._say(f"the image was built with other constants: {differs}")
         if self._left:
@@ -63,7 +63,7 @@ class ImageSettings:
             self._finish()
 
     def hear(self, now_us: int, data: bytes) -> None:
-        """Take what the board sends; nothing but answers is looked at."""
+        """Take a packet from the board; ignore all but answers."""
         if self._left and (packet := decode(data)).port in PORTS and self._controls.hear(now_us, packet):
             self._go_on(now_us)
 

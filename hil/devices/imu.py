@@ -1,8 +1,8 @@
-"""The BMI088 on the virtual board: angular rate and specific force at the centre of mass to int16 counts at 1 kHz.
+"""The virtual board's BMI088: converts angular rate and specific force at the centre of mass to int16 counts at 1 kHz.
 
-One `sample` is one data-ready: call it once per millisecond, after `body.advance`. Chain: second-order low pass, bias,
-white noise of sensor and motors, rounding, saturation; compiled. Sensor frame S is B turned
-about z by `azimuth`; counts come in S.
+One `sample` is one data-ready: call it once per millisecond, after `body.advance`. Compiled chain: second-order low pass,
+bias, white noise of sensor and motors, rounding, saturation. Sensor frame S is B turned about z by `azimuth`; counts are
+in S.
 """
 
 import math
@@ -21,7 +21,7 @@ from hil.world.fixed_order import compiled, normal
 from hil.world.motion import GRAVITY
 
 View = NDArray[np.float64]
-Counts = NDArray[np.int64]  # (7,) those of a sample, then the rows of noise that are left
+Counts = NDArray[np.int64]  # (7,) of a sample, then the number of noise rows left
 LEFT = 6
 
 
@@ -36,7 +36,7 @@ COS, SIN = cos(S_AZIMUTH), sin(S_AZIMUTH)  # of the default
 def channel(row: View, truth: float, shaken: float, draw: float) -> int:
     """Filter (transposed form II, b = B0 (1, 2, 1)), disturb and round one channel; returns counts.
 
-    `shaken`: the noise of vibration, beside the sensor's own.
+    `shaken`: vibration noise, added to the sensor's own.
     """
     low = row[B0] * truth + row[NOW_1]
     row[NOW_1] = 2.0 * row[B0] * truth - row[A1] * low + row[NOW_2]
@@ -83,8 +83,7 @@ def low_pass(bandwidth: float) -> tuple[float, float, float]:
 class VirtualImu:
     """One specimen of the sensor: its biases are drawn from `rng` when it is made.
 
-    `noise_scale`, `rate_bias` (p, q, r [rad/s] in B), `rate_range` [rad/s], `frozen` and `silent` hold the values last
-    set.
+    `noise_scale`, `rate_bias` (p, q, r [rad/s] in B), `rate_range` [rad/s], `frozen` and `silent` are the last values set.
     """
 
     def __init__(self, config: ImuConfig, rng: np.random.Generator) -> None:
@@ -147,10 +146,10 @@ class VirtualImu:
         self._rows[:3, RANGE] = min(max(round(rate * GYRO_COUNTS), 1), COUNTS)
 
     def freeze(self, frozen: bool) -> None:
-        """Repeat the last sample from now on, or end that."""
+        """Start or stop repeating the last sample."""
         self.frozen = frozen
         self._rows[:, STUCK] = float(frozen)
 
     def silence(self, silent: bool) -> None:
-        """Raise no data-ready interrupt from now on, or end that."""
+        """Suppress the data-ready interrupt, or raise it again."""
         self.silent = silent

@@ -1,6 +1,6 @@
 """Eight reflective markers on the robot, and which of them the cameras around the tunnel see.
 
-The robot's body says where they are. `hil.devices.rigid_body` makes points and poses of what is seen.
+The robot's body defines their places. `hil.devices.rigid_body` computes points and poses from those seen.
 """
 
 import math
@@ -28,7 +28,7 @@ NO_POINTS: Points = np.zeros((0, 3))
 class Sighting:
     """The view of one robot's markers in one exposure; row k belongs to label k + 1."""
 
-    points: Points  # (8, 3) [m] in W; of labels that are not seen: their places on the fitted body
+    points: Points  # (8, 3) [m] in W; an unseen label has its place on the fitted body
     seen: Mask  # (8,)
     residuals: Points  # (8,) [m] distance from the fitted body; 0 where nothing is seen or fitted
     ghosts: Points  # (N, 3) [m] in W
@@ -42,14 +42,14 @@ class Sighting:
 
     @property
     def unlabelled(self) -> Points:
-        """Points that belong to no body, (N, 3) [m] in W: ghosts, and all the markers when the body is not tracked."""
+        """Points of no tracked body, (N, 3) [m] in W: ghosts, and all markers when the body is not tracked."""
         return self.ghosts if self.pose else np.vstack((self.points[self.seen], self.ghosts))
 
 
 class Cameras:
-    """The cameras' places, and what the robot itself hides from them.
+    """The cameras' places, and how the robot itself blocks their view.
 
-    That is one flat square, and a ball around the centre of mass. A marker is placed when enough cameras have it in sight.
+    A flat square and a ball around the centre of mass hide markers. A marker is located when enough cameras see it.
     """
 
     def __init__(self, config: MarkersConfig, markers: Markers) -> None:

@@ -1,12 +1,12 @@
-"""The Crazyradio between ground station and board in lockstep: a modelled host, which polls without pause.
+"""The Crazyradio between ground station and board in lockstep, with a modelled host that polls without pause.
 
 One exchange carries at most one packet in each direction: the host hands a packet (or an empty poll) to the dongle over USB,
-and the board's answer goes back to it. A packet that the dongle repeats in vain is repeated by the host with the same
-contents; safelink's counters make delivery exactly once and in order. Losses on the air are in `hil.crazyflie.shockburst`.
+and the board's answer goes back to it. When the dongle's retries fail, the host sends the same packet again; safelink's
+counters ensure delivery exactly once and in order. `hil.crazyflie.shockburst` models radio loss.
 
-Exchanges that carry something are events. The empty polls in between are not: when something is ready, the
-poll that it meets is computed (the first of the pause) or drawn (any later one: the host's jitter has made
-its phase uniform). Connecting and disconnecting are not modelled: the host repeats for ever.
+Exchanges with a payload are events. The empty polls in between are not: when a packet is ready, the current poll is
+computed (the first of a pause) or drawn (any later one: the host's jitter has made its phase uniform). Connecting and
+disconnecting are not modelled: the host repeats for ever.
 """
 
 from collections import deque
@@ -53,7 +53,7 @@ class DirectionCounters:
     latency_max_us: int = 0
 
     def count_delivery(self, latency_us: int) -> None:
-        """One more packet has arrived."""
+        """Count a packet that has arrived."""
         self.delivered += 1
         self.latency_sum_us += latency_us
         if latency_us > self.latency_max_us:
@@ -75,7 +75,7 @@ class VirtualRadio:
         medium: Air | None = None,
         wire_us: Callable[[bytes], int] = syslink_us,
     ) -> None:
-        """`wire_us`: how long a packet takes between the board's two chips."""
+        """`wire_us`: a packet's time between the board's two chips."""
         self.medium = medium or Air.of(config)
         self._wire_us = wire_us
         self.up = DirectionCounters()
@@ -98,13 +98,13 @@ class VirtualRadio:
     def connect(
         self, on_board: Receiver, on_ground: Receiver, on_poll: Callable[[int], object] = _nobody_asks
     ) -> None:
-        """Name the receivers of the uplink, of the downlink, and of empty polls that fetch something."""
+        """Set the receivers of the uplink, the downlink, and empty polls that fetch a packet."""
         self._on_board = on_board
         self._on_ground = on_ground
         self._on_poll = on_poll
 
     def uplink(self, now_us: int, data: bytes) -> None:
-        """Take a packet for the board; when the host's queue is full its oldest packet is dropped."""
+        """Take a packet for the board; drop the oldest when the host's queue is full."""
         _check_size(data)
         queue, counters = self._up_queue, self.up
         counters.sent += 1
@@ -119,7 +119,7 @@ class VirtualRadio:
         self._wake_for_uplink(now_us)
 
     def downlink(self, now_us: int, data: bytes) -> bool:
-        """Take a packet for the ground; False when the nRF51's queue is full and the sender has to wait."""
+        """Take a packet for the ground; False when the nRF51's queue is full and the sender must wait."""
         _check_size(data)
         counters, ready_us = self.down, now_us + self._wire_us(data)
         if not self._board.put(Waiting(ready_us, now_us, data)):
@@ -139,27 +139,27 @@ class VirtualRadio:
     # The host: when the next exchange begins, and with what.
 
     def _wake_for_uplink(self, now_us: int) -> None:
-        """A packet may be ready at the host; on an idle link it follows the empty poll in progress."""
+        """Plan the exchange of a ready packet; on an idle link it follows the empty poll in progress."""
         if not self._busy and self._up_queue and self._up_queue[0].ready_us <= now_us:
             _, end_us, answered = self._poll_at(now_us)
             self._plan(end_us, answered, now_us)
 
     def _plan(self, start_us: int, answered: bool, now_us: int) -> None:
-        """Begin at `start_us`; if the poll before was not answered, the host has to repeat it first."""
+        """Begin at `start_us`; if the previous poll was not answered, the host repeats it first."""
         self._busy = True
         if start_us > now_us:
             self._events.at(start_us, self._begin if answered else self._exchange)
-        else:  # the poll has begun, and empty
+        else:  # the poll has begun without a packet
             self._exchange(start_us)
 
     def _begin(self, now_us: int) -> None:
-        """The host is free: it takes the packet that is ready, if any."""
+        """Take the packet that is ready, if any, when the host is free."""
         if self._up_queue and self._up_queue[0].ready_us <= now_us:
             self._uploading = self._up_queue.popleft()
         self._exchange(now_us)
 
     def _poll_at(self, t_us: int) -> tuple[int, int, bool]:
-        """The empty poll in progress at `t_us` on an idle link: its start, its end, whether it is answered."""
+        """Return the empty poll in progress at `t_us` on an idle link: start, end, whether answered."""
         config = self._config
         host_us = 2 * config.usb_us + config.usb_jitter_us // 2
         length_us = host_us + exchange_us(POLL_BYTES, EMPTY_ACK_BYTES, config.bits_per_second)
@@ -182,7 +182,7 @@ class VirtualRadio:
     # One exchange
 
     def _exchange(self, start_us: int) -> None:
-        """Hand packet or poll to the dongle."""
+        """Hand a packet or poll to the dongle."""
         self._answer_size = None
         exchange = RadioExchange(
             POLL_BYTES if self._uploading is None else len(self._uploading.data),
@@ -191,7 +191,7 @@ class VirtualRadio:
         self._transmitter.send(start_us, exchange)
 
     def _hear(self, now_us: int) -> int:
-        """The board hears the packet, passes it on if it is new, and answers; every later try gets the same answer."""
+        """Receive the packet on board, pass it on if it is new, and answer; every retry gets the same answer."""
         if self._answer_size is None:
             if self._board.takes(self._counter) and self._uploading is not None:
                 deliver = partial(self._deliver_up, self._uploading)
@@ -203,13 +203,13 @@ class VirtualRadio:
         return self._answer_size
 
     def _ended(self, repetitions: int | None, now_us: int) -> None:
-        """The answer is at the host, and the exchange complete in both directions; or the host repeats it."""
+        """Complete the exchange when its answer is at the host, or repeat it."""
         if repetitions is None:
             self._exchange(now_us)
             return
         self._counter ^= 1
         self._uploading = None
-        received = self._board.confirm()  # the next poll would confirm it, which may not be simulated
+        received = self._board.confirm()  # the next poll would confirm it, but may not be simulated
         if self._board.queue or (self._up_queue and self._up_queue[0].ready_us <= now_us):
             self._begin(now_us)
         else:
@@ -224,7 +224,7 @@ class VirtualRadio:
         self._on_board(now_us, packet.data)
 
     def _uniform(self) -> float:
-        """The next number of 0..1, drawn in blocks: one call of numpy costs as much as fifty numbers."""
+        """Return a random number of 0..1; drawn in blocks, as one numpy call costs as much as fifty numbers."""
         if not self._uniforms:
             self._uniforms = self._rng.random(256).tolist()
         return self._uniforms.pop()
@@ -234,7 +234,7 @@ class VirtualRadio:
 def _polls_met(
     lost: float, length_us: int, host_us: int, again_us: int
 ) -> tuple[tuple[int, ...], tuple[float, ...], float]:
-    """Lengths [us] of polls by number of repetitions, and the chance to meet them: by frequency and by length."""
+    """Return poll lengths [us] by number of repetitions, and the chance to meet each: frequency times length."""
     lengths = (
         *(length_us + tries * again_us for tries in range(RETRIES + 1)),
         host_us + (RETRIES + 1) * again_us,

@@ -1,8 +1,8 @@
-"""A flight core that a real board executes, call by call: the fourth plug of the core runner.
+"""A flight core that a real board executes, call by call: the fourth core runner.
 
-The memory of the core lies here, as with every board, and on the board. Before a call, what has changed here is written
-there; after it, the board tells a CRC of all its bytes. What the call should have come to is computed here beside it:
-where the CRC confirms that, nothing has to be read, otherwise all memory is. So what flies is what the board computed.
+The core's memory exists here, as with every board, and on the board. Before a call, changes here are written to the
+board; after it, the board reports a CRC of its memory. The expected result is computed here as well: if the CRC confirms
+it, nothing is read; otherwise all memory is. So the board's result flies.
 """
 
 from contextlib import ExitStack
@@ -20,17 +20,17 @@ from ground_station.links.core_client import CoreClient, runs
 from hil.errors import LabError
 
 Bytes = NDArray[np.uint8]
-# What runs every millisecond is executed on this side: a link takes longer than that for a call.
+# Calls of every millisecond are executed here: a call over a link takes longer.
 HERE = ("begin_step", "take_sample")
 
 
 def is_link(board: str) -> bool:
-    """Whether a board is a real one, named by the URI of its link."""
+    """Whether a board is real, named by the URI of its link."""
     return "://" in board
 
 
 def open_real_core(uri: str, option: str, stack: ExitStack) -> CoreClient:
-    """Return a board's core, whose link is closed with the stack. Raises `LabError` that names the option."""
+    """Return a board's core; the stack closes its link. Raises `LabError` that names the option."""
     try:
         from ground_station.links.packets import CflibPackets
 
@@ -44,24 +44,24 @@ def open_real_core(uri: str, option: str, stack: ExitStack) -> CoreClient:
 
 
 def real_core(uri: str, stack: ExitStack) -> RunnerFactory:
-    """Return what executes the core on a board, until the stack is closed. Raises `LabError`."""
+    """Return the core runner of a board, until the stack is closed. Raises `LabError`."""
     client = open_real_core(uri, "--board", stack)
     return lambda blocks: RealCore(blocks, client)
 
 
 class RealCore:
-    """A `CoreRunner` and a `CoreCosts`; `load` counts cycles by entry point, as the board measures them.
+    """A `CoreRunner` and a `CoreCosts`; `load` has the cycles of each entry point, measured by the board.
 
-    `about` is the board. Raises `LinkError` when the board does not answer, or its memory is of another layout.
+    `about` is the board. Raises `LinkError` when the board does not answer or has another memory layout.
     """
 
     def __init__(self, blocks: CoreBlocks, client: CoreClient) -> None:
         self.load = {entry.name.lower(): EntryLoad() for entry in Call if entry.name.lower() not in HERE}
-        self.unexpected = 0  # calls that came to something else than here
+        self.unexpected = 0  # calls with another result than here
         self._client = client
         self._host = PythonRunner(blocks)
         self._here = _bytes_of(blocks)
-        # where a call is computed without touching what flies
+        # computes a call without changing the flight
         self._copy = CoreBlocks(blocks.parameters.kind.allocate(), PythonRunner, blocks.logic)
         self._expected = _bytes_of(self._copy)
         size = sum(memory.size for memory in self._here)
@@ -76,7 +76,7 @@ class RealCore:
         self._ahead: tuple[str, Bytes, Called] | None = None
 
     def call(self, name: str) -> int:
-        """Have an entry point executed and let its results out; what was executed ahead on the same inputs is taken."""
+        """Execute an entry point and apply its results; reuse one executed ahead on the same inputs."""
         if name in HERE:
             return self._host.call(name)
         inputs = np.concatenate(self._here)
@@ -94,7 +94,7 @@ class RealCore:
         return called.answer
 
     def estimate_us(self) -> int:
-        """Return the processor time of the estimator's next call, with that of the poses filed since the last one."""
+        """Return the processor time of the estimator's next call, including the poses filed since the last one."""
         return self._microseconds(self._filed_cycles + self._look_ahead("estimate").cycles)
 
     def control_us(self) -> int:
@@ -105,7 +105,7 @@ class RealCore:
         return Usage(None, self.about.size, None, self.load)
 
     def _look_ahead(self, name: str) -> Called:
-        """Have an entry point executed without letting its results out."""
+        """Execute an entry point without applying its results."""
         inputs = np.concatenate(self._here)
         called = self._execute(name, inputs)
         self._ahead = name, inputs, called

@@ -1,13 +1,12 @@
-"""A real board in the loop: its firmware flies with the samples of the virtual gyro, its servo counts drive the plant.
+"""A real board in the loop: its firmware flies on samples of the virtual gyro, and its servo counts drive the plant.
 
-Over the link the board reports the state of its supervisor, its servo counts and some counters. It does not report the
-core's estimate; those columns of the log are NaN. Corrections go to the board as in a real
-flight. Between the instant that the board's gyro shows and the one at which its flaps act lie the way of the samples to
-the board, their wait there, and the way of the counts back: the loop's own delay, which is measured. Each pose's age
-includes the link latency, estimated as half the round trip without queueing.
+Over the link the board reports its supervisor's state, its servo counts and some counters. It does not report the core's
+estimate; those columns of the log are NaN. Corrections go to the board as in a real flight. The link delays the samples
+to the board, the board's buffer delays them again, and the link delays the counts on their return: the sum is measured as
+the loop's delay. Each pose's age includes the link latency, estimated as half the round trip without queueing.
 
-The plant follows the board: when the board is late the plant waits, and when a sample is late the flight on board stands
-still. So a link that is too slow makes the flight slower than real time, and its delay no longer than the window of samples
+The plant follows the board: when the board is late the plant waits, and when a sample is late the flight on board pauses.
+So a slow link slows the flight below real time, but the delay stays within the window of samples
 (`hil.devices.sample_window`).
 """
 
@@ -49,16 +48,16 @@ from hil.devices.sample_window import SampleWindow
 
 SAMPLE_US = 1000
 SILENCE_US = 1_000_000
-LATE_MAX_US = 10_000  # that the plant makes up for behind a wait, so that samples are on their way at once
-LOOK_S = 0.001  # between two looks at the link, while the plant waits
-SLEW_US = 25  # by which time is moved, a hundred times a second, for each sample that too many wait on board
+LATE_MAX_US = 10_000  # that the plant catches up after a wait, so that samples flow at once
+LOOK_S = 0.001  # between two reads of the link, while the plant waits
+SLEW_US = 25  # time shift, a hundred times a second, for each sample too many that waits on board
 SLEW_MAX_US = 1000
 COUNTED = ("waiting", "held", "late", "lost", "doubled")  # by the board, of samples
-KEPT = 50  # of what the board told, half a second: what the loop adds is their mean
+KEPT = 50  # board reports, half a second: the loop's added delay is their mean
 
 
 class _Clock:
-    """The time of a processor that nobody here schedules."""
+    """The clock of a processor that is not scheduled here."""
 
     next_wake_us: ClassVar[None] = None
 
@@ -70,43 +69,43 @@ class _Clock:
         self.now_us = now_us
 
     def run(self, now_us: int, until_us: int = 0) -> None:
-        """Let it be so late; nothing happens by itself."""
+        """Set the time; nothing happens by itself."""
         self.now_us = now_us
 
     def stop_before(self, us: int) -> None:
-        """Nothing: it does not run ahead."""
+        """Do nothing: it does not run ahead."""
 
     def reports(self) -> tuple[TaskReport, ...]:
-        """Nothing: what a board's tasks do is not told."""
+        """Return nothing: a board does not report its tasks."""
         return ()
 
 
 @dataclass(frozen=True, slots=True)
 class RealBoard:
-    """A board that is to fly in the loop; `moving`: its servos move as well."""
+    """A board to fly in the loop; `moving`: its servos move as well."""
 
     client: CoreClient
     moving: bool
-    wall: Paced  # the wall clock, and how simulated time lies on it
+    wall: Paced  # maps simulated time to the wall clock
     needs_polls: ClassVar[bool] = False
 
     def wire_us(self, data: bytes) -> int:
-        """Return what the serial line between the two chips of a board takes."""
+        """Return the time on the serial line between a board's two chips."""
         return syslink_us(data)
 
     def boot(self, start: PowerOn) -> RealFirmware:
-        """Take it into the loop. Raises `LinkError` when it does not answer."""
+        """Switch the board to the loop. Raises `LinkError` when it does not answer."""
         return RealFirmware(self, start.board)
 
     def leave(self) -> None:
-        """Let it go back to its own gyro, if it is still there."""
+        """Switch the board back to its own gyro, if it still answers."""
         with suppress(LinkError):
             self.client.execute([loop(Hil.OFF)])
 
 
 @dataclass(slots=True)
 class _Supervisor:
-    """What the board reported last about its supervisor."""
+    """The supervisor's last state that the board reported."""
 
     state: State = State.CALIBRATING
     cause: Cause = Cause.NONE
@@ -115,7 +114,7 @@ class _Supervisor:
 class RealFirmware:
     """The firmware of a board in the loop. Raises `LinkError` when the board does not answer."""
 
-    log_numbers: ClassVar[Mapping[str, int]] = {}  # its log service is not asked
+    log_numbers: ClassVar[Mapping[str, int]] = {}  # its log service is not used
     scheduler: ClassVar[None] = None
     usage: ClassVar[None] = None
     clock_us: ClassVar[None] = None
@@ -126,9 +125,9 @@ class RealFirmware:
     def __init__(self, real: RealBoard, board: Board) -> None:
         self.kernel = self.statistics = _Clock()
         self._told: Looped | None = None  # last
-        self._delay_us = 0  # from a sample to the counts that came of it, lately
-        self._added_us = 0  # the link's way, which corrections tell on top of their age
-        self._stood_us = 0  # how long simulated time stood still in all, because the board was late
+        self._delay_us = 0  # recent mean, from a sample to the counts it caused
+        self._added_us = 0  # the link's latency, which corrections add to their age
+        self._stood_us = 0  # total pause of simulated time because the board was late
         self._supervisor = _Supervisor()
         self.signals = Signals(
             np.full(16, nan, np.float32), np.zeros(len(COUNTERS), np.int32), np.full(4, nan, np.float32),
@@ -145,17 +144,17 @@ class RealFirmware:
         self._wall = real.wall
         self._mode = Hil.MOVING if real.moving else Hil.STILL
         self._window = SampleWindow()
-        self._correction: bytes | None = None  # that waits for the link
+        self._correction: bytes | None = None  # waits for the link
         self._heard_us = 0
-        self._delays: deque[tuple[int, int]] = deque(maxlen=KEPT)  # whole, and what of it waited in buffers
+        self._delays: deque[tuple[int, int]] = deque(maxlen=KEPT)  # total, and the part spent in buffers
         self._about = real.client.begin()
 
     def __str__(self) -> str:
         return f"{self._client.name}: core {self._about.core}, profile {self._about.profile}, in the loop"
 
     def imu_ready(self) -> None:
-        """The virtual IMU has a sample: hand it on, take what the board has told, and wait for it when it is late."""
-        if self._window.count == 0:  # what compiles has been compiled: from now on samples come
+        """Send the virtual IMU's new sample, read the board's reports, and wait for the board when it is late."""
+        if self._window.count == 0:  # compilation is done: samples flow from now on
             self._client.execute([loop(self._mode)])
         self._window.put(self._board.read_imu()[:3])
         self._exchange()
@@ -171,7 +170,7 @@ class RealFirmware:
         self._wall.shift(too_late_us)
 
     def radio_received(self, data: bytes, broadcast: bool = False) -> None:
-        """Hand a correction on, with the age that it has for this board; nothing else is for it."""
+        """Forward a correction with its age at this board; drop other packets."""
         packet = crtp.decode(data)
         if packet.port != crtp.PORT_LOCALISATION:
             return
@@ -185,13 +184,13 @@ class RealFirmware:
         self._send()
 
     def radio_polled(self) -> None:
-        """Nothing: the board's own radio is polled."""
+        """Do nothing: the board's own radio is polled."""
 
     def uart_ready(self) -> None:
-        """Nothing: no serial line leads to the board."""
+        """Do nothing: the board has no serial line."""
 
     def check_watchdog(self) -> None:
-        """Raise `LinkError` when the board has told nothing for too long."""
+        """Raise `LinkError` when the board has reported nothing for too long."""
         if self.kernel.now_us - self._heard_us > SILENCE_US:
             raise self._silent()
 
@@ -203,14 +202,14 @@ class RealFirmware:
         return 0 if self._told is None else int(getattr(self._told, name))
 
     def _exchange(self, timeout_s: float = 0.0) -> None:
-        """Take what the board tells, within a time, and send what the link and the board have room for."""
+        """Read the board's reports, within a timeout, and send what the link and the board have room for."""
         for raw in self._client.packets.received(timeout_s):
             self._hear(raw)
         self._send()
 
     def _send(self) -> None:
         packets = self._client.packets
-        if packets.ready and self._correction is not None:  # first: there are few of them
+        if packets.ready and self._correction is not None:  # first: these are few
             packets.send_any(self._correction)
             self._correction = None
         if packets.ready and (data := self._window.packet(self._wall.wall_us())) is not None:
@@ -234,9 +233,9 @@ class RealFirmware:
             self._measure(told)
 
     def _measure(self, told: Looped) -> None:
-        """Take in how old the sample was from which these counts came, and keep as many waiting as the board wants."""
+        """Measure the age of the sample behind these counts, and keep as many waiting as the board wants."""
         window = self._window
-        batch_us = (window.batch - 1) * SAMPLE_US // 2  # that a sample waits on the mean for its packet
+        batch_us = (window.batch - 1) * SAMPLE_US // 2  # a sample's mean wait for its packet
         self._delays.append(((window.count - window.used) * SAMPLE_US, told.waiting * SAMPLE_US + batch_us))
         total_us, waited_us = (sum(values) // len(self._delays) for values in zip(*self._delays, strict=True))
         self._delay_us, self._added_us = total_us, max(0, total_us - waited_us) // 2

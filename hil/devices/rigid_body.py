@@ -1,7 +1,7 @@
 """From the markers of one exposure to the pose of the body: noise, wrong labels, ghosts, and the best fit.
 
-Exchanging two labels leaves the fitted pose unchanged or turns it by 180 degrees, and shows
-in the mean error; a body that fits badly is not tracked, as in Motive.
+Exchanging two labels leaves the fitted pose unchanged or turns it by 180 degrees, and raises the mean error; a body that
+fits badly is not tracked, as in Motive.
 """
 
 import math
@@ -18,7 +18,7 @@ from hil.world.fixed_order import eigen, normal, product
 
 NOISE_ROWS = 512  # exposures of noise drawn at once
 SPREAD = 0.01  # [m] root of the sum of squared distances from the best line through markers; below, they count as collinear
-WORST_PAIR = (0, 2)  # rows: of the pairs whose exchange turns the body by 180 deg, the one that fits best
+WORST_PAIR = (0, 2)  # rows: the best-fitting pair whose exchange turns the body by 180 deg
 GHOST_REACH = 0.3  # [m] from the body, along each axis; chosen
 
 
@@ -32,11 +32,11 @@ class BodyFit:
 
 
 class MarkerBody:
-    """A body that is known by its markers' places, (8, 3) [m] in B."""
+    """A body defined by its markers' places, (8, 3) [m] in B."""
 
     def __init__(self, places: Points) -> None:
         self._places = places
-        # By the markers seen: centre (3,) and the places around it; None where these are collinear.
+        # By the markers seen: centre (3,) and the places about it; None if these are collinear.
         self._parts: dict[bytes, tuple[Points, Points] | None] = {}
 
     def fit(self, points: Points, seen: Mask) -> BodyFit | None:
@@ -87,8 +87,8 @@ def _best_turn(body: Points, points: Points) -> Quaternion:
 class VirtualMarkers:
     """The markers on one robot. Plain attributes that may change in flight:
 
-    `hidden` how many are covered, from marker 1 on; `swapped` 1: markers 1 and 3 have each other's label; `noise_scale`
-    factor on the noise; `ghosts` per frame.
+    `hidden` number of covered markers, from marker 1 on; `swapped` 1: markers 1 and 3 have each other's label;
+    `noise_scale` factor on the noise; `ghosts` per frame.
     """
 
     def __init__(

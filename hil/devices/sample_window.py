@@ -1,8 +1,8 @@
-"""The gyro samples that are under way to a board in the loop: how many may be, in which packets, and what is repeated.
+"""The gyro samples in flight to a board in the loop: how many are allowed, their packets, and repetition.
 
-The loop's delay is bounded by this window, not by what queues on the way would hold: with `WINDOW` samples that the board
-has not taken the plant has to wait, and with `PACKETS` packets that it has not acknowledged the next one waits, and gets
-longer. What was lost is sent again, with all behind it. `firmware_py.wire.core_port` has the board's half.
+This window bounds the loop's delay, not the queues of the link: the plant waits while the board has not taken `WINDOW`
+samples. The next packet waits, and grows, while `PACKETS` packets are not acknowledged. Lost samples are sent again, with
+all after them. `firmware_py.wire.core_port` has the board's half.
 """
 
 from collections import deque
@@ -14,26 +14,26 @@ from firmware_py.wire.core_port import SAMPLES_MAX, Looped, encode_samples
 # samples: the ten between two steps of the controller, and twenty for which the tuned hover holds its limits
 WINDOW = 30
 PACKETS = 4
-SAMPLES_MIN = 4  # in a packet, 250 packets a second, and one more for each that is under way
-REPEAT_US = 50_000  # without news of what was sent
+SAMPLES_MIN = 4  # in a packet, 250 packets a second, and one more for each packet in flight
+REPEAT_US = 50_000  # without an acknowledgement
 
 
 class SampleWindow:
-    """Counts samples from 0. `used`: that the board has taken; `batch`: in the last packet; `repeated`: packets again."""
+    """Counts samples from 0. `used`: taken by the board; `batch`: in the last packet; `repeated`: packets sent again."""
 
     def __init__(self) -> None:
         self.count = self.used = 0
         self.batch = SAMPLES_MIN
         self.repeated = 0
-        self._samples: deque[Sequence[int]] = deque()  # that are not acknowledged
+        self._samples: deque[Sequence[int]] = deque()  # not acknowledged
         self._sent = 0  # number of the next one to send
-        self._ends: deque[int] = deque()  # of the packets under way
-        self._lost = 0  # as the board has counted
+        self._ends: deque[int] = deque()  # of the packets in flight
+        self._lost = 0  # as counted by the board
         self._news_us = 0
 
     @property
     def full(self) -> bool:
-        """Whether the board has to take some before there are more."""
+        """Whether the board must take samples before more are sent."""
         return self.count - self.used >= WINDOW
 
     def put(self, sample: Sequence[int]) -> None:
@@ -42,7 +42,7 @@ class SampleWindow:
         self.count += 1
 
     def hear(self, told: Looped, now_us: int) -> bool:
-        """Take in what the board has; whether it has taken more of it than before."""
+        """Take a report of the board; return whether it has taken more samples."""
         taken = told.used - self.used & 0xFFFF
         acknowledged = self.count - len(self._samples)
         more = told.received - acknowledged & 0xFFFF
@@ -63,7 +63,7 @@ class SampleWindow:
         return taken > 0
 
     def packet(self, now_us: int) -> bytes | None:
-        """Return the data of the packet that is to be sent now, if there is one."""
+        """Return the data of the packet to send now, if any."""
         if self._ends and now_us - self._news_us >= REPEAT_US:
             self._repeat()
         under_way = len(self._ends)

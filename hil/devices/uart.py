@@ -1,10 +1,10 @@
 """The serial line between ground station and board: baud rate, buffers, interrupts by chunk, wrong bits, a cable.
 
-A byte takes 10 bits on the line (8N1), without flow control. At either end a receiver gathers bytes and hands them
-over as one chunk: when it has `interrupt_threshold` of them, or when the line has been silent for a byte's time. On
-board a chunk waits in the receive buffer until `read` after the interrupt; bytes that find no room are lost (overrun).
-At the ground an adapter on USB stands between the line and the program, one latency in each direction. Wrong bits are data
-bits; a wrong start or stop bit, which garbles the byte as well, is not modelled separately. Events are planned per chunk.
+A byte takes 10 bits on the line (8N1), without flow control. At either end a receiver gathers bytes and hands them over
+as one chunk: when it has `interrupt_threshold` of them, or when the line has been silent for a byte's time. On board a
+chunk waits in the receive buffer until `read` after the interrupt; bytes without room are lost (overrun). On the ground a
+USB adapter adds a latency in each direction. Bit errors hit data bits; a wrong start or stop bit, which garbles the byte
+as well, is not modelled separately. Events are planned per chunk.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from hil.events import EventQueue
 
 BYTE_BITS = 10  # start, 8 data, stop
 HOST_BUFFER = 4096  # bytes; Linux, drivers/usb/serial: one page for what a program writes
-NEVER = 2.0**60  # bits that no flight sends
+NEVER = 2.0**60  # more bits than any flight sends
 BYTE_TICKS = BYTE_BITS * 1_000_000  # a byte's time in units of 1/baud microseconds
 
 Arrived = Callable[[bytes, int, int], None]  # (chunk, sent_us, now_us)
@@ -29,18 +29,18 @@ Arrived = Callable[[bytes, int, int], None]  # (chunk, sent_us, now_us)
 class LineCounters:
     """Bytes of one direction. Sent bytes are delivered, overrun, cut, or in transit; dropped ones were never sent."""
 
-    sent_bytes: int = 0  # taken from the sender
+    sent_bytes: int = 0  # accepted from the sender
     dropped_bytes: int = 0  # no room at the sender
     delivered_bytes: int = 0
-    overrun_bytes: int = 0  # found no room on board
-    cut_bytes: int = 0  # the cable was out
+    overrun_bytes: int = 0  # no room on board
+    cut_bytes: int = 0  # with the cable unplugged
     wrong_bits: int = 0
-    busy_us: int = 0  # time on the line of all that was sent
+    busy_us: int = 0  # total time on the line
     deliveries: int = 0  # chunks
     latency_sum_us: int = 0  # of the deliveries, for a chunk's last byte, from sender to receiver
 
     def count_delivery(self, size: int, latency_us: int) -> None:
-        """One more chunk has arrived."""
+        """Count a chunk that has arrived."""
         self.delivered_bytes += size
         self.deliveries += 1
         self.latency_sum_us += latency_us
@@ -66,7 +66,7 @@ class _Line:
         self._rng = rng
         self._free_ticks = 0  # end of the last byte
         self._gathered = b""  # bytes that the silence after the last byte hands over
-        self._silence = 0  # its number: a later byte makes it void
+        self._silence = 0  # its number: a later byte cancels it
         self._rate = 0.0  # of wrong bits
         self._good_bits = 0  # before the next wrong one
 
@@ -76,7 +76,7 @@ class _Line:
         return self._capacity - max(0, waiting)
 
     def send(self, now_us: int, data: bytes, sent_us: int) -> None:
-        """Put bytes behind those that wait, and plan when the receiver hands them over."""
+        """Queue bytes, and plan when the receiver hands them over."""
         counters, baud, threshold = self.counters, self._baud, self._threshold
         counters.sent_bytes += len(data)
         counters.busy_us = counters.sent_bytes * BYTE_TICKS // baud
@@ -102,7 +102,7 @@ class _Line:
             self._arrived(chunk, sent_us, now_us)
 
     def spoil(self, data: bytes, rate: float) -> bytes:
-        """Return the data with its wrong bits; the distance between them is drawn."""
+        """Return the data with bit errors at drawn distances."""
         if rate != self._rate:
             self._rate = rate
             self._good_bits = self._draw() if rate else 0
@@ -144,12 +144,12 @@ class VirtualSerial:
         self._received = bytearray()  # on board
 
     def connect(self, on_board: Callable[[int], object], on_ground: Callable[[int, bytes], object]) -> None:
-        """Name the board's interrupt, after which it can `read`, and the ground's receiver (now_us, chunk)."""
+        """Set the board's interrupt, after which it can `read`, and the ground's receiver (now_us, chunk)."""
         self._on_board = on_board
         self._on_ground = on_ground
 
     def uplink(self, now_us: int, data: bytes) -> None:
-        """Take bytes for the board; bytes that find no room at the host are dropped."""
+        """Take bytes for the board; drop those without room at the host."""
         self._events.at(now_us + self._config.host_latency_us, partial(self._start_up, data, now_us))
 
     def _start_up(self, data: bytes, sent_us: int, now_us: int) -> None:
@@ -174,7 +174,7 @@ class VirtualSerial:
         return self.up.overrun_bytes
 
     def read(self) -> bytes:
-        """Return what has arrived on board since the last time, and make room."""
+        """Return the bytes that arrived on board since the last call, and free their room."""
         data = bytes(self._received)
         self._received.clear()
         return data
