@@ -1,1 +1,1 @@
-"""One assembly of robot, cameras, lines and time line, for every flight: in lockstep, paced over a real link, or served."""
+"""Assembles robot, cameras, links and time line for every flight: in lockstep, paced over a real link, or served."""

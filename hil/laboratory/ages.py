@@ -1,10 +1,10 @@
 """The latency budget of a flight's poses, from its ground station's record `telemetry.csv`.
 
-For a radio in lockstep the station knows only a typical latency; there it is taken from the flight log.
+For a radio in lockstep the station knows only a typical latency; the flight log has the real one.
 
-In the log of a real flight a row is written with the newest pose available, which is some 40 ms old; what the cameras
-saw at the row's own instant comes with a later row. `at_exposure` puts it in when the log is read from its stream: between
-the two exposures around the instant, and NaN where those are too far apart, or the second one never came.
+Each row in the log of a real flight has the newest available pose, some 40 ms old; the pose of the row's own time arrives
+with a later row. `at_exposure` inserts it when the log is read from its stream, interpolated between the two exposures
+around that time; NaN if they are too far apart or the second one is missing.
 """
 
 from collections.abc import Iterator
@@ -20,17 +20,17 @@ from ground_station.latency import STAGES, Row, Stage, budget_of
 from ground_station.telemetry_log import AGE_COLUMNS, GOAL_COLUMNS, TELEMETRY, TIME_COLUMN
 from hil.laboratory.metrics import column, is_real
 
-# Column of the log: the computer's clock, which stamps a station's record.
+# Column of the log: the computer's clock, used in a station's record.
 STATION_CLOCK = "station.clock"
-STATION_START = b"station_start_us"  # in the metadata of a real flight's log: that clock when its time began
+STATION_START = b"station_start_us"  # in the metadata of a real flight's log: that clock at the log's time 0
 
 EXPOSED = "cameras.exposed"  # column: exposure of the row's pose, in the log's time [us]
-GAP_US = 100_000  # between two exposures, beyond which the pose in between is unknown
+GAP_US = 100_000  # between two exposures; with a longer gap the pose in between is unknown
 ROTATION = ("cameras.qw", "cameras.qx", "cameras.qy", "cameras.qz")
 
 
 def ages_of(reported: pa.Table, log: pa.Table, link: str) -> tuple[Stage, ...]:
-    """The budget of a flight over `link`; empty when no telemetry came."""
+    """Return the budget of a flight over `link`; empty without telemetry."""
     rows: list[Row] = list(zip(*(_us(reported, stage) for stage in STAGES), strict=True))
     radio_us = _on_air(log) if link == "radio" else np.empty(0)
     if rows and len(radio_us):
@@ -42,7 +42,7 @@ def ages_of(reported: pa.Table, log: pa.Table, link: str) -> tuple[Stage, ...]:
 
 
 def reported_ages(folder: Path) -> pa.Table:
-    """The ages of sent poses as the station reported them: `t` [us] by its clock, and each stage [ms].
+    """Return the ages of sent poses that the station reported: `t` [us] by its clock, and each stage [ms].
 
     An unknown stage is NaN. The last line of the file may be cut.
     """
@@ -53,7 +53,7 @@ def reported_ages(folder: Path) -> pa.Table:
 
 
 def ages_in_time_of(log: Iterator[pa.Table], folder: Path) -> pa.Table:
-    """The ages that the station reported, with `t` [us] in the time of the log, which comes in pieces, and its metadata.
+    """Return the station's reported ages, with `t` [us] in the time of the log, given in pieces, and its metadata.
 
     Empty for a real flight whose log lacks the station's clock at its start, as older logs do.
     """
@@ -73,7 +73,7 @@ def ages_in_time_of(log: Iterator[pa.Table], folder: Path) -> pa.Table:
 
 
 def goals_sent(telemetry: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-    """The recorded goals of the station: times (N,) [us] by its clock, (N, 4) x, y, z [m] and yaw [rad] in W; None: none."""
+    """Return the station's goals: times (N,) [us] by its clock, (N, 4) x, y, z [m] and yaw [rad] in W; None: none."""
     rows = _read(telemetry, (TIME_COLUMN, *GOAL_COLUMNS))
     if not len(rows):
         return None
@@ -81,7 +81,7 @@ def goals_sent(telemetry: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]
 
 
 def with_goals_sent(telemetry: Path, log: pa.Table) -> pa.Table:
-    """Return a flight log with the goals that the station actually sent, from its own record."""
+    """Return a flight log with the goals that the station sent, from its record."""
     sent = goals_sent(telemetry)
     if sent is None:
         return log
@@ -114,7 +114,7 @@ def _us(reported: pa.Table, stage: str) -> list[float]:
 
 
 def _on_air(log: pa.Table) -> NDArray[np.float64]:
-    """The time of each uplink packet from sender to board [us], if a radio was simulated."""
+    """Return each uplink packet's latency from sender to board [us], if a radio was simulated."""
     if "link.retried" not in log.column_names or log.num_rows < 2:
         return np.empty(0)
     delivered, sum_us = np.diff(column(log, "link.up_delivered", "link.up_latency_sum"), axis=0).T
@@ -123,7 +123,7 @@ def _on_air(log: pa.Table) -> NDArray[np.float64]:
 
 
 def at_exposure(log: pa.Table) -> pa.Table:
-    """Return a log whose cameras' columns belong to the instants of their rows; one without cameras unchanged."""
+    """Return a log with camera columns moved to the times of their rows; unchanged without cameras."""
     if EXPOSED not in log.column_names:
         return log
     names = [name for name in log.column_names if name.startswith("cameras.") and name != EXPOSED]
@@ -153,7 +153,7 @@ def _rotations(
     share: NDArray[np.float64],
     known: NDArray[np.bool_],
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the quaternions between two, which may have opposite signs for neighbouring rotations."""
+    """Interpolate quaternions; neighbours may have opposite signs."""
     q = np.stack([log.column(name).to_numpy()[fresh] for name in ROTATION], axis=1)
     a, b = q[after - 1], q[after]
     b = b * np.where((a * b).sum(axis=1) < 0, -1.0, 1.0)[:, None]

@@ -1,7 +1,7 @@
-"""What a flight log holds: names, units, frames and where each value comes from.
+"""The columns of a flight log: names, units, frames and the source of each value.
 
-Counters are cumulative. `estimate.flap_*` are deviations from the hover angle, like in the filter's state. The log of a real
-flight has what its ground station knows, NaN before the first value: `station_channels`.
+Counters are cumulative. `estimate.flap_*` are deviations from the hover angle, as in the filter's state. The log of a
+real flight has its ground station's values, NaN before the first: `station_channels`.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,11 +30,11 @@ from hil.world.body import Channel, Quantity
 if TYPE_CHECKING:
     from ground_station.links.mavlink import MavlinkLink  # needs pymavlink
 
-UNKNOWN = (nan, nan, nan)  # a vector that nothing has measured
+UNKNOWN = (nan, nan, nan)  # a vector without a measurement
 UNKNOWN_STATE = 4  # of the supervisor, beside those of `firmware_py.wire.supervisor`
 WRAP = 1 << 16  # the board's counters of poses are uint16
 AGE_UNIT_US = 100  # of locSrv.age
-LOOP = "loop"  # group of variables that a real board in the loop has
+LOOP = "loop"  # group of variables of a real board in the loop
 MEASUREMENTS = "measurements"  # the queue of poses on board
 
 
@@ -91,7 +91,7 @@ STATION = (
 
 
 def radio_channel(radio: VirtualRadio) -> Channel:
-    """Return what the radio counts."""
+    """Return the radio's counters."""
     up, down, air = radio.up, radio.down, radio.air
     names = "up_sent up_delivered up_dropped down_sent down_delivered down_dropped retried unanswered"
     return Channel(
@@ -107,7 +107,7 @@ def radio_channel(radio: VirtualRadio) -> Channel:
 def serial_channel(uart: VirtualSerial, firmware: BoardFirmware, link: "MavlinkLink | None") -> Channel:
     """Return the counters of a serial line with MAVLink; without a `link` the station's frames are unknown and stay 0.
 
-    `link.*` counts pieces of the stream, `serial.*` bytes, bits and frames.
+    `link.*` counts chunks of the stream, `serial.*` bytes, bits and frames.
     """
     up, down, board = uart.up, uart.down, firmware.mavlink
     assert board is not None
@@ -148,7 +148,7 @@ def battery_channel(battery: Battery) -> Channel:
 
 
 def tracker_channel(tracker: Tracker) -> Channel:
-    """Return what the tracker makes of frames."""
+    """Return the tracker's outputs."""
     counters = tracker.counters
     return Channel(
         "int32",
@@ -158,7 +158,7 @@ def tracker_channel(tracker: Tracker) -> Channel:
 
 
 def board_channels(firmware: BoardFirmware) -> tuple[Channel, ...]:
-    """Return what logic of the user's own logs, what the loop through a real board costs, and the board's own time."""
+    """Return the user logic's variables, the delays of the loop through a real board, and the board's own time."""
     own = [variable for variable in firmware.variables if variable.name.partition(".")[0] in (GROUP, LOOP)]
     channels = []
     for dtype, is_float in (("float32", True), ("int32", False)):
@@ -178,18 +178,18 @@ def _all(reads: Sequence[Callable[[], float]]) -> Callable[[], list[float]]:
 
 
 def excitation_channel(firmware: BoardFirmware) -> Channel:
-    """Return what is added to the inputs for identification."""
+    """Return the excitation added to the inputs for identification."""
     reads = [variable.read for variable in firmware.variables if variable.name.startswith("excite.")]
     return Channel("float32", _all(reads), (quantity("excite", "u1 u2 u3 u4", "rad"),))
 
 
 def fault_channel(active: Sequence[Fault]) -> Channel:
-    """Return how many faults are in force."""
+    """Return the number of active faults."""
     return Channel("int8", lambda: len(active), (quantity("fault", "active"),))
 
 
 def marker_channel(mocap: VirtualMocap) -> Channel:
-    """Return which markers the last exposure saw (bit 0: marker 1), how many points have no label, how well all fit."""
+    """Return the markers of the last exposure (bit 0: marker 1), the number of unlabelled points, and the fit's error."""
 
     def read() -> tuple[float, ...]:
         seen = mocap.sighting
@@ -207,7 +207,7 @@ def _view(array: Any) -> Callable[[], Any]:
 
 
 def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]:
-    """Return the channels of any flight; the first column, `t`, is the recorder's own."""
+    """Return the channels of any flight; the recorder adds the first column, `t`."""
     body, board, firmware = robot.body, robot.board, robot.firmware
     imu = Channel("int16", lambda: board.imu, (quantity("imu", "gx gy gz ax ay az", "counts", "S"),))
     return (
@@ -226,7 +226,7 @@ def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]
 
 
 def _core_channels(signals: Signals, imu: Channel) -> tuple[Channel, ...]:
-    """Return what our flight core shows, with the samples that it gets."""
+    """Return the signals of our flight core, with its samples."""
     counters = (quantity("estimator", " ".join(COUNTERS[:-1])), quantity("estimator", COUNTERS[-1], "us"))
     return (
         Channel("float32", _view(signals.estimate), (*ESTIMATE, quantity("estimate", FLAPS, "rad", "B"))),
@@ -239,7 +239,7 @@ def _core_channels(signals: Signals, imu: Channel) -> tuple[Channel, ...]:
 
 
 def _stock_channels(robot: Robot, trajectory: Trajectory, imu: Channel) -> tuple[Channel, ...]:
-    """Return what the Crazyflie's own firmware shows, with the samples that it gets; its estimate brought into G."""
+    """Return the signals of the Crazyflie's own firmware, with its samples; its estimate is converted to G."""
     board, firmware = robot.board, robot.firmware
 
     def estimate() -> Sequence[float]:
@@ -262,7 +262,7 @@ def _coordinates(goal: Goal) -> tuple[float, ...]:
 
 
 def _scheduler_channels(firmware: BoardFirmware) -> tuple[Channel, ...]:
-    """Return what the scheduler counts; a real board does not report what its tasks do."""
+    """Return the scheduler's counters; a real board does not report its tasks."""
     scheduler = firmware.scheduler
     if scheduler is None:
         return ()
@@ -285,7 +285,7 @@ def _scheduler_channels(firmware: BoardFirmware) -> tuple[Channel, ...]:
 
 
 class Unwrapped:
-    """A 16-bit counter without wrapping, counted from its first value on; NaN before."""
+    """A 16-bit counter, unwrapped and relative to its first value; NaN before that."""
 
     def __init__(self) -> None:
         self._last = self._total = nan
@@ -298,7 +298,7 @@ class Unwrapped:
 
 
 class StationView:
-    """What a ground station knows now, as rows of a log; `start_us` is when the log's time began."""
+    """A ground station's current values as rows of a log; `start_us` is the log's time 0."""
 
     def __init__(self, cockpit: Cockpit, start_us: int) -> None:
         self._link, self._ground, self._start_us = cockpit.link, cockpit.ground, start_us
@@ -318,7 +318,7 @@ class StationView:
         return (frame.t_us - self._start_us, *frame.p_WB, *frame.q_WB, *v_WB, *w_B)
 
     def telemetry(self) -> tuple[float, ...] | float:
-        """Return TELEMETRY, when there is a sample of every block."""
+        """Return TELEMETRY once every block has a sample."""
         newest = self._ground.telemetry
         if any(block.id not in newest for block in BLOCKS):
             return nan
@@ -351,7 +351,7 @@ class StationView:
 def station_channels(
     cockpit: Cockpit, free: Callable[[], bool], goal: Callable[[], Goal], start_us: int
 ) -> tuple[Channel, ...]:
-    """Return the channels of a flight that only its ground station sees; `start_us` is when the log's time began."""
+    """Return the channels of a flight that only its ground station sees; `start_us` is the log's time 0."""
     view, ground = StationView(cockpit, start_us), cockpit.ground
     tracker = () if ground.tracker is None else (tracker_channel(ground.tracker),)
     return (

@@ -60,24 +60,23 @@ class Experiment:
     """One experiment; `limits` maps names of `hil.laboratory.metrics.METRICS` or of its own `metrics` to bounds in that
     metric's unit.
 
-    `script` is called once with the flight, at the release or before it, and plans events. Everything
-    in here can be pickled, because flights are flown in parallel processes. Raises `LabError` for an invalid name, duration
-    or metric.
+    `script` is called once with the flight, at the release or before it, and plans events. All fields can be pickled,
+    because flights run in parallel processes. Raises `LabError` for an invalid name, duration or metric.
     """
 
     name: str
     summary: str  # one line
     duration_s: float  # of free flight, after the release
-    limits: Mapping[str, float]  # of the default profile; another one has its own in [limits.NAME]
+    limits: Mapping[str, float]  # of the default profile; another profile has its own in [limits.NAME]
     trajectory: Callable[[Goal, int], Trajectory] = stay  # (home, release instant [us])
-    prepare: Callable[[Robot], None] = need_nothing  # creates from the start what the script will need
+    prepare: Callable[[Robot], None] = need_nothing  # creates at the start what the script will need
     script: Callable[[Any], None] = leave_alone  # takes the `Flight`, which is described above this file
-    settings: tuple[str, ...] = ()  # "section.key=value", on top of the profile
-    faults: tuple[Fault, ...] = ()  # those of the command line come on top
+    settings: tuple[str, ...] = ()  # "section.key=value", override the profile
+    faults: tuple[Fault, ...] = ()  # those of the command line are added
     # Computes the experiment's own metrics from the rows after the release.
     measure: Callable[[pa.Table], Mapping[str, float]] = nothing
     metrics: Mapping[str, Metric] = field(default_factory=dict)  # what `measure` returns beyond METRICS
-    pictures: tuple[str, ...] = ()  # names of its own, first in the report; `hil.pictures.gallery` has them
+    pictures: tuple[str, ...] = ()  # its own pictures by name in `hil.pictures.gallery`, first in the report
     # Draws one more picture, a matplotlib Figure, from the rows after the release.
     draw: Callable[[pa.Table], Any] | None = None
     source: Source | None = None  # None: it ships, or is in no file
@@ -106,7 +105,7 @@ class Experiment:
 
     @property
     def is_known(self) -> bool:
-        """Whether this is more than a stand-in."""
+        """Whether this is not a stand-in."""
         return not isinstance(self.trajectory, Unknown)
 
     def measured(self, flight: pa.Table) -> Mapping[str, float]:
@@ -124,9 +123,9 @@ class Experiment:
     def check_goals(
         self, home: tuple[float, float, float], duration_s: float, left: Callable[[Sequence[float]], str]
     ) -> None:
-        """Raise `LabError` when the trajectory has no goal at an instant, leaves the flow, or jumps too far to be followed.
+        """Raise `LabError` when the trajectory lacks a goal at some time, leaves the flow, or jumps too far to follow.
 
-        `left` returns why a robot would be lost at a place (3,) [m] in W; empty: it would not.
+        `left` returns why a robot would be lost at a place (3,) [m] in W; empty if not.
         """
         t_us, before = 0, home
         try:
@@ -148,7 +147,7 @@ class Experiment:
 
 @dataclass(frozen=True, slots=True)
 class Unknown:
-    """The trajectory of an experiment that is unknown here: it raises."""
+    """The trajectory of an experiment that is unknown here; calling it raises."""
 
     name: str
 
@@ -158,5 +157,5 @@ class Unknown:
 
 
 def unknown(name: str, source: Source | None) -> Experiment:
-    """Return the stand-in for an experiment that is unknown here: it has a name, but cannot be flown."""
+    """Return the stand-in for an unknown experiment: it has a name, but cannot be flown."""
     return Experiment(name, "", 1.0, {}, trajectory=Unknown(name), source=source)

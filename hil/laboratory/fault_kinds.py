@@ -1,7 +1,7 @@
-"""What can go wrong in a flight: for every kind of fault the value of the world that it changes, its size, and its outcome.
+"""The kinds of faults in a flight, each with the value of the world that it changes, its size, and its outcome.
 
-A size is written in customary units (deg, ms); `scale` converts it to SI. Several faults may turn one knob at once: its
-value is then what it was before the first of them, blended with the size of each.
+A size has customary units (deg, ms); `scale` converts it to SI. Several faults may change one knob at once: the size of
+each is then blended into the value from before the first of them.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from hil.laboratory.robot import Robot
 
 Outcome = Literal["holds", "degrades", "failsafe", "lost", ""]
-OCCLUSION_RADIUS = 0.3  # [m] around the axis: the robot is inside the shadow wherever it is in its box
-PUSH_S = 0.1  # and the sizes of pushes and shadow: what the default profile takes
+OCCLUSION_RADIUS = 0.3  # [m] around the axis: the shadow covers the robot anywhere in its box
+PUSH_S = 0.1  # this and the sizes of pushes and shadow: what the default profile withstands
 MARKERS_ON = "markers.enabled=true"
 GLIMPSE_S = 0.3  # shorter than the supervisor's patience of 0.5 s
 
@@ -39,7 +39,7 @@ Blend = Callable[[float, float], float]
 @checked
 @dataclass(frozen=True, slots=True, eq=False)
 class Knob:
-    """One number of the world. `read` creates whatever it needs; `blend` takes its value and a fault's size."""
+    """One number of the world. `read` creates whatever it needs; `blend` combines its value with a fault's size."""
 
     read: Read
     turn: Turn
@@ -49,10 +49,10 @@ class Knob:
 @checked
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of fault. `low` and `high` bound its size; where they are the same, the size is fixed.
+    """A kind of fault. `low` and `high` bound its size; if they are equal, the size is fixed.
 
-    `outcome` is that of the hover with the default profile, for the default size and duration, 6 s after it begins; of a
-    robot that ships besides Floaty, with its profile:
+    `outcome` is that of a hover with the default size and duration, 6 s after the fault begins, with the default profile
+    or, for another robot that ships, with its own:
 
         holds     all limits of the hover hold
         degrades  a limit fails, the robot flies on
@@ -70,13 +70,13 @@ class Kind:
     outcome: Outcome = ""
     scale: float = 1.0  # from the unit to SI
     duration_s: float = math.inf  # default; inf: to the end of the flight
-    link: Literal["", "radio", "mavlink"] = ""  # the only one on which it acts
-    markers: bool = False  # acts on markers: only with `markers.enabled`
-    body: str = ""  # the only one that has the part that fails, also the name of its profile
+    link: Literal["", "radio", "mavlink"] = ""  # the only link that it affects
+    markers: bool = False  # affects markers: only with `markers.enabled`
+    body: str = ""  # the only body with the part that fails, also the name of its profile
 
     @property
     def sized(self) -> bool:
-        """Whether there is a size to choose."""
+        """Whether its size can be chosen."""
         return self.low < self.high
 
     @property
@@ -102,15 +102,15 @@ def times(value: float, size: float) -> float:
 
 
 def either(value: float, size: float) -> float:
-    """The chance of one or the other."""
+    """Return the chance of one or the other."""
     return 1.0 - (1.0 - value) * (1.0 - size)
 
 
 @checked
 def knob(owner: Callable[[Robot], object], name: str, blend: Blend) -> Knob:
-    """Return the knob that is a plain attribute of a part of the robot, by that part and the attribute's name.
+    """Return the knob for a plain attribute of a part of the robot, by part and attribute name.
 
-    Raises `LabError` for an attribute that the part lacks or that is no number.
+    Raises `LabError` for an attribute that is missing or not a number.
     """
     from hil.laboratory.robot import attributes_of, specimen
 
@@ -358,7 +358,7 @@ SHIPPED = frozenset(KINDS)
 
 @checked
 def declare(name: str, kind: Kind) -> Kind:
-    """Register the user's own kind of fault under a name. Raises `LabError` for a name that is taken or knobs that fail."""
+    """Register a user's kind of fault under a name. Raises `LabError` for a taken name or failing knobs."""
     if not re.fullmatch(r"\w[\w.-]*", name):
         raise LabError(f"fault kind {name!r}: a name has letters, digits, dots, hyphens and underscores")
     if name in SHIPPED:
@@ -374,7 +374,7 @@ def declare(name: str, kind: Kind) -> Kind:
 
 
 def _try(name: str, kind: Kind) -> None:
-    """Turn all knobs of a kind there and back, on every robot on which it acts. Raises `LabError` when that fails."""
+    """Change and reset all knobs of a kind, on every robot that it affects. Raises `LabError` when that fails."""
     from hil.laboratory.robot import LINKS, specimen
 
     for link in (kind.link,) if kind.link else LINKS:

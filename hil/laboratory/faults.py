@@ -1,6 +1,6 @@
-"""Faults as data: what goes wrong, from when, for how long, how much; `hil.laboratory.fault_kinds.KINDS` has the kinds.
+"""Faults as data: kind, start, duration and size; `hil.laboratory.fault_kinds.KINDS` has the kinds.
 
-As text a fault is KIND@START[:DURATION][=SIZE], start in seconds after the release, duration in seconds (`inf`: to the
+A fault's text is KIND@START[:DURATION][=SIZE], start in seconds after the release, duration in seconds (`inf`: to the
 end), size in the kind's unit: `mocap.dropout@10:0.5`, `push.y@3=2`, `servo.stuck.2@5`.
 """
 
@@ -28,7 +28,7 @@ _LENGTH_AND_SIZE = r"(?::(?P<duration>[^@:=]+))?(?:=(?P<size>[^@:=]+))?"
 SHAPE = re.compile(rf"(?P<kind>[^@:=]+)@(?P<start>[^@:=]+){_LENGTH_AND_SIZE}")
 LIVE_SHAPE = re.compile(rf"(?P<kind>[^@:=]+){_LENGTH_AND_SIZE}")
 SWITCHED = re.compile(r"fault (?P<fault>[^@ ]+) (?P<change>begins|ends)")  # event of a live fault
-SWITCHED_ON = b"switched_on"  # key in the metadata of a log that is drawn
+SWITCHED_ON = b"switched_on"  # key in the metadata of a log to draw
 
 
 @checked
@@ -78,7 +78,7 @@ class Span:
 
 @checked
 def parse(text: str, live: bool = False) -> Fault:
-    """Return the fault that a text means; omitted parts have the kind's defaults. Raises `LabError`.
+    """Parse the text of a fault; omitted parts have the kind's defaults. Raises `LabError`.
 
     A `live` one, for a running server, has no start.
     """
@@ -99,7 +99,7 @@ def parse(text: str, live: bool = False) -> Fault:
 
 
 def check(faults: Iterable[Fault], duration_s: float, link: str, config: LabConfig) -> None:
-    """Raise `LabError` when a fault begins after the flight, or acts on something that the flight lacks."""
+    """Raise `LabError` when a fault begins after the flight, or affects something that the flight lacks."""
     for fault in faults:
         if fault.start_s >= duration_s:
             raise LabError(
@@ -118,7 +118,7 @@ def check(faults: Iterable[Fault], duration_s: float, link: str, config: LabConf
 
 
 def spans(faults: Iterable[Fault], release_us: int) -> list[Span]:
-    """Return when faults act in a flight that is released at `release_us`."""
+    """Return when faults act in a flight released at `release_us`."""
     times = [(fault, release_us + round(fault.start_s * 1e6)) for fault in faults]
     return [
         Span(fault, begin_us, begin_us + round(fault.duration_s * 1e6) if math.isfinite(fault.duration_s) else math.inf)
@@ -140,7 +140,7 @@ def switched_on(events: Iterable[Mapping[str, Any]]) -> dict[bytes, bytes]:
 
 
 def spans_of(metadata: Mapping[bytes, bytes] | None) -> list[Span]:
-    """Return when the faults of a flight act, from the metadata of its log; those of kinds unknown here are left out."""
+    """Return when the faults of a flight act, from the metadata of its log; omit those of unknown kinds."""
     texts = stored_in(metadata, "request").get("faults", ())
     faults = [parse(text) for text in texts if text.partition("@")[0] in KINDS]
     live = json.loads((metadata or {}).get(SWITCHED_ON, b"[]"))
@@ -151,9 +151,9 @@ def spans_of(metadata: Mapping[bytes, bytes] | None) -> list[Span]:
 
 
 class Switchboard:
-    """Sets the knobs of one robot as faults begin and end; nothing else may set a knob while a fault does.
+    """Sets the knobs of one robot as faults begin and end; nothing else may set a knob during a fault.
 
-    `active` has the faults in force, and changes with time.
+    `active` has the current faults, and changes with time.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -162,7 +162,7 @@ class Switchboard:
         self._before: dict[Knob, float] = {}  # values before the faults
 
     def prepare(self, faults: Iterable[Fault]) -> None:
-        """Create from the start whatever faults will need."""
+        """Create at the start whatever faults will need."""
         for fault in faults:
             kind = KINDS[fault.kind]
             if not why_not(kind, self._robot):
@@ -170,7 +170,7 @@ class Switchboard:
                     knob.read(self._robot)
 
     def plan(self, faults: Iterable[Fault], release_us: int, end_us: int) -> None:
-        """Plan begin and end of faults that begin before `end_us`; those that cannot act on the robot are skipped."""
+        """Plan begin and end of faults that begin before `end_us`; skip those that cannot act on the robot."""
         for span in spans(faults, release_us):
             if why_not(KINDS[span.fault.kind], self._robot) or span.begin_us >= end_us:
                 continue
@@ -179,7 +179,7 @@ class Switchboard:
                 self._robot.events.at(int(span.end_us), partial(self.end, span.fault))
 
     def act(self, fault: Fault, now_us: int) -> None:
-        """Begin a fault now, whatever its start. Raises `LabError` for one that cannot act on this robot."""
+        """Begin a fault now, ignoring its start. Raises `LabError` if it cannot act on this robot."""
         if reason := why_not(KINDS[fault.kind], self._robot):
             raise LabError(f"fault {fault.kind}: {reason}")
         self.begin(fault, now_us)
@@ -192,7 +192,7 @@ class Switchboard:
         self._switch(fault, [*self.active, fault], now_us)
 
     def end(self, fault: Fault, now_us: int) -> None:
-        """Reset the knobs, if the fault is still in force."""
+        """Reset the knobs, if the fault is still active."""
         if fault not in self.active:
             return
         self._robot.say("lab", f"fault {fault} ends")

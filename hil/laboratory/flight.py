@@ -1,7 +1,7 @@
-"""One flight of one robot: an experiment's script and faults, what is recorded and noted, how it ends.
+"""One flight of one robot: the experiment's script and faults, recording, event log, and outcome.
 
-The line makes the robot and connects it to the ground: `hil.laboratory.lockstep` models link and ground station on the same
-time line, `hil.servers.linked` connects the robot to a ground station in a process of its own.
+The line makes the robot and connects it to the ground: `hil.laboratory.lockstep` models link and ground station on the
+same time line, `hil.servers.linked` connects the robot to a ground station in another process.
 """
 
 from collections.abc import Callable

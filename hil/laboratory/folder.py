@@ -1,7 +1,7 @@
-"""The folder of a flight: its name, an older run in it, and that one flight at a time writes there.
+"""The folder of a flight: its name, an older run in it, and the lock that admits one flight at a time.
 
-No flight replaces that of another request. An older run of the same request is set aside until the flight begins, and
-brought back when there is no board or link to fly with.
+No flight replaces one of another request. An older run of the same request is set aside until the flight begins, and
+restored when no board or link is available.
 """
 
 import fcntl
@@ -25,7 +25,7 @@ def prepare(folder: Path) -> None:
     """Make a folder ready for a run: set an older one aside. Raises `LabError` when it holds something else."""
     with writing("--out", folder):
         folder.mkdir(parents=True, exist_ok=True)
-        bring_back(folder)  # before a flight that was never begun
+        bring_back(folder)  # from an attempt that never began
         if older := list(folder.iterdir()):
             if not any((folder / name).exists() for name in (RESULT, EVENTS)):
                 raise LabError(
@@ -37,7 +37,7 @@ def prepare(folder: Path) -> None:
 
 
 def bring_back(folder: Path) -> None:
-    """Undo what `prepare` did to an older run, and what an attempt to fly has left."""
+    """Restore the older run after `prepare`, and delete the files of a failed attempt."""
     if (folder / OLDER).exists():
         for path in folder.iterdir():
             if path.name != OLDER:
@@ -53,20 +53,20 @@ def drop_older(folder: Path) -> None:
 
 
 def folder_of(request: Request, parent: Path = RUNS) -> Path:
-    """Return parent/EXPERIMENT-SEED, or, while that holds something else, the first of -2, -3, … that does not."""
+    """Return parent/EXPERIMENT-SEED or, if that is taken, the first of -2, -3, … that is not."""
     name = f"{request.experiment.name}-{request.seed}"
     names = (name if number == 1 else f"{name}-{number}" for number in count(1))
     return next(parent / name for name in names if not other_in(parent / name, request))
 
 
 def moved(request: Request, folder: Path) -> str:
-    """Return the line that says why a flight is not in its usual folder; empty when it is."""
+    """Return one line on why a flight is not in its usual folder; empty when it is."""
     usual = folder.with_name(f"{request.experiment.name}-{request.seed}")
     return f"{usual} holds {other_in(usual, request)}; this flight is in {folder}" if folder != usual else ""
 
 
 def other_in(folder: Path, request: Request) -> str:
-    """Return what a folder holds that a flight must not replace; empty for nothing, or a flight of the same request."""
+    """Name the contents that a flight must not replace; empty for none, or a flight of the same request."""
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return ""
     older = folder / OLDER
@@ -81,10 +81,10 @@ def other_in(folder: Path, request: Request) -> str:
 
 @contextmanager
 def reserved(request: Request, folder: Path, replace: bool = False) -> Iterator[None]:
-    """Make a folder for a flight, and keep other flights out until its last file is written.
+    """Make a folder for a flight, and lock out other flights until its last file is written.
 
-    Raises `LabError` when another flight is writing there or, unless it may `replace` that, when another request was flown.
-    The lock is the kernel's, on the folder: it ends with the process, however that ends.
+    Raises `LabError` when another flight is writing there or, without `replace`, when it holds another request's run. The
+    kernel locks the folder until the process ends, also if it is killed.
     """
     made = not folder.exists()
     with writing("--out", folder):

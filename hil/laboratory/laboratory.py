@@ -1,7 +1,7 @@
-"""The common time line of robots, cameras, lines and stations: hardware events own time, then firmware runs.
+"""The common time line of robots, cameras, links and stations: hardware events advance time, then firmware runs.
 
-Without a wall clock the firmware runs by itself up to the next hardware event. With one, every instant waits
-for its turn, and bytes from outside arrive in between.
+Without a wall clock the firmware runs up to the next hardware event. With one, every event waits for its time, and bytes
+from outside arrive in between.
 """
 
 from collections.abc import Callable
@@ -30,9 +30,9 @@ class Laboratory:
         self.end_us = NEVER_US
 
     def run(self, progress: Progress | None = None) -> None:
-        """Go from one instant at which anything happens to the next, until `end_us`; may be called again.
+        """Execute events and firmware in order of time, until `end_us`; may be called again.
 
-        Raises `LabError` when an experiment plans events at one instant without end.
+        Raises `LabError` when an experiment plans endless events at one instant.
         """
         try:
             self._run(progress)
@@ -61,11 +61,11 @@ class Laboratory:
         self.end_us = us
 
     def stop(self) -> None:
-        """End `run` after the present instant."""
+        """End `run` after the current instant."""
         self.end_us = self.now_us
 
     def _step_alone(self) -> None:
-        """Run the only robot's firmware by itself up to the hardware's next event, and let that happen."""
+        """Run the only robot's firmware up to the hardware's next event, then that event."""
         robot = self.robots[0]
         robot.run(self.now_us, self._next_event_us() - 1)
         now_us = self._next_event_us()
@@ -83,7 +83,7 @@ class Laboratory:
             else:
                 robot.run(max(wake_us, min(now_us, other_us) - 1))
                 if other_us < now_us or (events.next_us is not None and events.next_us < now_us):
-                    return  # another robot comes first, or a task has triggered hardware that acts earlier
+                    return  # another robot is next, or a task has triggered an earlier hardware event
         if clock.paced:
             now_us = clock.wait_until(now_us)
         for robot in self.robots:
@@ -95,7 +95,7 @@ class Laboratory:
         self._run_firmware()
 
     def _next_event_us(self) -> int:
-        """Return when hardware acts next, or the end."""
+        """Return the next hardware event's time, or the end."""
         next_us, end_us = self.events.next_us, self.end_us
         return end_us if next_us is None or next_us > end_us else next_us
 
@@ -105,7 +105,7 @@ class Laboratory:
             robot.run(self.now_us)
 
     def _first_to_wake(self) -> tuple[Robot | None, int, int]:
-        """Return the robot whose firmware acts first, when, and when the next one does."""
+        """Return the robot whose firmware acts first, its time, and the time of the next robot."""
         first, first_us, next_us = None, NEVER_US, NEVER_US
         for robot in self.robots:
             wake_us = robot.next_wake_us

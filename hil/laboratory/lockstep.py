@@ -1,4 +1,4 @@
-"""A flight in lockstep: the radio or the serial line modelled, the ground station on the same time line."""
+"""A flight in lockstep: radio or serial line are modelled, and the ground station shares the time line."""
 
 import shlex
 from collections.abc import Callable
@@ -70,7 +70,7 @@ class ModelledLine:
         self.station = GroundStation(
             self._link, self.trajectory, self._telemetry, config.station, self.tracker
         )
-        self._hearing: list[Receiver] = [self.station.on_packet]  # what the board sends over the radio
+        self._hearing: list[Receiver] = [self.station.on_packet]  # receivers of the board's radio packets
         if self.robot.firmware.flashed is not None and not config.pilot.enabled:
             self._set_up(site, self.robot.firmware.flashed)
         self.radio.connect(self.robot.packet_received, self._on_ground, self.robot.polled)
@@ -83,7 +83,7 @@ class ModelledLine:
             receive(now_us, data)
 
     def _set_up(self, site: Site, flashed: Flashed) -> None:
-        """Let the settings of the flight reach the board; mention firmware that may not drive this robot."""
+        """Send the flight's settings to the board; report firmware that may not drive this robot."""
         if APP_PARAMETER not in flashed.parameters:
             site.say(SETTINGS, NO_APP)
         settings = ImageSettings(
@@ -98,7 +98,7 @@ class ModelledLine:
         self._hearing.append(settings.hear)
 
     def begin(self, release: Callable[[int], None]) -> None:
-        """Have the release planned for when the profile has it."""
+        """Plan the release at the profile's time."""
         release(self._release_us)
 
     def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
@@ -115,7 +115,7 @@ class ModelledLine:
         return link, channel
 
     def _crazyflie_link(self, request: Request, times: FlightTimes, latency_us: int) -> CrazyflieLink:
-        """Return the link that flies the stock firmware. Raises `LabError` for a parameter that the image lacks."""
+        """Return the link to the stock firmware. Raises `LabError` for a parameter that the image lacks."""
         config, flashed = request.config, self.robot.firmware.flashed
         table = {} if flashed is None else flashed.parameters
         if APP_PARAMETER in table:
@@ -141,8 +141,8 @@ class ModelledLine:
         )
 
     def _serial(self, site: Site, uart: VirtualSerial, telemetry: Path | None) -> tuple[Link, Channel]:
-        """Return the station's end of the serial line. Raises `LabError` when no flight fits on it."""
-        from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig  # whose package is an extra
+        """Return the station's end of the serial line. Raises `LabError` when it is too slow for a flight."""
+        from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig  # its package is an extra
 
         config = site.config
         settings = MavlinkLinkConfig(
@@ -169,11 +169,11 @@ class ModelledLine:
         self.trajectory.steer(trajectory)
 
     def command(self, now_us: int, packet: bytes) -> None:
-        """Send a packet of the operator over the radio."""
+        """Send an operator's packet over the radio."""
         self.radio.uplink(now_us, packet)
 
     def listen(self, receive: Receiver) -> None:
-        """Let an operator hear what the board sends over the radio, too."""
+        """Also pass the board's radio packets to an operator."""
         if self.robot.uart is not None:
             raise LabError("over MAVLink a flight in lockstep has no operator who sets parameters")
         self._hearing.append(receive)
@@ -186,7 +186,7 @@ class ModelledLine:
         return [("station", line) for line in lines]
 
     def finish(self, lab: Laboratory) -> None:
-        """Nothing: the station ends with its time line."""
+        """Do nothing: the station ends with its time line."""
 
     def close(self) -> None:
         with ExitStack() as closing:  # all of them, even on a full disk
@@ -207,7 +207,7 @@ def lockstep_flight(
 
 
 def in_lockstep(request: Request, telemetry: Path | None, stack: ExitStack) -> Flight:
-    """Return a flight over a modelled link. Raises `LabError` when its board is not available here."""
+    """Return a flight over a modelled link. Raises `LabError` if its board is not available."""
     try:
         return lockstep_flight(request, telemetry, _executor(request, stack))
     except LinkError as error:
@@ -227,7 +227,7 @@ def _executor(request: Request, stack: ExitStack) -> Executor:
 
 
 def image_at(board: str, elf: Path | None, debugger: GdbServer | None = None) -> ChipImage:
-    """Return the image that `--board` and `--elf` name. Raises `LabError` when it cannot run here."""
+    """Return the image that `--board` and `--elf` name. Raises `LabError` if it cannot run here."""
     check_image(board)
     try:
         return ChipImage.load(Path(board), elf, BUILD, debugger)
@@ -236,7 +236,7 @@ def image_at(board: str, elf: Path | None, debugger: GdbServer | None = None) ->
 
 
 def debugger(port: int | None, image: Path, stack: ExitStack) -> GdbServer | None:
-    """Open the port that `--gdb` asks for until the stack is closed; it prints the command to type when it waits."""
+    """Open the port of `--gdb` until the stack is closed; it prints the command to type when it waits."""
     if port is None:
         return None
 

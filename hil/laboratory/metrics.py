@@ -1,8 +1,8 @@
-"""From a flight log to metrics and verdicts, after the release: from the truth, never from the estimate.
+"""Computes metrics and verdicts from a flight log after the release: from the truth, never from the estimate.
 
-In a real flight, whose truth is unknown, from the cameras' poses: errors and shares are those of the time `flown`, in
-which the robot was seen; the rest of the flight is the metric `unseen`. A lost flight holds none of its limits, unless
-its limit on `lost` admits the loss.
+The truth of a real flight is unknown, so the cameras' poses replace it: errors and shares cover the time `flown`, in
+which the robot was seen; the metric `unseen` is the rest. A lost flight fails all limits, unless its limit on `lost`
+admits the loss.
 """
 
 from collections.abc import Mapping
@@ -21,15 +21,15 @@ from hil.errors import LabError, hint
 
 NEAR = 0.06  # [m] "less than 6 cm over each axis"
 BOX = 0.10  # [m] half of the 20 cm box
-UNDER_WAY_US = 100_000  # at the end of a real flight, whose last poses have not arrived yet
-STEADY = tuple(f"estimate.{name}" for name in "xyzpqr")  # change in every step of an estimator that runs
-SHORT_S = 0.1  # less than this of the flight's duration need not be mentioned
+UNDER_WAY_US = 100_000  # at the end of a real flight: its last poses are in flight
+STEADY = tuple(f"estimate.{name}" for name in "xyzpqr")  # a running estimator changes them in every step
+SHORT_S = 0.1  # a shorter missing part of the flight is not reported
 
-# Limits of every flight, for which an experiment may have its own.
+# Limits of every flight; an experiment may override them.
 ALWAYS: Mapping[str, float] = {
     "resets": 0.0,
-    "uncontrolled": 0.2,  # [s] a silence that outlasts the supervisor's patience a little
-    "unseen": 0.5,  # [s] the patience itself
+    "uncontrolled": 0.2,  # [s] a silence slightly longer than the supervisor's timeout
+    "unseen": 0.5,  # [s] that timeout
 }
 
 
@@ -165,7 +165,7 @@ class Verdict:
     holds: bool
     unit: str
     sense: Literal["max", "min"]  # of the bound
-    applies: bool = True  # False: the flight was lost, and what was measured before says nothing
+    applies: bool = True  # False: the flight was lost, so its earlier values do not count
 
     @property
     def mark(self) -> str:
@@ -181,7 +181,7 @@ class Verdict:
 
 @checked
 def column(table: pa.Table, *names: str) -> NDArray[np.float64]:
-    """Return columns of a log as an array (N,) or (N, len(names)). Raises `LabError` for a column that it lacks."""
+    """Return columns of a log as an array (N,) or (N, len(names)). Raises `LabError` for a missing column."""
     for name in names:
         if name not in table.column_names:
             raise LabError(f"column {shown(name)}: the log has none; {hint(name, table.column_names)}")
@@ -190,7 +190,7 @@ def column(table: pa.Table, *names: str) -> NDArray[np.float64]:
 
 
 def is_real(table: pa.Table) -> bool:
-    """Whether a log is of a real flight, or of one that only its ground station recorded."""
+    """Whether a log is of a real flight, or only its ground station's record."""
     return "cameras.x" in table.column_names
 
 
@@ -201,7 +201,7 @@ def body(table: pa.Table, *names: str) -> NDArray[np.float64]:
 
 
 def known(table: pa.Table) -> pa.Table:
-    """Return the rows that have a pose and an estimate; in a real flight the cameras or the board may not report them."""
+    """Return the rows with a pose and an estimate; in a real flight the cameras or the board may not report them."""
     if not is_real(table):
         return table
     return rows_where(table, np.isfinite(column(table, "cameras.x") + column(table, "estimate.x")))
@@ -231,7 +231,7 @@ def free_flight(table: pa.Table) -> pa.Table:
 
 
 def rows_where(table: pa.Table, chosen: NDArray[np.bool_]) -> pa.Table:
-    """Return the rows that are chosen; when they stand together, as they mostly do, without a copy of an hour's flight."""
+    """Return the chosen rows; without a copy of an hour's flight when they are contiguous, the usual case."""
     numbers = np.flatnonzero(chosen)
     if len(numbers) and numbers[-1] - numbers[0] + 1 == len(numbers):
         return table.slice(int(numbers[0]), len(numbers))
@@ -247,7 +247,7 @@ def _seen(table: pa.Table) -> NDArray[np.bool_]:
 
 
 def _time_seen(table: pa.Table) -> tuple[float, float]:
-    """Return how long [s] the robot was seen between the release and the end, and how long it was not."""
+    """Return how long [s] the robot was seen and not seen between the release and the end."""
     free = rows_where(table, _free(table))
     times, seen = column(free, "t"), _seen(free) if is_real(table) else np.ones(free.num_rows, np.bool_)
     if (last := times[seen][-1]) >= times[-1] - UNDER_WAY_US:
@@ -258,19 +258,19 @@ def _time_seen(table: pa.Table) -> tuple[float, float]:
 
 
 def _without_control(table: pa.Table) -> tuple[float, float]:
-    """Return how long [s] the supervisor was in failsafe after the release, and how long no loop was closed."""
+    """Return how long [s] after the release the supervisor was in failsafe, and how long no loop was closed."""
     free = rows_where(table, _free(table))
     times, state = column(free, "t"), column(free, "supervisor.state")
     open_loop = state != State.FLYING
     if not is_real(table):
         stands = (np.diff(column(free, *STEADY), axis=0) == 0.0).all(axis=1)
-        open_loop[1:] |= stands  # also of a board that hangs in flight, whose state is what it was
+        open_loop[1:] |= stands  # also for a board that hangs in flight, whose state stays unchanged
     whole_s = float(times[-1] - times[0]) * 1e-6
     return float((state == State.FAILSAFE).mean()) * whole_s, float(open_loop.mean()) * whole_s
 
 
 def _boots(table: pa.Table) -> int:
-    """Return how often a board began to calibrate its gyro after the release, which it does after a reset."""
+    """Return how often a board calibrated its gyro after the release, as it does after a reset."""
     calibrating = column(rows_where(table, _free(table)), "supervisor.state") == State.CALIBRATING
     return int((calibrating[1:] & ~calibrating[:-1]).sum())
 
@@ -278,7 +278,7 @@ def _boots(table: pa.Table) -> int:
 def measure(table: pa.Table, lost: bool, resets: int | None = None) -> dict[str, float]:
     """Return every metric of METRICS; NaN where the flight was too short.
 
-    `resets`: of the board after the release; None: as far as the log shows them.
+    `resets`: of the board after the release; None: count them in the log.
     """
     flight = free_flight(table)
     values = dict.fromkeys(METRICS, float("nan"))
@@ -325,12 +325,12 @@ def _mean_age(flight: pa.Table) -> float:
     if "estimator.pose_age_us" not in flight.schema.names:
         return np.nan
     ages = column(flight, "estimator.pose_age_us")
-    ages = ages[np.isfinite(ages)]  # a real board has not reported it before its first telemetry
+    ages = ages[np.isfinite(ages)]  # unknown before a real board's first telemetry
     return float(ages.mean()) * 1e-6 if len(ages) else np.nan
 
 
 def limits_of(own: Mapping[str, float], profile: Mapping[str, float] | None = None) -> dict[str, float]:
-    """Return the limits of a flight: those of every flight, and the profile's for the experiment or the experiment's own."""
+    """Return the limits of a flight: those of every flight, and the experiment's own or the profile's for it."""
     always = {name: own.get(name, bound) for name, bound in ALWAYS.items()}
     return {**(own if profile is None else profile), **always, **(profile or {})}
 
@@ -340,7 +340,7 @@ def judge(
 ) -> list[Verdict]:
     """Return the verdict on each limit; a metric that is not a number fails. Raises `LabError` like `check_limits`.
 
-    A lost flight fails all of them, unless the limit on `lost` admits the loss.
+    A lost flight fails all limits, unless the one on `lost` admits the loss.
     """
     check_limits(limits, own)
     lost = values.get("lost", 0.0) > limits.get("lost", 0.0)
@@ -354,7 +354,7 @@ def judge(
 
 
 def short_of(metric: Metric, value: float, flown_s: float, duration_s: float) -> str:
-    """Return what follows a share of the time: of how much time, where that is less than the flight's duration."""
+    """Return the text after a share of time: the time it covers, if less than the flight's duration."""
     short = metric.over_time and np.isfinite(value) and flown_s < duration_s - SHORT_S
     return f" of {flown_s:.4g} s" if short else ""
 

@@ -1,8 +1,8 @@
-"""A real flight into a run folder like that of a simulated one: what the ground station sees of the board that it flies.
+"""Records a real flight, as seen by its ground station, in a run folder like that of a simulated one.
 
-`log.parquet` has no truth but the cameras' poses (`cameras.*`, W and B), what telemetry tells of estimate, controller and
-flaps, link, tracker and ages. `flight.free` is 1 from the trajectory's start on, for as long as its experiment takes, or
-until the robot has left the flow: that is what metrics and limits are of.
+`log.parquet` has no truth; it has the cameras' poses (`cameras.*`, W and B), telemetry of estimate, controller and flaps,
+link, tracker and ages. `flight.free` is 1 from the trajectory's start to the end of its experiment, or until the robot
+leaves the flow: metrics and limits cover this time.
 """
 
 import shutil
@@ -30,10 +30,10 @@ from hil.world.config import LimitsConfig
 
 
 class RealFlight:
-    """Records one flight of `floaty station` into `folder`, which it makes; `turn` is a hand of the station's program.
+    """Records one flight of `floaty station` into a new `folder`; the station's program calls `turn` in its loop.
 
-    Without a folder nothing is kept: there is only who looks on. Raises `LabError` when something is there already: real
-    flights are not flown again.
+    Without a folder nothing is stored, but onlookers get the rows. Raises `LabError` when the folder exists: a real
+    flight cannot be repeated.
     """
 
     def __init__(
@@ -54,26 +54,26 @@ class RealFlight:
         self._say = say
         self._clock = clock
         self._start_us = clock()
-        self._early: list[tuple[int, str, str]] = []  # notes from before there is a recorder
+        self._early: list[tuple[int, str, str]] = []  # notes from before the recorder started
         self._recorder: Recorder | None = None
         self._now_us = self._next_us = 0
-        self._is_free = False  # the row that is being recorded belongs to what is judged
-        self._whole = False  # all of it was flown
+        self._is_free = False  # metrics and limits cover the current row
+        self._whole = False  # it was flown to its end
         body = make_body(request.config, Streams.of_seed(0).gusts, request.config.flight.home)
         self._look_of_robot = body.look
         self._lost: str | None = None
         self._state: int | None = None  # the supervisor's
-        self._broken = False  # nothing can be written any more
+        self._broken = False  # writing has failed
         if folder is not None:
             _make(folder)
 
     @property
     def telemetry(self) -> Path | None:
-        """Where the station's own record belongs."""
+        """The path of the station's own record."""
         return None if self._folder is None else self._folder / TELEMETRY
 
     def note(self, source: str, text: str) -> None:
-        """Put a line into the event log."""
+        """Add a line to the event log."""
         self._note(self._clock(), source, text)
 
     def _note(self, now_us: int, source: str, text: str) -> None:
@@ -84,11 +84,11 @@ class RealFlight:
 
     @property
     def log_us(self) -> int:
-        """The present instant by the log's clock."""
+        """The current time by the log's clock."""
         return self._now_us - self._start_us
 
     def turn(self, cockpit: Cockpit, now_us: int) -> None:
-        """Record a row when it is time to."""
+        """Record a row when it is due."""
         if now_us < self._next_us:
             return
         if self._recorder is None:
@@ -111,7 +111,7 @@ class RealFlight:
             self._note(*early)
 
     def _write(self, write: Callable[[Recorder], None]) -> None:
-        """Write, as long as that is possible: a full disk ends the record, not the flight."""
+        """Write, if possible: a full disk ends the record, not the flight."""
         if self._recorder is None or self._broken:
             return
         try:
@@ -121,7 +121,7 @@ class RealFlight:
             self._say(f"{self._folder}: no more is recorded: {error.strerror or error}")
 
     def _look(self, cockpit: Cockpit, now_us: int) -> None:
-        """Notice what the board does, the trajectory's begin and end, and a loss."""
+        """Note the board's state, the trajectory's begin and end, and a loss."""
         state = cockpit.link.supervisor_state
         if state != self._state and state is not None:
             self._state = state
@@ -142,9 +142,9 @@ class RealFlight:
                 self._note(now_us, "lab", f"lost: {self._lost}; what follows is not judged")
 
     def close(self, failure: str = "", interrupted: bool = False) -> Result | None:
-        """Finish the log and write `result.json`; None for a flight that never began or is not kept: it leaves no folder.
+        """Finish the log and write `result.json`; None, without a folder, for a flight that never began or is not stored.
 
-        `failure` is why the station gave up. Raises `LabError` when it cannot be written.
+        `failure` is why the station gave up. Raises `LabError` when writing fails.
         """
         folder = self._folder
         if self._recorder is None:
@@ -161,7 +161,7 @@ class RealFlight:
         return result
 
     def _result(self, folder: Path, digest: str, failure: str, interrupted: bool) -> Result:
-        """Return how it went, from the log."""
+        """Return the result, from the log."""
         log = load_log(folder)
         own = self._experiment.metrics
         metrics = measure(log, self._lost is not None) | dict.fromkeys(own, nan)
@@ -169,7 +169,7 @@ class RealFlight:
         if free.num_rows > 1:
             try:
                 metrics.update(self._experiment.measured(free))
-            except LabError as error:  # what only a laboratory can see
+            except LabError as error:  # only a laboratory measures it
                 self._say(
                     f"{self._experiment.name}: its own metrics need {error}, which a real flight has not"
                 )
@@ -200,7 +200,7 @@ def _make(folder: Path) -> None:
 
 
 def why_lost(frame: MocapFrame, limits: LimitsConfig, home: tuple[float, float, float]) -> str | None:
-    """Return why a flight is over at a pose, by the limits that the laboratory has; None while it is not."""
+    """Return why a flight is over at a pose, by the laboratory's limits; None while it is not."""
     x, y, z = frame.p_WB
     _, qx, qy, _ = frame.q_WB
     upright = 1.0 - 2.0 * (qx * qx + qy * qy)  # cosine of the tilt

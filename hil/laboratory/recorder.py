@@ -1,4 +1,4 @@
-"""The flight log: one row per 10 ms, written during the flight, so that a crash keeps the rows before it.
+"""The flight log: one row per 10 ms, written during the flight, so that the rows before a crash are kept.
 
 During the flight the rows go to `log.arrows` (an Arrow stream, one batch per second); closing turns it into `log.parquet`.
 Texts (console, supervisor, causes) go to `events.jsonl`, line by line. Each column carries `unit` and `frame` in its

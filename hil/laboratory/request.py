@@ -1,4 +1,4 @@
-"""A request: which flight to fly, on which bench. Whatever flies or reads a flight has this description of it.
+"""A request: which flight to fly, on which bench. All code that flies or reads a flight uses this description.
 
 A run folder stores the request, and `Request.read` returns an equal one, given a function that finds its experiment.
 """
@@ -37,7 +37,7 @@ from hil.laboratory.metrics import check_limits, limits_of
 
 RADIO, MAVLINK = "radio", "mavlink"
 LOCKSTEP = (RADIO, MAVLINK)  # links that are fully simulated
-REAL = "real"  # the board of a flight that only its ground station saw
+REAL = "real"  # the board of a flight recorded only by its ground station
 DURATION_MAX_S = 86_400.0
 SEED_MAX = 2**62
 USUAL = {"profile": DEFAULT_PROFILE, "link": RADIO, "board": PYTHON}  # of `Request.parts`
@@ -45,7 +45,7 @@ USUAL = {"profile": DEFAULT_PROFILE, "link": RADIO, "board": PYTHON}  # of `Requ
 InLoop = Literal["still", "moving"] | None
 Find = Callable[
     [str, Source | None], Experiment | None
-]  # the experiment of a name or source, None: unknown here
+]  # returns the experiment of a name or source, None: unknown here
 
 
 @checked
@@ -53,17 +53,17 @@ Find = Callable[
 class Bench:
     """The link and the board of a flight, and how they run."""
 
-    link: str = RADIO  # radio and mavlink: in lockstep; a URI: a station in a process of its own, paced
-    board: str = PYTHON  # what executes the flight core, the path of an image that is flashed whole, a link
-    elf: Path | None = None  # with the symbols of an image that has none
-    in_loop: InLoop = None  # a real board flies by its own tasks and clock; its servos stay, or move as well
+    link: str = RADIO  # radio and mavlink: in lockstep; a URI: a station in another process, paced
+    board: str = PYTHON  # a runner of the flight core, the path of a complete image, or a link
+    elf: Path | None = None  # the symbols of an image without its own
+    in_loop: InLoop = None  # a real board flies by its own tasks and clock, with its servos still or moving
     gdb: int | None = None  # port on which an image waits for a debugger; 0: any
     realtime: bool = False  # pace the flight to the wall clock
-    trace: bool = False  # the schedule of the whole flight, not only of 50 ms
+    trace: bool = False  # record the schedule of the whole flight, not only 50 ms
 
     @property
     def is_image(self) -> bool:
-        """Whether the board executes an image that is flashed whole."""
+        """Whether the board executes a complete image."""
         return self.board not in (*BOARDS, REAL) and not is_link(self.board)
 
     @property
@@ -72,7 +72,7 @@ class Bench:
         return self.link in LOCKSTEP
 
     def check(self) -> None:
-        """Raise `LabError` when link, board and options do not fit together, or a package for them is missing."""
+        """Raise `LabError` when link, board and options do not match, or a package for them is missing."""
         if self.is_image:
             check_image(self.board)
         if self.is_image and self.link.startswith(MAVLINK):
@@ -115,12 +115,12 @@ class Options(TypedDict, total=False):
 
     profile: str  # one that ships, or a path that ends in .toml; default: floaty
     overrides: Overrides  # {"section.key": value}, or "section.key=value" as for `--set`
-    seed: int  # of everything random; default: 1
+    seed: int  # of all random numbers; default: 1
     duration_s: float | None  # of free flight; default: the experiment's
-    faults: Sequence[Fault | str]  # on top of the experiment's own
+    faults: Sequence[Fault | str]  # added to the experiment's own
     trajectory: Callable[[Goal, int], Trajectory]  # instead of the experiment's, like Along(path)
     link: str  # radio and mavlink: in lockstep; a URI: in real time; default: radio
-    board: str  # what executes the flight core: python, c or cortex-m4; default: python
+    board: str  # runner of the flight core: python, c or cortex-m4; default: python
     elf: Path | None
     in_loop: InLoop
     gdb: int | None
@@ -158,13 +158,13 @@ class Request:
     overrides: tuple[str, ...]
     seed: Annotated[int, BeforeValidator(lambda seed: 0 if seed is None else seed)]
     duration_s: float
-    faults: tuple[str, ...]  # as text: of kinds that are unknown where it is read, too
+    faults: tuple[str, ...]  # as text, because the reader may not know their kinds
     bench: Bench
 
     @classmethod
     @checked
     def of(cls, experiment: Experiment, **options: Unpack[Options]) -> Request:
-        """Return the request for an experiment: its settings and faults first. Raises `LabError` for one that cannot fly."""
+        """Return the request for an experiment: its settings and faults first. Raises `LabError` if it cannot fly."""
         trajectory, duration_s = options.get("trajectory"), options.get("duration_s")
         if trajectory is not None:
             experiment = dataclasses.replace(experiment, trajectory=trajectory)
@@ -182,7 +182,7 @@ class Request:
         return request
 
     def check(self) -> None:
-        """Raise `LabError` when the flight cannot be flown: before anything is written."""
+        """Raise `LabError` when the flight cannot be flown, before writing anything."""
         self.bench.check()
         if not 0 <= self.seed <= SEED_MAX:
             raise LabError(f"--seed {self.seed}: expected a whole number, 0 to {SEED_MAX}")
@@ -202,7 +202,7 @@ class Request:
         self.experiment.check_goals(home, self.duration_s, partial(why_left, self.config))
 
     def _check_pilot(self, times: FlightTimes) -> None:
-        """Raise `LabError` when the Crazyflie's firmware cannot be flown like that."""
+        """Raise `LabError` when the Crazyflie's firmware cannot fly this request."""
         if not self.bench.is_image or self.bench.link != RADIO:
             raise LabError(
                 f"profile {self.profile}: its robot flies with the Crazyflie's own firmware over the radio; "
@@ -226,7 +226,7 @@ class Request:
 
     @cached_property
     def times(self) -> FlightTimes | None:
-        """When a robot with the Crazyflie's firmware takes off and lands; None for one that hovers from its release on."""
+        """The take-off and landing times with the Crazyflie's firmware; None for a robot that hovers from its release on."""
         if not self.config.pilot.enabled:
             return None
         return FlightTimes.of(self.config.pilot, self.config.flight.release_us, round(self.duration_s * 1e6))
@@ -243,7 +243,7 @@ class Request:
 
     @property
     def is_real(self) -> bool:
-        """Whether it was a real flight, which has no seed, and of which only the ground station's view is known."""
+        """Whether it was a real flight: without a seed, known only from the ground station."""
         return self.bench.board == REAL
 
     @property
@@ -257,7 +257,7 @@ class Request:
         return f"{self.experiment.name}, {'real flight' if self.is_real else f'seed {self.seed}'}"
 
     def parts(self) -> dict[str, str]:
-        """Return what was asked for as text, by what `floaty fly` calls it: equal for equal flights."""
+        """Return the options as text, by their names in `floaty fly`: equal for equal flights."""
         return {
             "": self.experiment.reference, "seed": str(self.seed), "duration": f"{self.duration_s!r} s",
             "profile": self.profile, "set": " ".join(self.overrides), "fault": " ".join(self.faults),
@@ -281,7 +281,7 @@ class Request:
 
 
 def _nested(values: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a stored request as its parts, which take what is theirs."""
+    """Return a stored request as nested parts; each picks its own fields."""
     return {**values, "experiment": values, "bench": values}
 
 
@@ -295,7 +295,7 @@ def _parsed(faults: Sequence[Fault | str]) -> tuple[Fault, ...]:
 
 
 def why_left(config: LabConfig, p_W: Sequence[float]) -> str:
-    """Return why a robot at a place [m] has left the flow or its room, by the limits of its body; empty when it has not."""
+    """Return why a robot at a place [m] is outside the flow or its room, by its body's limits; empty when inside."""
     if config.pilot.enabled:
         room, ceiling = config.quadrotor.room, config.quadrotor.ceiling
         inside = max(abs(p_W[0]), abs(p_W[1])) <= room and 0.0 <= p_W[2] <= ceiling
@@ -310,7 +310,7 @@ def why_left(config: LabConfig, p_W: Sequence[float]) -> str:
 
 
 def check_image(board: str) -> None:
-    """Raise `LabError` when no file is where `--board` says."""
+    """Raise `LabError` when the file of `--board` is missing."""
     if not Path(board).is_file():
         raise LabError(
             f"--board {board}: expected {', '.join(BOARDS)}, an image of a Crazyflie's firmware: an ELF file, or the link "

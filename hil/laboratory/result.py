@@ -1,7 +1,7 @@
 """The result of a run: its origin and outcome; `result.json`, written once and read back as the same type.
 
-A number that a flight does not have is NaN here and null in the file. Of a run whose process was killed, which left no
-`result.json`, origin and metrics come from the log.
+A missing number is NaN here and null in the file. A killed process leaves no `result.json`; origin and metrics then come
+from the log.
 """
 
 import json
@@ -30,9 +30,9 @@ from hil.laboratory.request import Find, Request, StoredRequest
 from hil.scene import Look
 
 RESULT = "result.json"
-PARTS = ("request", "program", "experiment", "bench")  # whose own parts stand beside the others in the file
+PARTS = ("request", "program", "experiment", "bench")  # their fields are on the top level of the file
 
-# reset: flown to its end, but the board was reset on the way.
+# reset: flown to its end, but the board was reset in flight.
 Outcome = Literal["completed", "lost", "reset", "interrupted", "error"]
 
 
@@ -48,21 +48,21 @@ class QueueReport:
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """What computed a flight."""
+    """The program that computed a flight."""
 
     versions: Mapping[str, str]  # of the packages
     commit: str
-    logic: str  # hash of the user's modules in the core, empty without
-    robot: str = ""  # hash of the file of the user's own body, empty without
+    logic: str  # hash of the user's modules in the core, empty if none
+    robot: str = ""  # hash of the file of the user's own body, empty if none
 
     @classmethod
     def of(cls, config: LabConfig) -> "Program":
-        """Return this program, with the modules of a configuration."""
+        """Return this program with the modules of a configuration."""
         return cls(versions(), commit(), digest_of(config.logic), digest_of_body(config))
 
 
 def metadata_of(request: Request, program: Program, look: Look) -> dict[str, str]:
-    """Return the origin of a flight and the look of its robot as text for its log's schema."""
+    """Return a flight's origin and its robot's look as text for the log's schema."""
     return {
         "request": json.dumps(request.stored()),
         "program": json.dumps(asdict(program)),
@@ -73,7 +73,7 @@ def metadata_of(request: Request, program: Program, look: Look) -> dict[str, str
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """The outcome of a run. In its file the parts of request and program stand beside the others."""
+    """The outcome of a run. Its file has the fields of request and program on the top level."""
 
     request: StoredRequest
     program: Program
@@ -88,7 +88,7 @@ class Result:
     queues: tuple[QueueReport, ...] = ()
     usage: Usage | None = None  # of the board, where it was measured
     real_time_factor: Figure = math.nan
-    stood_still_ms: Figure = math.nan  # simulated time, while the machine was too slow for a paced flight
+    stood_still_ms: Figure = math.nan  # of simulated time, while the machine was too slow for a paced flight
     folder: Annotated[Path, Field(exclude=True)] = Path()  # its run folder
     image: ImageReport | None = None  # of a board that executes an image
     not_shown: int | None = None  # rows of the log that the live viewer did not take; null without one
@@ -96,19 +96,19 @@ class Result:
     @computed_field  # type: ignore[prop-decorator]
     @property
     def passed(self) -> bool:
-        """Whether the flight ended by itself, which may be a crash if a limit admits it, and every limit holds."""
+        """Whether the flight ended by itself, or in a crash that a limit admits, and every limit holds."""
         return self.outcome in ("completed", "reset", "lost") and all(
             verdict.holds for verdict in self.verdicts
         )
 
     @property
     def failed(self) -> tuple[Verdict, ...]:
-        """The limits that its figures fail; of a lost flight that on the loss alone, which fails the others."""
+        """The limits that failed; for a lost flight only the limit on the loss, which fails the others."""
         return tuple(verdict for verdict in self.verdicts if verdict.applies and not verdict.holds)
 
 
 def with_resets(outcome: Outcome, cause: str | None, resets: float) -> tuple[Outcome, str | None]:
-    """Return outcome and cause of a flight whose board was reset so often."""
+    """Return outcome and cause of a flight with this number of resets of its board."""
     if not resets > 0:
         return outcome, cause
     how = f"the board was reset {resets:.0f} time{'s' if resets > 1 else ''}"
@@ -125,7 +125,7 @@ def write_result(result: Result) -> None:
 
 
 def read_result(folder: Path, find: Find = unknown) -> Result:
-    """Return the result of a run folder; `find` finds its experiment, by default there is a stand-in.
+    """Return the result of a run folder; `find` finds its experiment, by default a stand-in.
 
     Raises `LabError` when the folder holds no run of this version.
     """
@@ -163,7 +163,7 @@ def _of_killed(folder: Path, find: Find) -> Result:
 
 
 def _first_of(error: ValidationError) -> str:
-    """Return the first error: the value, and what is expected."""
+    """Return the first error: the value and what is expected."""
     detail = error.errors()[0]
     place = detail["loc"][sum(part in PARTS for part in detail["loc"][:-1]) :]
     name, message = ".".join(map(str, place)), detail["msg"]

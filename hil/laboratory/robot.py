@@ -1,7 +1,7 @@
 """One robot in its tunnel: body, battery, IMU, the cameras that see it, and a board whose firmware boots and reboots.
 
-All instants are the laboratory's, except those of the firmware, which counts from its boot. The destination of the board's
-radio packets and the other end of its UART are handed in.
+All times are the laboratory's, except the firmware's, which count from its boot. The caller provides the receiver of the
+board's radio packets and the other end of its UART.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from hil.world.battery import Battery, open_circuit_voltage
 from hil.world.body import Body, Carrier
 
 IMU_PERIOD_US = 1_000
-# Share of a gyro's noise in flight before the fans run, where it is more than the stock firmware accepts at rest: it
-# requires less than 100 counts squared.
+# Share of a gyro's flight noise before the fans run, if it exceeds what the stock firmware accepts at rest: less than 100
+# counts squared.
 BENCH_NOISE, BENCH_GYRO = 0.05, 10.0 / GYRO_COUNTS  # [rad/s]
 MOCAP_PHASE_US = 7_000  # so that a pose of 40 ms reaches the estimator 1-3 ms before its step
 
 See = Callable[[MocapFrame, int, Sighting | None], None]  # (frame, now_us, sighting of the markers)
 Say = Callable[[str, str], None]  # (source, text)
 PYTHON_BOARD = PythonBoard()
-SendPacket = Callable[[int, bytes], bool]  # (now_us, packet): False when it has to wait
+SendPacket = Callable[[int, bytes], bool]  # (now_us, packet): False when it must wait
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class Streams:
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """Where a robot stands, on which time line, and what executes its firmware."""
+    """A robot's place, its time line, and the executor of its firmware."""
 
     config: LabConfig
     events: EventQueue
@@ -75,10 +75,10 @@ class Site:
 
 @dataclass(frozen=True, slots=True)
 class Ports:
-    """What a robot's board leads to: the medium of its radio and its UART, None where it lacks them, and who takes what.
+    """The connections of a robot's board: the medium of its radio and its UART, None if missing, and the receivers.
 
-    `polled`: a real host polls its radio, so empty polls need no model. `restart` boots the robot again after a reset of its
-    processor; by default it does so itself. `fail` lets a part of it fail. `memory` may have something in it.
+    `polled`: a real host polls its radio, so empty polls need no model. `restart` boots the robot after a reset of its
+    processor; by default it does so itself. `fail` makes a part of it fail. `memory` may have contents.
     """
 
     send_packet: SendPacket
@@ -93,8 +93,8 @@ class Ports:
 class Robot:
     """Built at rest in its holder at home, with the firmware running; `watch` starts IMU and cameras.
 
-    `air` (of its radio) and `uart` are changed by faults of its lines, None for a line that it lacks. `firmware` is that
-    of the present boot.
+    Faults of its links change `air` (of its radio) and `uart`; None for a missing link. `firmware` is that of the current
+    boot.
     """
 
     def __init__(self, site: Site, ports: Ports) -> None:
@@ -141,7 +141,7 @@ class Robot:
         if self.uart is not None:
             self.uart.read()  # a booted processor starts with an empty buffer
         self.board.boot(now_us)
-        specimen = deepcopy(self.imu)  # so that the sensor's noise in flight is the same for every board
+        specimen = deepcopy(self.imu)  # gives every board the same sensor noise in flight
         specimen.set_noise_scale(BENCH_NOISE if self.config.imu.gyro_noise > BENCH_GYRO else 1.0)
         rest = None if now_us else lambda: specimen.sample(self.body)
         start = PowerOn(
@@ -154,7 +154,7 @@ class Robot:
             self._occupy(self._thief)
 
     def cut_power(self) -> None:
-        """Stop the firmware: the servos keep their last pulse."""
+        """Stop the firmware; the servos keep their last pulse."""
         self.powered = False
 
     def watch(self, start_us: int) -> None:
@@ -163,12 +163,12 @@ class Robot:
         self.events.every(self.config.mocap.period_us, start_us + MOCAP_PHASE_US, self._expose)
 
     def seen_by(self, see: See) -> None:
-        """Pass every frame of the cameras to `see` when their computer has it."""
+        """Pass every camera frame to `see` when the cameras' computer has it."""
         self._seen_by.append(see)
 
     @property
     def thief(self) -> Thief:
-        """What takes processor time from the board, there from its first use on; it takes nothing until its share is set."""
+        """The load that takes processor time from the board, created at first use; its share is 0 until set."""
         if self._thief is None:
             self._thief = Thief()
             self._occupy(self._thief)
@@ -213,13 +213,13 @@ class Robot:
         self.free = False
 
     def put_back(self, now_us: int) -> None:
-        """Put the body into the holder, as at the start; actuators, air and faults are unchanged."""
+        """Return the body to the holder, as at the start; actuators, air and faults stay unchanged."""
         self.body.advance(now_us)
         self.body.put_back(self.start_W)
         self.free = False
 
     def look(self, now_us: int) -> str | None:
-        """Bring the truth and the battery up to this instant; returns why the flight is over, None while it is not."""
+        """Advance the truth and the battery to this time; return why the flight is over, None while it is not."""
         self.body.advance(now_us)
         self.battery.draw(now_us, self.body.draw(now_us, self.battery.voltage))
         self.board.supply(self.battery.millivolts)
@@ -230,7 +230,7 @@ class Robot:
     # Interrupts
 
     def packet_received(self, now_us: int, data: bytes, broadcast: bool = False) -> None:
-        """The radio chip has a packet."""
+        """Interrupt: the radio chip has a packet."""
         if self.powered:
             self.firmware.radio_received(data, broadcast)
 
@@ -277,7 +277,7 @@ class Robot:
 
 
 def with_system(config: LabConfig, system: int) -> LabConfig:
-    """Return the configuration with another MAVLink system id. Raises `LabError` for one that does not exist."""
+    """Return the configuration with another MAVLink system id. Raises `LabError` for an invalid one."""
     if system > MAX_SYSTEM:
         raise LabError(f"mavlink.system = {system}: ids end at {MAX_SYSTEM}")
     mavlink = config.mavlink.model_copy(update={"system": system})
@@ -288,7 +288,7 @@ MAX_SYSTEM = 255
 
 
 def nobody_listens(now_us: int, data: bytes) -> bool:
-    """Lose a packet."""
+    """Drop a packet."""
     return True
 
 
@@ -297,7 +297,7 @@ LINKS: tuple[Literal["radio", "mavlink"], ...] = ("radio", "mavlink")
 
 @cache
 def specimen(link: Literal["", "radio", "mavlink"], markers: bool) -> Robot:
-    """Return a booted robot that never flies, for trying what a user declares; without a link it has both."""
+    """Return a booted robot that never flies, to try a user's declarations; without a link it has both."""
     config, events = load_config(overrides=("markers.enabled=true",) if markers else ()), EventQueue()
     site = Site(config, events, Streams.of_seed(0), lambda *_: None)
     air = Air.of(config.radio) if link != "mavlink" else None
@@ -306,7 +306,7 @@ def specimen(link: Literal["", "radio", "mavlink"], markers: bool) -> Robot:
 
 
 def attributes_of(part: object) -> list[str]:
-    """Return the attributes of a part that are numbers and can be set."""
+    """Return the numeric attributes of a part that can be set."""
     found = []
     for name in dir(part):
         value = getattr(part, name)

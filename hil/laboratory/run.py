@@ -1,7 +1,7 @@
 """A run: one flight into its folder, with log, telemetry, events, result, recording and report.
 
 `runs/<experiment>-<seed>/` holds `log.parquet`, `events.jsonl`, `telemetry.csv`, `result.json`, `flight.rrd` and
-`report.html`. Whatever ends the flight (its time, a crash, Ctrl-C, an error in a task), the data up to then are kept.
+`report.html`. Whatever ends the flight (its time, a crash, Ctrl-C, an error in a task), earlier data are kept.
 """
 
 import gc
@@ -36,11 +36,11 @@ from hil.laboratory.result import (
     write_result,
 )
 
-LOADED_US = 250_000  # every part of the core has been called by then
+LOADED_US = 250_000  # every part of the core has run by then
 
-COLLECTIONS = (100_000, 20, 50)  # Python's usual ones take a tenth of a flight, which makes little garbage
+COLLECTIONS = (100_000, 20, 50)  # Python's defaults take a tenth of a flight, which makes little garbage
 
-# (request, telemetry log, what is closed after the flight)
+# (request, telemetry log, stack closed after the flight)
 MakeFlight = Callable[[Request, Path | None, ExitStack], Flight]
 
 
@@ -51,7 +51,7 @@ def fly(
     onlooker: Onlooker | None = None,
     flight_of: MakeFlight = in_lockstep,
 ) -> Result:
-    """Fly once and write everything but the pictures into `folder`, where an older run is replaced.
+    """Fly once and write everything but the pictures into `folder`, replacing an older run.
 
     `flight_of` assembles the flight. An error of the firmware ends in the outcome "error", Ctrl-C in "interrupted".
     """
@@ -115,7 +115,7 @@ def fly(
 
 
 def _fly_to_the_end(flight: Flight, progress: Progress, recorder: Recorder) -> tuple[Outcome, str | None]:
-    """Fly; return the outcome and its cause, which goes into the event log when the firmware ended the flight."""
+    """Fly; return the outcome and its cause, and log the cause when the firmware ended the flight."""
     try:
         end = flight.run(progress, recorder)
     except WatchdogError as error:
@@ -132,9 +132,9 @@ def _fly_to_the_end(flight: Flight, progress: Progress, recorder: Recorder) -> t
 
 
 def _close(flight: Flight, recorder: Recorder, folder: Path) -> str:
-    """Finish the files of a flight and release its resources; returns the hash of what was recorded."""
+    """Finish the files of a flight and release its resources; return the hash of the record."""
     record = flight.line.record
-    with closing(flight):  # even when the recorder cannot write on a full disk
+    with closing(flight):  # even when the recorder cannot write to a full disk
         digest = recorder.close(None if record is None else partial(with_goals_sent, record))
     flight.write_schedule(folder)
     return digest

@@ -1,4 +1,4 @@
-"""Which task ran when: the kernel's trace of a window of the flight, as `schedule.parquet`.
+"""The schedule of tasks: the kernel's trace of a window of the flight, as `schedule.parquet`.
 
 Columns: `us` (instant), `event` and `who` (the words of tests/vectors/README.md), `a`, `b`. By default the window
 is the 50 ms after the release, enough for a picture; `floaty fly --perfetto` traces the whole flight.
@@ -37,13 +37,13 @@ class ScheduleTrace:
         self._rows: list[tuple[int, str, str, int, int]] = []
 
     def begin(self, now_us: int) -> None:
-        """Start tracing; the task that has the processor is noted as if it had just been switched to."""
+        """Start tracing; record a switch to the running task first."""
         if self._scheduler is not None:
             self._take(now_us, "IN", self._scheduler.current.name, self._scheduler.current.priority, 0)
             self._scheduler.set_trace(self._take)
 
     def end(self, now_us: int) -> None:
-        """Stop tracing, if it goes on."""
+        """Stop tracing if it is running."""
         if self._scheduler is not None and self._scheduler.trace is not None:
             self._take(now_us, "END", "-", 0, 0)
             self._scheduler.set_trace(None)
@@ -59,13 +59,13 @@ class ScheduleTrace:
 
 
 def load_schedule(folder: Path) -> pa.Table:
-    """Return a run's schedule; an empty one when it has none, as after a kill."""
+    """Return a run's schedule; empty when it has none, as after a kill."""
     path = folder / FILE
     return pa.parquet.read_table(path) if path.is_file() else SCHEMA.empty_table()
 
 
 def runs(schedule: pa.Table) -> Iterator[Turn]:
-    """Yield the intervals in which tasks had the processor, the idle task included, without those of no length."""
+    """Yield the intervals in which tasks had the processor, including the idle task, without empty ones."""
     events, times, names = (schedule.column(name).to_pylist() for name in ("event", "us", "who"))
     task, start_us = "", 0
     for event, us, who in zip(events, times, names, strict=True):
