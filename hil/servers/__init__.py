@@ -1,1 +1,1 @@
-"""What leads robots out to real programs: a virtual Crazyradio, UDP, serial lines, Motive, a ground station."""
+"""Connects robots to real programs: by a virtual Crazyradio, UDP, serial lines, Motive, or a ground station."""

@@ -1,8 +1,8 @@
 """Gives unmodified cflib programs a Crazyradio that is really a running `floaty serve --radio`.
 
-This file needs nothing but the standard library: it is a pytest plugin (`pytest -p hil.servers.dongle_plugin`), and the
-folder `dongle_site` beside it loads it into any Python program by PYTHONPATH, also where this package is not installed. The
-environment variable FLOATY_DONGLE=127.0.0.1:PORT says where the server listens. It replaces
+This file needs only the standard library: it is a pytest plugin (`pytest -p hil.servers.dongle_plugin`), and the folder
+`dongle_site` beside it loads it into any Python program by PYTHONPATH, even without this package installed. The
+environment variable FLOATY_DONGLE=127.0.0.1:PORT is the server's address. It replaces
 `libusb_package.get_libusb1_backend` by a back end for pyusb that sends each USB transfer over a socket.
 
 A frame on the socket: kind (1 byte), sequence number (1), length (1), data. The client sends `C` (vendor request:
@@ -67,13 +67,13 @@ class Connection:
         self._socket.sendall(frame(kind, self._sequence, data))
 
     def read(self, timeout_s: float) -> bytes:
-        """Return the answer to the last frame; `TimeoutError` when none comes."""
+        """Return the answer to the last frame. Raises `TimeoutError` without one."""
         self._socket.settimeout(timeout_s)
         while True:
             size = HEAD_SIZE + self._received[2] if len(self._received) >= HEAD_SIZE else HEAD_SIZE
             if len(self._received) >= HEAD_SIZE and len(self._received) >= size:
                 answer, self._received = self._received[:size], self._received[size:]
-                if answer[1] == self._sequence:  # an older one belongs to a transfer that was given up
+                if answer[1] == self._sequence:  # an older one answers an abandoned transfer
                     return answer[HEAD_SIZE:]
                 continue
             data = self._socket.recv(4096)
@@ -86,7 +86,7 @@ class Connection:
 
 
 class Backend:
-    """What pyusb asks of a back end (`usb.backend.IBackend`), for one Crazyradio that is present while a server runs."""
+    """Implements pyusb's back end (`usb.backend.IBackend`) for one Crazyradio, present while a server runs."""
 
     def __init__(self, server: str) -> None:
         host, _, port = server.rpartition(":")
@@ -101,7 +101,7 @@ class Backend:
         yield self
 
     def get_parent(self, device: object) -> None:
-        """A dongle has no hub."""
+        """Return None: a dongle has no hub."""
 
     def get_device_descriptor(self, device: object) -> object:
         """Return the descriptor of a Crazyradio 2 with firmware 5.4."""
@@ -155,10 +155,10 @@ class Backend:
         """The connection is the claim."""
 
     def reset_device(self, handle: Connection) -> None:
-        """Nothing to reset: the host sets everything afterwards."""
+        """Do nothing: the host sets everything afterwards."""
 
     def is_kernel_driver_active(self, handle: Connection, interface: int) -> bool:
-        """No driver of the kernel wants it."""
+        """Return False: no kernel driver uses it."""
         return False
 
     def bulk_write(self, handle: Connection, endpoint: int, interface: int, data: Any, timeout: int) -> int:
@@ -200,7 +200,7 @@ class Backend:
 
 
 def _usb_error(error: OSError) -> Any:
-    """Return what pyusb raises: a time-out, or a device that was pulled."""
+    """Return pyusb's error: a time-out or an unplugged device."""
     import usb.core
 
     if isinstance(error, TimeoutError):
@@ -209,10 +209,10 @@ def _usb_error(error: OSError) -> Any:
 
 
 def install() -> None:
-    """Put the virtual dongle in the place of the USB bus, in this process."""
+    """Replace this process's USB bus with the virtual dongle."""
     try:
         import libusb_package
-    except ImportError:  # this program does not use Crazyradios
+    except ImportError:  # this program uses no Crazyradio
         return
     backend = Backend(os.environ.get(VARIABLE) or DEFAULT_SERVER)
     setattr(libusb_package, "get_libusb1_backend", lambda: backend)  # noqa: B010

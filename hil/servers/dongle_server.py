@@ -1,7 +1,7 @@
 """The USB side of the virtual dongles: a localhost socket on which `dongle_plugin` sends its transfers.
 
-Each connection is a dongle of its own. Nothing here blocks: the board server calls `accept` and the connections when
-their sockets are readable. Frames: see `dongle_plugin`.
+Each connection is a separate dongle. Nothing here blocks: the board server calls `accept` and the connections when their
+sockets are readable. Frames: see `dongle_plugin`.
 """
 
 import socket
@@ -36,7 +36,7 @@ class DongleServer:
         self._cables.append(_UsbCable(connection, self._readers, self._new_dongle()))
 
     def close(self) -> None:
-        """Pull all dongles and stop listening."""
+        """Unplug all dongles and stop listening."""
         for cable in self._cables:
             cable.unplug()
         del self._readers[self._socket]
@@ -88,6 +88,6 @@ class _UsbCable:
         return self._socket in self._readers
 
     def unplug(self) -> None:
-        """Pull the dongle."""
+        """Unplug the dongle."""
         self._readers.pop(self._socket, None)
         self._socket.close()

@@ -1,8 +1,7 @@
 """MAVLink's artificial failures as faults: the kinds of faults for each unit and failure, and the answers.
 
-A failure lasts until its unit is set to OK, and replaces the one before, so that a repeated command
-acts once. Instance 0 stands for all of a unit; the actuators of a body are counted from 1, every other unit has one
-instance.
+A failure lasts until its unit is set to OK, and replaces the previous one, so that a repeated command acts once. Instance
+0 means all instances of a unit; a body's actuators count from 1, every other unit has one instance.
 """
 
 import math
@@ -14,13 +13,13 @@ from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Fault, Switchboard, why_not
 from hil.laboratory.robot import Robot
 
-ANSWER_US = 100_000  # a line is cut after the answer has passed, and ...
-DEAF_S = 3.0  # ... ends by itself: no command could set it to OK
+ANSWER_US = 100_000  # a line is cut after the answer has been sent, and ...
+DEAF_S = 3.0  # ... restored by itself: no command could set it to OK
 CUT = "serial.cut"
 
-# The kinds of faults for each way of failing; * stands for the actuators of the robot's body, {} for the number of one.
+# The kinds of faults for each failure; * means the actuators of the robot's body, {} the number of one.
 KindsByFailing = dict[Failing, tuple[str, ...]]
-# The IMU is one part: its gyro does not fail alone.
+# The IMU is one part: its gyro cannot fail alone.
 _IMU: KindsByFailing = {
     Failing.OFF: ("imu.silent",),
     Failing.STUCK: ("imu.freeze",),
@@ -58,7 +57,7 @@ class Failures:
         self._switchboard = switchboard
 
     def inject(self, now_us: int, unit: int, failing: int, instance: int) -> CommandResult:
-        """Plan the fault of these numbers for the present instant."""
+        """Plan the fault of these numbers for the current instant."""
         if unit not in TABLE or failing not in (Failing.OK, *TABLE[Unit(unit)]):
             return CommandResult.UNSUPPORTED
         kinds = TABLE[Unit(unit)]

@@ -1,4 +1,4 @@
-"""Who stands beside the tunnel: lets a robot go once it flies in its holder, and puts it back when it is lost."""
+"""The person at the tunnel: releases a robot once it flies in its holder, and returns it when it is lost."""
 
 from collections.abc import Callable
 
@@ -11,7 +11,7 @@ WATCH_PERIOD_US = 10_000
 
 
 class Holder:
-    """Watches one robot. `let_go` is called when it has flown in its holder for a second, or when it stands by itself."""
+    """Watches one robot. Calls `let_go` when it has flown in its holder for a second, or stands on the floor."""
 
     def __init__(self, robot: Robot, let_go: Callable[[int], None]) -> None:
         self._robot = robot
@@ -20,7 +20,7 @@ class Holder:
         robot.events.every(WATCH_PERIOD_US, WATCH_PERIOD_US, self._watch)
 
     def put_back_later(self, now_us: int) -> None:
-        """Put the robot back into the holder after a while."""
+        """Return the robot to the holder after a delay."""
         self._robot.catch()
         self._robot.events.at(now_us + PUT_BACK_US, self._put_back)
 

@@ -1,7 +1,7 @@
 """A flight with a real board in the loop: the plant's clock follows the board's, everything else is as in lockstep.
 
-The board flies by its own tasks with the samples of the virtual IMU (`hil.devices.real_firmware`); cameras, ground station
-and the modelled radio with its faults are those of a flight in lockstep, behind which the corrections go to the board.
+The board's own tasks fly on samples of the virtual IMU (`hil.devices.real_firmware`). Cameras, ground station and the
+modelled radio with its faults are those of a flight in lockstep; corrections pass through them to the board.
 """
 
 from contextlib import ExitStack
@@ -17,11 +17,11 @@ from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
 
-HOLD_US = 2_000_000  # in the holder at least: the gyro's zero has to be found through the link
+HOLD_US = 2_000_000  # in the holder at least: the board finds its gyro's zero through the link
 
 
 def in_the_loop(request: Request, telemetry: Path | None, stack: ExitStack) -> Flight:
-    """Return such a flight, on a clock that follows the wall. Raises `LabError` when there is no board."""
+    """Return such a flight, on a clock that follows the wall clock. Raises `LabError` without a board."""
     paced = Paced()
     core = open_real_core(request.bench.board, "--board", stack)
     board = RealBoard(core, request.bench.in_loop == "moving", paced)
@@ -32,7 +32,7 @@ def in_the_loop(request: Request, telemetry: Path | None, stack: ExitStack) -> F
 def flight_in_the_loop(
     request: Request, board: RealBoard, clock: Clock, telemetry: Path | None = None
 ) -> Flight:
-    """Return a flight with an opened board, which is held until its gyro's zero is known."""
+    """Return a flight with an opened board, held until its gyro's zero is known."""
     held_us = max(request.config.flight.release_us, HOLD_US)
     held = replace(request, overrides=(*request.overrides, f"flight.release_us={held_us}"))
     try:

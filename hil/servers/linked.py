@@ -1,8 +1,8 @@
 """A flight over a real link, in real time: the robot in its tunnel here, `floaty station` in another process.
 
-The station is the one that flies a real board. It sees the virtual dongle, the UDP port or a serial port (a pty), and
-has its poses from a virtual Motive, as in the laboratory. The robot is released when the board has flown in its holder
-for a second; then the experiment's script and faults begin to count, and the station's trajectory as well.
+The station is the program that flies a real board. It uses the virtual dongle, the UDP port or a serial port (a pty), and
+gets its poses from a virtual Motive, as in the laboratory. The robot is released when the board has flown in its holder
+for a second; this starts the experiment's script and faults, and the station's trajectory.
 """
 
 import os
@@ -39,19 +39,19 @@ SITE = Path(__file__).parent / "dongle_site"
 RELEASE_TIMEOUT_US = 60_000_000  # for the station to start, connect, and fly in the holder
 STATION_EXIT_TIMEOUT_US = 15_000_000
 LISTEN_PERIOD_US = 250_000
-OUTPUT_MAX = 65_536  # bytes of the station that are read at once
+OUTPUT_MAX = 65_536  # bytes of the station's output read at once
 SERIAL = "mavlink:"
 ALIGNED = [
     f"--set=capture.{value}"
     for value in ("origin=[0,0,0]", "yaw=0", "body_offset=[0,0,0]", "body_yaw=0", "multicast=false")
-]  # whatever the profile says of the real cameras
+]  # overrides the profile's real cameras
 
 
 class StationProcess:
-    """`hil.laboratory.flight.Line` with `floaty station` at its far end; starts it when the flight begins.
+    """`hil.laboratory.flight.Line` to `floaty station`, which it starts when the flight begins.
 
-    `uri` is `radio://…` (the board's own), `udp://127.0.0.1:PORT` or `mavlink:PATH`; `arguments` are those of the
-    station's command line that say which profile it has.
+    `uri` is `radio://…` (the board's own), `udp://127.0.0.1:PORT` or `mavlink:PATH`; `arguments` select the profile on
+    the station's command line.
     """
 
     def __init__(
@@ -83,13 +83,13 @@ class StationProcess:
         self._typed = tempfile.TemporaryFile("wb+")  # noqa: SIM115 - likewise
         self._station: subprocess.Popen[bytes] | None = None
         flashed = self.robot.firmware.flashed
-        if flashed is not None:  # what the laboratory's own board has from the profile, an operator sets
+        if flashed is not None:  # an operator sets these; the laboratory's own board has them already
             lines = [f"set {name} {value!r}\n" for name, value in to_set(flashed.parameters, config)]
             self._typed.write("".join(lines).encode())
             self._typed.flush()
 
     def _serve(self, uri: str, baud: int) -> tuple[str, dict[str, str]]:
-        """Open the side of the board that a URI means; returns the station's URI and what its environment needs."""
+        """Open the board's end of a URI; return the station's URI and its environment variables."""
         if uri == self._served.uri:
             paths = [str(SITE), os.environ.get("PYTHONPATH", "")]
             server = self._ends.serve_radio(0)
@@ -107,17 +107,17 @@ class StationProcess:
 
     @property
     def trajectory(self) -> Trajectory:
-        """The goals that the station is expected to send; what it really sent is in its telemetry."""
+        """The goals that the station should send; its telemetry has those it really sent."""
         return self
 
     def at(self, t_us: int) -> Goal:
-        """The goal at an instant of the laboratory."""
+        """Return the goal at a laboratory time."""
         if self._release_us is None:
             return self._home
         return self._experiment.trajectory(self._home, self._release_us).at(t_us)
 
     def begin(self, release: Callable[[int], None]) -> None:
-        """Have the robot released when its board has flown in the holder."""
+        """Plan the robot's release for when its board has flown in the holder."""
 
         def let_go(now_us: int) -> None:
             self._release_us = now_us
@@ -126,7 +126,7 @@ class StationProcess:
         Holder(self.robot, let_go)
 
     def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
-        """What line and board count; the station keeps its own record."""
+        """The counters of line and board; the station keeps its own record."""
         robot = self.robot
         if robot.uart is not None:
             line: tuple[Channel, ...] = (serial_channel(robot.uart, robot.firmware, None),)
@@ -145,7 +145,7 @@ class StationProcess:
         raise LabError("the ground station is a program of its own: set parameters there")
 
     def look(self, now_us: int) -> list[tuple[str, str]]:
-        """Raise `LabError` when the station has ended, or nothing flies for too long; return what it said."""
+        """Raise `LabError` when the station has ended, or nothing flies for too long; return its output."""
         if now_us < WARM_UP_US:
             return []
         station = self._running_station()
@@ -159,7 +159,7 @@ class StationProcess:
         return self._listen()
 
     def _running_station(self) -> subprocess.Popen[bytes]:
-        """Return the station's process; it starts when the laboratory already runs, which may take a while to compile."""
+        """Return the station's process; it starts once the laboratory runs, whose compilation may take time."""
         if self._station is None:
             self._typed.seek(0)
             self._station = subprocess.Popen(
@@ -174,7 +174,7 @@ class StationProcess:
         raise LabError(f"{why}: {self._said or 'no output'}")
 
     def _listen(self) -> list[tuple[str, str]]:
-        """Return what the station said since the last time."""
+        """Return the station's output since the last call."""
         fresh = os.pread(self._output.fileno(), OUTPUT_MAX, self._heard)
         lines = fresh[: fresh.rfind(b"\n") + 1]
         self._heard += len(lines)
@@ -183,7 +183,7 @@ class StationProcess:
         return [("station", text) for text in texts]
 
     def finish(self, lab: Laboratory) -> None:
-        """Let the station leave in order, with the board still there, or kill it."""
+        """Let the station end in an orderly manner while the board still runs, or kill it."""
         station = self._running_station()
 
         def progress(now_us: int) -> None:
@@ -212,9 +212,9 @@ class StationProcess:
 
 
 def linked_flight(request: Request, telemetry: Path | None, stack: ExitStack) -> Flight:
-    """Return a flight over a real link, always paced; it is released when its board flies.
+    """Return a flight over a real link, always paced; released when its board flies.
 
-    Raises `LabError` for an experiment whose trajectory the station's process cannot find.
+    Raises `LabError` if the station's process cannot find the experiment's trajectory.
     """
     experiment = request.experiment
     found = find_again(experiment.name, experiment.source)
@@ -231,7 +231,7 @@ def linked_flight(request: Request, telemetry: Path | None, stack: ExitStack) ->
 
 
 def _pty(uri: str) -> Address:
-    """Return the pty of `mavlink:pty` or `mavlink:PATH`, where nothing may be yet: a line needs two ends."""
+    """Return the pty of `mavlink:pty` or `mavlink:PATH`, which must not exist: a line needs two ends."""
     path = uri.removeprefix(SERIAL)
     if path == "pty":
         return Address("pty")

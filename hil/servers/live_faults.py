@@ -31,7 +31,7 @@ class LiveFaults:
         self._rest = b""
 
     def listen(self, stream: IO[str]) -> None:
-        """Take lines from a stream from now on, until its end; a stream without a file is left alone."""
+        """Read lines from a stream until its end; ignore a stream without a file."""
         try:
             descriptor = stream.fileno()
         except (OSError, ValueError):
@@ -51,7 +51,7 @@ class LiveFaults:
             readers[descriptor] = read
 
     def take(self, line: str, now_us: int) -> None:
-        """Do what a line says; a line that says nothing possible changes nothing and is answered."""
+        """Execute a line; answer an invalid line without changing anything."""
         if line == "help":
             self._say(HELP)
         elif line == "kinds":
@@ -85,7 +85,7 @@ class LiveFaults:
 
 
 def _fault(text: str) -> Fault:
-    """Return the fault that a line means; `LabError` names the commands, too, when it is none."""
+    """Parse a line as a fault; otherwise raise a `LabError` that also names the commands."""
     try:
         return parse(text, live=True)
     except LabError as error:
@@ -96,7 +96,7 @@ def _fault(text: str) -> Fault:
 
 
 def _status(robot: Robot) -> str:
-    """Return what a robot does, in a few words."""
+    """Return a robot's state, in a few words."""
     if not robot.powered:
         return "without power"
     supervisor = robot.firmware.signals.supervisor

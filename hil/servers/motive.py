@@ -1,11 +1,10 @@
-"""A virtual Motive: a NatNet server for programs of this computer that streams what the virtual cameras see.
+"""A virtual Motive: a NatNet server that streams the virtual cameras' view to programs of this computer.
 
 It answers connect, model definitions, echo, keep-alive and the bitstream request on its command port, and sends every
-frame either to the multicast group or to each client: to the data port of its computer and, once it keeps alive, to
-where it speaks from, because clients differ in where they listen. Clients differ as well in the interface on which they
-join the group, so its frames go out on the loopback interface and on the one that the routes name, never beyond this
-computer. Nothing here blocks: the board server calls it.
-What it cannot read is counted. Its clock counts from its own start, as that of another computer would.
+frame either to the multicast group or to each client: to the data port of its computer and, after a keep-alive, also to
+the client's sending port, because clients listen on one or the other. Clients also join the group on different
+interfaces, so frames go out on the loopback interface and on the default route's, never beyond this computer. Nothing
+here blocks: the board server calls it. Malformed requests are counted. Its clock starts with it, like another computer's.
 """
 
 import socket
@@ -41,8 +40,8 @@ from hil.scene import Points
 from hil.servers.dongle_server import HOST
 from hil.servers.natnet_bytes import encode_frame, encode_models, encode_server_info
 
-MAX_CLIENTS = 16  # one more displaces the one that has been silent for longest
-MAX_COMMAND = 256  # bytes of a request that are looked at
+MAX_CLIENTS = 16  # one more replaces the client silent for longest
+MAX_COMMAND = 256  # bytes of a request that are read
 
 _RELEASES: dict[Version, tuple[int, int, int, int]] = {
     (3, 1): (2, 2, 0, 0),
@@ -50,7 +49,7 @@ _RELEASES: dict[Version, tuple[int, int, int, int]] = {
 }  # of Motive
 _TICKS_PER_US = 10  # the performance counter of its computer
 _NO_PARENT = 0xFFFF_FFFF  # -1 as the unsigned number that clients read
-_PASSIVE = 0  # label of a marker that does not shine by itself
+_PASSIVE = 0  # label of a passive marker
 _OCCLUDED, _RECONSTRUCTED, _FILLED, _OF_MODEL = 1, 2, 4, 8  # bits of a labelled marker
 _SEEN, _UNSEEN = _RECONSTRUCTED | _OF_MODEL, _OCCLUDED | _FILLED | _OF_MODEL
 _HEADER = struct.Struct("<HH")  # kind, length
@@ -70,9 +69,9 @@ _TURNS: dict[Up, Callable[[float, float, float], Vector]] = {  # from W to the a
 
 @dataclass(frozen=True, slots=True)
 class Streaming:
-    """What Motive's streaming pane says."""
+    """The settings of Motive's streaming pane."""
 
-    port: int  # of commands, 0: any; frames go to the next one, which clients are told
+    port: int  # of commands, 0: any; frames go to the next one, which is announced to clients
     version: Version
     multicast: bool  # to the group, else to each client
     up: Up = "y"  # the axis; z: those of the world
@@ -87,21 +86,21 @@ def streaming_of(config: CaptureConfig) -> Streaming:
 
 @dataclass(frozen=True, slots=True)
 class _Client:
-    """Who has connected."""
+    """A connected client."""
 
     version: Version
-    keeps_alive: bool  # then it takes frames where it speaks from; others would take them for answers
+    keeps_alive: bool  # then it takes frames on its sending port; others would read them as answers
 
 
 def in_axes(up: Up, p_WB: Vector, q_WB: Quaternion) -> tuple[Vector, Quaternion]:
-    """A pose as Motive streams it, in its axes for world and body alike."""
+    """Return a pose as Motive streams it, in its axes for both world and body."""
     w, a, b, c = q_WB
     turn = _TURNS[up]
     return turn(*p_WB), (w, *turn(a, b, c))
 
 
 def _send(sender: socket.socket, data: bytes, to: Address) -> None:
-    with suppress(OSError):  # a full buffer, nobody there: UDP loses packets then
+    with suppress(OSError):  # a full buffer or no listener: UDP loses packets then
         sender.sendto(data, to)
 
 
@@ -147,9 +146,9 @@ class VirtualMotive:
             )
         )
         self._readers = readers
-        self._clients: dict[Address, _Client] = {}  # who spoke last comes last
+        self._clients: dict[Address, _Client] = {}  # the latest sender is last
         self._number = 0
-        # Of the frame that is being put together.
+        # Of the frame being assembled.
         self._seen: list[BodyPose] = []
         self._labelled: list[LabelledMarker] = []
         self._unlabelled: list[Vector] = []
@@ -175,7 +174,7 @@ class VirtualMotive:
             each.close()
 
     def take(self, body: int, frame: MocapFrame, now_us: int, sighting: Sighting | None = None) -> None:
-        """Take what was seen of a body, of another clock, on which it is `now_us`; the last body completes a frame."""
+        """Take a body's frame of another clock, whose time is `now_us`; the last body completes a frame."""
         p, q = in_axes(self._up, frame.p_WB, frame.q_WB)
         error = 0.0 if sighting is None else sighting.error
         self._seen.append(BodyPose(body, p, q, error, frame.valid))
@@ -189,7 +188,7 @@ class VirtualMotive:
         self._number += 1
         sent = self._ticks()
         exposed, received = (
-            max(0, sent - (now_us - t_us) * _TICKS_PER_US)  # nothing lies before the start
+            max(0, sent - (now_us - t_us) * _TICKS_PER_US)  # not before the start
             for t_us in (frame.t_us, now_us if frame.received_us is None else frame.received_us)
         )
         whole = Frame(
@@ -214,11 +213,11 @@ class VirtualMotive:
             _send(self._socket, encoded[version], target)
 
     def _ticks(self) -> int:
-        """What Motive's clock shows."""
+        """Return the time of Motive's clock."""
         return (clock_us() - self._start_us) * _TICKS_PER_US
 
     def _targets(self) -> dict[Address, Version]:
-        """Where frames go without multicast, and in which version."""
+        """Return the frames' destinations without multicast, with their versions."""
         ports = {(host, self.data_port): client.version for (host, _), client in self._clients.items()}
         return ports | {at: client.version for at, client in self._clients.items() if client.keeps_alive}
 
@@ -226,7 +225,7 @@ class VirtualMotive:
         """Take one datagram and answer it."""
         try:
             data, client = self._socket.recvfrom(2048)
-        except OSError:  # the report of an earlier packet that a client did not want
+        except OSError:  # reports an earlier packet that a client refused
             return
         kind, size = _HEADER.unpack_from(data) if len(data) >= HEADER_SIZE else (None, 0)
         payload = data[HEADER_SIZE:]
@@ -263,18 +262,18 @@ class VirtualMotive:
         )
 
     def _admit(self, address: Address, client: _Client) -> None:
-        """Note that a client is there."""
+        """Register a client."""
         self._clients.pop(address, None)
         self._clients[address] = client
         if len(self._clients) > MAX_CLIENTS:
             del self._clients[next(iter(self._clients))]
 
     def _version_of(self, client: Address) -> Version:
-        """The version that a client is spoken to in."""
+        """Return the protocol version used for a client."""
         return self._clients[client].version if client in self._clients else self._version
 
     def _obey(self, command: bytes, client: Address) -> bytes:
-        """Return the answer to a command: only the one about the version is known."""
+        """Return the answer to a command; only the version command is supported."""
         name, comma, wanted = command.partition(b",")
         if name != b"Bitstream":
             return packet(MessageId.UNRECOGNIZED)
@@ -289,12 +288,12 @@ class VirtualMotive:
         return _REFUSED
 
     def _all_turned(self, points: Points) -> list[Vector]:
-        """Points (N, 3) of W or B in Motive's axes."""
+        """Return points (N, 3) of W or B in Motive's axes."""
         turn = _TURNS[self._up]
         return [turn(x, y, z) for x, y, z in points.tolist()]
 
     def _labels(self, body: int, sighting: Sighting) -> list[LabelledMarker]:
-        """All the markers of a body that is tracked: those that nobody sees stand where the body has them."""
+        """Return all markers of a tracked body; unseen ones are at their places on the body."""
         points, seen = self._all_turned(sighting.points), sighting.seen.tolist()
         rows = zip(points, seen, sighting.residuals.tolist(), strict=True)
         return [

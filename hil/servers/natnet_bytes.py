@@ -1,4 +1,4 @@
-"""What Motive says on the network, as bytes: the other direction of `ground_station.sources.natnet`, whose values it packs.
+"""Motive's network messages as bytes: packs the values that `ground_station.sources.natnet` unpacks.
 
 Pure functions; sockets: `hil.servers.motive`. Layouts: those of `ground_station.sources.natnet`.
 """
@@ -32,14 +32,14 @@ _RIGID_BODY = 1  # kind of a description
 
 
 def encode_server_info(info: ServerInfo) -> bytes:
-    """The answer to CONNECT, alike in all versions."""
+    """Return the answer to CONNECT, the same in all versions."""
     group = (int(part) for part in info.group.split("."))
     rest = (*info.app_version, *info.natnet_version, info.clock_hz, info.data_port, info.multicast, *group)
     return packet(MessageId.SERVER_INFO, SERVER_INFO.pack(info.name.encode(), *rest))
 
 
 def encode_models(models: ModelDefinition, version: Version) -> bytes:
-    """The answer to REQUEST_MODELDEF."""
+    """Return the answer to REQUEST_MODELDEF."""
     rest = [_COUNT.pack(len(models.bodies))]
     for body in models.bodies:
         described = _described(body, version)
@@ -79,7 +79,7 @@ def _described(body: BodyDescription, version: Version) -> bytes:
 
 
 def _section(items: Sequence[bytes], version: Version) -> bytes:
-    """A list in a frame; from 4.1 on its size in bytes follows the count."""
+    """Return a list in a frame; from 4.1 on its size in bytes follows the count."""
     data = b"".join(items)
     size = _COUNT.pack(len(data)) if version >= (4, 1) else b""
     return _COUNT.pack(len(items)) + size + data

@@ -1,8 +1,8 @@
-"""Where the serial line of a served board comes out: a pty, a UDP socket that talks first, or a TCP port.
+"""The open end of a served board's serial line: a pty, a UDP socket that sends first, or a TCP port.
 
-The line itself (baud rate, buffers, wrong bits) is `hil.devices.uart`; here bytes are only passed on. Nothing here
-blocks: what a client does not take is lost, as on a line without flow control, and a client that leaves is not noticed
-on board.
+`hil.devices.uart` is the line itself (baud rate, buffers, bit errors); this file only passes bytes on. Nothing here
+blocks: bytes that a client does not read are lost, as without flow control, and the board does not notice when a client
+leaves.
 """
 
 import os
@@ -23,7 +23,7 @@ Received = Callable[[int, bytes], object]  # (now_us, data)
 READ_SIZE = 4096
 WHOLE_SIZE = (
     1 << 18
-)  # more than a client's socket holds back on the loopback interface in one turn of the server
+)  # more than a client's socket buffers on the loopback interface in one turn of the server
 UDP_PORT = 14550  # where ground stations listen
 TCP_PORT = 5760  # where vehicles listen
 PTYS = "/dev/pts/"
@@ -33,13 +33,13 @@ EXPECTED = "expected pty, pty:PATH, udp, udp:PORT, udp:HOST:PORT, tcp, tcp:PORT 
 class Endpoint(Protocol):
     """One open end."""
 
-    master: str  # what MAVProxy calls it, after `--master=`
+    master: str  # its name for MAVProxy, after `--master=`
 
     def send(self, data: bytes) -> None:
-        """Pass bytes of the board on to the client, if there is one."""
+        """Pass the board's bytes to the client, if there is one."""
 
     def close(self) -> None:
-        """Give everything back; to close it again changes nothing."""
+        """Release all resources; closing again has no effect."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Address:
     path: Path | None = None  # of a link to the pty
 
     def open(self, readers: Readers, received: Received) -> Endpoint:
-        """Open it; `received` gets what clients send. `LabError` when that is impossible."""
+        """Open it; `received` gets the clients' bytes. Raises `LabError` on failure."""
         where = self.path or f"{self.host}:{self.port}"
         try:
             if self.kind == "pty":
@@ -95,7 +95,7 @@ class PtyEnd:
         self._link = link
         self._closed = False
         if link is not None and link.is_symlink() and os.readlink(link).startswith(PTYS):
-            link.unlink()  # left behind by a server that was killed
+            link.unlink()  # left by a killed server
         self._master, self._slave = os.openpty()  # the slave stays open, so that clients may come and go
         self._forget_unread = partial(termios.tcflush, self._slave, termios.TCIFLUSH)
         device = os.ttyname(self._slave)
@@ -112,7 +112,7 @@ class PtyEnd:
         readers[self._master] = self._read
 
     def send(self, data: bytes) -> None:
-        """Pass bytes on; when nobody reads, those that wait are given up."""
+        """Pass bytes on; drop the waiting ones when nobody reads."""
         try:
             written = os.write(self._master, data)
         except BlockingIOError:
@@ -126,7 +126,7 @@ class PtyEnd:
 
     def close(self) -> None:
         """Remove the pty and the link to it."""
-        if self._closed:  # its descriptors and its link may be those of another end by now
+        if self._closed:  # another end may use its descriptors and its link by now
             return
         self._closed = True
         if self._link is not None:
@@ -154,12 +154,12 @@ class UdpEnd:
         readers[self._socket] = self._read
 
     def send(self, data: bytes) -> None:
-        """Send a datagram; it is lost when nobody listens."""
+        """Send a datagram; it is lost without a listener."""
         with suppress(OSError):
             self._socket.send(data)
 
     def _read(self, now_us: int) -> None:
-        with suppress(OSError):  # the report of a datagram that nobody wanted
+        with suppress(OSError):  # reports a datagram that nobody received
             self._received(now_us, self._socket.recv(READ_SIZE))
 
     def close(self) -> None:
@@ -186,7 +186,7 @@ class TcpEnd:
         self._readers[client] = partial(self._read, client)
 
     def send(self, data: bytes) -> None:
-        """Pass bytes on; what a slow client does not take is lost for it."""
+        """Pass bytes on; a slow client loses those it does not read."""
         for client in self._clients.copy():
             try:
                 client.send(data)
@@ -196,7 +196,7 @@ class TcpEnd:
                 self._leave(client)
 
     def _read(self, client: socket.socket, now_us: int) -> None:
-        """Take all that a client has sent, so that no frame of another's comes into the middle of one of its own."""
+        """Read all that a client has sent, so that another client's frames do not split its own."""
         try:
             data = client.recv(WHOLE_SIZE)
         except BlockingIOError:

@@ -45,7 +45,7 @@ class BoardFiles:
             raise LabError(f"--state {folder}: {error.strerror}") from None
 
     def load(self) -> None:
-        """Put into the memories what was kept; `LabError` for a file that is no such memory."""
+        """Load the stored memories. Raises `LabError` for a file that is not such a memory."""
         for path, memory in self._memories.items():
             try:
                 content = path.read_bytes()
@@ -58,7 +58,7 @@ class BoardFiles:
             memory[:] = self._kept[path] = content
 
     def keep(self) -> None:
-        """Write what has changed; a file is never half written."""
+        """Write changed memories; a file is never half written."""
         for path, memory in self._memories.items():
             if memory == self._kept.get(path, b""):
                 continue
@@ -74,16 +74,16 @@ class BoardFiles:
 CHANNEL = 80
 RATE_NAMES = ("250K", "1M", "2M")  # in a URI
 UDP_RETRY_US = 500_000
-STAYS_US = 1_000_000  # a radio that was moved and stays there this long is reported
-UDP_QUEUE = 1000  # packets of a program that wait at the host: cflib does not repeat over UDP
+STAYS_US = 1_000_000  # a radio's new setting is reported once it has stayed this long
+UDP_QUEUE = 1000  # packets of a program waiting at the host: cflib does not repeat over UDP
 
 
 def address_of(number: int) -> bytes:
-    """Radio address of board 1, 2, ...: the Crazyflie's default, then E7E7E7E702 and on."""
+    """Return the radio address of board 1, 2, ...: the Crazyflie's default, then E7E7E7E702 and on."""
     return bytes((0xE7, 0xE7, 0xE7, 0xE7, 0xE7 if number == 1 else number))
 
 
-WORLD = Goal((0.0, 0.0, 0.0), 0.0)  # seen from here a pose is absolute
+WORLD = Goal((0.0, 0.0, 0.0), 0.0)  # relative to this goal a pose is absolute
 
 
 class _PosesOnly(LoopbackLink):
@@ -99,13 +99,13 @@ class _PosesOnly(LoopbackLink):
         self._settings = settings
 
     def start_telemetry(self, now_us: int) -> None:
-        """Send settings instead."""
+        """Send the settings instead."""
         for packet in self._settings():
             self._transmit(now_us, packet)
 
 
 class ServedRobot:
-    """One robot and its ends; it is the `PoweredProcessor` of its radio chip, and boots the robot."""
+    """One robot and its connections; it is the `PoweredProcessor` of its radio chip, and boots the robot."""
 
     def __init__(
         self,
@@ -123,7 +123,7 @@ class ServedRobot:
         self.number = number
         self.udp: UdpServer | None = None
         self._say = say
-        self._udp_awaited = False  # somebody else has the port
+        self._udp_awaited = False  # another program has the port
         self._line_end: Endpoint | None = None
         patient = config.radio.model_copy(update={"uplink_queue": UDP_QUEUE})
         self.udp_radio = VirtualRadio(patient, events, rng, air, wire_us)
@@ -145,13 +145,13 @@ class ServedRobot:
 
     @property
     def uri(self) -> str:
-        """Where cflib finds it on the radio."""
+        """Its radio URI for cflib."""
         radio = self.nrf51.settings
         rate = RATE_NAMES[RATES.index(radio.bits_per_second)]
         return f"radio://0/{radio.channel}/{rate}/{radio.address.hex().upper()}"
 
     def serve_udp(self, port: int, readers: Readers) -> str:
-        """Be reachable over UDP, too; returns the URI."""
+        """Serve it over UDP, too; return the URI."""
         self.udp = UdpServer(
             port, readers, self.udp_radio.uplink, lambda text: self._say(f"board {self.number}: {text}")
         )
@@ -160,23 +160,23 @@ class ServedRobot:
         return f"udp://127.0.0.1:{self.udp.port}"
 
     def _poll(self, now_us: int) -> None:
-        """Fetch what an image has to say, as the dongle of a client on UDP would: no poll of it is modelled."""
+        """Fetch an image's packets, as a dongle would for a client on UDP: its polls are not modelled."""
         if self.udp is not None and self.udp.has_session(now_us):
             self.robot.polled(now_us)
 
     def serve_mavlink(self, address: Address, readers: Readers) -> str:
-        """Lead the serial line out; returns what MAVProxy calls its end. Only for a robot with a UART."""
+        """Open the serial line; return its name for MAVProxy. Only for a robot with a UART."""
         assert self.robot.uart is not None
         self._line_end = address.open(readers, self.robot.uart.uplink)
         return self._line_end.master
 
     def keep(self) -> None:
-        """Write down what survives a restart of the server."""
+        """Write the memories that survive a restart of the server."""
         if self._files is not None:
             self._files.keep()
 
     def close(self) -> None:
-        """Close what was opened for clients."""
+        """Close the connections to clients."""
         self.keep()
         if self.udp is not None:
             self.udp.close()
@@ -185,9 +185,9 @@ class ServedRobot:
             self._line_end = None
 
     def fly(self, absolute: bool = False) -> None:
-        """Send poses from a ground station on a wire that no client sees: corrections for home, or absolute poses.
+        """Send poses from a ground station on a link hidden from clients: corrections for home, or absolute poses.
 
-        With absolute poses the goal is the clients' matter.
+        With absolute poses the clients set the goal.
         """
         config = self.robot.config
         settings = (
@@ -239,7 +239,7 @@ class ServedRobot:
             self.udp.close()
 
     def greet(self, now_us: int) -> None:
-        """Talk to the radio from now on: its client is newer than that on UDP."""
+        """Switch to the radio: its client is newer than that on UDP."""
         if self.udp is not None:
             self.udp.end_session()
 
@@ -250,7 +250,7 @@ class ServedRobot:
         self.robot.polled(now_us)
 
     def retuned(self, now_us: int) -> None:
-        """Report where the radio is, once it has stayed there: a program that scans moves it a hundred times."""
+        """Report the radio's setting once it is stable: a scanning program changes it a hundred times."""
         settings = self.nrf51.settings
 
         def report(now_us: int) -> None:
@@ -264,7 +264,7 @@ class ServedRobot:
         self.robot.events.at(now_us + STAYS_US, report)
 
     def _open_udp(self, now_us: int) -> None:
-        """Listen again; while the board was off, another program may have taken the port: then try until it is free."""
+        """Listen again; if another program took the port while the board was off, try until it is free."""
         if self.udp is None or not self.robot.powered:
             return
         try:
@@ -280,7 +280,7 @@ class ServedRobot:
             self._say(f"board {self.number}: udp port {self.udp.port} is open again")
 
     def _settings_at_boot(self) -> AirSettings:
-        """Return where the firmware sets the radio at boot: to its configuration block; nowhere else when that is none."""
+        """Return the radio setting at boot, from the configuration block; unchanged without a valid one."""
         try:
             block = decode_config(bytes(self._memory.eeprom[:CONFIG_SIZE]))
             return AirSettings(block.channel, RATES[block.data_rate], block.address.to_bytes(5))
@@ -290,7 +290,7 @@ class ServedRobot:
     # Packets of the board
 
     def _send(self, now_us: int, data: bytes) -> bool:
-        """Send a packet of the firmware to who talked to it: the UDP session if there is one, else the radio."""
+        """Send a packet of the firmware to its client: the UDP session if there is one, else the radio."""
         if self.udp is not None and self.udp.has_session(now_us):
             return self.udp_radio.downlink(now_us, data)
         return self.nrf51.send(now_us, data)
@@ -305,7 +305,7 @@ class ServedRobot:
 
 
 def _pose_kind(absolute: bool) -> Sequence[bytes]:
-    """Return what sets what the poses are: an image that has booted begins with absolute ones."""
+    """Return the setting of the kind of poses: a booted image begins with absolute ones."""
     return (encode_pose_kind(absolute),)
 
 

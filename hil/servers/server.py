@@ -1,4 +1,4 @@
-"""Robots for real clients, paced: one laboratory whose time follows the wall clock and that answers sockets in between."""
+"""Serves robots to real clients: one laboratory follows the wall clock and answers sockets in between."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -37,14 +37,14 @@ from hil.servers.serial_server import Address
 from hil.servers.served_robot import ServedRobot
 from hil.world.body import Channel
 
-DONGLE_SEED = 10_000  # random streams of dongles: apart from those of the robots
-# Of each USB transfer: cflib and the socket of the dongle, unpaced, manage 4500 exchanges per second.
+DONGLE_SEED = 10_000  # random streams of dongles: separate from those of the robots
+# Of each USB transfer: cflib and the dongle's socket, unpaced, reach 4500 exchanges per second.
 HOST_SHARE_US = 110
-BUTTON_US = 5_000_000  # off, or in the bootloader with nobody talking to it: then somebody presses the button
+BUTTON_US = 5_000_000  # off, or in the bootloader without a client: then the button is pressed
 
 
 class Ends:
-    """What leads the robots of a laboratory out; open what is wanted, `close` at the end."""
+    """The connections of a laboratory's robots to clients; open those you need, `close` at the end."""
 
     def __init__(self, lab: Laboratory, readers: Readers, config: LabConfig, seed: int) -> None:
         self.robots: list[ServedRobot] = []
@@ -61,13 +61,13 @@ class Ends:
         return self._dongles.address
 
     def serve_udp(self, port: int) -> list[str]:
-        """Offer every robot on UDP, from this port on; returns their URIs."""
+        """Offer every robot on UDP, from this port on; return their URIs."""
         return [
             robot.serve_udp(port + robot.number - 1 if port else 0, self._readers) for robot in self.robots
         ]
 
     def serve_mavlink(self, addresses: Sequence[Address]) -> list[str]:
-        """Lead out the serial line of every robot; returns what MAVProxy calls their ends."""
+        """Open the serial line of every robot; return their names for MAVProxy."""
         try:
             return [
                 robot.serve_mavlink(address, self._readers)
@@ -78,7 +78,7 @@ class Ends:
             raise
 
     def serve_motive(self, settings: Streaming) -> VirtualMotive:
-        """Let Motive see every robot, under its number."""
+        """Stream every robot from Motive, under its number."""
         names = {robot.number: name_of(robot.number) for robot in self.robots}
         markers = self.robots[0].robot.body.markers.places if self._config.markers.enabled else NO_POINTS
         self.motive = VirtualMotive(settings, names, self._readers, markers)
@@ -95,7 +95,7 @@ class Ends:
             self.motive.close()
 
     def _new_dongle(self) -> VirtualDongle:
-        """Return a dongle at a real host, which takes its share of every exchange itself."""
+        """Return a dongle at a real host, which takes real time in every exchange."""
         self._seed += 1
         rng = Streams.of_seed(self._seed).radio
         radio = self._config.radio
@@ -106,17 +106,17 @@ class Ends:
 
 
 def name_of(number: int) -> str:
-    """What Motive calls a body."""
+    """Return Motive's name for a body."""
     return "floaty" if number == 1 else f"floaty{number}"
 
 
 class Shown:
-    """Shows a served robot to who looks on, with home as its goal: nobody here knows those of the clients."""
+    """Shows a served robot to onlookers, with home as its goal: the clients' goals are unknown here."""
 
     def __init__(self, served: ServedRobot, onlooker: Onlooker) -> None:
         self._served = served
         if served.robot.firmware.flashed is None:
-            # A task that a fault may add later: the columns are those of all tasks.
+            # A fault may add this task later, but the columns must include all tasks.
             served.robot.thief.share = 0.0
         self._firmware = served.robot.firmware
         config = served.robot.config
@@ -144,10 +144,10 @@ class Shown:
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """What is served: `count` robots of a profile, and what happens to them.
+    """What to serve: `count` robots of a profile, and their faults.
 
-    `faults` act from the first release of each robot on. EEPROM and deck memories are kept in the folder `state`;
-    `executor` is what is on board.
+    `faults` act from the first release of each robot on. The folder `state` stores EEPROM and deck memories; `executor`
+    executes the firmware.
     """
 
     config: LabConfig
@@ -160,7 +160,7 @@ class Service:
 
 
 class Server:
-    """Robots that are let go when they fly, and put back when they are lost; `run` them after opening ends.
+    """Releases robots when they fly and returns lost ones; open ends, then `run`.
 
     `say` gets lines for the user, `onlooker` sees the first robot.
     """
@@ -211,7 +211,7 @@ class Server:
         self.lab.events.every(RECORD_PERIOD_US, RECORD_PHASE_US, partial(self._look, served, holder))
 
     def run(self, stopping: Callable[[], bool]) -> None:
-        """Go on until told to stop; may be called again."""
+        """Run until `stopping` returns true; may be called again."""
 
         def progress(now_us: int) -> None:
             for line in self.clock.notices():

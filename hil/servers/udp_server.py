@@ -1,11 +1,10 @@
 """A board on `udp://127.0.0.1:PORT`: one datagram is one CRTP packet, for quick use without a radio.
 
-The first client is the session: the board hears it alone, until it is silent for `SESSION_TIMEOUT_US` (cflib pings ten
-times per second) or its port is closed. Packets of others are counted and reported in one line. Who looks for boards sends
-an empty packet and is answered without becoming the session.
+The first client is the session: the board receives only its packets, until it is silent for `SESSION_TIMEOUT_US` (cflib
+pings ten times per second) or its port is closed. Packets of others are counted and reported in one line. A scan for
+boards sends an empty packet and is answered without becoming the session.
 
-What happens between here and the board is the matter of a `VirtualRadio`, which repeats what the air loses: cflib does not
-repeat over UDP.
+A `VirtualRadio` carries packets between here and the board and repeats lost ones: cflib does not repeat over UDP.
 """
 
 import socket
@@ -19,7 +18,7 @@ from hil.errors import LabError
 from hil.servers.dongle_server import HOST
 
 SESSION_TIMEOUT_US = 1_000_000
-PROBE_PERIOD_US = 100_000  # between looks whether the session's port is still open, while others send
+PROBE_PERIOD_US = 100_000  # between checks of the session's port, while others send
 IP_RECVERR = 11  # Linux: report that a client's port is closed
 MAX_PACKET = 31
 
@@ -27,7 +26,7 @@ Address = tuple[str, int]
 
 
 class UdpServer:
-    """One board's port (0: any, kept afterwards). `received` gets the packets of the session, `say` lines for the user."""
+    """One board's port (0: any, then fixed). `received` gets the packets of the session, `say` lines for the user."""
 
     def __init__(
         self, port: int, readers: Readers, received: Callable[[int, bytes], None], say: Callable[[str], None]
@@ -41,11 +40,11 @@ class UdpServer:
         self.open()
 
     def open(self) -> None:
-        """Listen (the board has power), without a session; `LabError` when somebody else has the port."""
+        """Listen (the board has power), without a session. Raises `LabError` when the port is taken."""
         if self._socket is not None:
             return
         self._session: Address | None = None
-        self._heard_us = 0  # when the session spoke last
+        self._heard_us = 0  # of the session's last packet
         self._probed_us = -PROBE_PERIOD_US
         opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         opened.setblocking(False)
@@ -61,21 +60,21 @@ class UdpServer:
         self._readers[opened] = self._read
 
     def close(self) -> None:
-        """Close the port (power off): clients are refused, which they notice."""
+        """Close the port (power off): clients get an error."""
         if self._socket is not None:
             del self._readers[self._socket]
             self._socket.close()
             self._socket = None
 
     def end_session(self) -> None:
-        """Let go of the client: it is gone, or one on another link is newer."""
+        """Drop the client: it is gone, or one on another link is newer."""
         if self.ignored:
             self._say(f"udp port {self.port}: {self.ignored} packets of others were ignored")
         self.ignored = 0
         self._session = None
 
     def has_session(self, now_us: int) -> bool:
-        """Whether a client talks to the board."""
+        """Whether a client is connected."""
         if self._socket is None or self._session is None:
             return False
         if now_us - self._heard_us > SESSION_TIMEOUT_US:
@@ -83,7 +82,7 @@ class UdpServer:
         return self._session is not None
 
     def send(self, data: bytes) -> None:
-        """Send a packet of the board to the session, if there is one."""
+        """Send the board's packet to the session, if there is one."""
         if self._socket is not None and self._session is not None:
             try:
                 self._socket.sendto(data, self._session)
@@ -96,7 +95,7 @@ class UdpServer:
         assert self._socket is not None
         try:
             data, client = self._socket.recvfrom(2048)
-        except ConnectionRefusedError:  # the report of an earlier packet: its client is gone
+        except ConnectionRefusedError:  # reports an earlier packet: its client is gone
             self.end_session()
             return
         except OSError:
@@ -112,14 +111,14 @@ class UdpServer:
         self._received(now_us, data)
 
     def _probe(self, now_us: int) -> None:
-        """Let go of a session whose port is closed: its program has ended, and cflib sends its first packet only once."""
+        """Drop a session whose port is closed: its program has ended, and cflib sends its first packet only once."""
         if now_us - self._probed_us >= PROBE_PERIOD_US:
             self._probed_us = now_us
-            for _ in range(2):  # the second reports what the first has found
+            for _ in range(2):  # the second reports the error of the first
                 self.send(bytes((NULL,)))
 
     def _admit(self, now_us: int, client: Address) -> bool:
-        """Make a client the session when there is none; refuse any other."""
+        """Make a client the session if there is none; refuse any other."""
         if client != self._session and self.has_session(now_us):
             self._probe(now_us)
         if self._session is not None and client != self._session:
