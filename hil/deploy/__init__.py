@@ -1,1 +1,1 @@
-"""The check that all targets are equal, and the tools that it needs."""
+"""The check that all targets compute the same, and its tools."""

@@ -1,12 +1,12 @@
-"""An image flies beside the Python board from one seed: what may differ, by how much, and what does.
+"""Compares an image with the Python board in flights from one seed, within bounds.
 
-A second flight takes the supervisor through its states, which have to be the same in the same order.
+A second flight takes the supervisor through its states, which must be the same in the same order.
 
 The two are never equal bit for bit: boot time, gyro zero, the estimator's phase and the board's microsecond differ
-(`hil.studies.two_boards`). The bounds are about four times what these make of an image that is right, in a hover of 4 s with
-a push and a link that is cut; the position then differs by 0.4 mm, the servo counts by 330 (rms). The first pose after the
-cut is about as old as the filter's horizon, and the phase decides whether it is fused: where one board takes it and the
-other waits for the next one, the estimate differs by 5 cm in one row of 400, which is 2.7 mm rms.
+(`hil.studies.two_boards`). The bounds are about four times the differences of a correct image, in a hover of 4 s with a
+push and a cut link; there the position differs by 0.4 mm, the servo counts by 330 (rms). The first pose after the cut is
+about as old as the filter's horizon, and the phase decides whether it is fused: if one board fuses it and the other waits
+for the next one, the estimate differs by 5 cm in one row of 400, which is 2.7 mm rms.
 """
 
 from collections.abc import Callable, Iterator
@@ -96,7 +96,7 @@ class Compared:
 
 
 def compare_flights(first: FlownRun, second: FlownRun) -> Iterator[Compared]:
-    """Yield what differs between the free flights of two runs, each beside its bound."""
+    """Yield the differences between the free flights of two runs, each with its bound."""
     flights = [free_flight(run.log) for run in (first, second)]
     rows = min(flight.num_rows for flight in flights)
     for bound in BOUNDS:
@@ -111,7 +111,7 @@ def compare_flights(first: FlownRun, second: FlownRun) -> Iterator[Compared]:
 def fly_beside_python(
     image: Path, profile: str, overrides: tuple[str, ...], progress: Callable[[str, int, Flight], None]
 ) -> tuple[list[Compared], list[str], list[str]]:
-    """Fly an image and the Python board; return the differences, and which ends and which states were others."""
+    """Fly an image and the Python board; return the differences in columns, outcomes and states."""
     options: Options = {"profile": profile, "overrides": overrides, "seed": SEED}
     disturbed: Options = {**options, "duration_s": SECONDS, "faults": FAULTS}
     requests = Request.of(HOVER, **disturbed), Request.of(DRILL, **options)
@@ -148,7 +148,7 @@ def states_of(folder: Path) -> list[str]:
 
 
 def compare_states(python: Path, image: Path) -> Iterator[str]:
-    """Yield the first state of the supervisor that one board reached, and the other did not."""
+    """Yield the first supervisor state that only one board reached."""
     both = zip_longest(states_of(python), states_of(image), fillvalue="the end")
     for number, (first, second) in enumerate(both, 1):
         if first != second:

@@ -1,8 +1,8 @@
-"""Flights in which every implementation of the flight core runs beside the one that flies, compared after every call.
+"""Flights that run every implementation of the flight core in parallel and compare them after every call.
 
-The reference is the board of every other flight: the core's Python compiled by numba. The targets are the same source as
-plain Python, as C for this machine, and as machine code of the Cortex-M4. After its last step a flight makes the two calls
-of a board whose controller has stopped and then flies by another gyro.
+The reference is the board of all other flights: the core's Python compiled by numba. The targets are the same source as
+plain Python, as C for this machine, and as machine code of the Cortex-M4. After its last step a flight makes the two
+calls of a board whose controller has stopped and which then flies by another gyro.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,7 +30,7 @@ from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Options, Request
 
 DEFAULT = ("hover", "yaw-step")  # and the one with faults: 10 000 ticks in all
-LATER_US = 1_000_000  # without a look of the supervisor: it has lost the controller
+LATER_US = 1_000_000  # without a step of the supervisor: it has lost the controller
 LONGEST_S = 60.0  # of an experiment with --all: `endurance` takes half an hour
 FAULTY_S = 65.0
 FAULTS = (
@@ -42,7 +42,7 @@ FAULTS = (
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """One flight and how the targets did."""
+    """One flight and the results of its targets."""
 
     request: Request
     outcome: str  # completed, lost (and why), interrupted, error (and which)
@@ -51,12 +51,12 @@ class Checked:
 
     @property
     def failed(self) -> bool:
-        """Whether a board did not hold out to the end."""
+        """Whether a board did not fly to the end."""
         return self.outcome.startswith("error")
 
     @property
     def equal(self) -> bool:
-        """Whether no target has differed in any bit."""
+        """Whether all targets are equal bit for bit."""
         return all(target.divergence is None for target in self.targets)
 
 
@@ -102,7 +102,7 @@ def check_flight(
 
 
 def reached(checked: Sequence[Checked]) -> tuple[str, str]:
-    """Return which of the supervisor's states and causes flights reached, and which none of them reached, as text."""
+    """Return the supervisor's states and causes that flights reached, and those that none reached, as text."""
     states, causes = map(set, zip(*{pair for one in checked for pair in one.reached}, strict=True))
     there = {_word(state): state in states for state in State}
     there |= {_word(cause): cause in causes for cause in Cause if cause}
@@ -119,9 +119,8 @@ def plan(
 ) -> list[Request]:
     """Return the flights to check: one experiment, every one, or by default hover and yaw step.
 
-    All but the first have with them a hover with the faults that act on the robot, and those that take the supervisor
-    through its states. What only own logic can cause needs targets that are built for it (`own_logic`), and a profile
-    that has none itself.
+    All but the first also include a hover with the faults that act on the robot, and flights through the supervisor's
+    states. Causes that only user logic has need targets built for it (`own_logic`), and a profile without any.
     """
     duration_s, faults = options.get("duration_s"), options.get("faults", ())
     if every and experiment is not None:

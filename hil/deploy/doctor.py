@@ -1,7 +1,7 @@
-"""What is connected, in plain words: firmware, app, link, memory, core, IMU and servos of a real board.
+"""Examines a real board and reports in plain words: firmware, app, link, memory, core, IMU and servos.
 
-Nothing moves. The core that is tried has memory of its own; for half a second the board is taken into the loop, behind which
-it seeks its gyro's zero anew.
+Nothing moves. The tested core has separate memory; for half a second the board is in the loop, and then finds its gyro's
+zero again.
 """
 
 from collections.abc import Iterator
@@ -39,14 +39,14 @@ from hil.devices.sample_window import SampleWindow
 
 ROUND_TRIPS = 100
 BURST = 600  # packets
-LOSSY = 0.1  # of them repeated
-LOOKS = 60  # at the gyro, with as many different samples
-LOOP_SAMPLES = 500  # of the gyro, which a board in the loop takes in as many milliseconds
+LOSSY = 0.1  # share of them repeated
+LOOKS = 60  # readings of the gyro, with as many different samples
+LOOP_SAMPLES = 500  # of the gyro; a board in the loop takes one per millisecond
 LOOP_TIMEOUT_US = 5_000_000
 LOOK_S = 0.001
 TICKS = 20  # of the core
 VERSION_TIMEOUT_S = 1.0
-STILL_COUNTS = 100.0  # standard deviation; that of the board's own search for the zero
+STILL_COUNTS = 100.0  # standard deviation; from the board's own gyro calibration
 ZERO_MAX = 100.0  # [counts] 6 deg/s: the data sheet allows 1 deg/s
 PULSE_COUNTS = (21_000, 42_000)
 BATTERY_MV = (3_000, 4_350)
@@ -54,7 +54,7 @@ BATTERY_MV = (3_000, 4_350)
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One line: what was looked at, what was found, and whether that is as it should be."""
+    """One line: the item, the finding, and whether it is correct."""
 
     subject: str
     text: str
@@ -62,7 +62,7 @@ class Finding:
 
 
 def examine(client: CoreClient, config: LabConfig) -> Iterator[Finding]:
-    """Yield what is found. Raises `LinkError` when the board does not answer, or flies."""
+    """Yield the findings. Raises `LinkError` when the board does not answer, or flies."""
     firmware = _firmware(client)
     try:
         about = client.begin()
@@ -86,7 +86,7 @@ def examine(client: CoreClient, config: LabConfig) -> Iterator[Finding]:
 
 
 def _firmware(client: CoreClient) -> Finding:
-    """Ask the stock firmware's platform service."""
+    """Query the stock firmware's platform service."""
     ask = bytes((VERSION_FIRMWARE,))
     client.packets.send_any(crtp.encode(crtp.Packet(crtp.PORT_PLATFORM, PLATFORM_VERSION, ask)))
     end_us = clock_us() + round(VERSION_TIMEOUT_S * 1e6)
@@ -112,7 +112,7 @@ def _app(about: About, config: LabConfig) -> Iterator[Finding]:
 
 
 def _link(client: CoreClient, poses_hz: float) -> Finding:
-    """Measure the link; a flight needs one packet per pose, and repeats none."""
+    """Measure the link; a flight needs one packet per pose, without repeats."""
     trips_us = []
     for _ in range(ROUND_TRIPS):
         start_us = clock_us()
@@ -162,7 +162,7 @@ def _health(client: CoreClient) -> Iterator[Finding]:
 
 
 def _core(client: CoreClient, about: About, config: LabConfig) -> Finding:
-    """Have some ticks computed there and here."""
+    """Compute some ticks on the board and here."""
     try:
         blocks = CoreBlocks(
             parameters_of(config), lambda blocks: RealCore(blocks, client), load_logic(config.logic)
@@ -192,7 +192,7 @@ def _loop(client: CoreClient) -> Finding:
     while window.used < LOOP_SAMPLES and clock_us() - start_us < LOOP_TIMEOUT_US:
         if not window.full:
             window.put((0, 0, 0))
-        # Before the board tells anything it takes nothing.
+        # The board takes no samples before its first report.
         while told and client.packets.ready and (data := window.packet(clock_us())) is not None:
             client.packets.send_any(crtp.encode(crtp.Packet(PORT_CORE, CHANNEL_LOOP, data)))
         told = _told(client, window) or told
@@ -205,7 +205,7 @@ def _loop(client: CoreClient) -> Finding:
 
 
 def _told(client: CoreClient, window: SampleWindow) -> Looped | None:
-    """Let the window hear what the board tells, of which the last is returned; a full one waits for it."""
+    """Pass the board's reports to the window and return the last; wait for one if the window is full."""
     told = None
     for packet in map(crtp.decode, client.packets.received(LOOK_S if window.full else 0.0)):
         if (packet.port, packet.channel) == (PORT_CORE, CHANNEL_LOOP):

@@ -1,7 +1,7 @@
 """Two flights that take the supervisor through all of its states and causes.
 
-Parameters and the watchdog's food arrive over the radio, as a client sends them. What lasts for seconds happens while the
-robot is held. In free flight poses and samples fail for a moment; in the end the watchdog of the emergency stop starves.
+Parameters and watchdog packets arrive over the radio, as from a client. Changes that last for seconds happen while the
+robot is held. In free flight poses and samples fail for a moment; at the end the watchdog of the emergency stop expires.
 The cause `no control` belongs to a board whose controller has stopped: `hil.deploy.check` ends each flight with it.
 """
 
@@ -32,13 +32,13 @@ GO_TO = encode(
     )
 )
 STOP = encode(Packet(high_level.PORT, 0, bytes((high_level.PathCommand.STOP, 0))))
-THRUST = encode(Packet(PORT_COMMANDER, 0, bytes(12) + b"\1\0"))  # an attitude set-point: it is refused
+THRUST = encode(Packet(PORT_COMMANDER, 0, bytes(12) + b"\1\0"))  # an attitude set-point, which is refused
 FAILING = Path(firmware_py.logic.__path__[0]) / "failing.py"
 RECOVERY = ((0.0, "floaty.stop", Scalar.U8, 1), (0.2, "floaty.stop", Scalar.U8, 0))
 
 
 def drill(flight: Flight) -> None:
-    """Plan the first poses and what a client does and undoes: disarm, stop, tighten bounds, move the flaps, plan a path."""
+    """Plan the first poses and a client's reversed actions: disarm, stop, tighten bounds, move the flaps, plan a path."""
     estimator, supervisor = flight.config.estimator, flight.config.supervisor
     [cameras] = KINDS["mocap.dropout"].knobs
     cameras.turn(flight.robot, 1.0)
@@ -67,14 +67,14 @@ def drill(flight: Flight) -> None:
 
 
 def fail(flight: Flight) -> None:
-    """Plan when own logic returns NaN."""
+    """Plan the time at which user logic returns NaN."""
     for start_s, name in ((2.0, "logic.law_fails"), (3.0, "logic.filter_fails")):
         plan(flight, start_s, (0.0, name, Scalar.F32, 1), (0.2, name, Scalar.F32, 0))
         plan(flight, start_s + 0.4, *RECOVERY)
 
 
 def plan(flight: Flight, start_s: float, *writes: tuple[float, str, Scalar, float]) -> None:
-    """Plan writes of parameters: when after the start [s], name, type and value."""
+    """Plan writes of parameters: time after the start [s], name, type and value."""
     for after_s, name, scalar, value in writes:
         packet = encode_set_by_name(SetByName(name, scalar, value))
         at_us = round((start_s + after_s) * 1e6)

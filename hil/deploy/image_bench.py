@@ -1,7 +1,7 @@
-"""An image on the bench: the emulated chip at rest, a client on its radio, and its memory in view.
+"""Tests an image on the bench: the emulated chip at rest, a client on its radio, and access to its memory.
 
-What a client can write is compared with the table of parameters that the profile exports; the servo outputs with the
-registers that make 400 Hz of them. Nothing flies here.
+The parameters that a client can write are compared with the table that the profile exports, the servo outputs with the
+registers for 400 Hz. Nothing flies here.
 """
 
 import re
@@ -26,9 +26,9 @@ from hil.events import EventQueue
 from hil.laboratory.robot import BENCH_NOISE, Streams
 
 STEP_US = 1_000
-ANSWER_US = 200_000  # within which a client gets the answer to a write
+ANSWER_US = 200_000  # time limit for the answer to a write
 ACT_US = 20_000  # from a request until the stabilizer task has served it
-STALE_US = 150_000  # from a controller's last step until the app has put the servos to hover, and more
+STALE_US = 150_000  # more than from a controller's last step until the app has moved the servos to hover
 CONTROLLER, OTHER_CONTROLLER = "stabilizer.controller", 1
 TARGET = re.compile(r"(\w+)(?:\.(\w+))?(?:\[(\d+)\])?$")  # of an `AppParameter`
 TIMERS = {"TIM3": 0x4000_0400, "TIM5": 0x4000_0C00}  # RM0090 section 2.3
@@ -36,7 +36,7 @@ PORTS = {"GPIOA": 0x4002_0000, "GPIOB": 0x4002_0400}
 TIMER_REGISTERS = {"CR1": 0x00, "CCMR1": 0x18, "CCMR2": 0x1C, "CCER": 0x20, "PSC": 0x28, "ARR": 0x2C}
 PORT_REGISTERS = {"MODER": 0x00, "OTYPER": 0x04, "AFRL": 0x20}
 # 84 MHz / 4 / 52501 = 400 Hz; PWM mode 1 with preload, active high; alternate function 2, open drain.
-SERVO_OUTPUTS: tuple[tuple[str, str, int, int], ...] = (  # register, of, mask, value
+SERVO_OUTPUTS: tuple[tuple[str, str, int, int], ...] = (  # register, peripheral, mask, value
     *((timer, name, 0xFFFF, value) for timer in TIMERS for name, value in (("CR1", 0x81), ("PSC", 3), ("ARR", 52_500))),
     ("TIM3", "CCMR1", 0xFFFF, 0x6868), ("TIM3", "CCER", 0xFF, 0x11),
     ("TIM5", "CCMR2", 0xFFFF, 0x6868), ("TIM5", "CCER", 0xFF00, 0x1100),
@@ -48,7 +48,7 @@ SERVO_OUTPUTS: tuple[tuple[str, str, int, int], ...] = (  # register, of, mask, 
 def check_parameters(
     table: Sequence[AppParameter], board: "ImageBench", progress: Callable[[int], None] = lambda done: None
 ) -> Iterator[str]:
-    """Yield every way in which a board's parameters differ from the table; the board is left as it was."""
+    """Yield every difference between a board's parameters and the table; the board is restored."""
     for done, parameter in enumerate(table):
         yield from _check_parameter(parameter, board)
         progress(done + 1)
@@ -82,13 +82,13 @@ def _check_parameter(parameter: AppParameter, board: "ImageBench") -> Iterator[s
 
 
 def _behind(parameter: AppParameter, value: float) -> float:
-    """Return the number in memory for a client's value, rounded as the board does."""
+    """Return the number in memory for a client's value, rounded as on board."""
     product = float(np.float32(parameter.scale) * np.float32(value))
     return parameter.place.scalar.cast(product)
 
 
 def _values(parameter: AppParameter, scalar: Scalar) -> list[float]:
-    """Return a value inside the limits, not the default, and those right outside that the type can hold."""
+    """Return a value inside the limits, not the default, and those just outside that fit the type."""
     low, high = (float(np.float32(limit)) for limit in (parameter.low, parameter.high))
     if scalar.is_float:
         inside = [scalar.cast(low + share * (high - low)) for share in (0.625, 0.375)]
@@ -122,7 +122,7 @@ class ImageBench:
         self._of_parameters = flashed.image.symbol("floaty_toc_apply").address
 
     def constants(self, config: FirmwareConfig) -> str:
-        """Return in which constants the image differs from a profile; empty: in none."""
+        """Return the image's constants that differ from a profile; empty if none."""
         return self._firmware.differences(config)
 
     def scalar(self, name: str) -> Scalar | None:
@@ -130,11 +130,11 @@ class ImageBench:
         return self._table[name].scalar if name in self._table else None
 
     def value(self, name: str) -> float:
-        """Return a parameter as a client reads it."""
+        """Return a parameter as read by a client."""
         return self._table[name].read()
 
     def write(self, name: str, value: float) -> None:
-        """Write a parameter over the radio. Raises `LabError` when no answer comes."""
+        """Write a parameter over the radio. Raises `LabError` without an answer."""
         entry = self._table[name]
         ident = encode_ident(entry.number)
         data = encode(Packet(PORT_PARAMETERS, CHANNEL_WRITE, ident + entry.scalar.pack(value)))
@@ -150,11 +150,11 @@ class ImageBench:
         )
 
     def field(self, parameter: AppParameter) -> float:
-        """Return the number in memory that a parameter acts on."""
+        """Return the number in memory that a parameter sets."""
         return self.memory(parameter.target, parameter.place.scalar)
 
     def memory(self, target: str, scalar: Scalar) -> float:
-        """Return a number by its expression in C, like `floaty_parameters.trim[2]`."""
+        """Return a number in memory by its C expression, like `floaty_parameters.trim[2]`."""
         image = self._firmware.image
         matched = TARGET.match(target)
         assert matched is not None
@@ -165,7 +165,7 @@ class ImageBench:
         return scalar.unpack(self._firmware.chip.read(address, scalar.size))
 
     def check_switches(self) -> Iterator[str]:
-        """Yield what the parameters that are requests do not do: stop, disarm, start the estimator afresh."""
+        """Yield the failures of the request parameters: stop, disarm, restart the estimator."""
         for name, value, target in (
             ("stop", 1, "floaty_supervisor.stopped"), ("stop", 0, "floaty_supervisor.stopped"),
             ("armed", 0, "floaty_supervisor.armed"), ("armed", 1, "floaty_supervisor.armed"),
@@ -179,7 +179,7 @@ class ImageBench:
             yield f"floaty.reset = 1: floaty_estimator.tick = {ticks:g} goes on, expected from 0 again"
 
     def check_watch(self) -> Iterator[str]:
-        """Yield what is wrong with the watch over the controller: it acts when another one runs, and only then."""
+        """Yield the failures of the controller's watch: it must act when another controller runs, and only then."""
         hovers = self.memory("floaty_observed.stale_hovers", Scalar.U32)
         if hovers:
             yield f"servos put to hover {hovers:g} times for a controller that stands still, expected 0: none does"
@@ -198,7 +198,7 @@ class ImageBench:
             self.run(ACT_US)
 
     def check_servo_outputs(self) -> Iterator[str]:
-        """Yield the registers of timers and pins that are not as the servos need them."""
+        """Yield the registers of timers and pins that are wrong for the servos."""
         for unit, name, mask, expected in SERVO_OUTPUTS:
             base, offset = (
                 (TIMERS[unit], TIMER_REGISTERS[name])
@@ -210,7 +210,7 @@ class ImageBench:
                 yield f"servo outputs: {unit}.{name} = 0x{found:x}, expected 0x{expected:x}"
 
     def run(self, us: int) -> None:
-        """Let time pass, with a sample of the IMU each millisecond."""
+        """Run for a time, with an IMU sample each millisecond."""
         for _ in range(us // STEP_US):
             self._now_us += STEP_US
             self._firmware.kernel.run(self._now_us)

@@ -1,4 +1,4 @@
-"""What `floaty deploy check --elf` proves of everything around the core that was linked, and what it does not."""
+"""The checks of `floaty deploy check --elf` on everything linked around the core, and their limits."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,7 +13,7 @@ from hil.laboratory.lockstep import image_at
 from hil.stm32f405.image import Image, MemoryUse
 
 FREE_LEAST = 1024  # [bytes]
-APP = "floaty_toc_apply"  # there is one in images with the exported app
+APP = "floaty_toc_apply"  # exists in images with the exported app
 UNPROVEN = (
     "values of log variables; limits that the laboratory's own parameters do not have",
     "absolute poses and the stock commander, manual angles, poses through the app channel",
@@ -25,14 +25,14 @@ Show = Callable[[str, int, int], None]  # (what, done, of how many)
 
 
 def check_memory(memory: tuple[MemoryUse, ...]) -> Finding:
-    """Return how full the memories are; less than a kilobyte left is a warning."""
+    """Return the use of the memories; less than a kilobyte left is a warning."""
     short = [f"{one.name} has less than {FREE_LEAST} B left" for one in memory if one.free < FREE_LEAST]
     uses = (f"{one.name} {one.used} B of {one.size}, {one.free} B free" for one in memory)
     return Finding("memory", "; ".join((*uses, *short)), not short)
 
 
 def check_image(elf: Path, profile: str, overrides: tuple[str, ...], show: Show) -> Iterator[Finding]:
-    """Yield what is found about the app in an image, on the bench and in flight. Raises `LabError`."""
+    """Yield the findings on an image's app, on the bench and in flight. Raises `LabError`."""
     config = load_config(profile, overrides)
     flashed = image_at(str(elf), None)
     show("boot", 0, 1)
@@ -64,7 +64,7 @@ def check_image(elf: Path, profile: str, overrides: tuple[str, ...], show: Show)
 
 
 def has_app(elf: Path) -> tuple[bool, tuple[MemoryUse, ...]]:
-    """Return whether an image has the exported app, and what it takes of the memories. Raises `LabError`."""
+    """Return whether an image has the exported app, and its memory use. Raises `LabError`."""
     image = Image(elf)
     return image.has(APP), image.memory
 

@@ -1,4 +1,4 @@
-"""The implementations of the flight core that `floaty deploy check` can put beside the one that flies."""
+"""The implementations of the flight core that `floaty deploy check` can compare with the flying one."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -26,7 +26,7 @@ TICK_HZ = 100
 
 
 def target_names(text: str | None) -> tuple[str, ...]:
-    """Return the targets that a comma-separated text names, real boards by their links; None: all but those.
+    """Return the targets in a comma-separated text, real boards by their links; None: all but boards.
 
     Raises `LabError`.
     """
@@ -42,7 +42,7 @@ def target_names(text: str | None) -> tuple[str, ...]:
 
 
 class Metered(CortexM4Runner):
-    """Machine code whose ticks are counted: the poses, the estimator and the controller of each."""
+    """Machine code with counted ticks: each has poses, the estimator and the controller."""
 
     def __init__(self, blocks: CoreBlocks, image: CoreImage, meter: Path, ticks: EntryLoad) -> None:
         super().__init__(blocks, image, meter)
@@ -50,7 +50,7 @@ class Metered(CortexM4Runner):
         self._so_far: tuple[int, int] | None = None  # instructions, cycles at the last tick's end; None: boot
 
     def call(self, name: str) -> int:
-        """Execute an entry point; with the controller a tick ends."""
+        """Execute an entry point; the controller's ends a tick."""
         answer = super().call(name)
         if name != "control":
             return answer
@@ -64,9 +64,9 @@ class Metered(CortexM4Runner):
 
 @dataclass(slots=True)
 class MachineCode:
-    """What the machine code takes of the board, over all flights of a check: memory, and processor time per tick."""
+    """The machine code's use of the board over all flights of a check: memory, and processor time per tick."""
 
-    flash_bytes: int | None  # None: with a firmware around it
+    flash_bytes: int | None  # None: part of a firmware
     ticks: EntryLoad
     entries: Loads = field(default_factory=dict)
     ram_bytes: int = 0
@@ -74,24 +74,24 @@ class MachineCode:
 
     @property
     def loads(self) -> tuple[float, float]:
-        """The share of the processor that a mean and the worst tick take."""
+        """The processor load of the mean and the worst tick."""
         return self.ticks.mean_us * 1e-6 * TICK_HZ, self.ticks.worst_us * 1e-6 * TICK_HZ
 
 
 class Toolbox:
     """Builds what the targets need, once.
 
-    `logic` is what flies beside the core, `source` is the text of a floaty_core.c in place of the exported one, `elf` a
-    linked firmware whose core is the machine code.
+    `logic` is the user's logic, `source` the text of a floaty_core.c that replaces the exported one, `elf` a linked
+    firmware whose core is the machine code.
 
-    Raises `LabError` for a compiler or package that is missing and for C that cannot be compiled.
+    Raises `LabError` for a missing compiler or package and for C that does not compile.
     """
 
     def __init__(
         self, names: Sequence[str], logic: LogicConfig, source: str | None = None, elf: Path | None = None
     ) -> None:
         self.machine_code: MachineCode | None = None
-        self.boards: dict[str, Loads] = {name: {} for name in names if is_link(name)}  # as they measured it
+        self.boards: dict[str, Loads] = {name: {} for name in names if is_link(name)}  # board measurements
         self._native: dict[str, RunnerFactory] = {}
         self._names = names
         if elf and CORTEX_M4 not in names:
@@ -113,7 +113,7 @@ class Toolbox:
             raise LabError(str(error)) from None
 
     def factories(self, stack: ExitStack) -> dict[str, RunnerFactory]:
-        """Return how to make the targets' runners, which end with the stack."""
+        """Return functions that make the targets' runners, which end with the stack."""
 
         def plain(blocks: CoreBlocks) -> CoreRunner:
             runner = PlainRunner(blocks)
@@ -140,7 +140,7 @@ class Toolbox:
         return {name: board(name) if is_link(name) else factories[name] for name in self._names}
 
     def _measure(self, runner: Metered) -> None:
-        """Note what memory a flight took."""
+        """Record a flight's memory use."""
         assert self.machine_code is not None
         self.machine_code.ram_bytes = runner.ram_bytes
         self.machine_code.stack_bytes = max(self.machine_code.stack_bytes, runner.stack_bytes)
@@ -148,6 +148,6 @@ class Toolbox:
 
 
 def add_loads(total: Loads, flight: Loads) -> None:
-    """Add what a flight took to what all before it have taken."""
+    """Add a flight's loads to the total."""
     for name, load in flight.items():
         total.setdefault(name, EntryLoad()).merge(load)
