@@ -1,1 +1,1 @@
-"""A microcontroller, which executes an image as it is flashed, and what is read of it while it runs."""
+"""A microcontroller that executes a flashed image, and tools that inspect it while it runs."""

@@ -1,8 +1,8 @@
 """An STM32F405 that executes an image: unicorn for the instructions, `native/` for everything around them.
 
-Time is that of the chip: cycles of 168 MHz since power-on. `run` goes on until an instant or until something outside is to
-be done; what is compiled calls no Python. Cycles are those of `firmware_py.export.cycles`, plus three for every jump; flash
-is taken to keep up with the core.
+Time counts in cycles of 168 MHz since power-on. `run` continues until a given time or until the caller must act; compiled
+code calls no Python. Cycles are those of `firmware_py.export.cycles`, plus three for every jump; flash is assumed to keep
+up with the core.
 """
 
 import mmap
@@ -34,25 +34,25 @@ POWER_ON, SOFTWARE, WATCHDOG = 0x0C00_0000, 0x1400_0000, 0x2400_0000
 
 
 class Why(IntEnum):
-    """Why a run ended before its time: `WHY_...` of machine.h."""
+    """Reasons why a run ended early: `WHY_...` of machine.h."""
 
     TIME = 0
     SERIAL = 1  # a USART has sent something and is silent now
     COMPARE = 2  # a timer's compare register has changed
-    RESET = 4  # software asks for a reset
-    WATCHDOG = 8  # the independent watchdog does
+    RESET = 4  # software requests a reset
+    WATCHDOG = 8  # the independent watchdog resets
     BREAK = 16
     LOCKUP = 32  # a fault inside the handler of a fault
     STEP = 64
     OVERFLOW = 128  # a task has written below its stack
     LOW_READ = 256  # the first read near address 0
     DIVISION = 512  # the first integer division by zero
-    WATCHPOINT = 1024  # an access that the debugger waits for, at most a block of instructions ago
+    WATCHPOINT = 1024  # an access that the debugger watches, at most a block of instructions ago
     LOW_WRITE = 2048  # the first write of an instruction near address 0
 
 
 def build_machine(folder: Path) -> Path:
-    """Compile `native/` for this machine; `folder` keeps it. Raises `ExportError`."""
+    """Compile `native/` for this machine into `folder`. Raises `ExportError`."""
     texts = {path.name: path.read_text(encoding="utf-8") for path in sorted(SOURCES.glob("*.[ch]"))}
     return compile_texts(
         texts, [name for name in texts if name.endswith(".c")], HOST_FLAGS, "machine.so", folder, zig()
@@ -61,7 +61,7 @@ def build_machine(folder: Path) -> Path:
 
 @cache
 def declared() -> Any:
-    """Return what machine.h declares, as cffi knows it. Raises `ExportError` when cffi is missing."""
+    """Return the declarations of machine.h for cffi. Raises `ExportError` when cffi is missing."""
     try:
         from cffi import FFI
     except ImportError:
@@ -74,10 +74,10 @@ def declared() -> Any:
 
 
 class Chip:
-    """One microcontroller with an image in flash, in reset; `state` has the clock and what has happened.
+    """One microcontroller with an image in flash, in reset; `state` has the clock and the machine's state.
 
-    `code` begins with the vector table, which `base` is the address of; `constants` are its half words that are no
-    instructions, counted from there. Raises `ExportError` when unicorn is missing.
+    `code` begins with the vector table at address `base`; `constants` are the half words without instructions, counted
+    from there. Raises `ExportError` when unicorn is missing.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Chip:
             unicorn_const.UC_ARCH_ARM, unicorn_const.UC_MODE_THUMB | unicorn_const.UC_MODE_MCLASS
         )
         self._cpu.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
-        self._cpu.ctl_set_tlb_mode(unicorn_const.UC_TLB_VIRTUAL)  # machine.c says who may execute
+        self._cpu.ctl_set_tlb_mode(unicorn_const.UC_TLB_VIRTUAL)  # machine.c decides what is executable
         self._numbers = _register_numbers(arm_const)
         self._map(unicorn_const)
         self._ffi = declared()
@@ -114,13 +114,13 @@ class Chip:
         ]
         self._sent = self._ffi.new("uint8_t[]", self._library.LINE_BYTES)
         self._kept: list[NDArray[np.uint8]] = []  # memory of devices
-        self.breakpoints: set[int] = set()  # of a debugger: addresses before whose instructions a run stops
-        self.crash_points: set[int] = set()  # of who reports crashes
+        self.breakpoints: set[int] = set()  # of a debugger: a run stops before these instructions
+        self.crash_points: set[int] = set()  # of the crash reports
         self._planted: set[int] = set()
         self.reset(POWER_ON)
 
     def _map(self, const: Any) -> None:
-        """Map flash, RAM, CCM and the system's memory. The alias of flash at 0 is mapped when it is used (`run`)."""
+        """Map flash, RAM, CCM and the system's memory. The alias of flash at 0 is mapped at its first use (`run`)."""
         read, write, execute = const.UC_PROT_READ, const.UC_PROT_WRITE, const.UC_PROT_EXEC
         self._system = _memory(SYSTEM_SIZE)
         self._system[:] = 0xFF
@@ -135,7 +135,7 @@ class Chip:
         self.set_system(FLASH_KBYTES, (FLASH_SIZE // 1024).to_bytes(2, "little"))
 
     def _engine(self, loaded: Any) -> Any:
-        """Return unicorn's functions, out of the library that its package has loaded."""
+        """Return unicorn's functions from the library that its package has loaded."""
         engine = self._ffi.new("struct engine *", {"uc": self._ffi.cast("uc_engine *", self._cpu._uch.value)})
         unicorn = self._ffi.dlopen(loaded._name)
         for name, field in self._ffi.typeof(engine[0]).fields[1:]:
@@ -150,7 +150,7 @@ class Chip:
 
     @property
     def in_block(self) -> bool:
-        """Whether it stands where it would not have stood by itself, in the middle of a block of instructions."""
+        """Whether it stopped inside a block of instructions, where it would not stop by itself."""
         return bool(self.state.resume == self.state.pc)
 
     @property
@@ -159,7 +159,7 @@ class Chip:
         return int(self.state.now) // CYCLES_PER_US
 
     def run(self, until_cycles: int) -> int:
-        """Run up to an instant, or until something outside is to be done; return why it ended, a sum of `Why`."""
+        """Run up to a time, or until the caller must act; return why it ended, a sum of `Why`."""
         if self.breakpoints | self.crash_points != self._planted:
             self._plant(self.breakpoints | self.crash_points)
         why: int = self._library.machine_run(self.state, until_cycles)
@@ -168,7 +168,7 @@ class Chip:
         return why
 
     def _map_alias(self) -> None:
-        """Let flash be seen at 0 as well, as it is from a start on."""
+        """Map flash at 0 as well, as after a normal start."""
         from unicorn import unicorn_const as const
 
         rights = const.UC_PROT_READ | const.UC_PROT_EXEC
@@ -176,7 +176,7 @@ class Chip:
 
     def step(self) -> int:
         """Execute one instruction."""
-        self._cpu.ctl_flush_tb()  # hooks act on what is translated after them, and until it is forgotten
+        self._cpu.ctl_flush_tb()  # hooks act on code translated after them, until it is flushed
         why: int = self._library.machine_step(self.state)
         if why & Why.LOW_READ:
             self._map_alias()
@@ -184,28 +184,28 @@ class Chip:
         return why
 
     def reset(self, cause: int) -> None:
-        """Reset the processor: memory stays, time goes on."""
+        """Reset the processor: memory is kept, time continues."""
         self._library.machine_reset(self.state, self.vectors, cause)
 
     # Pins
 
     def pin(self, port: str, number: int, high: bool) -> None:
-        """Give a pin a level from outside."""
+        """Set a pin's level from outside."""
         self._library.machine_pin(self.state, ord(port) - ord("A"), number, int(high))
 
     def feed(self, usart: int, data: bytes) -> int:
-        """Let bytes arrive at USART 1..6, from now on; returns how many found room on the line."""
+        """Let bytes arrive at USART 1..6, from now on; return how many the line accepted."""
         return int(self._library.usart_feed(self.state, usart - 1, data, len(data)))
 
     def sent(self, usart: int) -> bytes:
-        """Return what USART 1..6 has sent since the last time."""
+        """Return the bytes that USART 1..6 has sent since the last call."""
         size = self._library.machine_sent(self.state, usart - 1, self._sent)
         return bytes(self._ffi.buffer(self._sent, size)) if size else b""
 
     def add_device(
         self, bus: int, address: int, memory: NDArray[np.uint8], address_bytes: int = 1, pairs: bool = False
     ) -> None:
-        """Put memory behind a 7-bit address on I2C 1..3; `pairs`: every byte written has its own address before it."""
+        """Add memory at a 7-bit address on I2C 1..3; `pairs`: every written byte follows its own address."""
         self._kept.append(memory)
         place = self._pointer(memory)
         at = bus - 1, address, place, memory.size, address_bytes, pairs
@@ -213,14 +213,14 @@ class Chip:
             raise LabError("more I2C devices than there is room for")
 
     def set_system(self, address: int, contents: bytes) -> None:
-        """Write what stands in the chip's own memory: OTP, unique id."""
+        """Write the chip's own memory: OTP, unique id."""
         begin = address - SYSTEM
         self._system[begin : begin + len(contents)] = np.frombuffer(contents, np.uint8)
 
     # Debugging
 
     def read(self, address: int, size: int) -> bytes:
-        """Return memory, or registers as the core would read them. Raises `LabError` where there is neither."""
+        """Return memory, or registers as the core reads them. Raises `LabError` at any other address."""
         for base, end, read, _ in self._registers:
             if base <= address and address + size <= end:
                 words = range(address & ~3, address + size, 4)
@@ -231,7 +231,7 @@ class Chip:
         return self.view(address, size).tobytes()
 
     def view(self, address: int, size: int) -> NDArray[np.uint8]:
-        """Return memory that goes on to change. Raises `LabError` where there is none."""
+        """Return a live view of memory. Raises `LabError` at any other address."""
         array, begin = self._place(address, size)
         return array[begin : begin + size]
 
@@ -266,7 +266,7 @@ class Chip:
 
     @property
     def task_return(self) -> int:
-        """Return EXC_RETURN of the last exception that has interrupted a task."""
+        """Return EXC_RETURN of the last exception that interrupted a task."""
         return int(self.state.task_return)
 
     def set_register(self, name: str, value: int) -> None:
@@ -281,21 +281,21 @@ class Chip:
         self._cpu.ctl_flush_tb()
 
     def _plant(self, addresses: set[int]) -> None:
-        """Tell the machine of the breakpoints."""
+        """Set the machine's breakpoints."""
         for address in addresses ^ self._planted:
             if not self._library.machine_break(self.state, address, int(address in addresses)):
                 raise LabError("more breakpoints than there is room for")
         self._planted = addresses
-        self._cpu.ctl_flush_tb()  # hooks act on what is translated after them
+        self._cpu.ctl_flush_tb()  # hooks act on code translated after them
 
 
 def _memory(size: int) -> NDArray[np.uint8]:
-    """Return zeroed memory that begins at a page of this machine."""
+    """Return zeroed memory, aligned to a page of this machine."""
     return np.frombuffer(mmap.mmap(-1, size), np.uint8)
 
 
 def _sums_before(code: bytes, base: int, constants: frozenset[int], first_bit: int) -> NDArray[np.uint64]:
-    """Return the cycles and, from a bit on, instructions that begin before each half word of flash."""
+    """Return the sums of cycles and, from a bit on, instructions before each half word of flash."""
     before = (base - FLASH) // 2
     counted = count(code, constants)
     sums = counted.cycles + (counted.instructions.astype(np.uint64) << np.uint64(first_bit))

@@ -1,10 +1,9 @@
-"""What a firmware died of, in words: a fault, an assertion or its watchdog, with task, function, line and who called.
+"""Reports of a firmware's crash: a fault, an assertion or its watchdog, with task, function, line and callers.
 
-A hang and a stack overflow are reported when they are seen, because what they lead to names somebody else.
+A hang and a stack overflow are reported when they are detected, because their consequences blame other code.
 
-A handler of faults, and the function that a failed assertion calls, are looked at when their first instruction is about to
-run: `addresses` are the breakpoints of that. The bits are those of the ARMv7-M Architecture Reference Manual, B3.2.15 and
-B3.2.16.
+Fault handlers and the function of failed assertions are inspected before their first instruction runs: `addresses` has
+these breakpoints. The bits are those of the ARMv7-M Architecture Reference Manual, B3.2.15 and B3.2.16.
 """
 
 from contextlib import suppress
@@ -21,11 +20,11 @@ from hil.stm32f405.image import Image
 
 CFSR, HFSR, MMFAR, BFAR = 0xE000_ED28, 0xE000_ED2C, 0xE000_ED34, 0xE000_ED38
 USES_PSP = 1 << 2  # in EXC_RETURN
-NOT_STACKED = 1 << 12  # in CFSR: there is no frame of who was interrupted
+NOT_STACKED = 1 << 12  # in CFSR: the interrupted code has no frame
 FAULTS = {3: "HardFault", 4: "MemManage fault", 5: "BusFault", 6: "UsageFault"}
 FIRST_INTERRUPT = 16
 LONGEST_TEXT = 128
-NULL_SIZE = 0x400  # of what is reached through a null pointer: a member of a structure, an item of an array
+NULL_SIZE = 0x400  # reach of a null pointer: a member of a structure, an item of an array
 NAMES = (*(f"r{n}" for n in range(13)), "sp", "lr", "pc")
 CFSR_WORDS = {
     0: "an instruction fetched where none may be executed", 1: "access to protected memory",
@@ -44,11 +43,11 @@ VECTOR_UNREADABLE = 1 << 1  # in HFSR
 
 @dataclass(frozen=True, slots=True)
 class Crash:
-    """Why the firmware did not go on."""
+    """Why the firmware stopped."""
 
     what: str  # what happened
     who: str  # the task or interrupt in which it happened
-    trace: tuple[str, ...]  # where, in its caller, and so on: each `function (file.c:12)`
+    trace: tuple[str, ...]  # the place, its caller, and so on: each `function (file.c:12)`
 
     def __str__(self) -> str:
         runs = [(place, len(list(same))) for place, same in groupby(self.trace)]
@@ -67,37 +66,37 @@ class CrashReports:
 
     @property
     def addresses(self) -> frozenset[int]:
-        """Return where the machine has to stop for `here`, once: a handler may be a loop of one instruction."""
+        """Return where the machine must stop for `here`, once: a handler may be a loop of one instruction."""
         return frozenset({*self._handlers, self._assertion} - {0})
 
     def here(self) -> Crash:
-        """Return what happened, at one of `addresses`."""
+        """Return the crash at one of `addresses`."""
         if self._chip.register("pc") == self._assertion:
             return self._assertion_failed()
         return self._fault()
 
     def watchdog(self) -> Crash:
-        """Return who ran when the watchdog had waited long enough."""
+        """Return the code that ran when the watchdog expired."""
         return self._here("watchdog reset: nobody fed it in time; this ran then")
 
     def lockup(self) -> Crash:
-        """Return where the processor gave up: at a fault inside the handler of a fault, or on the way there."""
+        """Return where the processor gave up: at a fault inside a fault's handler or on entry to it."""
         return self._here(f"lock-up, no fault handler could run: {self._reasons()}")
 
     def overflow(self, task: int) -> Crash:
-        """Return whose stack has overflowed, and where it is now: it may have returned."""
+        """Return the task whose stack overflowed, and its current place: it may have returned."""
         registers, what = self._registers_of(task), "stack overflow"
         if self._kernel is not None and registers[SP] >= self._kernel.stack_begin(task):
             what += ", some calls before this place"
         return Crash(what, self._task(task), self._trace(registers))
 
     def hang(self, task: int, busy_us: int) -> Crash:
-        """Return where a task is that lets no other one of its priority or below run."""
+        """Return the place of a task that blocks all others of its priority or below."""
         what = f"hang: busy for {busy_us // 1000} ms without waiting for anything"
         return Crash(what, self._task(task), self._trace(self._registers_of(task)))
 
     def low_access(self, address: int, writes: bool) -> Crash:
-        """Return who uses a pointer that is 0, or an offset from it."""
+        """Return the code that uses a null pointer, or an offset from it."""
         pointer = "null pointer" if address < NULL_SIZE else "wild pointer"
         if writes:
             return self._here(f"{pointer}: write to 0x{address:08x}, which has no effect and causes no fault")
@@ -105,7 +104,7 @@ class CrashReports:
         return self._here(f"{what}, and the next reads are not reported")
 
     def division(self) -> Crash:
-        """Return who divides by zero."""
+        """Return the code that divides by zero."""
         return self._here(
             "division by zero: its result is 0; no fault follows, and the next ones are not reported"
         )
@@ -123,7 +122,7 @@ class CrashReports:
         )
 
     def _with_place(self, line: str, trace: tuple[str, ...]) -> tuple[str, ...]:
-        """Return a trace that begins at a line: a function's last call leaves no frame behind, or another line."""
+        """Return a trace that begins at a line: a function's last call leaves no frame, or another line."""
         place = self._image.place(code) if (code := self._image.debug.address_of(line)) else ""
         if not place or place in trace[:1]:
             return trace
@@ -187,14 +186,14 @@ class CrashReports:
         return self._numbered(stacked_registers(self._chip.read, psp, exc_return))
 
     def _trace(self, registers: dict[int, int]) -> tuple[str, ...]:
-        """Return the places of a backtrace, as far as the stack can be read and functions were called."""
+        """Return the places of a backtrace, as far as the stack can be read."""
         pcs: list[int] = []
         with suppress(LabError):
             for pc in self._image.debug.frames.backtrace(registers, self._word):
                 if pcs and not self._follows_call(pc + 1):
-                    break  # nobody calls the function of a task
+                    break  # the function of a task has no caller
                 pcs.append(pc)
-        # Compilers forget where a function's early end has its frame. Then the link register still knows the caller.
+        # Compilers omit the frame at a function's early end. The link register still has the caller then.
         caller = (registers[LR] & ~1) - 1
         elsewhere = self._image.function_at(caller) != self._image.function_at(registers[PC])
         if len(pcs) == 1 and elsewhere and self._follows_call(caller + 1):
@@ -210,11 +209,11 @@ class CrashReports:
         return bool((first & 0xF800 == 0xF000 and second & 0xD000 == 0xD000) or second & 0xFF87 == 0x4780)
 
     def _registers(self) -> dict[int, int]:
-        """Return r0 to pc as they are, by number."""
+        """Return the current r0 to pc by number."""
         return {number: self._chip.register(name) for number, name in enumerate(NAMES)}
 
     def _numbered(self, registers: dict[str, int]) -> dict[int, int]:
-        """Return r0 to pc by number; what was not kept is as it is now."""
+        """Return r0 to pc by number, with current values for unsaved ones."""
         return {n: registers.get(name, self._chip.register(name)) for n, name in enumerate(NAMES)}
 
     def _vector(self, exception: int) -> int:
@@ -224,7 +223,7 @@ class CrashReports:
         )
 
     def _text(self, address: int) -> str:
-        """Return a string of the image's constants; its address when there is none."""
+        """Return a string from the image's constants, or its address."""
         try:
             text = self._chip.read(address, LONGEST_TEXT).partition(b"\0")[0].decode("ascii")
         except (LabError, UnicodeDecodeError):

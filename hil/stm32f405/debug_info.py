@@ -1,7 +1,7 @@
-"""What the compiler wrote down about an image (DWARF): lines of addresses, members of structures, and who called whom:
-stack frames undone by the call frame information.
+"""Reads an image's debugging information (DWARF): lines of addresses, members of structures, and callers, by unwinding
+stack frames with the call frame information.
 
-Each compilation unit is read when something of it is asked for the first time.
+Each compilation unit is read at its first use.
 """
 
 from bisect import bisect_right
@@ -18,12 +18,12 @@ from hil.errors import LabError, hint
 SP, LR, PC = 13, 14, 15
 DEEPEST = 32
 SHARED = MAXIMUM = (
-    0xFFFF_FFFF  # in .debug_frame (32-bit DWARF), the mark of an entry that several functions share
+    0xFFFF_FFFF  # in .debug_frame (32-bit DWARF), the mark of an entry shared by several functions
 )
 
 
 class CallFrames:
-    """The rules of one image. Of its thousands of entries, only those of the functions in a backtrace are decoded."""
+    """The rules of one image. Only the entries of functions in a backtrace are decoded, of thousands."""
 
     def __init__(self, dwarf: Any) -> None:
         self._dwarf = dwarf
@@ -32,7 +32,7 @@ class CallFrames:
         self._entries = sorted(self._headers())
 
     def _headers(self) -> Iterator[tuple[int, int, int, int]]:
-        """Yield begin and end of a function's code, where its entry is, and where the entry that several share."""
+        """Yield begin and end of a function's code, and the places of its entry and of the shared one."""
         at = 0
         while at < len(self._content):
             length, shared, begin, size = unpack_from("<4I", self._content, at)
@@ -46,7 +46,7 @@ class CallFrames:
         `registers` has at least sp (13), lr (14) and pc (15); `read_word` reads the stack.
         """
         yield registers[PC]
-        if self._rules_at(registers[PC]) is None:  # a jump to where no function is has not changed the stack
+        if self._rules_at(registers[PC]) is None:  # a jump outside all functions has not changed the stack
             registers = registers | {PC: (registers[LR] & ~1) - 1}
             yield registers[PC]
         for _ in range(DEEPEST):
@@ -56,7 +56,7 @@ class CallFrames:
             yield registers[PC]
 
     def _caller(self, registers: dict[int, int], read_word: Callable[[int], int]) -> dict[int, int]:
-        """Return the registers as the caller had them at its call; empty when that cannot be found."""
+        """Return the caller's registers at its call; empty when unknown."""
         rules = self._rules_at(registers[PC])
         if rules is None or rules["cfa"].reg not in registers:
             return {}
@@ -66,20 +66,20 @@ class CallFrames:
             if isinstance(number, int) and number <= LR and rule.type == "OFFSET":
                 before[number] = read_word(frame + rule.arg)
         before[SP] = frame
-        # A return address follows its call, and with it perhaps the function: one before it lies inside the call.
+        # A return address follows its call and may lie behind the function; the byte before is inside the call.
         before[PC] = (before[LR] & ~1) - 1
         return before if (before[PC], frame) != (registers[PC], registers[SP]) else {}
 
     def _rules_at(self, address: int) -> dict[Any, Any] | None:
-        """Return how the frame of a function is undone at an address."""
+        """Return the rule that unwinds a function's frame at an address."""
         index = bisect_right(self._entries, (address, MAXIMUM)) - 1
         begin, end, at, shared = self._entries[index] if index >= 0 else (0, 0, 0, 0)
         if not begin <= address < end:
             return None
-        # Two entries alone, the second referring to the first, which is at 0.
+        # Only two entries; the second refers to the first, which is at 0.
         content = self._entry(shared) + self._entry(at)[:4] + bytes(4) + self._entry(at)[8:]
         common, own = call_frames(self._dwarf, content)
-        # A function that keeps nothing on its stack has no rows of its own, only those that all functions begin with.
+        # A function that saves nothing on its stack has only the rows with which all functions begin.
         rows = [row for row in own.get_decoded().table if row["pc"] <= address] or common.get_decoded().table
         return rows[-1] if rows else None
 
@@ -94,7 +94,7 @@ POINTER_SIZE = 4
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """Where a member lies in its structure."""
+    """The place of a member in its structure."""
 
     offset: int
     size: int
@@ -102,7 +102,7 @@ class Member:
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """A structure as the compiler laid it out; members of members by dotted names, those of anonymous ones directly."""
+    """A structure's layout; members of members have dotted names, those of anonymous ones their own."""
 
     name: str
     size: int
@@ -124,11 +124,11 @@ class DebugInfo:
 
     @cached_property
     def frames(self) -> CallFrames:
-        """Return what tells the callers of a function."""
+        """Return the rules to find a function's callers."""
         return CallFrames(self._dwarf)
 
     def line_at(self, address: int) -> str:
-        """Return file and line of an address of code as `file.c:12`, empty when the compiler did not say."""
+        """Return file and line of a code address as `file.c:12`, empty if unknown."""
         unit = self._unit_at(address)
         if unit is None:
             return ""
@@ -137,7 +137,7 @@ class DebugInfo:
         return table[index][1] if index >= 0 else ""
 
     def address_of(self, line: str) -> int:
-        """Return the first address of the code of `file.c:12`, 0 when there is none in that file itself."""
+        """Return the first code address of `file.c:12`, 0 if that file has none."""
         file = line.partition(":")[0]
         for _, _, unit in self._units:
             if Path(_name(unit.get_top_DIE())).name == file:
@@ -147,7 +147,7 @@ class DebugInfo:
         return 0
 
     def structure(self, name: str, address: int) -> Structure:
-        """Return `struct name` as the file around a function's address knows it; raises `LabError` when it does not."""
+        """Return `struct name` of the file with a function's address; raises `LabError` if it has none."""
         unit = self._unit_at(address)
         for entry in unit.iter_DIEs() if unit is not None else ():
             if entry.tag in AGGREGATES and "DW_AT_byte_size" in entry.attributes and _name(entry) == name:
@@ -157,7 +157,7 @@ class DebugInfo:
         raise LabError(f"{self._path}: struct {name} is not described around 0x{address:08x}")
 
     def variable(self, name: str, address: int) -> Structure:
-        """Return the structure that a variable has in the file around a function; raises `LabError` for no variable."""
+        """Return a variable's structure in the file of a function; raises `LabError` without such a variable."""
         unit = self._unit_at(address)
         for entry in unit.iter_DIEs() if unit is not None else ():
             if entry.tag == "DW_TAG_variable" and _name(entry) == name and "DW_AT_type" in entry.attributes:
@@ -172,7 +172,7 @@ class DebugInfo:
         pieces = []
         for unit in self._dwarf.iter_CUs():
             for low, high in _ranges(unit, lists):
-                if low:  # what the linker dropped lies at 0
+                if low:  # code dropped by the linker is at 0
                     pieces.append((low, high, unit))
         return sorted(pieces, key=lambda piece: piece[0])
 
@@ -182,7 +182,7 @@ class DebugInfo:
 
     @cached_property
     def _index(self) -> Any:
-        """Return what GCC writes so that not every unit has to be looked at; other compilers leave it out."""
+        """Return GCC's index, which saves reading every unit; other compilers omit it."""
         return self._dwarf.get_aranges()
 
     def _unit_at(self, address: int) -> Any:
@@ -211,7 +211,7 @@ class DebugInfo:
             index = state.file - first
             known = not state.end_sequence and 0 <= index < len(files) and state.line
             table.append((state.address, f"{files[index]}:{state.line}" if known else ""))
-        # At one address the last row counts, but the end of one piece yields to the beginning of the next.
+        # At one address the last row counts, but a piece's beginning takes precedence over another's end.
         return sorted(table, key=lambda row: (row[0], bool(row[1])))
 
 
@@ -246,7 +246,7 @@ def _name(entry: Any) -> str:
 
 
 def _members(entry: Any, prefix: str, base: int) -> list[tuple[str, Member]]:
-    """Return the members of a structure and of the structures in it, each with its full name."""
+    """Return the members of a structure and of its inner structures, each with its full name."""
     found = []
     for child in entry.iter_children():
         if child.tag != "DW_TAG_member":
@@ -270,7 +270,7 @@ def _stripped(kind: Any) -> Any:
 
 
 def _size(kind: Any) -> int:
-    """Return the size of a type in bytes, 0 when it is not known."""
+    """Return the size of a type in bytes, 0 if unknown."""
     kind = _stripped(kind)
     if "DW_AT_byte_size" in kind.attributes:
         return int(kind.attributes["DW_AT_byte_size"].value)

@@ -1,7 +1,7 @@
-"""FreeRTOS as it stands in the memory of a running image: tasks, stacks and heap, by symbols and debugging information.
+"""Reads FreeRTOS in the memory of a running image: tasks, stacks and heap, by symbols and debugging information.
 
-The names are those of FreeRTOS V10 (tasks.c, list.h, heap_4.c); where its members lie is read from the image, because that
-depends on its configuration. A look in the middle of a critical section sees what the kernel sees there.
+The names are those of FreeRTOS V10 (tasks.c, list.h, heap_4.c); the places of members are read from the image, because
+they depend on its configuration. A read during a critical section sees the kernel's temporary state.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Read = Callable[[int, int], bytes]  # (address, size)
 
 NO_FLOATS = 1 << 4  # in EXC_RETURN
 FRAME, FLOATS, PADDED = 0x20, 0x48, 1 << 9  # of an exception, ARMv7-M Architecture Reference Manual, B1.5.7
-UNUSED = 0xA5  # what a stack is filled with
+UNUSED = 0xA5  # fills a new stack
 WAITING_FOR_NOTIFICATION = 1
 STACK_CHUNK, MOST_TASKS = 64, 256
 RUNNING_TASK = "pxCurrentTCB"
@@ -26,12 +26,12 @@ HEAP, HEAP_LEAST = "xFreeBytesRemaining", "xMinimumEverFreeBytesRemaining"  # of
 
 @dataclass(frozen=True, slots=True)
 class TaskView:
-    """One task; `stack_free_bytes` were never used since it was created."""
+    """One task; `stack_free_bytes` were never used since its creation."""
 
     name: str
     state: str  # running, ready, blocked, suspended or deleted
     priority: int
-    base_priority: int  # without what it inherits of a mutex
+    base_priority: int  # without a priority inherited through a mutex
     stack_free_bytes: int
     block: int  # address of its control block
 
@@ -55,24 +55,24 @@ class FreeRtos:
 
     @property
     def places(self) -> tuple[int, int, int, int, int]:
-        """Return where the current task's pointer, in a task its stack and its list, and the ready lists begin and end."""
+        """Return the places of the current task's pointer, of a task's stack and list, and of the ready lists."""
         ready = self._image.symbol("pxReadyTasksLists")
         stack, container = self._task["pxStack"], self._task[f"xStateListItem.{self._container}"]
         return (self._current, stack.offset, container.offset, ready.address, ready.address + ready.size)
 
     @property
     def running(self) -> bool:
-        """Return whether the scheduler was started."""
+        """Return whether the scheduler has started."""
         return self._word(self._image.symbol("xSchedulerRunning").address) != 0
 
     @property
     def heap_free_bytes(self) -> int:
-        """Return what heap_4 has left."""
+        """Return the free bytes of heap_4."""
         return self._word(self._image.symbol(HEAP).address)
 
     @property
     def heap_least_free_bytes(self) -> int:
-        """Return what it had left when it was fullest."""
+        """Return its smallest number of free bytes so far."""
         return self._word(self._image.symbol(HEAP_LEAST).address)
 
     def tasks(self) -> list[TaskView]:
@@ -103,7 +103,7 @@ class FreeRtos:
                 item = self._word(item + self._item["pxNext"].offset)
 
     def _waits(self, task: int) -> bool:
-        """Return whether a task without a time-out waits for an event; FreeRTOS has it in the list of the suspended."""
+        """Return whether a task waits for an event without a time-out; FreeRTOS lists it as suspended."""
         event = self._word(task + self._task[f"xEventListItem.{self._container}"].offset)
         notified = self._read(task + self._task["ucNotifyState"].offset, 1)[0]
         return event != 0 or notified == WAITING_FOR_NOTIFICATION
@@ -135,7 +135,7 @@ class FreeRtos:
         return self._word(task + self._task["pxStack"].offset)
 
     def saved_registers(self, task: int) -> dict[str, int]:
-        """Return the registers of a task that does not run, as its port keeps them on its stack: those of the Cortex-M4F."""
+        """Return the registers that the Cortex-M4F port saved on the stack of a task that is not running."""
         place = self._word(task + self._task["pxTopOfStack"].offset)
         *saved, exc_return = unpack("<9I", self._read(place, 36))
         place += 36 + (0 if exc_return & NO_FLOATS else 64)
@@ -143,7 +143,7 @@ class FreeRtos:
         return registers | {f"r{4 + number}": value for number, value in enumerate(saved)}
 
     def _unused(self, stack: int) -> int:
-        """Return how many bytes from the far end of a stack on were never written."""
+        """Return how many bytes at the far end of a stack were never written."""
         unused = 0
         while True:
             chunk = self._read(stack + unused, STACK_CHUNK)
@@ -157,7 +157,7 @@ class FreeRtos:
 
 
 def stacked_registers(read: Read, frame: int, exc_return: int) -> dict[str, int]:
-    """Return what an exception has put on a stack, with the stack pointer before it; raises `LabError` without memory."""
+    """Return the registers that an exception stacked, and the previous stack pointer; raises `LabError` without memory."""
     stacked = unpack("<8I", read(frame, FRAME))
     size = FRAME + (0 if exc_return & NO_FLOATS else FLOATS) + (4 if stacked[7] & PADDED else 0)
     names = ("r0", "r1", "r2", "r3", "r12", "lr", "pc", "xpsr")

@@ -1,7 +1,7 @@
-"""`--gdb PORT`: a debugger on 127.0.0.1 at the chip in lockstep.
+"""`--gdb PORT`: connects a debugger on 127.0.0.1 to the chip in lockstep.
 
-While the chip stands at a breakpoint nothing else of the laboratory runs, so that no time passes in tunnel and radio, and
-the flight goes on as if it had never stood. Ctrl-C is seen each time the laboratory lets the chip run.
+While the chip is stopped at a breakpoint the whole laboratory waits: no time passes in tunnel and radio, and the flight
+continues as if it had not stopped. Ctrl-C is checked each time the laboratory runs the chip.
 """
 
 import select
@@ -18,10 +18,10 @@ READ_SIZE = 4096
 
 
 class GdbServer:
-    """One debugger at a time. Raises `LabError` when the port cannot be had."""
+    """Serves one debugger at a time. Raises `LabError` when the port is taken."""
 
     def __init__(self, port: int, waiting: Callable[[int], None] = lambda _: None) -> None:
-        """Listen; port 0 takes a free one. `waiting` gets the port when the machine stands and waits for a debugger."""
+        """Listen; port 0 takes a free one. `waiting` gets the port when the stopped machine waits for a debugger."""
         self._waiting = waiting
         self._client: socket.socket | None = None
         try:
@@ -38,11 +38,11 @@ class GdbServer:
 
     @property
     def port(self) -> int:
-        """Return the port that clients connect to."""
+        """Return the port for clients."""
         return int(self._listener.getsockname()[1])
 
     def hold(self, signal: int = SIGTRAP, watched: int | None = None) -> Wish:
-        """Let the machine stand until the debugger wants it to run, step, be left alone, or end; waits for one at first."""
+        """Stop the machine until the debugger runs, steps, leaves or ends it; wait for a debugger first."""
         if self._client is None:
             self._welcome()
         elif self._protocol.wish in (Wish.RUN, Wish.STEP):
@@ -55,7 +55,7 @@ class GdbServer:
         return wish
 
     def wants_to_stop(self) -> bool:
-        """Return whether the debugger pressed Ctrl-C, or a new one has come, while the machine ran. Never blocks."""
+        """Return whether the debugger sent Ctrl-C, or a new one connected, while the machine ran. Never blocks."""
         waiting = self._listener if self._client is None else self._client
         if not select.select([waiting], [], [], 0)[0]:
             return False
@@ -65,7 +65,7 @@ class GdbServer:
         return self._protocol.interrupted
 
     def stops_at(self, address: int) -> bool:
-        """Return whether the debugger has a breakpoint there."""
+        """Return whether the debugger has a breakpoint at an address."""
         return self._protocol.has_breakpoint(address)
 
     def close(self) -> None:
@@ -79,7 +79,7 @@ class GdbServer:
         self._protocol = RemoteProtocol(self._debuggee, self._kernel)
 
     def _receive(self) -> None:
-        """Answer what comes next; who hangs up has let the machine go."""
+        """Answer the next packet; a disconnected debugger releases the machine."""
         assert self._client is not None
         try:
             data = self._client.recv(READ_SIZE)
@@ -96,7 +96,7 @@ class GdbServer:
         try:
             self._client.sendall(data)
         except OSError:
-            return  # the next `recv` says that it has gone
+            return  # the next `recv` reports the disconnection
 
     def _part(self) -> None:
         if self._client is not None:
@@ -105,7 +105,7 @@ class GdbServer:
 
 
 class DebuggedChip:
-    """Runs a chip as its debugger wants it; at first it waits for one."""
+    """Runs a chip under its debugger; waits for one first."""
 
     def __init__(self, chip: Chip, server: GdbServer, kernel: FreeRtos | None = None) -> None:
         server.attach(chip, kernel)
@@ -113,7 +113,7 @@ class DebuggedChip:
         self._wish = Wish.STAND
 
     def run(self, until_cycles: int) -> int:
-        """Run up to an instant, or until something outside is to be done, as `Chip.run`.
+        """Run up to a time, or until the caller must act, like `Chip.run`.
 
         Raises `KeyboardInterrupt` when the debugger ends it.
         """
@@ -122,7 +122,7 @@ class DebuggedChip:
         seen: int = Why.TIME
         while True:
             stands = self._wish is Wish.STEP
-            # What is to be done outside is done between two blocks, as without a debugger.
+            # The caller acts between two blocks, as without a debugger.
             until = int(self._chip.state.now) if seen else until_cycles
             seen |= self._chip.step() & ~Why.STEP if stands else self._chip.run(until)
             pc = self._chip.register("pc")

@@ -1,6 +1,6 @@
 """GDB's remote serial protocol for a Cortex-M4F: packets in, packets out, without a socket or a clock.
 
-The machine stands still while packets are answered; `GdbServer` (gdb.py) carries the bytes.
+The machine is stopped while packets are answered; `GdbServer` (gdb.py) carries the bytes.
 """
 
 from collections.abc import Callable, Iterable
@@ -16,7 +16,7 @@ SIGINT, SIGTRAP = 2, 5
 INTERRUPT = 0x03
 ESCAPE, ESCAPED_WITH = 0x7D, 0x20
 MALFORMED, FAULT = b"E01", b"E0e"  # the numbers of EPERM and EFAULT
-# Name and bytes, in the order of the target description: its number is the number of the register on the wire.
+# Name and bytes, in the order of the target description: the index is the register's number on the wire.
 CORE = tuple((name, 4) for name in (*(f"r{n}" for n in range(13)), "sp", "lr", "pc", "xpsr"))
 FLOATING = (*((f"d{n}", 8) for n in range(16)), ("fpscr", 4))
 SYSTEM = tuple((name, 4) for name in ("msp", "psp", "primask", "basepri", "faultmask", "control"))
@@ -25,18 +25,18 @@ TYPES = {"sp": "data_ptr", "pc": "code_ptr", "msp": "data_ptr", "psp": "data_ptr
 
 
 class Debuggee(Protocol):
-    """A machine that stands still. Its registers have the names of `REGISTERS`; addresses in `breakpoints` are even."""
+    """A stopped machine. Its registers have the names of `REGISTERS`; addresses in `breakpoints` are even."""
 
     breakpoints: set[int]
 
     def watch(self, kind: int, address: int, size: int, on: bool) -> None:
-        """Stop after writes (2), reads (3) or both (4) of memory, or no longer; raises `LabError` where it cannot."""
+        """Set or clear a stop after writes (2), reads (3) or both (4) of memory; raises `LabError` if it cannot."""
 
     def read(self, address: int, size: int) -> bytes:
-        """Return memory; raises `LabError` where there is none."""
+        """Return memory; raises `LabError` at any other address."""
 
     def write(self, address: int, data: bytes) -> None:
-        """Change memory, code too; raises `LabError` where there is none."""
+        """Change memory, also code; raises `LabError` at any other address."""
 
     def register(self, name: str) -> int:
         """Return a register, without its sign."""
@@ -46,7 +46,7 @@ class Debuggee(Protocol):
 
 
 class Wish(Enum):
-    """What the debugger wants of the machine."""
+    """The debugger's request to the machine."""
 
     STAND = auto()
     RUN = auto()
@@ -56,11 +56,11 @@ class Wish(Enum):
 
 
 class MalformedError(Exception):
-    """A packet that does not say what its command needs."""
+    """A packet without the arguments of its command."""
 
 
 def target_description() -> str:
-    """Return the registers as GDB wants to be told of them."""
+    """Return the description of the registers for GDB."""
 
     def feature(name: str, registers: tuple[tuple[str, int], ...]) -> str:
         lines = "".join(
@@ -85,12 +85,12 @@ def framed(payload: bytes) -> bytes:
 
 @dataclass(slots=True)
 class Framing:
-    """Cuts what arrives into packets; what is longer than `2 * PACKET_SIZE` without an end is dropped."""
+    """Splits received bytes into packets; drops more than `2 * PACKET_SIZE` without an end."""
 
     _waiting: bytearray
 
     def take(self, data: bytes) -> list[bytes]:
-        """Return what is whole: `$payload` of good packets, `!` for each with a wrong checksum, `+`, `-` and Ctrl-C."""
+        """Return complete items: `$payload` of good packets, `!` for each with a wrong checksum, `+`, `-` and Ctrl-C."""
         self._waiting += data
         found = []
         while self._waiting:
@@ -111,12 +111,12 @@ class Framing:
 
 
 class RemoteProtocol:
-    """One debugger at one machine: what it asks is answered, what it wants of the machine stands in `wish`."""
+    """One debugger of one machine: answers its queries; `wish` is its request to the machine."""
 
     def __init__(self, debuggee: Debuggee, kernel: FreeRtos | None = None) -> None:
-        """`kernel` has the tasks that are GDB's threads, each by the address of its control block."""
+        """`kernel` has the tasks, GDB's threads, each by the address of its control block."""
         self._debuggee, self._kernel = debuggee, kernel
-        self._thread = 0  # whose registers are asked for; 0: those of the machine
+        self._thread = 0  # whose registers are requested; 0: those of the machine
         self._framing = Framing(bytearray())
         self._items: list[bytes] = []
         self._watched: set[tuple[int, int, int]] = set()
@@ -147,7 +147,7 @@ class RemoteProtocol:
         }
 
     def receive(self, data: bytes) -> bytes:
-        """Return the bytes that answer what arrived. While the machine runs, packets wait until it stands."""
+        """Return the answer to received bytes. While the machine runs, packets wait until it stops."""
         self._items += self._framing.take(data)
         answers, waiting = b"", []
         for item in self._items:
@@ -159,17 +159,17 @@ class RemoteProtocol:
         return answers
 
     def stopped(self, signal: int, watched: int | None = None) -> bytes:
-        """Return the bytes that tell the debugger that the machine, which it let run, stands again; what it accessed."""
+        """Return the report to the debugger that its running machine has stopped, and the watched access."""
         self.wish, self._signal, self.interrupted, self._thread = Wish.STAND, signal, False, 0
         self._last = framed(self._stop_reply(watched))
         return self._last + self.receive(b"")
 
     def has_breakpoint(self, address: int) -> bool:
-        """Return whether the debugger has set one there."""
+        """Return whether the debugger has set one at an address."""
         return address in self._debuggee.breakpoints
 
     def leave(self, wish: Wish) -> None:
-        """Leave no breakpoint behind at the machine."""
+        """Remove all breakpoints from the machine."""
         self._debuggee.breakpoints.clear()
         for watched in self._watched:
             self._debuggee.watch(*watched, on=False)
@@ -192,7 +192,7 @@ class RemoteProtocol:
         return acknowledgement + reply
 
     def _reply(self, payload: bytes) -> bytes:
-        """Return the packet that answers one; nothing while the machine runs, or when it was killed."""
+        """Return the answer to a packet; nothing while the machine runs or after it was killed."""
         command = self._commands.get(payload[:1])
         if command is None:
             return framed(b"")
@@ -209,13 +209,13 @@ class RemoteProtocol:
         return b"T%02x%sthread:%x;" % (self._signal, why, self._running)
 
     def _registers(self, numbers: Iterable[int]) -> bytes:
-        """Return registers of the selected thread; `x` for what is not kept of it."""
+        """Return registers of the selected thread; `x` for those not saved."""
         kept = None
         if self._kernel is not None and not self._is_machine():
             kept = self._kernel.saved_registers(self._thread)
         found = b""
         for name, size in map(_known, numbers):
-            if kept is None or (name, size) in SYSTEM:  # what the processor has only once
+            if kept is None or (name, size) in SYSTEM:  # registers that the processor has only once
                 value: int | None = self._debuggee.register(name)
             else:
                 value = kept.get(name)
@@ -227,17 +227,17 @@ class RemoteProtocol:
 
     @property
     def _running(self) -> int:
-        """The thread whose registers are the machine's: 1 without a scheduler."""
+        """Return the thread whose registers are the machine's: 1 without a scheduler."""
         return self._kernel.current_block if self._kernel is not None and self._kernel.running else 1
 
     def _all_threads(self) -> dict[int, str]:
-        """Return all, the running one first, which alone is there without a scheduler."""
+        """Return all threads, the running one first; it is the only one without a scheduler."""
         tasks = self._kernel.tasks() if self._kernel is not None and self._kernel.running else []
         every = {task.block: f"{task.name}, {task.state}, priority {task.priority}" for task in tasks}
         return {self._running: every.get(self._running, "")} | every
 
     def _select(self, rest: bytes) -> bytes:
-        """Take the thread whose registers are meant; which one runs on is not chosen."""
+        """Select the thread for register access; ignore the choice of which one runs."""
         if rest[:1] == b"g":
             self._thread = 0 if rest[1:] in (b"0", b"-1") else _hex(rest[1:])
             if self._thread and self._thread not in self._all_threads():

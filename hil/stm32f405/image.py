@@ -1,6 +1,6 @@
-"""What is flashed: the ELF of an STM32F405, or the .bin that was made of one, with the names of its addresses.
+"""The flashed image: the ELF of an STM32F405, or the .bin made of one, with the names of its addresses.
 
-Everything that cannot run here, or could not be inspected while it runs, is refused in one line.
+An image that cannot run here, or be inspected while it runs, is refused in one line.
 """
 
 from bisect import bisect_right
@@ -17,7 +17,7 @@ from hil.stm32f405.debug_info import DebugInfo
 
 @dataclass(frozen=True, slots=True)
 class MemoryUse:
-    """How much of a memory the linker has given away."""
+    """How much of a memory the linker has allocated."""
 
     name: str
     used: int  # [bytes]
@@ -25,12 +25,12 @@ class MemoryUse:
 
     @property
     def free(self) -> int:
-        """Return what is left [bytes]."""
+        """Return the free bytes."""
         return self.size - self.used
 
 
 class Image:
-    """An image and what its addresses mean. Raises `LabError` with one line for what cannot run on an STM32F405."""
+    """An image and its symbols. Raises `LabError` with one line if it cannot run on an STM32F405."""
 
     def __init__(self, path: Path, elf: Path | None = None) -> None:
         self.path = path
@@ -56,7 +56,7 @@ class Image:
         self._check_vectors()
         self.memory = tuple(_memory_use(elf, self.code))
         self._take_names(elf)
-        self.constants = elf.constants(self.base, len(self.code))  # half words that are no instructions
+        self.constants = elf.constants(self.base, len(self.code))  # half words without instructions
 
     def _take_names(self, elf: Elf) -> None:
         if not elf.symbols:
@@ -80,7 +80,7 @@ class Image:
 
     @property
     def initial_stack_pointer(self) -> int:
-        """Return what the core loads into the main stack pointer at reset."""
+        """Return the main stack pointer at reset."""
         return int(unpack_from("<I", self.code, 0)[0]) & ~3
 
     @property
@@ -89,7 +89,7 @@ class Image:
         return int(unpack_from("<I", self.code, 4)[0]) & ~1
 
     def symbol(self, name: str) -> Symbol:
-        """Return a variable or function by its name; raises `LabError` when there are none or several."""
+        """Return a variable or function by its name; raises `LabError` for none or several."""
         found = self._variables.get(name) or [f for f in self._functions if f.name == name]
         if len(found) == 1:
             return found[0]
@@ -109,7 +109,7 @@ class Image:
         return function.name if function and address < function.address + function.size else ""
 
     def place(self, address: int) -> str:
-        """Return an address of code in words: function and line as far as they are known, else the number."""
+        """Return a code address as text: function and line if known, else the number."""
         name = self.function_at(address)
         if not name:
             return f"0x{address:08x}, outside every function"
@@ -139,7 +139,7 @@ class Image:
 
 
 def _same(path: Path, content: bytes, elf: Elf) -> bytes:
-    """Return the content of a .bin, if it holds what the segments of its ELF do."""
+    """Return the content of a .bin if it equals the segments of its ELF."""
     for segment in elf.in_flash:
         begin, data = segment.load - elf.base, segment.data
         there = content[begin : begin + len(data)]
@@ -153,7 +153,7 @@ def _same(path: Path, content: bytes, elf: Elf) -> bytes:
 
 
 def _memory_use(elf: Elf, code: bytes) -> Iterator[MemoryUse]:
-    """Yield what code takes of flash, and variables, with those of the start-up code and its stack, of the others."""
+    """Yield the use of flash by code, and of the others by variables, including the start-up code's and its stack."""
     yield MemoryUse("flash", len(code), FLASH + FLASH_SIZE - elf.base)
     for name, base, size in MEMORIES:
         used = (segment.size for segment in elf.segments if base <= segment.address < base + size)

@@ -1,6 +1,6 @@
-"""The chip as the laboratory's time line sees it, and the tasks of the scheduler in its image.
+"""The chip on the laboratory's time line, and the tasks of its image's scheduler.
 
-Run times and switches are counted by the machine itself, whenever the scheduler's pointer to the running task has moved.
+The machine itself counts run times and switches, whenever the scheduler's pointer to the running task changes.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from hil.stm32f405.chip import CYCLES_PER_US, Chip
 from hil.stm32f405.freertos import FreeRtos
 
 NEVER_US = 1 << 62
-SLICE_US = 100  # as short as a millisecond's work wants it, and no more than the wall clock's own jitter
+SLICE_US = 100  # short against a millisecond's work, and within the wall clock's own jitter
 IDLE = "IDLE"
 TICK_US = 1_000
 INTERRUPTS = 6  # above the priorities of all tasks
@@ -20,7 +20,7 @@ INTERRUPTS = 6  # above the priorities of all tasks
 
 @dataclass(slots=True)
 class ChipTask:
-    """A task of the image's scheduler. Deadlines are not known of it."""
+    """A task of the image's scheduler. Its deadlines are unknown."""
 
     name: str
     priority: int
@@ -33,14 +33,14 @@ Trace = Callable[[int, str, str, int, int], None]
 
 
 class ChipProcessor:
-    """The chip's time as `firmware_py.rtos.Kernel` shows it: microseconds since the firmware's boot."""
+    """The chip's time in the form of `firmware_py.rtos.Kernel`: microseconds since the firmware's boot."""
 
     queues: tuple[Any, ...] = ()
 
     def __init__(
         self, chip: Chip, kernel: FreeRtos | None, act: Callable[[int], None], run: Callable[[int], int]
     ) -> None:
-        """`run` lets the chip run as `Chip.run` does, and `act` gets why it ended before its time."""
+        """`run` runs the chip like `Chip.run`, and `act` gets the reason when it ends early."""
         self.chip = chip
         self.trace: Trace | None = None
         self.ahead_us = 0  # of the chip's time before the boot's
@@ -51,31 +51,31 @@ class ChipProcessor:
         self._limit_us = NEVER_US
         self._own = EventQueue()  # by the chip's time
         self._kernel = kernel
-        self._outside: ChipTask | None = None  # what occupies the processor
+        self._outside: ChipTask | None = None  # the outside load
         self._place = 0  # among the tasks, in the order in which they first ran
         if kernel is not None:
             chip.state.kernel = kernel.places
 
     def every(self, period_us: int, do: Callable[[int], object]) -> None:
-        """Do something again and again by the chip's time."""
+        """Call something periodically by the chip's time."""
         self._own.every(period_us, self.chip.now_us + period_us, do)
 
     def begin(self, us: int) -> None:
-        """Let an instant be the one from which time counts."""
+        """Set the time from which the clock counts."""
         self.ahead_us += us
         self._target_us -= us
 
     @property
     def now_us(self) -> int:
-        """The present instant; the chip itself may have finished a block of code beyond it."""
+        """The current time; the chip itself may have finished a block of code beyond it."""
         return min(self.chip.now_us - self.ahead_us, self._target_us)
 
     @property
     def next_wake_us(self) -> int:
-        """The next instant at which the chip is to run on without the outside; a busy one runs in slices.
+        """The next time at which the chip runs without an event; a busy chip runs in slices.
 
-        A flight in lockstep runs it from event to event and does not ask. Where many take turns, or the wall clock has its
-        turn, what it sends within a slice counts as sent at the slice's end.
+        A flight in lockstep runs it from event to event and does not use this. With several robots or a wall clock,
+        packets sent within a slice count as sent at the slice's end.
         """
         own_us = NEVER_US if self._own.next_us is None else self._own.next_us - self.ahead_us
         state, ready_us = self.chip.state, self.chip.now_us - self.ahead_us + SLICE_US
@@ -87,7 +87,7 @@ class ChipProcessor:
         self.run(now_us)
 
     def run(self, now_us: int, until_us: int = 0) -> None:
-        """Run the chip up to an instant, and on to a later one, if given; less far where hardware acts before."""
+        """Run the chip up to a time, and on to a later one, if given; stop earlier at a hardware event."""
         now_us = max(now_us, until_us)
         self._target_us, self._limit_us = now_us, NEVER_US
         own, state = self._own, self.chip.state
@@ -111,7 +111,7 @@ class ChipProcessor:
         self._limit_us = min(self._limit_us, us - 1)
 
     def occupy(self, name: str, taken_us: Callable[[], int]) -> None:
-        """Let something outside take the processor at every tick, before all tasks, for as long as it says then."""
+        """Let an outside load take the processor at every tick, before all tasks, for the time it returns."""
         state = self.chip.state
         self._outside, self._place = ChipTask(name, INTERRUPTS, 0), state.task_count
 
@@ -124,7 +124,7 @@ class ChipProcessor:
 
     @property
     def tasks(self) -> list[ChipTask]:
-        """Return the tasks that have run, in the order in which they first did, with what occupies the processor."""
+        """Return the tasks that have run, in the order of their first run, with the outside load."""
         state = self.chip.state
         return self._with_outside(
             [self._task(task.block) for task in state.task[0 : state.task_count]], self._outside
@@ -138,7 +138,7 @@ class ChipProcessor:
         return self._task(state.task[state.running].block)
 
     def run_times_us(self) -> list[int]:
-        """Return how long each task has had the processor, interrupts and the idle task's sleep included, over resets."""
+        """Return each task's processor time, including interrupts and the idle task's sleep, across resets."""
         state = self.chip.state
         cycles = [task.cycles for task in state.task[0 : state.task_count]]
         if cycles:
@@ -146,20 +146,20 @@ class ChipProcessor:
         return [own // CYCLES_PER_US for own in self._with_outside(cycles, state.taken)]
 
     def activations(self) -> list[int]:
-        """Return how often each task got the processor."""
+        """Return each task's number of activations."""
         state = self.chip.state
         return self._with_outside([task.times for task in state.task[0 : state.task_count]], 0)
 
     def _with_outside(self, of_tasks: list[T], of_outside: T | None) -> list[T]:
-        """Return what is known of each task, and of what occupies the processor where it came between them."""
+        """Return the values of each task, with the outside load inserted at its place."""
         if self._outside is None or of_outside is None:
             return of_tasks
         return [*of_tasks[: self._place], of_outside, *of_tasks[self._place :]]
 
     def longest_busy(self, least_us: int) -> tuple[int, int] | None:
-        """Return the task of the highest priority that has not waited for so long, and its microseconds; None without one.
+        """Return the highest-priority task that has not waited for so long, and its microseconds; None without one.
 
-        Those below it may only wait for it. The idle task never waits.
+        Tasks below it may be waiting for it. The idle task never waits.
         """
         state = self.chip.state
         busy = [

@@ -20,12 +20,12 @@ static void raise_flag(struct machine *m, unsigned n, unsigned s, uint32_t flag)
     update_line(m, n, s);
 }
 
-static uint8_t *ram_byte(struct machine *m, uint32_t address) /* the CCM is out of its reach, chapter 2.3.1 */
+static uint8_t *ram_byte(struct machine *m, uint32_t address) /* it cannot reach the CCM, chapter 2.3.1 */
 {
     return address - RAM_BASE < RAM_SIZE ? m->ram + (address - RAM_BASE) : 0;
 }
 
-/* Move one byte between a peripheral's data register and memory; returns 0 when no stream serves it. `last`: it was. */
+/* Move one byte between a peripheral's data register and memory; return 0 without a stream for it. `last`: the last one. */
 static int move(struct machine *m, uint32_t peripheral, uint32_t direction, uint8_t *byte, int *last)
 {
     for (unsigned n = 0; n < DMAS; n++)
@@ -107,7 +107,7 @@ void dma_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value)
                 stream->cr &= ~(uint32_t)ENABLE;
             usart_kick(m);
         } else if (was & ENABLE && !(value & ENABLE)) {
-            raise_flag(m, n, s, 32); /* software has ended it: complete all the same, chapter 10.3.14 */
+            raise_flag(m, n, s, 32); /* software has ended it: complete as well, chapter 10.3.14 */
         }
         update_line(m, n, s);
         break;

@@ -1,7 +1,7 @@
 /* Exceptions of the Cortex-M4: NVIC, SysTick, system control block, entry and return with and without floats (B1.5, B3.2).
 
-Unicorn knows the exception number and with it the handler mode and its stack, everything else happens here. Floats are
-stacked at once where the chip would only reserve their place. */
+Unicorn has the exception number, handler mode and its stack; everything else is here. Floats are stacked at once; the chip
+would only reserve their space. */
 #include "machine.h"
 
 enum { SPSEL = 2, FPCA = 4, ENTRY_CYCLES = 12, RETURN_CYCLES = 10, ALIGNED = 1 << 9 };
@@ -34,7 +34,7 @@ static uint32_t *word(struct machine *m, uint32_t address)
     return 0;
 }
 
-/* The running task has written below its stack. */
+/* The running task has written below its stack: record it. */
 void note_overflow(struct machine *m)
 {
     if (m->overflow)
@@ -93,7 +93,7 @@ static int running_urgency(struct machine *m)
     return least;
 }
 
-/* The exception to be entered now, 0 if none may; `waking`: as WFI sees it, which does not look at PRIMASK (B1.5.17). */
+/* Return the exception to enter now, 0 if none; `waking`: as for WFI, which ignores PRIMASK (B1.5.17). */
 unsigned next_exception(struct machine *m, int waking)
 {
     unsigned best = 0;
@@ -193,7 +193,7 @@ static void look_at_stack(struct machine *m, uint32_t block)
     m->canary = last && *last == UNUSED;
 }
 
-/* The scheduler may have chosen another task. */
+/* Check for another task of the scheduler. */
 static void look_at_task(struct machine *m)
 {
     uint32_t *current = word(m, m->kernel.current_place), i = 0;
@@ -213,7 +213,7 @@ static void look_at_task(struct machine *m)
     while (i < m->task_count && m->task[i].block != *current)
         i++;
     if (i == TASKS)
-        i--; /* all that find no room are one */
+        i--; /* all without room count as one */
     else if (i == m->task_count)
         m->task[m->task_count++].block = *current;
     m->task[i].times++;
@@ -262,7 +262,7 @@ void leave(struct machine *m, uint32_t exc_return)
         look_at_task(m);
 }
 
-/* Enter the handler of a fault, or HardFault where it is off or comes inside itself (B1.5.14). */
+/* Enter the handler of a fault, or HardFault if it is disabled or already active (B1.5.14). */
 void raise_fault(struct machine *m, unsigned exception, uint32_t status, uint32_t pc)
 {
     m->cfsr |= status;
@@ -299,7 +299,7 @@ static uint32_t icsr(struct machine *m)
 
 static uint32_t bits_of(const uint64_t *set, uint32_t index)
 {
-    unsigned first = IRQ + 32 * index; /* 32 interrupts lie across two words of 64 exceptions */
+    unsigned first = IRQ + 32 * index; /* 32 interrupts span two words of 64 exceptions */
     uint64_t low = first < 128 ? set[first >> 6] >> (first & 63) : 0;
     uint64_t high = (first & 63) > 32 && first >> 6 == 0 ? set[1] << (64 - (first & 63)) : 0;
     return (uint32_t)(low | high);
@@ -393,12 +393,12 @@ void system_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t given,
     uint32_t at = (uint32_t)offset, value = (uint32_t)given, index = (at & 0x7F) / 4;
     if (priority_byte(m, at)) {
         for (unsigned i = 0; i < size && priority_byte(m, at + i); i++)
-            *priority_byte(m, at + i) = (uint8_t)(value >> 8 * i) & 0xF0; /* four bits are there, chapter 12.2 */
+            *priority_byte(m, at + i) = (uint8_t)(value >> 8 * i) & 0xF0; /* four bits exist, chapter 12.2 */
         return;
     }
     if (at >= 0xE100 && at < 0xE300) {
         write_bits(m, at < 0xE200 ? m->enabled : m->pending, index, value, !(at & 0x80));
-        for (unsigned irq = 0; at >= 0xE280 && irq < 32; irq++) /* a request that goes on is pending again */
+        for (unsigned irq = 0; at >= 0xE280 && irq < 32; irq++) /* a continuing request is pending again */
             if (value >> irq & 1 && 32 * index + irq < EXCEPTIONS - IRQ) {
                 unsigned exception = IRQ + 32 * index + irq;
                 if (m->line[exception >> 6] >> (exception & 63) & 1)

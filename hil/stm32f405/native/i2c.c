@@ -1,5 +1,5 @@
-/* The I2C controllers as masters (chapter 27): start, address, bytes and stop take their time on the bus; DMA takes bytes
-that are received. Devices are memory behind a pointer that the first bytes of a write set. */
+/* The I2C controllers as masters (chapter 27): start, address, bytes and stop take bus time; DMA moves received bytes.
+Devices are memories with a pointer, which the first bytes of a write set. */
 #include "machine.h"
 
 #include <string.h>
@@ -209,7 +209,7 @@ static void write_control(struct machine *m, unsigned n, uint32_t value)
         b->sr1 = 0;
         act(m, n, NOTHING, 0);
     } else if (stopping) {
-        b->cr1 |= STOP; /* it is under way, and a start waits for it */
+        b->cr1 |= STOP; /* it is in progress, and a start waits for it */
     } else if (value & STOP) {
         act(m, n, STOPPING, 1);
     } else if (value & START && b->action != STARTING) {

@@ -1,10 +1,10 @@
-/* The machine as a whole: it runs code from block to block, lets what is due happen in between, and stops for the outside. */
+/* The whole machine: it runs code block by block, executes due events in between, and stops when the caller must act. */
 #include "machine.h"
 
 #include <stddef.h>
 #include <string.h>
 
-enum { HOOK_INTR = 1, HOOK_CODE = 4, HOOK_BLOCK = 8, HOOK_READ = 0x400, HOOK_WRITE = 0x800, HOOK_TLB = 0x20000, HOOK_INVALID = 0x3F0 /* accesses where nothing is */ };
+enum { HOOK_INTR = 1, HOOK_CODE = 4, HOOK_BLOCK = 8, HOOK_READ = 0x400, HOOK_WRITE = 0x800, HOOK_TLB = 0x20000, HOOK_INVALID = 0x3F0 /* accesses to unmapped memory */ };
 enum { READ_UNMAPPED = 6, WRITE_UNMAPPED, FETCH_UNMAPPED, INVALID = 10, WRITE_PROTECTED = 12, FETCH_PROTECTED = 14 };
 enum { ACCESS_FETCH = 18, RIGHT_READ = 1, RIGHT_WRITE = 2, RIGHT_EXECUTE = 4, FLUSH_TLB = 11 | 1 << 30 };
 enum { TRAP_SVC = 2, TRAP_BREAKPOINT = 7, TRAP_RETURN = 8, TRAP_NO_FLOATS = 17, TRAP_STATE = 18 };
@@ -93,7 +93,7 @@ static int in_task(const struct machine *m)
     return !m->active[0] && !m->active[1];
 }
 
-/* In a task; exceptions have a stack of their own. */
+/* In a task; exceptions have a separate stack. */
 static void look_at_stack_pointer(struct machine *m)
 {
     if (get_register(m, R_SP) < m->stack_begin)
@@ -109,7 +109,7 @@ static void on_block(uc_engine *uc, uint64_t address, uint32_t size, void *user)
         stop(m, (uint32_t)address);
         return;
     }
-    if (resumed == (uint32_t)address) /* in the middle of a block, all of which was counted when it began */
+    if (resumed == (uint32_t)address) /* in the middle of a block, which was counted as a whole at its begin */
         return;
     if (m->stacks && m->stack_begin && !m->overflow && in_task(m))
         look_at_stack_pointer(m);
@@ -149,8 +149,8 @@ static void on_trap(uc_engine *uc, uint32_t number, void *user)
     }
 }
 
-/* Before a hook of an access in an IT block, unicorn writes the condition of that instruction into XPSR, and leaves it there: the next
-   block that it looks up would be executed under it (github.com/unicorn-engine/unicorn/issues/2309). */
+/* Before a hook of an access in an IT block, unicorn writes that instruction's condition into XPSR, and leaves it there:
+it would then apply to the next block (github.com/unicorn-engine/unicorn/issues/2309). */
 static void forget_condition(struct machine *m)
 {
     uint32_t xpsr = get_register(m, R_XPSR);
@@ -166,7 +166,7 @@ static int on_invalid(uc_engine *uc, int type, uint64_t address, int size, int64
     return 0;
 }
 
-/* Map a page for data alone until something there is executed: unicorn stores slowly to a page with code, which it watches. */
+/* Map a page for data only until code there is executed: unicorn watches pages with code and stores to them slowly. */
 static int on_page(uc_engine *uc, uint64_t address, int type, struct page *page, void *user)
 {
     struct machine *m = user;
@@ -175,7 +175,7 @@ static int on_page(uc_engine *uc, uint64_t address, int type, struct page *page,
     if (place < RAM_SIZE) {
         uint8_t *known = &m->executed[place / PAGE_SIZE];
         if (executed && !*known)
-            m->engine.ctl(uc, FLUSH_TLB); /* forget that its data alone were mapped */
+            m->engine.ctl(uc, FLUSH_TLB); /* forget the mapping for data only */
         executed = *known |= executed;
     }
     if (type != ACCESS_FETCH)
@@ -197,7 +197,7 @@ static void on_break(uc_engine *uc, uint64_t address, uint32_t size, void *user)
     stop(m, (uint32_t)address);
 }
 
-/* Sleep until something wakes the core, without leaving the engine: WFI comes ten thousand times a second. */
+/* Sleep until an interrupt wakes the core, without leaving the engine: WFI runs ten thousand times a second. */
 static void on_sleep(uc_engine *uc, uint64_t address, uint32_t size, void *user)
 {
     struct machine *m = user;
@@ -221,13 +221,13 @@ static void on_sleep(uc_engine *uc, uint64_t address, uint32_t size, void *user)
     unsigned exception = next_exception(m, 0);
     if (exception) {
         enter(m, exception, after);
-    } else { /* masked: it goes on behind the instruction */
+    } else { /* masked: continue after the instruction */
         m->pc = after;
         set_register(m, R_PC, after | 1);
     }
 }
 
-/* A division by zero has the result 0 (unless CCR.DIV_0_TRP is set): stop in front of the first one. */
+/* A division by zero results in 0 (unless CCR.DIV_0_TRP is set): stop before the first one. */
 static void on_division(uc_engine *uc, uint64_t address, uint32_t size, void *user)
 {
     struct machine *m = user;
@@ -240,15 +240,15 @@ static void on_division(uc_engine *uc, uint64_t address, uint32_t size, void *us
     stop(m, (uint32_t)address);
 }
 
-/* Whether an instruction may lower the stack pointer, by its first half word: PUSH, SUB, MOV or ADD to SP, and stores and
-   floats with write-back to it. */
+/* Return whether an instruction may lower the stack pointer, by its first half word: PUSH, SUB, MOV or ADD to SP, and
+   stores and floats with write-back to it. */
 static int lowers_stack(uint16_t first)
 {
     return (first & 0xFE00) == 0xB400 || (first & 0xFF80) == 0xB080 || (first & 0xFC87) == 0x4485 || (first & 0xFE0F) == 0xE80D ||
            (first & 0xFE0F) == 0xEC0D || (first & 0xF80F) == 0xF00D || (first & 0xFE0F) == 0xEA0D || (first & 0xFE0F) == 0xF80D;
 }
 
-/* Find the instructions that sleep, divide or stack; elsewhere than at an instruction nothing comes of it. */
+/* Find the instructions that sleep, divide or stack; matches outside instructions have no effect. */
 static int look_at_code(struct machine *m)
 {
     uint16_t at[2];
@@ -272,7 +272,7 @@ uint64_t machine_size(void)
     return sizeof(struct machine);
 }
 
-/* Lay out a machine in zeroed memory, its buses mapped and its hooks set; the engine and the memories are there. */
+/* Initialise a machine in zeroed memory, map its buses and set its hooks; engine and memories must exist. */
 int machine_attach(struct machine *m, const struct engine *engine, uint8_t *flash, uint8_t *ram, uint8_t *ccm,
                    uint64_t *before)
 {
@@ -296,7 +296,7 @@ int machine_attach(struct machine *m, const struct engine *engine, uint8_t *flas
     return failed | look_at_code(m);
 }
 
-/* Reset the processor; time and the pins' levels go on. `cause` stands in RCC's register of causes. */
+/* Reset the processor; time and pin levels continue. `cause` goes to RCC's register of causes. */
 void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause)
 {
     uint32_t words[2];
@@ -334,7 +334,7 @@ void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause)
     m->pc = words[1] & ~1u;
 }
 
-/* The first sixteen are. */
+/* True for the first sixteen. */
 static int is_new_low_writer(struct machine *m)
 {
     for (uint32_t i = 0; i < m->low_writer_count; i++)
@@ -350,13 +350,13 @@ static void fault_of(struct machine *m, int error)
 {
     uint32_t pc = get_register(m, R_PC);
     m->pc = pc & ~1u;
-    if (!(get_register(m, R_XPSR) & THUMB)) { /* whatever is at that address */
+    if (!(get_register(m, R_XPSR) & THUMB)) { /* no matter what is at that address */
         raise_fault(m, USAGE_FAULT, 1 << 17, pc);
     } else if ((error == READ_UNMAPPED || error == FETCH_UNMAPPED) && m->fault_address < FLASH_SIZE) {
-        m->resume = m->pc; /* the alias of flash, which is mapped when this has been reported */
+        m->resume = m->pc; /* the alias of flash, mapped after this report */
         m->why |= WHY_LOW_READ;
     } else if (error == WRITE_PROTECTED || (error == WRITE_UNMAPPED && m->fault_address < FLASH_SIZE)) {
-        /* Flash that is not being programmed takes no store, and nothing else comes of it. */
+        /* A store to flash has no effect unless it is being programmed. */
         uint16_t first;
         if (m->fault_address < FLASH_SIZE && is_new_low_writer(m)) {
             m->resume = m->pc;
@@ -383,17 +383,17 @@ static void execute(struct machine *m, uint64_t count_of)
         fault_of(m, error);
     } else if (!m->stopping) {
         m->pc = get_register(m, R_PC) & ~1u;
-        m->asleep = !m->stepping; /* nothing else ends it */
+        m->asleep = !m->stepping; /* nothing else ends the sleep */
     }
 }
 
-/* Run up to an instant, or until something outside has to be done; returns why (`WHY_...`, 0: it is `until`). */
+/* Run up to a time, or until the caller must act; return the reason (`WHY_...`, 0: it is `until`). */
 uint32_t machine_run(struct machine *m, uint64_t until)
 {
     m->until = until;
     m->why = 0;
     m->stepping = 0;
-    if (m->skip_at != m->pc) /* somebody has gone elsewhere since */
+    if (m->skip_at != m->pc) /* the pc has changed since */
         m->skip_at = NOWHERE;
     for (;;) {
         if (m->resume != m->pc) {
@@ -425,7 +425,7 @@ uint32_t machine_run(struct machine *m, uint64_t until)
     }
 }
 
-/* Stop in front of the second instruction of a step, in the middle of its block. */
+/* Stop before the second instruction of a step, in the middle of its block. */
 static void on_step(uc_engine *uc, uint64_t address, uint32_t size, void *user)
 {
     struct machine *m = user;
@@ -466,7 +466,7 @@ uint32_t machine_step(struct machine *m)
     return m->why | WHY_STEP;
 }
 
-/* Set or take away a breakpoint; returns 0 where there is no room. */
+/* Set or remove a breakpoint; return 0 without room. */
 int machine_break(struct machine *m, uint32_t address, int on)
 {
     for (unsigned i = 0; i < BREAKPOINTS; i++) {
@@ -485,7 +485,7 @@ int machine_break(struct machine *m, uint32_t address, int on)
     return 0;
 }
 
-/* The chip stops behind the block of instructions that has the access; the real one's watchpoints are late as well. */
+/* Stop after the block of instructions with the access; real watchpoints are late as well. */
 static void on_access(uc_engine *uc, int type, uint64_t address, int size, int64_t value, void *user)
 {
     struct watchpoint *w = user;
@@ -497,7 +497,7 @@ static void on_access(uc_engine *uc, int type, uint64_t address, int size, int64
     w->machine->why |= WHY_WATCHPOINT;
 }
 
-/* Set or take away a watchpoint of a kind as GDB numbers it: 2 writes, 3 reads, 4 both; returns 0 where there is no room. */
+/* Set or remove a watchpoint of a GDB kind: 2 writes, 3 reads, 4 both; return 0 without room. */
 int machine_watch(struct machine *m, uint32_t kind, uint32_t address, uint32_t size, int on)
 {
     static const int hooks[3] = {HOOK_WRITE, HOOK_READ, HOOK_READ | HOOK_WRITE};
@@ -528,7 +528,7 @@ int machine_device(struct machine *m, uint32_t bus, uint32_t address, uint8_t *m
     return 1;
 }
 
-/* Hand out what a USART has sent; returns how many bytes. */
+/* Copy the bytes that a USART has sent; return their number. */
 uint32_t machine_sent(struct machine *m, uint32_t n, uint8_t *bytes)
 {
     uint32_t size = m->usart[n].filled;

@@ -1,12 +1,12 @@
 /* The STM32F405 around the instruction emulator unicorn: what all parts of the machine share.
 
-Time counts in cycles of the 168 MHz core clock since power-on. A part that will act by itself plans that in its slot of
-`due`; a part whose interrupt request changes calls `set_line`. Code runs from basic block to basic block, and between two
-of them whatever is due happens, exceptions are entered, and the machine stops for the outside. Chapters are those of
-ST's reference manual RM0090; B1 is that of ARM's ARMv7-M Architecture Reference Manual.
+Time counts in cycles of the 168 MHz core clock since power-on. A part plans its next action in its slot of `due`; a part
+whose interrupt request changes calls `set_line`. Code runs by basic blocks; between them due actions run, exceptions are
+entered, and the machine stops when the caller must act. Chapters refer to ST's reference manual RM0090, B1 to ARM's
+ARMv7-M Architecture Reference Manual.
 
-Python reads this file as well (chip.py): layouts, prototypes and numbers are declared here alone. It does not see lines
-that begin with #. */
+Python reads this file as well (chip.py): layouts, prototypes and numbers are declared only here. It ignores lines that
+begin with #. */
 #ifndef MACHINE_H
 #define MACHINE_H
 
@@ -23,13 +23,13 @@ enum {
     DEVICES = 8, BREAKPOINTS = 64, LOW_WRITERS = 16, WATCHPOINTS = 8, LINE_BYTES = 4096, TASKS = 32, SWITCHES = 4096,
 };
 
-/* Three sums in one number, from these bits on: cycles, instructions, and modulo 2^16 what may lower a stack pointer. */
+/* Three sums in one number, from these bits on: cycles, instructions, and modulo 2^16 those that may lower a stack pointer. */
 enum { SUM_CYCLES = 0, SUM_INSTRUCTIONS = 28, SUM_STACKERS = 48 };
 
 /* Exceptions, B1.5.2. */
 enum { RESET = 1, NMI, HARD_FAULT, MEMORY_FAULT, BUS_FAULT, USAGE_FAULT, SVC = 11, PENDSV = 14, SYSTICK };
 
-/* What may be due. */
+/* Slots of `due`. */
 enum {
     DUE_SYSTICK,
     DUE_TIMER,
@@ -59,7 +59,7 @@ typedef struct uc_engine uc_engine;
 typedef uint64_t (*read_call)(uc_engine *, uint64_t, unsigned, void *);
 typedef void (*write_call)(uc_engine *, uint64_t, unsigned, uint64_t, void *);
 
-/* Functions of libunicorn, which is loaded already when this library is. */
+/* Functions of libunicorn, loaded before this library. */
 struct engine {
     uc_engine *uc;
     int (*reg_read)(uc_engine *, int, void *);
@@ -75,15 +75,15 @@ struct engine {
 struct timer {
     uint64_t since; /* when the counter was `base` */
     uint64_t seen;  /* overflows that have set the flag already */
-    uint32_t base, cr1, dier, sr, psc, arr, prescaler; /* `prescaler` acts from the last update on */
+    uint32_t base, cr1, dier, sr, psc, arr, prescaler; /* `prescaler`: in effect since the last update */
     uint32_t others[32];
 };
 
-struct device { /* an I2C device that is memory: registers, or an EEPROM */
+struct device { /* a memory as an I2C device: registers, or an EEPROM */
     uint8_t *memory;
-    uint32_t size, pointer, address_bytes, left; /* `left`: bytes of the address that are still to come */
-    uint32_t bus, address, writes, pairs; /* `pairs`: every byte that is written has its own address before it */
-    uint8_t burst[256]; /* what a read in progress sees */
+    uint32_t size, pointer, address_bytes, left; /* `left`: missing bytes of the address */
+    uint32_t bus, address, writes, pairs; /* `pairs`: every written byte follows its own address */
+    uint8_t burst[256]; /* the data of a read in progress */
 };
 
 struct bus {
@@ -106,18 +106,18 @@ struct dma {
     struct stream stream[STREAMS];
 };
 
-struct task { /* by its control block: cycles that it had the processor for, interrupts included */
-    uint64_t cycles, busy_since; /* since when it has not waited for anything; 0: it waits */
+struct task { /* by its control block: cycles of processor time, including interrupts */
+    uint64_t cycles, busy_since; /* since when it has not waited; 0: it waits */
     uint32_t block, times;
 };
 
-struct kernel { /* of FreeRTOS: where members and lists lie; 0: unknown */
+struct kernel { /* of FreeRTOS: places of members and lists; 0: unknown */
     uint32_t current_place; /* address of the pointer to the running task's control block */
     uint32_t stack_offset, container_offset; /* in a control block: its stack's begin, the list that it is in */
-    uint32_t ready_begin, ready_end; /* the lists of tasks that are ready */
+    uint32_t ready_begin, ready_end; /* the lists of ready tasks */
 };
 
-struct watchpoint { /* memory that a debugger waits for an access to */
+struct watchpoint { /* memory whose access stops for a debugger */
     struct machine *machine;
     uint64_t hook; /* 0: free */
     uint32_t address, size, kind;
@@ -134,23 +134,23 @@ struct machine {
     uint32_t pc, why, asleep, watchdog_on;
     uint32_t fault_address, unknown_count;
     uint32_t unknown[16];
-    uint64_t owed, taken; /* cycles that something outside takes before all tasks, but not before interrupts; has taken */
+    uint64_t owed, taken; /* cycles that an outside load takes before all tasks, but not before interrupts; has taken */
     uint32_t tracing, task_count, switch_count;
     struct kernel kernel;
     uint64_t running_since;
     struct task task[TASKS]; /* the running one is `task[running]` */
     uint32_t running, locked;
-    uint32_t resume;  /* where the middle of a block goes on that was counted as a whole */
-    uint32_t skip_at; /* the breakpoint at which somebody has stood already */
+    uint32_t resume;  /* where to resume inside a block that was counted as a whole */
+    uint32_t skip_at; /* the breakpoint at which the last run stopped */
     uint32_t stack_begin; /* of the running task, 0: unknown */
     uint32_t overflow;    /* the task whose stack has overflowed first since the reset, 0: none */
     uint32_t divided;     /* a division by zero was reported */
-    uint32_t watch_address; /* what a watchpoint has seen last */
+    uint32_t watch_address; /* the last access of a watchpoint */
     uint32_t task_return;   /* EXC_RETURN of the last exception that has interrupted a task */
     struct task_switch task_switch[SWITCHES];
     struct engine engine;
     uint64_t until, due[SLOTS];
-    uint64_t *before; /* sums of `SUM_...` over what begins before each half word of flash */
+    uint64_t *before; /* sums of `SUM_...` over instructions before each half word of flash */
     uint32_t stacks;  /* whether the last block may lower a stack pointer */
     uint64_t next_address;
     uint8_t *flash, *ram, *ccm;
@@ -159,8 +159,8 @@ struct machine {
     uint64_t break_hook[BREAKPOINTS];
     uint32_t break_address[BREAKPOINTS];
     struct watchpoint watchpoint[WATCHPOINTS];
-    uint32_t low_writers[LOW_WRITERS], low_writer_count; /* instructions that were reported */
-    uint32_t canary; /* the last word of the running task's stack was never used when it got the processor */
+    uint32_t low_writers[LOW_WRITERS], low_writer_count; /* reported instructions */
+    uint32_t canary; /* the last word of the running task's stack was unused when it got the processor */
 
     uint32_t input[PORTS];
     struct device device[DEVICES];
@@ -180,10 +180,10 @@ struct machine {
     struct bus bus[BUSES];
     struct usart usart[USARTS];
     struct dma dma[DMAS];
-    uint32_t plain[PERIPHERALS_SIZE / 4]; /* registers that only keep what is written */
+    uint32_t plain[PERIPHERALS_SIZE / 4]; /* registers that only store values */
 };
 
-/* What Python calls. */
+/* Called by Python. */
 uint64_t machine_size(void);
 int machine_attach(struct machine *m, const struct engine *engine, uint8_t *flash, uint8_t *ram, uint8_t *ccm,
                    uint64_t *before);

@@ -1,7 +1,7 @@
-/* Where a peripheral's register is: what has behaviour here or in a file of its own, and what only keeps what is written.
+/* Finds a peripheral's register: some have behaviour, here or in separate files, others only store values.
 
-RCC says that every clock is ready, PWR that the voltage is, FLASH that it is idle; GPIO, EXTI, the watchdog, ADC, USB
-without a host, and the random numbers are here (chapters 7, 5, 3, 8, 12, 21, 13, 34, 24). */
+RCC reports every clock as ready, PWR the voltage, FLASH that it is idle; GPIO, EXTI, the watchdog, ADC, USB without a
+host, and the random numbers are here (chapters 7, 5, 3, 8, 12, 21, 13, 34, 24). */
 #include "machine.h"
 
 enum { LSI_HZ = 32000 };
@@ -82,7 +82,7 @@ static void update_exti(struct machine *m)
     set_line(m, 40, (on & 0xFC00) != 0);
 }
 
-/* A pin gets another level from outside. */
+/* Set a pin's level from outside. */
 void machine_pin(struct machine *m, uint32_t port, uint32_t pin, uint32_t high)
 {
     uint32_t was = m->input[port] >> pin & 1, source = m->plain[(0x13808 + pin / 4 * 4) / 4] >> pin % 4 * 4 & 15;
@@ -105,7 +105,7 @@ static void exti_write(struct machine *m, uint32_t at, uint32_t value)
     update_exti(m);
 }
 
-/* RCC: every clock that is switched on is ready, and the one that is chosen runs. */
+/* RCC: every enabled clock is ready, and the selected one runs. */
 
 static uint32_t rcc_read(struct machine *m, uint32_t at)
 {
@@ -197,7 +197,7 @@ uint64_t usb_read(uc_engine *uc, uint64_t where, unsigned size, void *user)
 {
     struct machine *m = user;
     uint32_t offset = (uint32_t)where;
-    if (offset == 0x10) /* GRSTCTL: idle, and no reset is under way */
+    if (offset == 0x10) /* GRSTCTL: idle, no reset in progress */
         return 0x80000000;
     if (offset == 0x60804) /* RNG: a number is ready */
         return 1;

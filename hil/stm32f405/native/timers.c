@@ -1,7 +1,7 @@
 /* Timers 1 to 14 (chapters 17 to 20): up-counting, prescaler, period, update interrupt, compare registers.
 
-The counter is computed when it is read. An overflow is an event only where its interrupt is on; a flag alone is found when
-it is looked at, so that PWM at some hundred kilohertz costs nothing. */
+The counter is computed when it is read. An overflow is an event only if its interrupt is enabled; a flag alone is
+computed when it is read, so that PWM at some hundred kilohertz costs nothing. */
 #include "machine.h"
 
 enum { CR1 = 0x00, DIER = 0x0C, SR = 0x10, EGR = 0x14, CNT = 0x24, PSC = 0x28, ARR = 0x2C, CCR1 = 0x34, CCR4 = 0x40 };
@@ -46,7 +46,7 @@ static void update_line(struct machine *m, unsigned n)
     set_line(m, UPDATE_IRQ[n], m->timer[n].sr & m->timer[n].dier & 1);
 }
 
-/* Count on from here, with what may have changed about the clock. */
+/* Count on from here, with a possibly changed clock. */
 static void restart(struct machine *m, unsigned n, uint32_t count)
 {
     struct timer *t = &m->timer[n];
@@ -59,7 +59,7 @@ void timer_due(struct machine *m, unsigned n)
 {
     struct timer *t = &m->timer[n];
     look_for_overflow(m, n);
-    if (t->prescaler != t->psc) { /* it is preloaded: acts from an update on */
+    if (t->prescaler != t->psc) { /* it is preloaded: takes effect at an update */
         restart(m, n, 0);
         t->prescaler = t->psc;
     }

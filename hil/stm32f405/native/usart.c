@@ -1,6 +1,6 @@
 /* The USARTs (chapter 30), 8 bits and no parity: one byte in the register, one in the shifter, by interrupt or by DMA.
 
-Bytes from outside arrive back to back, at the rate of the receiver. What is sent is kept until the line falls silent. */
+Bytes from outside arrive back to back, at the rate of the receiver. Sent bytes are kept until the line is silent. */
 #include "machine.h"
 
 enum { ORE = 1 << 3, RXNE = 1 << 5, TC = 1 << 6, TXE = 1 << 7 };
@@ -42,7 +42,7 @@ static void write_data(struct machine *m, unsigned n, uint32_t byte)
     }
 }
 
-/* Let DMA fill whatever is empty. */
+/* Let DMA fill empty registers. */
 void usart_kick(struct machine *m)
 {
     for (unsigned n = 0; n < USARTS; n++) {
@@ -93,7 +93,7 @@ void usart_receive_due(struct machine *m, unsigned n)
     update_line(m, n);
 }
 
-/* Bytes from outside begin to arrive now, behind those that are still arriving; returns how many found room. */
+/* Start the arrival of bytes from outside, after those still arriving; return the number accepted. */
 uint32_t usart_feed(struct machine *m, unsigned n, const uint8_t *bytes, uint32_t size)
 {
     struct usart *u = &m->usart[n];
