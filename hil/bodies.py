@@ -1,4 +1,4 @@
-"""The bodies that can fly: those that ship, by name, and the user's own in a file (docs/tutorials/your-own-robot.md)."""
+"""The bodies that can fly: shipped ones by name, and a user's in a file (docs/tutorials/your-own-robot.md)."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -1,1 +1,1 @@
-"""The parts of a Crazyflie around its microcontroller, and its radio chip, as hardware that any firmware may use."""
+"""The parts of a Crazyflie around its microcontroller, and its radio chip, as hardware for any firmware."""

@@ -1,7 +1,7 @@
-"""The BMP388 of a Crazyflie 2.1: the height of the body to the pressure's counts, with noise and its own filter.
+"""The BMP388 of a Crazyflie 2.1: converts the body's height to counts of pressure, with noise and its own filter.
 
-It measures 50 times per second, as Bitcraze's firmware sets it. The data sheet's compensation of this specimen's calibration
-is linear to a part in ten thousand over the heights of a room. The temperature is constant.
+It measures 50 times per second, as set by Bitcraze's firmware. With this specimen's calibration the data sheet's
+compensation is linear to 1e-4 over the heights of a room. The temperature is constant.
 """
 
 import numpy as np

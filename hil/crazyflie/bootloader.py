@@ -1,9 +1,8 @@
 """Both bootloaders of the board, as bytes in and bytes out: target FF is the STM32, target FE the nRF51.
 
 A page is loaded into a buffer in packets of up to 25 bytes, written to flash with one command, and can be read back.
-Writing replaces a page and takes no time. What is flashed is kept and can be compared; the emulated firmware is
-Python and starts whatever the flash holds. Facts: cflib's bootloader module and Bitcraze's
-two bootloaders.
+Writing replaces a page and takes no time. The flashed contents are kept and can be compared; the emulated firmware is
+Python and starts with any contents. Facts: cflib's bootloader module and Bitcraze's two bootloaders.
 """
 
 import struct

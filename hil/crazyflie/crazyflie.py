@@ -1,6 +1,6 @@
-"""A Crazyflie from power-on: the microcontroller with an image, the parts around it, and its radio chip's end of the line.
+"""A Crazyflie from power-on: the microcontroller with an image, the parts around it, and the serial line to its radio chip.
 
-Of the image it knows what all of Bitcraze's firmware has: a console, the clock of usec_time.c, `assertFail`.
+It uses only what all of Bitcraze's firmware has: a console, the clock of usec_time.c, `assertFail`.
 """
 
 import struct

@@ -1,4 +1,4 @@
-"""How a Crazyflie's own parts fail: its four motors, each with its propeller."""
+"""The failures of a Crazyflie's own parts: four motors, each with its propeller."""
 
 from hil.world.body import Failure
 

@@ -1,7 +1,7 @@
-"""An image's log variables and parameters, found in the firmware's own tables of them, and read in the chip's memory.
+"""An image's log variables and parameters, found by the firmware's own tables and read from the chip's memory.
 
-A table is an array of entries in flash, groups beginning and ending with entries of their own; a number in a table of
-contents counts those in between.
+A table is an array of entries in flash; special entries begin and end a group. A number in a table of contents counts the
+other entries.
 """
 
 import struct

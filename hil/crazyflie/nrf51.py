@@ -1,10 +1,10 @@
-"""The board's radio chip, which is also the master of its power: safelink on the wire, power switch, reset.
+"""The board's radio chip, which also controls its power: safelink, power switch, reset.
 
-Every packet heard is acknowledged with the head of a queue of 8. Safelink's counters stand in the headers' two spare bits:
-a packet that repeats the last one is not passed on again, and an answer is repeated until the host's counter confirms it.
-With an empty queue the firmware acknowledges with its signal strength, the bootloader with an empty packet.
-The firmware also receives packets to all boards on its channel, which are not acknowledged.
-Facts: Bitcraze's nRF51 crazyflie2-nrf-firmware and crazyflie2-nrf-bootloader.
+Every received packet is acknowledged with the head of a queue of 8. Safelink's counters are in the headers' two spare
+bits: a repeated packet is not passed on again, and an answer is repeated until the host's counter confirms it. With an
+empty queue the firmware acknowledges with its signal strength, the bootloader with an empty packet. The firmware also
+receives packets to all boards on its channel, which are not acknowledged. Facts: Bitcraze's nRF51 crazyflie2-nrf-firmware
+and crazyflie2-nrf-bootloader.
 """
 
 import struct

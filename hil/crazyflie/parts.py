@@ -1,7 +1,7 @@
-"""What a Crazyflie 2.1 has around its STM32F405: BMI088 and BMP388 on I2C3, EEPROM on I2C1, pins.
+"""The parts around a Crazyflie 2.1's STM32F405: BMI088 and BMP388 on I2C3, EEPROM on I2C1, pins.
 
-The sensors are register files, as their data sheets number them; the IMU's counts are put in from outside at every
-data-ready, which is the gyro's interrupt on PC14. What the others measure they read off the body.
+The sensors are register files, numbered as in their data sheets; the caller supplies the IMU's counts at every
+data-ready, the gyro's interrupt on PC14. The others measure the body themselves.
 """
 
 import struct

@@ -2,10 +2,10 @@
 
 Frames: W world (z up, the floor at 0), B body (x forward, y left, z up, at the centre of mass). The motors count as in the
 firmware: M1 front right, M2 back right, M3 back left, M4 front left; seen from above M1 and M3 turn counter-clockwise.
-The sources of all constants stand at the keys of `QuadrotorConfig`; `V_TO_THRUST` is the one curve that the firmware, too,
-computes with: both have it from Bitcraze's measurement.
+The keys of `QuadrotorConfig` name the sources of all constants; the firmware also uses one curve, `V_TO_THRUST`: both
+have it from Bitcraze's measurement.
 
-The truth lives on a grid of whole milliseconds, as that of every body.
+The truth is computed per whole millisecond, as for every body.
 """
 
 import math

@@ -1,10 +1,9 @@
 """Enhanced ShockBurst between a dongle and a board: one packet up, and in its acknowledgement one down.
 
-`Transmitter` is the dongle's radio: it repeats a packet until it hears the answer. `BoardEnd` is what the board's radio
-chip has to keep for that: its queue, and safelink's counters, one bit per direction, which make every packet arrive once.
-The polling host is elsewhere: `hil.devices.radio` models one and skips empty polls, a dongle has a real one.
-Figures: Crazyradio, nRF24L01+, Bitcraze's nRF51 firmware and its documentation. Radios that
-send at the same time do not disturb each other.
+`Transmitter` is the dongle's radio: it repeats a packet until it hears the answer. `BoardEnd` is the state of the board's
+radio chip: its queue, and safelink's counters, one bit per direction, which deliver every packet once. The polling host
+is separate: `hil.devices.radio` models one and skips empty polls, a dongle has a real one. Figures: Crazyradio,
+nRF24L01+, Bitcraze's nRF51 firmware and its documentation. Radios that send at the same time do not disturb each other.
 """
 
 from __future__ import annotations
