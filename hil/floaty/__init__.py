@@ -1,1 +1,1 @@
-"""Floaty: its shape, its plates in the flow, its identified correction, and how it is drawn."""
+"""Floaty: its shape, its plates in the flow, its identified correction, and its drawing."""

@@ -1,6 +1,6 @@
 """Trim, linearisation and the identified correction of the plate model (docs/explanation/plant.md).
 
-Everything that depends on the plate model (trim, its own constants L, its lift ratio l) is computed here once from the
+The values that depend on the plate model (trim, its own constants L, its lift ratio l) are computed here once by the
 compiled model itself; only the target constants T are typed, with their source.
 """
 
@@ -40,7 +40,7 @@ class Constants:
     yaw_u3: float
     yaw_rate: float
     z_u4: float
-    # Couplings that the Table omits or that no variant changes; they follow from the others (any flat plates)
+    # Couplings that the Table omits or that no variant changes; the others determine them (any flat plates)
     z_vz: float = math.nan
     y_vy: float = math.nan
     x_vx: float = math.nan
@@ -49,7 +49,7 @@ class Constants:
 
 
 TABLE = Constants(**{name: value for name, (value, _) in PAPER_TABLE.items()})
-# [1/s2] paper, Methods: contradicts the Table's +1100; tests/hil/test_paper.py decides for it
+# [1/s2] paper, Methods: contradicts the Table's +1100; tests/hil/test_paper.py supports it
 PITCH_INPUT_METHODS = -1066.0
 
 LIFT_SAMPLES = np.linspace(-LIFT_U4_MAX, LIFT_U4_MAX, 45)  # [rad] u4 at which l is fitted, every 0.025
@@ -74,7 +74,7 @@ def calm(s: State, speed: float) -> State:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class OperatingPoint:
-    """Where a robot flies on the mean: inputs u1..u4 [rad], attitude roll, pitch, yaw [rad], side wind [m/s, W]."""
+    """A robot's mean state in flight: inputs u1..u4 [rad], attitude roll, pitch, yaw [rad], side wind [m/s, W]."""
 
     inputs: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     attitude: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -102,7 +102,7 @@ def accelerations(c: State, cause: str, amount: float) -> State:
 
 
 def slope(c: State, cause: str) -> State:
-    """Return how ACC (W) and ALPHA (B), (6,), of a calm plant change with a cause, per its unit."""
+    """Return the change of ACC (W) and ALPHA (B), (6,), of a calm plant per unit of a cause."""
     h = DIFFERENCE
     near = accelerations(c, cause, h) - accelerations(c, cause, -h)
     far = accelerations(c, cause, 2 * h) - accelerations(c, cause, -2 * h)

@@ -1,13 +1,13 @@
-"""How Floaty looks: base plate, four flaps that turn, stand, and the markers of the cameras.
+"""Floaty's look: base plate, four turning flaps, stand, and the markers of the cameras.
 
-Shapes of flaps are in F, which has its origin on the body's z axis where the flap axes meet and is parallel to B when the
-flap angle is 0; a flap turns about its axis, outwards, by its signed angle.
+Shapes of flaps are in F, which has its origin on the body's z axis where the flap axes meet and is parallel to B at flap
+angle 0; a flap turns about its outward axis by its signed angle.
 
-The places of the real robot's markers are not published; here they sit on rigid parts, which excludes the flaps: four
-on the flap axes, which do not move when the flaps turn, two on posts over the base plate, two on the frame below.
-No two arms are alike, so that no other assignment of labels fits (the closest misses by 19 mm, test_markers.py), any
-three markers are far from one line, and they spread far enough for both noise figures of `[mocap]` to come out of one:
-1.1 mm per marker and axis makes 0.4 mm and 0.004 rad of the pose.
+The places of the real robot's markers are not published; here they are on rigid parts, not on the flaps: four on the flap
+axes, which do not move when the flaps turn, two on posts over the base plate, two on the frame below. All arms differ, so
+that no other assignment of labels fits (the closest misses by 19 mm, test_markers.py). No three markers are close to one
+line. Their spread gives both noise figures of `[mocap]` from one: 1.1 mm per marker and axis makes 0.4 mm and 0.004 rad
+of the pose.
 """
 
 import numpy as np

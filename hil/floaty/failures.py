@@ -1,4 +1,4 @@
-"""How Floaty's own parts fail: its four servos, each with its flap."""
+"""The failures of Floaty's own parts: four servos, each with its flap."""
 
 import math
 

@@ -1,5 +1,4 @@
-"""The shape of flap 2 and the robot's mass properties: from the profile's numbers to surfaces, mass, centre of mass and
-inertia.
+"""The shape of flap 2 and the robot's mass properties: computes surfaces, mass, centre of mass and inertia from a profile.
 
 Frames: F has its origin on the body's z axis where the flap axes meet, and is parallel to B. Flap 2 lies in the quadrant
 (+,+) of F when its angle is 0; the others are mirror images. An impossible geometry is refused here, in one line.
@@ -89,7 +88,7 @@ def _level_axis(geometry: GeometryConfig) -> Points:
 
 
 def _cut(polygon: list[Corner], axis: int, at: float, above: bool) -> list[Corner]:
-    """Return the part of a convex polygon where coordinate 0 or 1 is beyond `at`, or not."""
+    """Return the part of a convex polygon with coordinate 0 or 1 above or below `at`."""
     kept: list[Corner] = []
     for a, b in pairwise([*polygon, polygon[0]]):
         a_in, b_in = (p[axis] == at or (p[axis] > at) == above for p in (a, b))

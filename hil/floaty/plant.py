@@ -1,4 +1,4 @@
-"""Floaty in the tunnel, as the laboratory sees it (`hil.world.body`): pulses arrive, flaps turn, plates catch the flow."""
+"""Floaty in the tunnel, as a body of the laboratory (`hil.world.body`): pulses turn flaps, and the flow acts on plates."""
 
 import math
 from collections.abc import Sequence
@@ -44,7 +44,7 @@ def assemble(geometry: GeometryConfig, config: PlantConfig, tunnel: TunnelConfig
 class Plant(InTunnel):
     """Body, servos, tether and the air around them.
 
-    Attributes (read-only numpy views of the present truth, SI), besides those of `InTunnel`:
+    Attributes (read-only numpy views of the current truth, SI), besides those of `InTunnel`:
         truth (layout.SIZE,) everything; flaps (4,) [rad] signed flap angles;
         wrench_B (6,) force [N] and torque [N m] of the flow about the centre of mass;
         zero_offset (4,) [rad] of the servos' middle, for which the board was trimmed;
@@ -65,7 +65,7 @@ class Plant(InTunnel):
     ) -> None:
         """Start level, at rest, the flaps at the hover angle, at the hover point unless `p_WB` [m] says otherwise.
 
-        Of the battery's configuration it takes what its servos and its electronics draw.
+        From the battery's configuration it takes the power of servos and electronics.
         """
         s, air = assemble(geometry, config, tunnel)
         super().__init__(s, air, config, rng_gust)
@@ -106,7 +106,7 @@ class Plant(InTunnel):
         omega_B: Vector = (0.0, 0.0, 0.0),
         flaps: Vector | None = None,
     ) -> None:
-        """Set the state of the body, and the flaps' angles [rad]; None leaves them as they are. Raises LabError."""
+        """Set the state of the body, and the flaps' angles [rad]; None leaves them unchanged. Raises LabError."""
         if flaps is not None:
             if not all(map(math.isfinite, flaps)):
                 raise LabError(f"cannot place the plant with flaps = {flaps}: not finite")
@@ -122,7 +122,7 @@ class Plant(InTunnel):
         self.advance(now_us)
         self._commanded = commanded_angles(counts, self.zero_offset, self._commanded)
         s = self._s
-        # An earlier change may have been latched since the last millisecond: then this one queues behind it.
+        # An earlier change may have been latched since the last millisecond: then this one follows it.
         at_us, angles = (at.AFTER_US, at.AFTER) if s[at.NEXT_US] <= now_us else (at.NEXT_US, at.NEXT)
         s[at_us], s[angles : angles + 4] = next_period_us(now_us), self._commanded
 
@@ -159,7 +159,7 @@ class Plant(InTunnel):
         )
 
     def set_servo_fault(self, servo: int, trim_error: float = 0.0, speed: float = 1.0) -> None:
-        """Mount servo 0..3 with an error [rad] and run it at `speed` times its pace, 0: stuck; the defaults restore it."""
+        """Give servo 0..3 a mounting error [rad] and `speed` times its usual speed, 0: stuck; the defaults restore it."""
         self._s[at.SERVO_TRIM + servo], self._s[at.SERVO_SPEED + servo] = trim_error, speed
 
     def _trim(self, servo: int) -> Setting:

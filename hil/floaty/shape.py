@@ -58,7 +58,7 @@ def _outlined(geometry: GeometryConfig) -> list[tuple[float, NDArray[np.float64]
 
 
 def _quadrant(geometry: GeometryConfig) -> list[tuple[float, NDArray[np.float64]]]:
-    """Return area and centre for a quadrant without the base plate's corner; all bits of G0's flights rest on these sums."""
+    """Return area and centre for a quadrant without the base plate's corner; G0's hashes depend on these sums."""
     side, corner = geometry.footprint / 2, geometry.base_side / 2
     width, kink = geometry.strip_width, geometry.kink_angle
     quadrant, strip = side * side - corner * corner, width * side
@@ -72,7 +72,7 @@ def _quadrant(geometry: GeometryConfig) -> list[tuple[float, NDArray[np.float64]
 
 
 def drag_coefficient(geometry: GeometryConfig, airspeed: float, hover_angle: float) -> float:
-    """Return the C_D with which the robot hovers at a speed [m/s] and an opening of its flaps [rad]."""
+    """Return the C_D at which the robot hovers at a speed [m/s] and an opening of its flaps [rad]."""
     lift = geometry.base_side * geometry.base_side  # [m2] per dynamic pressure and C_D
     c, s = cos(hover_angle), -sin(hover_angle)  # flap 2 hovers at the negative angle
     for part in flap_plates(geometry):
@@ -87,7 +87,7 @@ def drag_coefficient(geometry: GeometryConfig, airspeed: float, hover_angle: flo
 
 
 def check_hover(geometry: GeometryConfig, plant: PlantConfig) -> None:
-    """Raise `LabError` when no plates of this size would carry the robot at its design speed and hover angle."""
+    """Raise `LabError` when no plates of this size carry the robot at its design speed and hover angle."""
     found = drag_coefficient(geometry, plant.airspeed, plant.hover_angle)
     low, high = DRAG_COEFFICIENTS
     if not low <= found <= high:

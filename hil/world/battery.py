@@ -1,6 +1,6 @@
 """The battery: the power drawn, the remaining charge, and the voltage under load.
 
-The cells are alike and in series. Voltages are those of one cell; the board measures the mean of its cells.
+The cells are equal and in series. Voltages are per cell; the board measures the mean of its cells.
 """
 
 import math
@@ -18,14 +18,14 @@ def open_circuit_voltage(charge: float) -> float:
 
 
 class Battery:
-    """Charge and voltage over time; `draw` is called at every row of the log.
+    """Charge and voltage over time; the caller calls `draw` at every row of the log.
 
     Attributes: charge 0..1; voltage [V] of one cell under load, as it reaches the board; power [W] of the whole robot since
     the last call; sag_V [V] lost between each cell and the board, for a fault.
     """
 
     def __init__(self, config: BatteryConfig, power: float = 0.0) -> None:
-        """Begin under a load of `power` [W]."""
+        """Start under a load of `power` [W]."""
         self.sag_V = 0.0
         self.charge = config.charge
         self.power = power
@@ -54,7 +54,7 @@ class Battery:
         self.charge = max(self.charge - current * duration / self._config.capacity, 0.0)
 
     def _loaded(self) -> float:
-        """Return the voltage V at which V (OCV - V) / R is the power of a cell; half of OCV when it cannot supply that."""
+        """Return the voltage V with V (OCV - V) / R equal to a cell's power; half of OCV when it cannot supply that."""
         open_circuit = open_circuit_voltage(self.charge)
         per_cell = self.power / self._config.cells
         return 0.5 * (

@@ -1,7 +1,7 @@
-"""A robot's body as the laboratory knows it: timer outputs in; motion, air, supply power, loss and log columns out.
+"""The laboratory's interface to a robot's body: timer outputs in; motion, air, supply power, loss and log columns out.
 
 Floaty (`hil.floaty.plant`) is one of them. SI units; frames W (world, z up) and B (body, x forward, y left, z up, origin at
-the centre of mass). Instants are the laboratory's, in whole microseconds.
+the centre of mass). Times are the laboratory's, in whole microseconds.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hil.scene import Look, Markers
 from hil.world.tunnel import Tunnel
 
 Vector = Sequence[float]
-View = NDArray[np.float64]  # read-only, of memory that the body keeps for its whole life
+View = NDArray[np.float64]  # read-only, of memory that lives as long as the body
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A kind of fault of a body: sizes in `unit`, and which of its settings the size changes, in SI by `scale`."""
+    """A kind of fault of a body: the size in `unit`, and the settings that it changes, in SI by `scale`."""
 
     meaning: str
     unit: str
@@ -56,13 +56,13 @@ class Failure:
     low: float
     high: float
     setting: str
-    blend: Literal["add", "times"]  # several sizes with one another and with the setting
+    blend: Literal["add", "times"]  # combines sizes with one another and with the setting
     outcome: Literal["holds", "degrades", "failsafe", "lost"]  # of the hover, as of `Kind`
     scale: float = 1.0
 
 
 class Motion(Protocol):
-    """The present truth, as views whose memory stays where it is."""
+    """The current truth, as views of fixed memory."""
 
     @property
     def state(self) -> View:
@@ -86,7 +86,7 @@ class Motion(Protocol):
 
     @property
     def vibration(self) -> View:
-        """(2,) [rad/s, m/s2] rms per axis of what motors add to the rate and the specific force of one sample."""
+        """(2,) [rad/s, m/s2] rms per axis that motors add to a sample's rate and specific force."""
 
     @property
     def flow_W(self) -> View:
@@ -95,22 +95,22 @@ class Motion(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Carrier:
-    """What carries a board, and the random stream of its sensors."""
+    """The body that carries a board, and the random stream of its sensors."""
 
     motion: Motion
     rng: np.random.Generator
 
 
 class Body(Motion, Protocol):
-    """What flies. It is made at rest at its start, and held there from `hold` to `release`."""
+    """A flying body. It starts at rest, and is held from `hold` to `release`."""
 
     @property
     def outputs(self) -> Sequence[tuple[int, int]]:
-        """Timer and channel, counted from 0, of the microcontroller's outputs that drive it: those of M1 to M4."""
+        """Timer and channel, from 0, of the microcontroller's outputs that drive it: M1 to M4."""
 
     @property
     def tunnel(self) -> Tunnel:
-        """The air around it, whose knobs faults turn."""
+        """The air around it, whose knobs faults change."""
 
     @property
     def pushes(self) -> View:
@@ -118,7 +118,7 @@ class Body(Motion, Protocol):
 
     @property
     def look(self) -> Look:
-        """What it looks like, for the pictures."""
+        """Its look, for the pictures."""
 
     @property
     def markers(self) -> Markers:
@@ -126,32 +126,32 @@ class Body(Motion, Protocol):
 
     @property
     def settings(self) -> Mapping[str, Setting]:
-        """What faults may change in it besides `push` and `tunnel`, by name."""
+        """The settings that faults may change, besides `push` and `tunnel`, by name."""
 
     @property
     def lost(self) -> str | None:
         """The first reason why the flight is over, with its value and unit; None while it flies."""
 
     def advance(self, now_us: int) -> None:
-        """Bring the truth to the last of its own steps that ends at or before `now_us`."""
+        """Advance the truth by all of its steps that end at or before `now_us`."""
 
     def set_counts(self, now_us: int, counts: Sequence[int]) -> None:
-        """Take the compare counts of the timers at `outputs`; they act when hardware would let them."""
+        """Take the compare counts of the timers at `outputs`; they take effect when they would on hardware."""
 
     def draw(self, now_us: int, cell_V: float) -> float:
-        """Return the mean power [W] of the whole robot since the last call; `cell_V` [V] is what a cell gives meanwhile."""
+        """Return the mean power [W] of the whole robot since the last call, at `cell_V` [V] per cell."""
 
     def hold(self) -> None:
         """Clamp the body where it is, at rest; actuators, air and sensors continue."""
 
     def release(self) -> None:
-        """Let it go."""
+        """Release it."""
 
     def put_back(self, p_WB: Vector) -> None:
-        """Hold it upright at a place, as at its start, with the cause of a loss cleared; the actuators continue."""
+        """Hold it upright at a place, as at its start, and clear the cause of a loss; the actuators continue."""
 
     def push(self, force_W: Vector, torque_B: Vector = (0.0, 0.0, 0.0)) -> None:
         """Apply a force [N] at the centre of mass and a torque [N m] until the next call."""
 
     def channels(self) -> tuple[Channel, ...]:
-        """Return what it logs besides its motion."""
+        """Return its log channels besides its motion."""

@@ -1,6 +1,6 @@
 """The robot as it really is in this world: body, tether, limits, servos. Every default names its source.
 
-"paper" is the Floaty paper, "assumed" has no source; docs/explanation/plant.md says what follows from the choices.
+"paper" is the Floaty paper, "assumed" has no source; docs/explanation/plant.md explains the consequences.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Linear algebra, and the elementary functions compiled, in a fixed order: the same bits on every processor.
+"""Linear algebra in a fixed order, and compiled elementary functions: the same bits on every processor.
 
-BLAS and LAPACK, behind numpy's `@` and `numpy.linalg`, choose their code by processor and sum in another order on each; so
-nothing that flies uses them. Made for the few small matrices of a flight. Normal noise has the same bits everywhere, too.
+BLAS and LAPACK, behind numpy's `@` and `numpy.linalg`, choose code by processor and sum in different orders, so flights
+do not use them. This file suits the few small matrices of a flight. Normal noise also has the same bits everywhere.
 """
 
 import math
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from firmware_py import compiling, elementary
 
-# What compiled functions of the laboratory depend on, besides their own files.
+# The dependencies of the laboratory's compiled functions, besides their own files.
 SOURCES = (
     Path(__file__).parent,
     Path(elementary.__file__),
@@ -24,7 +24,7 @@ compiled = compiling.compiler(*SOURCES)
 Matrix = NDArray[np.float64]
 
 SWEEPS_MAX = 50  # of Jacobi's method; 4 to 6 are usual
-NEGLIGIBLE = 1e-36  # sum of squares beside the diagonal, as a share of all
+NEGLIGIBLE = 1e-36  # sum of squares off the diagonal, as a share of all
 
 sine_ahead = compiled(elementary.sine_ahead)
 exp = compiled(elementary.exp)
@@ -82,8 +82,8 @@ def eigen(S: Matrix) -> tuple[Matrix, Matrix]:
 def fit_polynomial(x: Matrix, y: Matrix, order: int) -> Matrix:
     """Return the coefficients (order + 1,), from the constant on, of the least-squares polynomial through points (N,).
 
-    Forsythe's polynomials, which are orthogonal on the points, make every coefficient a sum of its own: no equations to
-    solve, and nothing is ill-conditioned. `fsum` rounds once, whatever the order.
+    Forsythe's polynomials are orthogonal on the points, so every coefficient is a separate sum: no equations to solve,
+    and nothing is ill-conditioned. `fsum` rounds once, in any order.
     """
     fit = np.zeros(order + 1)
     before, now = np.zeros(order + 1), np.eye(1, order + 1)[0]  # coefficients of two successive polynomials
@@ -106,6 +106,6 @@ STEPS = 65536.0  # per standard deviation
 def normal(rng: np.random.Generator, shape: int | tuple[int, ...]) -> NDArray[np.float64]:
     """Return numbers of the standard normal distribution, rounded to 1 / `STEPS`.
 
-    Beyond 3.65, numpy takes a logarithm of the C library, which differs in its last bit; rounding removes that.
+    Beyond 3.65, numpy uses the C library's logarithm, whose last bit differs; rounding removes that.
     """
     return np.asarray(np.rint(rng.standard_normal(shape) * STEPS) / STEPS)

@@ -1,8 +1,8 @@
 """A rigid body in the tunnel: its truth, the air around it, its holder, pushes, tether, net and limits.
 
-The truth lives on a grid of whole milliseconds from time 0: `advance(now_us)` does every step that ends at or before
-`now_us`. The same generator and the same calls give the same bits however the time to an instant is divided into calls.
-What the flow and the actuators do is up to a subclass: `hil.floaty.plant`, `hil.world.rigid`.
+The truth is computed per whole millisecond from time 0: `advance(now_us)` does every step that ends at or before
+`now_us`. The same generator and the same inputs give the same bits, however the time is divided into calls. Subclasses
+compute flow and actuators: `hil.floaty.plant`, `hil.world.rigid`.
 """
 
 import math
@@ -31,11 +31,11 @@ LOSS_TEXTS = {
 
 
 class InTunnel:
-    """The part of a body that all bodies in the tunnel share. `s` is its array, with mass and inertia in it.
+    """The common part of all bodies in the tunnel. `s` is its array, including mass and inertia.
 
-    Attributes (read-only numpy views of the present truth, SI): state (13,) p_WB, v_WB, q_WB, omega_B in one piece;
-    p_WB, v_WB (3,) in W; q_WB (4,) w x y z; omega_B (3,) in B; specific_force_B (3,) at the centre of mass; flow_W (3,) of
-    the air there; pushes (6,) force [N, W] and torque [N m, B] last set.
+    Attributes (read-only numpy views of the current truth, SI): state (13,) p_WB, v_WB, q_WB, omega_B in one piece; p_WB,
+    v_WB (3,) in W; q_WB (4,) w x y z; omega_B (3,) in B; specific_force_B (3,) at the centre of mass; flow_W (3,) of the
+    air there; pushes (6,) force [N, W] and torque [N m, B] last set.
     """
 
     # Compute forces and accelerations from the state; do every step up to `_now_us`, True: the draws ran out before.
@@ -60,7 +60,7 @@ class InTunnel:
         self._rng = rng_gust
         self._draws = normal(rng_gust, (NOISE_ROWS, 14))
         self._now_us = np.zeros(1, np.int64)
-        self._due_us = 0  # until then the truth stays
+        self._due_us = 0  # until then the truth is constant
         self.state, self.pushes = self._view(at.P, 13), self._view(at.PUSH, 6)
         self.p_WB, self.v_WB, self.q_WB = self._view(at.P, 3), self._view(at.V, 3), self._view(at.Q, 4)
         self.omega_B = self._view(at.OMEGA, 3)
@@ -79,7 +79,7 @@ class InTunnel:
         v_WB: Vector = (0.0, 0.0, 0.0),
         omega_B: Vector = (0.0, 0.0, 0.0),
     ) -> None:
-        """Set the state of the body; `q_WB` is normalised. Raises LabError for what is no pose."""
+        """Set the state of the body; `q_WB` is normalised. Raises LabError for an invalid pose."""
         s = self._s
         length = math.sqrt(math.fsum(component * component for component in q_WB))
         if not (length > 0.0 and all(map(math.isfinite, (*p_WB, *q_WB, *v_WB, *omega_B)))):
@@ -89,7 +89,7 @@ class InTunnel:
         self._evaluate()
 
     def advance(self, now_us: int) -> None:
-        """Bring the truth to the last whole millisecond at or before `now_us`."""
+        """Advance the truth to the last whole millisecond at or before `now_us`."""
         if now_us < self._due_us:
             return
         self._now_us[0] = now_us
@@ -113,7 +113,7 @@ class InTunnel:
         self._evaluate()
 
     def put_back(self, p_WB: Vector) -> None:
-        """Clamp the body upright at a place, with all causes of a loss cleared; the actuators stay as they are."""
+        """Clamp the body upright at a place, and clear all causes of a loss; the actuators stay unchanged."""
         self._s[at.LOST] = 0.0
         self.place(p_WB, UPRIGHT)
         self.hold()

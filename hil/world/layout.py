@@ -1,9 +1,9 @@
 """The layout of the plant's single flat float64 array.
 
-One array is the whole plant: state, values computed from it, inputs that may change during a flight, and constants.
-A compiled kernel call then costs one argument, and truth is read through numpy views. Units are SI; frames are in the
-names or comments: W world (z up), B body (x forward, y left, z up, at the centre of mass).
-Flaps count 0..3 here, at the quadrants (+,-), (+,+), (-,+), (-,-) of B; plate 2i is the flat part of flap i, 2i+1 its kink.
+One array holds the whole plant: state, values computed from it, inputs that may change during a flight, and constants. A
+compiled kernel call then has one argument, and truth is read through numpy views. Units are SI; frames are in the names
+or comments: W world (z up), B body (x forward, y left, z up, at the centre of mass). Flaps count 0..3 here, at the
+quadrants (+,-), (+,+), (-,+), (-,-) of B; plate 2i is the flat part of flap i, 2i+1 its kink.
 """
 
 _size = 0
@@ -42,12 +42,12 @@ PLATE_FORCES = _take(15)  # [N] base and four flaps as isolated plates, in W
 ACC = _take(3)  # [m/s2] of the centre of mass, in W, gravity included
 ALPHA = _take(3)  # [rad/s2] in B
 SPECIFIC_FORCE = _take(3)  # [m/s2] as measured by an accelerometer at the centre of mass, in B
-VIBRATION = _take(2)  # [rad/s], [m/s2] rms of rate and specific force by what turns, per axis
+VIBRATION = _take(2)  # [rad/s], [m/s2] rms of rate and specific force by rotating parts, per axis
 PULL = _take(3)  # [N] of the tether, in W
 GROUND = _take(6)  # force [N] of the net, in W, and its torque [N m], in B
 
 # Servos
-COMMAND = _take(4)  # [rad] commanded angles in force
+COMMAND = _take(4)  # [rad] current commanded angles
 NEXT_US = _take()  # instant at which NEXT takes effect, inf: never
 NEXT = _take(4)
 AFTER_US = _take()  # instant at which AFTER takes effect, inf: never

@@ -1,4 +1,4 @@
-"""How the plant moves in one millisecond: gusts, servos, rigid body by the midpoint rule, end of a flight; compiled."""
+"""The plant's step of one millisecond: gusts, servos, rigid body by the midpoint rule, end of a flight; compiled."""
 
 import math
 
@@ -100,7 +100,7 @@ def turn_flaps(s: State, duration: float) -> None:
 
 @compiled
 def drive_servos(s: State, start_us: float, end_us: float) -> None:
-    """Turn the flaps from `start_us` to `end_us`, latching new counts at their instant in between."""
+    """Turn the flaps from `start_us` to `end_us`, latching new counts at their times in between."""
     if s[at.NEXT_US] < end_us:
         latch_us = max(s[at.NEXT_US], start_us)
         turn_flaps(s, (latch_us - start_us) * 1e-6)
@@ -129,7 +129,7 @@ def rotate(s: State, qw: float, qx: float, qy: float, qz: float, duration: float
 
 @compiled
 def watch(s: State) -> None:
-    """Note the first reason why the flight is over."""
+    """Record the first reason why the flight is over."""
     x, y, z = s[at.P], s[at.P + 1], s[at.P + 2] - s[at.HOVER_HEIGHT]
     radius = math.sqrt(x * x + y * y)
     cos_tilt = s[at.R + 8]

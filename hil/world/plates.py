@@ -13,9 +13,9 @@ from firmware_py.elementary import tan
 from hil.world import layout as at
 from hil.world.fixed_order import compiled, sine_ahead
 
-# Slope of the wind beyond which identified stiffness does not grow.
+# Slope of the wind above which identified stiffness does not grow.
 TILT_MAX = tan(math.radians(35.0))
-LIFT_U4_MAX = 0.55  # [rad] the lift ratio l(u4) is fitted for |u4| up to here
+LIFT_U4_MAX = 0.55  # [rad] largest |u4| in the fit of the lift ratio l(u4)
 UPFLOW_MIN = 0.1  # [m/s] keeps the slope of the wind finite when the air stands still
 
 State = NDArray[np.float64]  # (layout.SIZE,)
@@ -82,7 +82,7 @@ def flap_upflow(s: State, flap: int) -> float:
 
 @compiled
 def strike(s: State, plate: int, c: float, d: float, ux: float, uy: float, uz: float) -> Wrench:
-    """Return force and torque of a plate of a flap with this cosine and sine, in the wind (ux, uy, uz) at the flap; in B."""
+    """Return force and torque of a flap's plate at a cosine and sine, in the wind (ux, uy, uz) at the flap; in B."""
     n, r = at.NORMAL + 9 * plate, at.CENTRE + 9 * plate
     ox, oy, oz = s[at.OMEGA], s[at.OMEGA + 1], s[at.OMEGA + 2]
     nx = s[n] + s[n + 3] * c + s[n + 6] * d
@@ -106,7 +106,7 @@ def added(a: Wrench, b: Wrench) -> Wrench:
 
 @compiled
 def press(s: State) -> None:
-    """Write force and torque of all plates as they stand (DRAG) and at the hover angle (HOVER_DRAG), in B."""
+    """Write force and torque of all plates at their current (DRAG) and hover angles (HOVER_DRAG), in B."""
     bz = s[at.WIND + 2]
     base = s[at.PRESSURE] * s[at.BASE_AREA] * bz * abs(bz)
     s[at.PLATE_FORCES], s[at.PLATE_FORCES + 1], s[at.PLATE_FORCES + 2] = 0.0, 0.0, base

@@ -1,8 +1,7 @@
-"""A robot of the user's own: a rigid body whose forces a Python method computes; integration, air and holder are here.
+"""A user's robot: a rigid body whose forces a Python method computes; integration, air and holder are here.
 
-A subclass states mass and inertia and computes a wrench; it may move actuators once per millisecond. The same midpoint rule
-as Floaty's on the same grid. Elementary functions have the same bits everywhere only if they are those of
-`firmware_py.elementary`.
+A subclass states mass and inertia and computes a wrench; it may move actuators once per millisecond. Midpoint rule and
+time grid are Floaty's. Only the elementary functions of `firmware_py.elementary` have the same bits everywhere.
 """
 
 import math
@@ -36,17 +35,17 @@ class World(Protocol):
 
     @property
     def plant(self) -> PlantConfig:
-        """Of it: tether, ground, limits, and the factors on mass and inertia."""
+        """The tether, ground, limits, and the factors on mass and inertia."""
 
     @property
     def battery(self) -> BatteryConfig:
-        """Of it: what the electronics draw."""
+        """The power of the electronics."""
 
 
 class RigidBody(InTunnel):
     """A body made of `mass` [kg], `inertia` about x, y, z of B [kg m2] and a method `wrench`.
 
-    `counts` are those of the board's four timers, of the last that were set.
+    `counts` are the last counts of the board's four timers.
     """
 
     mass: ClassVar[float]
@@ -54,11 +53,11 @@ class RigidBody(InTunnel):
     outputs: Sequence[tuple[int, int]] = OUTPUTS
     settings: Mapping[str, Setting] = {}
     parts: tuple[Part, ...] = (ball(0.05),)
-    logged: Mapping[str, tuple[str, str]] = {}  # by attribute: the names of its numbers, and their unit
-    radius: float = 0.1  # [m] of the ball on which the cameras' markers are
+    logged: Mapping[str, tuple[str, str]] = {}  # by attribute: names of its numbers, and their unit
+    radius: float = 0.1  # [m] of the ball with the cameras' markers
 
     def __init__(self, world: World, rng_gust: np.random.Generator, p_WB: Vector) -> None:
-        """Start upright and at rest at a place [m]. Raises `LabError` for a subclass that is none."""
+        """Start upright and at rest at a place [m]. Raises `LabError` for an invalid subclass."""
         s = np.zeros(at.SIZE)
         super().__init__(s, Tunnel(world.tunnel, s), world.plant, rng_gust)
         self._check_masses()
@@ -90,11 +89,11 @@ class RigidBody(InTunnel):
         """Move the actuators for a millisecond, `duration` [s], towards `counts`."""
 
     def power(self) -> float:
-        """Return what the actuators draw now [W]."""
+        """Return the actuators' current power [W]."""
         return 0.0
 
     def channels(self) -> tuple[Channel, ...]:
-        """Return what it logs besides its motion: the `logged` attributes, as columns `robot.NAME`."""
+        """Return its log channels besides its motion: the `logged` attributes, as columns `robot.NAME`."""
         return tuple(
             Channel(
                 "float64",
@@ -119,11 +118,11 @@ class RigidBody(InTunnel):
 
     @property
     def markers(self) -> Markers:
-        """Eight markers that nothing hides but the trunk."""
+        """Eight markers; only the trunk hides them."""
         return Markers(eight_markers(self.radius))
 
     def set_counts(self, now_us: int, counts: Sequence[int]) -> None:
-        """Take the counts of the timers; they act from the next millisecond on."""
+        """Take the counts of the timers; they take effect at the next millisecond."""
         self.advance(now_us)
         self.counts = tuple(counts)
 
@@ -137,7 +136,7 @@ class RigidBody(InTunnel):
 
     @property
     def lost(self) -> str | None:
-        """The first reason why the flight is over, also what its own code did wrong; None while it flies."""
+        """The first reason why the flight is over, including errors of its own code; None while it flies."""
         return self._failed or super().lost
 
     def _given(self, name: str, ask: Callable[[], Any], count: int) -> list[float]:
@@ -163,7 +162,7 @@ class RigidBody(InTunnel):
                 raise LabError(f"{type(self).__name__}.{name} = {value!r}: expected {what}")
 
     def _evaluate(self) -> None:
-        """Compute air, wrench and accelerations; a wrench that is none ends the flight with the body clamped."""
+        """Compute air, wrench and accelerations; an invalid wrench ends the flight with the body clamped."""
         self._surround()
         s = self._s
         if self._failed is None:
@@ -224,6 +223,6 @@ class RigidBody(InTunnel):
 
 
 def _numbers(part: Any) -> Iterator[float]:
-    """Yield the numbers of what should be a vector; nothing for anything else."""
+    """Yield the numbers of a vector; nothing for anything else."""
     if isinstance(part, Sequence | np.ndarray) and not isinstance(part, str):
         yield from (float(one) for one in part if isinstance(one, int | float | np.generic))

@@ -1,4 +1,4 @@
-"""The wind tunnel: mean profile, gusts, side wind, fans, a blocked patch; constants, and values that may change in flight.
+"""The wind tunnel: mean profile, gusts, side wind, fans, a blocked area; constants, and values that may change in flight.
 
 The air is computed inside the plant's kernel (`hil.world.plates`); `Tunnel` writes that kernel's inputs. World frame: z
 up, origin in the middle of the tunnel's exit, hover point `hover_height` above it.
@@ -24,9 +24,9 @@ GUST_GROWTH_MAX = 6.0  # ... up to this
 
 
 class Tunnel:
-    """The knobs of the tunnel during a flight; a change acts from the next millisecond on.
+    """The knobs of the tunnel during a flight; a change takes effect at the next millisecond.
 
-    `fan_factor`, `gust_scale`, `side_wind` (x, y, z) and `shadow` (the share that is blocked) hold the values last set.
+    `fan_factor`, `gust_scale`, `side_wind` (x, y, z) and `shadow` (the blocked share) are the last values set.
     """
 
     def __init__(self, config: TunnelConfig, state: NDArray[np.float64]) -> None:
