@@ -1,1 +1,1 @@
-"""The command line, one file per command; nothing else knows click or rich."""
+"""The command line, one file per command; no other room imports click or rich."""

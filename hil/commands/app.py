@@ -15,7 +15,7 @@ from hil.commands.options import INTERRUPTED
 from hil.errors import LabError
 from hil.installation import describe
 
-# The file of this room and the function for each command, in the order of the help.
+# File and function of each command, in the order of the help.
 COMMANDS = {
     "fly": "fly.fly",
     "new": "new.new",
@@ -41,7 +41,7 @@ COMMANDS = {
 }
 
 
-# What became of options and commands that no longer exist.
+# Replacements of removed options and commands.
 MOVED = {
     "deploy export": "floaty deploy write DIR",
     "--baud": "--set serial.baud=N",
@@ -55,7 +55,7 @@ MOVED = {
 
 
 class LazyGroup(click.Group):
-    """A group that imports the file of a command when the command is asked for."""
+    """A group that imports a command's file at the command's first use."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names in the order of the help."""
@@ -86,13 +86,13 @@ def _print_version(context: click.Context, option: click.Parameter, wanted: bool
     help="Show version, commit, packages and programs found, and exit.",
 )
 def app() -> None:
-    """Floaty virtual laboratory: firmware, ground station and wind tunnel, joined by real bytes."""
+    """Floaty virtual laboratory: firmware, ground station and wind tunnel, connected by real bytes."""
 
 
 def main() -> None:
-    """Run the command line and leave with its exit code."""
-    gc.set_threshold(100_000, 20, 50)  # imports alone would cause collections of 0.3 s in sum
-    atexit.register(gc.freeze)  # Python's last collection would take 0.5 s from the result to the prompt
+    """Run the command line and exit with its code."""
+    gc.set_threshold(100_000, 20, 50)  # imports alone would cause 0.3 s of collections
+    atexit.register(gc.freeze)  # Python's last collection would delay the prompt by 0.5 s
     if STALE:
         print(f"floaty: pure Python, not what `make fast` has compiled: {STALE}", file=sys.stderr)
     try:

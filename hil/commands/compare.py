@@ -1,4 +1,4 @@
-"""`floaty compare`: where two flights first differ, their metrics side by side, both in one picture."""
+"""`floaty compare`: the first difference of two flights, their metrics side by side, both in one picture."""
 
 import math
 from pathlib import Path
@@ -29,7 +29,7 @@ folder_type = click.Path(path_type=Path)
 def compare(first: Path, second: Path, out: Path | None) -> int:
     """Compare one flight with another: first difference, metrics, settings, both in one plot.
 
-    Of flights that differ in their boards only: the first servo count that differs, and why. Of two folders of such runs
+    For flights that differ only in their boards: the first different servo count, and why. For two folders of such runs
     (`floaty fly EXPERIMENT --seeds N --board BOARD --out DIR`): a row per seed.
 
     Exit code 0: the logs are identical; 1: they differ; 2: bad input.
@@ -93,7 +93,7 @@ def _print_comparison(first: Path, second: Path, comparison: "Comparison") -> No
 
 
 def _print_seeds(first: Path, second: Path, seeds: list["Seed"]) -> int:
-    """Print a row per seed; returns the exit code."""
+    """Print a row per seed; return the exit code."""
     table = Table(title=f"{first} | {second}")
     for heading in (
         "seed",

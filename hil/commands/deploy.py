@@ -1,7 +1,7 @@
-"""`floaty deploy write | check | flash`: the flight core as C for a Crazyflie, and the proof that it equals the one that
-flew.
+"""`floaty deploy write | check | flash`: the flight core as C for a Crazyflie, and the proof that it equals the simulated
+one.
 
-And `floaty board doctor`: the state of what is connected, within a minute.
+And `floaty board doctor`: the state of a connected board, within a minute.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ def check(
     """Fly with numba, plain Python, C and Cortex-M4 machine code side by side; compare the core's memory bit for bit.
 
     Without EXPERIMENT: hover, yaw step, a hover with faults, 10 000 ticks of 10 ms, and flights that take the supervisor
-    through all states and causes. Exit code 0: no bit differs; 1: one
-    does; 2: bad input; 130: interrupted. With --elf 1 also when anything else in the firmware is not as in PROFILE.
+    through all states and causes. Exit code 0: no bit differs; 1: one does; 2: bad input; 130: interrupted. With --elf
+    also 1 when anything else in the firmware differs from PROFILE.
     """
     from hil.config import settings_of
     from hil.deploy.check import check_flight, plan, reached
@@ -132,13 +132,13 @@ def check(
 
 
 def _check_around(elf: Path, profile: str, overrides: tuple[str, ...]) -> bool:
-    """Check what is around the core in an image; print what is found, and what stays unproven."""
+    """Check an image around its core; print the findings, and what remains unproven."""
 
     from hil.deploy.image_check import UNPROVEN, check_image, check_memory, has_app
 
     app, memory = has_app(elf)
     well = True
-    say_finding(check_memory(memory))  # a warning: it flies
+    say_finding(check_memory(memory))  # only a warning
     if not app:
         console.print(f"unproven: everything but the core: {elf} has no exported app", soft_wrap=True)
         return True
@@ -157,7 +157,7 @@ def _check_around(elf: Path, profile: str, overrides: tuple[str, ...]) -> bool:
 
 
 def say_finding(finding: Finding) -> None:
-    """Print a line about a board or an image, marked when it is not as it should be."""
+    """Print a line about a board or an image, marked when it reports a defect."""
     say(f"{'  ' if finding.good else '! '}{finding.subject:<10}{finding.text}")
 
 
@@ -208,7 +208,7 @@ def _print_machine_code(code: MachineCode) -> None:
 
 
 def _print_measured(board: str, measured: Loads, counted: Loads) -> None:
-    """Print the cycles that a board has measured beside those counted for the machine code."""
+    """Print a board's measured cycles beside those counted for the machine code."""
     console.print(f"{board}: cycles per call, mean and worst, as measured on the board", soft_wrap=True)
     for name, load in measured.items():
         if load.calls == 0:
@@ -289,9 +289,9 @@ def board() -> None:
 @profile_option
 @set_option
 def doctor(link: str, profile: str, overrides: tuple[str, ...]) -> int:
-    """Report what is at LINK (radio://0/80/2M/E7E7E7E7E7, usb://0, udp://HOST:PORT), and whether it is in order.
+    """Examine the board at LINK (radio://0/80/2M/E7E7E7E7E7, usb://0, udp://HOST:PORT), and report its defects.
 
-    The board must not fly, and nothing moves. Exit code 0: all is well; 1: something is not; 2: no board answers.
+    The board must not fly, and nothing moves. Exit code 0: no defect; 1: a defect; 2: no board answers.
     """
     from hil.config import load_config
     from hil.deploy.doctor import examine

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from hil.design.analysis import Analysis
     from hil.design.sweeps import Point
 
-SPEED_MAX = 60.0  # [m/s] the greatest that a profile allows
+SPEED_MAX = 60.0  # [m/s] the largest that a profile allows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,7 +78,7 @@ out_option = click.option(
 @out_option
 @asked_as(DesignOptions)
 def design(context: click.Context, robot: DesignOptions) -> None:
-    """Trim, constants, poles, authority and sweeps of a profile's robot, beside the paper's claims of its design."""
+    """Compute trim, constants, poles, authority and sweeps of a profile's robot, and compare the paper's claims."""
     require("floaty design", "design", "scipy", "control")
     if context.invoked_subcommand is not None:
         return
@@ -164,7 +164,7 @@ def write_profile(point: "Point", path: Path, about: str, length: float = 1.0) -
 
 
 def point_of(robot: DesignOptions) -> "Point":
-    """Return a profile's robot, or a similar one, at its design hover or at the hover of another speed or angle."""
+    """Return a profile's robot, or a similar one, in its design hover or at another speed or angle."""
     from hil.config import load_config
     from hil.design.sweeps import point_of as own_point_of
     from hil.design.trim import opening_at, scaled

@@ -123,7 +123,7 @@ def fly(
 
 
 def _check_seeds(seeds: int, request: Request, target: str | None) -> None:
-    """Raise `LabError` for a request of which only one seed can fly at a time."""
+    """Raise `LabError` for a request that can only fly one seed at a time."""
     bench = request.bench
     if bench.realtime or target or bench.trace:
         raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
@@ -136,7 +136,7 @@ def _check_seeds(seeds: int, request: Request, target: str | None) -> None:
 
 
 def _fly_one(request: Request, folder: Path, target: str | None) -> int:
-    """Fly one seed with all its pictures; returns the exit code."""
+    """Fly one seed with all its pictures; return the exit code."""
 
     from hil.api import maker_of
     from hil.laboratory.run import fly
@@ -174,7 +174,7 @@ def _fly_one(request: Request, folder: Path, target: str | None) -> int:
 
 
 def _fly_many(requests: list[Request], options: Options, parent: Path, crew: dict[str, Any]) -> int:
-    """Fly seeds in parallel processes; one row per seed, a summary at the end; returns the exit code."""
+    """Fly seeds in parallel processes; print one row per seed and a summary; return the exit code."""
     from hil.campaigns.jobs import Job
     from hil.campaigns.run import Runner
     from hil.laboratory.folder import folder_of, moved

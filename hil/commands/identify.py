@@ -1,4 +1,4 @@
-"""`floaty identify` and `floaty tune`: from flights to the model's constants, and from those to gains."""
+"""`floaty identify` and `floaty tune`: compute the model's constants from flights, and gains from the constants."""
 
 from collections.abc import Iterable
 from math import degrees, inf
@@ -143,10 +143,10 @@ def tune(
     runs: Path,
     **crew: Any,
 ) -> int:
-    """Make gains of the paper's control law for the profile's model, and fly them in lockstep with the profile's plant.
+    """Compute gains of the paper's control law for the profile's model, and fly them in lockstep with its plant.
 
-    Exit code 0: the new gains hover no worse than the old ones, which are kept otherwise; 1: they do; 2: bad input, no
-    gains, or a lost robot.
+    Exit code 0: the new gains hover at least as well as the old ones; 1: they do not, and the old ones are kept; 2: bad
+    input, no gains, or a lost robot.
     """
     require("floaty tune", "design", "scipy", "control")
     from hil.campaigns.run import Runner

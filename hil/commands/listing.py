@@ -1,4 +1,4 @@
-"""`floaty list`: what can be flown; `floaty runs`: what has been flown."""
+"""`floaty list`: the experiments; `floaty runs`: the past flights."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ HASH_DIGITS = 12
 def list_experiments(file: Path | None, faults: bool) -> None:
     """List the experiments, the robustness studies and the profiles, or the kinds of faults.
 
-    Experiments of installed packages are included, with their package; FILE.py: those of a file, and its faults.
+    Includes experiments of installed packages, with their package; FILE.py: those of a file, and its faults.
     """
     from hil.config import DEFAULT_PROFILE, profile_names
     from hil.experiments import EXPERIMENTS
@@ -108,7 +108,7 @@ def runs(folder: Path) -> None:
 
 
 def _request_of(result: Result) -> str:
-    """Return what was flown, without what is usual."""
+    """Return the request as text, without default parts."""
     from hil.laboratory.request import USUAL
 
     asked = {**result.request.parts(), "": result.request.experiment.name}
@@ -118,7 +118,7 @@ def _request_of(result: Result) -> str:
 
 
 def verdict_of(result: Result) -> str:
-    """Return how a flight went, in a few words."""
+    """Return a flight's result in a few words."""
     failed = [verdict.metric for verdict in result.verdicts if not verdict.holds]
     if result.outcome != "completed":
         return result.outcome

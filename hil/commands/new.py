@@ -1,7 +1,7 @@
-"""`floaty new` and `floaty policy`: folders with a control law, profile and tests, ready to fly.
+"""`floaty new` and `floaty policy`: make folders with a control law, profile and tests, ready to fly.
 
-The first has a small law of the user's own, with experiments, or a robot of the user's own; the second a trained network
-as a law.
+The first has a small control law with experiments, or a robot, for the user to change; the second has a trained network
+as its law.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 TEMPLATES = Path(__file__).parent / "project"  # NAME.in
 POLICY_TEMPLATES = Path(__file__).parent / "policy_project"
 ROBOT_TEMPLATES = Path(__file__).parent / "robot_project"
-NAMED = {"gitignore": ".gitignore"}  # files that would act on the template itself
+NAMED = {"gitignore": ".gitignore"}  # files that would affect the template itself
 TOLERANCE = 1e-4  # of an action, -1..1
-ROOM = 0.9  # of the control slot: the cycles are those of one compiler, on some states
+ROOM = 0.9  # of the control slot: the cycles are from one compiler, for some states
 
 
 @click.command()
@@ -36,7 +36,7 @@ ROOM = 0.9  # of the control slot: the cycles are those of one compiler, on some
     "--robot", is_flag=True, help="A robot of your own: robot.py, its controller, profile and tests."
 )
 def new(folder: Path, robot: bool) -> None:
-    """Make a project in DIR, which is new or empty: controller.py, profile.toml, experiments.py, tests, README.md."""
+    """Make a project in DIR, a new or empty folder: controller.py, profile.toml, experiments.py, tests, README.md."""
     write_project("new", ROBOT_TEMPLATES if robot else TEMPLATES, folder, name=project_name("new", folder))
     console.print(
         f"cd {folder}; floaty fly hover --profile profile.toml; pytest; see README.md for more",
@@ -53,8 +53,8 @@ def new(folder: Path, robot: bool) -> None:
 def policy(file: Path, folder: Path) -> None:
     """Write the control law of a trained policy: FILE.onnx or FILE.safetensors, a perceptron with tanh or ReLU.
 
-    Its input is the observation and its output the action of firmware_py/core/observation.py. The law is called as machine
-    code of the Cortex-M4, compared with FILE, and refused when a call exceeds its control slot.
+    Its input is the observation and its output the action of firmware_py/core/observation.py. The law is run as Cortex-M4
+    machine code, compared with FILE, and refused when a call exceeds its control slot.
     """
     from firmware_py.policy.measuring import LawFigures, measure
     from firmware_py.policy.reading import LIBRARIES, read_policy
@@ -102,7 +102,7 @@ def project_name(command: str, folder: Path) -> str:
 
 
 def require_empty(command: str, folder: Path) -> None:
-    """Raise `LabError` for a folder that has content, and for what is no folder."""
+    """Raise `LabError` for a folder with content, or a path that is not a folder."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise LabError(
             f"{command} {folder}: it exists and is not empty; choose a folder that is new or empty"
@@ -110,7 +110,7 @@ def require_empty(command: str, folder: Path) -> None:
 
 
 def write_project(command: str, templates: Path, folder: Path, **values: object) -> None:
-    """Write the files of a folder of templates, with the values in them, into one that is new or empty."""
+    """Write a folder's templates, filled with the values, into a new or empty folder."""
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(
@@ -129,7 +129,7 @@ def write_project(command: str, templates: Path, folder: Path, **values: object)
 
 
 def _constant(values: NDArray[np.float32]) -> str:
-    """Return an array as a constant of the subset, each row on lines of its own."""
+    """Return an array as a constant of the subset, each row on separate lines."""
     if values.ndim == 1:
         return f"constant({_wrapped(', '.join(map(str, values)))})"
     rows = (f"({', '.join(map(str, row))}{',' * (len(row) == 1)})," for row in values)

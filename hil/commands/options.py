@@ -1,4 +1,4 @@
-"""What several commands share: consoles, exit codes, options, and the notice before a long compilation."""
+"""The common parts of commands: consoles, exit codes, options, and the notice before a long compilation."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ notices = Console(stderr=True, highlight=False)
 
 
 def wide_console(width: int = 150) -> Console:
-    """Return the console for a table that needs a width, however narrow the terminal is."""
+    """Return the console for a table of a fixed width, in any terminal."""
     return Console(highlight=False, width=max(console.width, width))
 
 
@@ -89,7 +89,7 @@ COMPILING = "first run on this machine: compiling flight core and plant, once, s
 
 
 def asked_as(kind: type[Asked]) -> Callable[[Callable[..., int | None]], Callable[..., int | None]]:
-    """Return the decorator of a command that takes its options as one value of a frozen dataclass."""
+    """Return the decorator that passes a command's options as one frozen dataclass."""
 
     def decorator(command: Callable[..., int | None]) -> Callable[..., int | None]:
         @wraps(command)
@@ -102,7 +102,7 @@ def asked_as(kind: type[Asked]) -> Callable[[Callable[..., int | None]], Callabl
 
 
 def announce_compilation() -> None:
-    """Announce that the first run compiles, because that takes a while."""
+    """Announce that the first run compiles, which takes a while."""
     from firmware_py.compiling import is_kept
     from hil.devices.imu import channels
 
@@ -111,19 +111,19 @@ def announce_compilation() -> None:
 
 
 def say(text: str) -> None:
-    """Print a line and flush it, because a program may read it."""
+    """Print a line and flush it: a program may read it."""
     print(text)
     sys.stdout.flush()
 
 
 def progress_bar(*columns: ProgressColumn) -> Progress:
-    """Return a progress bar on standard error with further columns, invisible where that is not a terminal."""
+    """Return a progress bar on standard error with more columns, invisible without a terminal."""
     shown = (TextColumn("{task.description}"), BarColumn(), *columns)
     return Progress(*shown, console=notices, transient=True, disable=not notices.is_terminal)
 
 
 def stop_signals() -> list[int]:
-    """Return a list that gets the signals which ask for an orderly end."""
+    """Return a list that receives the signals for an orderly end."""
     stops: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, _: stops.append(received))
@@ -131,7 +131,7 @@ def stop_signals() -> list[int]:
 
 
 def open_live(target: str | None) -> LiveView | None:
-    """Open the picture that `--view` asks for, for this command; it closes with the command, however that ends."""
+    """Open the picture of `--view`; it always closes with the command."""
     if target is None:
         return None
     from hil.live.feed import open_view
@@ -141,7 +141,7 @@ def open_live(target: str | None) -> LiveView | None:
 
 
 def close_live(view: LiveView | None, result: Result | None = None) -> None:
-    """Close the picture, and record and report the rows that it has missed."""
+    """Close the picture, and record and report the rows that it missed."""
     if view is None:
         return
     from hil.laboratory.result import write_result
@@ -155,7 +155,7 @@ def close_live(view: LiveView | None, result: Result | None = None) -> None:
 
 
 def write_pictures(folder: Path, experiment: Experiment) -> None:
-    """Write report and recording; without rerun only the report, because the recording can be written later from the log."""
+    """Write report and recording; without rerun only the report: the log allows a recording later."""
     from hil.pictures.report import write_report
 
     write_report(folder, experiment)

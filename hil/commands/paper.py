@@ -57,7 +57,7 @@ def paper(seeds: int, out: Path, only: str | None, no_studies: bool, **crew: Any
     """Fly the paper's experiments on both profiles, and the robustness studies; write one report.
 
     Exit code 0: all limits hold for the default profile; 1: one fails; 2: bad input; 130: interrupted, with a report
-    of what was flown.
+    on the finished flights.
     """
     from hil.studies.catalogue import STUDIES
     from hil.studies.paper import select

@@ -55,7 +55,7 @@ def get(names: tuple[str, ...], uri: str, profile: str, overrides: tuple[str, ..
 @profile_option
 @set_option
 def set_values(settings: tuple[str, ...], uri: str, profile: str, overrides: tuple[str, ...]) -> None:
-    """Change parameters, until the board's next boot; `floaty param save` keeps them."""
+    """Change parameters until the board's next boot; `floaty param save` stores them."""
     from firmware_py.table import on_board
 
     wanted = [_setting(text) for text in settings]
@@ -72,7 +72,7 @@ def set_values(settings: tuple[str, ...], uri: str, profile: str, overrides: tup
 @profile_option
 @set_option
 def save(uri: str, profile: str, overrides: tuple[str, ...]) -> None:
-    """Keep the parameters for the board's next boot."""
+    """Store the parameters for the board's next boot."""
     _ask(uri, profile, overrides, [ControlRequest(ControlAction.SAVE)])
     say("saved")
 
@@ -90,7 +90,7 @@ def _setting(text: str) -> tuple[str, float]:
 def _ask(
     uri: str, profile: str, overrides: tuple[str, ...], requests: list[ControlRequest]
 ) -> list[Settings]:
-    """Send requests over a link; return the values of each answer. Raises `LabError` for the first one refused."""
+    """Send requests over a link; return the values of each answer. Raises `LabError` for the first refused one."""
     from ground_station.program import ask, link_settings, why
     from hil.config import load_config
 

@@ -94,11 +94,11 @@ def station(asked: StationOptions) -> int:
 
     `floaty list` names the experiments. Telemetry is shown and logged.
 
-    Ctrl-C ends the flight: no more poses are sent, the board puts its flaps to hover, the link is closed.
+    Ctrl-C ends the flight: no more poses are sent, the board moves its flaps to hover, the link is closed.
 
     While it flies, lines like goal 0.1 0 1.15, set controller.gain_y -2.0 or stop act at once; help lists the commands.
 
-    Exit code with --out: as `floaty fly`, by the limits of EXPERIMENT on what the cameras saw.
+    Exit code with --out: as for `floaty fly`, by the limits of EXPERIMENT on the cameras' poses.
     """
     from ground_station.operator import COMMANDS, Operator
     from ground_station.program import Cockpit, Session, fly, run_until, why

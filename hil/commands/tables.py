@@ -60,7 +60,7 @@ def print_seeds(rows: list[Row]) -> None:
 
 
 def print_result(result: Result) -> None:
-    """Print the verdicts of one flight and the files."""
+    """Print one flight's verdicts and files."""
 
     from hil.laboratory.metrics import METRICS, short_of
     from hil.laboratory.recorder import SETTINGS, load_events
