@@ -1,1 +1,1 @@
-"""Campaigns: thousands of flights over sampled parameters and faults, and what breaks the robot in them."""
+"""Campaigns: thousands of flights over sampled parameters and faults, and the causes of failures."""

@@ -1,4 +1,4 @@
-"""What a campaign's TOML file may say: experiments, what varies and how, when to stop, how long a flight may take.
+"""The contents of a campaign's TOML file: experiments, varied values, when to stop, and limits on a flight's time.
 
 Every mistake is a `LabError` of one line that names the key, its value and what is allowed.
 """
@@ -23,7 +23,7 @@ Value = bool | int | float | str
 Sampling = Literal["random", "sobol", "latin", "saltelli", "morris"]
 DESIGNS = ("saltelli", "morris")  # the indices need all their points, so they cannot stop early
 STOP = re.compile(r"failure rate known to (?:±|\+-)\s*(\d+(?:\.\d+)?)\s*%")
-# What pydantic calls the forms of a value, in the place of an error.
+# Pydantic's names for the forms of a value, in the location of an error.
 FORM = re.compile(r"(float|Distribution)$|(tuple|literal|function-\w+)\[")
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -33,7 +33,7 @@ class _Part(BaseModel):
 
 
 class Distribution(_Part):
-    """How one number varies: exactly one of the four."""
+    """The distribution of one number: exactly one of the four."""
 
     uniform: tuple[Finite, Finite] | None = Field(None, description="[low, high]")
     log_uniform: tuple[Finite, Finite] | None = Field(None, description="[low, high], above 0")
@@ -71,7 +71,7 @@ class SampledFault(_Part):
 
 
 class TableConfig(_Part):
-    """Constants of the paper's Table, each within its ±; they act as `plant.constant_factors`."""
+    """Constants of the paper's Table, each within its ±; applied as `plant.constant_factors`."""
 
     constants: Literal["all"] | tuple[ConstantName, ...] = Field("all", description="by name")
     distribution: Literal["uniform", "normal"] = Field(
@@ -87,14 +87,14 @@ class TableConfig(_Part):
 
 
 class FlightLimits(_Part):
-    """When a flight is aborted; it becomes a row with the limit as its error."""
+    """Limits that abort a flight; its row has the limit as its error."""
 
     wall_s: float = Field(120.0, gt=0, le=86_400, description="real time; the process is ended at twice this")
     simulated_s: float = Field(3_600.0, gt=0, le=100_000, description="simulated time, from the boot on")
 
 
 class Spec(_Part):
-    """A campaign. Flight number i is a function of this and i alone."""
+    """A campaign. Flight number i depends only on this and i."""
 
     experiments: tuple[str, ...] = Field(min_length=1, description="names, or FILE.py:NAME")
     profiles: tuple[str, ...] = Field((DEFAULT_PROFILE,), min_length=1)
@@ -132,7 +132,7 @@ class Spec(_Part):
 
     @property
     def half_width(self) -> float | None:
-        """The half width of the failure rate's interval at which to stop; None: all flights are flown."""
+        """The half width of the failure rate's interval at which to stop; None: fly all."""
         match = STOP.fullmatch(self.stop)
         return float(match[1]) / 100.0 if match else None
 
@@ -143,7 +143,7 @@ class Spec(_Part):
 
     @property
     def points(self) -> int:
-        """Points of the sampling; the last one may lack some of its flights."""
+        """Points of the sampling; the last one may have fewer flights."""
         return math.ceil(self.flights / self.cells)
 
 
@@ -163,7 +163,7 @@ def table_dimensions(table: TableConfig | None) -> list[tuple[str, Distribution]
 
 
 def find_spec(campaign: str) -> Path:
-    """Return the file of a campaign: a path that ends in .toml, or the name of one that ships. Raises `LabError`."""
+    """Return the file of a campaign: a path that ends in .toml, or a shipped name. Raises `LabError`."""
     if campaign.endswith(".toml"):
         return Path(campaign)
     names = sorted(path.stem for path in Path(__file__).parent.glob("*.toml"))
@@ -175,12 +175,12 @@ def find_spec(campaign: str) -> Path:
 
 
 def read_spec(path: Path) -> Spec:
-    """Return the campaign of a file; paths in it are relative to its folder. Raises `LabError` of one line."""
+    """Return the campaign of a file; paths in it are relative to its folder. Raises a one-line `LabError`."""
     tree = read_toml("campaign", path)
     try:
         spec = Spec.model_validate(tree)
     except ValidationError as error:
-        # A misspelt key explains a missing one, and the deepest complaint is about the form that the user chose.
+        # A misspelt key explains a missing one, and the deepest error concerns the form that the user chose.
         found = min(error.errors(), key=lambda one: (one["type"] != "extra_forbidden", -len(one["loc"])))
         raise LabError(f"campaign {path}: {_explain(found)}") from None
     folder = path.parent.resolve()
@@ -194,7 +194,7 @@ def read_spec(path: Path) -> Spec:
 
 
 def _explain(detail: ErrorDetails) -> str:
-    """Return what is wrong: the key, its value, what is allowed."""
+    """Return the error: the key, its value, what is allowed."""
     names = [str(part) for part in detail["loc"] if not FORM.match(str(part))]
     where, value = ".".join(names), detail["input"]
     if detail["type"] == "missing":

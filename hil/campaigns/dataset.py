@@ -1,8 +1,8 @@
-"""The dataset of many flights: one row per flight, stored as it arrives, so that it survives whatever ends the program.
+"""The dataset of many flights: one row per flight, stored on arrival, so that it survives the program's end.
 
 `DIR/campaign.json` describes the plan. A row is first a line of `DIR/arriving.jsonl`; at the end the lines become
-`DIR/flights/all.parquet`, written under another name and then renamed. After a kill in between, at worst a row is in both,
-which reading detects, or a line is incomplete, and its flight is flown again.
+`DIR/flights/all.parquet`, written under another name and then renamed. After a kill in between, at worst a row is in
+both, which the reader detects, or a line is incomplete, and its flight is repeated.
 """
 
 import hashlib
@@ -28,14 +28,14 @@ from hil.installation import commit, versions
 from hil.laboratory.metrics import METRICS, limits_of
 
 ABOUT, ARRIVING, FLIGHTS = "campaign.json", "arriving.jsonl", Path("flights", "all.parquet")
-AT_ONCE = 500  # lines that are read at a time
+AT_ONCE = 500  # lines read at a time
 TYPES = {bool: pa.bool_(), str: pa.string()}  # others are float
 
 
 class Dataset:
     """The flights so far; `add` stores a row at once. Raises `LabError` when it cannot be written.
 
-    A plan that has been begun in the folder is continued when `resume`, replaced when `replace`, otherwise refused.
+    An unfinished plan in the folder is continued with `resume`, replaced with `replace`, otherwise refused.
     """
 
     def __init__(self, folder: Path, plan: Plan, resume: bool, replace: bool = False) -> None:
@@ -79,7 +79,7 @@ class Dataset:
             self._arriving.flush()
 
     def close(self, end: int | None = None) -> None:
-        """Store all rows in one file in the order of the flights, without those from number `end` on."""
+        """Store all rows before number `end` in one file, in the order of the flights."""
         if self._arriving is not None:
             with writing("--out", self.folder):
                 self._arriving.close()
@@ -123,7 +123,7 @@ class Dataset:
 
 
 def about(plan: Plan) -> dict[str, Any]:
-    """Return what identifies a plan: if it is equal, flights of the same number are equal."""
+    """Return a plan's identity: plans with equal ones have equal flights of equal number."""
     sources = [find_experiment(name).source for name in plan.experiments]
     board = Path(plan.job(0).options.get("board", PYTHON))
     return {

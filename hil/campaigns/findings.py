@@ -1,6 +1,6 @@
-"""What a campaign has found: failure rates with their intervals, distributions, what they depend on, the worst flights.
+"""The findings of a campaign: failure rates with intervals, distributions, influences, and the worst flights.
 
-Which sampling a measure of influence needs:
+The samplings that each measure of influence needs:
 
     PAWN            any: the median distance of the distributions in slices of an axis from that of all flights, 0..1;
                     shown are axes beyond what the strongest of all axes reaches by chance in 95 % of random orders
@@ -47,8 +47,8 @@ MAPPED_FROM = 5  # failures, and flights that hold
 ORDERS, CHANCE = (
     200,
     0.95,
-)  # random orders of the flights, and the share of them that stays below the threshold
-SHARE_KNOWN = 1.0  # half interval with which a share of the variance is shown
+)  # random orders of the flights, and their share below the threshold
+SHARE_KNOWN = 1.0  # largest half interval of a shown share of the variance
 PULL = 1.0  # weight of the prior that pulls the logistic map towards no influence
 
 
@@ -62,7 +62,7 @@ class Limited:
     metric: Metric
     bound: float
     rate: Rate
-    values: Array  # of the flights that have the metric
+    values: Array  # of the flights with the metric
 
     def quantile(self, share: float) -> str:
         """Return a quantile as text, counted from good to bad."""
@@ -79,13 +79,13 @@ class Influence:
     figure: str
     method: str
     by_axis: Mapping[str, float]
-    chance: float | None = None  # what the strongest axis reaches without any influence, in 95 % of cases
+    chance: float | None = None  # bound of the strongest axis without any influence, in 95 % of cases
     halves: Mapping[str, float] = field(default_factory=dict)  # of the 95 % intervals by SALib
-    most: float = math.inf  # half interval with which a measure is shown
+    most: float = math.inf  # largest half interval of a shown measure
 
     @property
     def ranked(self) -> list[tuple[str, float]]:
-        """Axes that are above chance and known well enough, the strongest first."""
+        """Axes above chance with small enough intervals, the strongest first."""
         above = [
             (name, value)
             for name, value in self.by_axis.items()
@@ -99,7 +99,7 @@ class Influence:
         return [name for name, half in self.halves.items() if not half <= self.most]
 
     def text(self, name: str) -> str:
-        """Return the measure of an axis, with its interval where there is one."""
+        """Return the measure of an axis, with its interval if it has one."""
         half = f" ± {self.halves[name]:.2g}" if name in self.halves else ""
         return f"{name} {self.by_axis[name]:.3g}{half}"
 
@@ -128,7 +128,7 @@ class FailureMap:
 
 @dataclass(frozen=True, slots=True)
 class Worst:
-    """A flight, and the command that flies it again."""
+    """A flight, and the command that repeats it."""
 
     index: int
     outcome: str
@@ -159,7 +159,7 @@ class Findings:
 
 
 def find(spec: Spec, flights: pa.Table) -> Findings:
-    """Return what the flights of a campaign show."""
+    """Return the findings from a campaign's flights."""
     passed = flights["passed"].to_numpy(zero_copy_only=False).astype(bool)
     limits = _limits(spec, flights)
     points = points_of(spec)
@@ -176,7 +176,7 @@ def find(spec: Spec, flights: pa.Table) -> Findings:
 
 
 def _rate(flights: pa.Table, column: str, size: int, cluster: int) -> Rate:
-    """Return how often a column is false, for clusters of `cluster` numbers of which `size` are in the table."""
+    """Return how often a column is false, for clusters of `cluster` numbers, of which the table has `size`."""
     tally = Tally(size)
     for index, holds in zip(flights["index"].to_pylist(), flights[column].to_pylist(), strict=True):
         if holds is not None:
@@ -291,7 +291,7 @@ def _influence(spec: Spec, figure: str, points: Array, means: Array) -> Influenc
 
 
 def slices(points: Array) -> NDArray[np.bool_]:
-    """Return which points (N, D) are in which slice of each axis, (N, D, SLICES); each has as many points."""
+    """Return which points (N, D) are in which slice of each axis, (N, D, SLICES), of equal numbers of points."""
     edges = np.quantile(points, np.linspace(0.0, 1.0, SLICES + 1), axis=0)
     number = [np.searchsorted(edges[1:-1, d], points[:, d], side="right") for d in range(points.shape[1])]
     return np.equal(np.array(number).T[:, :, None], np.arange(SLICES))
@@ -300,7 +300,7 @@ def slices(points: Array) -> NDArray[np.bool_]:
 def pawn(inside: NDArray[np.bool_], values: Array) -> Array:
     """Return each axis' median distance (Kolmogorov-Smirnov) of the values in its slices from all values, (D,)."""
     order = np.argsort(values, kind="stable")
-    last = np.append(np.diff(values[order]) > 0.0, True)  # of equal values the last one's place counts
+    last = np.append(np.diff(values[order]) > 0.0, True)  # equal values have the last one's place
     counts = inside[order].cumsum(axis=0)
     sizes = np.maximum(counts[-1], 1)
     share = np.arange(1, len(values) + 1) / len(values)
@@ -309,7 +309,7 @@ def pawn(inside: NDArray[np.bool_], values: Array) -> Array:
 
 
 def _worst(spec: Spec, flights: pa.Table, limits: tuple[Limited, ...]) -> tuple[Worst, ...]:
-    """Return the flights that failed, the worst first: lost early, then far beyond a limit; errors are listed separately."""
+    """Return the failed flights, the worst first: lost early, then far beyond a limit; errors are listed separately."""
     bounds = {(one.experiment, one.profile, one.name): one for one in limits}
     failed = flights.filter(pc.and_(pc.invert(flights["passed"]), pc.not_equal(flights["outcome"], "error")))
     ranked = []
@@ -328,7 +328,7 @@ def _worst(spec: Spec, flights: pa.Table, limits: tuple[Limited, ...]) -> tuple[
 
 
 def again(spec: Spec, index: int) -> str:
-    """Return the command that flies a flight again, or in parentheses why there is none."""
+    """Return the command that repeats a flight, or in parentheses why there is none."""
     try:
         return command_of(draw(spec, index).request()) or "(an experiment that no command names)"
     except LabError as error:
@@ -336,7 +336,7 @@ def again(spec: Spec, index: int) -> str:
 
 
 def _beyond(limit: Limited, value: float) -> float:
-    """Return by which share of the limit a value misses it."""
+    """Return a value's excess as a share of the limit."""
     if not np.isfinite(value):
         return float("inf")
     sign = 1.0 if limit.metric.bound == "max" else -1.0

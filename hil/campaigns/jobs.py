@@ -1,4 +1,4 @@
-"""One flight of many: its description, from which any worker process makes the same request, and its row.
+"""One flight of many: its description, which gives the same request in any worker process, and its row.
 
 A flight that cannot be flown, raises or takes too long becomes a row with its error. A full disk raises instead.
 """
@@ -32,12 +32,12 @@ from hil.laboratory.run import LOADED_US, fly
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 LOG = ("log.parquet", "events.jsonl", "result.json")
-LOG_AND_TELEMETRY = (*LOG, "telemetry.csv")  # what `floaty identify` reads
+LOG_AND_TELEMETRY = (*LOG, "telemetry.csv")  # the input of `floaty identify`
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Flight `index` of a plan: what is flown, the values drawn for it, and what is kept of it."""
+    """Flight `index` of a plan: its experiment, the values drawn for it, and its kept files."""
 
     index: int
     experiment: str  # as `find_experiment` accepts it
@@ -47,16 +47,16 @@ class Job:
     files: tuple[str, ...] | None = (
         None  # kept in the folder; None: all, and no other flight is replaced there
     )
-    limits: FlightLimits | None = None  # None: it may take as long as it likes
+    limits: FlightLimits | None = None  # None: no limit
     source: Source | None = None  # of the experiment when the plan was made
 
     def request(self) -> Request:
-        """Return the request. Raises `LabError` for what cannot be flown."""
+        """Return the request. Raises `LabError` if it cannot be flown."""
         return Request.of(find_experiment(self.experiment), **self.options)
 
     @property
     def text(self) -> str:
-        """What is flown as text: equal for equal flights."""
+        """The flight as text: equal for equal flights."""
         return json.dumps([self.experiment, self.options], default=str, sort_keys=True)
 
 
@@ -118,20 +118,20 @@ class Row:
 
 @dataclass(frozen=True)
 class Plan:
-    """Flights by their numbers, and all that they depend on. Flights of equal numbers of equal plans are equal."""
+    """Flights by number, and all that they depend on. Equal plans have equal flights of equal number."""
 
-    about: Mapping[str, Any]  # what was asked for, as JSON values
+    about: Mapping[str, Any]  # the specification, as JSON values
     flights: int
     job: Callable[[int], Job]
     experiments: tuple[str, ...]
     profiles: tuple[str, ...]
     values: Mapping[str, type]  # drawn for each flight
-    half_width: float | None = None  # of the failure rate's interval at which to stop; None: all are flown
-    cluster: int = 1  # flights in a row whose results resemble one another
+    half_width: float | None = None  # of the failure rate's interval at which to stop; None: fly all
+    cluster: int = 1  # consecutive flights with similar results
 
     @classmethod
     def of(cls, jobs: Sequence[Job]) -> Plan:
-        """Return the plan of some flights, which are numbered here. Raises `LabError` for an unknown experiment."""
+        """Return the plan of some flights, numbered here. Raises `LabError` for an unknown experiment."""
         sources = {
             name: find_experiment(name).source for name in dict.fromkeys(job.experiment for job in jobs)
         }
@@ -150,8 +150,8 @@ class TooLongError(Exception):
 
 
 def fly_job(job: Job) -> Row:
-    """Fly. Raises `LabError` when there is no room on the disk, or an experiment's file has changed."""
-    # One of many that were sampled: the others are flown whatever becomes of it.
+    """Fly. Raises `LabError` for a full disk or a changed experiment file."""
+    # One of many samples: its failure does not stop the others.
     limited = job.limits is not None
     experiment = find_again(job.experiment, job.source)
     if experiment is None:
@@ -182,7 +182,7 @@ def _flown(job: Job, request: Request) -> Result:
 
 
 def fly_within(request: Request, limits: FlightLimits | None) -> Result:
-    """Fly within limits without leaving files. Real time counts from the end of loading and compiling."""
+    """Fly within limits without leaving files. Real time starts after loading and compiling."""
     begun: list[float] = []
 
     def watch(now_us: int, flight: Flight) -> None:
@@ -200,12 +200,12 @@ def fly_within(request: Request, limits: FlightLimits | None) -> Result:
 
 
 def _unlogged(request: Request, _telemetry: Path | None, stack: ExitStack) -> Flight:
-    """Return the flight without the station's log, which nobody would read: an eighth of its time."""
+    """Return the flight without the station's unused log, which takes an eighth of its time."""
     return in_lockstep(request, None, stack)
 
 
 def row_of(job: Job, result: Result) -> Row:
-    """Return the row of a flight that was flown. Raises `LabError` when it found no room on the disk."""
+    """Return the row of a finished flight. Raises `LabError` for a full disk."""
     cause = result.cause or ""
     if result.outcome == "error" and any(os.strerror(number) in cause for number in FULL):
         raise LabError(f"flight {job.index}: {tempfile.gettempdir()}: {cause}")
@@ -215,5 +215,5 @@ def row_of(job: Job, result: Result) -> Row:
 
 
 def failed(job: Job, error: str) -> Row:
-    """Return the row of a flight that did not end by itself."""
+    """Return the row of a flight that ended with an error."""
     return Row(job, "error", error, passed=False, hash="", metrics={}, holds={})

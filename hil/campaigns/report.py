@@ -30,16 +30,16 @@ TICKS = 5
 SHADES = 10
 BINS = (5, 40)  # of a histogram, by the number of flights
 CELLS = (10, 8)  # of a failure map
-NAMED = 3  # flights of a cell, those that failed first
-FEW = 100  # flights, up to which a histogram shows each and counts linearly
+NAMED = 3  # flights of a cell, failed ones first
+FEW = 100  # with at most this many flights a histogram shows each and counts linearly
 
 
 def write_report(named: str, spec: Spec, dataset: Dataset, complete: bool) -> tuple[Path, Findings]:
-    """Write report and result of the dataset of a campaign, as the user names it; return report and findings."""
+    """Write report and result of a campaign's dataset, under the user's name for it; return report and findings."""
     folder, findings = dataset.folder, find(spec, dataset.table())
     histograms = [one for one in findings.limits if len(one.values) > 1 and np.ptp(one.values) > 0.0]
     drawn = None if findings.failure_map is None else _map(findings.failure_map)
-    image = data_uri(png(lambda: drawn.figure)) if drawn is not None else ""  # which places its axes
+    image = data_uri(png(lambda: drawn.figure)) if drawn is not None else ""  # this places its axes
     page = write_page(
         folder / REPORT, "campaign.html.j2", spec=spec, found=findings, complete=complete,
         histograms=data_uri(png(lambda: _histograms(histograms))) if histograms else "",
@@ -123,7 +123,7 @@ class MapCell:
     text: str  # the values there
     failed: int
     flown: int
-    flights: tuple[tuple[int, bool, str], ...]  # number, whether it failed, command that flies it again
+    flights: tuple[tuple[int, bool, str], ...]  # number, whether it failed, command that repeats it
 
     def holds(self) -> float:
         """Return the share of its flights that held."""
@@ -132,7 +132,7 @@ class MapCell:
 
 @dataclass(frozen=True, slots=True)
 class DrawnMap:
-    """A failure map as a figure, and which flights are in it."""
+    """A failure map as a figure, and its flights."""
 
     figure: Figure
     axes: Axes
@@ -143,7 +143,7 @@ class DrawnMap:
     failed: NDArray[np.bool_]  # (N,)
 
     def cells(self, spec: Spec) -> Iterator[MapCell]:
-        """Yield the cells with flights, once the figure was written."""
+        """Yield the cells with flights, after the figure was written."""
         which = np.minimum((self.points * CELLS).astype(int), np.array(CELLS) - 1)
         for row, column in product(range(CELLS[1]), range(CELLS[0])):
             inside = np.flatnonzero((which == (column, row)).all(axis=1))
@@ -171,9 +171,9 @@ def _range(axis: CubeAxis, low: float, high: float) -> str:
 
 
 def _map(found: FailureMap) -> DrawnMap:
-    """Draw the two numbers on which failing depends most, with the faults that they belong to, and those flights.
+    """Draw the two numbers with most influence on failing, with their faults, and those flights.
 
-    All other numbers are at their centres, all other faults as frequent as they are.
+    All other numbers are at their centres, all other faults at their frequencies.
     """
     strongest = np.argsort(-np.abs(found.weights))
     numbers_first = sorted(strongest, key=lambda n: found.axes[n].varies is None)

@@ -1,8 +1,8 @@
-"""The one way to fly many flights: workers, a dataset, progress, Ctrl-C and the decision when enough is known.
+"""The runner of many flights: workers, a dataset, progress, Ctrl-C and the decision when to stop.
 
-A campaign, a study, the paper, seeds and tuning are plans (`hil.campaigns.jobs`); their questions are answered from the
-rows. Rows arrive in any order; decisions are made on the flights in the order of their numbers, so they are the same for
-every number of workers.
+A campaign, a study, the paper, seeds and tuning are plans (`hil.campaigns.jobs`); each is evaluated from its rows. Rows
+arrive in any order; decisions use the flights in the order of their numbers, so they do not depend on the number of
+workers.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ from hil.campaigns.workers import Workers
 from hil.errors import LabError
 from hil.laboratory.request import Options
 
-DEVIATIONS = 1.959963984540054  # of the normal distribution, that hold 95 %
+DEVIATIONS = 1.959963984540054  # of the normal distribution, contain 95 %
 STOP_FROM = 30  # flights; from fewer the interval is too wide to stop
 ALIKE = 2.0  # failures
 
-# From flights to their rows, in any order; ends early when interrupted.
+# Turns flights into rows, in any order; ends early when interrupted.
 Flyer = Callable[[Iterator[Job]], Generator[Row]]
 
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """How often something failed."""
+    """A failure rate."""
 
     failed: int
     flown: int
-    design: float = 1.0  # variance over that of as many independent flights
+    design: float = 1.0  # variance, relative to as many independent flights
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The rate's interval with 95 % confidence: Wilson's, for as many flights as the clusters are worth."""
+        """The rate's interval with 95 % confidence: Wilson's, for the effective number of flights."""
         return interval(self.failed / self.flown if self.flown else 0.0, self.flown / self.design)
 
     def __str__(self) -> str:
@@ -59,7 +59,7 @@ class Standing(Rate):
     """The interim result."""
 
     planned: int
-    complete: bool  # all flights that the plan needs have been flown
+    complete: bool  # all needed flights have been flown
 
 
 def interval(share: float, flown: float) -> tuple[float, float]:
@@ -73,10 +73,10 @@ def interval(share: float, flown: float) -> tuple[float, float]:
 
 
 class Tally:
-    """Counts flights that come in clusters of `size`, whose results resemble one another: one robot in one wind.
+    """Counts flights in clusters of `size` with similar results: one robot in one wind.
 
-    The clusters' scatter gives the variance of the rate, as a bootstrap over the clusters would, but also for few
-    failures: these count beside `ALIKE` failures of which the whole cluster fails.
+    The clusters' scatter gives the variance of the rate, like a bootstrap over the clusters, but also for few failures:
+    `ALIKE` failures of whole clusters are added to them.
     """
 
     def __init__(self, size: int) -> None:
@@ -105,11 +105,11 @@ class Tally:
 
 
 class Progress:
-    """Counts rows; `end` is the number of flights that the plan needs, once it is known."""
+    """Counts rows; `end` is the number of flights that the plan needs, once known."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
-        self._waiting: dict[int, bool] = {}  # flights of which some predecessors are missing
+        self._waiting: dict[int, bool] = {}  # flights with missing predecessors
         self._all, self._known = Tally(plan.cluster), Tally(plan.cluster)
         self.end: int | None = None
 
@@ -131,14 +131,14 @@ class Progress:
 
     @property
     def standing(self) -> Standing:
-        """The interim result now."""
+        """The current interim result."""
         tally = self._all if self.end is None else self._known
         planned = self._plan.flights if self.end is None else self.end
         return Standing(**asdict(tally.rate), planned=planned, complete=self.end is not None)
 
 
 def conduct(dataset: Dataset, flyer: Flyer, show: Callable[[Standing], None]) -> Standing:
-    """Fly the flights missing in the dataset, until all are flown, enough is known or the flyer ends."""
+    """Fly the flights missing in the dataset, until all are flown, the rate is known or the flyer ends."""
     plan, progress, there = dataset.plan, Progress(dataset.plan), set()
     for row in dataset.table(["index", "passed"]).to_pylist():
         progress.add(row["index"], row["passed"])
@@ -157,9 +157,9 @@ def conduct(dataset: Dataset, flyer: Flyer, show: Callable[[Standing], None]) ->
 
 
 class Runner:
-    """Flies plans, each into a dataset. Its workers start with the first flight and stay until the `with` block ends.
+    """Flies plans, each into a dataset. Its workers run from the first flight to the end of the `with` block.
 
-    `interrupted` is set by Ctrl-C, after which the flights that have begun are completed, and no other plan is flown.
+    Ctrl-C sets `interrupted`: running flights are completed, and no other plan is flown.
     """
 
     def __init__(
@@ -185,13 +185,13 @@ class Runner:
         return bool(self._stops)
 
     def campaign(self, plan: Plan, folder: Path, replace: bool = False) -> tuple[Dataset, Standing]:
-        """Fly a plan into the dataset of a folder; a plan that was begun there may be replaced, unless it is resumed."""
+        """Fly a plan into the dataset of a folder; an unfinished plan there may be replaced, unless it is resumed."""
         dataset = Dataset(folder, plan, self._resume, replace)
         with self._progress() as show, self._stops_noted():
             return dataset, conduct(dataset, self._flown, show)
 
     def fly(self, name: str, jobs: Sequence[Job], out: Path) -> list[Row]:
-        """Return the rows of flights, after Ctrl-C of those that are complete; their dataset is `out/campaigns/name`."""
+        """Return the rows of flights, after Ctrl-C of the complete ones; their dataset is `out/campaigns/name`."""
         return self.campaign(Plan.of(jobs), out / "campaigns" / name, replace=True)[0].rows()
 
     def log(self, name: str, flights: Mapping[str, tuple[str, Options]], out: Path) -> list[Row]:

@@ -1,13 +1,12 @@
 """Flight number i as a pure function of (spec, i): its experiment, profile, seed, settings and faults.
 
-A campaign is a cube: one axis for every number that varies, 0..1. A sampling gives points of the cube, each axis has a
-distribution that turns its coordinate into a value. Values have nine digits, so that they do not depend on the processor's
-logarithm.
+A campaign is a cube: one axis for every varied number, 0..1. A sampling gives points of the cube; each axis has a
+distribution that turns its coordinate into a value. Values have nine digits, so that they do not depend on the
+processor's logarithm.
 
-    random            points do not depend on one another; any number of flights
-    sobol             fills the cube evenly at any number of flights, best at a power of two
-    latin             every axis evenly, at the number of flights that the spec says
-    saltelli, morris  the designs that Sobol's and Morris' indices need (SALib): N (D + 2) and N (D + 1) points of D axes,
+    random            independent points; any number of flights sobol             fills the cube evenly at any number of
+    flights, best at a power of two latin             every axis evenly, for the number of flights in the spec saltelli,
+    morris  the designs that Sobol's and Morris' indices need (SALib): N (D + 2) and N (D + 1) points of D axes,
                       of which those of a base row have the same seed
 """
 
@@ -39,7 +38,7 @@ class CubeAxis:
 
     name: str
     varies: Distribution | None  # None: whether the fault happens
-    fault: int | None = None  # whose axis it is
+    fault: int | None = None  # the fault of the axis
 
 
 @lru_cache(maxsize=8)
@@ -67,7 +66,7 @@ def _name(number: int, fault: SampledFault) -> str:
 
 
 def _happens_from(fault: SampledFault) -> float:
-    """Return the coordinate from which on a fault happens."""
+    """Return the coordinate above which a fault happens."""
     return 1.0 - fault.probability
 
 
@@ -109,7 +108,7 @@ def _sobol(width: int, seed: int, first: int, count: int) -> NDArray[np.float64]
     sequence = qmc.Sobol(width, scramble=True, rng=np.random.default_rng(seed))
     if first:  # scipy cannot skip 0 points
         sequence.fast_forward(first)
-    # One by one, because for several at once it requires a power of two.
+    # One by one: several at once must be a power of two.
     return np.concatenate([sequence.random(1) for _ in range(count)])
 
 
@@ -137,7 +136,7 @@ def per_base(spec: Spec) -> int:
 
 
 def cluster_of(spec: Spec) -> int:
-    """Return how many flights in a row resemble one another: those of a point; those of a seed where nothing varies."""
+    """Return the number of consecutive similar flights: those of a point, or of a seed if nothing varies."""
     return per_base(spec) * (spec.cells if axes(spec) else spec.cells // spec.seeds)
 
 
@@ -197,7 +196,7 @@ def draw_at(spec: Spec, shares: NDArray[np.float64], index: int, point: int, cel
     """Return the flight at a point of the cube."""
     repetition, which = divmod(cell, len(spec.experiments) * len(spec.profiles))
     experiment, profile = divmod(which, len(spec.profiles))
-    base = point // per_base(spec)  # the points of a base row differ by what is varied, not by the wind
+    base = point // per_base(spec)  # the points of a base row differ by the varied values, not by the wind
     share = dict(zip((axis.name for axis in axes(spec)), shares.tolist(), strict=True))
     parameters = {name: value_at(varies, share[name]) for name, varies in _parameters(spec)}
     faults = (_fault_at(number, fault, share) for number, fault in enumerate(spec.faults))
@@ -237,7 +236,7 @@ def value_at(varies: Distribution, share: float) -> Value:
         assert varies.normal is not None
         mean, deviation, *cut = varies.normal
         below, above = (float(ndtr((bound - mean) / deviation)) for bound in cut) if cut else (0.0, 1.0)
-        tail = 1e-12  # a design has points at the very ends of its axes
+        tail = 1e-12  # a design has points at the ends of its axes
         value = mean + deviation * float(ndtri(min(max(below + share * (above - below), tail), 1.0 - tail)))
     return float(f"{value:.{DIGITS}g}")
 
@@ -249,9 +248,9 @@ def _toml(value: Value) -> str:
 
 
 def check_spec(spec: Spec) -> None:
-    """Raise `LabError` for mistakes that can be found before flying: unknown names, values out of range.
+    """Raise `LabError` for mistakes that show before flying: unknown names, values out of range.
 
-    Checked are every experiment and profile, both ends of every axis, and all values of a choice.
+    Checks every experiment and profile, both ends of every axis, and all values of a choice.
     """
     check_design(spec)
     width = len(axes(spec))

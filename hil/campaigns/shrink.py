@@ -1,7 +1,7 @@
-"""A failing flight reduced to what it needs to fail: fewest faults and parameters, smallest sizes, shortest times.
+"""Reduces a failing flight to the fewest faults and parameters, smallest sizes and shortest times that still fail.
 
-Every step is a flight. Faults and parameters are left out one at a time and stay out when the flight still fails; sizes and
-durations are halved towards harmless as long as it still fails. So no single part of the result can be left out; a smaller
+Every step is a flight. Faults and parameters are removed one at a time if the flight still fails without them; sizes and
+durations are halved towards harmless as long as it still fails. So no single part of the result can be removed; a smaller
 combination may still exist.
 """
 
@@ -17,7 +17,7 @@ from hil.laboratory.faults import Fault, parse
 from hil.laboratory.request import Options, Request
 from hil.laboratory.result import Result
 
-HALVINGS = 6  # a size is found to 1/64 of what was drawn
+HALVINGS = 6  # a size is found to 1/64 of the drawn one
 SHORTEST_S = 0.01
 
 
@@ -25,7 +25,7 @@ SHORTEST_S = 0.01
 class Trial:
     """The reduced faults and settings of a flight."""
 
-    settings: tuple[str, ...]  # that were sampled
+    settings: tuple[str, ...]  # the sampled ones
     faults: tuple[Fault, ...]
 
 
@@ -33,7 +33,7 @@ Fails = Callable[[Trial], bool]
 
 
 def shrink(trial: Trial, duration_s: float, fails: Fails) -> Trial:
-    """Return the least that still fails. Raises `LabError` when the whole does not."""
+    """Return the smallest failing trial. Raises `LabError` when the whole does not fail."""
     if not fails(trial):
         raise LabError("--shrink: the flight does not fail; there is nothing to shrink")
     trial = _fewer(trial, fails)
@@ -44,7 +44,7 @@ def shrink(trial: Trial, duration_s: float, fails: Fails) -> Trial:
 
 
 def _fewer(trial: Trial, fails: Fails) -> Trial:
-    """Leave out parts one at a time until every one is needed."""
+    """Remove parts one at a time until every one is needed."""
     changed = True
     while changed:
         changed = False
@@ -57,7 +57,7 @@ def _fewer(trial: Trial, fails: Fails) -> Trial:
 
 def _one_less(trial: Trial) -> Iterator[Trial]:
     if trial.settings:
-        yield replace(trial, settings=())  # all at once, because mostly none of them matters
+        yield replace(trial, settings=())  # all at once: mostly none of them matters
     for n in range(len(trial.faults)):
         yield replace(trial, faults=trial.faults[:n] + trial.faults[n + 1 :])
     for n in range(len(trial.settings)) if len(trial.settings) > 1 else ():
@@ -99,7 +99,7 @@ def _with(trial: Trial, number: int, fault: Fault) -> Trial:
 
 
 def harmless(name: str) -> float | None:
-    """Return the size at which a kind of fault has no effect, or its mildest; None: there is no size to choose."""
+    """Return the size at which a kind of fault has no effect, or the mildest one; None: it has no size."""
     kind = KINDS[name]
     if not kind.sized:
         return None
@@ -111,7 +111,7 @@ def harmless(name: str) -> float | None:
 
 
 class Reflight:
-    """Flies reduced versions of one flight of a campaign; `said` is called with a line per flight."""
+    """Flies reduced versions of one flight of a campaign; calls `said` with a line per flight."""
 
     def __init__(self, spec: Spec, drawn: Job, said: Callable[[str], None]) -> None:
         self._spec, self._drawn, self._said = spec, drawn, said

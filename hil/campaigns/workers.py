@@ -1,7 +1,7 @@
-"""Processes that fly: of this computer, or those of a Dask scheduler.
+"""Worker processes that fly: on this computer, or of a Dask scheduler.
 
-A process of this computer flies one flight at a time. A process that dies is replaced and its flight is flown again; a
-flight whose process dies again becomes a row.
+A process of this computer flies one flight at a time. A dead process is replaced and its flight is repeated; if it dies
+again, the flight becomes a row.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from distributed import Client
 
 LOOK_S = 0.2  # how often Ctrl-C is checked
-PER_WORKER = 2  # of a scheduler: one flies and one waits, so that no worker is idle while a row is sent
+PER_WORKER = 2  # of a scheduler: one flies and one waits, so that no worker idles while a row is sent
 CONNECT_S = 30.0
 DIED = "the process that flew it died, also when it flew it again"
 FlyOne = Callable[[Job], Row]
 
-_ALONE = threading.Lock()  # one flight per process at a time: its time limit is the process'
+_ALONE = threading.Lock()  # one flight per process at a time: the process has one time limit
 
 
 def fly_alone(job: Job, fly_one: FlyOne) -> Row:
-    """Fly in a worker; a flight that hangs ends the process."""
+    """Fly in a worker; a hanging flight ends the process."""
     with _ALONE, open(os.devnull, "w") as nowhere:
         if job.limits is not None:
             faulthandler.dump_traceback_later(2.0 * job.limits.wall_s, exit=True, file=nowhere)
@@ -46,7 +46,7 @@ def fly_alone(job: Job, fly_one: FlyOne) -> Row:
 class Workers:
     """Workers until `close`. `address` is that of a Dask scheduler; empty: `count` processes of this computer.
 
-    Raises `LabError` when the scheduler is not there or has no workers.
+    Raises `LabError` when the scheduler does not answer or has no workers.
     """
 
     def __init__(self, count: int, address: str = "") -> None:
@@ -70,7 +70,7 @@ class Workers:
         self._room = PER_WORKER * sum(self._client.nthreads().values())
 
     def close(self) -> None:
-        """End the processes that were started here, with their flights."""
+        """End the processes started here, with their flights."""
         if self._client is not None:
             self._client.close()
             return
@@ -84,12 +84,12 @@ class Workers:
     ) -> Generator[Row]:
         """Yield the rows of flights as they arrive. Raises `LabError` for a full disk or a lost cluster.
 
-        `stopped` counts the requests to end: after the first no flight begins, the second does not wait for the others.
+        `stopped` counts the requests to end: the first starts no more flights, the second does not wait for running ones.
         """
         free = [number for number in range(len(self._executors)) for _ in range(self._room)]
         flying: dict[Future[Row], tuple[int, Job]] = {}
         again: list[Job] = []
-        died: set[int] = set()  # flights whose process has died
+        died: set[int] = set()  # flights whose process died
         while stopped() < 2:
             while free and not stopped() and (job := again.pop() if again else next(jobs, None)) is not None:
                 executor = self._executors[free[-1]]
@@ -131,7 +131,7 @@ class Workers:
 
 
 def _process() -> ProcessPoolExecutor:
-    """Return one process; all are forked from a server that has loaded the laboratory once."""
+    """Return a process, forked from a server that has loaded the laboratory once."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])
     return ProcessPoolExecutor(1, context, _begin)

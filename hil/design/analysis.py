@@ -1,4 +1,4 @@
-"""Everything that `floaty design` computes for one robot, and the files that it writes: pictures, table, page."""
+"""The computations of `floaty design` for one robot, and its files: pictures, table, page."""
 
 import json
 from collections.abc import Callable
@@ -100,7 +100,7 @@ def analyse(point: Point) -> Analysis:
 
 
 def write(analysis: Analysis, folder: Path) -> Path:
-    """Write `design.html`, `design.json` and the pictures; returns the page."""
+    """Write `design.html`, `design.json` and the pictures; return the page."""
     for one, content in analysis.pictures:
         (folder / f"{one.name}.png").write_bytes(content)
     result = {

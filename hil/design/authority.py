@@ -1,7 +1,7 @@
 """The authority of the flaps: every input inside the flaps' range, singly and together.
 
-The robot is level in its updraft, so that each plate's force depends on its vertical normal alone; all openings
-at once are one array.
+The robot is level in its updraft, so that each plate's force depends only on its vertical normal; one array holds all
+openings.
 """
 
 from dataclasses import dataclass
@@ -17,17 +17,17 @@ from hil.world.config import GeometryConfig
 from hil.world.motion import GRAVITY
 
 GRID = 11  # openings of each flap between its limits
-LEVEL_SHARE = 0.02  # of the weight: within it the lift counts as holding the height
+LEVEL_SHARE = 0.02  # of the weight: a lift within it holds the height
 QUANTITIES = ("roll", "pitch", "yaw", "lift")  # [rad/s2] three times, then in weights
 Wrenches = NDArray[np.float64]  # (N, 6) force [N] and torque [N m] in B
 
 
 @dataclass(frozen=True, slots=True)
 class Attainable:
-    """What all combinations of openings achieve."""
+    """The wrenches of all combinations of openings."""
 
     all: NDArray[np.float64]  # (N, 4) in the order of QUANTITIES
-    level: NDArray[np.float64]  # (M, 4) those whose lift is the weight
+    level: NDArray[np.float64]  # (M, 4) those with the weight as lift
 
 
 def wrenches(geometry: GeometryConfig, openings: NDArray[np.float64], pressure: float) -> Wrenches:
@@ -73,14 +73,14 @@ def attainable(geometry: GeometryConfig, opening: float, low: float, high: float
 
 
 def reach(opening: float, low: float, high: float) -> float:
-    """Return by how much [rad] every flap can turn in both directions from the hover."""
+    """Return the angle [rad] that every flap can turn in both directions from the hover."""
     return max(min(opening - low, high - opening), 0.0)
 
 
 def single(
     geometry: GeometryConfig, opening: float, low: float, high: float
 ) -> dict[str, tuple[float, float]]:
-    """Return the least and greatest of its own quantity that each input attains alone inside the flaps' range."""
+    """Return each input's smallest and largest own quantity, reached alone inside the flaps' range."""
     found = {}
     for index, name in enumerate(QUANTITIES):
         towards = SIGNS * MIX[:, index]  # of u on the openings: theta = SIGNS * opening

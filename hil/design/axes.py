@@ -6,7 +6,7 @@
     flap' = flap_rate (u - flap)
 
 Symbols of the paper's Methods. Constants have their names in a profile's [model], except k (`NUISANCES`): flaps above the
-centre of mass push sideways when the robot turns, which neither the Table nor the model on board contains.
+centre of mass push sideways when the robot turns, an effect missing in the Table and in the model on board.
 """
 
 from collections.abc import Mapping
@@ -48,13 +48,13 @@ class Axis:
     input: int
     states: tuple[
         str, ...
-    ]  # the first is the controlled one: the integral of the next, and a cause of nothing
-    gains: tuple[str, ...]  # by state, then of the integral of the first one where there is one
+    ]  # the first is the controlled one: the integral of the next, without effect on others
+    gains: tuple[str, ...]  # by state, then of the first one's integral, if any
     constants: tuple[str, ...]  # in the order of UNITS
 
     @property
     def label(self) -> str:
-        """The name with the coordinate that a turn moves."""
+        """The name with the coordinate that the axis moves."""
         return f"{self.name}, {self.coordinate}" if ANGLE in self.states and self.coordinate else self.name
 
     @property
@@ -71,7 +71,7 @@ class Axis:
 
     @property
     def pose(self) -> dict[str, int]:
-        """The states that a pose shows, each with its column among x y z, roll pitch yaw."""
+        """The states in a pose, each with its column among x y z, roll pitch yaw."""
         place = {POSITION: "xyz".index(self.coordinate)} if self.coordinate else {}
         return place | ({ANGLE: 3 + self.input} if ANGLE in self.states else {})
 

@@ -1,4 +1,4 @@
-"""The paper's claims about its design beside the results of the plate model of a robot; the reason where they differ.
+"""Compares the paper's claims about its design with the plate model of a robot, with reasons for differences.
 
 Sections: "Embodied intelligence through design optimization" with Fig. robustness f and g; of the Supplement "Detailed
 derivation of scaling analysis", "Force analysis", "Torque analysis" and the Table of dynamics constants.
@@ -29,7 +29,7 @@ from hil.floaty.geometry import weigh
 from hil.floaty.paper_table import PAPER_TABLE
 
 AGREES, DIFFERS, NOTHING = "agrees", "differs", "no value"
-ROUGHLY = 0.15  # relative deviation that "approximately" still covers
+ROUGHLY = 0.15  # relative deviation that "approximately" covers
 
 DESIGN, SCALING = "Design optimization, Fig. robustness f, g", "Scaling analysis"
 FORCES, CONSTANTS = "Force and torque analysis", "Table of dynamics constants"
@@ -51,14 +51,14 @@ WHY = {
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """One claim of the paper and what was computed."""
+    """One claim of the paper and the computed value."""
 
     title: str
     place: str
     paper: str
     ours: str
     verdict: str
-    why: str = ""  # why they differ, or how to read it
+    why: str = ""  # reason for the difference, or a reading aid
 
 
 def _near(ours: float, paper: float) -> str:

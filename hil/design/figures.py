@@ -1,4 +1,4 @@
-"""Pictures of a design: the robot itself, its stability, its hover angle, its reach, and its laws of scale."""
+"""Pictures of a design: the robot itself, its stability, its hover angle, its reach, and its scaling laws."""
 
 from math import degrees
 
@@ -129,7 +129,7 @@ def hover(point: Point, sweep: HoverAngles) -> Figure:
 
 
 def reach(point: Point, found: Attainable) -> Figure:
-    """Draw the attainable set, quantity against quantity; the inner one has just the weight as its lift."""
+    """Draw the attainable set, quantity against quantity; the inner one has the weight as its lift."""
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     pairs = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
     for axes, (a, b) in zip(figure.subplots(2, 3).flat, pairs, strict=True):
@@ -184,7 +184,7 @@ def scale(laws: tuple[PowerLaw, ...]) -> Figure:
 def pareto(
     names: tuple[str, str], found: Points, front: Points, marks: dict[str, tuple[float, float]]
 ) -> Figure:
-    """Draw what an optimisation tried (N, 2), the Pareto front (M, 2), and robots by name."""
+    """Draw an optimisation's shapes (N, 2), the Pareto front (M, 2), and robots by name."""
     figure = Figure(figsize=(0.7 * WIDTH, 3.6), layout="constrained")
     axes = figure.subplots()
     axes.plot(*found.T, ".", color=GREY, markersize=2, alpha=0.5, label="tried")

@@ -1,8 +1,8 @@
-"""A default design of the controller's gains for any robot: the least quadratic cost that the law's structure allows.
+"""Designs default gains of the controller for any robot: the least quadratic cost with the law's structure.
 
-Per axis the plate model stands behind the flaps' lag and one period of delay; the law feeds back position, velocity, angle
-and rate, not the flap angles. Its gains minimise the stationary cost under gusts (static output feedback), with
-weights by Bryson's rule. `floaty design --write` puts them into a profile.
+Per axis the plate model follows the flaps' lag and one period of delay; the law feeds back position, velocity, angle and
+rate, not the flap angles. Its gains minimise the stationary cost under gusts (static output feedback), with weights by
+Bryson's rule. `floaty design --write` puts them into a profile.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ from hil.design.loop import held
 from hil.errors import LabError
 
 FLAP_RATE = 20.0  # [1/s] of the servos' lag; original firmware
-# The greatest deviation that Bryson's rule allows, in SI units.
+# The largest deviation in Bryson's rule, in SI units.
 ALLOWED = {POSITION: 0.06, VELOCITY: 0.3, ANGLE: radians(8.0), RATE: 1.0}
 TURN_ALLOWED = ALLOWED | {ANGLE: radians(10.0)}  # of yaw
 FLAPS_ALLOWED = radians(8.0)
@@ -38,12 +38,12 @@ def gains_of(model: Linear) -> dict[str, float]:
 
 
 def rounded(gains: Matrix) -> list[float]:
-    """Return gains to the four digits that a profile keeps."""
+    """Return gains rounded to the four digits of a profile."""
     return [float(f"{gain:.4g}") for gain in gains]
 
 
 def with_integral(axis: Axis, gains: Matrix) -> Matrix:
-    """Return the gains on the states, and that of the integral where there is one."""
+    """Return the gains on the states, and the integral's if it has one."""
     return gains if len(axis.gains) == len(axis.states) else np.append(gains, INTEGRAL * gains[0])
 
 
@@ -64,7 +64,7 @@ def regulator(axis: Axis, A: Matrix, B: Matrix, allowed: Mapping[str, float], in
 
 def _least_cost(axis: Axis, robot: Robot) -> Matrix:
     Phi, Gamma = held(*dynamics(axis, robot), STEP_S)
-    n, size = len(axis.states), len(Phi) + 1  # the last state is the command, which is still delayed
+    n, size = len(axis.states), len(Phi) + 1  # the last state is the delayed command
     A, B = np.zeros((size, size)), np.eye(size)[:, -1:]
     A[:-1] = np.hstack([Phi, Gamma[:, :1]])
     allowed = TURN_ALLOWED if axis is YAW else ALLOWED
@@ -85,7 +85,7 @@ def _least_cost(axis: Axis, robot: Robot) -> Matrix:
 
     search = {"maxiter": 4000, "maxfev": 4000, "xatol": 1e-5, "fatol": 1e-9, "adaptive": True}
     best = regulator(axis, A, B, allowed, FLAPS_ALLOWED)[:n]
-    for _ in range(2):  # the second from the end of the first, with a fresh simplex
+    for _ in range(2):  # the second starts at the first one's end, with a fresh simplex
         best = np.asarray(minimize(cost, best, method="Nelder-Mead", options=search).x)
     if cost(best) >= LOST * 0.9:
         raise LabError(

@@ -41,13 +41,13 @@ class Linear:
         }
 
     def poles(self, axis: Axis) -> list[complex]:
-        """Return the open-loop poles [1/s] of an axis with the velocity that it drives, the slowest oscillation first."""
+        """Return the open-loop poles [1/s] of an axis and its velocity, the slowest oscillation first."""
         chosen = places(axis)
         found = np.linalg.eigvals(self.A[np.ix_(chosen, chosen)])
         return sorted(map(complex, found), key=lambda pole: (-abs(pole.imag), -pole.real, -pole.imag))
 
     def steady(self, axis: Axis) -> float:
-        """Return the sideways acceleration per input [m/s2] once the attitude has followed, in its usual direction.
+        """Return the sideways acceleration per input [m/s2] after the attitude has settled, in its usual direction.
 
         Negative: the robot steers in the opposite direction to the paper's; NaN for yaw and height.
         """
@@ -57,12 +57,12 @@ class Linear:
         return -(f.y_u1 - f.y_roll * f.roll_u1 / f.roll_roll) if axis is ROLL else math.nan
 
     def growth(self, axis: Axis) -> float:
-        """Return the largest real part of an axis' poles [1/s]: positive when it falls over by itself."""
+        """Return the largest real part of an axis' poles [1/s]: positive when it is unstable."""
         return max(pole.real for pole in self.poles(axis))
 
 
 def places(axis: Axis) -> list[int]:
-    """Return the places of an axis' states in CAUSES; the controlled one, a cause of nothing, has none."""
+    """Return the places of an axis' states in CAUSES, except the controlled one, which has no effect."""
     return [_place(axis, state) for state in axis.states[1:]]
 
 
@@ -80,7 +80,7 @@ def calm_plates(geometry: GeometryConfig, speed: float, opening: float) -> State
 
 
 def linear(geometry: GeometryConfig, speed: float, opening: float) -> Linear:
-    """Return the dynamics of the plates at a hover that carries the weight, at a speed [m/s] and opening [rad]."""
+    """Return the dynamics of the plates in a hover at a speed [m/s] and opening [rad]."""
     c = calm_plates(geometry, speed, opening)
     slopes = np.array([slope(c, cause) for cause in CAUSES]).T  # (6, 13)
     A, B = np.zeros((STATES, STATES)), np.zeros((STATES, 4))

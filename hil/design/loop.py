@@ -1,11 +1,11 @@
 """One axis of the whole loop, sampled every 10 ms.
 
-Plant (the linear model behind servo lag and delay), gyro (mean over a tick), poses (a horizon late), the board's stationary
-filter and predictor on the board's own model, the history of its commands, the gains. Poses of every second tick count as
-poses of every tick that are half as certain. The robot may differ from the model on board: both are handed in.
+Plant (the linear model after servo lag and delay), gyro (mean over a tick), poses (a horizon late), the board's
+stationary filter and predictor with its own model, the history of commands, the gains. Poses of every second tick count
+as poses of every tick with twice the variance. The robot may differ from the model on board: both are arguments.
 
-The loop is broken between command and servo, where the estimator still knows the command: `now = Gv v + Gu u + Gw w`, v what
-the servos get, u what the board commands, w accelerations of the flow. In flight v = u = -k now.
+The loop is opened between command and servo, so the estimator still has the command: `now = Gv v + Gu u + Gw w`, v the
+servos' input, u the board's command, w accelerations of the flow. In flight v = u = -k now.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ def held(flow: Matrix, columns: Matrix, seconds: float) -> tuple[Matrix, Matrix]
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """The age of poses, and what the board knows of it."""
+    """The age of poses, and the board's horizon for it."""
 
     age_s: float
-    horizon: int  # ticks that the filter runs behind and the predictor bridges
+    horizon: int  # ticks by which the filter is late, bridged by the predictor
 
     @classmethod
     def of(cls, config: LabConfig, age_s: float) -> Timing:
-        """Return the timing of a profile's board with poses of an age."""
+        """Return the timing of a profile's board for poses of an age."""
         predictor = config.predictor
         if not predictor.enabled:
             return cls(age_s, 0)
@@ -63,12 +63,12 @@ class Timing:
         return cls(ticks * STEP_S, ticks)  # the fraction of a tick is bridged by the velocities
 
     def later(self, seconds: float) -> Timing:
-        """Return the timing with poses that are older than they state."""
+        """Return the timing with poses older than their stated age."""
         return Timing(self.age_s + seconds, self.horizon)
 
 
 def filter_gain(axis: Axis, config: LabConfig, Phi: Matrix) -> tuple[Matrix, Matrix]:
-    """Return the stationary gain of the board's filter, and the rows that it measures: gyro, then pose."""
+    """Return the stationary gain of the board's filter, and its measured rows: gyro, then pose."""
     n, noise = len(axis.states), config.estimator
     process = {
         POSITION: noise.process_position,
@@ -100,7 +100,7 @@ class Loop:
     A: Matrix
     Bv: Matrix  # (S, 1)
     Bu: Matrix  # (S, 1)
-    Bw: Matrix  # (S, W) accelerations of the flow: of the velocity, of the rate, as the axis has them
+    Bw: Matrix  # (S, W) accelerations of the flow: of the velocity, of the rate, if the axis has them
     N: Matrix  # (G, S) the quantity that each gain multiplies
     C: Matrix  # (n, S) true states
 
@@ -115,7 +115,7 @@ class Loop:
 
     @cached_property
     def answers(self) -> tuple[Complex, Complex]:
-        """Return `now` (L, G, 2 + W) and true states (L, n, 2 + W) per v, u, w on the lines, whatever the gains."""
+        """Return `now` (L, G, 2 + W) and true states (L, n, 2 + W) per v, u, w on the lines, for any gains."""
         z = np.exp(2j * np.pi * FREQUENCIES * STEP_S)
         inputs = np.concatenate([self.Bv, self.Bu, self.Bw], axis=1)
         solved: Complex = np.linalg.solve(z[:, None, None] * np.eye(len(self.A)) - self.A, inputs)
@@ -129,7 +129,7 @@ class Loop:
         return L
 
     def response_to(self, spectrum: Complex, gains: Matrix) -> tuple[Matrix, float]:
-        """Return the variances of the true states (n,) and of the command in a flow of that spectrum (L, W, W), per Hz."""
+        """Return the variances of the true states (n,) and of the command in a flow with a spectrum (L, W, W), per Hz."""
         now, answers = self.answers
         fed = np.einsum("g,lgc->lc", gains, now)
         u = -fed[:, 2:] / (1 + fed[:, 0] + fed[:, 1])[:, None]
@@ -147,16 +147,16 @@ def build(axis: Axis, robot: Robot, config: LabConfig, timing: Timing) -> Loop:
     K, seen = filter_gain(axis, config, Phi_b)
     n, horizon, lag = len(axis.states), timing.horizon, timing.age_s / STEP_S
     rows = [axis.states.index(state) for state in axis.pose]
-    depth = max(horizon, int(np.ceil(lag))) + 1  # ticks of poses that are kept, besides the present one
+    depth = max(horizon, int(np.ceil(lag))) + 1  # ticks of stored poses, besides the current one
 
-    # Each part of the loop as rows over all parts and inputs: a tick is then written down as it happens.
+    # Each part of the loop is a row over all parts and inputs: the code then follows the order of a tick.
     sizes = (n + 1, 1, depth * len(rows), horizon + 1, n + 1, len(axis.gains) - n)
     every = np.eye(sum(sizes) + 1 + whole.shape[1])
     x, v_before, past, commands, xi, integral, v, u, w = np.split(every, np.cumsum([*sizes, 1, 1]))
 
     rate = axis.states.index(RATE) if RATE in axis.states else None
     N = xi
-    for step in range(horizon):  # the predictor: through the commands, rates from the gyro
+    for step in range(horizon):  # the predictor: uses the commands, and rates from the gyro
         N = Phi_b @ N + Gamma_b @ commands[horizon - step - 1][None]
         if rate is not None:
             N[rate] = _gyro(x[rows], past, horizon - step - 1)
@@ -187,13 +187,13 @@ def _robot_tick(axis: Axis, robot: Robot) -> tuple[Matrix, Matrix, Matrix, Matri
 
 
 def _gyro(present: Matrix, past: Matrix, ticks: int) -> Matrix:
-    """Return the row of the mean rate over the tick that ended that many ticks ago."""
+    """Return the row of the mean rate over the tick that ended `ticks` ago."""
     mean: Matrix = (_ago(present, past, ticks)[-1] - _ago(present, past, ticks + 1)[-1]) / STEP_S
     return mean
 
 
 def _ago(present: Matrix, past: Matrix, ticks: float) -> Matrix:
-    """Return the rows of position and angle that many ticks ago."""
+    """Return the rows of position and angle `ticks` ago."""
     first, share = int(ticks), ticks - int(ticks)
     history = np.concatenate([present, past]).reshape(-1, *present.shape)
     mixed: Matrix = (1 - share) * history[first]

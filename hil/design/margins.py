@@ -1,4 +1,4 @@
-"""The stability margins of an axis' loop that is opened between command and servo, and how late its poses may be."""
+"""The stability margins of an axis' loop, opened between command and servo, and its tolerance of late poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,17 +11,17 @@ from hil.config import LabConfig
 from hil.design.axes import STEP_S, Axis, Matrix, Robot
 from hil.design.loop import FREQUENCIES, Complex, Loop, Timing, build
 
-DOUBLINGS = 6  # of a tick, up to which late poses are tried
-FINE_S = 1e-4  # to which their margin is found
+DOUBLINGS = 6  # of a tick, up to the latest tried poses
+FINE_S = 1e-4  # resolution of their margin
 
 
 @dataclass(frozen=True, slots=True)
 class Margins:
     stable: bool
-    gain: float  # factor on the gain up to which it is stable, infinite without
-    least_gain: float  # factor below 1 down to which it is stable, 0 without
+    gain: float  # factor on the gain up to which it is stable; inf: any
+    least_gain: float  # factor below 1 down to which it is stable; 0: any
     phase: float  # [rad]
-    delay: float  # [s] between command and servo, on top of the present delay
+    delay: float  # [s] between command and servo, added to the existing delay
     peak: float  # of the sensitivity 1 / (1 + L)
 
 
@@ -29,7 +29,7 @@ UNSTABLE = Margins(False, 1.0, 1.0, 0.0, 0.0, np.inf)
 
 
 def margins(loop: Loop, gains: Matrix) -> Margins:
-    """Return the margins of a loop with gains; none of an unstable one."""
+    """Return the margins of a loop with gains; none if it is unstable."""
     if loop.radius(gains) >= 1.0:
         return UNSTABLE
     return margins_of(2 * np.pi * FREQUENCIES, loop.open_loop(gains))
@@ -54,7 +54,7 @@ def peak_of(L: Complex) -> float:
 
 
 def pose_delay_margin(axis: Axis, robot: Robot, config: LabConfig, timing: Timing, gains: Matrix) -> float:
-    """Return by how much poses may be older than they state [s] before the loop is unstable; at most 0.64 s."""
+    """Return how much older than stated poses may be [s] before the loop is unstable; at most 0.64 s."""
 
     def excess(seconds: float) -> float:
         return build(axis, robot, config, timing.later(seconds)).radius(gains) - 1.0

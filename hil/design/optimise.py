@@ -1,12 +1,12 @@
-"""Better shapes: kink, centre of mass, base plate and kinked strip that maximise a figure, at fixed span, mass and speed.
+"""Searches kink, centre of mass, base plate and kinked strip that maximise a figure, at fixed span, mass and speed.
 
-The hover angle follows: mass, speed and drag coefficient leave one for each flap area. Every robot is passively
-stable in roll and pitch and steers sideways with one sign at openings up to `RESERVE` smaller and larger than the hover's: a
-robot like the paper's reverses its sign there (its steady x per u2). All shapes tried are kept, for the Pareto picture.
+Mass, speed and drag coefficient determine the hover angle for each flap area. Every robot is passively stable in roll and
+pitch and steers sideways with one sign at openings up to `RESERVE` smaller and larger than the hover's: a robot like the
+paper's reverses its sign there (its steady x per u2). All tried shapes are kept for the Pareto picture.
 
-Differential evolution begins at the profile's robot, its neighbours and shapes from everywhere; a shape that violates
-conditions is the worse the more it does. The optimum lies where conditions end: the least authority is then climbed along
-them by sequential quadratic programming, from the best shape and from the profile's, and again until that gains nothing.
+Differential evolution starts from the profile's robot, its neighbours and random shapes; the loss of a shape grows with
+its violation of conditions. The optimum lies on the boundary of conditions: sequential quadratic programming then climbs
+the least authority along it, from the best shape and from the profile's, repeated while that gains.
 """
 
 import math
@@ -33,12 +33,12 @@ BOUNDS = {  # shares of the footprint, except the kink
 LOW, HIGH = np.array(list(BOUNDS.values())).T
 POPULATION, GENERATIONS = 40, 25
 NEAR = 0.1  # of the bounds, standard deviation of the reference's neighbours
-AGAIN, GAIN = 5, 1e-4  # how often a climb begins again, as long as it gains that much
-MARGIN = 1e-4  # of conditions during a climb, so that it ends where they hold
+AGAIN, GAIN = 5, 1e-4  # repetitions of a climb, as long as each gains that much
+MARGIN = 1e-4  # of conditions during a climb, so that they hold at its end
 NO_HOVER = 10.0  # loss
 # Typical sizes of the conditions: Routh's three of an axis, and steering times stiffness.
 SIZES = (5.0, 100.0, 1000.0, 1000.0)
-STEP = math.radians(3.0)  # between the openings at which a range of speeds is checked
+STEP = math.radians(3.0)  # between the checked openings of a range of speeds
 BAD = -1.0  # figure of a robot that violates a condition
 
 
@@ -48,8 +48,8 @@ class Tried:
 
     point: Point
     stiffness: float  # f_αα [1/s2]
-    authority: float  # the least over the axes, as a share of the reference's
-    ratio: float  # greatest over least updraft that it holds; 0: not evaluated
+    authority: float  # the smallest over the axes, as a share of the reference's
+    ratio: float  # of its largest to its smallest updraft; 0: not evaluated
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class Optimum:
 
 
 def held(point: Point) -> tuple[float, float]:
-    """Return the updrafts [m/s] around the hover that the robot holds: stable, steering, 8° of each flap in reserve."""
+    """Return the robot's updrafts [m/s] around the hover: stable, steering, 8° of each flap in reserve."""
     openings = np.arange(point.low + RESERVE, point.high - RESERVE + 1e-9, STEP)
     good = [_flies(replace(point, opening=one)) for one in openings.tolist()]
     middle = int(np.abs(openings - point.opening).argmin())
@@ -112,7 +112,7 @@ def least_authority(point: Point, reference: Mapping[str, float]) -> float:
 
 
 def speed_range(point: Point, reference: Mapping[str, float]) -> float:
-    """Return the greatest over the least updraft that the robot holds."""
+    """Return the ratio of the robot's largest to its smallest updraft."""
     low, high = held(point)
     return high / low if math.isfinite(low) else BAD
 
@@ -124,7 +124,7 @@ FIGURES: Mapping[str, Callable[[Point, Mapping[str, float]], float]] = {
 
 
 class Shapes:
-    """The shapes of a search, as shares of the footprint (4,) in the order of BOUNDS, with those that were tried."""
+    """The shapes of a search, as shares of the footprint (4,) in the order of BOUNDS, and those already tried."""
 
     def __init__(self, reference: Point, figure: str) -> None:
         self._reference, self._of, self._speed = reference, FIGURES[figure], reference.speed
@@ -136,7 +136,7 @@ class Shapes:
         self.first = np.clip(own, LOW, HIGH)
 
     def build(self, x: NDArray[np.float64]) -> Point | None:
-        """Return the robot of a shape; None where it has no hover at the reference's speed within the flaps' range."""
+        """Return the robot of a shape; None if it cannot hover at the reference's speed within the flaps' range."""
         geometry, span = self._reference.geometry, self._reference.geometry.footprint
         kink, height, base, strip = np.clip(x, LOW, HIGH).tolist()
         try:
@@ -149,7 +149,7 @@ class Shapes:
         return point if point.low < opening < point.high else None
 
     def loss(self, x: NDArray[np.float64]) -> float:
-        """Return the negative figure, or by how much the conditions are violated, which is positive."""
+        """Return the negative figure, or the violation of the conditions, which is positive."""
         point = self.build(x)
         if point is None:
             return NO_HOVER
@@ -161,14 +161,14 @@ class Shapes:
         return lack or -value
 
     def begin(self, seed: int) -> NDArray[np.float64]:
-        """Return the first generation: the reference, its neighbours, and as many shapes from everywhere."""
+        """Return the first generation: the reference, its neighbours, and as many random shapes."""
         near = ndtri(qmc.LatinHypercube(len(LOW), rng=seed).random(POPULATION // 2 - 1))
         far = qmc.LatinHypercube(len(LOW), rng=seed).random(POPULATION // 2)
         places = [self.first, *(self.first + NEAR * near * (HIGH - LOW)), *(LOW + far * (HIGH - LOW))]
         return np.asarray(np.clip(places, LOW, HIGH), float)
 
     def climb(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the shape with the largest least authority that is reached along the conditions from x."""
+        """Return the shape with the largest least authority, climbing along the conditions from x."""
 
         def above(z: NDArray[np.float64]) -> NDArray[np.float64]:
             point = self.build(LOW + z[:-1] * (HIGH - LOW))
@@ -220,7 +220,7 @@ def _look(point: Point, reference: Mapping[str, float], ratio: float) -> Tried:
 
 
 def front(tried: tuple[Tried, ...], figure: str) -> NDArray[np.float64]:
-    """Return (M, 2) of stability -f_αα and figure: robots that no other one beats in both."""
+    """Return (M, 2) of stability -f_αα and figure: robots not dominated in both."""
     found = sorted(placed(tried, figure).tolist(), reverse=True)
     kept: list[list[float]] = []
     for place in found:

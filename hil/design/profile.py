@@ -1,4 +1,4 @@
-"""A design as a profile that flies: its geometry, its design point, its own model on board, and gains for it."""
+"""A design as a flyable profile: its geometry, its design point, its own model on board, and gains for it."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -12,7 +12,7 @@ from hil.world.config import GeometryConfig
 
 
 def profile_text(point: Point, gains: Mapping[str, float], about: str, length: float = 1.0) -> str:
-    """Return a TOML profile on top of `floaty`; the tunnel is wider for a robot `length` times as long, never narrower."""
+    """Return a TOML profile based on `floaty`; the tunnel grows with a robot `length` times as long, never shrinks."""
     found = point.linear
     model = asdict(found.constants)
     sections: dict[str, Mapping[str, Any]] = {
@@ -31,7 +31,7 @@ def profile_text(point: Point, gains: Mapping[str, float], about: str, length: f
 
 
 def toml_text(about: str, base: str, sections: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a profile on top of another one, with comments first; sections without keys are left out."""
+    """Return a profile based on another one, with comments first; omit sections without keys."""
     lines = [*(f"# {line}" for line in about.splitlines()), f'base = "{base}"']
     for name, values in sections.items():
         if values:

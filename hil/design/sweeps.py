@@ -1,4 +1,4 @@
-"""Sweeps over the shape: where roll is stable, which hover angle leaves most authority, the effect of size and mass."""
+"""Sweeps over the shape: stability of roll, the hover angle with most authority, the effects of size and mass."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ HEIGHTS = np.arange(0.0, 0.1201, 0.015)  # [m] of the flap axes above the centre
 OPENINGS = np.radians(np.arange(10.0, 45.1, 0.5))
 FACTORS = np.array([0.5, 0.7, 1.0, 1.4, 2.0])  # on length or mass
 VISCOSITY = 1.81e-5  # [Pa s] of air at 15 deg C, dynamic
-NEAR_BEST = 0.95  # share of the best figure within which hover angles count as equally good
+NEAR_BEST = 0.95  # share of the best figure at which hover angles count as equally good
 Curve = NDArray[np.float64]
 
 
@@ -32,7 +32,7 @@ class Point:
     geometry: GeometryConfig
     coefficient: float  # of drag
     opening: float  # [rad]
-    low: float  # [rad] least and greatest opening
+    low: float  # [rad] smallest and largest opening
     high: float
 
     @property
@@ -180,7 +180,7 @@ _CAUSES: Mapping[str, Callable[[Point], float]] = {
 
 
 def updrafts(point: Point, reserve: float) -> tuple[float, float]:
-    """Return the least and greatest updraft [m/s] that the flaps hold with `reserve` [rad] left to both limits."""
+    """Return the smallest and largest updraft [m/s] for the flaps with `reserve` [rad] to both limits."""
     return (
         speed_at(point.geometry, point.coefficient, point.low + reserve),
         speed_at(point.geometry, point.coefficient, point.high - reserve),
@@ -191,7 +191,7 @@ RESERVE = radians(8.0)  # of the opening, for attitude: 95 % of the hover's time
 
 
 def flat_high(point: Point) -> Point:
-    """Return the paper's first idea: flat flaps, the centre of mass in their plane; the inertia is kept."""
+    """Return the paper's first idea: flat flaps, the centre of mass in their plane, the same inertia."""
     return replace(point, geometry=balanced(changed(point.geometry, kink_angle=0.0), 0.0, keep_inertia=True))
 
 

@@ -1,7 +1,7 @@
-"""Hover angle and airspeed of a robot whose drag coefficient is known, and robots of another size, mass or centre of mass.
+"""Hover angle and airspeed of a robot of known drag coefficient, and robots of another size, mass or centre of mass.
 
-The coefficient is that of the plates and does not change with shape, mass or speed: it is the profile's, which its design
-airspeed and hover angle fix. Openings are flap angles, positive for every flap.
+The plates' coefficient does not change with shape, mass or speed: the profile's design airspeed and hover angle determine
+it. Openings are flap angles, positive for every flap.
 """
 
 import math
@@ -19,7 +19,7 @@ OPENINGS = np.radians(np.arange(-20.0, 75.5, 2.5))  # searched for a trim
 
 
 def coefficient_of(config: LabConfig) -> float:
-    """Return the drag coefficient with which a profile's robot hovers at its design point."""
+    """Return the drag coefficient at which a profile's robot hovers at its design point."""
     return drag_coefficient(config.geometry, config.plant.airspeed, config.plant.hover_angle)
 
 
@@ -29,7 +29,7 @@ def speed_at(geometry: GeometryConfig, coefficient: float, opening: float) -> fl
 
 
 def opening_at(geometry: GeometryConfig, coefficient: float, speed: float) -> float:
-    """Return the opening [rad] of the hover at a speed [m/s]: where opening the flaps further makes the robot sink.
+    """Return the hover opening [rad] at a speed [m/s]: there a larger opening makes the robot sink.
 
     Raises `LabError` when there is none.
     """
@@ -82,9 +82,9 @@ def scaled(geometry: GeometryConfig, length: float, mass: float) -> GeometryConf
 
 
 def balanced(geometry: GeometryConfig, height: float, keep_inertia: bool = False) -> GeometryConfig:
-    """Return the robot whose centre of mass is `height` [m] below the flap axes, because `masses` hang higher or lower.
+    """Return the robot with the centre of mass `height` [m] below the flap axes, by moving `masses` up or down.
 
-    A fitted inertia grows like that of the masses, unless it is kept.
+    A fitted inertia changes like that of the masses, unless it is kept.
     """
     before = weigh(geometry)
     hung = sum(one.mass * (4 if one.mirrored else 1) for one in geometry.masses)

@@ -1,9 +1,9 @@
-"""Gains of the law's own structure for one axis: least motion in the measured flow, within the margins, for every robot.
+"""Tunes the gains of the law for one axis: least motion in the measured flow, within the margins, for every robot.
 
-The design model is `hil.design.loop`, with estimator, predictor, lag and delays inside. The search (Nelder-Mead) begins at
-the linear quadratic regulator of the axis and at the old gains, and adds the worst of the drawn robots to those that it
-considers until no robot is worse. A robot that moves too much for the box or the flaps, or a loop without its margins, costs
-more than any motion.
+The design model is `hil.design.loop`, with estimator, predictor, lag and delays inside. The search (Nelder-Mead) starts
+at the axis' linear quadratic regulator and at the old gains, and adds the worst of the drawn robots to its set until no
+robot is worse. A robot that moves too much for the box or the flaps, or a loop without its margins, costs more than any
+motion.
 """
 
 from collections.abc import Sequence
@@ -22,22 +22,22 @@ from hil.errors import LabError
 
 PEAK = 1.9  # of the sensitivity, for every robot: a gain margin of 2.1, a phase margin of 30 deg
 BOX_M = 0.10
-SIGMAS = 3.0  # that stay inside the box and clear of the flaps' limits
+SIGMAS = 3.0  # inside the box and clear of the flaps' limits
 UNITS = {POSITION: 0.02, VELOCITY: 0.3, ANGLE: radians(5.0), RATE: 2.0}  # one unit of motion in the cost
 FLAP_UNIT = 0.1  # [rad] of the regulator
-OF_FLAPS = 0.25  # share of a flap's range that one input may take, standard deviation
+OF_FLAPS = 0.25  # share of a flap's range for one input, standard deviation
 ROUNDS = 3
 WORST = 2  # robots added per round
-WORSE = 10  # robots whose margin for late poses is computed, the worst of an axis
+WORSE = 10  # the worst robots of an axis, whose margin for late poses is computed
 TOO_MUCH = 1e3
-LEAST_GAIN, STEP = 0.02, 0.2  # of the search: least scale of a gain, and the first step
+LEAST_GAIN, STEP = 0.02, 0.2  # of the search: smallest scale of a gain, and the first step
 
 
 @dataclass(frozen=True, slots=True)
 class Flow:
     """The disturbance of an axis in a hover, and its mean input and angle."""
 
-    spectrum: Complex  # (L, W, W) on FREQUENCIES, per Hz: of the velocity, of the rate, as the axis has them
+    spectrum: Complex  # (L, W, W) on FREQUENCIES, per Hz: of the velocity, of the rate, if the axis has them
     input: float  # [rad] mean
     angle: float  # [rad] mean; 0 for yaw and height
 
@@ -54,18 +54,18 @@ class GainTask:
 
     @property
     def flap_range(self) -> float:
-        """The way of a flap from the hover to the nearer limit [rad]."""
+        """The angle of a flap from the hover to the nearer limit [rad]."""
         allocation = self.config.allocation
         hover, least, greatest = allocation.hover_angle, allocation.opening_min, allocation.opening_max
         return float(min(greatest - hover, hover - least))
 
     @property
     def error_limit(self) -> float:
-        """The largest error of the main state for which the flaps alone should suffice."""
+        """The largest error of the main state that the flaps should handle."""
         return self.config.controller.limit_xy if ANGLE in self.axis.states else 0.0
 
     def offset(self, gains: Matrix) -> float:
-        """Return where the main state comes to rest; an integral brings it to its goal."""
+        """Return the main state's steady offset; an integral removes it."""
         if len(gains) > len(self.axis.states):
             return 0.0
         turned = gains[self.axis.states.index(ANGLE)] * self.flow.angle if self.axis.main == POSITION else 0.0
@@ -87,7 +87,7 @@ def motion(loop: Loop, task: GainTask, gains: Matrix) -> PredictedMotion:
 
 
 def cost(loop: Loop, task: GainTask, gains: Matrix) -> float:
-    """Return the cost of a robot with gains: motion in units, and far more for violated conditions."""
+    """Return the cost of a robot with gains: motion in units, and much more for violated conditions."""
     radius = loop.radius(gains)
     if radius >= 1.0:
         return TOO_MUCH * (1.0 + radius)
@@ -109,7 +109,7 @@ def cost(loop: Loop, task: GainTask, gains: Matrix) -> float:
 
 
 def delay_margin(L: Complex) -> float:
-    """Return the delay margin [s] by the lines beside each crossing: the search asks for it too often for splines."""
+    """Return the delay margin [s] from the lines beside each crossing: the search needs it too often for splines."""
     size, turned = np.log(np.abs(L)), np.unwrap(np.angle(L))
     at = np.flatnonzero(np.signbit(size[:-1]) != np.signbit(size[1:]))
     share = size[at] / (size[at] - size[at + 1])
@@ -119,7 +119,7 @@ def delay_margin(L: Complex) -> float:
 
 
 def by_regulator(axis: Axis, robot: Robot) -> Matrix:
-    """Return the gains of the axis' regulator, without its feedback of the flap angles."""
+    """Return the gains of the axis' regulator, without its flap angle feedback."""
     Phi, Gamma = held(*dynamics(axis, robot), STEP_S)
     return with_integral(axis, regulator(axis, Phi, Gamma[:, :1], UNITS, FLAP_UNIT)[: len(axis.states)])
 
@@ -167,7 +167,7 @@ class TunedAxis:
     old_margins: Margins
     margins: Margins
     least: Margins  # of all robots
-    late: float  # [s] by which poses may be older than they state, for the robot
+    late: float  # [s] by which poses may be older than stated, for the robot
     least_late: float  # of the worst robots
     old_motion: PredictedMotion | None  # None: not stable by the model
     motion: PredictedMotion
