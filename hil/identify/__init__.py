@@ -1,1 +1,1 @@
-"""From flight data to the model's constants."""
+"""Estimates the model's constants from flight data."""

@@ -1,7 +1,7 @@
-"""The flow's effect on a robot, from a hover's telemetry: the accelerations that its model does not explain.
+"""The flow's effect on a robot, from a hover's telemetry: accelerations that its model does not explain.
 
-With them the design predicts how far another controller lets the robot move. The inputs are those that the flaps really
-took, so that limits, limit cycles and excitations do not count as disturbance. The cameras' noise counts as flow.
+From them the design predicts the robot's motion under another controller. The inputs are the flaps' actual ones, so that
+limits, limit cycles and excitations do not count as disturbance. The cameras' noise counts as flow.
 """
 
 import numpy as np
@@ -43,7 +43,7 @@ def flow_of(record: Record, axis: Axis, robot: Robot) -> Flow:
         return np.asarray(np.fft.rfft(cut, axis=1)[:, 1 : 1 + len(w)])
 
     s: Complex = 1j * w
-    shown: Complex = np.exp(s * LATE_S)  # by how much poses are later than their stamps
+    shown: Complex = np.exp(s * LATE_S)  # lateness of poses against their stamps
     of: dict[str, Complex] = {state: spectra(values) / shown for state, values in poses.items()}
     if POSITION in of:
         of[VELOCITY] = s * of[POSITION]

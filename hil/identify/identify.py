@@ -1,9 +1,9 @@
-"""`floaty identify`: estimates of every constant from a set of flights, by three methods, and how reliable they are.
+"""`floaty identify`: estimates every constant from a set of flights, by three methods, and judges the reliability.
 
-Flights with an excitation go to the instrumental variables and the joint fit, pairs without one and with different gains to
-the paper's method. Constants are those at the mean flap angles of the flights. A constant is `identified` when the joint
-fit's 95 % interval is narrow, the instruments agree, the response follows the excitation and the linear model explains the
-log; `weak` when its sign and size are known; else `not identifiable`: its number is then only where the fit stopped.
+The instrumental variables and the joint fit use flights with an excitation, the paper's method pairs without one and with
+different gains. Constants refer to the mean flap angles of the flights. A constant is `identified` when the joint fit's
+95 % interval is narrow, the instruments agree, the response follows the excitation and the linear model explains the log;
+`weak` when its sign and size are known; else `not identifiable`: its number is then arbitrary.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from hil.laboratory.robot import Streams
 
 IDENTIFIED, WEAK, UNKNOWN = "identified", "weak", "not identifiable"
 NARROW, KNOWN = 0.25, 0.7  # half width of the interval over the value
-EXPLAINED = 10.0  # misfit beyond which the linear model does not explain the log
+EXPLAINED = 10.0  # largest misfit at which the linear model explains the log
 SATURATED, LOST = 0.05, 0.30  # shares of the rows
-COHERENT = 0.35  # least mean coherence of an axis with its excitation; noise alone has 1 over the realisations plus 1
+COHERENT = 0.35  # smallest mean coherence of an axis with its excitation; pure noise has 1 over the realisations plus 1
 PLAUSIBLE = 10.0  # times the profile's value
 
 
@@ -57,7 +57,7 @@ class IdentifiedConstant:
 
     @property
     def differs(self) -> bool:
-        """Whether the instruments and the joint fit exclude each other."""
+        """Whether the instruments and the joint fit contradict each other."""
         return abs(self.joint[0] - self.instrumental[0]) > hypot(self.joint[1], self.instrumental[1])
 
     @property
@@ -73,11 +73,11 @@ class Identification:
     constants: tuple[IdentifiedConstant, ...]
     excited: tuple[Excited, ...]
     estimate: Estimate  # of the joint fit
-    records: tuple[Record, ...]  # with an excitation, in the order that `excited` refers to
+    records: tuple[Record, ...]  # with an excitation, in the order of `excited`
     free: tuple[Record, ...]  # without
 
     def constant(self, name: str) -> IdentifiedConstant:
-        """Return one by its name."""
+        """Return a constant by its name."""
         return next(constant for constant in self.constants if constant.name == name)
 
 
@@ -126,7 +126,7 @@ def identify(records: Sequence[Record]) -> Identification:
 
 
 def _joint(excited: Sequence[Excited], by_instruments: Estimate, record: Record) -> Estimate:
-    """Return the joint fit, begun at the instruments' constants and at the profile's; of a Floaty with what plates do."""
+    """Return the joint fit, started at the instruments' and the profile's constants; a Floaty's includes the identities."""
     config, turns = record.config, dict.fromkeys(NUISANCES, 0.0)
     known: Callable[[Mapping[str, float]], list[float]] = _nothing
     if config.robot.has_plates:
@@ -141,7 +141,7 @@ def _nothing(values: Mapping[str, float]) -> list[float]:
 
 
 def _truths(record: Record, rich: Sequence[Record], excited: Sequence[Excited]) -> dict[str, float]:
-    """Return every constant's true value where it was excited, else where `record` flew; NaN where none is known."""
+    """Return every constant's true value at its excitation's flight, else at that of `record`; NaN if unknown."""
     flown = {one.axis.name: rich[one.record] for one in reversed(excited)}
     every: dict[str, float] = {}
     for axis in AXES:
@@ -151,7 +151,7 @@ def _truths(record: Record, rich: Sequence[Record], excited: Sequence[Excited]) 
 
 
 def operating_point(record: Record) -> OperatingPoint:
-    """Return where a robot flew on the mean."""
+    """Return a robot's mean operating point."""
     u, attitude = record.u.mean(axis=0).tolist(), record.pose[:, 3:].mean(axis=0).tolist()
     return OperatingPoint((*u,), (*attitude,), record.config.tunnel.side_wind)
 
@@ -167,11 +167,11 @@ def truth_of(record: Record) -> dict[str, float]:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What speaks against a constant, besides its interval."""
+    """The evidence against a constant, besides its interval."""
 
     misfit: float
     saturated: float  # share of the rows of the worst record
-    coherence: float  # of the axis' clearest output with the excitation, mean over the lines
+    coherence: float  # of the axis' most coherent output with the excitation, mean over the lines
 
     @classmethod
     def of(cls, fitted: Estimate, records: Sequence[Record], own: Sequence[Excited]) -> Evidence:
@@ -182,7 +182,7 @@ class Evidence:
 
 
 def _verdict(one: IdentifiedConstant, evidence: Evidence, usual: float) -> tuple[str, str]:
-    """Return the verdict and its reason; `usual` is the constant in the profile that flew, NaN where it has none."""
+    """Return the verdict and its reason; `usual` is the constant in the flown profile, NaN if it has none."""
     value, half = one.joint
     if value != value:
         return UNKNOWN, "its axis is not excited"

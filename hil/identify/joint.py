@@ -1,12 +1,12 @@
 """The two estimates that use the excitation: instrumental variables, and the joint fit of all axes.
 
-Both take the cross spectra with the excitation (`hil.identify.spectra`), which the disturbance does not bias, and weight
-each line by the covariance that the disturbance has there, not that of white noise.
+Both use the cross spectra with the excitation (`hil.identify.spectra`), which the disturbance does not bias, and weight
+each line by the disturbance's covariance there, not by that of white noise.
 
 Instrumental variables: the axes' equations are linear in their constants; lag and delay are taken from the profile, and
 their uncertainty is part of the intervals. Joint fit: all axes at once with one servo lag and one delay, by the errors of
-the predicted outputs (`scipy.optimize.least_squares`), started from the former. Where the errors are larger than the scatter
-of the periods explains, they are model errors: the intervals grow with them.
+the predicted outputs (`scipy.optimize.least_squares`), started from the former. Errors beyond the scatter of the periods
+are model errors: the intervals grow with them.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,10 +27,10 @@ CONFIDENCE = 0.95
 LAG_SPREAD = 0.2  # of the profile's lag, standard deviation
 # Half a tick of holding, the PWM period, computing, half the gyro's mean.
 DELAY_S, DELAY_SPREAD_S = 0.013, 0.003
-# Lateness of a pose against the gyro: half its mean, and the telemetry's latency.
+# Lateness of a pose against the gyro: half the gyro's mean, and the telemetry's latency.
 LATE_S, LATE_SPREAD_S = -0.008, 0.003
 ROUNDS = 6
-# How far the identities of flat plates may be off, standard deviations.
+# Errors of the identities of flat plates, standard deviations.
 STIFFNESS_SPREAD, STIFFNESS_LEAST = 0.05, 0.1  # of the value, and [rad/s/m]
 DAMPING_SPREAD, TURN_SPREAD = 0.03, 0.015  # [1/s], [m/s/rad]
 DIFFERENCE = 1e-6  # of a parameter over its size
@@ -61,7 +61,7 @@ class Excited:
 
 
 def excited_axes(records: Sequence[Record]) -> list[Excited]:
-    """Return the axes that are excited, by record. Raises `LabError` for a record that cannot be used."""
+    """Return the excited axes by record. Raises `LabError` for an unusable record."""
     found = []
     for number, record in enumerate(records):
         periods = period_spectra(record)
@@ -72,7 +72,7 @@ def excited_axes(records: Sequence[Record]) -> list[Excited]:
 
 
 def pose_lateness(excited: Sequence[Excited], record: int) -> float:
-    """Return by how much poses are later than their stamps [s]: the gyro's angle against the cameras'."""
+    """Return the lateness of poses against their stamps [s]: the gyro's angle against the cameras'."""
     above = below = 0.0
     for one in excited:
         if one.record != record or len(outputs(one.axis)) < 2:
@@ -126,7 +126,7 @@ def _equations(axis: Axis) -> Iterator[tuple[list[str], Callable[[Array, Complex
 def _equation(axis: Axis, affected: str, w: Array, F: Complex, late: float) -> Rows:
     s: Complex = 1j * w
     signals = 1 + len(outputs(axis))
-    # What telemetry says of each state: a signal, and the factor on it. Angles are those of the gyro.
+    # The telemetry signal of each state, and the factor on it. Angles are the gyro's.
     of = {FLAP: (0, F), RATE: (1, s**0), ANGLE: (1, 1 / s), VELOCITY: (signals - 1, s * np.exp(s * late))}
     causes = [cause for state, cause in axis.terms.values() if state == affected]
     combined = np.zeros((len(w), 1 + len(causes), signals), complex)
@@ -173,16 +173,16 @@ class JointFit:
     lag: float  # [s] of the profile
     known: Callable[
         [Mapping[str, float]], list[float]
-    ]  # by how much constants differ from what is known, in its units
+    ]  # returns the differences of constants from prior knowledge, in its units
 
     def parted(self, x: Array) -> tuple[dict[str, float], dict[int, float]]:
-        """Return constants by name, and by record how late poses are [s]."""
+        """Return constants by name, and the lateness of poses by record [s]."""
         theta = (x * self.scale).tolist()
         late = dict(zip(self.records, theta[len(self.names) :], strict=True))
         return dict(zip(self.names, theta, strict=False)), late
 
     def prior(self, x: Array) -> Array:
-        """Return by how much parameters differ from what is known without the flight."""
+        """Return the parameters' differences from prior knowledge."""
         values, late = self.parted(x)
         usual = [(values[LAG] / self.lag - 1) / LAG_SPREAD, (values[DELAY] - DELAY_S) / DELAY_SPREAD_S]
         usual += [(late[record] - LATE_S) / LATE_SPREAD_S for record in self.records]
@@ -196,7 +196,7 @@ class JointFit:
         )
 
     def slopes(self, x: Array) -> Array:
-        """Return the derivatives of the errors, of each axis by those parameters alone that it depends on."""
+        """Return the derivatives of the errors, of each axis only by its own parameters."""
         at, known = self.errors(x), self.prior(x)
         found = np.zeros((len(at), len(x)))
         for column, name in enumerate([*self.names, *self.records]):
@@ -213,7 +213,7 @@ class JointFit:
         return found / DIFFERENCE
 
     def solved(self, x: Array) -> OptimizeResult:
-        """Return the solution that is reached from x."""
+        """Return the solution reached from x."""
         return least_squares(self.errors, x, self.slopes, x_scale="jac", max_nfev=100)
 
 
@@ -223,10 +223,9 @@ def joint(
     begin: Sequence[Mapping[str, float]],
     known: Callable[[Mapping[str, float]], list[float]],
 ) -> Estimate:
-    """Return all excited axes' constants, lag and delay by the joint fit, the best of those from several beginnings.
+    """Return all excited axes' constants, lag and delay by the joint fit, the best of several starts.
 
-    `lag` [s] is the profile's; `known` returns by how much constants differ from what is known without the flight, in units
-    of its uncertainty.
+    `lag` [s] is the profile's; `known` returns the constants' differences from prior knowledge, in units of its uncertainty.
     """
     names = [name for axis in AXES if any(one.axis is axis for one in excited) for name in axis.constants]
     names += [LAG, DELAY]
@@ -255,9 +254,9 @@ def joint(
 
 
 def identities(values: Mapping[str, float], speed: float, turns: Mapping[str, float]) -> list[float]:
-    """Return by how much constants differ from what holds for any flat plates in a flow, in units of what is usual.
+    """Return the constants' differences from the identities of flat plates in a flow, in usual units.
 
-    A horizontal velocity tilts the wind as the same angle of the robot does (docs/explanation/plant.md). `speed` [m/s] is
+    A horizontal velocity tilts the wind like the same angle of the robot (docs/explanation/plant.md). `speed` [m/s] is
     the tunnel's, `turns` the plates' x_rate and y_rate.
     """
     left = []

@@ -2,7 +2,7 @@
 
 For each excited axis: measured and fitted frequency response with the coherence, the errors over the scatter with their
 autocorrelation from line to line, and the response over one period, measured, simulated from the input and predicted row by
-row, on a flight that was not fitted where there is one. For the paper's method one picture that explains its result.
+row, on a held-out flight if there is one. For the paper's method one picture explains its result.
 """
 
 from collections.abc import Mapping
@@ -73,7 +73,7 @@ def write_pages(out: Path, found: Identification, held_out: Record | None) -> Pa
 def _axis(
     found: Identification, fitted: list[Excited], held_out: list[Excited], records: tuple[Record, ...]
 ) -> Figure:
-    """Draw one axis; `records` are those of the shown response."""
+    """Draw one axis; `records` belong to the shown response."""
     axis = fitted[0].axis
     values = found.estimate.values
     figure = Figure(figsize=(WIDTH, 8.0), layout="constrained")

@@ -1,9 +1,9 @@
-"""What the drawings contribute to an identification: how the effect of inputs and tilt bends with the flap angles.
+"""The geometry's part in an identification: how the effects of inputs and tilt bend with the flap angles.
 
-Plates twist the robot by about sin(phi) cos(phi)^2: the slope changes by several percent per degree, also with what the
-other inputs do to the flaps. A linear fit of such a response finds a mean over all that. The geometry of the profile says
-how the effects bend, and the flight what they are: the records are straightened before the fit, whose constants are then
-those at the mean flap angles.
+Plates twist the robot by about sin(phi) cos(phi)^2: the slope changes by several percent per degree, also through the
+other inputs. A linear fit of such a response finds a mean over all that. The profile's geometry gives the curvature of
+the effects, and the flight their size: the records are straightened before the fit, whose constants then refer to the
+mean flap angles.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hil.identify.record import Array, Record
 from hil.laboratory.robot import Streams
 from hil.world.motion import GRAVITY
 
-# Inputs that act as the plates do, and the axis of B about which they turn; the identified pitch and height act otherwise.
+# Inputs with the plates' effect, and the axis of B about which they turn; the identified pitch and height differ.
 BENT = {0: 0, 2: 2}
 SIDEWAYS, HEIGHT = 1, 2  # y, whose force depends on flaps and roll and bends with both; z
 STEP = 0.02  # [rad, m/s, rad/s] of the differences
@@ -32,17 +32,17 @@ STILL: Rates = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class Straightened:
-    """A record as if effects were linear, on its own instants."""
+    """A record as if effects were linear, at its own times."""
 
     u: Array  # (N, 4) [rad]
-    bent: Array  # (N, 2) [m/s2] the accelerations along y and z that are not linear
+    bent: Array  # (N, 2) [m/s2] the nonlinear accelerations along y and z
 
 
 def straightened(record: Record) -> Straightened:
-    """Return inputs as if their effects were linear, and the accelerations along y and z that are not.
+    """Return inputs as if their effects were linear, and the nonlinear accelerations along y and z.
 
-    Along z these are what roll and sideways velocity do to a robot that leans in a side wind. The flaps follow their
-    commands by the profile's lag. How another robot than Floaty bends is not known: its record stays as it is.
+    Along z these are the effects of roll and sideways velocity on a robot that leans in a side wind. The flaps follow
+    their commands by the profile's lag. Records of other robots than Floaty stay unchanged: their curvature is unknown.
     """
     if not record.config.robot.has_plates:
         return Straightened(record.u, np.zeros((len(record.t), 2)))
@@ -60,7 +60,7 @@ def straightened(record: Record) -> Straightened:
         return float(motion(mean, roll, speed)[SIDEWAYS])
 
     model = config.model
-    # In which a robot that leans so stays in place.
+    # In this flow a robot with this lean stays in place.
     wind = (model.y_u1 * mean[0] + model.y_roll * middle) / model.y_vy
     damping = (aside(STEP - wind) - aside(-STEP - wind)) / (2 * STEP)
     tilting = (aside(-wind, middle + STEP) - aside(-wind, middle - STEP)) / (2 * STEP)
@@ -73,7 +73,7 @@ def straightened(record: Record) -> Straightened:
         motion(mean + one, tilt, along - wind)
         for one, tilt, along in zip(moved, roll.tolist(), speed.tolist(), strict=True)
     ])  # fmt: skip
-    scale = GRAVITY / level[:, 2].mean()  # the flight, not the profile, knows the mass
+    scale = GRAVITY / level[:, 2].mean()  # the mass comes from the flight, not from the profile
     straight = record.u.copy()
     for number, about in BENT.items():
         more = level[:, 3 + about] / slopes[number][3 + about] - moved[:, number]
@@ -86,7 +86,7 @@ def straightened(record: Record) -> Straightened:
 
 
 def turns_of(record: Record) -> dict[str, float]:
-    """Return x_rate and y_rate [m/s/rad] of plates at the mean flap angles: by how much turning alone pushes the robot."""
+    """Return x_rate and y_rate [m/s/rad] of plates at the mean flap angles: the push on the robot by turning alone."""
     motion, mean = _plates(record.config), record.u.mean(axis=0)
     about_x = motion(mean, turn=(STEP, 0.0, 0.0)) - motion(mean, turn=(-STEP, 0.0, 0.0))
     about_y = motion(mean, turn=(0.0, STEP, 0.0)) - motion(mean, turn=(0.0, -STEP, 0.0))
@@ -96,7 +96,7 @@ def turns_of(record: Record) -> dict[str, float]:
 def _plates(config: LabConfig) -> Callable[..., Array]:
     """Return a function from inputs, roll, velocity along y and rates to specific force (W) and angular acceleration (B).
 
-    Both are those of plates alone in calm air, (6,) together.
+    Both are for plates alone in calm air, (6,) together.
     """
     plain = config.plant.model_copy(update={"variant": "plate", "constant_factors": {}, "mass_factor": 1.0})
     air = config.tunnel.model_copy(update={"side_wind": (0.0, 0.0, 0.0)})

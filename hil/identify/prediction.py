@@ -1,8 +1,8 @@
-"""One-step prediction: what the identified model, in the board's stationary filter, predicts for the next sample.
+"""One-step prediction: the next sample as predicted by the identified model in the board's stationary filter.
 
-A simulation from the input alone ignores the flow; a prediction is corrected by every sample, so that the errors
-are the flow's accelerations of one step, the noise of the sensors, and the errors of the model. A step is from one row of
-the telemetry to the next.
+A simulation from the input alone ignores the flow; every sample corrects a prediction, so that its errors are the flow's
+accelerations of one step, the noise of the sensors, and the errors of the model. A step is from one row of the telemetry
+to the next.
 """
 
 from collections.abc import Mapping
@@ -19,9 +19,9 @@ from hil.identify.response import DELAY, LAG
 def one_step(
     record: Record, input: int, values: Mapping[str, float], late: float
 ) -> tuple[Array, Array, Array]:
-    """Return instants t (N,) [s], the measured values, and those predicted a step before, (N,) each.
+    """Return times t (N,) [s], the measured values, and those predicted one step before, (N,) each.
 
-    The signal is the axis' angular rate [rad/s] in B, of u4 the height [m] in W, without their means. `values` are those of
+    The signal is the axis' angular rate [rad/s] in B, of u4 the height [m] in W, without their means. `values` come from
     `hil.identify.joint`; poses are `late` [s] later than their stamps.
     """
     axis, step = AXES[input], record.period_s
@@ -33,7 +33,7 @@ def one_step(
     shown = [np.interp(t + late, record.pose_t, record.pose[:, column]) for column in axis.pose.values()]
     turn = [np.interp(t, record.t, record.rates[:, input])] if RATE in axis.states else []
     measured = np.stack([*turn, *shown], axis=1)
-    # The mean effect until the next step; `delay` counts the half tick by which an input that is held is late.
+    # The mean effect until the next step; `delay` includes the half tick of a held input.
     u = np.interp(t - values[DELAY] + step / 2, record.u_t, record.u[:, input])
     measured -= measured.mean(axis=0)
     u -= u.mean()

@@ -1,9 +1,9 @@
-"""A profile with the identified constants, based on another one: model, servo lag, trim, with the uncertainty as comments,
-and as a file beside it for `floaty tune`.
+"""Writes a profile with the identified constants, based on another one: model, servo lag, trim, with the uncertainty as
+comments, and in a file beside it for `floaty tune`.
 
-The values of an excited axis are those of the joint fit together, also where single constants cannot be separated: with the
-identities of plates, on which the fit relies, the profile's model responds as the robot did. The constants of an axis
-of which nothing is identifiable keep their values.
+An excited axis takes all values from the joint fit, even if single constants cannot be separated: with the identities of
+plates, on which the fit relies, the profile's model responds like the robot. An axis without an identifiable constant
+keeps its values.
 """
 
 from pathlib import Path
@@ -19,13 +19,13 @@ from hil.identify.response import DELAY, LAG
 from hil.identify.robots import write_known
 from hil.world.servos import WORDS_PER_RADIAN
 
-TRIM_LEAST = 0.005  # [rad] least mean input for which a trim is written
+TRIM_LEAST = 0.005  # [rad] smallest mean input with a written trim
 
 
 def write_profile(path: Path, profile: str, found: Identification) -> str:
     """Write the profile and return what it changes besides the model, empty for nothing.
 
-    Raises `LabError` when nothing was identified, or it cannot be written.
+    Raises `LabError` when nothing was identified, or writing fails.
     """
     if not any(constant.verdict != UNKNOWN and constant.name != DELAY for constant in found.constants):
         raise LabError(f"--profile-out {path}: nothing was identified that belongs in a profile")
@@ -55,14 +55,14 @@ def write_profile(path: Path, profile: str, found: Identification) -> str:
     lines += ["", *trim]
     with writing("--profile-out", path):
         path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
-    config = load_config(str(path))  # an invalid profile is an error here, not at the next flight
+    config = load_config(str(path))  # an invalid profile is an error now, not at the next flight
     with writing("--profile-out", path):
         write_known(path, config, found, fitted.values[DELAY])
     return f"servo trim changed: {trim[1].partition('# ')[2]}" if trim else ""
 
 
 def _trim(found: Identification) -> list[str]:
-    """Return the section [servo] that makes the mean inputs zero, empty where they are."""
+    """Return the section [servo] that makes the mean inputs zero, empty if they are."""
     mean = np.mean([record.u.mean(axis=0) for record in found.records], axis=0)
     if np.all(np.abs(mean) < TRIM_LEAST):
         return []

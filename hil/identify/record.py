@@ -1,8 +1,8 @@
-"""A flight's log for identification: inputs, excitation, gyro rates and poses, each with its instants.
+"""A flight's log for identification: inputs, excitation, gyro rates and poses, each with its times.
 
-The log is the ground station's `telemetry.csv`, alone or in a run folder, of a simulated or a real flight. Times are those
-of the board's clock; a pose's instant comes from the ground's clock, which runs `clock_s` ahead. What remains between the
-two, the telemetry's latency, is a few milliseconds and is estimated from the data (`hil.identify.spectra`).
+The log is the ground station's `telemetry.csv`, alone or in a run folder, of a simulated or a real flight. Times are
+those of the board's clock; a pose's time comes from the ground's clock, which runs `clock_s` ahead. The remaining offset,
+the telemetry's latency, is a few milliseconds and is estimated from the data (`hil.identify.spectra`).
 """
 
 import csv
@@ -26,15 +26,15 @@ BOARD_COLUMN = "board.t [ms]"
 INPUTS = tuple(f"controller.u{i} [rad]" for i in range(1, 5))
 EXCITATIONS = tuple(f"excite.u{i} [rad]" for i in range(1, 5))
 RATES = tuple(f"stateEstimate.{name}_rate [rad/s]" for name in ("roll", "pitch", "yaw"))
-FACING = np.radians(30.0)  # a choice: how far the robot may have turned on the median
+FACING = np.radians(30.0)  # a choice: largest median turn of the robot
 WRAP_MS = 1 << 24  # of the board's time stamps
 SHARES = (SIGNS[:, None] * MIX).T  # (4, 4) opening of each flap per input; u4 closes
-TICK_MS = 10.0  # the controller runs in every tenth millisecond, on the rates of the millisecond before
+TICK_MS = 10.0  # the controller runs in every tenth millisecond, on the previous millisecond's rates
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One flight under control. Rows of `t` (N,) and of `pose_t` (M,) are at different instants."""
+    """One controlled flight. Rows of `t` (N,) and of `pose_t` (M,) have different times."""
 
     name: str
     t: Array  # (N,) [s] board's clock, of the tick for which the rates were estimated
@@ -44,29 +44,29 @@ class Record:
     rates: Array  # (N, 3) [rad/s] gyro, B
     pose_t: Array  # (M,) [s] board's clock, when the cameras exposed
     pose: Array  # (M, 6) x y z [m], roll pitch yaw [rad], W
-    saturated: float  # share of the rows in which a flap was at its limit
-    lost_rows: float  # share of the rows that are missing
+    saturated: float  # share of the rows with a flap at its limit
+    lost_rows: float  # share of missing rows
     config: LabConfig  # the profile that flew: gains and limits
     simulated: bool  # its plant is known
 
     @property
     def flap_angle(self) -> float:
-        """The mean opening of all flaps [rad], to which the constants refer."""
+        """The mean opening of all flaps [rad], where the constants hold."""
         return float(self.config.allocation.hover_angle + np.mean(self.u.mean(axis=0) @ SHARES))
 
     @property
     def period_s(self) -> float:
-        """Between two rows, the usual one."""
+        """The usual period of rows."""
         return float(np.median(np.diff(self.t)))
 
 
 def profile_of(path: Path) -> str:
-    """Return the profile with which a run folder was flown; the default one for a bare `telemetry.csv`."""
+    """Return the profile of a run folder; the default one for a bare `telemetry.csv`."""
     return read_result(path).request.profile if path.is_dir() else DEFAULT_PROFILE
 
 
 def load_record(path: Path, profile: str) -> Record:
-    """Return the record of a run folder, or of a `telemetry.csv`, which was flown with `profile`. Raises `LabError`."""
+    """Return the record of a run folder, or of a `telemetry.csv`, flown with `profile`. Raises `LabError`."""
     folder, file = (path, path / TELEMETRY) if path.is_dir() else (path.parent, path)
     if not file.is_file():
         raise LabError(f"{path}: no {TELEMETRY} there; identify takes run folders and telemetry.csv")
@@ -109,9 +109,9 @@ def load_record(path: Path, profile: str) -> Record:
 
 
 def _ticks(sampled_s: Array) -> tuple[Array, Array]:
-    """Return the ticks that commanded the inputs and that estimated the rates of rows sampled at these instants.
+    """Return the ticks of the inputs and of the rates in rows sampled at these times.
 
-    A row that was sampled in the last millisecond of a tick contains the next tick's rates beside this tick's inputs.
+    A row sampled in the last millisecond of a tick has the next tick's rates and this tick's inputs.
     """
     inputs_s = np.floor(np.round(1e3 * sampled_s) / TICK_MS) * TICK_MS * 1e-3
     last = np.round(1e3 * (sampled_s - inputs_s)) == TICK_MS - 1.0
@@ -126,7 +126,7 @@ def _read(file: Path) -> dict[str, Array]:
     except (UnicodeDecodeError, csv.Error):
         raise LabError(f"{file}: not a CSV file; identify takes run folders and {TELEMETRY}") from None
     titles = rows[0] if rows else []
-    # The record of a killed process may end in half a row.
+    # A killed process may leave half a row.
     whole = [row for row in rows[1:] if len(row) == len(titles)]
     try:
         table = np.array(whole, float).reshape(len(whole), len(titles))
@@ -142,9 +142,9 @@ def _read(file: Path) -> dict[str, Array]:
 
 
 def _flown_with(folder: Path) -> tuple[LabConfig, bool, float]:
-    """Return a run folder's configuration, whether its world was simulated, and when it was released [s], board's clock.
+    """Return a run folder's configuration, whether it was simulated, and its release [s], board's clock.
 
-    0: not known.
+    0: unknown.
     """
     metadata = load_log(folder).schema.metadata or {}
     simulated = not read_result(folder).request.is_real
@@ -160,7 +160,7 @@ def _flown_with(folder: Path) -> tuple[LabConfig, bool, float]:
 
 
 def _limited(u: Array, config: LabConfig) -> tuple[Array, float]:
-    """Return the inputs that the limited flaps produce, and how often a flap was limited, like `allocate` on board."""
+    """Return the inputs produced by the limited flaps, and how often a flap was limited, like `allocate` on board."""
     allocation = config.allocation
     opening = allocation.hover_angle + u @ SHARES
     inside = np.clip(opening, allocation.opening_min, allocation.opening_max)

@@ -1,4 +1,4 @@
-"""The frequency responses of flaps and axes as telemetry shows them, behind servo lag and delay."""
+"""The frequency responses of flaps and axes in telemetry, including servo lag and delay."""
 
 from collections.abc import Mapping
 
@@ -9,13 +9,13 @@ from hil.identify.record import Array
 from hil.identify.spectra import Complex
 
 LAG, DELAY = "lag", "delay"  # [s] DELAY is from input to gyro
-TICK_DELAYS_S = 0.010  # of it besides the robot's own: half a tick of holding, half the gyro's mean
-SHOWN = (RATE, ANGLE, POSITION)  # states that telemetry shows, in the order of an axis' outputs
+TICK_DELAYS_S = 0.010  # part not caused by the robot: half a tick of holding, half the gyro's mean
+SHOWN = (RATE, ANGLE, POSITION)  # states in telemetry, in the order of an axis' outputs
 UNIT = {name: UNITS[term] for axis in AXES for name, term in axis.terms.items()} | {LAG: "s", DELAY: "s"}
 
 
 def outputs(axis: Axis) -> tuple[int, ...]:
-    """Return the signals of `hil.identify.spectra.period_spectra` that show the axis."""
+    """Return the axis' signals of `hil.identify.spectra.period_spectra`."""
     turn = (8 + axis.input,) if RATE in axis.states else ()
     return (*turn, *(11 + axis.pose[state] for state in SHOWN if state in axis.pose))
 

@@ -1,7 +1,7 @@
-"""How well a profile's model is known: `floaty identify` writes it beside the profile, `floaty tune` draws robots from it.
+"""The uncertainty of a profile's model: `floaty identify` writes it beside the profile, `floaty tune` draws robots from it.
 
-`mine.json` belongs to `mine.toml`: the model that was identified with it, and the covariance of its constants, lag and delay
-as in the reported intervals. A profile without one counts every constant as known to `UNKNOWN_SHARE`.
+`mine.json` belongs to `mine.toml`: the identified model, and the covariance of its constants, lag and delay as in the
+reported intervals. Without one every constant is known to `UNKNOWN_SHARE`.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from hil.identify.response import DELAY as INPUT_TO_GYRO
 from hil.identify.response import LAG, TICK_DELAYS_S
 from hil.identify.two_controllers import SIGMAS
 
-UNKNOWN_SHARE = 0.2  # half a 95 % interval over the value, of a constant of unknown uncertainty
+UNKNOWN_SHARE = 0.2  # half a 95 % interval over the value, for a constant of unknown uncertainty
 FLAP_RATE = "flap_rate"
 
 
@@ -40,14 +40,14 @@ def beside(profile: str) -> Path:
 
 
 def write_known(path: Path, config: LabConfig, found: Identification, delay_s: float) -> None:
-    """Write an identification's uncertainty beside the profile `path` that it wrote, which reads as `config`."""
+    """Write an identification's uncertainty beside its written profile `path`, which loads as `config`."""
     estimate = found.estimate
     assert estimate.covariance is not None
     names = list(estimate.values)
     kept = [index for index, name in enumerate(names) if name not in NUISANCES]
     half = np.array([estimate.errors[name] for name in names])[kept]
     own = estimate.covariance[np.ix_(kept, kept)]
-    grown = half / SIGMAS / np.sqrt(np.diag(own))  # curvature makes the intervals wider than the scatter does
+    grown = half / SIGMAS / np.sqrt(np.diag(own))  # curvature makes intervals wider than scatter alone
     known = KnownModel(
         values=config.model.model_dump(),
         half_widths={names[index]: float(width) for index, width in zip(kept, half, strict=True)},
@@ -59,7 +59,7 @@ def write_known(path: Path, config: LabConfig, found: Identification, delay_s: f
 
 @dataclass(frozen=True, slots=True)
 class Robots:
-    """The robot that a profile describes, and others within its uncertainty."""
+    """A profile's robot, and others within its uncertainty."""
 
     nominal: dict[str, float]
     drawn: tuple[dict[str, float], ...]
@@ -103,7 +103,7 @@ def _read(file: Path) -> KnownModel:
 def _draw(
     nominal: dict[str, float], names: list[str], covariance: Array, count: int
 ) -> tuple[dict[str, float], ...]:
-    """Return robots, evenly from the normal distribution of that covariance about the nominal one."""
+    """Return robots, drawn evenly from the normal distribution of a covariance about the nominal one."""
     if not count:
         return ()
     places = [name for name in names if name in nominal or name in (LAG, INPUT_TO_GYRO)]

@@ -1,9 +1,9 @@
-"""Spectra on the lines of the excitation, realisation by realisation: the responses, and how far each one scatters.
+"""Spectra on the lines of the excitation, for each realisation: the responses, and their scatter.
 
 The excitation's phases are new in every realisation (`firmware_py/core/excitation.py`). In each period of 20 s sines and
-cosines of all lines are fitted to the samples that there are, so that rows may be missing and the rate may be any that
-suffices for the lines. The responses per excitation have a mean over the realisations, and scatter about it: by the
-disturbance of any colour, and by everything that is not linear. This gives the covariance of the mean.
+cosines of all lines are fitted to the existing samples, so that rows may be missing and any rate sufficient for the lines
+is allowed. The responses per excitation scatter about their mean over the realisations, by a disturbance of any colour
+and by nonlinearity. This gives the covariance of the mean.
 """
 
 from collections.abc import Sequence
@@ -20,12 +20,12 @@ from hil.identify.record import Array, Record
 Complex = NDArray[np.complexfloating[Any, Any]]
 # firmware_py/core/excitation.py
 PERIOD_S, REALISATION_S, SPACING_HZ = 20.0, 22.0, 0.05
-SETTLING_S = 1.8  # left out of each realisation; the rest of its 2 s allows for a first row that is missing
+SETTLING_S = 1.8  # omitted in each realisation; the rest of its 2 s allows for a missing first row
 LEAST_PERIODS = 4
-LINE = 0.1  # of the strongest line: weaker ones do not count
-NEIGHBOURS = 4  # lines to either side, also those between the excited ones, that give the scatter at a line
+LINE = 0.1  # of the strongest line: weaker ones are ignored
+NEIGHBOURS = 4  # lines to either side, excited or not, that give the scatter at a line
 LEAST_SAMPLES = 1.5  # per unknown of the fit
-PURE = 0.05  # share of the excitation that may lie off its lines, or differ in size from period to period
+PURE = 0.05  # allowed share of the excitation off its lines, or changing in size between periods
 # The power of w that turns a signal into an acceleration.
 POWERS = {**dict.fromkeys(range(8, 11), 1), **dict.fromkeys(range(11, 17), 2)}
 
@@ -48,7 +48,7 @@ class Spectra:
 
 
 def windows(record: Record) -> list[float]:
-    """Return when each whole period of the excitation begins, board's clock. Raises `LabError` when there are too few."""
+    """Return the start of each whole period of the excitation, board's clock. Raises `LabError` for too few."""
     excited = np.any(record.excitation != 0.0, axis=1)
     if not excited.any():
         raise LabError(
@@ -114,7 +114,7 @@ def period_spectra(record: Record) -> tuple[list[NDArray[np.int_]], Array, Compl
     starts = windows(record)
     own = excited_lines(record, starts)
     excited = np.concatenate(own)
-    lines = np.arange(1, 1 + excited.max(initial=0))  # those in between take up the disturbance
+    lines = np.arange(1, 1 + excited.max(initial=0))  # lines in between absorb the disturbance
     if not len(lines):
         raise LabError(
             f"{record.name}: rows of {record.period_s * 1e3:.0f} ms are too far apart for the excitation's lines"
@@ -138,7 +138,7 @@ def period_spectra(record: Record) -> tuple[list[NDArray[np.int_]], Array, Compl
 
 
 def _refuse_impure(name: str, lines: NDArray[np.int_], own: Sequence[NDArray[np.int_]], sizes: Array) -> None:
-    """Raise `LabError` for an excitation (P, L, 4) that is not the same sum of its lines in every period."""
+    """Raise `LabError` for an excitation (P, L, 4) that is not an equal sum of its lines in every period."""
     expected = np.zeros_like(sizes)
     for i, chosen in enumerate(own):
         expected[:, np.isin(lines, chosen), i] = sizes[:, np.isin(lines, chosen), i].mean(axis=0)
@@ -168,7 +168,7 @@ def spectra_of(
     scatter = P[:, :, columns]
     scatter[:, places] -= Z * r[:, :, None]
     scatter *= flat
-    # Of a single period, at every line; odd curvature shows on the lines between, too.
+    # Of a single period, at every line; odd curvature also appears on the lines between.
     power_of = np.einsum("pls,plt->lst", scatter, scatter.conj()) / count
     power_of[places] *= count / (count - 1)
     others = np.isin(lines, np.concatenate([found for i, found in enumerate(own) if i != axis]))

@@ -1,11 +1,11 @@
-"""The paper's method, as its Methods print it: two flights with different controllers, nothing but the flow's disturbance.
+"""The paper's method, as printed in its Methods: two flights with different controllers, only the flow's disturbance.
 
-Of each flight the closed loop's constants by eq. (roll_dynamics_sys_of_equations): jw A' = [A' A Y'] [b* c* d*], least
-squares over the low frequencies of windows of 4 s, as in the author's script. From the two by eq.
-(roll_dynamics_input_const): a = (c1* - c2*) / (c1 - c2) with the controllers' own c, then b, c and d.
+Each flight gives the closed loop's constants by eq. (roll_dynamics_sys_of_equations): jw A' = [A' A Y'] [b* c* d*], least
+squares over the low frequencies of windows of 4 s, as in the author's script. The two give, by eq.
+(roll_dynamics_input_const), a = (c1* - c2*) / (c1 - c2) with the controllers' own c, then b, c and d.
 
-It does not recover a known plant. A' is the derivative of the same A, so that jw A' = -w^2 A holds in every bin whatever the
-robot does: least squares find b* near 0 and c* near the mean of -w^2 over the spectrum (`hil.identify.pages` shows it).
+It does not recover a known plant. A' is the derivative of the same A, so that jw A' = -w^2 A holds in every bin for any
+robot: least squares find b* near 0 and c* near the mean of -w^2 over the spectrum (`hil.identify.pages` shows it).
 """
 
 from collections.abc import Sequence
@@ -77,7 +77,7 @@ def closed_loop(record: Record, axis: Axis) -> ClosedLoop:
 
 
 def two_controllers(records: Sequence[Record]) -> dict[str, tuple[float, float]]:
-    """Return a, b, c, d of roll and pitch with 95 % errors, from the first two records whose gains on the angle differ."""
+    """Return a, b, c, d of roll and pitch with 95 % errors, from the first two records with different gains on the angle."""
     found: dict[str, tuple[float, float]] = {}
     for axis in (ROLL, PITCH):
         gains = [axis.gains[axis.states.index(state)] for state in (RATE, ANGLE, VELOCITY)]
@@ -98,7 +98,7 @@ def two_controllers(records: Sequence[Record]) -> dict[str, tuple[float, float]]
 
 
 def _pair(records: Sequence[Record], gain: str) -> tuple[Record, Record] | None:
-    """Return two records without excitation and with different gains; None when there are none."""
+    """Return two records without excitation and with different gains; None if there are none."""
     free = [record for record in records if not record.excitation.any()]
     for other in free[1:]:
         if getattr(other.config.controller, gain) != getattr(free[0].config.controller, gain):
