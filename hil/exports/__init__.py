@@ -1,1 +1,1 @@
-"""From a run folder to files of other programs: a wide table, MCAP, a telemetry log of MAVLink; reads run folders only."""
+"""Writes run folders in formats of other programs: a wide table, MCAP, a MAVLink telemetry log; reads only run folders."""

@@ -1,11 +1,11 @@
 """A flight as an MCAP file, for Foxglove and PlotJuggler: poses, frames and texts in Foxglove's types, the rest as numbers.
 
 Foxglove's types (protobuf): `/truth/pose` (`/cameras/pose` of a real flight), `/estimate/pose` and `/goal/pose`
-(PoseInFrame), `/tf` (the frames world, goal, body and estimate for its 3-D panel), `/text` (Log). All other columns
-of the log go as JSON with a schema that names units and frames: `/truth/twist`, `/estimate/twist`, `/flaps`,
-`/estimate/flaps` (deviations from the hover angle), and one topic for each other prefix of the log (`/link`,
-`/battery`, `/estimator`, …). MCAP's times cannot be negative, so they count from the start of the log; the file's
-metadata `flight` has the instant of the release. Foxglove's SDK comes with the extra `export`.
+(PoseInFrame), `/tf` (the frames world, goal, body and estimate for its 3-D panel), `/text` (Log). All other columns of
+the log are JSON with a schema that names units and frames: `/truth/twist`, `/estimate/twist`, `/flaps`, `/estimate/flaps`
+(deviations from the hover angle), and one topic for each other prefix of the log (`/link`, `/battery`, `/estimator`, …).
+MCAP's times cannot be negative, so they count from the start of the log; the file's metadata `flight` has the time of the
+release. Foxglove's SDK comes with the extra `export`.
 """
 
 import math
@@ -67,7 +67,7 @@ def log_texts(events: Iterable[Mapping[str, Any]], context: foxglove.Context) ->
 
 
 def topics_of(names: list[str]) -> dict[str, list[str]]:
-    """Return which columns of a log form a topic of numbers, by topic."""
+    """Return the columns of a log in each topic of numbers."""
     topics: dict[str, list[str]] = {}
     for name in names:
         prefix, _, rest = name.partition(".")

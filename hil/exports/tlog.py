@@ -1,11 +1,10 @@
 """A flight as a telemetry log of MAVLink, which ground stations and pymavlink open: each frame after its time.
 
-Made from the flight log, whatever link was flown: the board's messages about its estimate (HEARTBEAT, ATTITUDE,
-LOCAL_POSITION_NED, SERVO_OUTPUT_RAW, BATTERY_STATUS, STATUSTEXT), from system 255 the goal when it changes
-(SET_POSITION_TARGET_LOCAL_NED) and the true pose, in a real flight the cameras' (ATT_POS_MOCAP). Times count from the
-start of the log, in microseconds; STATUSTEXT "released" is the release. The log has the estimate relative to the
-goal, which reaches the board some 30 ms late: for that long after a jump of the goal the estimate here is wrong by that
-jump.
+Made from the flight log, for any link: the board's messages about its estimate (HEARTBEAT, ATTITUDE, LOCAL_POSITION_NED,
+SERVO_OUTPUT_RAW, BATTERY_STATUS, STATUSTEXT), from system 255 the goal when it changes (SET_POSITION_TARGET_LOCAL_NED)
+and the true pose, in a real flight the cameras' (ATT_POS_MOCAP). Times count from the start of the log, in microseconds;
+STATUSTEXT "released" is the release. The log has the estimate relative to the goal, which reaches the board some 30 ms
+late: after a jump of the goal the estimate here is wrong by that jump for this time.
 """
 
 from collections.abc import Iterator
@@ -84,7 +83,7 @@ def _flown(log: pa.Table) -> Iterator[Said]:
 
 
 def _estimated(ms: int, goal: list[float], estimate: list[float]) -> Iterator[Any]:
-    """Yield the estimate, which the log has in the goal frame, as the board reports it, in the world."""
+    """Yield the log's estimate, converted from the goal frame to the world, as the board reports it."""
     goal_x, goal_y, goal_z, goal_yaw = goal
     x, y, z, vx, vy, vz, roll, pitch, yaw, *rates = estimate
     q_WG = yaw_quaternion(goal_yaw)

@@ -1,1 +1,1 @@
-"""Many flights and what is learnt from them."""
+"""Studies of many flights."""

@@ -1,8 +1,8 @@
-"""The robustness studies beyond the paper, as data: what is made worse, for which variants, and the expected outcome.
+"""The robustness studies beyond the paper, as data: the disturbance, the variants, and the expected outcome.
 
 A study flies its experiment for every variant, size and seed. Faults begin 2 s after the release and last to the end
-unless the study says otherwise. Expectations were measured over at least 5 seeds and are stated with one step of reserve;
-for latency and jitter other seeds were flown as well.
+unless stated otherwise. Expectations were measured over at least 5 seeds and are stated with one step of reserve; for
+latency and jitter other seeds were flown as well.
 """
 
 from collections.abc import Callable
@@ -14,10 +14,10 @@ from hil.studies.study import Change, Expected, Study, Variant
 
 AS_FLOWN = "as-flown"
 PROFILES = (DEFAULT_PROFILE, AS_FLOWN)
-AIR_US = 2_000  # what radio, USB and the wait for the next step add to the cameras' latency
+AIR_US = 2_000  # added to the cameras' latency by radio, USB and the wait for the next step
 NO_TRACKER = ("tracker.enabled=false",)
 NO_PREDICTOR, FIXED_PREDICTOR = ("predictor.enabled=false",), ("predictor.age=fixed",)
-# Gains between the author's and the profile's, which show best when the predictor is needed.
+# Gains between the author's and the profile's: these show best when the predictor is needed.
 MID = (
     "controller.gain_y=-2.5",
     "controller.gain_vy=-0.8",
@@ -44,7 +44,7 @@ def _latency(size: float) -> Change:
 
 
 def _fault(kind: str, harmless: float) -> Callable[[float], Change]:
-    """Return the change that makes a fault of each size, and none of the harmless one."""
+    """Return the change that makes a fault of each size, but none for the harmless one."""
     return lambda size: Change() if size == harmless else Change(faults=(f"{kind}@2={size:g}",))
 
 

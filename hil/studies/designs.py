@@ -1,7 +1,7 @@
 """Studies of three designs side by side: flat flaps with the centre of mass in their plane, the paper's, an optimised one.
 
-All three are isolated plates of one drag coefficient, with gains by `hil.design.gains`. At an updraft other than the
-design's the hover angle on board is the one that carries the robot; gains and model stay those of the design.
+All three are isolated plates of one drag coefficient, with gains by `hil.design.gains`. At another updraft the hover
+angle on board is the one that carries the robot there; gains and model remain the design's.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ def _point(profile: str) -> Point:
 
 
 def _updraft(profile: str) -> Callable[[float], Change]:
-    """Return the change that makes an updraft of each speed [m/s], with the hover angle adapted within the flaps' range."""
+    """Return the change that sets an updraft of each speed [m/s] and adapts the hover angle within the flaps' range."""
 
     def change(speed: float) -> Change:
         point = _point(profile)

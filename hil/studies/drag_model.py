@@ -1,9 +1,9 @@
 """The paper's test of its drag model: forces and torques on the robot mounted in the tunnel, over the flaps' angles.
 
 The model is the paper's simplified one ("Force analysis"): base and flaps as isolated flat plates in a uniform flow, pushed
-along their normals. What is measured is the plant, clamped level at the hover point of the tunnel, with its profile and
-its gusts, through a force sensor, for 10 s at each angle: means and standard deviations. The plant's plates are isolated
-too, so what the paper sees at extreme angles, flaps in each other's wake, does not occur here.
+along their normals. A force sensor measures the plant, clamped level at the hover point of the tunnel, with its profile
+and its gusts, for 10 s at each angle: means and standard deviations. The plant's plates are isolated too, so the paper's
+effect at extreme angles, flaps in each other's wake, does not occur here.
 
 Torques are about the centre of mass. Two sweeps as in the paper's figure drag_model_evaluation: (a) flaps 2 and 3 turned by
 the same angle in opposite directions, (b) flaps 1 and 3 in the same direction; the others stay at the hover angle.

@@ -1,6 +1,6 @@
-"""Flying the whole paper: every row's experiment on both profiles with several seeds, and the studies.
+"""Flies the whole paper: every row's experiment on both profiles with several seeds, and the studies.
 
-Flights of rows keep their logs in `OUT/EXPERIMENT-PROFILE-SEED`, those of studies leave only their rows.
+Flights of rows keep their logs in `OUT/EXPERIMENT-PROFILE-SEED`, those of studies only their rows.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from hil.studies.study_run import StudyResult, distance, flights_of, summarise
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """A metric over the seeds, in the displayed unit; flights without a value are left out."""
+    """A metric over the seeds, in the displayed unit; flights without a value are omitted."""
 
     unit: str
     count: int
     mean: float
-    deviation: float  # standard, of a single flight; NaN of one
+    deviation: float  # standard, of a single flight; NaN for one flight
     low: float
     high: float
 
@@ -68,12 +68,12 @@ class Trials:
 
     @property
     def holds(self) -> bool:
-        """Whether all flights did."""
+        """Whether all flights held every limit."""
         return self.passed == len(self.results) > 0
 
     @property
     def failed(self) -> list[str]:
-        """Limits that failed, with how often, and why flights were lost."""
+        """Failed limits with their number, and causes of lost flights."""
         failures = [name for row in self.results for name in row.failed]
         return [f"{name} {failures.count(name)}×" for name in dict.fromkeys(failures)]
 
@@ -83,7 +83,7 @@ class Trials:
         return sum(result.outcome == "lost" for result in self.results)
 
     def missed(self, row: PaperRow, metric: str) -> str:
-        """Return by how much the mean misses the paper's value; empty when it does not, or the paper has none."""
+        """Return how far the mean misses the paper's value; empty when it does not, or the paper has none."""
         bound, spread = row.claims[metric].bound, Spread.of(metric, self.results)
         if bound is None or not spread.count:
             return ""
@@ -109,7 +109,7 @@ class Paper:
 
     @property
     def misses(self) -> list[tuple[PaperRow, str, list[str]]]:
-        """Rows and profiles that miss a value of the paper or fail a limit, with the reasons."""
+        """Rows and profiles that miss a paper's value or fail a limit, with the reasons."""
         found = []
         for _, row, both in self.rows:
             for trials in both:
@@ -131,7 +131,7 @@ class Paper:
 
     @property
     def surprises(self) -> int:
-        """The number of expectations of the studies that were not met."""
+        """The number of unmet expectations of the studies."""
         return sum(len(result.surprises(curve)) for result in self.studies for curve in result.curves)
 
     @property
@@ -154,7 +154,7 @@ def select(pattern: str | None) -> list[str]:
 
 
 def fly_paper(names: Sequence[str], studies: Sequence[Study], seeds: int, out: Path, runner: Runner) -> Paper:
-    """Fly rows and studies, equal flights once; after Ctrl-C the result holds what is complete."""
+    """Fly rows and studies, equal flights once; after Ctrl-C the result has the complete ones."""
     trials = {
         (name, profile): [
             Job(0, name, Options(profile=profile, seed=seed), {}, out / f"{name}-{profile}-{seed}", LOG)
@@ -184,5 +184,5 @@ def fly_paper(names: Sequence[str], studies: Sequence[Study], seeds: int, out: P
 
 
 def _error(row: Row) -> tuple[bool, float]:
-    """Return an order of flights from good to bad."""
+    """Return the key that sorts flights from good to bad."""
     return row.outcome != "completed", distance(row.metrics)

@@ -1,7 +1,7 @@
-"""The paper's identification of roll: its printed numbers, its arithmetic, its method and others where the truth is known.
+"""The paper's identification of roll: its printed numbers, its arithmetic, and its method and others with known truth.
 
-Methods, eq. (roll_dynamics_input_const): from c* of two flights with gains on roll of 0.2 and 0.15 follow a and c. The same
-two flights are flown here, and one with an excitation of u1 for the methods that need it: four minutes of flight.
+Methods, eq. (roll_dynamics_input_const): c* of two flights with gains on roll of 0.2 and 0.15 gives a and c. The same two
+flights are flown here, and one with an excitation of u1 for the methods that need it: four minutes of flight.
 """
 
 from collections.abc import Sequence
@@ -56,7 +56,7 @@ def fly_identification(out: Path, runner: Runner) -> tuple[PaperConstant, ...]:
 
 
 def identified(rows: Sequence[Row]) -> Identification:
-    """Return what flights of one robot show. Raises `LabError` for one that was lost."""
+    """Return the identification from flights of one robot. Raises `LabError` for a lost one."""
     for row in rows:
         if row.outcome != "completed":
             raise LabError(f"{row.folder}: {row.error}")

@@ -36,7 +36,7 @@ from hil.studies.study_run import StudyResult
 REPORT = "report.html"
 # Names of the pages beside those of the experiments.
 DRAG_MODEL, STUDIES, DESIGN = "drag-model", "studies", "design/design"
-OF_EVERY_FLIGHT = (TRACK, PICTURES[0])  # for an experiment without pictures of its own
+OF_EVERY_FLIGHT = (TRACK, PICTURES[0])  # for an experiment without own pictures
 
 
 def write_paper(
@@ -46,11 +46,10 @@ def write_paper(
     shape: Analysis | None = None,
     constants: Sequence[PaperConstant] = (),
 ) -> Path:
-    """Write `result.json`, `report.html` and the pictures of the studies; returns the report.
+    """Write `result.json`, `report.html` and the pictures of the studies; return the report.
 
-    `mounted` is the test of the drag model: with it, its files are written into `drag-model` as well. `shape` is the
-    analysis of the design: with it, its page and pictures are written into `design`. `constants` are the rows of the
-    identification.
+    `mounted`, the test of the drag model, is also written into `drag-model`. `shape`, the analysis of the design, is
+    written as page and pictures into `design`. `constants` are the rows of the identification.
     """
     content = _content(paper) | ({"design": [asdict(claim) for claim in shape.claims]} if shape else {})
     if constants:

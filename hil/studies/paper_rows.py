@@ -1,7 +1,7 @@
 """The paper's results that a laboratory without hardware can reproduce: the paper's claim, its place, and our measurement.
 
-One row per experiment. Verdicts come from the limits of the experiments, which state the behaviour of this plant; beside
-them stands by how much a row misses the paper's value, and why. docs/explanation/plant.md describes the plant.
+One row per experiment. Verdicts come from the limits of the experiments, which state the behaviour of this plant; each
+row also has its difference from the paper's value, and the reason. docs/explanation/plant.md describes the plant.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ class MetricClaim:
     """The paper's claim about a metric."""
 
     text: str = ""  # empty: no claim
-    bound: float | None = None  # in the metric's unit; the mean over the seeds reaches it or misses it
+    bound: float | None = None  # in the metric's unit; the mean over the seeds reaches or misses it
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,12 +26,12 @@ class PaperRow:
     """One row of the paper's table."""
 
     title: str
-    claim: str  # the paper's, in short
+    claim: str  # the paper's, shortened
     place: str  # in the paper
     claims: Mapping[str, MetricClaim]  # by metric, in the order of the table
     why: str = ""  # why it misses the paper's value, if it does
     note: str = ""  # how to read ours
-    marks: tuple[Instant, ...] = ()  # numbers of the paper that have a place on our picture's time axis
+    marks: tuple[Instant, ...] = ()  # the paper's numbers on our picture's time axis
 
 
 SETTLED = (Instant("paper", BEGIN_S + 0.5, "paper: settled"),)

@@ -1,7 +1,7 @@
 """Agility against size, from flights: the paper's robot, half and twice as long, each in its own updraft.
 
-The masses go with the cube of the length, so that the updraft goes with its root (eq. airflow_proportionality). All three
-fly an excitation of u3 and one of u1, and `floaty identify` finds from the telemetry alone the acceleration per input.
+The masses grow with the cube of the length, so that the updraft grows with its root (eq. airflow_proportionality). All
+three fly excitations of u3 and u1, and `floaty identify` estimates the acceleration per input from telemetry alone.
 """
 
 from pathlib import Path
@@ -16,7 +16,7 @@ from hil.studies.paper_identification import identified
 
 PROFILES = ("design-half", "design-paper", "design-double")
 FLIGHTS = {"yaw_u3": "identify-u3", "roll_u1": "identify-u1"}
-# [rad] rms, half of what the default robot withstands, because the smallest one drifts by 20 cm with it.
+# [rad] rms, half of what the default robot withstands; the smallest one drifts by 20 cm with it.
 AMPLITUDES = {"identify-u3": 0.03, "identify-u1": 0.025}
 DURATION_S = 113.0  # five realisations
 PAPER, NEAR = -1.0, 0.15  # exponent over the length, and the deviation that "goes with" allows
@@ -24,7 +24,7 @@ AGAINST = "At the same hover angle; with servos that are as slow at every size."
 
 
 def fly_scaling(out: Path, runner: Runner) -> list[Claim]:
-    """Fly and identify; empty after Ctrl-C. Raises `LabError` for a robot that is lost or not identified."""
+    """Fly and identify; empty after Ctrl-C. Raises `LabError` for a lost or unidentified robot."""
     rows = runner.log(
         "scaling",
         {

@@ -1,6 +1,6 @@
 """A robustness study: one axis of sizes, several variants, and the expected outcome of each.
 
-Sizes go from harmless to harmful, in the order in which they are listed; "up to" and "from" mean that order.
+Sizes are listed from harmless to harmful; "up to" and "from" refer to that order.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ class Expected:
 
     holds_to: float | None = None  # every seed holds the experiment's limits up to this size
     flies_to: float | None = None  # no seed is lost up to this size
-    # The size from which on the supervisor opens the loop or the robot is lost.
+    # From this size on the supervisor opens the loop or the robot is lost.
     failsafe_from: float | None = None
     lost_from: float | None = None  # every seed is lost from this size on
 
@@ -53,10 +53,10 @@ class Study:
 
     name: str
     question: str
-    axis: str  # what the sizes are
+    axis: str  # meaning of the sizes
     unit: str
     sizes: tuple[float, ...]
     variants: tuple[Variant, ...]
     duration_s: float = 8.0
     experiment: str = "hover"
-    remark: str = ""  # what the picture shows
+    remark: str = ""  # explains the picture

@@ -1,6 +1,6 @@
 """The picture of a study: the error over its sizes, a curve per variant, and below it the outcome of every cell.
 
-A curve is the mean over the seeds that were not lost, its band their range; it ends where all are lost.
+A curve is the mean over the surviving seeds, its band their range; it ends where all are lost.
 """
 
 import numpy as np

@@ -20,7 +20,7 @@ class VariantOutcome:
 
     size: float
     outcomes: tuple[str, ...]
-    errors: tuple[float, ...]  # rms distance from the goal [m], of the flights that were not lost
+    errors: tuple[float, ...]  # rms distance from the goal [m], of the surviving flights
 
     @property
     def ranks(self) -> list[int]:
@@ -29,7 +29,7 @@ class VariantOutcome:
 
     @property
     def typical(self) -> str:
-        """The median outcome; of two the worse one."""
+        """The median outcome; the worse of two."""
         return OUTCOMES[self.ranks[len(self.outcomes) // 2]]
 
     @property
@@ -40,7 +40,7 @@ class VariantOutcome:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A variant over the sizes that were flown."""
+    """A variant over the flown sizes."""
 
     variant: Variant
     cells: tuple[VariantOutcome, ...]
@@ -60,7 +60,7 @@ class StudyResult:
         return found
 
     def _bounds(self, expected: Expected, cell: VariantOutcome) -> Iterator[bool]:
-        """Yield whether a cell keeps each bound that concerns it."""
+        """Yield whether a cell keeps each of its bounds."""
         sizes, best, worst = self.study.sizes, cell.ranks[0], cell.ranks[-1]
         place = sizes.index(cell.size)
         for last, allowed in ((expected.holds_to, HOLDS), (expected.flies_to, FAILSAFE)):
@@ -72,14 +72,14 @@ class StudyResult:
 
     @property
     def holds(self) -> bool:
-        """Whether every outcome was expected and every flight was flown."""
+        """Whether all flights were flown with expected outcomes."""
         return len(self.curves) == len(self.study.variants) and all(
             len(curve.cells) == len(self.study.sizes) and not self.surprises(curve) for curve in self.curves
         )
 
 
 def flights_of(study: Study, seeds: int) -> Iterator[Job]:
-    """Yield every flight of a study; only the row of each is kept."""
+    """Yield every flight of a study; only its row is kept."""
     for variant in study.variants:
         for size in study.sizes:
             change = variant.change(size)
@@ -105,7 +105,7 @@ def outcome_of(row: Row) -> str:
 
 
 def summarise(study: Study, flown: Iterable[tuple[Job, Row]]) -> StudyResult:
-    """Return the result of a study from those of its flights that were flown."""
+    """Return the result of a study from its finished flights."""
     by_cell: dict[tuple[Value, Value], list[Row]] = {}
     for job, row in flown:
         by_cell.setdefault((job.values["variant"], job.values["size"]), []).append(row)

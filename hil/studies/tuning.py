@@ -1,7 +1,7 @@
 """`floaty tune`: a hover measures the flow, the design computes gains, and hovers test them, also on the worst robots.
 
-A round of `--repeat` begins one step earlier: it flies the excitations and identifies the model. All of it takes telemetry
-and a link alone; the plant's truth is used only to fly other robots.
+A round of `--repeat` first flies the excitations and identifies the model. Everything needs only telemetry and a link;
+the plant's truth is used only to fly other robots.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,12 +34,12 @@ HOVER_S = 60.0
 EXCITATIONS = tuple(f"identify-u{number}" for number in range(1, 5))
 FLOWN = 3  # of the worst robots
 FACTOR_MAX = 4.0  # of plant.constant_factors
-BETTER = 0.95  # of the old gains' rms, or the round is the last
+BETTER = 0.95  # of the old gains' rms, else the round is the last
 
 
 @dataclass(frozen=True, slots=True)
 class TuningFlights:
-    """The settings that all flights share."""
+    """The common settings of all flights."""
 
     seed: int
     board: str
@@ -83,7 +83,7 @@ class Tuned:
     axes: tuple[TunedAxis, ...]
     robots: Robots
     age_s: float
-    jitter_s: float  # by which the oldest of a hundred poses is older than the mean
+    jitter_s: float  # extra age of the oldest of a hundred poses, over the mean
     config: LabConfig  # with the new gains
     before: Row
 
@@ -94,7 +94,7 @@ class Tuned:
 
 
 def tune(profile: str, flights: TuningFlights, count: int) -> Tuned:
-    """Return gains for a profile's robot and `count` others within its intervals. Raises `LabError` when there are none."""
+    """Return gains for a profile's robot and `count` others within its intervals. Raises `LabError` if none exist."""
     config = load_config(profile)
     if config.logic.controller:
         raise LabError(
@@ -127,7 +127,7 @@ def _with_gains(config: LabConfig, axes: Sequence[TunedAxis]) -> LabConfig:
 
 
 def write_tuned(path: Path, base: str, config: LabConfig, about: str) -> None:
-    """Write a profile based on another one, with the values of `config` that differ: model, trim, gains."""
+    """Write a profile based on another one, with the different values of `config`: model, trim, gains."""
     old = load_config(base)
     sections = {
         name: changes(getattr(config, name), getattr(old, name)) for name in ("model", "servo", "controller")
@@ -138,7 +138,7 @@ def write_tuned(path: Path, base: str, config: LabConfig, about: str) -> None:
 
 
 def worst_settings(tuned: Tuned, config: LabConfig) -> list[tuple[str, ...]]:
-    """Return the settings that make the plant the worst of the drawn robots, as far as the plant can represent them."""
+    """Return the settings that make the plant the worst drawn robot, as far as it can represent it."""
     if config.plant.variant == "plate" or not config.robot.has_plates:
         return []
     plant = Plant(config.geometry, config.plant, config.tunnel, config.actuators, Streams.of_seed(1).gusts)
@@ -161,7 +161,7 @@ def worst_settings(tuned: Tuned, config: LabConfig) -> list[tuple[str, ...]]:
 
 
 def rms(row: Row) -> float:
-    """Return the rms distance from the goal [m], infinite for a robot that was lost."""
+    """Return the rms distance from the goal [m], infinite for a lost robot."""
     if row.outcome != "completed":
         return float("inf")
     return distance(row.metrics)
@@ -173,27 +173,27 @@ class Round:
 
     tuned: Tuned
     flown: tuple[Row, ...]
-    given: str  # the profile that was tuned
-    written: Path  # the one with the new gains
+    given: str  # the tuned profile
+    written: Path  # the profile with the new gains
 
     @property
     def better(self) -> bool:
-        """Whether the new gains hover no worse than the old ones, with the same model on board and in the same wind."""
+        """Whether the new gains hover at least as well as the old ones, with equal model on board and wind."""
         return rms(self.flown[0]) <= rms(self.tuned.before)
 
     @property
     def worth_another(self) -> bool:
-        """Whether the new gains hover so much better than the old ones that another round may gain more."""
+        """Whether the new gains hover so much better that another round may help."""
         return rms(self.flown[0]) <= BETTER * rms(self.tuned.before)
 
     @property
     def profile(self) -> str:
-        """The profile that flies the better gains."""
+        """The profile with the better gains."""
         return str(self.written) if self.better else self.given
 
 
 def fly_round(profile: str, flights: TuningFlights, count: int) -> Round:
-    """Tune a profile and fly the result. Raises `LabError` when nothing can be flown."""
+    """Tune a profile and fly the result. Raises `LabError` if it cannot be flown."""
     tuned = tune(profile, flights, count)
     path = flights.folder / "tuned.toml"
     write_tuned(path, profile, tuned.config, "Gains by floaty tune.")
@@ -202,7 +202,7 @@ def fly_round(profile: str, flights: TuningFlights, count: int) -> Round:
 
 
 def rounds(profile: str, flights: TuningFlights, count: int, most: int) -> Iterator[Round]:
-    """Yield rounds of excitation, identification and tuning, `most` of them or until new gains are hardly better.
+    """Yield rounds of excitation, identification and tuning, at most `most`, until new gains are hardly better.
 
     Raises `LabError` when a robot is lost, or nothing is identified.
     """

@@ -1,8 +1,8 @@
-"""Why a flight of one board is not, bit for bit, that of another with the same seed: causes, computed from the two logs.
+"""Explains why flights of two boards with the same seed differ in bits: causes, computed from the two logs.
 
-The two boards are in one laboratory, whose truth and sensors are equal until the first servo count differs. What makes it
-differ is on the boards: when they were powered, which samples at rest gave the gyro's zero, when in its ten milliseconds the
-estimator runs, what else is on the air, and how long the board's microsecond is (`clock.board_us`, which images have).
+The two boards are in one laboratory, whose truth and sensors are equal until the first servo count differs. The causes
+are on the boards: the time of power-on, the samples at rest for the gyro's zero, the estimator's phase in its ten
+milliseconds, other radio packets, and the length of the board's microsecond (`clock.board_us`, only from images).
 """
 
 from collections.abc import Sequence
@@ -28,16 +28,16 @@ ESTIMATING = (
     "KALMAN",
     "STABILIZER",
     "STABILIZE",
-)  # tasks in which it may run, the first that runs for so long
-LONG_US = 200  # as no step without an estimate takes
+)  # its possible tasks: the first that runs for so long
+LONG_US = 200  # longer than any step without an estimate
 SAME_ZERO = 1e-6  # [rad/s] a count over 512 samples is 2e-6
 CLOCK = "clock.board_us"
-JUMP_US = 1000  # by which a clock that is read while it carries may be wrong
+JUMP_US = 1000  # possible error of a clock read during a carry
 
 
 @dataclass(frozen=True, slots=True)
 class FirstCount:
-    """The first row with another servo count; `why` is the cause that shows there."""
+    """The first row with a different servo count; `why` is its visible cause."""
 
     row: int
     t_s: float  # from the release
@@ -53,21 +53,21 @@ class FirstCount:
 
 @dataclass(frozen=True, slots=True)
 class TwoBoards:
-    """What sets two boards apart in one laboratory; `causes` are sentences, each with its figures."""
+    """The differences of two boards in one laboratory; `causes` are sentences, each with its figures."""
 
     first: FirstCount | None  # None: no servo count differs
     causes: tuple[str, ...]
 
 
 def comparable(a: FlownRun, b: FlownRun) -> bool:
-    """Return whether two runs differ in their boards, and in nothing else that was asked for."""
+    """Return whether two runs differ only in their boards, by their requests."""
     asked = [{**one.result.request.parts(), "board": "", "duration": ""} for one in (a, b)]
     boards = {one.result.request.bench.board for one in (a, b)}
     return asked[0] == asked[1] and not a.result.request.is_real and len(boards) == 2
 
 
 def two_boards(a: FlownRun, b: FlownRun) -> TwoBoards:
-    """Compare two runs that are `comparable`; of the longer one the rows that both have."""
+    """Compare two runs that are `comparable`, over the rows that both have."""
     rows = min(a.log.num_rows, b.log.num_rows)
     logs = a.log.slice(0, rows), b.log.slice(0, rows)
     differing = np.array([column(logs[0], name) != column(logs[1], name) for name in COUNTS])
@@ -85,7 +85,7 @@ def two_boards(a: FlownRun, b: FlownRun) -> TwoBoards:
     causes = tuple(f"{name}: {text}" for name, text in found if text)
     counts = tuple(int(column(log, servo)[row]) for log in logs)
     flying = [column(log, "supervisor.state")[row] == State.FLYING for log in logs]
-    # A servo moves with its loop; while both loops are closed, every cause acts that there is, the earliest first.
+    # A servo moves with its loop; while both loops are closed, every cause applies, the earliest first.
     later = [name for name, text in found[1:] if text]
     why = "boot time" if flying[0] != flying[1] else (later or ["none of the known causes"])[0]
     first = FirstCount(row, float(since_release(logs[0])[row]), servo, (counts[0], counts[1]), why)
@@ -93,7 +93,7 @@ def two_boards(a: FlownRun, b: FlownRun) -> TwoBoards:
 
 
 def _boot(logs: Sequence[pa.Table]) -> str:
-    """Tell when each board had been powered, and when it closed its loop."""
+    """Describe when each board was powered, and when it closed its loop."""
     ran_s = [
         1e-6 * sum(column(log, name)[0] for name in log.column_names if name.startswith("cpu."))
         for log in logs
@@ -112,7 +112,7 @@ def _boot(logs: Sequence[pa.Table]) -> str:
 
 
 def _gyro_zero(logs: Sequence[pa.Table]) -> str:
-    """Tell how far the gyros' zeros are apart: by the rates that are estimated of equal samples, both loops closed."""
+    """Describe the difference of the gyros' zeros, by the estimated rates of equal samples, with both loops closed."""
     same = np.logical_and.reduce([column(logs[0], name) == column(logs[1], name) for name in GYRO])
     flying = np.logical_and.reduce([column(log, "supervisor.state") == State.FLYING for log in logs])
     until = len(same) if same.all() else int(np.argmax(~same))
@@ -127,7 +127,7 @@ def _gyro_zero(logs: Sequence[pa.Table]) -> str:
 
 
 def _phases(a: FlownRun, b: FlownRun) -> str:
-    """Tell when in its ten milliseconds each estimator begins, and how old the poses are that it takes."""
+    """Describe each estimator's phase in its ten milliseconds, and the age of its poses."""
     begins = [_phase_us(run.result.folder) for run in (a, b)]
     ages = [_pose_age_us(run.log) for run in (a, b)]
     if begins == [None, None] or begins[0] == begins[1] or None in begins or not all(map(np.isfinite, ages)):
@@ -153,7 +153,7 @@ def _pose_age_us(log: pa.Table) -> float:
 
 
 def _radio(logs: Sequence[pa.Table]) -> str:
-    """Tell how long packets take up, which hangs on what comes down beside them."""
+    """Describe the uplink latency of packets, which depends on the downlink."""
     if any("link.up_latency_sum" not in log.column_names for log in logs):
         return ""
     up, sums, down = (
@@ -167,7 +167,7 @@ def _radio(logs: Sequence[pa.Table]) -> str:
 
 
 def _clocks(logs: Sequence[pa.Table]) -> str:
-    """Tell how long the boards' microseconds are; that of a board without a clock of its own is the laboratory's."""
+    """Describe the length of the boards' microseconds; a board without a clock uses the laboratory's."""
     lengths = [_microsecond(log) for log in logs]
     if lengths[0] == lengths[1]:
         return ""
@@ -189,12 +189,12 @@ class Seed:
     seed: int
     first: FirstCount | None
     rms_m: tuple[NDArray[np.float64], NDArray[np.float64]]  # (3,) each, of the position errors
-    apart_m: float  # of the bodies at most
+    apart_m: float  # largest distance of the bodies
     fused: tuple[int, int]  # poses
 
 
 def seeds_of(first: Path, second: Path) -> list[Seed]:
-    """Return the seeds that stand in two folders of runs, flown by another board in each. Raises `LabError` for none."""
+    """Return the seeds in two folders of runs, flown by another board in each. Raises `LabError` for none."""
     seeds = []
     for folder in first.iterdir():
         other = second / folder.name
