@@ -1,4 +1,4 @@
-"""The experiments: one small file per subject, with trajectory, faults and limits; `EXPERIMENTS` lists them by name."""
+"""The experiments: one small file per subject, with trajectory, faults and limits; `EXPERIMENTS` has them by name."""
 
 from hil.errors import LabError, hint
 from hil.experiments.airspeed import AIRSPEEDS
@@ -40,7 +40,7 @@ __all__ = ["EXPERIMENTS", "Experiment", "find_again", "find_experiment"]
 
 
 def find_experiment(name: str) -> Experiment:
-    """Return an experiment: by its name, if it ships or an installed package has it, or as FILE.py:NAME.
+    """Return an experiment: by name, if it ships or is in an installed package, or as FILE.py:NAME.
 
     Raises `LabError` for an unknown one, with the nearest name.
     """
@@ -56,7 +56,7 @@ def find_experiment(name: str) -> Experiment:
 
 
 def find_again(name: str, source: Source | None) -> Experiment | None:
-    """Return the experiment that a run has flown; None when it is unknown here or has changed."""
+    """Return the experiment of a run; None when it is unknown here or has changed."""
     if source is None:
         return EXPERIMENTS.get(name)
     try:

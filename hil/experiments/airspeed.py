@@ -1,7 +1,7 @@
-"""Airspeeds: the paper's 8 to 11 m/s, the hover angle adapted to each, and what this plant's lift allows.
+"""Airspeeds: the paper's 8 to 11 m/s, with the hover angle adapted to each, within this plant's lift.
 
 By the Table the lift at speed V and opening theta is m g (V/10)^2 (1 + (2.3/g) (25 deg - theta)): closing a flap further
-gives little more, opening it costs little. Attitude control takes up to 8 degrees of the opening (95 % of the hover's
+adds little lift, opening it costs little. Attitude control needs up to 8 degrees of the opening (95 % of the hover's
 time), so that the flaps can carry the robot between -3 and 44 degrees: 9.5 to 10.4 m/s. Outside it sinks or rises; 8 m/s
 would need 56 % more lift than at 10 m/s, and a flat plate of Floaty's size has 18 % more. Every speed is flown with the
 flaps opened through zero.
@@ -24,12 +24,12 @@ FOR_ATTITUDE = radians(8.0)  # [rad] of the opening
 
 
 def hover_angle(speed: float) -> float:
-    """Return the opening [rad] at which the lift is the weight at `speed` [m/s], even outside the flaps' range."""
+    """Return the opening [rad] at which the lift equals the weight at `speed` [m/s], even outside the flaps' range."""
     return DESIGN_ANGLE - ((DESIGN_SPEED / speed) ** 2 - 1.0) / LIFT_PER_RAD
 
 
 def attainable() -> tuple[float, float]:
-    """Return the least and the greatest speed [m/s] at which the flaps carry the robot and control its attitude."""
+    """Return the smallest and the largest speed [m/s] at which the flaps carry the robot and control its attitude."""
     low, high = (
         DESIGN_SPEED / sqrt(1.0 + LIFT_PER_RAD * (DESIGN_ANGLE - opening))
         for opening in (OPENING_MIN + FOR_ATTITUDE, OPENING_MAX - FOR_ATTITUDE)
@@ -38,7 +38,7 @@ def attainable() -> tuple[float, float]:
 
 
 def holding(speed: float, flight: pa.Table) -> Mapping[str, float]:
-    """Return the mean error in height over the second half, and whether that agrees with the lift model."""
+    """Return the mean error in height over the second half, and whether it agrees with the lift model."""
     low, high = attainable()
     times, height = column(flight, "t"), position_error(flight)[:, 2]
     error = float(abs(height[times >= times.mean()].mean()))

@@ -1,9 +1,9 @@
-"""Identification: flights from whose logs `floaty identify` estimates constants.
+"""Identification: flights whose logs `floaty identify` uses to estimate constants.
 
-The excitation is a parameter of the board, which the operator switches on over the link once the robot hovers. How strong
-it is and which band it has are settings, like `--set excitation.u1=0.08 --set excitation.high=6`. The amplitudes here keep
-the default robot inside its 20 cm box. The paper's method needs two flights with different gains and no excitation at all;
-its gains on roll are those of its Methods, -0.2 and -0.15.
+The excitation is a parameter of the board; the operator switches it on over the link once the robot hovers. Settings
+select its strength and band, like `--set excitation.u1=0.08 --set excitation.high=6`. The amplitudes here keep the
+default robot inside its 20 cm box. The paper's method needs two flights with different gains and without excitation; the
+gains on roll are those of its Methods, -0.2 and -0.15.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from hil.laboratory.experiment import Experiment
 if TYPE_CHECKING:
     from hil.laboratory.flight import Flight
 
-BEGIN_US = 2_000_000  # the robot has come to rest after its release
-REALISATIONS = 6  # of 22 s: 2 s in which the response settles, and a period
+BEGIN_US = 2_000_000  # the robot is at rest after its release
+REALISATIONS = 6  # of 22 s: 2 s to settle, and a period
 DURATION_S = 2.0 + 22.0 * REALISATIONS + 1.0
 LIMITS = {"lost": 0.0}
-ALONE = {"u1": 0.05, "u2": 0.08, "u3": 0.06, "u4": 0.10}  # [rad] rms; larger ones are no longer linear
+ALONE = {"u1": 0.05, "u2": 0.08, "u3": 0.06, "u4": 0.10}  # [rad] rms; larger ones are not linear
 TOGETHER = {"u1": 0.04, "u2": 0.06, "u3": 0.05, "u4": 0.08}
 
 

@@ -1,7 +1,7 @@
-"""What the experiments measure besides the errors of every flight: steps, sines, recoveries; truth against goal.
+"""The experiments' measures besides the errors of every flight: steps, sines, recoveries; truth against goal.
 
-Every function takes the rows after the release, of a flight that may have ended early; what cannot be determined is NaN,
-which no limit accepts. The names of the results are those of `hil.laboratory.metrics.METRICS`.
+Every function takes the rows after the release of a flight that may have ended early; undetermined values are NaN, which
+no limit accepts. The results have the names of `hil.laboratory.metrics.METRICS`.
 """
 
 from collections.abc import Mapping
@@ -17,10 +17,10 @@ from hil.laboratory.metrics import BOX, body, column, position_error
 
 BAND = 0.05  # of a step: settled; a choice, the paper names no band
 RISEN = 0.90  # of a step
-JUDGED_S = 0.5  # after a step: over a real link the goal's clock runs ahead, so that one more may begin before the end
+JUDGED_S = 0.5  # after a step: over a real link the goal's clock runs ahead, so another step may begin before the end
 HOLD_S = 3.0  # before the next step: the robot is at rest by then
 CALM_S = 0.5  # before the next disturbance: the robot has recovered by then
-BLOWN_S = 5.0  # before the wind ends: the robot leans into it by then
+BLOWN_S = 5.0  # before the wind ends: the robot leans steadily by then
 ROW_S = 0.01
 Signal = NDArray[np.float64]  # (N,), one value per row
 
@@ -33,7 +33,7 @@ def seconds(flight: pa.Table) -> Signal:
 
 
 def yaw_and_goal(flight: pa.Table) -> tuple[Signal, Signal]:
-    """Return the true yaw without jumps at half turns, counted like the wanted one, and the wanted one [rad]."""
+    """Return the true yaw without jumps at half turns, counted like the goal, and the goal [rad]."""
     yaw, goal = (
         np.unwrap(euler_zyx_of(body(flight, "qw", "qx", "qy", "qz"))[:, 2]),
         column(flight, "goal.yaw"),
@@ -42,7 +42,7 @@ def yaw_and_goal(flight: pa.Table) -> tuple[Signal, Signal]:
 
 
 def axis_and_goal(axis: str, flight: pa.Table) -> tuple[Signal, Signal]:
-    """Return the true coordinate x, y or z and the wanted one, W [m]."""
+    """Return the true coordinate x, y or z and the goal, W [m]."""
     return body(flight, axis), column(flight, f"goal.{axis}")
 
 
@@ -109,7 +109,7 @@ def response(times: Signal, value: Signal, goal: Signal, frequency_hz: float) ->
 
 
 def yaw_sine(frequency_hz: float, flight: pa.Table) -> Mapping[str, float]:
-    """Return how yaw follows a sine."""
+    """Return gain and lag of yaw in a sine."""
     yaw, goal = yaw_and_goal(flight)
     gain, lag = response(seconds(flight), yaw, goal, frequency_hz)
     rms = float(np.sqrt(((yaw - goal) ** 2).mean()))
@@ -117,13 +117,13 @@ def yaw_sine(frequency_hz: float, flight: pa.Table) -> Mapping[str, float]:
 
 
 def height_sine(frequency_hz: float, flight: pa.Table) -> Mapping[str, float]:
-    """Return how the height follows a sine."""
+    """Return gain and lag of the height in a sine."""
     gain, lag = response(seconds(flight), *axis_and_goal("z", flight), frequency_hz)
     return {"gain": gain, "lag": lag}
 
 
 def recoveries(faults: tuple[Fault, ...], duration_s: float, flight: pa.Table) -> Mapping[str, float]:
-    """Return how the robot recovered after each disturbance, until the next one or the end of the flight."""
+    """Return the recovery after each disturbance, until the next one or the end of the flight."""
     times, error = seconds(flight), np.abs(position_error(flight)).max(axis=1)
     starts = [fault.start_s for fault in faults]
     recovered, slowest = 0, 0.0

@@ -1,9 +1,9 @@
-"""Overload: a task above all others takes more and more of the processor while the robot hovers.
+"""Overload: a task of the highest priority takes more and more processor time while the robot hovers.
 
 The thief's share of every tick rises from 0 to 100 % in steps of 5 % and 1.5 s. Its load makes the estimator, and
 then the controller, miss their deadlines (the end of the tick in which they became ready); the effect on the hover is
-in the position error. Losing the robot at full load is no failure of the experiment: the limits say up to which load
-the flight has to hold.
+in the position error. Losing the robot at full load does not fail the experiment: the limits state the load that the
+flight must withstand.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def thief_load(flight: pa.Table) -> NDArray[np.float64]:
 
 
 def loads_that_hurt(flight: pa.Table) -> Mapping[str, float]:
-    """Return the loads at which tasks are first late, infinity when they never are, and the last step inside the box."""
+    """Return the loads at which tasks are first late, infinity if never, and the last step inside the box."""
     load, error = thief_load(flight), np.abs(position_error(flight))
 
     def first(wrong: Any) -> float:

@@ -1,6 +1,6 @@
-"""The user's own experiments: in a Python file, as FILE.py:NAME, or in an installed package, as an entry point.
+"""A user's experiments: in a Python file, as FILE.py:NAME, or in an installed package, as an entry point.
 
-Every error in a file is one line that names file and line.
+Every error in a file gives one line with file and line number.
 """
 
 import hashlib
@@ -17,7 +17,7 @@ GROUP = "floaty.experiments"
 
 
 def in_file(reference: str) -> Experiment:
-    """Return the experiment of FILE.py:NAME, or the only one of FILE.py. Raises `LabError` when there is none."""
+    """Return the experiment FILE.py:NAME, or the only one of FILE.py. Raises `LabError` without one."""
     text, _, name = reference.rpartition(":") if ".py:" in reference else (reference, "", "")
     found = in_whole_file(Path(text))
     if not name and len(found) == 1:
@@ -31,7 +31,7 @@ def in_file(reference: str) -> Experiment:
 
 
 def in_whole_file(path: Path) -> dict[str, Experiment]:
-    """Return the experiments of a file by the names of their variables. Raises `LabError` when it cannot be executed."""
+    """Return the experiments of a file by variable name. Raises `LabError` when it cannot be executed."""
     module, digest = load_file("experiment", path)
     place = path.resolve()
     return {

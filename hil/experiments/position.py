@@ -1,7 +1,7 @@
 """Position: the paper's sine in height, 20 cm at 0.05 Hz, and square in y, 10 cm to either side; a figure of eight.
 
-The square's period is that of the author's ground station, 10 s; the amplitude is the flow's: beyond 20 cm from its axis
-hovering is not stable (paper, Horizontal tracking performance). The eight is larger: for robots that need no flow.
+The square's period is that of the author's ground station, 10 s; the flow limits the amplitude: beyond 20 cm from its
+axis hovering is not stable (paper, Horizontal tracking performance). The eight is larger, for robots without flow.
 """
 
 from functools import partial

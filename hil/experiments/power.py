@@ -1,7 +1,7 @@
 """Power: the power drawn in hover, the battery life, and a comparison (paper, figure robustness a, b).
 
-`endurance` hovers until the battery is empty: the supervisor's failsafe for a low battery is its stated end. `power` hovers
-for a minute and computes the rest from the mean power and the same model of the battery.
+`endurance` hovers until the battery is empty: the supervisor's failsafe for a low battery ends it. `power` hovers for a
+minute and computes the battery life from the mean power and the same battery model.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def power(flight: pa.Table) -> dict[str, float]:
 
 
 def estimate(flight: pa.Table) -> Mapping[str, float]:
-    """Return power, and the minutes for which the battery model can supply it."""
+    """Return power, and the minutes that the battery model can supply it."""
     values, config = power(flight), _configuration(flight)
     empty_V = 1e-3 * config["supervisor"]["low_battery_mv"]
     battery = BatteryConfig.model_validate(config["battery"])
@@ -57,7 +57,7 @@ def estimate(flight: pa.Table) -> Mapping[str, float]:
 
 
 def until_empty(flight: pa.Table) -> Mapping[str, float]:
-    """Return power, and the minutes until the failsafe; NaN when the flight ended before it."""
+    """Return power, and the minutes until the failsafe; NaN if the flight ended earlier."""
     times = column(flight, "t")
     stopped = column(flight, "supervisor.state")[-1] == State.FAILSAFE
     return power(flight) | {
@@ -84,7 +84,7 @@ ENDURANCE = Experiment(
     name="endurance",
     summary="hover until the supervisor reports the battery empty (paper: 33 min)",
     duration_s=LONGEST_S,
-    limits=LIMITS,  # the failsafe at its end lasts less than `uncontrolled` allows
+    limits=LIMITS,  # the final failsafe is shorter than the limit `uncontrolled`
     script=end_with_the_battery,
     measure=until_empty,
     pictures=("specific-power", "discharge"),

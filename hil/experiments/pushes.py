@@ -1,8 +1,7 @@
 """Pushes: forces and torques of a tenth of a second from every side, one after the other (paper, figure robustness c).
 
-Their sizes are those that the default profile withstands (x withstands 1 N; at 1 N the robot may
-need more than the 4 s to climb back, because attitude takes precedence over height). The last ones are the hardest for the
-author's gains.
+The default profile withstands their sizes (x withstands 1 N, but then the robot may need more than the 4 s to climb back,
+because attitude takes precedence over height). The last ones are the hardest for the author's gains.
 """
 
 from functools import partial

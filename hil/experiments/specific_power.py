@@ -1,8 +1,8 @@
 """Specific power of hovering vehicles by the paper's method (Supplement, "Estimation and calculation of specific power").
 
-Drones: energy of the battery over the longest flight that the maker states. Helicopters: the share of their rated power
-that the paper assumes for a hover, 75-90 % with pistons and 60-75 % with turbines; the middle of the range is the value.
-The two quadcopters that the authors flew: their measurements. Floaty is not included: its power comes from a flight's log.
+Drones: energy of the battery over the maker's longest flight time. Helicopters: the paper's assumed share of rated power
+in a hover, 75-90 % with pistons and 60-75 % with turbines; the value is the middle of the range. The two quadcopters that
+the authors flew: their measurements. Floaty is not included: its power comes from a flight's log.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ CONVENTIONAL_W_PER_KG = (100.0, 250.0)  # paper: "typically in the range of", sh
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """A vehicle in hover; `power_range` [W] are the bounds of the method, equal where there is one value only."""
+    """A vehicle in hover; `power_range` [W] are the bounds of the method, equal for a single value."""
 
     name: str
     kind: Literal["quadcopter", "drone", "helicopter"]

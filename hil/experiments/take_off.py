@@ -4,9 +4,9 @@ The robot stands on the net in still air, its flaps at the hover angle. The fans
 is switched on (a request to arm, over the radio), the robot lifts off; flight speed, then landing speed: it sinks onto
 the net; controller and fans off. The goal is the hover point all the time.
 
-Order and times are the menu's, the speeds are not: it has 75 to 80 % of the flight speed for take-off and landing, where
-this plant has 0.6 to 0.7 times its weight of lift. Here the flow gains 5 % per metre towards the net; with flat flaps the
-robot lifts off from 90 % on and stays at the hover point from 95 % on.
+Order and times are the menu's, but not the speeds: it uses 75 to 80 % of the flight speed for take-off and landing, where
+this plant's lift is 0.6 to 0.7 times its weight. Here the flow gains 5 % per metre towards the net; with flat flaps the
+robot lifts off at 90 % and stays at the hover point at 95 %.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from hil.laboratory.flight import Flight
 
 TAKE_OFF, FLIGHT, LANDING = 0.93, 1.0, 0.88  # of the flight speed
-STANDING_Z = 0.049  # [m] of the centre of mass: the feet's height less how far they sink in
+STANDING_Z = 0.049  # [m] of the centre of mass: the feet's height minus their depth in the net
 CLEAR = 0.02  # [m] above the net
 
 # After the release [s]; waits and stages as in the menu
@@ -65,7 +65,7 @@ def _us(seconds: float) -> int:
 
 
 def _switch(flight: Flight, on: bool, now_us: int) -> None:
-    """Ask the board to close or open the loop, as a Crazyflie client arms and disarms."""
+    """Request the board to close or open the loop, as a Crazyflie client arms and disarms."""
     flight.line.command(now_us, encode(Packet(PORT_PLATFORM, 0, bytes((1, on)))))
     flight.note("lab", f"controller {'on' if on else 'off'}")
 
@@ -86,7 +86,7 @@ def _setter(flight: Flight, factor: float) -> Callable[[int], None]:
 
 
 def measure(flight: pa.Table) -> Mapping[str, float]:
-    """Return when it lifted off and was in the box, and how it touched down; NaN for events that did not occur."""
+    """Return the times of lift-off and in the box, and the touch-down; NaN for events that did not occur."""
     times = column(flight, "t") * 1e-6
     times = times - times[0]
     x, y, z, climb = body(flight, "x", "y", "z", "vz").T

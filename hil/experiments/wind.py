@@ -1,10 +1,10 @@
-"""Disturbed flow: a fan beside the tunnel (paper, figure robustness d and e) and a flow that is blocked for a moment.
+"""Disturbed flow: a fan beside the tunnel (paper, figure robustness d and e) and a briefly blocked flow.
 
-The fan spins up by 1 m/s every half second and blows for 10 s in total. At 4 m/s, the paper's most, the flaps that lean the
-robot into the wind are missing for lift between 0 and 52 degrees, and about every third flight is lost: there the limit is
-only that the robot withstands everything before. `side-wind-4-open` opens the flaps through zero, to -17 degrees, and hovers
-at 10 instead of 25 degrees: both give lift, and 1 of 80 flights is lost (at -11 degrees, 1 of 20). In x the robot has 1.1
-m/s2 to set against 1 m/s2 per m/s of wind: it withstands a quarter of a metre per second safely.
+The fan spins up by 1 m/s every half second and blows for 10 s in total. At 4 m/s, the paper's maximum, flaps between 0
+and 52 degrees that lean the robot into the wind give too little lift, and about every third flight is lost: there the
+limit only requires that the robot withstands everything before. `side-wind-4-open` opens the flaps through zero, to -17
+degrees, and hovers at 10 instead of 25 degrees: both give lift, and 1 of 80 flights is lost (at -11 degrees, 1 of 20). In
+x the robot has 1.1 m/s2 against 1 m/s2 per m/s of wind: it safely withstands 0.25 m/s.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ DURATION_S = END_S + 2.0
 
 
 def fan(kind: str, speed: float, steps: int) -> tuple[Fault, ...]:
-    """Return the wind of a fan that comes up to `speed` [m/s] in equal steps."""
+    """Return the wind of a fan that spins up to `speed` [m/s] in equal steps."""
     starts = [BEGIN_S + index * SPIN_UP_S for index in range(steps)]
     return tuple(Fault(kind, start, END_S - start, speed / steps) for start in starts)
 

@@ -1,11 +1,11 @@
 """Yaw: the paper's steps up to 110 degrees, settled in less than 0.5 s, and sines of 90 degrees up to 0.15 Hz.
 
-The step asks for more than the flaps give between 0 and 52 degrees: the time-optimal bound there is 0.47 s. Opened through
-zero, to -11 degrees, they give more torque, and the step settles in time; its gains are a little lower, so that yaw
-neither creeps up the last five per cent nor swings back out of them. `yaw-step-0` is the same step with the values of the
+The step needs more torque than the flaps give between 0 and 52 degrees: the time-optimal bound there is 0.47 s. Opened
+through zero, to -11 degrees, they give more, and the step settles in time; its gains are slightly lower, so that yaw
+neither creeps through the last five per cent nor overshoots them. `yaw-step-0` is the same step with the values of the
 profile.
 
-A step above the estimator's gate (28 degrees) counts from its second pose on, 20 ms later: settling includes that.
+The estimator accepts a step above its gate (28 degrees) with the second pose, 20 ms later: settling includes that.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from ground_station.trajectory import Goal, Offsets, Sine, Step, Trajectory
 from hil.experiments.measures import yaw_sine, yaw_step
 from hil.laboratory.experiment import Experiment
 
-BEGIN_S = 1.0  # the robot has come to rest after its release
+BEGIN_S = 1.0  # the robot is at rest after its release
 STEP = radians(110.0)  # paper, Yaw tracking performance
 SWING = radians(90.0)  # paper, likewise
 LATE_S = 0.22  # measured 0.17 s: 40 ms of pose latency, 50 ms of flaps, the gains
@@ -56,7 +56,7 @@ YAW_STEP_0 = Experiment(
 
 
 def follow_sine(frequency_hz: float, periods: int, more: Mapping[str, float]) -> Experiment:
-    """Return the sine of one frequency; yaw follows it, late by no more than `LATE_S`."""
+    """Return the sine of one frequency; yaw lags it by at most `LATE_S`."""
     lag = tau * frequency_hz * LATE_S
     limits = {"lost": 0.0, "gain": 0.97, "lag": lag, "rms_yaw": SWING / sqrt(2.0) * lag + ROUGH}
     return Experiment(

@@ -1,9 +1,8 @@
 """Many robots in compiled code, one control step of 10 ms at a time: the fast fidelity.
 
-Plant, servo lag, tunnel and gusts are the laboratory's (`hil.world`), in one midpoint step per 10 ms instead of ten. What
-the board does is reduced to its observation, allocation and servo mapping, which are the core's own functions. Estimator,
-predictor, cameras and radio are reduced to a delay of the pose and to errors of the estimate: their sizes are those of the
-laboratory's hover.
+Plant, servo lag, tunnel and gusts are the laboratory's (`hil.world`), in one midpoint step per 10 ms instead of ten. The
+board is reduced to its observation, allocation and servo mapping, the core's own functions. Estimator, predictor, cameras
+and radio are reduced to a delay of the pose and errors of the estimate, as large as in the laboratory's hover.
 """
 
 from __future__ import annotations
@@ -33,8 +32,8 @@ from hil.world.servos import MIDDLE_COUNTS, PERIOD_COUNTS, RAD_PER_COUNT, TIMER_
 
 CONTROL_US = 10_000
 DELAY_MAX = 12  # control steps
-SEEN = 9  # position, velocity in W, and Euler angles, which come from the cameras
-ERRORS = SEEN + 3  # and the rates, from the gyro
+SEEN = 9  # position, velocity in W, and Euler angles, from the cameras
+ERRORS = SEEN + 3  # plus the rates, from the gyro
 GUSTS = 14
 Array = NDArray[np.float64]
 compiled = compiler(Path(__file__).parent, *SOURCES)
@@ -43,7 +42,7 @@ Actions = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class EstimateErrors:
-    """Errors of the estimate, rms. Those of the pose and velocity last `tau_s`; those of the rates are new in every step."""
+    """Errors of the estimate, rms. Errors of pose and velocity last `tau_s`; those of the rates change in every step."""
 
     position: float = 0.0015  # [m]
     velocity: float = 0.025  # [m/s]
@@ -72,7 +71,7 @@ def wrapped(angle: float) -> float:
 
 @compiled
 def command(s: Array, counts: Array, zero_offset: Array) -> None:
-    """Latch the timer counts at the next PWM period, 1 ms of the board's work from now at the earliest."""
+    """Latch the timer counts at the next PWM period, at least 1 ms from now for the board's computation."""
     ready_us = s[at.TIME_US] + at.STEP_US
     period = math.floor(ready_us * TIMER_MHZ / PERIOD_COUNTS) + 1.0
     s[at.NEXT_US] = math.ceil(period * PERIOD_COUNTS / TIMER_MHZ)
@@ -82,7 +81,7 @@ def command(s: Array, counts: Array, zero_offset: Array) -> None:
 
 @compiled
 def push(s: Array, t: float, pushes: Array) -> None:
-    """Apply the pushes of this step: rows are instants, kinds and sizes."""
+    """Apply the pushes of this step: rows are times, kinds and sizes."""
     for i in range(6):
         s[at.PUSH + i] = 0.0
     for i in range(PUSHES):
@@ -92,7 +91,7 @@ def push(s: Array, t: float, pushes: Array) -> None:
 
 @compiled
 def look(s: Array, row: Array) -> None:
-    """Write what the cameras see: position, velocity in W, and roll, pitch, yaw."""
+    """Write the cameras' measurement: position, velocity in W, and roll, pitch, yaw."""
     for i in range(6):
         row[i] = s[at.P + i]
     row[6] = atan2(s[at.R + 7], s[at.R + 8])
@@ -104,7 +103,7 @@ def look(s: Array, row: Array) -> None:
 def estimate(
     s: Array, seen: Array, rates: Array, errors: Array, goal: Array, now: NDArray[np.float32]
 ) -> None:
-    """Write the estimated state as the board has it: in the goal frame, with errors."""
+    """Write the board's estimated state: in the goal frame, with errors."""
     c, z = sine_ahead(goal[3], 1), sine_ahead(goal[3], 0)
     for part in (0, 3):
         x, y = seen[part] + errors[part], seen[part + 1] + errors[part + 1]
@@ -123,7 +122,7 @@ def estimate(
 
 @compiled
 def find_goal(s: Array, home: Array, path: Array, goal: Array) -> None:
-    """Write the present goal: position in W, yaw."""
+    """Write the current goal: position in W, yaw."""
     t = s[at.TIME_US] * 1e-6
     for axis in range(4):
         goal[axis] = home[axis] + path[0, axis] * sine_ahead(2.0 * math.pi * path[1, axis] * t, 0)
@@ -131,7 +130,7 @@ def find_goal(s: Array, home: Array, path: Array, goal: Array) -> None:
 
 @compiled
 def tilt_of(x: float, y: float, z: float) -> float:
-    """Return the angle between the body's z axis and the vertical [rad], for the vertical (x, y, z) as seen in B."""
+    """Return the angle between the body's z axis and the vertical [rad], for the vertical (x, y, z) in B."""
     return float(atan2(math.sqrt(x * x + y * y), z))
 
 
@@ -209,15 +208,15 @@ def observe_start(
 
 @compiled
 def observe_board(parameters: Any, estimator: Any, previous: Actions, out: Actions) -> None:
-    """Write the observation of a board's core, of its memory."""
+    """Write the observation from the memory of a board's core."""
     observe(parameters[0], estimator[0], previous, out)
 
 
 class Fleet:
     """Robots that fly at the same time, each its own episode, in the arrays of `advance_all`.
 
-    `config` is that of the boards; `worlds` are the robots that an episode may draw, free and at home.
-    `delay_us` is the age of the pose that the estimate does not compensate for. `plants`, (count, layout.SIZE), may be read.
+    `config` is the boards'; `worlds` are the robots that an episode may draw, free and at home. `delay_us` is the pose's
+    age that the estimate does not compensate. `plants`, (count, layout.SIZE), may be read.
     """
 
     def __init__(
@@ -239,7 +238,7 @@ class Fleet:
         self._control = Control.allocate().arg
 
     def begin(self, n: int, episode: Episode, rng: np.random.Generator, out: Actions) -> None:
-        """Put robot `n` at the start of an episode, at rest in air that moves already; write its observation (20,)."""
+        """Put robot `n` at the start of an episode, at rest in moving air; write its observation (20,)."""
         robot, s = int(episode.robot * len(self._templates)), self.plants[n]
         s[:] = self._templates[robot]
         s[at.P : at.P + 3] += episode.start

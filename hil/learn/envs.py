@@ -49,8 +49,8 @@ from hil.learn.batch import (
 from hil.learn.tasks import AXES, PUSH_KINDS, PUSH_S, Episode, EpisodeTask, draw_episode, find_task
 
 Fidelity = Literal["fast", "firmware"]
-JUST_BEFORE_US = 1  # a step ends so long before the controller acts, after the estimator
-# Position error and velocity [m, m/s], angles [rad], rates [rad/s], flaps [rad], actions: what a board's estimate reaches.
+JUST_BEFORE_US = 1  # a step ends this long before the controller runs, after the estimator
+# Position error and velocity [m, m/s], angles [rad], rates [rad/s], flaps [rad], actions: bounds of a board's estimate.
 REACH = np.repeat(np.array([10.0, 20.0, np.pi, 40.0, np.pi, 1.0], np.float32), (3, 3, 3, 3, 4, 4))
 OBSERVATION_SPACE = Box(-REACH, REACH, dtype=np.float32)
 ACTION_SPACE = Box(-1.0, 1.0, (ACTIONS,), np.float32)
@@ -59,15 +59,15 @@ Info = dict[str, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class Setup:
-    """What an environment is made with. Raises `LabError` for values that no flight can have."""
+    """The settings of an environment. Raises `LabError` for impossible values."""
 
-    profile: str = DEFAULT_PROFILE  # of the board, and of the robot where no `robots` are drawn
+    profile: str = DEFAULT_PROFILE  # of the board, and of the robot without `robots`
     overrides: Overrides = ()  # "section.key=value"
     robots: str = ""  # a campaign, by name or path: its parameters are drawn for each episode
-    robot_count: int = 100  # that are drawn in all
+    robot_count: int = 100  # total number drawn
     duration_s: float = 10.0
     faults: Sequence[Fault | str] = ()  # of every episode; fidelity firmware only
-    pose_delay_us: int = 0  # that the board does not compensate for; fidelity fast only
+    pose_delay_us: int = 0  # not compensated by the board; fidelity fast only
     errors: EstimateErrors = field(default_factory=EstimateErrors)  # of the estimate; fidelity fast only
 
     def __post_init__(self) -> None:
@@ -123,7 +123,7 @@ def _setup(values: dict[str, Any]) -> Setup:
 
 
 class FastVectorEnv(VectorEnv[Actions, Actions, NDArray[Any]]):
-    """Many robots at once; an episode that ends is replaced in the same step (`info["final_obs"]` has its last one)."""
+    """Many robots at once; an ended episode is replaced in the same step (`info["final_obs"]` has its last observation)."""
 
     def __init__(self, task: EpisodeTask, num_envs: int, setup: Setup) -> None:
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
@@ -144,7 +144,7 @@ class FastVectorEnv(VectorEnv[Actions, Actions, NDArray[Any]]):
         seeds = [seed + n for n in range(self.num_envs)] if isinstance(seed, int) else seed
         if seeds is not None or not self._streams:
             self._streams = [seeding.np_random(one)[0] for one in seeds or [None] * self.num_envs]
-            self.np_random = self._streams[0].spawn(1)[0]  # for what all share
+            self.np_random = self._streams[0].spawn(1)[0]  # for common draws
         for n in range(self.num_envs):
             self._begin(n)
         return self._observations.copy(), {}
@@ -213,9 +213,9 @@ class FastEnv(gymnasium.Env[Actions, Actions]):
 
 
 class FirmwareEnv(gymnasium.Env[Actions, Actions]):
-    """One robot in the laboratory: emulated board, estimator, radio, cameras, faults. Flies its action as own logic.
+    """One robot in the laboratory: emulated board, estimator, radio, cameras, faults. Flies its action as user logic.
 
-    `flight` is that of the present episode.
+    `flight` is the current episode's.
     """
 
     def __init__(self, task: EpisodeTask, setup: Setup) -> None:
@@ -310,7 +310,7 @@ def pushes_of(episode: Episode) -> tuple[Fault, ...]:
 
 
 def fleet_of(setup: Setup, count: int) -> Fleet:
-    """Return the fast robots of a setup. Raises `LabError` for what only the whole laboratory has."""
+    """Return the fast robots of a setup. Raises `LabError` for features of the whole laboratory only."""
     if setup.faults:
         raise LabError(f'faults = {setup.faults!r}: need fidelity="firmware"')
     board = load_config(setup.profile, settings_of(setup.overrides))

@@ -1,6 +1,6 @@
 """The control law of an environment: flies the action that the environment has set, a number -1..1 per input.
 
-It is logic as a user writes it: the estimate, the guard, the allocation and the servo mapping around it are the board's.
+It is written like user logic: the estimate, the guard, the allocation and the servo mapping around it are the board's.
 """
 
 from typing import Annotated
@@ -21,7 +21,7 @@ class Action(Struct):
 
 
 class Memory(Struct):
-    """The previous action, and what the law has observed before this one."""
+    """The previous action, and the law's observation before it."""
 
     action: Annotated[F32s, 4]
     previous: Annotated[F32s, 4]

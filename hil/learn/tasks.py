@@ -1,4 +1,4 @@
-"""The tasks of the environments, and what is drawn for an episode: start, path of the goal, pushes, robot.
+"""The tasks of the environments, and the draws for an episode: start, path of the goal, pushes, robot.
 
 A seed draws the same episodes in both fidelities. Lengths in m, angles in rad, times in s from the release.
 """
@@ -29,13 +29,13 @@ PUSH_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class EpisodeTask:
-    """What an episode draws, each uniformly within ± these bounds."""
+    """The bounds of an episode's draws, each uniform within ± its bound."""
 
     name: str
     summary: str
     start: tuple[float, float, float]  # [m] from home, W
     path: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # amplitudes of `AXES`
-    frequency_hz: tuple[float, float] = (0.05, 0.2)  # lowest and highest, of each axis by itself
+    frequency_hz: tuple[float, float] = (0.05, 0.2)  # lowest and highest, drawn for each axis
     pushes: tuple[float, ...] = (0.0,) * 6  # largest size of each of `PUSH_KINDS`; all 0: none
 
 
@@ -54,7 +54,7 @@ TASKS: Mapping[str, EpisodeTask] = {
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """What was drawn for one episode."""
+    """The draws of one episode."""
 
     start: NDArray[np.float64]  # (3,) [m] from home, W
     amplitude: NDArray[np.float64]  # (4,) of `AXES`
@@ -66,14 +66,14 @@ class Episode:
 
 
 def find_task(name: str) -> EpisodeTask:
-    """Return the task of a name. Raises `LabError` for an unknown one."""
+    """Return a task by name. Raises `LabError` for an unknown one."""
     if name not in TASKS:
         raise LabError(f"task {name!r}: unknown; {hint(name, list(TASKS))}")
     return TASKS[name]
 
 
 def draw_episode(task: EpisodeTask, rng: np.random.Generator, duration_s: float) -> Episode:
-    """Draw an episode; every task takes as many numbers of the generator."""
+    """Draw an episode; every task draws the same number of random numbers."""
     share = rng.random(3 + 8 + 3 * PUSHES + 1)
     low, high = task.frequency_hz
     at = share[11 : 11 + PUSHES]

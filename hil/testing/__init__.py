@@ -1,8 +1,7 @@
-"""Tests of the user's own logic with pytest: the fixture `floaty`, a board without a world, and faults and paths for
-Hypothesis.
+"""Tests of user logic with pytest: the fixture `floaty`, a board without a world, and faults and paths for Hypothesis.
 
-`docs/howto/tests.md` shows all of it. pytest finds the plugin by itself; `faults` and `trajectories` need Hypothesis and are
-loaded when they are first used.
+`docs/howto/tests.md` has examples. pytest finds the plugin by itself; `faults` and `trajectories` need Hypothesis and are
+loaded at first use.
 """
 
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""A board without a world: the firmware alone, in simulated time, which passes only in `run` and `expect`."""
+"""A board without a world: the firmware alone, in simulated time, which advances only in `run` and `expect`."""
 
 from collections.abc import Mapping, Sequence
 
@@ -47,8 +47,8 @@ class SerialPins:
 class BareBoard:
     """A booted board. It is at rest and level until `feed_imu` is called.
 
-    `sent` holds what it sent, each with its instant [us]; `console` its lines; `counts` the servo timers' compare
-    counts. With `serial` it speaks MAVLink over its UART: `receive` and `sent` are the bytes there.
+    `sent` has its sent packets, each with its time [us]; `console` its lines; `counts` the servo timers' compare counts.
+    With `serial` it speaks MAVLink over its UART: `receive` and `sent` are the bytes there.
     """
 
     def __init__(self, config: LabConfig, runner: RunnerFactory = PythonRunner, serial: bool = False) -> None:
@@ -58,8 +58,8 @@ class BareBoard:
         self.now_us = 0
         self._noise = 1
         self.imu_running = True  # False: no more interrupts of the IMU
-        self._heard = 0  # lines of the console that an `expect` has matched or passed
-        self._repeats = 0  # the present generation of repeated packets
+        self._heard = 0  # console lines that an `expect` has matched or passed
+        self._repeats = 0  # the current generation of repeated packets
         self._events = EventQueue()
         self._serial = SerialPins(self.sent) if serial else None
         self._board = VirtualBoard(self._set_counts, self._send, self._say, self._serial)
@@ -75,7 +75,7 @@ class BareBoard:
         f_B: Vector = (0.0, 0.0, GRAVITY),
         counts: ImuCounts | None = None,
     ) -> None:
-        """Set what the IMU measures from now on: rates [rad/s] and specific force [m/s2], both in B, or counts."""
+        """Set the IMU's measurement from now on: rates [rad/s] and specific force [m/s2], both in B, or counts."""
         (p, q, r), (fx, fy, fz) = omega_B, f_B
         rates = (COS * p + SIN * q, COS * q - SIN * p, r)
         forces = (COS * fx + SIN * fy, COS * fy - SIN * fx, fz)
@@ -129,7 +129,7 @@ class BareBoard:
             self._run_until(min(self.now_us + IMU_PERIOD_US, end_us))
 
     def read(self, name: str) -> float:
-        """Return a log variable, like `stateEstimate.z`. Raises `LabError` for one that is not there."""
+        """Return a log variable, like `stateEstimate.z`. Raises `LabError` for a missing one."""
         for variable in self.firmware.variables:
             if variable.name == name:
                 return variable.read()
@@ -150,7 +150,7 @@ class BareBoard:
         self._board.supply(value)
 
     def _run_until(self, end_us: int) -> None:
-        """Go from one instant at which anything happens to the next: hardware first, then the firmware."""
+        """Execute events in order of time: hardware first, then the firmware."""
         events, firmware = self._events, self.firmware
         while self.now_us < end_us:
             wakes = (end_us, events.next_us, firmware.next_wake_us)
@@ -163,7 +163,7 @@ class BareBoard:
 
     def _sample(self, now_us: int) -> None:
         if self.imu_running:
-            self._noise = -self._noise  # of one count: a real gyro never repeats itself for long
+            self._noise = -self._noise  # of one count: a real gyro does not repeat samples for long
             *before, r, x, y, z = self._fed
             self._board.measure((*before, r + self._noise, x, y, z))
             self.firmware.imu_ready()

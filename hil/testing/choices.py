@@ -1,4 +1,4 @@
-"""Seeds, boards and profiles of a test, from its mark or the command line; and whether they are available."""
+"""Seeds, boards and profiles of a test, from its mark or the command line, and their availability."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Marked:
 
     @classmethod
     def of(cls, words: Mapping[str, Any]) -> Marked:
-        """Check the mark's words: `seeds` is a number, which counts from 1 on, or the seeds themselves."""
+        """Check the mark's arguments: `seeds` is a number of seeds from 1 on, or the seeds themselves."""
         for word in words:
             if word not in WORDS:
                 raise LabError(f"{word}: {hint(word, WORDS)}")
@@ -65,9 +65,9 @@ class Marked:
 
 
 def choices_of(marked: Marked, wanted: Wanted) -> list[Options]:
-    """Return the seeds, boards, profiles and link of a test as the options that its flights start from.
+    """Return the seeds, boards, profiles and link of a test as the default options of its flights.
 
-    The command line overrides the mark, and a board that the test needs is its board.
+    The command line overrides the mark; without either, a board that the test needs is used.
     """
     needed = tuple(board for board in marked.needs if board in BOARDS)
     seeds = tuple(range(1, wanted.seeds + 1)) or marked.seeds or (1,)
@@ -90,7 +90,7 @@ def name_of(choice: Options, choices: Sequence[Options]) -> str:
 
 
 def why_not(choice: Options, needs: Iterable[str]) -> str:
-    """Return why a test cannot fly on its choice here, empty when it can."""
+    """Return why a test cannot fly its choice here, empty when it can."""
     board, link = choice["board"], choice["link"]
     in_lockstep = link in LOCKSTEP
     if not in_lockstep and board != PYTHON:

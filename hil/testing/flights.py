@@ -1,4 +1,4 @@
-"""The fixture `floaty`: flights into folders of the test's own, and boards without a world."""
+"""The fixture `floaty`: flights into the test's own folders, and boards without a world."""
 
 import hashlib
 import math
@@ -21,7 +21,7 @@ from hil.laboratory.request import MAVLINK, RADIO, Options, Request
 from hil.testing.board import BareBoard
 from hil.testing.choices import why_no_board
 
-SHOWN = 3  # flights of a test; of more, the last
+SHOWN = 3  # flights of a test; of more, only the last
 PICTURE = "flight.png"
 NAME_MAX = 80
 
@@ -41,13 +41,13 @@ class Item:
 
     name: str  # pytest's
     folder: Path
-    choice: Options  # that its flights start from
+    choice: Options  # default options of its flights
     flown: list[Flown] = field(default_factory=list)
     failed: bool = False
 
 
 class Flights:
-    """The fixture `floaty`. `seed`, `profile` and `target`, the board, are those of the test."""
+    """The fixture `floaty`. `seed`, `profile` and `target`, the board, are the test's."""
 
     def __init__(self, home: Path, folder: Path) -> None:
         self.home = home  # pytest's root folder: paths of profiles and experiments are relative to it
@@ -55,20 +55,20 @@ class Flights:
         self._item: Item | None = None
 
     def begin(self, name: str, choice: Options) -> Item:
-        """Fly for a test from now on."""
+        """Start flying for a test."""
         self._item = Item(name, self._folder / folder_of(name), choice)
         shutil.rmtree(self._item.folder, ignore_errors=True)
         return self._item
 
     @property
     def choice(self) -> Options:
-        """The choice of the present test."""
+        """The choice of the current test."""
         assert self._item is not None
         return self._item.choice
 
     @property
     def seed(self) -> int:
-        """Of everything random."""
+        """The seed of all random numbers."""
         return self.choice["seed"]
 
     @property
@@ -78,15 +78,15 @@ class Flights:
 
     @property
     def target(self) -> str:
-        """What executes the flight core: python, c or cortex-m4."""
+        """The runner of the flight core: python, c or cortex-m4."""
         return self.choice["board"]
 
     @checked
     def fly(self, experiment: Experiment | str = "hover", **options: Unpack[Options]) -> Run:
-        """Fly once; defaults of options come from the test's mark and the command line.
+        """Fly once; the test's mark and the command line give the default options.
 
-        Options are those of `hil.fly`. A failed limit is no error: the test reads `passed`, `metrics`, `verdicts`. Skips the
-        test when a board is not available here. Raises `LabError` for bad input.
+        Options are those of `hil.fly`. A failed limit is not an error: the test reads `passed`, `metrics`, `verdicts`.
+        Skips the test when a board is not available here. Raises `LabError` for bad input.
         """
         item = self._item
         assert item is not None
@@ -126,7 +126,7 @@ class Flights:
 
 
 def folder_of(name: str) -> str:
-    """Return a folder name for a test, which no other test has."""
+    """Return a unique folder name for a test."""
     plain = re.sub(r"[^\w.-]+", "-", name).strip("-")
     if len(plain) <= NAME_MAX and plain == name:
         return plain
@@ -134,12 +134,12 @@ def folder_of(name: str) -> str:
 
 
 def shown_of(item: Item) -> list[Flown]:
-    """Return the flights that a failure shows: all of a few, of many the last, the smallest that Hypothesis found."""
+    """Return the flights shown on a failure: all if few, else the last, the smallest that Hypothesis found."""
     return item.flown if len(item.flown) <= SHOWN else item.flown[-1:]
 
 
 def text_of(item: Item, kept: bool, options: str) -> str:
-    """Return the text that a failure shows about a test's flights; `options` are those of pytest that chose the flights."""
+    """Return the text on a failed test's flights; `options` are the pytest options that chose the flights."""
     texts = []
     for one in shown_of(item):
         request, result = one.request, one.run.result
@@ -161,7 +161,7 @@ def text_of(item: Item, kept: bool, options: str) -> str:
 
 
 def properties_of(item: Item) -> list[tuple[str, str]]:
-    """Return a test's properties for a JUnit file: hash, command, and every metric that has a value, in its unit."""
+    """Return a test's properties for a JUnit file: hash, command, and every metric with a value, in its unit."""
     found = []
     shown = shown_of(item)
     for one in shown:
@@ -178,7 +178,7 @@ def properties_of(item: Item) -> list[tuple[str, str]]:
 
 
 def draw(item: Item) -> None:
-    """Draw one picture into the folder of every flight that a failure shows."""
+    """Draw one picture into the folder of every flight shown on a failure."""
     from hil.pictures.drawing import png
     from hil.pictures.figures import errors
 

@@ -1,7 +1,7 @@
 """The pytest plugin: options, the mark `floaty`, the fixture `floaty`, and the report of a failed flight.
 
-The fixture lives as long as the session, because Hypothesis calls a test many times with one fixture; before each test it is
-switched to it. Nothing of the laboratory is loaded before a test requests it.
+The fixture lives as long as the session, because Hypothesis calls a test many times with one fixture; before each test it
+is switched to that test. Nothing of the laboratory is loaded before a test requests it.
 """
 
 from __future__ import annotations
@@ -26,9 +26,7 @@ KEEP = ("failed", "all", "none")
 FOLDER = "runs/pytest"  # in pytest's root folder
 FLIGHTS = pytest.StashKey["Flights"]()
 ITEM = pytest.StashKey["Item"]()
-FIRST = pytest.StashKey[
-    dict[str, str]
-]()  # the test that an error of the user's failed first, by the error's text
+FIRST = pytest.StashKey[dict[str, str]]()  # the first test failed by a user's error, by the error's text
 ALL = pytest.StashKey[list["Item"]]()  # of this process
 MARK = (
     "floaty(seeds=20, boards=[...], profiles=[...], needs=...): choices of the fixture `floaty`. seeds: how many, or "
@@ -111,7 +109,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Show a failed test's flights, and record those of every test; a request that cannot be flown is one line."""
+    """Show a failed test's flights, and record those of every test; show an impossible request in one line."""
     flown = item.stash.get(ITEM, None)
     if flown is None:
         return (yield)
@@ -134,20 +132,20 @@ def pytest_runtest_makereport(
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Remove the run folders that are not kept; until now a longer-lived fixture may have read them."""
-    # its summary would load all of Hypothesis, also where no test has used it
+    """Remove unkept run folders; until now a longer-lived fixture may have read them."""
+    # its summary would load all of Hypothesis, even if no test used it
     if "hypothesis" not in sys.modules and session.config.pluginmanager.has_plugin(HYPOTHESIS):
         session.config.pluginmanager.unregister(name=HYPOTHESIS)
     keep = session.config.getoption("floaty_keep")
     for flown in session.config.stash[ALL]:
         if not (keep == "all" or (keep == "failed" and flown.failed)):
             shutil.rmtree(flown.folder, ignore_errors=True)
-    with suppress(OSError):  # a folder that is not empty stays
+    with suppress(OSError):  # a non-empty folder is kept
         (session.config.rootpath / FOLDER).rmdir()
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """Report what was not flown, also without -rs."""
+    """Report skipped flights, also without -rs."""
     reasons: dict[str, int] = {}
     for report in terminalreporter.stats.get("skipped", []):
         text = str(report.longrepr[2]) if isinstance(report.longrepr, tuple) else str(report.longrepr)
@@ -167,7 +165,7 @@ def _flights(config: pytest.Config) -> Flights:
 def _in_one_line(
     item: pytest.Item, call: pytest.CallInfo[None], report: pytest.TestReport
 ) -> pytest.TestReport:
-    """Show what the user has done wrong without a traceback, and once when it fails many tests."""
+    """Show a user's error without a traceback, and only once when it fails many tests."""
     from hil.errors import LabError
 
     if call.excinfo is None or not isinstance(error := call.excinfo.value, LabError):

@@ -1,7 +1,7 @@
-"""Faults and trajectories for Hypothesis, on grids on which "smaller" means simpler for an engineer.
+"""Faults and trajectories for Hypothesis, on grids where "smaller" means simpler for an engineer.
 
-A failing flight shrinks to the first kind of fault that fails, to the size nearest to no fault at all, and to the earliest
-begin; a trajectory to the fewest goals nearest to home.
+A failing flight shrinks to the first failing kind of fault, the size nearest to no fault, and the earliest begin; a
+trajectory to the fewest goals nearest to home.
 """
 
 import math
@@ -30,9 +30,9 @@ def faults(
 ) -> SearchStrategy[Fault]:
     """Return faults of some kinds, by default all that act on every flight.
 
-    They begin `start_s` after the release, from..to, and last `duration_s`, from..to, or as long as the kind's do. Sizes are
-    those of the kind, or the part of them inside `size`, in steps of about a three-hundredth of the kind's range. Raises
-    `LabError` for an unknown kind.
+    They begin `start_s` after the release, from..to, and last `duration_s`, from..to, by default the kind's duration.
+    Sizes are the kind's, or those inside `size`, in steps of about 1/300 of the kind's range. Raises `LabError` for an
+    unknown kind.
     """
     names = kinds or tuple(name for name, kind in KINDS.items() if not kind.needs)
     return st.one_of([_of_kind(name, start_s, duration_s, size) for name in names])
@@ -58,7 +58,7 @@ class Waypoints:
     goals: tuple[tuple[float, float, float, float], ...]  # x, y, z [m], yaw [rad]
 
     def __call__(self, t_s: float) -> tuple[float, float, float, float]:
-        index = int(t_s / self.every_s) - 1  # home comes first
+        index = int(t_s / self.every_s) - 1  # home is first
         return (
             self.goals[min(index, len(self.goals) - 1)] if index >= 0 and self.goals else (0.0, 0.0, 0.0, 0.0)
         )
