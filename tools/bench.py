@@ -1,13 +1,13 @@
-"""Where the time goes: real-time factor of whole flights and the cost of their parts, side by side in one run.
+"""Measures the real-time factor of whole flights and the cost of their parts, side by side in one run.
 
     python tools/bench.py             everything but the first compilation
     python tools/bench.py --compile   also a first compilation in an empty cache (about half a minute)
     python tools/bench.py --campaign  also flights of a campaign on Dask's workers (about two minutes)
-    python tools/bench.py --json FILE also writes the figures there
+    python tools/bench.py --json FILE also write the figures there
 
-Figures are processor time, but for start and campaign, of this machine at this moment: compare rows of one run, not of two.
-Peers in the same run: simpy on the scheduler's scenario, a flight of RotorPy (extra `bench`), and as the floor a loop of as
-many events in which nothing happens.
+Figures are processor time, except for start and campaign, of this machine at this moment: compare rows of one run, not of
+two. Peers in the same run: simpy on the scheduler's scenario, a flight of RotorPy (extra `bench`), and as the floor a
+loop of as many empty events.
 """
 
 import argparse
@@ -47,14 +47,14 @@ ROOT = Path(__file__).parent.parent
 FLIGHT_S = 30.0
 REPEATS = 3
 IMAGE_S = 5.0  # of flight
-# Of the events of a hover: IMU, exposures, their frames, rows of the log, and what the radio does.
+# Of the events of a hover: IMU, exposures, their frames, rows of the log, and radio events.
 EVENT_PERIODS_US = (1000, 5000, 5000, 10_000, 4000, 4000, 4000)
 ROTORPY_S = 5.0
 HOVER = "fly hover --duration 6"
 
 
 def best(measure: Callable[[], float]) -> float:
-    """Return the smallest of a few measurements: the one that was disturbed least."""
+    """Return the smallest of a few measurements, the least disturbed one."""
     return min(measure() for _ in range(REPEATS))
 
 
@@ -155,14 +155,14 @@ def command_s(*words: str) -> float:
 
 
 def image_factor(elf: str) -> float:
-    """Real-time factor of the binary that FLOATY_CF2_ELF names, without its start."""
+    """Real-time factor of the binary FLOATY_CF2_ELF, without its start."""
     request = Request.of(EXPERIMENTS["hover"], duration_s=IMAGE_S, board=elf)
     with tempfile.TemporaryDirectory() as folder:
         return fly(request, Path(folder)).real_time_factor
 
 
 def empty_loop_us() -> float:
-    """Microseconds of one millisecond of a loop with as many events as a hover has, in which nothing happens."""
+    """Microseconds of one millisecond of a loop with as many events as a hover, all empty."""
     heap = [(period_us, period_us) for period_us in sorted(EVENT_PERIODS_US)]
 
     def nothing(now_us: int) -> None:
@@ -196,7 +196,7 @@ def rotorpy_s() -> float:
 
 
 class Figures:
-    """What was measured: a table to look at, and the same to be read by programs."""
+    """The measurements: a table for people, and the same for programs."""
 
     def __init__(self) -> None:
         self.table = Table(title=f"floaty bench: {STATE}")
@@ -211,7 +211,7 @@ class Figures:
 
 
 def add_commands(figures: Figures) -> None:
-    """Add what the command line costs: the slowest `--help`, and a short flight from Enter to the prompt."""
+    """Add the command line's cost: the slowest `--help`, and a short flight from Enter to the prompt."""
     empty = best(lambda: command_s("-c", ""))
 
     def add(name: str, seconds: float) -> None:
@@ -223,7 +223,7 @@ def add_commands(figures: Figures) -> None:
 
 
 def add_campaign(figures: Figures) -> None:
-    """Add a campaign's throughput on one worker and on one per core, and what Dask costs."""
+    """Add a campaign's throughput on one worker and on one per core, and Dask's cost."""
     from bench_campaign import flights_per_s, growth_kb, overhead_s  # the extra `campaign`
 
     factors = {

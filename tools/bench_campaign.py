@@ -1,6 +1,6 @@
-"""What the workers make of a campaign: `python tools/bench.py --campaign` calls this.
+"""Measures the workers of a campaign: `python tools/bench.py --campaign` calls this.
 
-The flights are those of `floaty campaign table`, of the length that the bench says.
+The flights are those of `floaty campaign table`, with a length given by the bench.
 """
 
 import time
@@ -18,12 +18,12 @@ SHORT_S, SETTLED, SHORT_FLIGHTS = 0.1, 200, 1200  # flights until memory is meas
 
 
 def nothing(job: Job) -> Row:
-    """Return a row without flying: what is left is drawing the flight and sending job and row."""
+    """Return a row without flying: this leaves drawing the flight and sending job and row."""
     return failed(job, "not flown")
 
 
 def flights_per_s(flight_s: float, count: int) -> float:
-    """Flights per second of wall time on `count` workers, after one flight of each that loads everything."""
+    """Flights per second of wall time on `count` workers, after one warm-up flight of each."""
     workers = Workers(count)
     _timed(workers, flight_s, range(count), fly_job)
     wall_s = _timed(workers, flight_s, range(count, count + FLIGHTS), fly_job)

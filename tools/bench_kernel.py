@@ -1,4 +1,4 @@
-"""Microseconds per task activation of our kernel and of simpy, on the flight's own pattern of waking.
+"""Microseconds per task activation of our kernel and of simpy, in the flight's pattern of waking.
 
 Every millisecond an interrupt gives a semaphore to a task of priority 4, which sends a sample to a queue and gives a
 semaphore to a task of priority 5, which waits for the next tick and gives a semaphore to a task of priority 2, which

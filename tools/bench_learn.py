@@ -1,4 +1,4 @@
-"""Control steps per second of the environments, beside RotorPy's batched quadrotors: `python tools/bench_learn.py`.
+"""Control steps per second of the environments and of RotorPy's batched quadrotors: `python tools/bench_learn.py`.
 
 Processor time of one core and actions of 0. RotorPy's environment needs the extra `bench`, torch, torchdiffeq, roma and
 stable-baselines3.

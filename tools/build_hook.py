@@ -1,5 +1,5 @@
-"""Put the commit into every wheel and sdist, and into a wheel that is built with FLOATY_COMPILED set (`make wheel`) also
-the compiled modules."""
+"""Put the commit into every wheel and sdist, and the compiled modules into a wheel built with FLOATY_COMPILED set (`make
+wheel`)."""
 
 import os
 import sys
@@ -11,18 +11,18 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 
 class ReleaseHook(BuildHookInterface[Any]):
-    """What hatchling calls; compiling needs the packages of the extra `fast`."""
+    """Called by hatchling; compiling needs the packages of the extra `fast`."""
 
     PLUGIN_NAME = "custom"
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """State the commit, and compile, before a wheel or sdist is packed. An editable installation asks git."""
+        """Write the commit, and compile, before a wheel or sdist is packed. An editable installation asks git."""
         if version != "standard":
             return
         sys.path.insert(0, self.root)
         from hil.installation import COMMIT, commit
 
-        # An sdist has the file already, and packs it as one of the package's.
+        # An sdist has the file already, and packs it with the package.
         if not COMMIT.is_file() and (text := commit()):
             self._folder = tempfile.TemporaryDirectory()
             stated = Path(self._folder.name) / COMMIT.name

@@ -2,10 +2,10 @@
 
     python tools/fast.py    (`make fast`; needs a C compiler and Python's headers, takes a minute or two)
 
-`firmware_py/fast.py` uses them until one of their sources changes. Modules that define pydantic models, functions for numba
-or protocols that are checked at run time cannot be compiled, nor may what others inherit from or copy, or what pydantic
-reads; and what runs once per flight need not be. Compiled code makes a float of an int where `float` stands: what may be
-whole says so.
+`firmware_py/fast.py` uses them until one of their sources changes. Modules with pydantic models, functions for numba or
+protocols checked at run time cannot be compiled, nor classes that others inherit or copy, or that pydantic reads; code
+that runs once per flight need not be. Compiled code converts an int to a float where the type is `float`: values that may
+be ints have another type.
 """
 
 import ast
@@ -17,14 +17,14 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-import setuptools  # mypyc looks whether it is there
+import setuptools  # mypyc checks that it is installed
 from mypyc.build import mypycify
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
-os.environ["FLOATY_PURE"] = "1"  # what may lie there already is none of this program's business
+os.environ["FLOATY_PURE"] = "1"  # ignore older compiled modules
 
-from firmware_py.fast import FOLDER, RECORD, digest  # noqa: E402 - from here, and pure
+from firmware_py.fast import FOLDER, RECORD, digest  # noqa: E402 - from this tree, and pure
 
 PACKAGES = ("firmware_py", "ground_station", "hil")
 MODULES = {
@@ -43,7 +43,7 @@ FILES = [f"{folder}/{name}.py" for folder, names in MODULES.items() for name in 
 
 
 def sources_of(modules: Iterable[str], root: Path = ROOT) -> list[Path]:
-    """Return the files of ours on which modules depend, themselves included: mypyc takes types and constants from them."""
+    """Return our files on which modules depend, including themselves: mypyc takes types and constants from them."""
     found: set[Path] = set()
     waiting = [root / module for module in modules]
     while waiting:
@@ -72,7 +72,7 @@ def _imported(path: Path, root: Path) -> Iterator[Path]:
 
 
 def build(modules: Iterable[str] = FILES) -> None:
-    """Compile the modules of this tree; what was compiled before is gone from the first moment on."""
+    """Compile the modules of this tree; delete the older compiled ones first."""
     modules = list(modules)
     shutil.rmtree(FOLDER, ignore_errors=True)
     sources = {str(path.relative_to(ROOT)): digest(path) for path in sources_of(modules)}

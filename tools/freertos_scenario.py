@@ -1,6 +1,6 @@
 """Prints the trace of a FreeRTOS scenario on our kernel: `python tools/freertos_scenario.py FILE --mode coop|preempt`.
 
-The formats of scenario and trace stand in tests/vectors/README.md. Exit code 2 for a file or a mode that is no good.
+tests/vectors/README.md has the formats of scenario and trace. Exit code 2 for an invalid file or mode.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from firmware_py.rtos import TICK_US, Kernel, KernelError, Mutex, Queue, Semapho
 NOT_HELD = -2  # result of giving a mutex that the task does not hold
 
 Operation = tuple[str, list[Any]]
-Interrupt = tuple[int, Operation]  # instant [us] and what is called then
+Interrupt = tuple[int, Operation]  # time [us] and the operation called then
 Record = Callable[[int, str, str, int, int], None]
 Call = tuple[str, Callable[..., Any]]
 
@@ -33,8 +33,8 @@ def _give(kernel: Kernel, given: Semaphore | Mutex) -> Generator[int, None, int]
     return (yield from given.give())
 
 
-# The operands of each operation and what it calls: n number, p positive number, q id of a queue, l of a semaphore or mutex,
-# t name of a task, T index of a timer, w the task's latest planned wake-up, which the scenario does not state.
+# The operands of each operation and its call: n number, p positive number, q id of a queue, l of a semaphore or mutex, t
+# name of a task, T index of a timer, w the task's latest planned wake-up, which is not in the scenario.
 OPERATIONS: dict[str, Call] = {
     "work": ("n", lambda kernel, us: kernel.work(us)),
     "delay": ("n", lambda kernel, ticks: kernel.delay(ticks)),
@@ -65,12 +65,12 @@ INTERRUPTS: dict[str, Call] = {
 
 @dataclass(slots=True)
 class PlannedWake:
-    """The tick until which a task last wanted to wait."""
+    """The tick of a task's last planned wake-up."""
 
     tick: int = 0
 
     def delay(self, kernel: Kernel, ticks: int) -> Generator[int, None, bool]:
-        """Wait until so many ticks after the last planned wake-up; return whether there was something to wait for."""
+        """Wait until `ticks` after the last planned wake-up; return whether it had to wait."""
         early = kernel.tick_count < self.tick  # FreeRTOS takes this for an overflow and does not wait
         self.tick += ticks
         waits = not early and self.tick > kernel.tick_count
@@ -79,12 +79,12 @@ class PlannedWake:
 
 
 class ScenarioError(Exception):
-    """A scenario that cannot be run; says the line and the reason."""
+    """A scenario that cannot be run; the text has line and reason."""
 
 
 @dataclass(slots=True)
 class Scenario:
-    """A parsed file. Operations hold words, which are looked up when everything is known."""
+    """A parsed file. Operations hold words, which are resolved at the end."""
 
     ticks: int = 0
     queues: dict[int, int] = field(default_factory=dict)  # id to length
@@ -96,7 +96,7 @@ class Scenario:
     tasks: list[tuple[str, int, bool, list[Operation]]] = field(default_factory=list)
 
     def kinds(self) -> dict[str, Any]:
-        """Return what each operand may name."""
+        """Return the allowed names of each operand."""
         semaphores = set(self.semaphores)
         return {
             "q": set(self.queues),
@@ -130,7 +130,7 @@ def parse(text: str) -> Scenario:
 
 
 def _parse_line(scenario: Scenario, words: list[str]) -> list[tuple[Operation, dict[str, Call]]]:
-    """Enters one line into the scenario; returns the operations that it holds, with the names allowed there."""
+    """Add one line to the scenario; return its operations, with the names allowed there."""
     match words:
         case ["run", ticks]:
             scenario.ticks = int(ticks)
@@ -205,7 +205,7 @@ class ScenarioRun:
             self.tasks[name] = kernel.create_task(name, priority, self._scripted_task, name, operations, once)
 
     def run(self) -> None:
-        """Run to the end; the instant of the end itself is not run."""
+        """Run up to the end time, exclusive."""
         kernel = self.kernel
         end_us = self.scenario.ticks * TICK_US
         kernel.start()
@@ -227,7 +227,7 @@ class ScenarioRun:
         self.record(self.kernel.now_us, "ISR", name, int(result or 0), int(self.kernel.task_woken))
 
     def _meant(self, signature: str, operands: list[Any]) -> list[Any]:
-        """Return the objects that operands name."""
+        """Return the objects named by operands."""
         places: dict[str, Any] = {"q": self.objects, "l": self.objects, "t": self.tasks, "T": self.timers}
         return [
             places[kind][operand] if kind in places else operand

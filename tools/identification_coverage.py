@@ -1,11 +1,11 @@
-"""How good `floaty identify` is where the truth is known: python tools/identification_coverage.py [ROBOTS] [FOLDER] [SEED].
+"""Measures `floaty identify` against known truth: python tools/identification_coverage.py [ROBOTS] [FOLDER] [SEED].
 
 Flies identify-u1 to identify-u4 on ROBOTS (default 20) whose constants and servo lags are drawn within 20 % and masses
-within 3 %, in each of four conditions: as they are, with three dropouts of the cameras, with 40 ms more latency, in 1 m/s of
-side wind along y (along x the robot is lost). For each condition it prints how many of the joint fit's 95 % intervals
-contain the truth at the flown point, the mean error of each constant over its mean half interval, and how many constants are
-called identified although they are wrong by more than twice their interval. Flights that are already in FOLDER are not flown
-again. A robot takes one to two minutes of one core per condition.
+within 3 %, in each of four conditions: undisturbed, with three dropouts of the cameras, with 40 ms more latency, in 1 m/s
+of side wind along y (along x the robot is lost). For each condition it prints how many of the joint fit's 95 % intervals
+contain the truth at the flown point, the mean error of each constant over its mean half interval, and how many constants
+are called identified although their error exceeds twice their interval. Flights already in FOLDER are not repeated. A
+robot takes one to two minutes of one core per condition.
 """
 
 import sys
@@ -24,7 +24,7 @@ from hil.identify.record import load_record
 from hil.laboratory.request import Options
 from hil.studies.tuning import EXCITATIONS
 
-FIRST_SEED = 1001  # nothing was developed on these
+FIRST_SEED = 1001  # not used in development
 UNTOUCHED = ("z_vz",)  # follows from the plate's physics
 WRONG = 2.0  # times the half interval
 DROPOUTS = ("mocap.dropout@20:0.25", "mocap.dropout@60:0.25", "mocap.dropout@100:0.25")
@@ -49,7 +49,7 @@ def drawn(seed: int) -> tuple[str, ...]:
 
 
 def fly(condition: str, seeds: range, folder: Path) -> None:
-    """Fly what is missing."""
+    """Fly the missing flights."""
     faults, settings = CONDITIONS[condition]
     flights = {
         f"{seed}-{name}": (

@@ -1,7 +1,7 @@
 """Computes the gains of profiles/lqr.py from the model of a profile: python tools/lqr_gains.py [PROFILE].
 
-One regulator per axis on its states and on what the flaps have reached of its input. The axes are decoupled, so that the
-four are the optimum of all 16 states. The weights are Bryson's: what counts as one unit of error.
+One regulator per axis, on its states and on the input that its flaps have reached. The axes are decoupled, so the four
+are the optimum of all 16 states. The weights are Bryson's: one accepted error counts as one unit.
 """
 
 import sys
@@ -17,7 +17,7 @@ ACCEPTED_INPUT = 0.1  # [rad]
 
 
 def gains(config: LabConfig) -> dict[str, float]:
-    """Return the 16 numbers of which the matrix is made: on the states, and on what the flaps have reached of each input."""
+    """Return the 16 numbers of the matrix: on the states, and on each input that the flaps have reached."""
     found = {}
     for axis in AXES:
         Phi, Gamma = held(*dynamics(axis, robot_of(config)), STEP_S)

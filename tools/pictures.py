@@ -1,8 +1,8 @@
-"""Make the documentation's pictures anew: python tools/pictures.py [NAME ...]; all of them without a name.
+"""Remake the documentation's pictures: python tools/pictures.py [NAME ...]; all of them without a name.
 
-Each is made from a flight that is flown for it. Needs chromium for the report, rerun and Xvfb for the scenes, and a
-cfclient (FLOATY_CFCLIENT names the Python that has it) for its window; what is missing is said, and the picture stays as
-it is. Exit code 1: a picture could not be made.
+Each picture shows a new flight. Needs chromium for the report, rerun and Xvfb for the scenes, and a cfclient
+(FLOATY_CFCLIENT names its Python) for its window; missing programs are reported, and their pictures stay unchanged. Exit
+code 1: a picture could not be made.
 """
 
 import os
@@ -22,7 +22,7 @@ DOCS = ROOT / "docs"
 BIN = Path(sys.executable).parent
 SERVED = "udp://127.0.0.1:19850"
 CFCLIENT = os.environ.get("FLOATY_CFCLIENT", "")
-# Opens cfclient's window off screen, connects it, and keeps what it shows.
+# Opens cfclient's window off screen, connects it, and stores its picture.
 WINDOW = """
 import os, sys
 sys.argv = ["cfclient"]
@@ -42,18 +42,18 @@ gui.main()
 
 
 class MissingError(Exception):
-    """A program that makes a picture is not there."""
+    """A program needed for a picture is missing."""
 
 
 def floaty(command: str) -> None:
-    """Run a command of floaty; a limit that fails is no error here."""
+    """Run a command of floaty; a failed limit is not an error here."""
     ran = subprocess.run([BIN / "floaty", *command.split()], stdout=subprocess.DEVNULL)
     if ran.returncode > 1:
         raise RuntimeError(f"floaty {command}: exit code {ran.returncode}")
 
 
 def program(*names: str) -> str:
-    """Return the first of these programs that is installed."""
+    """Return the first installed one of these programs."""
     for name in names:
         if found := shutil.which(name):
             return found
@@ -61,11 +61,11 @@ def program(*names: str) -> str:
 
 
 def scene(run: Path, at_s: float, out: Path) -> None:
-    """Write what rerun's viewer shows of a run at an instant."""
+    """Write the picture of rerun's viewer of a run at a time."""
     from hil.pictures.viewer.recording import ServedRecording
 
     recording = ServedRecording(run)
-    # The mouse pointer stands in the middle of the screen: below the window, where it lights nothing up.
+    # The mouse pointer is in the middle of the screen: below the window, where it highlights nothing.
     screen = [program("xvfb-run"), "-a", "-s", "-screen 0 3200x4400x24"]
     viewer = [str(BIN / "rerun"), recording.at(at_s), "--port", "0", "--screenshot-to", str(out)]
     command = [*screen, *viewer, "--window-size", "1600x1000"]
@@ -108,7 +108,7 @@ def latency(out: Path) -> None:
 
 
 def real_flight(out: Path) -> None:
-    """Fly a served robot with the ground station of real flights, and show what that has recorded."""
+    """Fly a served robot with the ground station of real flights, and show its recording."""
     with served():
         floaty(f"station --link {SERVED} --duration 10 --out run")
     scene(Path("run"), 4.0, out)

@@ -1,13 +1,12 @@
-"""Plant the mistakes of `planted_mistakes.toml` one at a time in a copy of the working tree; report which tests see them.
+"""Plant the mistakes of `planted_mistakes.toml` one at a time in a copy of the working tree; report which tests catch them.
 
     python tools/planted_mistakes.py [--only PATTERN] [--jobs N]
 
-The table lists by file, then by the tests that should fail, rows of a text that occurs once in the file and the text of a
-tired developer in its place; a row may name other tests. `hangs = true` says that the mistake makes a loop endless:
-only then does a run without an end count as caught. A mistake has to get past the compiler: a file in Python is compiled,
-a file in C is built in a folder by the function that `build` names for its own (`module:function`). A test that is named
-with `::` may be a long one. Exit code 0: at least 95 % are caught in every room, 1: fewer, 2: the table or the tests are not
-in order, and nothing was tested.
+The table lists, by file and by the tests that should fail, rows of a text that occurs once in the file and the wrong text
+that replaces it; a row may name other tests. `hangs = true` marks a mistake that makes a loop endless: only then does a
+hanging run count as caught. A mistake must compile: a file in Python is compiled, a file in C is built by the function
+that `build` names for its folder (`module:function`). A test named with `::` may be a long one. Exit code 0: at least 95
+% are caught in every room, 1: fewer, 2: the table or the tests are invalid, and nothing was tested.
 """
 
 import argparse
@@ -29,13 +28,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 SHARE_CAUGHT = 0.95
-LIMIT_S = 300  # generous: what is caught must not depend on what else the machine does
-PASSED, FAILED, NOT_COLLECTED = 0, 1, 2  # exit codes of pytest; an import that fails is seen, too
+LIMIT_S = 300  # generous: results must not depend on the machine's load
+PASSED, FAILED, NOT_COLLECTED = 0, 1, 2  # exit codes of pytest; a failed import counts as caught
 ENVIRONMENT = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}  # two mistakes within a second share a time stamp
 
 
 class TableError(Exception):
-    """A row that cannot be planted, or tests that fail without it."""
+    """A row that cannot be planted, or tests that fail without a mistake."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +46,11 @@ class Mistake:
     new: str
     tests: tuple[str, ...]
     hangs: bool = False
-    build: str = ""  # of a file in C
+    build: str = ""  # for a file in C
 
     @property
     def room(self) -> str:
-        """The folder of the file, not further down than a room."""
+        """The file's room: the first two levels of its folder."""
         return "/".join(Path(self.path).parts[:-1][:2]) or "."
 
     def __str__(self) -> str:
@@ -95,7 +94,7 @@ def planted(mistake: Mistake, root: Path) -> str:
 
 
 def copy_of(root: Path, folder: Path) -> Path:
-    """Copy what git knows or would add into a folder."""
+    """Copy the files that git tracks or would add into a folder."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(command, cwd=root, check=True, capture_output=True, text=True).stdout
     for name in listed.split("\0"):
@@ -116,7 +115,7 @@ def run_tests(copy: Path, tests: Sequence[str], limit_s: float | None = None) ->
 
 
 def check_clean(copy: Path, mistakes: Sequence[Mistake]) -> None:
-    """Raise `TableError` unless a copy imports its own files and passes all tests of the table; compiles what they need."""
+    """Raise `TableError` unless a copy imports its own files and passes the table's tests; compile what they need."""
     for package in sorted({Path(mistake.path).parts[0].removesuffix(".py") for mistake in mistakes}):
         code = f"import {package}; print({package}.__file__)"
         ran = subprocess.run(
@@ -136,7 +135,7 @@ def check_clean(copy: Path, mistakes: Sequence[Mistake]) -> None:
 
 @contextmanager
 def mistaken(mistake: Mistake, wrong: str, copy: Path) -> Iterator[None]:
-    """Plant a mistake in a copy, and take it out again."""
+    """Plant a mistake in a copy, and remove it again."""
     path = copy / mistake.path
     right = path.read_bytes()
     path.write_text(wrong, encoding="utf-8")
@@ -151,9 +150,7 @@ def check_build(mistake: Mistake, wrong: str, copy: Path) -> None:
     if not mistake.build:
         return
     module, _, function = mistake.build.partition(":")
-    folder = (
-        copy / "runs" / "build" / function
-    )  # it keeps what the compiler remembers from one mistake to the next
+    folder = copy / "runs" / "build" / function  # it keeps the compiler's cache between mistakes
     folder.mkdir(parents=True, exist_ok=True)
     code = f"from pathlib import Path; from {module} import {function}; {function}(Path({str(folder)!r}))"
     with mistaken(mistake, wrong, copy):
@@ -170,7 +167,7 @@ def check_build(mistake: Mistake, wrong: str, copy: Path) -> None:
 
 
 def fate(mistake: Mistake, wrong: str, copy: Path) -> tuple[bool, str]:
-    """Plant a mistake in a copy and run its tests; return whether it was caught, and a word on it."""
+    """Plant a mistake in a copy and run its tests; return whether it was caught, and a word on how."""
     with mistaken(mistake, wrong, copy):
         try:
             code = run_tests(copy, mistake.tests, LIMIT_S)
@@ -180,7 +177,7 @@ def fate(mistake: Mistake, wrong: str, copy: Path) -> tuple[bool, str]:
 
 
 def plant_all(mistakes: Sequence[Mistake], root: Path, jobs: int) -> list[Mistake]:
-    """Plant the mistakes and print what becomes of each; return the survivors. Raises `TableError` before the first."""
+    """Plant the mistakes and print each result; return the survivors. Raises `TableError` before the first."""
     wrong = [planted(mistake, root) for mistake in mistakes]
     with tempfile.TemporaryDirectory(prefix="planted-") as folder, ThreadPoolExecutor(jobs) as pool:
         clean = copy_of(root, Path(folder).resolve() / "0")
@@ -209,7 +206,7 @@ def plant_all(mistakes: Sequence[Mistake], root: Path, jobs: int) -> list[Mistak
                 return *fate(mistake, source, copy), time.monotonic() - start_s
 
         for _ in pool.map(build, mistakes, wrong):
-            pass  # raises what does not build
+            pass  # raises if it does not build
         runs = {pool.submit(plant, *both): both[0] for both in zip(mistakes, wrong, strict=True)}
         survivors = []
         for number, run in enumerate(as_completed(runs), 1):
@@ -221,13 +218,13 @@ def plant_all(mistakes: Sequence[Mistake], root: Path, jobs: int) -> list[Mistak
 
 
 def by_room(mistakes: Sequence[Mistake], survivors: Sequence[Mistake]) -> list[tuple[str, int, int]]:
-    """Return every room with how many of its mistakes were caught, and how many there are."""
+    """Return every room with its numbers of caught and of all mistakes."""
     planted_in, survived_in = (Counter(mistake.room for mistake in some) for some in (mistakes, survivors))
     return [(room, count - survived_in[room], count) for room, count in sorted(planted_in.items())]
 
 
 def main(arguments: Sequence[str], root: Path = ROOT, table: Path | None = None) -> int:
-    """Do what the command line asks and return the exit code."""
+    """Run the command line and return the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,6 +1,6 @@
-"""The pages of the reference that are tables of the code: the command line, profile keys, variables, log columns, faults.
+"""Generates the reference pages from the code: the command line, profile keys, variables, log columns, faults.
 
-mkdocs-gen-files runs this while `make docs` builds the site. `pages` returns their text, so that a test reads what is built.
+mkdocs-gen-files runs this while `make docs` builds the site. `pages` returns their text, so that a test can read it.
 """
 
 import math
@@ -24,7 +24,7 @@ from hil.config import LabConfig, load_config
 from hil.devices.board import VirtualBoard
 from hil.laboratory.fault_kinds import KINDS
 
-# What the groups of columns mean; a group without a sentence, or a sentence without a group, ends the build.
+# The meaning of the groups of columns; a group without a sentence, or the reverse, ends the build.
 GROUPS = {
     "t": "the simulated instant of the row",
     "truth": "what the plant does: the body's position and velocity, its attitude, its rates, the flaps' angles",
@@ -56,7 +56,7 @@ LEADS = {
     "around it. Override a key with `--set SECTION.KEY=VALUE`. The tables show the values of the default profile, `floaty`. "
     "More keys:",
 }
-# Pages of a long reference: title, and commands or sections. One that is on no page, or on two, ends the build.
+# Pages of a long reference: title, and commands or sections. One on no page, or on two, ends the build.
 COMMANDS = {
     "cli": ("Command line", "list fly new policy runs view report compare export"),
     "cli-studies": ("Command line: studies", "paper study drag-model campaign identify tune design"),
@@ -72,7 +72,7 @@ SECTIONS = {
 
 
 def pages() -> dict[str, str]:
-    """Return the text of each page by its place in the documentation."""
+    """Return the text of each page by its path in the documentation."""
     return {
         **split(COMMANDS, list(app.COMMANDS), command_line),
         **split(SECTIONS, list(LabConfig.model_fields), profile_keys),
@@ -85,7 +85,7 @@ def pages() -> dict[str, str]:
 def split(
     plan: Mapping[str, tuple[str, str]], names: list[str], part: Callable[[str], str]
 ) -> dict[str, str]:
-    """Return the pages of a reference by their places; the first one introduces it and lists the others."""
+    """Return the pages of a reference by path; the first one introduces it and lists the others."""
     if sorted(" ".join(shown for _, shown in plan.values()).split()) != sorted(names):
         raise ValueError(
             f"tools/reference_pages.py: {', '.join(plan)} do not show each of {', '.join(names)}"
@@ -247,7 +247,7 @@ def fault_kinds() -> str:
 
 
 def cell(text: str) -> str:
-    """One line, which may stand in a table."""
+    """Return a text as one line for a table cell."""
     return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")
 
 

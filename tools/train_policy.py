@@ -5,7 +5,7 @@
     floaty policy hover.onnx --out mylaw && floaty fly hover --profile mylaw/profile.toml
 
 PPO of stable-baselines3; a multilayer perceptron with two layers of 48 tanh units. Each episode draws a robot of the
-campaign `table`. The policy sees the observation of `firmware_py/core/observation.py`, scaled by `SCALE`; which becomes
+campaign `table`. The policy sees the observation of `firmware_py/core/observation.py`, scaled by `SCALE`, which becomes
 part of the network.
 """
 
@@ -29,7 +29,7 @@ ENVIRONMENTS, ROLLOUT = 128, 64
 
 
 class Adapter(VecEnv):
-    """A vector environment of gymnasium as stable-baselines3 wants it, with scaled observations."""
+    """A vector environment of gymnasium adapted to stable-baselines3, with scaled observations."""
 
     def __init__(self, env: Any) -> None:
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
@@ -83,7 +83,7 @@ class PrintedProgress(BaseCallback):
 
 
 class Network(torch.nn.Module):
-    """The deterministic policy from raw observations: what flies."""
+    """The deterministic policy from raw observations, as flown."""
 
     def __init__(self, policy: Any) -> None:
         super().__init__()
