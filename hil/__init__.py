@@ -1,7 +1,7 @@
-"""The world around the board and the bench that joins them: plant, tunnel, sensors, links, harness, experiments.
+"""The world around the board and the bench that connects them: plant, tunnel, sensors, links, harness, experiments.
 
-What a user's program needs is in `hil.api`, and can be imported from here: `from hil import fly`. It is loaded
-when it is first used.
+`hil.api` has the functions for users' programs, which can be imported from here: `from hil import fly`. It is loaded at
+first use.
 """
 
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""The laboratory for the user's own programs: fly, read the results, define experiments.
+"""The laboratory for users' programs: fly, read the results, define experiments.
 
 `docs/howto/python.md` has an example of each. Lengths are in m, angles in rad, forces in N, times in s, except a log's own
 clock, `t`, which counts microseconds; frames are W (world, z up) and B (body, x forward, y left, z up).
@@ -80,11 +80,11 @@ def fly(
 ) -> Run:
     """Fly once, into a run folder, by default `runs/EXPERIMENT-SEED`.
 
-    An earlier flight of the same request is replaced there. A flight of another request stays: by default the folder is then
-    `runs/EXPERIMENT-SEED-2` and so on; a `folder` that holds one is refused, unless it may be replaced.
+    An earlier flight of the same request is replaced there. A flight of another request is kept: by default the folder is
+    then `runs/EXPERIMENT-SEED-2` and so on; a `folder` with one is refused without `replace`.
 
     `flown` is an experiment, the name of one, FILE.py:NAME, or a `Request`, which takes no options. `progress` shows the
-    time in flight on standard error, or is called with the share of the flight that is over. `report` writes `report.html`.
+    time in flight on standard error, or is called with the completed share of the flight. `report` writes `report.html`.
 
     A crash or a failed limit is a result, not an error. Raises `LabError` for bad input.
     """
@@ -112,7 +112,7 @@ def fly(
 
 
 def maker_of(request: Request) -> MakeFlight:
-    """Return what assembles the flight of a request, by its link and board."""
+    """Return the function that assembles a request's flight, by its link and board."""
     if request.bench.in_loop:
         from hil.servers.in_the_loop import in_the_loop
 
@@ -126,7 +126,7 @@ def maker_of(request: Request) -> MakeFlight:
 
 @checked
 def load_run(folder: Path | str) -> Run:
-    """Return a run that was flown before. Raises `LabError` when the folder holds none."""
+    """Return an earlier run. Raises `LabError` when the folder has none."""
     return Run(read_result(Path(folder), find_again))
 
 
@@ -138,7 +138,7 @@ class Run:
 
     @property
     def request(self) -> Request:
-        """The request, equal to the one that was flown if its experiment is still known here."""
+        """The request, equal to the flown one if its experiment is still known here."""
         return self.result.request
 
     @property
@@ -173,7 +173,7 @@ class Run:
 
     @property
     def verdicts(self) -> tuple[Verdict, ...]:
-        """Every limit with the value and whether it holds."""
+        """Every limit with its value and whether it holds."""
         return self.result.verdicts
 
     @property
@@ -202,7 +202,7 @@ class Run:
         return frame.rename_axis("s")
 
     def to_dataset(self) -> Demonstrations:
-        """Return what the control law saw and did, for imitation learning: observations (N, 20), actions (N, 4)."""
+        """Return the control law's data for imitation learning: observations (N, 20), actions (N, 4)."""
         return demonstrations_of(self.log, self.request.config)
 
     @property
@@ -261,7 +261,7 @@ class Run:
 
 @checked
 def command_of(request: Request) -> str | None:
-    """Return the command that flies a request again, bit for bit; None for an experiment that no command can name."""
+    """Return the command that repeats a flight bit for bit; None for an experiment that no command can name."""
     experiment = request.experiment
     if find_again(experiment.name, experiment.source) != experiment:
         return None

@@ -1,6 +1,6 @@
-"""The check of every call from a user's program: its names and types, by the signature of what is called.
+"""Checks every call from a user's program: names and types, by the signature of the called function.
 
-Subscripted types are checked element by element; any real number is a `float`, also numpy's, but a truth value is no number.
+Subscripted types are checked element by element; any real number is a `float`, also numpy's, but a bool is not a number.
 """
 
 import builtins
@@ -80,7 +80,7 @@ def _guarded(function: Checked, name: str) -> Checked:
 
 
 def _plain(value: Any) -> Any:
-    """Return a number of numpy's as Python's own, which a file can hold."""
+    """Return a numpy number as a Python number, which can be stored in a file."""
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -95,7 +95,7 @@ def shown(value: object) -> str:
 
 
 class _Module(type):
-    """A module that is imported for type checking alone: every type in it is any type."""
+    """A module imported only for type checking: every type in it is any type."""
 
     def __getattr__(cls, name: str) -> Any:
         if name.startswith("_"):
@@ -104,7 +104,7 @@ class _Module(type):
 
 
 class _Unloaded(metaclass=_Module):
-    """A type or a module that is imported for type checking alone."""
+    """A type or a module imported only for type checking."""
 
 
 class _Names(dict[str, Any]):
@@ -121,7 +121,7 @@ def _hints_of(annotated: Any) -> dict[str, Any]:
 
 
 def fits(value: Any, kind: Any) -> bool:
-    """Whether a value is of a type, as an annotation describes it."""
+    """Whether a value matches an annotation."""
     origin, parts = get_origin(kind) or kind, get_args(kind)
     if origin in (Any, _Unloaded) or is_typeddict(origin):
         return True

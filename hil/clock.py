@@ -1,4 +1,4 @@
-"""How simulated time follows the wall clock: not at all, or step by step. The only file that sleeps."""
+"""Clocks: simulated time runs freely, or follows the wall clock step by step. The only file that sleeps."""
 
 import os
 import select
@@ -9,50 +9,50 @@ from pathlib import Path
 from typing import Protocol
 
 PROCESS = Path("/proc/self/stat")
-START_TIME = 19  # among its figures behind the process's name, in ticks since the machine's boot
+START_TIME = 19  # index of the field after the process's name, in ticks since the machine's boot
 
 Readers = dict[socket.socket | int, Callable[[int], None]]
 
 
 class Clock(Protocol):
-    """Waits until a simulated instant may happen."""
+    """Waits until the time of a simulated event."""
 
     paced: bool
-    stood_still_us: int  # how long simulated time stood still in total, because the machine was too slow
+    stood_still_us: int  # total pause of simulated time because the machine was too slow
 
     def start(self, now_us: int) -> None:
         """Start the clock at the simulated instant."""
 
     def wait_until(self, now_us: int) -> int:
-        """Wait for a simulated instant, or an earlier one at which something arrives from outside; returns which it is."""
+        """Wait for a simulated time, or for an earlier one with input from outside; return the one reached."""
 
     def serve(self, now_us: int) -> None:
-        """Read what arrived from outside, at the instant that `wait_until` returned."""
+        """Read the input from outside, at the time that `wait_until` returned."""
 
     def notices(self) -> list[str]:
-        """Lines for the user since the last call."""
+        """Return the lines for the user since the last call."""
 
     def pause(self, wait: Callable[[], None]) -> None:
-        """Let simulated time stand still while `wait` runs."""
+        """Pause simulated time while `wait` runs."""
 
 
 class FreeRunning:
-    """Every instant may happen at once."""
+    """Never waits."""
 
     paced = False
     stood_still_us = 0
 
     def start(self, now_us: int) -> None:
-        """Nothing: it is always now."""
+        """Do nothing: it never waits."""
 
     def wait_until(self, now_us: int) -> int:
         return now_us
 
     def serve(self, now_us: int) -> None:
-        """Nothing: nothing comes from outside."""
+        """Do nothing: there is no input from outside."""
 
     def notices(self) -> list[str]:
-        """Nothing: there is no wall clock to fall behind."""
+        """Return nothing: it cannot be late."""
         return []
 
     def pause(self, wait: Callable[[], None]) -> None:
@@ -62,9 +62,9 @@ class FreeRunning:
 class Paced:
     """One simulated second per real second.
 
-    A little lateness is caught up. More than `STALL_US` is a stall: simulated time continues from where it stood, because
-    outside clients would otherwise get a burst of past data, and a line reports how long it stood. `readers` are called
-    with the instant when their socket or file descriptor is readable.
+    Small delays are caught up. More than `STALL_US` is a stall: simulated time continues without catching up, because
+    outside clients would otherwise get a burst of past data, and a line reports the pause. `readers` are called with the
+    time when their socket or file descriptor is readable.
     """
 
     paced = True
@@ -78,34 +78,34 @@ class Paced:
         self.readers: Readers = {}
         self._readable: list[socket.socket | int] = []
         self._served_us = 0  # the latest instant
-        self._start_ns: int | None = None  # when simulated time was 0
-        self._reported_us = 0  # standstill that was reported
+        self._start_ns: int | None = None  # at simulated time 0
+        self._reported_us = 0  # reported pause
         self._next_notice_us = 0
 
     def start(self, now_us: int) -> None:
         self._start_ns = time.monotonic_ns() - now_us * 1000
 
     def shift(self, by_us: int) -> None:
-        """Shift every instant on the wall clock, later when positive."""
+        """Shift simulated time on the wall clock, later if positive."""
         if self._start_ns is not None:
             self._start_ns += by_us * 1000
 
     def late_us(self, now_us: int) -> int:
-        """By how much a simulated instant is over; only after `start`."""
+        """Return how late a simulated time is; only after `start`."""
         return self.now_us() - now_us
 
     def now_us(self) -> int:
-        """The simulated instant that the wall clock has reached; only after `start`."""
+        """The current simulated time by the wall clock; only after `start`."""
         assert self._start_ns is not None
         return (time.monotonic_ns() - self._start_ns) // 1000
 
     @staticmethod
     def wall_us() -> int:
-        """The wall clock, the same for all processes of this computer [us]."""
+        """Return the wall clock [us], the same for all processes of this computer."""
         return time.monotonic_ns() // 1000
 
     def ahead_us(self, now_us: int) -> int:
-        """How long it is until the simulated instant may happen, 0 when it may; the first call sets the start."""
+        """Return the time until a simulated instant, 0 when it is due; the first call sets the start."""
         if self._start_ns is None:
             self.start(now_us)
         late_us = self.late_us(now_us)
@@ -115,7 +115,7 @@ class Paced:
         return max(0, -late_us)
 
     def wait_until(self, now_us: int) -> int:
-        """Sleep until the wall clock has reached the instant, or something is readable."""
+        """Sleep until the wall clock reaches the time, or a reader has input."""
         ahead_us = self.ahead_us(now_us)
         if self.readers:
             self._readable, _, _ = select.select(self.readers, (), (), ahead_us * 1e-6)
@@ -127,7 +127,7 @@ class Paced:
         return now_us
 
     def serve(self, now_us: int) -> None:
-        """Call the readers of what is readable."""
+        """Call the readers that have input."""
         for readable in self._readable:
             if readable in self.readers:  # not closed by another reader
                 self.readers[readable](now_us)
@@ -139,7 +139,7 @@ class Paced:
         self.shift(self.wall_us() - began_us)
 
     def notices(self) -> list[str]:
-        """Lines for the user since the last call, one per simulated second at the most."""
+        """Return the lines for the user since the last call, at most one per simulated second."""
         fresh_us = self.stood_still_us - self._reported_us
         if fresh_us == 0 or self.now_us() < self._next_notice_us:
             return []
@@ -149,7 +149,7 @@ class Paced:
 
 
 def process_age_s() -> float:
-    """How long this process has been running; NaN where the system does not say when it began."""
+    """Return this process's age; NaN if the system does not report its start."""
     try:
         figures = PROCESS.read_text().rpartition(")")[2].split()
     except OSError:
@@ -164,7 +164,7 @@ class Pace:
         self.begin(0)
 
     def begin(self, now_us: int) -> None:
-        """Count from here."""
+        """Start counting."""
         self._us, self._ns = now_us, time.monotonic_ns()
 
     def factor(self, now_us: int) -> float:

@@ -1,4 +1,4 @@
-"""A profile: everything about a flight that is not the experiment, as one TOML file checked by one typed model.
+"""A profile: all of a flight except the experiment, as one TOML file checked by one typed model.
 
 `base = "name"` at the top of a profile builds on another one. `--set section.key=value` overrides single values.
 Every mistake becomes a `LabError` that names the key, its value and what is allowed.
@@ -34,7 +34,7 @@ _FOLDERS = (Path(__file__).parent.parent / "profiles", Path(__file__).parent / "
 
 
 class FlightConfig(Section):
-    """Where and when the flight begins."""
+    """The place and time of the flight's begin."""
 
     home: tuple[float, float, float] = Field(
         (0.0, 0.0, 1.15), description="home goal and start, W [m]; paper: 115 cm above the tunnel's centre"
@@ -69,7 +69,7 @@ class RobotConfig(Section):
 
 
 class LabConfig(FirmwareConfig):
-    """What is flashed, and the world around it."""
+    """The flashed firmware, and the world around it."""
 
     robot: RobotConfig = Field(default_factory=RobotConfig)
     geometry: GeometryConfig = Field(default_factory=GeometryConfig)
@@ -93,8 +93,8 @@ class LabConfig(FirmwareConfig):
     )
 
     def reads(self, section: str) -> bool:
-        """Whether a section has an effect on this robot; a body in a file may read them all."""
-        if self.pilot.enabled:  # neither Floaty's body nor its firmware
+        """Whether a section affects this robot; a user's body may read them all."""
+        if self.pilot.enabled:  # not Floaty's body or firmware
             return section not in {"geometry", "plant", "actuators", *FirmwareConfig.model_fields}
         return section != "quadrotor" or not self.robot.has_plates
 
@@ -104,7 +104,7 @@ def profile_names() -> list[str]:
 
 
 def load_config(profile: str = DEFAULT_PROFILE, overrides: Iterable[str] = ()) -> LabConfig:
-    """Return the configuration of a profile (a name that ships, or a path) with `section.key=value` overrides."""
+    """Return the configuration of a profile (a shipped name, or a path) with `section.key=value` overrides."""
     tree = _read_profile(profile, ())
     for override in overrides:
         _apply(tree, override)
@@ -122,7 +122,7 @@ def load_config(profile: str = DEFAULT_PROFILE, overrides: Iterable[str] = ()) -
 
 
 def _locate_files(tree: dict[str, Any], folder: Path) -> None:
-    """Make the paths in `[logic]` and `[robot]`, which begin at this folder, absolute."""
+    """Make the paths in `[logic]` and `[robot]`, relative to this folder, absolute."""
     for name, model in (("logic", LogicConfig), ("robot", RobotConfig)):
         section: Any = tree.get(name)
         for key in model.model_fields.keys() & section.keys() if isinstance(section, dict) else ():
@@ -132,14 +132,14 @@ def _locate_files(tree: dict[str, Any], folder: Path) -> None:
 
 
 def settings_of(overrides: Overrides) -> tuple[str, ...]:
-    """Return overrides as "section.key=value". Raises `LabError` for a value that no profile can have."""
+    """Return overrides as "section.key=value". Raises `LabError` for an impossible value."""
     if not isinstance(overrides, Mapping):
         return tuple(overrides)
     return tuple(f"{name}={_toml_of(name, value)}" for name, value in overrides.items())
 
 
 def _toml_of(name: str, value: Any) -> str:
-    """Return a value as TOML, a text as a bare word where that means the same."""
+    """Return a value as TOML, a text as a bare word if equivalent."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, list | tuple):
@@ -166,7 +166,7 @@ def read_toml(kind: str, path: Path) -> dict[str, Any]:
 
 
 def base_name(profile: str) -> str:
-    """Return the name of a profile as the base of another one, wherever that is stored."""
+    """Return the name of a profile as the base of another one, stored anywhere."""
     return Path(profile).resolve().as_posix() if profile.endswith(".toml") else profile
 
 
@@ -237,7 +237,7 @@ def _toml_value(text: str) -> Any:
 
 
 def _explain(tree: Mapping[str, Any], detail: ErrorDetails) -> str:
-    """Return one line: what, the value, what is allowed."""
+    """Return one line: the key, its value, what is allowed."""
     location = [str(part) for part in detail["loc"]]
     name = (
         ".".join(location).replace(".0", "[0]").replace(".1", "[1]").replace(".2", "[2]").replace(".3", "[3]")

@@ -1,6 +1,6 @@
-"""What a law saw and did in a recorded flight, as data for imitation learning.
+"""A control law's observations and actions in a recorded flight, as data for imitation learning.
 
-Observations and actions are those of `firmware_py/core/observation.py`, computed from the log by the board's own function.
+They follow `firmware_py/core/observation.py`, computed from the log by the board's own function.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Rows = NDArray[np.float32]
 class Demonstrations:
     """The controller's steps with the loop closed, one row per 10 ms."""
 
-    t_us: NDArray[np.int64]  # (N,) of the log; steps are missing where the loop was open
+    t_us: NDArray[np.int64]  # (N,) of the log; without the steps of an open loop
     observations: Rows  # (N, 20)
     actions: Rows  # (N, 4), -1..1
 
@@ -42,7 +42,7 @@ def observe_rows(parameters: Any, estimator: Any, states: Rows, previous: Rows, 
 
 
 def demonstrations_of(log: pa.Table, config: FirmwareConfig) -> Demonstrations:
-    """Return the steps of a log of a flight with this profile; none where it never closed the loop."""
+    """Return the steps in the log of a flight with this profile; none if it never closed the loop."""
     columns = {name: log.column(name).to_numpy() for name in ("t", "supervisor.state", *STATE, *INPUTS)}
     parameters = parameters_of(config)
     values: Any = parameters.fields

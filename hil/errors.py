@@ -14,11 +14,11 @@ PYTHON = Path(traceback.__file__).parent
 
 
 class LabError(Exception):
-    """A request of the user cannot be fulfilled; the text says what, the value, and what is allowed."""
+    """A user's request is invalid; the text has the key, the value, and what is allowed."""
 
 
 def require(what: str, extra: str, *modules: str) -> None:
-    """Raise `LabError` with the command that installs an extra when something needs a module that is missing."""
+    """Raise `LabError` with the command that installs an extra when `what` needs a missing module."""
     for module in modules:
         if find_spec(module) is None:
             raise LabError(f"{what}: {module} is missing: {install_command(extra)}")
@@ -34,7 +34,7 @@ def writing(option: str, path: Path | None) -> Iterator[None]:
 
 
 def hint(word: str, known: Iterable[str], otherwise: str = "") -> str:
-    """Return the nearest of the known words as a question; without a near one `otherwise`, or all of them."""
+    """Return the nearest of the known words as a question; else `otherwise`, or all of them."""
     names = list(known)
     near = difflib.get_close_matches(word, names, 1, 0.5)
     return f"did you mean {near[0]}?" if near else otherwise or f"there are {', '.join(names) or 'none'}"
@@ -60,4 +60,4 @@ def _is_known(file: Path) -> bool:
         return True
     if file.is_relative_to(PYTHON) and "site-packages" not in file.parts:
         return True
-    return file.parent.name == "importlib_metadata"  # takes over from Python's own wherever it is installed
+    return file.parent.name == "importlib_metadata"  # replaces Python's own if installed

@@ -1,8 +1,7 @@
 """Hardware events in the order of simulated time: one heap, integer microseconds.
 
-An event is a callback and the instant it was planned for. Events at the same instant run in the order in
-which they were planned, at most `EVENTS_AT_ONE_INSTANT`: time would never pass if a callback planned itself at its
-own instant.
+An event is a callback and its planned instant. Events at the same instant run in the order of planning, at most
+`EVENTS_AT_ONE_INSTANT`: time would never advance if a callback planned itself at its own instant.
 """
 
 from collections.abc import Callable
@@ -15,11 +14,11 @@ EVENTS_AT_ONE_INSTANT: Final = 10_000  # a hover needs 4
 
 
 class EndlessInstantError(Exception):
-    """The events of one instant do not end; the text names the callback and the instant."""
+    """The events of one instant are endless; the text names the callback and the instant."""
 
 
 class EventQueue:
-    """The planned events of the hardware. `next_us`: the earliest planned instant, None when there is none."""
+    """The planned events of the hardware. `next_us`: the earliest planned instant, or None."""
 
     __slots__ = ("_at_this_instant", "_heap", "_order", "next_us", "now_us")
 
@@ -31,7 +30,7 @@ class EventQueue:
         self.now_us = 0
 
     def at(self, time_us: int, callback: Callback) -> None:
-        """Plan `callback(time_us)`; an instant that has passed is a `ValueError`."""
+        """Plan `callback(time_us)`. Raises `ValueError` for a past instant."""
         self._plan(time_us, 0, callback)
 
     def every(self, period_us: int, start_us: int, callback: Callback) -> None:
@@ -43,7 +42,7 @@ class EventQueue:
     def run(self, now_us: int) -> None:
         """Run everything due by `now_us`, including what the callbacks plan until then.
 
-        Raises `EndlessInstantError` when that does not end.
+        Raises `EndlessInstantError` if that does not end.
         """
         heap = self._heap
         try:

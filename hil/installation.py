@@ -1,8 +1,8 @@
-"""What is installed here: version, commit, compiled modules, packages of the extras, and programs that are called or
+"""Describes the installation: version, commit, compiled modules, packages of the extras, and programs that are called or
 recommended.
 
-A clone asks git for its commit. A wheel or an sdist has it in a file, which `tools/build_hook.py` puts there: git would
-report the repository in which the package happens to be installed.
+A clone asks git for its commit. A wheel or an sdist has it in a file, written by `tools/build_hook.py`: git would report
+the repository around the installed package.
 """
 
 import platform
@@ -18,15 +18,15 @@ from firmware_py.fast import STATE
 
 COMMIT = Path(__file__).parent / "commit.txt"
 ROOT = Path(__file__).parent.parent
-COMPUTING = ("numpy", "numba", "pyarrow")  # the packages on whose versions the bits of a flight could depend
+COMPUTING = ("numpy", "numba", "pyarrow")  # packages whose versions could affect the bits of a flight
 DEVELOPMENT = ("fast", "bench", "docs", "test", "clients")  # extras of the Makefile: no command asks for them
-# Git reports the commit, the C compilers build `--board c`, the last two serve exported and emulated images.
+# Git reports the commit, the C compilers build `--board c`, the last two are for exported and emulated images.
 PROGRAMS = ("git", "gcc", "clang", "arm-none-eabi-gcc", "gdb-multiarch")
 PROGRAM_TIMEOUT_S = 2.0
 
 
 def commit() -> str:
-    """Return the git commit of the sources, with `+` when they were changed; empty when nothing knows it."""
+    """Return the git commit of the sources, with `+` when they were changed; empty if unknown."""
     if COMMIT.is_file():
         return COMMIT.read_text(encoding="utf-8").strip()
     if not (ROOT / ".git").exists():
@@ -83,7 +83,7 @@ def _version(package: str) -> str:
 
 
 def _version_of_program(name: str) -> str:
-    """Return what a program calls its version, without what stands in brackets: the packager's."""
+    """Return a program's version, without the packager's in brackets."""
     if shutil.which(name) is None:
         return "not found"
     first_line = _output(name, "--version", timeout_s=PROGRAM_TIMEOUT_S).partition("\n")[0]
@@ -92,7 +92,7 @@ def _version_of_program(name: str) -> str:
 
 
 def _output(*command: str, timeout_s: float) -> str:
-    """Return what a program prints; empty when it is missing, fails or takes longer."""
+    """Return a program's output; empty when it is missing, fails or takes longer."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=True)
     except (OSError, subprocess.SubprocessError):

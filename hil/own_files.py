@@ -1,4 +1,4 @@
-"""Python files of the user's own: each is executed once per content, and modules beside it can be imported."""
+"""Loads users' Python files: each is executed once per content, and can import modules beside it."""
 
 import hashlib
 import sys
@@ -11,7 +11,7 @@ _LOADED: dict[Path, tuple[str, ModuleType]] = {}  # with the hash of the execute
 
 
 def load_file(what: str, path: Path) -> tuple[ModuleType, str]:
-    """Return the module of a file, and the file's SHA-256. Raises `LabError`, which begins with `what` and the path."""
+    """Return the module of a file, and the file's SHA-256. Raises a `LabError` that begins with `what` and the path."""
     place = path.resolve()
     try:
         content = place.read_bytes()

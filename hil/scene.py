@@ -1,4 +1,4 @@
-"""What a robot looks like: its parts as triangles, its frame as lines, its markers; stored with a log for the pictures.
+"""The look of a robot: parts as triangles, frame as lines, markers; stored with a log for the pictures.
 
 Lengths in m, in B or in the frame F of a part, which is parallel to B while its angle is 0. Colours are `#rrggbb`.
 """
@@ -25,7 +25,7 @@ AROUND, DOWN = 12, 6  # faces of a ball along its equator, and from pole to pole
 class Part:
     """A rigid part. With `angle`, a column of the log [rad], it turns about `axis` through `place`.
 
-    `force` is the beginning of the names of the columns with the force on it [N, W]: `force.base` for `force.base_x`.
+    `force` is the prefix of the columns with the force on it [N, W]: `force.base` for `force.base_x`.
     """
 
     name: str
@@ -36,12 +36,12 @@ class Part:
     angle: str = ""
     force: str = ""
     label: str = ""
-    closed: bool = False  # its triangles turn outwards; else it is a plate, seen from both sides
+    closed: bool = False  # its triangles face outwards; else it is a plate, visible from both sides
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Markers:
-    """Eight markers, and what hides them: a flat square in B, and a ball around the centre of mass."""
+    """Eight markers, and the shapes that hide them: a flat square in B, and a ball around the centre of mass."""
 
     places: Points  # (8, 3) in B
     plate_height: float = 0.0
@@ -53,7 +53,7 @@ class Look:
     """A whole robot."""
 
     parts: tuple[Part, ...] = ()
-    frame: tuple[Points, ...] = ()  # lines through (N, 3) points: what holds the parts together
+    frame: tuple[Points, ...] = ()  # lines through (N, 3) points: the rods between parts
     outline: tuple[Points, ...] = ()  # of its ghost at the goal
     knot: Three = CENTRE  # where the tether is tied
     markers: tuple[Three, ...] = ()  # places
@@ -69,7 +69,7 @@ class Look:
 
     @classmethod
     def read(cls, stored: Mapping[str, Any]) -> "Look":
-        """Return what was stored; nothing to draw for a log without."""
+        """Return the stored look; an empty one if a log has none."""
         parts = tuple(
             Part(**{**part, "triangles": np.array(part["triangles"]).reshape(-1, 3, 3)})
             for part in stored.get("parts", ())
@@ -112,13 +112,13 @@ def box(size: Three, centre: Three = CENTRE, colour: str = PALE) -> Part:
 
 
 def _halved(quads: Sequence[tuple[Three, ...]]) -> Points:
-    """Return quadrilaterals as triangles, without those that have no area."""
+    """Return quadrilaterals as triangles, without empty ones."""
     halves = ((a, b, c) for q in quads for a, b, c in ((q[0], q[1], q[2]), (q[0], q[2], q[3])))
     return np.array([half for half in halves if len(set(half)) == 3])
 
 
 def eight_markers(radius: float) -> Points:
-    """Return places for eight markers around a robot, of which no two exchanged look alike, (8, 3)."""
+    """Return places for eight markers around a robot, (8, 3); exchanging any two changes the pattern."""
     directions = np.array(
         [
             (1.0, -0.2, 0.1), (0.5, 0.8, 0.3), (-0.7, 0.6, 0.0), (-0.8, -0.5, 0.3),

@@ -1,1 +1,1 @@
-"""Pictures of a flight while it happens, in a process of their own."""
+"""Live pictures of a flight, in a separate process."""

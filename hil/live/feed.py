@@ -1,9 +1,9 @@
-"""Sends rows and texts of a flight to a live picture of it.
+"""Sends rows and texts of a flight to its live picture.
 
-The picture has a process of its own (`hil.live.picture`), at a lower priority. Data for it wait in a bounded queue
-for the thread that writes it into a pipe: an Arrow stream, whose batches carry texts and the board's parameters as metadata.
-Lines come back: how many rows were taken, and what was typed there. So a picture that is slow, hangs, is
-closed or never opens delays nothing: what it does not take is dropped and counted.
+The picture has a separate process (`hil.live.picture`), at a lower priority. Its data wait in a bounded queue for the
+thread that writes them into a pipe: an Arrow stream, whose batches carry texts and the board's parameters as metadata.
+Lines come back: the number of rows taken, and typed commands. A picture that is slow, hangs, is closed or never opens
+delays nothing: rows that it does not take are dropped and counted.
 """
 
 import json

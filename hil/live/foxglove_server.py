@@ -1,6 +1,6 @@
-"""A flight in Foxglove while it happens: a WebSocket server with the topics of `hil.exports.mcap` and the parameters.
+"""A live flight in Foxglove: a WebSocket server with the topics of `hil.exports.mcap` and the parameters.
 
-A parameter that is changed there becomes a line for the station's operator; its new value is shown when the board has it.
+A parameter changed there becomes a line for the station's operator; its new value is shown when the board has it.
 """
 
 from collections.abc import Callable, Iterable, Mapping

@@ -1,6 +1,6 @@
-"""What is pressed in the panel while a flight in lockstep is watched: time, goal, faults, parameters, notes.
+"""Executes the panel's commands during a flight in lockstep: time, goal, faults, parameters, notes.
 
-A line acts at the next row of the log and is an event of the operator's: such a flight cannot be repeated by its request.
+A line takes effect at the next row of the log and is an operator's event: such a flight's request cannot repeat it.
 """
 
 from math import isfinite, radians

@@ -1,8 +1,8 @@
-"""The control panel of `--view web`: one page with scene, curves and the commands that the terminal takes, too.
+"""The control panel of `--view web`: one page with scene, curves and the commands of the terminal.
 
 The scene is drawn here, so that a browser without a graphics card shows it at once; rerun's viewer opens on request.
-Reachable from this computer only, with the token of its address; pages of other origins are refused. What is pressed
-there becomes a line, which `typed` takes; state and answers go to the page, a late one of which is replaced by the next.
+Reachable only from this computer, with the token in its address; pages of other origins are refused. A pressed button
+becomes a line for `typed`; state and answers go to the page, and a newer one replaces a late one.
 """
 
 import io

@@ -1,8 +1,8 @@
-"""The process that shows a flight while it happens: `python -m hil.live.picture TARGET PROGRAM`, fed by `hil.live.feed`.
+"""The process that shows a live flight: `python -m hil.live.picture TARGET PROGRAM`, fed by `hil.live.feed`.
 
 A TARGET is `window` (rerun's viewer), `web` (the same in a browser, with the commands of PROGRAM: fly, serve or station),
 `connect:HOST:PORT` (a viewer that is already open) or
-`foxglove` (a WebSocket server for Foxglove). Rows come in at standard input, lines go out at standard output.
+`foxglove` (a WebSocket server for Foxglove). It reads rows from standard input and writes lines to standard output.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""The recording of a run in rerun's viewer at an instant: in its window, or in a browser, by links of the report, too."""
+"""Shows a run's recording at a time in rerun's viewer: in its window or in a browser, also by links of the report."""
 
 import re
 import signal

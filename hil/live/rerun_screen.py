@@ -1,4 +1,4 @@
-"""A flight in rerun's viewer while it happens: in its window, in a browser, or in a viewer that is already open."""
+"""A live flight in rerun's viewer: in its window, in a browser, or in a viewer that is already open."""
 
 import re
 import subprocess

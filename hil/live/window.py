@@ -1,6 +1,6 @@
-"""The processes of rerun's own viewers: the window, and the server of the one in the browser.
+"""The processes of rerun's viewers: the window, and the server of the browser's viewer.
 
-Both are reachable from this computer only and send no usage statistics; `hil.pictures.viewer` sends them data.
+Both are reachable only from this computer and send no usage statistics; `hil.pictures.viewer` sends them data.
 """
 
 import os

@@ -1,1 +1,1 @@
-"""From a run folder to pictures: report, figures, scene, exports; reads logs only."""
+"""Makes pictures from a run folder: report, figures, scene, exports; reads only logs."""

@@ -1,8 +1,8 @@
-"""One flight against another: where their logs first differ, their metrics side by side, differences in the configuration.
+"""Compares two flights: first difference of their logs, metrics side by side, differences in the configuration.
 
-Logs are compared bit for bit, row by row, in the columns that both have; a NaN equals a NaN. Flights that are not released
-at the same instant of their logs, real ones and those over a real link, share no rows: there their distance
-over the time since the release shows what the model does not contain.
+Logs are compared bit for bit, row by row, in the columns that both have; a NaN equals a NaN. Flights released at
+different times of their logs, real ones and those over a real link, share no rows: their distance over the time since the
+release then shows what the model lacks.
 """
 
 import math

@@ -1,7 +1,6 @@
 """The curves of a flight for viewer and report, from log rows, in customary units.
 
-Lengths in cm, angles in degrees, times in ms. Colours are those of Okabe and Ito, which are distinguishable with every kind
-of colour vision.
+Lengths in cm, angles in degrees, times in ms. Okabe and Ito's colours are distinguishable with every kind of colour vision.
 """
 
 import json

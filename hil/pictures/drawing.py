@@ -1,6 +1,6 @@
 """Draws figures as PNG: size, style, and panels in matplotlib, which is loaded here.
 
-Grey: the robot was still held; red: a fault was in force; pink: failsafe; yellow strip below: a command at its limit;
+Grey: the robot was still held; red: a fault was active; pink: failsafe; yellow strip below: a command at its limit;
 dotted blue: an operator's action; black: the flight was lost.
 """
 

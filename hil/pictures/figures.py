@@ -1,6 +1,6 @@
-"""The figures of a flight, after the paper's figure Hover_figure; also of a flight that was lost or never began.
+"""The figures of a flight, like the paper's figure Hover_figure; also for a flight that was lost or never began.
 
-Axes carry cm, degrees, ms and seconds from the release. What has a time axis are panels, which a page can zoom.
+Axes have cm, degrees, ms and seconds from the release. Figures over time are panels, which a page can zoom.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The experiments' own pictures by the names under which experiments ask for them."""
+"""The experiments' own pictures, by the names that experiments use."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Links from a report into the recording of its flight.
 
-A page that is opened from disk cannot start a viewer, and in a browser rerun's viewer takes recordings from a server only.
-So the links lead to this computer, where `floaty view RUN --view web` answers them, for the run that they belong to.
+A page opened from disk cannot start a viewer, and rerun's browser viewer reads recordings only from a server. So the
+links lead to this computer, where `floaty view RUN --view web` answers them for their run.
 """
 
 from hil.laboratory.result import Result

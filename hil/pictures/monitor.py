@@ -1,6 +1,6 @@
 """The viewer's curves for monitoring a flight: rates of the link, the latency budget of poses, marks.
 
-Rates are per second, over the second before. Marks are instants at which something was refused.
+Rates are per second, over the previous second. Marks are the times of refusals.
 """
 
 from collections.abc import Mapping

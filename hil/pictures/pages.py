@@ -1,8 +1,8 @@
 """Pages: self-contained HTML files from the templates beside this file; their figures, zoomable or as PNG.
 
 Zoomable panels are data for `templates/figures.js`, drawn by uPlot (MIT licence; in the Python package
-youplot), whose script is embedded once per file. A panel's curves are thinned to the lowest and highest values of some 1500
-intervals, which is more than a screen shows at once.
+youplot), whose script is embedded once per file. A panel's curves are thinned to the lowest and highest values of some
+1500 intervals, more than a screen shows.
 """
 
 import base64

@@ -1,4 +1,4 @@
-"""The parts of a figure over time, and its marks; as values, drawn by `drawing` and, zoomable, in `pages`.
+"""The parts of a figure over time, and its marks, as values; `drawing` draws them, `pages` makes them zoomable.
 
 Times are seconds from the release.
 """

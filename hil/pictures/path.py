@@ -1,6 +1,6 @@
-"""The path of the body and that of its goal as SVG, which needs no drawing library: in space, from above, from the side.
+"""The paths of the body and of its goal as SVG, without a drawing library: in space, from above, from the side.
 
-Lengths in cm, in W from where the first goal is. A view turns such points into its plane: (2, 3), across and up.
+Lengths in cm, in W from the first goal. A view projects such points into its plane: (2, 3), across and up.
 """
 
 from collections.abc import Iterator

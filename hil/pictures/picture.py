@@ -1,4 +1,4 @@
-"""A picture of the report, and how matplotlib, which is slow to load, is loaded for the few that need it."""
+"""A picture of the report, and the loading of matplotlib, which is slow, for the few that need it."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The report of a flight: `report.html` in its run folder, one self-contained file.
 
-From `result.json`, `log.parquet` and `events.jsonl`; a flight that was lost, interrupted or killed has a report as well.
+Made from `result.json`, `log.parquet` and `events.jsonl`; lost, interrupted or killed flights have reports as well.
 """
 
 import json

@@ -1,6 +1,6 @@
-"""The story of a flight, which its report begins with: what failed, and what happened when, in seconds from the release;
-and close-ups of what happened around each fault, around the first limit passed, and in the last seconds before a loss,
-with sentences on the robot, the board's belief, its poses and its flaps, which only state what was recorded.
+"""The story of a flight, at the beginning of its report: failures and events, in seconds from the release; and close-ups
+around each fault, around the first exceeded limit, and in the last seconds before a loss, with sentences on the robot,
+the board's estimate, its poses and its flaps, which state only recorded facts.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""The experiments' own pictures, after the paper's figures: every trial light, a representative one, the first, dark.
+"""The experiments' own pictures, like the paper's figures: every trial light, the first, a representative one, dark.
 
 Time counts from the release.
 """

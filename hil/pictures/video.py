@@ -1,7 +1,7 @@
 """A flight as an animation of scene and curves, 30 frames per second, drawn without a display: `flight.mp4`, `flight.gif`.
 
-Pillow draws the robot, its goal and both paths, from above and beside, as the viewer's first look; matplotlib draws the
-curves once, of which each frame shows the part up to its instant.
+Pillow draws the robot, its goal and both paths, from above and beside, like the viewer's first view; matplotlib draws the
+curves once, and each frame shows the part up to its time.
 """
 
 from collections.abc import Iterator, Sequence

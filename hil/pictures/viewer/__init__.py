@@ -1,7 +1,7 @@
 """The flight in the rerun viewer: one picture for simulated and real flights, as a file, from a server, or live.
 
-Entities are below `/world` (`scene`; metres, W), `/plot` and `/state` (`plots`) and `/text`. This package alone knows
-rerun, which comes with the extra `view`: without it, importing from here raises `LabError`.
+Entities are below `/world` (`scene`; metres, W), `/plot` and `/state` (`plots`) and `/text`. Only this package uses
+rerun, from the extra `view`: without it, importing from here raises `LabError`.
 """
 
 from firmware_py.extras import install_command

@@ -1,4 +1,4 @@
-"""A flight as a rerun recording: row by row, as the file `flight.rrd`, and on a server for viewers."""
+"""Writes a flight as a rerun recording: row by row, as the file `flight.rrd`, and on a server for viewers."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping

@@ -1,4 +1,4 @@
-"""A rerun recording on the timeline of one flight: `from_release`, or `from_start` while the release is not known."""
+"""A rerun recording on the timeline of one flight: `from_release`, or `from_start` while the release is unknown."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
