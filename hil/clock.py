@@ -95,7 +95,7 @@ class Paced:
         return self.now_us() - now_us
 
     def now_us(self) -> int:
-        """The current simulated time by the wall clock; only after `start`."""
+        """Return the simulated time by the wall clock; only after `start`."""
         assert self._start_ns is not None
         return (time.monotonic_ns() - self._start_ns) // 1000
 

@@ -34,7 +34,7 @@ _FOLDERS = (Path(__file__).parent.parent / "profiles", Path(__file__).parent / "
 
 
 class FlightConfig(Section):
-    """The place and time of the flight's begin."""
+    """Place and time of the flight's begin."""
 
     home: tuple[float, float, float] = Field(
         (0.0, 0.0, 1.15), description="home goal and start, W [m]; paper: 115 cm above the tunnel's centre"

@@ -41,7 +41,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Markers:
-    """Eight markers, and the shapes that hide them: a flat square in B, and a ball around the centre of mass."""
+    """Eight markers, and their obstacles: a flat square in B, and a ball around the centre of mass."""
 
     places: Points  # (8, 3) in B
     plate_height: float = 0.0

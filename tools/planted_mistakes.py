@@ -94,7 +94,7 @@ def planted(mistake: Mistake, root: Path) -> str:
 
 
 def copy_of(root: Path, folder: Path) -> Path:
-    """Copy the files that git tracks or would add into a folder."""
+    """Copy all files that git does not ignore into a folder."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(command, cwd=root, check=True, capture_output=True, text=True).stdout
     for name in listed.split("\0"):

@@ -33,7 +33,7 @@ class _Part(BaseModel):
 
 
 class Distribution(_Part):
-    """The distribution of one number: exactly one of the four."""
+    """One number's distribution: exactly one of the four."""
 
     uniform: tuple[Finite, Finite] | None = Field(None, description="[low, high]")
     log_uniform: tuple[Finite, Finite] | None = Field(None, description="[low, high], above 0")

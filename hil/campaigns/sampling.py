@@ -131,7 +131,7 @@ def problem(width: int) -> dict[str, Any]:
 
 
 def per_base(spec: Spec) -> int:
-    """Return how many points in a row belong to one base row of a design; 1 for other samplings."""
+    """Return the number of consecutive points of one base row of a design; 1 for other samplings."""
     return len(axes(spec)) + {"saltelli": 2, "morris": 1}[spec.sampling] if spec.sampling in DESIGNS else 1
 
 

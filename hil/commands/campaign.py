@@ -1,4 +1,4 @@
-"""`floaty campaign`: thousands of flights over sampled parameters and faults, and what breaks the robot in them."""
+"""`floaty campaign`: thousands of flights over sampled parameters and faults, and the causes of failures."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def campaign(
 
     SPEC is a TOML file, or `table`: every robot that the paper's Table allows.
 
-    Exit code 0: all flights were flown, whatever their outcome; 2: bad input or a full disk, with the flights kept; 130:
+    Exit code 0: all flights were flown, with any outcome; 2: bad input or a full disk, with the flights kept; 130:
     interrupted, likewise.
     """
     require("floaty campaign", "campaign", "SALib", "scipy")

@@ -1,4 +1,4 @@
-"""`floaty identify` and `floaty tune`: compute the model's constants from flights, and gains from the constants."""
+"""`floaty identify` and `floaty tune`: the model's constants from flights, and gains from the constants."""
 
 from collections.abc import Iterable
 from math import degrees, inf

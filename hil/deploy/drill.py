@@ -67,7 +67,7 @@ def drill(flight: Flight) -> None:
 
 
 def fail(flight: Flight) -> None:
-    """Plan the time at which user logic returns NaN."""
+    """Plan a NaN from user logic."""
     for start_s, name in ((2.0, "logic.law_fails"), (3.0, "logic.filter_fails")):
         plan(flight, start_s, (0.0, name, Scalar.F32, 1), (0.2, name, Scalar.F32, 0))
         plan(flight, start_s + 0.4, *RECOVERY)

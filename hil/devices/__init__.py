@@ -1,1 +1,1 @@
-"""The hardware around the board: its pins, the radio and serial links, the cameras."""
+"""The hardware around the board: pins, links, sensors, cameras."""

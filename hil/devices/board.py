@@ -31,7 +31,7 @@ class Uart(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class KeptMemory:
-    """The memory that a board keeps without power."""
+    """A board's memory without power."""
 
     eeprom: bytearray = field(default_factory=lambda: bytearray(b"\xff" * EEPROM_SIZE))
     deck: bytearray = field(default_factory=lambda: bytearray(b"\xff" * DECK_MEMORY_SIZE))

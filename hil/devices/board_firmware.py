@@ -261,7 +261,7 @@ class Executor(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PythonBoard:
-    """Executes the firmware in Python; `runner` executes its flight core."""
+    """Executes the firmware in Python, with its flight core in `runner`."""
 
     runner: RunnerFactory = PythonRunner
     needs_polls: ClassVar[bool] = False

@@ -1,7 +1,7 @@
 """The motion capture cameras: noisy, delayed poses of the body, sometimes missing or wrong.
 
 A pose is the truth with noise or, with `markers.enabled`, the fit to eight markers (`hil.devices.rigid_body`).
-This file computes frames and arrival times; the harness exposes at `period_us` and delivers.
+Here frames and arrivals are computed; the harness exposes at `period_us` and delivers.
 """
 
 from __future__ import annotations

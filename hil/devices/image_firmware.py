@@ -69,7 +69,7 @@ class ImageStatistics:
         self._kernel = kernel
 
     def reports(self) -> list[TaskReport]:
-        """The tasks in the order in which they first ran."""
+        """Return the tasks in the order of their first run."""
         kernel = self._kernel
         counted = zip(kernel.tasks, kernel.run_times_us(), kernel.activations(), strict=True)
         return [

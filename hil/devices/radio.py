@@ -136,7 +136,7 @@ class VirtualRadio:
                 self._plan(end_us, answered, now_us)
         return True
 
-    # The host: when the next exchange begins, and with what.
+    # The host: time and packet of the next exchange.
 
     def _wake_for_uplink(self, now_us: int) -> None:
         """Plan the exchange of a ready packet; on an idle link it follows the empty poll in progress."""

@@ -174,7 +174,7 @@ class VirtualSerial:
         return self.up.overrun_bytes
 
     def read(self) -> bytes:
-        """Return the bytes that arrived on board since the last call, and free their room."""
+        """Return the bytes that arrived on board since the last call, and free them."""
         data = bytes(self._received)
         self._received.clear()
         return data

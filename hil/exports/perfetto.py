@@ -1,6 +1,6 @@
 """A run's schedule as a Perfetto trace: one track per task with its slices, opened by the Perfetto viewer.
 
-A slice is an interval in which the task had the processor; between READY and its slice the task waits for the processor.
+A slice is an interval in which the task had the processor; from READY to its slice the task waits for it.
 """
 
 from pathlib import Path

@@ -72,7 +72,7 @@ def marker_places(geometry: GeometryConfig, ground: NetConfig) -> Points:
 
 
 def markers_of(geometry: GeometryConfig, ground: NetConfig) -> Markers:
-    """Return the markers; base plate and flaps hide them as one flat square, whatever the flap angles."""
+    """Return the markers; base plate and flaps hide them as one flat square, at any flap angles."""
     return Markers(marker_places(geometry, ground), weigh(geometry).axis_height, geometry.footprint / 2)
 
 

@@ -23,7 +23,7 @@ TRIM_LEAST = 0.005  # [rad] smallest mean input with a written trim
 
 
 def write_profile(path: Path, profile: str, found: Identification) -> str:
-    """Write the profile and return what it changes besides the model, empty for nothing.
+    """Write the profile and return its changes besides the model, empty if none.
 
     Raises `LabError` when nothing was identified, or writing fails.
     """

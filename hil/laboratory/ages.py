@@ -57,7 +57,7 @@ def ages_in_time_of(log: Iterator[pa.Table], folder: Path) -> pa.Table:
 
     Empty for a real flight whose log lacks the station's clock at its start, as older logs do.
     """
-    begin = next(log)  # first: it refuses what is not a run folder
+    begin = next(log)  # first: it refuses other folders than runs
     table = reported_ages(folder)
     metadata = begin.schema.metadata or {}
     if STATION_START in metadata:

@@ -305,7 +305,7 @@ class StationView:
         self._poses, self._rejected = Unwrapped(), Unwrapped()
 
     def state(self) -> int:
-        """The supervisor's state."""
+        """Return the supervisor's state."""
         state = self._link.supervisor_state
         return UNKNOWN_STATE if state is None else state
 

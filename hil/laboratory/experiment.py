@@ -75,7 +75,7 @@ class Experiment:
     faults: tuple[Fault, ...] = ()  # those of the command line are added
     # Computes the experiment's own metrics from the rows after the release.
     measure: Callable[[pa.Table], Mapping[str, float]] = nothing
-    metrics: Mapping[str, Metric] = field(default_factory=dict)  # what `measure` returns beyond METRICS
+    metrics: Mapping[str, Metric] = field(default_factory=dict)  # of `measure`, beyond METRICS
     pictures: tuple[str, ...] = ()  # its own pictures by name in `hil.pictures.gallery`, first in the report
     # Draws one more picture, a matplotlib Figure, from the rows after the release.
     draw: Callable[[pa.Table], Any] | None = None

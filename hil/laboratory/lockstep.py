@@ -102,7 +102,7 @@ class ModelledLine:
         release(self._release_us)
 
     def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
-        """The counters of line and tracker."""
+        """Return the counters of line and tracker."""
         return (self._channel,), (tracker_channel(self.tracker),) if self.tracker else ()
 
     def _radio(self, request: Request) -> tuple[Link, Channel]:

@@ -108,7 +108,7 @@ class Result:
 
 
 def with_resets(outcome: Outcome, cause: str | None, resets: float) -> tuple[Outcome, str | None]:
-    """Return outcome and cause of a flight with this number of resets of its board."""
+    """Return outcome and cause of a flight with this number of resets."""
     if not resets > 0:
         return outcome, cause
     how = f"the board was reset {resets:.0f} time{'s' if resets > 1 else ''}"

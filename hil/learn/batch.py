@@ -139,7 +139,7 @@ def advance_all(
     plants: Array,  # (N, layout.SIZE)
     paths: Array,  # (N, 2, 4): amplitudes and frequencies of the goal
     pushes: Array,  # (N, 3, PUSHES): instants, kinds, sizes
-    rings: Array,  # (N, DELAY_MAX + 1, SEEN): what the cameras saw, the newest at `tick`
+    rings: Array,  # (N, DELAY_MAX + 1, SEEN): the cameras' measurements, the newest at `tick`
     errors: Array,  # (N, ERRORS): of the estimate
     actions: Actions,  # (N, 4)
     previous: Actions,  # (N, 4): overwritten by the actions as limited

@@ -139,20 +139,20 @@ class Backend:
         handle.close()
 
     def set_configuration(self, handle: Connection, value: int) -> None:
-        """There is only one."""
+        """Do nothing: there is only one."""
 
     def get_configuration(self, handle: Connection) -> int:
         """Return its number."""
         return 1
 
     def set_interface_altsetting(self, handle: Connection, interface: int, setting: int) -> None:
-        """There is only one."""
+        """Do nothing: there is only one."""
 
     def claim_interface(self, handle: Connection, interface: int) -> None:
-        """The connection is the claim."""
+        """Do nothing: the connection is the claim."""
 
     def release_interface(self, handle: Connection, interface: int) -> None:
-        """The connection is the claim."""
+        """Do nothing: the connection is the claim."""
 
     def reset_device(self, handle: Connection) -> None:
         """Do nothing: the host sets everything afterwards."""

@@ -126,7 +126,7 @@ class StationProcess:
         Holder(self.robot, let_go)
 
     def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
-        """The counters of line and board; the station keeps its own record."""
+        """Return the counters of line and board; the station keeps its own record."""
         robot = self.robot
         if robot.uart is not None:
             line: tuple[Channel, ...] = (serial_channel(robot.uart, robot.firmware, None),)
@@ -183,7 +183,7 @@ class StationProcess:
         return [("station", text) for text in texts]
 
     def finish(self, lab: Laboratory) -> None:
-        """Let the station end in an orderly manner while the board still runs, or kill it."""
+        """Let the station end in order while the board still runs, or kill it."""
         station = self._running_station()
 
         def progress(now_us: int) -> None:

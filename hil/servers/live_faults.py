@@ -23,7 +23,7 @@ COMMANDS = ("clear", "status", "restart", "kinds", "help")
 
 
 class LiveFaults:
-    """Reads lines; `say` answers."""
+    """Reads lines; answers by `say`."""
 
     def __init__(self, server: Server, say: Callable[[str], None]) -> None:
         self._server = server

@@ -217,7 +217,7 @@ class VirtualMotive:
         return (clock_us() - self._start_us) * _TICKS_PER_US
 
     def _targets(self) -> dict[Address, Version]:
-        """Return the frames' destinations without multicast, with their versions."""
+        """Return the unicast addresses for frames, with their versions."""
         ports = {(host, self.data_port): client.version for (host, _), client in self._clients.items()}
         return ports | {at: client.version for at, client in self._clients.items() if client.keeps_alive}
 
@@ -229,7 +229,7 @@ class VirtualMotive:
             return
         kind, size = _HEADER.unpack_from(data) if len(data) >= HEADER_SIZE else (None, 0)
         payload = data[HEADER_SIZE:]
-        if kind == MessageId.CONNECT:  # clients differ in what follows
+        if kind == MessageId.CONNECT:  # clients differ in the rest of the request
             self._admit(client, _Client(self._version, keeps_alive=False))
             _send(self._socket, self._info(), client)
         elif kind == MessageId.KEEPALIVE:

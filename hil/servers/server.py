@@ -44,7 +44,7 @@ BUTTON_US = 5_000_000  # off, or in the bootloader without a client: then the bu
 
 
 class Ends:
-    """The connections of a laboratory's robots to clients; open those you need, `close` at the end."""
+    """The connections of a laboratory's robots; open those you need, `close` at the end."""
 
     def __init__(self, lab: Laboratory, readers: Readers, config: LabConfig, seed: int) -> None:
         self.robots: list[ServedRobot] = []

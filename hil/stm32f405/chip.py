@@ -198,7 +198,7 @@ class Chip:
         return int(self._library.usart_feed(self.state, usart - 1, data, len(data)))
 
     def sent(self, usart: int) -> bytes:
-        """Return the bytes that USART 1..6 has sent since the last call."""
+        """Return the bytes sent by USART 1..6 since the last call."""
         size = self._library.machine_sent(self.state, usart - 1, self._sent)
         return bytes(self._ffi.buffer(self._sent, size)) if size else b""
 

@@ -124,7 +124,7 @@ class RemoteProtocol:
         self._signal = SIGTRAP
         self._last = b""
         self.wish = Wish.STAND
-        self.interrupted = False  # Ctrl-C came while the machine ran
+        self.interrupted = False  # Ctrl-C arrived while the machine ran
         self._commands: dict[bytes, Callable[[bytes], bytes]] = {
             b"?": lambda _: self._stop_reply(),
             b"g": lambda _: self._registers(range(len(REGISTERS))),

@@ -68,7 +68,7 @@ class Trials:
 
     @property
     def holds(self) -> bool:
-        """Whether all flights held every limit."""
+        """Whether all flights passed."""
         return self.passed == len(self.results) > 0
 
     @property

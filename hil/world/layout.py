@@ -63,7 +63,7 @@ HELD = _take()  # 1: the body is clamped where it is
 PUSH = _take(3)  # [N] in W
 PUSH_TORQUE = _take(3)  # [N m] in B
 LOST = _take()  # cause, 0: flying
-LOST_VALUE = _take()  # what exceeded its limit: [m] or [rad]
+LOST_VALUE = _take()  # value beyond its limit: [m] or [rad]
 
 # Tunnel
 SPEED = _take()  # [m/s] mean at the hover point
