@@ -138,8 +138,8 @@ def write_comparison(
     figures = [PageFigure(
         "both",
         "Both flights",
-        f"Position and attitude against the goal and the flap angles over time. Blue: {names[0]}; orange: {names[1]}. "
-        "Times count from the release of each.",
+        f"Position and attitude against the goal, and what moves the robots, if it is the same. Blue: {names[0]}; orange: "
+        f"{names[1]}. Times count from the release of each.",
         plot=embedded(plot),
     )]  # fmt: skip
     if apart := difference(a.log, b.log):
@@ -155,16 +155,17 @@ def write_comparison(
         )  # fmt: skip
 
 
-def shown_curves(log: pa.Table) -> tuple[tuple[str, curves.Curves], ...]:
-    """Return the curves that are compared, with their names."""
-    return (("position", curves.POSITION), ("attitude", curves.ATTITUDE), *curves.actuators(log))
+def shown_curves(a: pa.Table, b: pa.Table) -> tuple[tuple[str, curves.Curves], ...]:
+    """Return the curves that are compared, with their names; of flaps against rotors position and attitude alone."""
+    moving = [plot for plot in curves.actuators(a) if plot[1].fits(b.column_names)]
+    return (("position", curves.POSITION), ("attitude", curves.ATTITUDE), *moving)
 
 
-def pair(logs: Sequence[pa.Table], names: Sequence[str]) -> Plot:
-    """Return position, attitude and flap angles of two flights over time."""
+def pair(logs: tuple[pa.Table, pa.Table], names: Sequence[str]) -> Plot:
+    """Return position, attitude and what moves the robots of two flights over time."""
     times = [since_release(log) for log in logs]
     panels = []
-    for _, curve in shown_curves(logs[0]):
+    for _, curve in shown_curves(*logs):
         read = [curve.read(log) for log in logs]
         for index, title in enumerate(curve.names):
             both = tuple(
@@ -178,7 +179,7 @@ def pair(logs: Sequence[pa.Table], names: Sequence[str]) -> Plot:
 def difference(a: pa.Table, b: pa.Table) -> Plot | None:
     """Return the second flight less the first over the time that both flew; None where they have none in common."""
     panels = []
-    for label, curve in shown_curves(a):
+    for label, curve in shown_curves(a, b):
         times, miss = _miss(a, b, curve)
         if len(times) > 1:
             lines = zip(curve.names, curve.colours, miss.T, strict=True)
@@ -205,7 +206,7 @@ def _apart(a: pa.Table, b: pa.Table) -> Iterator[Apart]:
     lined_up = release_of(a.schema.metadata) == release_of(b.schema.metadata)
     if (lined_up and not (is_real(a) or is_real(b))) or min(log.num_rows for log in free) < 2:
         return
-    for _, curve in shown_curves(a):
+    for _, curve in shown_curves(a, b):
         _, differences = _miss(a, b, curve)
         for name, values in zip(curve.names, differences.T, strict=True):
             miss = values[np.isfinite(values)]

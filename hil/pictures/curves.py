@@ -223,7 +223,7 @@ def own_columns(rows: pa.Table, group: str) -> list[Curves]:
         Curves(
             tuple(name.removeprefix(f"{group}.") for name in names),
             tuple(SERIES_COLOURS[index % len(SERIES_COLOURS)] for index in range(len(names))),
-            unit, plain(*names),
+            unit, plain(*names), needs=" ".join(names),
         )
         for unit, names in by_unit.items()
     ]  # fmt: skip

@@ -173,6 +173,23 @@ def test_the_difference_is_the_second_less_the_first_at_the_same_time(runs: dict
 
 
 @pytest.mark.long
+def test_of_two_different_robots_position_and_attitude_are_compared(
+    runs: dict[str, Path], tmp_path: Path
+) -> None:
+    flaps = load_flown(runs["one"])
+    log = flaps.log.rename_columns(
+        [
+            f"rotor.thrust_{name[-1]}" if name.startswith("truth.flap_") else name
+            for name in flaps.log.column_names
+        ]
+    )
+    rotors = FlownRun(log, flaps.result)
+    for a, b in ((flaps, rotors), (rotors, flaps)):
+        page = Page(write_comparison(tmp_path, a, b, compare(a, b)).read_text(encoding="utf-8"))
+        labels = [panel["label"] for panel in page.plots["both"]["panels"]]
+        assert labels == ["x [cm]", "y [cm]", "z [cm]", "roll [deg]", "pitch [deg]", "yaw [deg]"]
+
+
 def test_the_caption_names_the_colours_of_the_lines(runs: dict[str, Path], tmp_path: Path) -> None:
     a, b = load_flown(runs["one"]), load_flown(runs["two"])
     figure = pair((a.log, b.log), ("a", "b"))
