@@ -28,11 +28,13 @@ from firmware_py.table import OF_PROFILE
 from hil.errors import LabError
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.metrics import body, column
+from hil.laboratory.recorder import stored_in
 from hil.live.rerun_screen import RerunScreen
 from hil.live.window import LOOPBACK, free_port
 from hil.pictures import curves
 from hil.pictures.pages import data_uri, library
 from hil.pictures.video import GOAL_COLUMNS, VideoScene
+from hil.scene import Look, Points
 
 PORT = 9095
 PAGE = Path(__file__).with_name("panel.html")
@@ -54,8 +56,8 @@ class PanelScreen:
     def __init__(self, program: str, typed: Callable[[str], None]) -> None:
         self._viewer: RerunScreen | None = None  # rerun's, once somebody wants it
         self.wants_viewer = False
-        self._scene: VideoScene | None = None
         self._past: list[pa.Table] = []  # the rows of the last seconds
+        self._goals: list[Points] = []  # (3,) [m] each, of the whole flight: the picture shows them all
         self.typed, self.token = typed, os.urandom(16).hex()
         self.pages: set[_Socket] = set()
         self.texts: list[str] = []
@@ -96,12 +98,11 @@ class PanelScreen:
         message: dict[str, Any] = {"state": _state(row), **_curves(rows)}
         if np.isfinite(body(row, "x", "qw")).all():
             past = pa.concat_tables(self._past)
-            self._scene = self._scene or VideoScene(row)
             path, course = body(past, "x", "y", "z")[::3], column(past, *GOAL_COLUMNS)[::3]
-            file = io.BytesIO()
-            self._scene.at(row, path[np.isfinite(path).all(axis=1)], course).save(
-                file, format="png", compress_level=1
-            )
+            path, file = path[np.isfinite(path).all(axis=1)], io.BytesIO()
+            self._goals.append(column(row, *GOAL_COLUMNS)[0])
+            scene = VideoScene(Look.read(stored_in(row.schema.metadata, "look")), np.array(self._goals), path)
+            scene.at(row, path, course).save(file, format="png", compress_level=1)
             message["scene"] = data_uri(file.getvalue())
         return message
 

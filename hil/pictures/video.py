@@ -35,6 +35,7 @@ CURVES_WIDTH = 440
 SHARPER = 2  # times, for smooth edges
 TRAIL_S = 4.0
 EYE = np.array([0.75, -0.62, 0.42])  # [m] from the middle of the scene
+FREE = 0.1  # [m] around the middle, which is in the picture from there
 ZOOM = 3.3  # width of what lies as far away as the middle, as a share of that distance
 SKY, INK, GOAL, PATH, TIME = (14, 18, 22), (136, 153, 170), (213, 94, 0), (255, 255, 255), (60, 60, 60)
 GOAL_COLUMNS = ("goal.x", "goal.y", "goal.z")
@@ -65,9 +66,10 @@ def write_gif(run: Path) -> Path:
         raise LabError(
             f"--gif {run}: {count / FRAMES_HZ:.0f} s: a GIF holds at most {GIF_MOST // FRAMES_HZ} s; use --video"
         )
-    path, pictures = run / GIF, frames(log)
-    first = next(pictures).quantize(64, dither=Image.Dither.NONE)
-    rest = [picture.quantize(palette=first, dither=Image.Dither.NONE) for picture in pictures]
+    # the last frame has all colours: nothing of its curves is pale
+    palette = next(frames(log, _instants(log)[-1:])).quantize(64, dither=Image.Dither.NONE)
+    path = run / GIF
+    first, *rest = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in frames(log))
     lengths = [length for length, _ in zip(cycle(GIF_MS), range(count), strict=False)]
     with writing("--gif", path):
         first.save(path, save_all=True, append_images=rest, duration=lengths, loop=0, optimize=True)
@@ -82,11 +84,13 @@ def _instants(log: pa.Table) -> NDArray[np.float64]:
     return np.asarray(times[0] + np.arange(0.0, times[-1] - times[0], 1.0 / FRAMES_HZ))
 
 
-def frames(log: pa.Table) -> Iterator[Image.Image]:
-    """Yield a picture of the flight for each thirtieth of a second after its release."""
+def frames(log: pa.Table, instants: NDArray[np.float64] | None = None) -> Iterator[Image.Image]:
+    """Yield a picture of the flight for each thirtieth of a second after its release, or for given instants [s]."""
     flight = known(free_flight(log))
-    instants, view, graph = _instants(log), VideoScene(flight), _Graph(log, flight)
+    instants = _instants(log) if instants is None else instants
     times, path, course = since_release(flight), body(flight, "x", "y", "z"), column(flight, *GOAL_COLUMNS)
+    view = VideoScene(Look.read(stored_in(flight.schema.metadata, "look")), course, path)
+    graph = _Graph(log, flight)
     rows = np.searchsorted(times, instants)
     for row, at_s in zip(rows.tolist(), instants.tolist(), strict=True):
         whole = Image.new("RGB", (SIDE + CURVES_WIDTH, HEIGHT), SKY)
@@ -111,13 +115,16 @@ def faces(
 class VideoScene:
     """Draws the robot at a row of a flight, its path, its goal with the box, and the goal's path."""
 
-    def __init__(self, flight: pa.Table) -> None:
-        """Look at the middle of the goals of these rows."""
-        self._robot = Look.read(stored_in(flight.schema.metadata, "look"))
-        middle = column(flight, *GOAL_COLUMNS).mean(axis=0)
+    def __init__(self, robot: Look, goals: Points, places: Points) -> None:
+        """Look at the middle of the goals, from where they and the robot's places, (N, 3) [m] each, are in the picture."""
+        self._robot = robot
+        middle = (goals.min(axis=0) + goals.max(axis=0)) / 2
         back = EYE / np.linalg.norm(EYE)
         right = np.cross([0.0, 0.0, 1.0], back) / np.linalg.norm(back[:2])
-        self._eye, self._look = middle + EYE, np.stack((right, np.cross(back, right), back))
+        self._look = np.stack((right, np.cross(back, right), back))
+        across, up, near = np.abs((np.concatenate([goals, places]) - middle) @ self._look.T).max(axis=0)
+        away = ZOOM * max(0.0, max(across, up) - FREE) + max(0.0, near - FREE)
+        self._eye = middle + EYE + away * back
 
     def at(self, row: pa.Table, trail: Points, course: Points) -> Image.Image:
         """Return the picture of one row, with the last places of the robot and the goal's path, (N, 3) [m] each."""

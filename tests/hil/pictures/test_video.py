@@ -15,7 +15,8 @@ from hil.laboratory.metrics import free_flight
 from hil.laboratory.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
-from hil.pictures import video
+from hil.pictures import curves, video
+from hil.scene import Look
 from support.command import Cli
 
 av = pytest.importorskip("av")
@@ -51,6 +52,28 @@ def test_each_frame_shows_the_robot_of_its_instant_and_the_curves_up_to_it(folde
     assert all((np.abs(a - b).max(axis=2) > 40).any() for a, b in pairwise(scenes))
     ink = [(picture[:, video.SIDE :].min(axis=2) < 100).sum() for picture in pictures]
     assert ink[0] < ink[15] < ink[-1]
+
+
+def test_a_gif_has_the_colours_of_the_curves(folder: Path) -> None:
+    video.write_gif(folder)
+    with Image.open(folder / "flight.gif") as picture:
+        picture.seek(picture.n_frames - 1)
+        shown = np.asarray(picture.convert("RGB")).reshape(-1, 3).astype(int)
+    for colour in curves.FLAP_COLOURS:
+        wanted = [int(colour[at : at + 2], 16) for at in (1, 3, 5)]
+        assert np.abs(shown - wanted).max(axis=1).min() < 12, colour
+
+
+def test_the_scene_shows_every_goal_and_every_place_of_the_robot() -> None:
+    still = np.zeros((1, 3))
+    for far in (0.0, 0.5, 3.0):
+        goals = np.array([(0.0, 0.0, 0.0), (far, -far, 2 * far), (-far, far, 0.0)])
+        for places in (still, goals + np.array([0.3, 0.0, -0.3])):
+            view = video.VideoScene(Look(), goals, places)
+            seen, distances = view._seen(np.concatenate([goals, places]))
+            assert (distances > 0.3).all()
+            assert seen.min() > 0
+            assert seen.max() < video.SHARPER * video.SIDE
 
 
 def test_the_robot_has_its_plates_where_the_geometry_has_them() -> None:
