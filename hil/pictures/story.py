@@ -4,9 +4,10 @@ the board's estimate, its poses and its flaps, which state only recorded facts.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,9 +15,10 @@ from numpy.typing import NDArray
 
 from firmware_py.wire.supervisor import State
 from hil.laboratory.fault_kinds import KINDS
-from hil.laboratory.faults import spans_of
+from hil.laboratory.faults import Span, spans_of
 from hil.laboratory.metrics import (
     BOX,
+    METRICS,
     NEAR,
     attitude_error,
     column,
@@ -34,6 +36,13 @@ from hil.pictures.monitor import REFUSALS
 from hil.pictures.pages import PageFigure, embedded
 from hil.pictures.panels import Marks, Panel, Plot, Series, Spell, panel, saturated
 
+FAILSAFE = "supervisor: failsafe, "  # begins a line of the board; its cause follows
+MEANING = {
+    "silence": "silence, the board has fused no pose for too long",
+    "imu stale": "the gyro delivers nothing new",
+}
+ROW_S = 0.02  # a line of the board and the row of its state are no farther apart
+
 
 @dataclass(frozen=True, slots=True)
 class Moment:
@@ -43,8 +52,10 @@ class Moment:
     text: str
 
 
-def story_of(log: pa.Table, result: Result) -> list[Moment]:
-    """Return release, faults, the first limit passed, the first command at its limit, failsafes and loss, in order."""
+def story_of(log: pa.Table, result: Result, events: Iterable[Mapping[str, Any]] = ()) -> list[Moment]:
+    """Return release, faults, the first limit passed and the end of that, the first command at its limit, failsafes and
+    loss, in order; `events` are those of the run, which have the causes of failsafes.
+    """
     release_us = release_of(log.schema.metadata)
     free = free_flight(log)
     if free.num_rows == 0:
@@ -58,15 +69,34 @@ def story_of(log: pa.Table, result: Result) -> list[Moment]:
     passed = [(_first(wrong), name) for name, wrong in _passed(free, result)]
     if passed:
         row, name = min(passed)
-        moments.append(Moment(seconds[row], f"first limit passed: {name}"))
+        moments += [Moment(seconds[row], f"first limit passed: {name}"), *_away(free)]
+    first: dict[int, list[str]] = {}
     for name, at_limit in saturated(free):
-        moments.append(Moment(seconds[_first(at_limit)], f"{name} saturates for the first time"))
+        first.setdefault(_first(at_limit), []).append(name)
+    for row, names in first.items():
+        verb = "saturate" if len(names) > 1 else "saturates"
+        moments.append(Moment(seconds[row], f"{', '.join(names)} {verb} for the first time"))
     failsafe = column(free, "supervisor.state") == State.FAILSAFE
+    causes = {1e-6 * (one["t_us"] - release_us): one["text"].partition(FAILSAFE)[2] for one in events}
     for row in np.flatnonzero(np.diff(failsafe, prepend=False)).tolist():
-        moments.append(Moment(seconds[row], f"failsafe {'begins' if failsafe[row] else 'ends'}"))
+        why = [cause for at_s, cause in causes.items() if cause and abs(at_s - seconds[row]) < ROW_S]
+        text = f"failsafe begins{''.join(f': {MEANING.get(one, one)}' for one in why)}"
+        moments.append(Moment(seconds[row], text if failsafe[row] else "failsafe ends"))
     if result.outcome == "lost":
         moments.append(Moment(seconds[-1], f"lost: {result.cause}"))
     return sorted(moments, key=lambda moment: moment.t_s)
+
+
+def _away(flight: pa.Table) -> Iterator[Moment]:
+    """Yield when the robot was farthest from its goal, and since when it stayed near it to the end."""
+    seconds, error = since_release(flight), np.abs(position_error(flight))
+    if not np.isfinite(error).all():
+        return
+    row, axis = np.unravel_index(np.argmax(error), error.shape)
+    yield Moment(seconds[row], f"farthest from the goal: {100 * error[row, axis]:.1f} cm ({'xyz'[axis]})")
+    far = np.flatnonzero((error > NEAR).any(axis=1))
+    if len(far) and far[-1] + 1 < len(seconds):
+        yield Moment(seconds[far[-1] + 1], f"within {100 * NEAR:.0f} cm of the goal from here to the end")
 
 
 def _first(wrong: NDArray[np.bool_]) -> int:
@@ -99,6 +129,7 @@ class FailedLimit:
     text: str  # the verdict
     at_s: float | None  # first passed; None: it has no such instant
     cause: str  # the fault that came before; empty where the instant is unknown
+    meaning: str  # of the metric; empty where the name says it
 
 
 RECENT_S = 3.0  # a fault that ended longer ago is not named as the cause
@@ -113,8 +144,14 @@ def failures_of(log: pa.Table, result: Result) -> list[FailedLimit]:
     )
     if result.outcome == "lost" and len(times):
         passed["lost"] = float(times[-1])
+    known = {**METRICS, **result.own_metrics}
     found = [
-        FailedLimit(str(one), at_s := passed.get(one.metric), "" if at_s is None else _before(log, at_s))
+        FailedLimit(
+            str(one),
+            at_s := passed.get(one.metric),
+            "" if at_s is None else _before(log, at_s),
+            known[one.metric].meaning if one.metric in known and one.metric != "lost" else "",
+        )
         for one in result.failed
     ]
     return sorted(found, key=lambda failure: math.inf if failure.at_s is None else failure.at_s)
@@ -125,7 +162,7 @@ def _before(log: pa.Table, at_s: float) -> str:
     release_us = release_of(log.schema.metadata)
     spans = [(1e-6 * (span.begin_us - release_us), span) for span in spans_of(log.schema.metadata)]
     recent = [
-        (begin_s, str(span.fault), KINDS[span.fault.kind].meaning)
+        (begin_s, str(span.fault), _meaning(span))
         for begin_s, span in spans
         if begin_s <= at_s <= 1e-6 * (span.end_us - release_us) + RECENT_S
     ]
@@ -133,6 +170,12 @@ def _before(log: pa.Table, at_s: float) -> str:
         return "no fault was in force"
     begin_s, fault, meaning = max(recent)
     return f"{at_s - begin_s:.2f} s after the begin of {fault} ({meaning})"
+
+
+def _meaning(span: Span) -> str:
+    """Return what a fault is, with its size where that has a unit."""
+    kind = KINDS[span.fault.kind]
+    return f"{span.fault.size:g} {kind.unit}: {kind.meaning}" if kind.sized and kind.unit else kind.meaning
 
 
 BEFORE_S, AFTER_S = 0.5, 1.0  # of a fault
@@ -238,7 +281,16 @@ def _robot(rows: pa.Table) -> Iterator[str]:
     seen = "In truth" if not is_real(rows) else "By the cameras"
     far, turned = _largest(curves.POSITION, rows), _largest(curves.ATTITUDE, rows)
     if far and turned:
-        yield f"{seen} the robot was up to {far} away from its goal, and {turned} from its attitude."
+        yield f"{seen} the robot was up to {far} away from its goal, and {turned} from its attitude{_speed(rows)}."
+
+
+def _speed(rows: pa.Table) -> str:
+    """Return the highest speed with its instant; empty where it is unknown."""
+    if is_real(rows):
+        return ""
+    speed = np.linalg.norm(column(rows, "truth.vx", "truth.vy", "truth.vz"), axis=1)
+    row = int(np.argmax(speed))
+    return f"; it moved at up to {speed[row]:.2f} m/s (at {since_release(rows)[row]:.2f} s)"
 
 
 def _belief(rows: pa.Table) -> Iterator[str]:
@@ -263,7 +315,7 @@ def _poses(rows: pa.Table) -> Iterator[str]:
         known = [name for name in names if name in rows.column_names]
         count = sum(float(np.ptp(column(rows, name))) for name in known)
         if count > 0:
-            yield f"{text.capitalize()}: {count:.0f} times."
+            yield f"{text.capitalize()}: {'once' if count == 1 else f'{count:.0f} times'}."
 
 
 def _limits(rows: pa.Table) -> Iterator[str]:
@@ -284,13 +336,15 @@ def _flaps(rows: pa.Table) -> Iterator[str]:
     away = np.abs(angles - curves.FLAPS_COMMAND.read(rows))
     deviations = column(rows, *(f"estimate.flap_{flap}" for flap in (1, 2, 3, 4)))
     believed = np.degrees(OUTWARDS * hover + deviations)
-    for flap in range(4):
-        if (away[:, flap] > FAR_DEG).mean() * (times[-1] - times[0]) > FAR_S:
-            row = int(np.argmax(np.abs(angles - believed)[:, flap]))
-            yield (
-                f"Flap {flap + 1} was up to {away[:, flap].max():.0f} deg away from its command: at {times[row]:.2f} s it "
-                f"stood at {angles[row, flap]:.0f} deg, and the board believed {believed[row, flap]:.0f} deg."
-            )
+    wrong = np.abs(angles - believed)
+    # a flap that only lags behind its command is known to the board
+    lasts_s = ((away > FAR_DEG) & (wrong > FAR_DEG)).mean(axis=0) * (times[-1] - times[0])
+    for flap in np.flatnonzero(lasts_s > FAR_S).tolist():
+        row = int(np.argmax(wrong[:, flap]))
+        yield (
+            f"Flap {flap + 1} was up to {away[:, flap].max():.0f} deg away from its command: at {times[row]:.2f} s it "
+            f"stood at {angles[row, flap]:z.0f} deg, and the board believed {believed[row, flap]:z.0f} deg."
+        )
 
 
 def _rotors(rows: pa.Table) -> Iterator[str]:

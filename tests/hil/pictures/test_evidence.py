@@ -10,14 +10,14 @@ import pytest
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.faults import parse
 from hil.laboratory.metrics import column, free_flight, position_error
-from hil.laboratory.recorder import load_log
+from hil.laboratory.recorder import load_log, stored_in
 from hil.laboratory.request import Request
 from hil.laboratory.result import read_result
 from hil.laboratory.run import fly
 from hil.pictures.curves import since_release
 from hil.pictures.figures import course_of, goal_moves
 from hil.pictures.panels import saturated
-from hil.pictures.story import _rotors, evidence, failures_of
+from hil.pictures.story import _rotors, evidence, failures_of, story_of
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +37,8 @@ def test_the_robot_and_the_time_without_a_pose_are_those_of_the_log(folder: Path
     rows = log.filter((since_release(log) >= 0.5) & (since_release(log) <= 1.1))
     robot, belief, supervisor, poses, *_ = evidence(rows)
     error = 100 * np.abs(position_error(rows))
+    speed = np.linalg.norm(column(rows, "truth.vx", "truth.vy", "truth.vz"), axis=1)
+    assert numbers(robot)[4] == pytest.approx(speed.max(), abs=0.006)
     assert numbers(robot)[0] == pytest.approx(error.max(), abs=0.06)
     assert f"({'xyz'[int(np.argmax(error.max(axis=0)))]}, at" in robot
     assert belief.startswith("The board's estimate was up to")
@@ -58,6 +60,37 @@ def test_a_stuck_flap_is_named_with_what_the_board_believed(folder: Path) -> Non
     assert evidence(log.slice(0, 1)) == []
 
 
+def test_a_flap_that_lags_as_the_board_knows_is_not_named(folder: Path) -> None:
+    log = load_log(folder)
+    rows = log.filter(since_release(log) >= 1.2)
+    lagging = rows.set_column(rows.column_names.index("estimate.flap_2"), "estimate.flap_2", known_flap(rows))
+    assert not any(sentence.startswith("Flap 2") for sentence in evidence(lagging))
+
+
+def known_flap(rows: pa.Table) -> pa.Array:
+    """What the board's estimate of flap 2 is when it believes the truth."""
+    hover = stored_in(rows.schema.metadata, "config")["allocation"]["hover_angle"]
+    return pa.array(column(rows, "truth.flap_2") + hover)
+
+
+def test_where_it_was_farthest_and_from_when_on_it_stayed_near_is_told(folder: Path) -> None:
+    log, result = load_log(folder), read_result(folder)
+    told = {moment.text.partition(":")[0]: moment for moment in story_of(log, result)}
+    free = free_flight(log)
+    error, times = np.abs(position_error(free)), since_release(free)
+    farthest = told["farthest from the goal"]
+    assert farthest.t_s == times[np.argmax(error.max(axis=1))]
+    assert numbers(farthest.text) == [pytest.approx(100 * error.max(), abs=0.06)]
+    near = told.get("within 6 cm of the goal from here to the end")
+    assert (near is None) == (error[-1].max() > 0.06)
+    calm = log.set_column(log.column_names.index("truth.y"), "truth.y", pa.array(np.zeros(log.num_rows)))
+    calm = calm.set_column(log.column_names.index("truth.z"), "truth.z", log.column("goal.z"))
+    away = np.where((since_release(log) > 1.0) & (since_release(log) < 2.0), 0.3, 0.0)
+    calm = calm.set_column(log.column_names.index("truth.x"), "truth.x", pa.array(away))
+    (back,) = [one for one in story_of(calm, result) if one.text.startswith("within 6 cm")]
+    assert back.t_s == pytest.approx(2.0, abs=0.011)
+
+
 def test_commands_at_their_limits_are_named_with_how_long_they_stood_there(folder: Path) -> None:
     log = load_log(folder)
     rows = log.filter(since_release(log) >= 1.5)
@@ -76,7 +109,9 @@ def test_a_limit_that_failed_names_the_fault_that_began_last(folder: Path) -> No
     first = failures[0]
     assert first.at_s is not None
     assert first.at_s > 1.5
-    assert first.cause == f"{first.at_s - 1.5:.2f} s after the begin of push.y@1.5=3 (force along y of W)"
+    assert (
+        first.cause == f"{first.at_s - 1.5:.2f} s after the begin of push.y@1.5=3 (3 N: force along y of W)"
+    )
 
 
 def test_the_course_is_the_flight_from_the_first_goal_red_while_a_fault_is_in_force(folder: Path) -> None:

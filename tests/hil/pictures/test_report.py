@@ -227,19 +227,24 @@ def test_the_report_begins_with_what_was_asked_for_what_failed_and_what_happened
     assert "1.99 s</span> on, 0.99 s after the begin of servo.slow.2@1=0.5" in failures
     assert 'href="#close-up-2"' in failures
     assert "The robot was lost, and so no limit holds." in failures
-    told = [(moment.t_s, moment.text) for moment in story_of(changed, lost)]
+    failsafe_us = int(log.column("t")[160].as_py())
+    events = [{"t_us": failsafe_us, "source": "board", "text": "supervisor: failsafe, silence"}]
+    told = [(moment.t_s, moment.text) for moment in story_of(changed, lost, events)]
     assert [(pytest.approx(t_s, abs=2e-3), text) for t_s, text in told] == [
         (0.0, "released"),
         (0.3, "fault push.y@0.3=2 begins"),
         (0.4, "fault push.y@0.3=2 ends"),
         (0.5, "first limit passed: in_box"),
+        (0.5, "farthest from the goal: 20.0 cm (x)"),
         (0.55, "flap 2 saturates for the first time"),
-        (0.6, "failsafe begins"),
+        (0.6, "failsafe begins: silence, the board has fused no pose for too long"),
         (0.7, "failsafe ends"),
         (1.0, "fault servo.slow.2@1=0.5 begins"),
         (1.99, "lost: fell"),
     ]
-    assert all(text in story for _, text in told)
+    assert all(text.partition(": silence")[0] in story for _, text in told), (
+        "the events of the page have no cause"
+    )
 
 
 def test_faults_failsafe_flap_limits_and_loss_are_marked_for_every_figure_and_shown_close_up(
