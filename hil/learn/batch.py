@@ -22,7 +22,9 @@ from firmware_py.core.guard import allocate
 from firmware_py.core.observation import ACTIONS, act, observe
 from firmware_py.core.servo import drive_servos
 from firmware_py.core.structs import ATTITUDE, FLAP, RATE, Control, Estimator
+from hil.arguments import checked
 from hil.config import LabConfig
+from hil.errors import LabError
 from hil.floaty.plant import Plant
 from hil.learn.tasks import PUSH_S, PUSHES, Episode
 from hil.world import layout as at
@@ -40,15 +42,24 @@ compiled = compiler(Path(__file__).parent, *SOURCES)
 Actions = NDArray[np.float32]
 
 
+@checked
 @dataclass(frozen=True, slots=True)
 class EstimateErrors:
-    """Errors of the estimate, rms. Errors of pose and velocity last `tau_s`; those of the rates change in every step."""
+    """Errors of the estimate, rms. Errors of pose and velocity last `tau_s`; those of the rates change in every step.
+
+    Raises `LabError` for values that no estimate can have.
+    """
 
     position: float = 0.0015  # [m]
     velocity: float = 0.025  # [m/s]
     attitude: float = 0.005  # [rad]
     rate: float = 0.025  # [rad/s]
     tau_s: float = 0.05
+
+    def __post_init__(self) -> None:
+        sizes = (self.position, self.velocity, self.attitude, self.rate)
+        if not (all(0.0 <= size < math.inf for size in sizes) and 0.0 < self.tau_s < math.inf):
+            raise LabError(f"{self}: expected sizes of 0 or more, and tau_s above 0")
 
 
 @compiled

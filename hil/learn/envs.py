@@ -24,6 +24,7 @@ from firmware_py.core.observation import ACTIONS, OBSERVATIONS
 from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner
 from firmware_py.geometry import rotation_matrix, to_euler_zyx, wrap_angle
 from ground_station.trajectory import Goal, Offsets, Sine, Trajectory
+from hil.arguments import checked
 from hil.campaigns.config import find_spec, read_spec
 from hil.campaigns.sampling import draw
 from hil.config import DEFAULT_PROFILE, Overrides, load_config, settings_of
@@ -57,6 +58,7 @@ ACTION_SPACE = Box(-1.0, 1.0, (ACTIONS,), np.float32)
 Info = dict[str, Any]
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class Setup:
     """The settings of an environment. Raises `LabError` for impossible values."""
@@ -98,7 +100,8 @@ def make_env(task: str, fidelity: Fidelity = "fast", **setup: Any) -> gymnasium.
     """Return the environment of a task with one robot; the keywords are those of `Setup`. Raises `LabError`."""
     if fidelity not in ("fast", "firmware"):
         raise LabError(f"fidelity = {fidelity!r}: expected fast or firmware")
-    return (FirmwareEnv if fidelity == "firmware" else FastEnv)(find_task(task), _setup(setup))
+    setup.pop("render_mode", None)
+    return (FirmwareEnv if fidelity == "firmware" else FastEnv)(find_task(task), Setup(**setup))
 
 
 def make_vec(task: str, num_envs: int = 1, fidelity: Fidelity = "fast", **setup: Any) -> FastVectorEnv:
@@ -109,17 +112,8 @@ def make_vec(task: str, num_envs: int = 1, fidelity: Fidelity = "fast", **setup:
         )
     if num_envs < 1:
         raise LabError(f"num_envs = {num_envs!r}: expected 1 or more")
-    return FastVectorEnv(find_task(task), num_envs, _setup(setup))
-
-
-def _setup(values: dict[str, Any]) -> Setup:
-    values.pop("render_mode", None)
-    try:
-        return Setup(**values)
-    except TypeError as error:
-        raise LabError(
-            f"{str(error).removeprefix('Setup.__init__() ')}: expected {', '.join(Setup.__annotations__)}"
-        ) from None
+    setup.pop("render_mode", None)
+    return FastVectorEnv(find_task(task), num_envs, Setup(**setup))
 
 
 class FastVectorEnv(VectorEnv[Actions, Actions, NDArray[Any]]):
@@ -219,6 +213,10 @@ class FirmwareEnv(gymnasium.Env[Actions, Actions]):
     """
 
     def __init__(self, task: EpisodeTask, setup: Setup) -> None:
+        if setup.pose_delay_us or setup.errors != EstimateErrors():
+            raise LabError(
+                'pose_delay_us, errors: need fidelity="fast"; the laboratory has its own, and faults'
+            )
         self.observation_space, self.action_space = OBSERVATION_SPACE, ACTION_SPACE
         self._task, self._setup = task, setup
         self._robots = setup.settings()

@@ -206,7 +206,15 @@ def test_the_errors_of_the_fast_model_are_those_of_the_laboratory_s_hover(tmp_pa
         ({"task": "Hover", "robot_count": 0}, "robot_count = 0: expected 1 or more"),
         ({"task": "Hover", "profile": "nosuch"}, "profile 'nosuch'"),
         ({"task": "Hover", "faults": ["mocap.dropout@1"]}, 'need fidelity="firmware"'),
-        ({"task": "Hover", "durations": 3}, "unexpected keyword argument 'durations': expected profile"),
+        ({"task": "Hover", "durations": 3}, "unknown argument 'durations'; did you mean duration_s?"),
+        ({"task": "Hover", "duration_s": "5"}, "duration_s = '5': expected a number"),
+        ({"task": "Hover", "robots": 3}, "robots = 3: expected text"),
+        ({"task": "Hover", "errors": None}, "errors = None: expected a EstimateErrors"),
+        ({"task": "Hover", "fidelity": "firmware", "pose_delay_us": 90_000}, 'need fidelity="fast"'),
+        (
+            {"task": "Hover", "fidelity": "firmware", "errors": hil.learn.EstimateErrors(tau_s=1.0)},
+            'need fidelity="fast"',
+        ),
         ({"task": "Hover", "num_envs": 0}, "num_envs = 0: expected 1 or more"),
     ],
 )
@@ -216,6 +224,12 @@ def test_bad_input_is_one_line(arguments: dict[str, Any], message: str) -> None:
         make(**arguments)
     assert message in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("wrong", [{"position": -0.1}, {"rate": float("nan")}, {"tau_s": 0.0}])
+def test_errors_that_no_estimate_can_have_are_one_line(wrong: dict[str, float]) -> None:
+    with pytest.raises(LabError, match="expected sizes of 0 or more, and tau_s above 0"):
+        hil.learn.EstimateErrors(**wrong)
 
 
 def test_a_step_before_the_reset_is_refused() -> None:
