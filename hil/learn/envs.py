@@ -238,8 +238,8 @@ class FirmwareEnv(gymnasium.Env[Actions, Actions]):
     def step(self, action: Actions) -> tuple[Actions, float, bool, bool, Info]:
         """Hand the action to the control law, and fly up to its next step."""
         flight = self.flight
-        if flight is None or self._blocks is None:
-            raise gymnasium.error.ResetNeeded("step: call reset first")
+        if flight is None or self._blocks is None or flight.robot.body.lost is not None:
+            raise gymnasium.error.ResetNeeded("step: call reset first; a flight ends with the robot's loss")
         limited = np.clip(np.asarray(action, np.float32).reshape(ACTIONS), -1.0, 1.0)
         own: Any = self._blocks.named["controller_own"].fields
         own.u1, own.u2, own.u3, own.u4 = limited

@@ -235,3 +235,17 @@ def test_errors_that_no_estimate_can_have_are_one_line(wrong: dict[str, float]) 
 def test_a_step_before_the_reset_is_refused() -> None:
     with pytest.raises(gymnasium.error.ResetNeeded, match="call reset first"):
         make_env("Hover", "firmware").step(np.zeros(4, np.float32))
+
+
+@pytest.mark.long
+def test_a_step_after_the_loss_is_refused() -> None:
+    env = make_env("Hover", "firmware")
+    env.reset(seed=1)
+    lost = False
+    for _ in range(999):
+        _, _, lost, _, _ = env.step(np.zeros(4, np.float32))
+        if lost:
+            break
+    assert lost, "nothing controls it"
+    with pytest.raises(gymnasium.error.ResetNeeded, match="ends with the robot's loss"):
+        env.step(np.zeros(4, np.float32))
