@@ -55,17 +55,19 @@ def identify(
     Exit code 0: at least one constant is identified; 1: none; 2: bad input.
     """
     require("floaty identify", "identify", "scipy")
-    from hil.identify.identify import IDENTIFIED
+    from hil.identify.identify import IDENTIFIED, check_held_out
     from hil.identify.identify import identify as identify_records
     from hil.identify.pages import write_pages
     from hil.identify.profile_out import write_profile
     from hil.identify.record import load_record, profile_of
 
-    if profile_out is not None and profile_out.suffix != ".toml":
-        raise LabError(f"--profile-out {profile_out}: a profile's name ends in .toml")
+    _check_profile("--profile-out", profile_out)
     profile = profile or profile_of(runs[0])
+    records = [load_record(run, profile) for run in runs]
     held_out = None if validate is None else load_record(validate, profile)
-    found = identify_records([load_record(run, profile) for run in runs])
+    if held_out is not None:
+        check_held_out(held_out, records)
+    found = identify_records(records)
     _print_constants(found)
     if found.excited or found.free:
         with writing("--out", out):
@@ -76,6 +78,14 @@ def identify(
             console.print(f"  {notice}", soft_wrap=True)
         console.print(f"  {profile_out}   (floaty fly hover --profile {profile_out})", soft_wrap=True)
     return 0 if any(constant.verdict == IDENTIFIED for constant in found.constants) else 1
+
+
+def _check_profile(option: str, path: Path | None) -> None:
+    """Refuse what no profile can be written to, before anything is flown or fitted."""
+    if path is not None and path.suffix != ".toml":
+        raise LabError(f"{option} {path}: a profile's name ends in .toml")
+    if path is not None and not path.parent.is_dir():
+        raise LabError(f"{option} {path}: cannot be written ({path.parent} is not a folder)")
 
 
 def _print_constants(found: "Identification") -> None:
@@ -153,8 +163,7 @@ def tune(
     from hil.config import load_config
     from hil.studies.tuning import TuningFlights, fly_round, rounds, write_tuned
 
-    if out is not None and out.suffix != ".toml":
-        raise LabError(f"--out {out}: a profile's name ends in .toml")
+    _check_profile("--out", out)
     with writing("--runs", runs):
         runs.mkdir(parents=True, exist_ok=True)
     announce_compilation()

@@ -25,6 +25,7 @@ from hil.identify.joint import Estimate, Excited, excited_axes, identities, inst
 from hil.identify.plates import turns_of
 from hil.identify.record import Record
 from hil.identify.response import DELAY, LAG, UNIT
+from hil.identify.spectra import windows
 from hil.identify.two_controllers import two_controllers
 from hil.laboratory.robot import Streams
 
@@ -96,7 +97,7 @@ def identify(records: Sequence[Record]) -> Identification:
                 f"{record.name}: {record.lost_rows:.0%} of the telemetry's rows are missing; at most {LOST:.0%} may be"
             )
     for one, other in combinations(records, 2):
-        if np.array_equal(one.t, other.t) and np.array_equal(one.rates, other.rates):
+        if _is_same(one, other):
             raise LabError(f"{other.name}: the same flight as {one.name}: each flight counts once")
     rich = tuple(record for record in records if record.excitation.any())
     free = tuple(record for record in records if not record.excitation.any())
@@ -123,6 +124,20 @@ def identify(records: Sequence[Record]) -> Identification:
         verdict, why = _verdict(constant, Evidence.of(fitted, rich, own), getattr(model, name, nan))
         constants.append(replace(constant, verdict=verdict, why=why))
     return Identification(tuple(constants), excited, fitted, rich, free)
+
+
+def check_held_out(held_out: Record, records: Sequence[Record]) -> None:
+    """Raise `LabError` for a flight that cannot validate the fit of others."""
+    windows(held_out)
+    if any(_is_same(held_out, record) for record in records):
+        raise LabError(f"--validate {held_out.name}: it is one of the fitted flights; expected another")
+    fitted = np.any([record.excitation.any(axis=0) for record in records], axis=0)
+    if not (fitted & held_out.excitation.any(axis=0)).any():
+        raise LabError(f"--validate {held_out.name}: it excites no input of the fit")
+
+
+def _is_same(one: Record, other: Record) -> bool:
+    return np.array_equal(one.t, other.t) and np.array_equal(one.rates, other.rates)
 
 
 def _joint(excited: Sequence[Excited], by_instruments: Estimate, record: Record) -> Estimate:

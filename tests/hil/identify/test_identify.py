@@ -12,11 +12,12 @@ from ground_station.telemetry_log import POSE_COLUMNS, TIME_COLUMN
 from hil.config import load_config
 from hil.design.axes import PITCH as PITCH_AXIS
 from hil.errors import LabError
-from hil.identify.identify import IDENTIFIED, UNKNOWN, Identification, identify
+from hil.identify.identify import IDENTIFIED, UNKNOWN, Identification, check_held_out, identify
 from hil.identify.prediction import one_step
 from hil.identify.profile_out import write_profile
 from hil.identify.record import BOARD_COLUMN, EXCITATIONS, INPUTS, RATES, load_record
 from hil.identify.two_controllers import closed_loop
+from support.command import Cli
 
 PITCH = {
     "pitch_u2": -900.0, "pitch_rate": -22.0, "pitch_pitch": -1300.0, "pitch_vx": -130.0, "x_u2": -0.9, "x_pitch": 2.7,
@@ -147,6 +148,41 @@ def test_a_log_that_cannot_tell_is_refused_with_the_reason(
 ) -> None:
     with pytest.raises(LabError, match=reason):
         identified(tmp_path, flight(5, seconds), change)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        ("same", "it is one of the fitted flights; expected another"),
+        ("free", "no excitation in it"),
+        ("other", "it excites no input of the fit"),
+    ],
+)
+def test_a_flight_that_cannot_validate_is_refused_before_the_fit(
+    tmp_path: Path, wrong: str, reason: str
+) -> None:
+    for name, columns in (("fit", flight(1)), ("held", flight(1 if wrong == "same" else 2))):
+        (tmp_path / name).mkdir()
+        if name == "held" and wrong != "same":
+            excitation = columns[EXCITATIONS[1]]
+            columns[EXCITATIONS[1]] = 0 * excitation
+            columns[EXCITATIONS[0]] = excitation if wrong == "other" else 0 * excitation
+        written(tmp_path / name, columns)
+    fitted, held_out = (load_record(tmp_path / name / "telemetry.csv", "floaty") for name in ("fit", "held"))
+    with pytest.raises(LabError, match=reason):
+        check_held_out(held_out, [fitted])
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"), [("runs", "name ends in .toml"), ("no/x.toml", "no is not a folder")]
+)
+@pytest.mark.parametrize("command", ["identify", "tune"])
+def test_a_profile_that_cannot_be_written_is_refused_at_once(
+    cli: Cli, tmp_path: Path, command: str, name: str, reason: str
+) -> None:
+    out = tmp_path / name
+    call = ("identify", "missing", "--profile-out", out) if command == "identify" else ("tune", "--out", out)
+    assert reason in cli.refusal(*call)
 
 
 @pytest.mark.long
