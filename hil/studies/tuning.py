@@ -95,11 +95,7 @@ class Tuned:
 
 def tune(profile: str, flights: TuningFlights, count: int) -> Tuned:
     """Return gains for a profile's robot and `count` others within its intervals. Raises `LabError` if none exist."""
-    config = load_config(profile)
-    if config.logic.controller:
-        raise LabError(
-            f"{profile}: tune makes gains for the built-in control law, not for {config.logic.controller}"
-        )
+    config = _tunable(profile)
     robots = robots_of(profile, config, count)
     (before,) = flights.hover("before", profile)
     if before.outcome == "lost":
@@ -119,6 +115,15 @@ def tune(profile: str, flights: TuningFlights, count: int) -> Tuned:
         axes.append(judged(task, every, loops, old, new))
     refuse_late(axes, jitter_s)
     return Tuned(tuple(axes), robots, age_s, jitter_s, _with_gains(config, axes), before)
+
+
+def _tunable(profile: str) -> LabConfig:
+    """Return the configuration of a profile. Raises `LabError` for one that flies without the built-in control law."""
+    config = load_config(profile)
+    other = "the Crazyflie's own firmware" if config.pilot.enabled else config.logic.controller
+    if other:
+        raise LabError(f"{profile}: tune makes gains for the built-in control law, not for {other}")
+    return config
 
 
 def _with_gains(config: LabConfig, axes: Sequence[TunedAxis]) -> LabConfig:
@@ -206,6 +211,7 @@ def rounds(profile: str, flights: TuningFlights, count: int, most: int) -> Itera
 
     Raises `LabError` when a robot is lost, or nothing is identified.
     """
+    _tunable(profile)
     for number in range(1, most + 1):
         folder = flights.folder / f"round-{number}"
         own = replace(flights, folder=folder, seed=flights.seed + 10 * (number - 1))

@@ -36,6 +36,8 @@ def test_the_profile_cad_has_the_plate_model_on_board() -> None:
     [
         (["--profile", "nobody"], "neither the name of a profile"),
         (["--profile", "lqr"], "tune makes gains for the built-in control law"),
+        (["--profile", "lqr", "--repeat", "1"], "tune makes gains for the built-in control law"),
+        (["--profile", "crazyflie"], "not for the Crazyflie's own firmware"),
         (["--out", "gains.txt"], "--out gains.txt: a profile's name ends in .toml"),
         (["--repeat", "0"], "--repeat"),
         (["--board", "abacus"], "--board abacus: expected python"),
