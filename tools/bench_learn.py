@@ -1,7 +1,7 @@
-"""Control steps per second of the environments and of RotorPy's batched quadrotors: `python tools/bench_learn.py`.
+"""Control steps per second of the environments, beside RotorPy's and gym-pybullet-drones': `python tools/bench_learn.py`.
 
 Processor time of one core and actions of 0. RotorPy's environment needs the extra `bench`, torch, torchdiffeq, roma and
-stable-baselines3.
+stable-baselines3; gym-pybullet-drones is a repository, not a package: pybullet, transforms3d, and its clone on PYTHONPATH.
 """
 
 import sys
@@ -67,16 +67,28 @@ def rotorpy() -> float:
     return steps_per_s(lambda: env.step(still), PEER_STEPS, MANY)
 
 
+def pybullet() -> float:
+    from gym_pybullet_drones.envs.HoverAviary import HoverAviary
+    from gym_pybullet_drones.utils.enums import ActionType
+
+    env, still = HoverAviary(act=ActionType.RPM, pyb_freq=200, ctrl_freq=100), np.zeros((1, 4), np.float32)
+    return steps_per_s(lambda: env.step(still), WHOLE_STEPS, 1, lambda: env.reset(seed=1))
+
+
+PEERS = {f"RotorPy, {MANY} quadrotors": rotorpy, "gym-pybullet-drones, one quadrotor": pybullet}
+
+
 def main() -> None:
     table = Table(title=f"control steps of 10 ms per second and core: {STATE}")
     table.add_column("environment")
     table.add_column("steps/s", justify="right")
     table.add_row(f"fast, {MANY} robots", f"{fast():,.0f}")
     table.add_row("firmware, one robot in the whole laboratory", f"{whole():,.0f}")
-    try:
-        table.add_row(f"RotorPy, {MANY} quadrotors", f"{rotorpy():,.0f}")
-    except (ImportError, NameError) as error:  # without torchdiffeq it imports, but lacks a name
-        print(f"RotorPy is left out: {error}", file=sys.stderr)
+    for name, measure in PEERS.items():
+        try:
+            table.add_row(name, f"{measure():,.0f}")
+        except (ImportError, NameError) as error:  # RotorPy imports without torchdiffeq, but lacks a name
+            print(f"{name}: left out: {error}", file=sys.stderr)
     Console(width=100).print(table)
 
 
