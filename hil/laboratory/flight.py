@@ -175,7 +175,8 @@ class Flight:
         """Fly to the end, the crash, or Ctrl-C, into a log of `channels`; it is left open for the caller to close."""
         interrupted = False
         self._recorder = recorder
-        for source, text in self._early:
+        early, self._early = self._early, []  # where nothing is recorded, they go there again
+        for source, text in early:
             self.note(source, text)
         try:
             self.lab.run(progress)

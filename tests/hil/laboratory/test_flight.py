@@ -1,5 +1,6 @@
 """Whole flights: the limits of the hover, determinism, what the predictor saves, how flights end."""
 
+import gc
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from hil.commands.tables import print_result, print_seeds
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_again
 from hil.laboratory.flight import Flight
+from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import ALWAYS, METRICS, column, judge
 from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import LOCKSTEP, Bench, Request
@@ -30,6 +32,27 @@ def test_hover_holds_its_limits(tmp_path: Path, seed: int) -> None:
     result = hover(tmp_path / "run", seed=seed)
     assert result.passed, explain(result)
     assert {verdict.metric for verdict in result.verdicts} == {*HOVER.limits, *ALWAYS}
+
+
+def test_flight_without_a_recorder_keeps_what_is_noted() -> None:
+    flight = lockstep_flight(Request.of(HOVER, duration_s=0.1))
+    flight.note("lab", "before the start")
+    assert flight.run().lost is None
+    flight.close()
+
+
+def test_flight_makes_no_garbage_that_only_the_collector_frees() -> None:
+    for duration_s in (0.1, 2.0):  # the first one leaves what is made once per process
+        flight = lockstep_flight(Request.of(HOVER, duration_s=duration_s))
+        gc.collect()
+        gc.disable()
+        try:
+            flight.run()
+            garbage = gc.collect()
+        finally:
+            gc.enable()
+            flight.close()
+    assert garbage == 0
 
 
 @pytest.mark.long
