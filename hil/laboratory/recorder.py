@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from hil.errors import LabError
 from hil.laboratory.ages import at_exposure
-from hil.world.body import Channel
+from hil.world.body import Channel, Quantity
 
 if "pandas" not in sys.modules:
     # The first array imports pandas, to know its types, which takes a second or so in mid-flight. If pandas seems
@@ -38,6 +38,7 @@ if "pandas" not in sys.modules:
     del sys.modules["pandas"]
 
 ROWS_PER_BATCH, BATCH_US = 100, 1_000_000  # whichever is full first goes to disk
+BUFFER_BYTES = 1 << 18  # of the file, more than a batch: it is written at once
 BATCHES_PER_PIECE = 160  # of a long flight's log, written and read at once
 PIECES_IN_MEMORY = 5  # of a log that is read as a whole: some ten minutes
 ROWS_SHOWN = 20  # given to the onlooker together: five times a second
@@ -68,27 +69,38 @@ class Recorder:
         onlooker: Onlooker | None = None,
     ) -> None:
         self.release_us: int | None = None
-        self._sources: list[tuple[Callable[[], Any], NDArray[Any]]] = []
-        self._times = np.zeros(ROWS_PER_BATCH, np.int64)
-        self._row = self._shown = 0
-        self._folder = folder
         self._onlooker = onlooker
-        fields = [pa.field("t", pa.int64(), metadata={"unit": "us", "frame": ""})]
-        for channel in channels:
-            columns = [(name, quantity) for quantity in channel.quantities for name in quantity.names]
-            block = np.zeros((ROWS_PER_BATCH, len(columns)), channel.dtype)
-            self._sources.append((channel.read, block))
-            for name, quantity in columns:
-                metadata_of_column = {"unit": quantity.unit, "frame": quantity.frame}
-                fields.append(pa.field(name, pa.from_numpy_dtype(block.dtype), metadata=metadata_of_column))
+        self._folder = folder
+        self._row = self._shown = 0
+        times = Channel("int64", lambda: 0, (Quantity(("t",), "us"),))
+        # A second of the log, column by column, as the file gets it; the rows are written across.
+        self._columns: list[NDArray[Any]] = []
+        fields: list[pa.Field] = []
+        arrays: list[pa.Array] = []
+        for channel in (times, *channels):
+            named = [(name, quantity) for quantity in channel.quantities for name in quantity.names]
+            columns = np.zeros((len(named), ROWS_PER_BATCH), channel.dtype)
+            kind = pa.from_numpy_dtype(columns.dtype)
+            self._columns.append(columns)
+            for column, (name, quantity) in zip(columns, named, strict=True):
+                of_column = {"unit": quantity.unit, "frame": quantity.frame}
+                fields.append(pa.field(name, kind, metadata=of_column))
+                # Not by `pa.array`, which imports modules in mid-flight.
+                arrays.append(pa.Array.from_buffers(kind, ROWS_PER_BATCH, [None, pa.py_buffer(column)]))
+        self._times = self._columns[0][0]
+        self._sources: list[tuple[Callable[[], Any], NDArray[Any]]] = [
+            (channel.read, columns.T) for channel, columns in zip(channels, self._columns[1:], strict=True)
+        ]
         self._schema = pa.schema(fields, metadata=dict(metadata))
+        self._batch = pa.record_batch(arrays, schema=self._schema)
         self._hash = hashlib.sha256(" ".join(self._schema.names).encode())
         self._file: Any = None
         self._stream: Any = None
         self._events: IO[str] | None = None
         if folder is not None:
-            self._file = pa.OSFile(str(folder / STREAM), "wb")
+            self._file = pa.output_stream(str(folder / STREAM), buffer_size=BUFFER_BYTES)
             self._stream = pa.ipc.new_stream(self._file, self._schema)
+            self._file.flush()
             self._events = (folder / EVENTS).open("w", encoding="utf-8")
 
     def released(self, at_us: int) -> None:
@@ -138,33 +150,20 @@ class Recorder:
 
     def _write_batch(self) -> None:
         self.show()
-        columns = self._columns(0)
+        count = self._row
         self._row = self._shown = 0
-        for values in columns:
-            self._hash.update(values.data)
+        for columns in self._columns:
+            self._hash.update(columns[:, :count].tobytes())
         if self._stream is not None:
-            self._stream.write_batch(self._batch(columns))
+            self._stream.write_batch(self._batch.slice(0, count))
+            self._file.flush()
 
     def show(self) -> None:
-        """Pass the rows that it has not seen to the onlooker."""
+        """Pass the rows that it has not seen to the onlooker, which may keep them."""
         if self._onlooker is not None:
-            self._onlooker.rows(self._batch(self._columns(self._shown)))
+            fresh = self._batch.slice(self._shown, self._row - self._shown).serialize()
+            self._onlooker.rows(pa.ipc.read_record_batch(fresh, self._schema))
             self._shown = self._row
-
-    def _columns(self, first: int) -> list[NDArray[Any]]:
-        """Return copies of the columns from a row on."""
-        columns = [self._times[first : self._row].copy()]
-        for _, block in self._sources:
-            columns.extend(block[first : self._row].T.copy())
-        return columns
-
-    def _batch(self, columns: list[NDArray[Any]]) -> pa.RecordBatch:
-        # Not by `pa.array`, which imports modules in mid-flight.
-        arrays = [
-            pa.Array.from_buffers(kind, len(values), [None, pa.py_buffer(values)])
-            for values, kind in zip(columns, self._schema.types, strict=True)
-        ]
-        return pa.record_batch(arrays, schema=self._schema)
 
 
 def finish_log(

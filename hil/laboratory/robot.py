@@ -223,7 +223,7 @@ class Robot:
         self.body.advance(now_us)
         self.battery.draw(now_us, self.body.draw(now_us, self.battery.voltage))
         self.board.supply(self.battery.millivolts)
-        if not isfinite(self.body.state.sum()):
+        if not isfinite(sum(self.body.state.tolist())):
             return f"the body is nowhere: p_WB = {self.body.p_WB.tolist()}, q_WB = {self.body.q_WB.tolist()}"
         return self.body.lost
 

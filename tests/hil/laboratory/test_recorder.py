@@ -8,11 +8,18 @@ import pyarrow as pa
 import pytest
 
 from hil.errors import LabError
-from hil.laboratory.recorder import BATCHES_PER_PIECE, ROWS_PER_BATCH, Recorder, load_events, load_log
+from hil.laboratory.recorder import (
+    BATCHES_PER_PIECE,
+    ROWS_PER_BATCH,
+    Onlooker,
+    Recorder,
+    load_events,
+    load_log,
+)
 from hil.world.body import Channel, Quantity
 
 
-def make(folder: Path, values: np.ndarray) -> Recorder:
+def make(folder: Path, values: np.ndarray, onlooker: Onlooker | None = None) -> Recorder:
     return Recorder(
         folder,
         (
@@ -20,6 +27,7 @@ def make(folder: Path, values: np.ndarray) -> Recorder:
             Channel("int32", lambda: int(values[0]), (Quantity(("n",), ""),)),
         ),
         {"seed": "7"},
+        onlooker,
     )
 
 
@@ -55,6 +63,29 @@ def test_a_long_log_is_read_without_memory_for_all_of_it(
     assert pa.total_allocated_bytes() - before < whole.nbytes / 10
     assert mapped.equals(whole, check_metadata=True)
     assert sorted(tmp_path.iterdir()) == files
+
+
+class Watcher:
+    """Keeps the rows that a recorder passes on."""
+
+    def __init__(self) -> None:
+        self.batches: list[pa.RecordBatch] = []
+
+    def rows(self, batch: pa.RecordBatch) -> None:
+        self.batches.append(batch)
+
+    def note(self, t_us: int, source: str, text: str) -> None:
+        raise AssertionError("nothing was noted")
+
+
+def test_rows_that_an_onlooker_keeps_stay_as_they_were_recorded(tmp_path: Path) -> None:
+    watcher, values = Watcher(), np.zeros(2)
+    recorder = make(tmp_path, values, watcher)
+    for row in range(250):
+        values[:] = row, -row
+        recorder.row(row)
+    recorder.close()
+    assert pa.Table.from_batches(watcher.batches).equals(load_log(tmp_path))
 
 
 def killed(folder: Path, lost_bytes: int = 0) -> Path:
