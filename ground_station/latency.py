@@ -49,12 +49,16 @@ def row_of(frame: MocapFrame, sent_us: int, link_us: int) -> Row:
     return (camera_us, processing_us, arrived_us - frame.transmitted_us, *rest)
 
 
-def budget_of(rows: Sequence[Row], medium: str) -> tuple[Stage, ...]:
+def columns_of(rows: Sequence[Row]) -> dict[str, tuple[float, ...]]:
+    """Return the times of many poses by stage; empty without poses."""
+    return dict(zip(STAGES, zip(*rows, strict=True), strict=True)) if rows else {}
+
+
+def budget_of(columns: Mapping[str, Sequence[float]], medium: str) -> tuple[Stage, ...]:
     """Return the reported stages, and the age on board as "pose" ahead of them; empty without poses."""
-    if not rows:
+    if not columns:
         return ()
-    columns = dict(zip(STAGES, zip(*rows, strict=True), strict=True))
-    pose = _stage("pose", [sum(row[3:]) for row in rows])
+    pose = _stage("pose", [sum(parts) for parts in zip(*(columns[name] for name in STAGES[3:]), strict=True)])
     stages = (_stage(medium if name == "link" else name, columns[name]) for name in reported_stages(columns))
     return (pose, *stages)
 
@@ -94,4 +98,4 @@ class LatencyBudget:
         return row_of(*self._sent[-1]) if self._sent else (nan,) * len(STAGES)
 
     def __str__(self) -> str:
-        return budget_line(budget_of([row_of(*sent) for sent in self._sent], str(self._link)))
+        return budget_line(budget_of(columns_of([row_of(*sent) for sent in self._sent]), str(self._link)))

@@ -16,7 +16,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import csv
 
-from ground_station.latency import STAGES, Row, Stage, budget_of
+from ground_station.latency import STAGES, Stage, budget_of
 from ground_station.telemetry_log import AGE_COLUMNS, GOAL_COLUMNS, TELEMETRY, TIME_COLUMN
 from hil.laboratory.metrics import column, is_real
 
@@ -31,14 +31,14 @@ ROTATION = ("cameras.qw", "cameras.qx", "cameras.qy", "cameras.qz")
 
 def ages_of(reported: pa.Table, log: pa.Table, link: str) -> tuple[Stage, ...]:
     """Return the budget of a flight over `link`; empty without telemetry."""
-    rows: list[Row] = list(zip(*(_us(reported, stage) for stage in STAGES), strict=True))
-    radio_us = _on_air(log) if link == "radio" else np.empty(0)
-    if rows and len(radio_us):
-        rows = [
-            (*row[:-1], us) for row, us in zip(rows, np.resize(radio_us, len(rows)).tolist(), strict=True)
-        ]
+    if not reported.num_rows:
+        return ()
+    columns = {stage: 1e3 * column(reported, stage) for stage in STAGES}
+    if link == "radio" and len(radio_us := _on_air(log)):
+        columns["link"] = np.resize(radio_us, reported.num_rows)
     medium = link.partition(":")[0]
-    return budget_of(rows, "serial" if medium == "mavlink" else medium)
+    times = {stage: column.tolist() for stage, column in columns.items()}
+    return budget_of(times, "serial" if medium == "mavlink" else medium)
 
 
 def reported_ages(folder: Path) -> pa.Table:
@@ -107,10 +107,6 @@ def _read(telemetry: Path, titles: tuple[str, ...]) -> NDArray[np.float64]:
     except (FileNotFoundError, pa.ArrowInvalid):  # no telemetry, not even a complete line
         return np.empty((0, len(titles)))
     return np.column_stack([table.column(title).to_numpy() for title in titles])
-
-
-def _us(reported: pa.Table, stage: str) -> list[float]:
-    return [1e3 * age for age in reported.column(stage).to_pylist()]
 
 
 def _on_air(log: pa.Table) -> NDArray[np.float64]:

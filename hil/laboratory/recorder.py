@@ -7,6 +7,7 @@ metadata; the schema carries configuration, seed, versions and commit. `load_log
 
 import hashlib
 import json
+import mmap
 import os
 import sys
 import warnings
@@ -17,6 +18,7 @@ from pathlib import Path
 from tempfile import NamedTemporaryFile
 from types import ModuleType
 from typing import IO, Any, Protocol
+from weakref import WeakSet
 
 import numpy as np
 import pyarrow as pa
@@ -43,6 +45,7 @@ BATCHES_PER_PIECE = 160  # of a long flight's log, written and read at once
 PIECES_IN_MEMORY = 5  # of a log that is read as a whole: some ten minutes
 ROWS_SHOWN = 20  # given to the onlooker together: five times a second
 SETTINGS = "settings"  # source of the events about what an image took over and what it lacks
+MAPPED: WeakSet[mmap.mmap] = WeakSet()  # the files of long logs that are in use
 OPERATOR = "operator"  # source of the events that an operator caused at the terminal
 RELEASE_US = b"release_us"  # in the metadata of a log whose flight was released
 PARQUET, STREAM, EVENTS = "log.parquet", "log.arrows", "events.jsonl"
@@ -192,7 +195,10 @@ def load_log(folder: Path) -> pa.Table:
     pieces = log_pieces(folder)
     table = pa.concat_tables(islice(pieces, PIECES_IN_MEMORY))
     following = next(pieces, None)
-    return table if following is None else _mapped(chain([table, following], pieces), folder)
+    if following is not None:
+        table = _mapped(chain([table, following], pieces), folder)
+        pa.default_memory_pool().release_unused()  # the pieces
+    return table
 
 
 def _mapped(pieces: Iterator[pa.Table], folder: Path) -> pa.Table:
@@ -202,7 +208,15 @@ def _mapped(pieces: Iterator[pa.Table], folder: Path) -> pa.Table:
         with pa.ipc.new_file(file.name, first.schema) as writer:
             for piece in chain([first], pieces):
                 writer.write_table(piece)
-        return pa.ipc.open_file(pa.memory_map(file.name)).read_all()
+        mapping = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    MAPPED.add(mapping)
+    return pa.ipc.open_file(pa.py_buffer(mapping)).read_all()
+
+
+def forget_read_columns() -> None:
+    """Give back the memory that columns of long logs have taken since they were read; read again, they take it again."""
+    for mapping in MAPPED:
+        mapping.madvise(mmap.MADV_DONTNEED)
 
 
 def log_pieces(folder: Path) -> Iterator[pa.Table]:

@@ -16,7 +16,7 @@ from hil.laboratory.experiment import Experiment
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Span, spans_of
 from hil.laboratory.metrics import METRICS, SHOWN, short_of
-from hil.laboratory.recorder import load_events, load_log, release_of, stored_in
+from hil.laboratory.recorder import forget_read_columns, load_events, load_log, release_of, stored_in
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.schedule import load_schedule
 from hil.pictures.curves import own_columns, with_marks
@@ -32,7 +32,7 @@ from hil.pictures.figures import (
 )
 from hil.pictures.gallery import pictures_of
 from hil.pictures.links import link_to
-from hil.pictures.pages import draw, write_page, zoomable
+from hil.pictures.pages import PageFigure, draw, write_page, zoomable
 from hil.pictures.panels import marks_of_flight
 from hil.pictures.picture import QUESTIONS
 from hil.pictures.story import close_ups, failures_of, story_of
@@ -82,10 +82,11 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     drawn += [(LATENCY_BUDGET, ages)] if ages.num_rows else []
     drawn += [(SCHEDULE, schedule.replace_schema_metadata(log.schema.metadata))] if schedule.num_rows else []
     marks = marks_of_flight(log, result.cause or "lost" if result.outcome == "lost" else None)
-    figures = {question: [
-        draw(picture, marks, rows)
-        for picture, rows in drawn if picture.question == question and picture.fits(rows.column_names)
-    ] for question in QUESTIONS}  # fmt: skip
+    figures: dict[str, list[PageFigure]] = {question: [] for question in QUESTIONS}
+    for picture, rows in drawn:
+        if picture.fits(rows.column_names):
+            figures[picture.question].append(draw(picture, marks, rows))
+            forget_read_columns()
     failures = failures_of(log, result)
     close = close_ups(log, marks, failures[0].at_s if failures else None)
     config = stored_in(log.schema.metadata, "config")

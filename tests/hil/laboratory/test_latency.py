@@ -17,6 +17,7 @@ from ground_station.latency import (
     LinkLatency,
     budget_line,
     budget_of,
+    columns_of,
     reported_stages,
     row_of,
 )
@@ -45,7 +46,7 @@ def frame(t_us: int, *way_us: int) -> MocapFrame:
 @given(st.lists(st.tuples(stage, stage, stage, stage, stage), min_size=1, max_size=30))
 def test_the_budget_is_numpys_mean_and_percentile_of_each_stage(times: list[tuple[int, ...]]) -> None:
     rows = [row_of(frame(7_000, *way[:3]), 7_000 + sum(way[:4]), way[4]) for way in times]
-    pose, *stages = budget_of(rows, "radio")
+    pose, *stages = budget_of(columns_of(rows), "radio")
     assert [one.name for one in stages] == ["camera", "processing", "network", "station", "radio"]
     for one, values in ((pose, np.sum(times, axis=1)), *zip(stages, np.transpose(times), strict=True)):
         assert one.mean_us == pytest.approx(np.mean(values))

@@ -13,6 +13,7 @@ from hil.laboratory.recorder import (
     ROWS_PER_BATCH,
     Onlooker,
     Recorder,
+    forget_read_columns,
     load_events,
     load_log,
 )
@@ -86,6 +87,28 @@ def test_rows_that_an_onlooker_keeps_stay_as_they_were_recorded(tmp_path: Path) 
         recorder.row(row)
     recorder.close()
     assert pa.Table.from_batches(watcher.batches).equals(load_log(tmp_path))
+
+
+def test_memory_of_a_long_log_is_given_back_and_the_log_still_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = 20 * ROWS_PER_BATCH * BATCHES_PER_PIECE
+    recorder = make(tmp_path, np.ones(2))
+    for row in range(rows):
+        recorder.row(row)
+    recorder.close()
+    monkeypatch.setattr("hil.laboratory.recorder.PIECES_IN_MEMORY", 1)
+    log = load_log(tmp_path)
+    total, before = log.column("t").to_numpy().sum(), mapped_bytes()
+    forget_read_columns()
+    assert mapped_bytes() < before - 0.9 * 8 * rows
+    assert log.column("t").to_numpy().sum() == total == rows * (rows - 1) / 2
+
+
+def mapped_bytes() -> int:
+    """Return how much of mapped files is in this process's memory."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("RssFile:"))
 
 
 def killed(folder: Path, lost_bytes: int = 0) -> Path:
