@@ -14,8 +14,10 @@ import struct
 import sys
 from collections.abc import Callable
 from functools import cache, cached_property, partial, update_wrapper
+from importlib.machinery import SourceFileLoader
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
@@ -46,6 +48,8 @@ def compiler(*sources: Path) -> Callable[[Function], Function]:
     def compiled(function: Function) -> Function:
         if PLAIN:
             return function
+        if not inspect.isfunction(function):  # `make fast` has compiled its module, too
+            function = getattr(_module_from_source(function.__module__), function.__name__)
         stamp = shared.copy()
         stamp.update(
             function.__module__.encode()
@@ -54,6 +58,15 @@ def compiler(*sources: Path) -> Callable[[Function], Function]:
         return cast(Function, Compiled(function, stamp.hexdigest()))
 
     return compiled
+
+
+@cache
+def _module_from_source(name: str) -> ModuleType:
+    """Return a module as its source has it, beside the one that is imported under its name."""
+    module = ModuleType(name)
+    path = Path(__file__).parent.parent / f"{name.replace('.', '/')}.py"
+    SourceFileLoader(name, str(path)).exec_module(module)
+    return module
 
 
 def _version_of_numba() -> list[Path]:

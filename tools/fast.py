@@ -2,9 +2,9 @@
 
     python tools/fast.py    (`make fast`; needs a C compiler and Python's headers, takes a minute or two)
 
-`firmware_py/fast.py` uses them until one of their sources changes. Modules with pydantic models, functions for numba or
-protocols checked at run time cannot be compiled, nor classes that others inherit or copy, or that pydantic reads; code
-that runs once per flight need not be. Compiled code converts an int to a float where the type is `float`: values that may
+`firmware_py/fast.py` uses them until one of their sources changes. Modules with pydantic models, functions decorated for
+numba or protocols checked at run time cannot be compiled, nor classes that others inherit or copy, or that pydantic reads;
+code that runs once per flight need not be. Compiled code converts an int to a float where the type is `float`: values that may
 be ints have another type.
 """
 
@@ -28,16 +28,17 @@ from firmware_py.fast import FOLDER, RECORD, digest  # noqa: E402 - from this tr
 
 PACKAGES = ("firmware_py", "ground_station", "hil")
 MODULES = {
-    "firmware_py": "firmware geometry pilot planner supervisor tasks",
+    "firmware_py": "elementary firmware geometry pilot planner supervisor tasks",
     "firmware_py/links": "crtp_stack localisation log",
     "firmware_py/rtos": "control_block kernel queue scheduler semaphore task timer",
     "firmware_py/wire": "crtp log telemetry",
-    "ground_station": "corrections mocap pose_filter station telemetry_log tracker",
+    "ground_station": "corrections latency mocap pose_filter station telemetry_log tracker",
+    "ground_station/links": "log_blocks loopback",
     "hil": "events",
     "hil/crazyflie": "shockburst",
     "hil/devices": "board cameras radio",
     "hil/laboratory": "channels flight laboratory lockstep recorder robot",
-    "hil/world": "battery",
+    "hil/world": "battery servos",
 }
 FILES = [f"{folder}/{name}.py" for folder, names in MODULES.items() for name in names.split()]
 

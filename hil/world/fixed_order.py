@@ -15,8 +15,8 @@ from firmware_py import compiling, elementary
 # The dependencies of the laboratory's compiled functions, besides their own files.
 SOURCES = (
     Path(__file__).parent,
-    Path(elementary.__file__),
-    Path(elementary.__file__).with_name("core"),
+    Path(compiling.__file__).with_name("elementary.py"),
+    Path(compiling.__file__).with_name("core"),
 )
 compiled = compiling.compiler(*SOURCES)
 
