@@ -1,8 +1,9 @@
 """A flight in lockstep: radio or serial line are modelled, and the ground station shares the time line."""
 
+import os
 import shlex
 from collections.abc import Callable
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from functools import partial
 from pathlib import Path
 
@@ -230,9 +231,17 @@ def image_at(board: str, elf: Path | None, debugger: GdbServer | None = None) ->
     """Return the image that `--board` and `--elf` name. Raises `LabError` if it cannot run here."""
     check_image(board)
     try:
-        return ChipImage.load(Path(board), elf, BUILD, debugger)
+        return ChipImage.load(Path(board), elf, _folder_of_machines(), debugger)
     except FirmwareError as error:
         raise LabError(f"--board {board}: {error}") from None
+
+
+def _folder_of_machines() -> Path:
+    """Return where the emulated chip is compiled: once for all of a user's projects, if there is a place for that."""
+    kept = Path.home() / ".cache" / "floaty"
+    with suppress(OSError):
+        kept.mkdir(parents=True, exist_ok=True)
+    return kept if os.access(kept, os.W_OK) else BUILD
 
 
 def debugger(port: int | None, image: Path, stack: ExitStack) -> GdbServer | None:

@@ -11,10 +11,12 @@ from hil.commands.app import main
 from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
+from hil.laboratory.lockstep import image_at
 from hil.laboratory.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.result import Result
 from support.flights import hover
+from support.stm32_firmware import build
 
 HOVER = EXPERIMENTS["hover"]
 DURATION_S = 1.5
@@ -109,3 +111,22 @@ def test_a_missing_package_is_said_in_one_line(
     assert said.count("\n") == 0
     assert said.startswith("floaty: --board cortex-m4: ")
     assert said.endswith(f"is missing: {install_command('deploy')}")
+
+
+@pytest.mark.long
+def test_the_emulated_chip_is_compiled_once_for_all_folders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for package in ("unicorn", "cffi", "ziglang"):
+        pytest.importorskip(package)
+    image = str(build())
+    (tmp_path / "file").touch()
+    places = []
+    for home, folder in (("home", "one"), ("home", "two"), ("file/none", "three")):
+        (tmp_path / folder).mkdir()
+        monkeypatch.chdir(tmp_path / folder)
+        monkeypatch.setenv("HOME", str(tmp_path / home))
+        places.append(image_at(image, None).library)
+    assert places[0] == places[1]
+    assert places[0].is_relative_to(tmp_path / "home" / ".cache" / "floaty")
+    assert places[2].is_relative_to(tmp_path / "three")  # nothing can be kept: it stays in the project
