@@ -4,8 +4,8 @@
 
 `firmware_py/fast.py` uses them until one of their sources changes. Modules with pydantic models, functions decorated for
 numba or protocols checked at run time cannot be compiled, nor classes that others inherit or copy, or that pydantic reads;
-code that runs once per flight need not be. Compiled code converts an int to a float where the type is `float`: values that may
-be ints have another type.
+code that runs once per flight need not be. Compiled code converts an int to a float where the type is `float`: values that
+may be ints have another type.
 """
 
 import ast

@@ -62,7 +62,7 @@ class Line(Protocol):
         """Fly another trajectory from now on. Raises `LabError` where the ground station is another program."""
 
     def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
-        """The channels to record: of the line itself, and of the ground station."""
+        """Return the channels to record: of the line itself, and of the ground station."""
 
     def begin(self, release: Callable[[int], None]) -> None:
         """Have the release planned, for an instant that is not over: once, now or when the robot is ready."""
