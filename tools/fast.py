@@ -32,7 +32,7 @@ MODULES = {
     "firmware_py/links": "crtp_stack localisation log",
     "firmware_py/rtos": "control_block kernel queue scheduler semaphore task timer",
     "firmware_py/wire": "crtp log telemetry",
-    "ground_station": "corrections latency mocap pose_filter station telemetry_log tracker",
+    "ground_station": "corrections mocap pose_filter station telemetry_log tracker",
     "ground_station/links": "log_blocks loopback",
     "hil": "events",
     "hil/crazyflie": "shockburst",
