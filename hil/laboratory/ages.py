@@ -106,7 +106,10 @@ def _read(telemetry: Path, titles: tuple[str, ...]) -> NDArray[np.float64]:
         table = csv.read_csv(telemetry, parse_options=parse, convert_options=convert)
     except (FileNotFoundError, pa.ArrowInvalid):  # no telemetry, not even a complete line
         return np.empty((0, len(titles)))
-    return np.column_stack([table.column(title).to_numpy() for title in titles])
+    columns = np.column_stack([table.column(title).to_numpy() for title in titles])
+    del table
+    pa.default_memory_pool().release_unused()  # of an hour, more than the columns themselves
+    return columns
 
 
 def _on_air(log: pa.Table) -> NDArray[np.float64]:

@@ -84,9 +84,9 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     marks = marks_of_flight(log, result.cause or "lost" if result.outcome == "lost" else None)
     figures: dict[str, list[PageFigure]] = {question: [] for question in QUESTIONS}
     for picture, rows in drawn:
+        forget_read_columns()
         if picture.fits(rows.column_names):
             figures[picture.question].append(draw(picture, marks, rows))
-            forget_read_columns()
     failures = failures_of(log, result)
     close = close_ups(log, marks, failures[0].at_s if failures else None)
     config = stored_in(log.schema.metadata, "config")
