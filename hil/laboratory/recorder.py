@@ -42,7 +42,7 @@ if "pandas" not in sys.modules:
 ROWS_PER_BATCH, BATCH_US = 100, 1_000_000  # whichever is full first goes to disk
 BUFFER_BYTES = 1 << 18  # of the file, more than a batch: it is written at once
 BATCHES_PER_PIECE = 160  # of a long flight's log, written and read at once
-PIECES_IN_MEMORY = 5  # of a log that is read as a whole: some ten minutes
+PIECES_IN_MEMORY = 3  # of a log that is read as a whole: eight minutes
 ROWS_SHOWN = 20  # given to the onlooker together: five times a second
 SETTINGS = "settings"  # source of the events about what an image took over and what it lacks
 MAPPED: WeakSet[mmap.mmap] = WeakSet()  # the files of long logs that are in use

@@ -110,6 +110,7 @@ def write_rrd(
         for first in range(0, piece.num_rows, ROWS_AT_ONCE):
             flight.add_rows(piece.slice(first, ROWS_AT_ONCE))
             recording.flush()
+        pa.default_memory_pool().release_unused()  # a long flight's curves would add up
     flight.add_events(events)
     flight.plots.add_schedule(schedule)
     if ages is not None:
