@@ -120,7 +120,11 @@ class Shown:
             served.robot.thief.share = 0.0
         self._firmware = served.robot.firmware
         config = served.robot.config
-        metadata = {"request": json.dumps({"experiment": "served"}), "config": config.model_dump_json()}
+        metadata = {
+            "request": json.dumps({"experiment": "served"}),
+            "config": config.model_dump_json(),
+            "look": json.dumps(served.robot.body.look.stored()),
+        }
         self._recorder = Recorder(None, self._channels(), metadata, onlooker)
 
     def row(self, now_us: int) -> None:
