@@ -33,11 +33,17 @@ def writing(option: str, path: Path | None) -> Iterator[None]:
         raise LabError(f"{option} {path}: cannot be written ({error.strerror or error})") from None
 
 
+LISTED = 12  # names in one line
+
+
 def hint(word: str, known: Iterable[str], otherwise: str = "") -> str:
-    """Return the nearest of the known words as a question; else `otherwise`, or all of them."""
+    """Return the nearest of the known words as a question; else `otherwise`, or a dozen of them."""
     names = list(known)
     near = difflib.get_close_matches(word, names, 1, 0.5)
-    return f"did you mean {near[0]}?" if near else otherwise or f"there are {', '.join(names) or 'none'}"
+    if near:
+        return f"did you mean {near[0]}?"
+    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+    return otherwise or f"there are {', '.join(names[:LISTED]) or 'none'}{more}"
 
 
 def blame(error: BaseException) -> str:

@@ -38,6 +38,7 @@ from hil import (
     position_error,
 )
 from hil.api import command_of, request_of
+from hil.errors import hint
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import KINDS, add
 from hil.laboratory.robot import attributes_of, specimen
@@ -309,3 +310,10 @@ def test_the_page_lists_the_attributes_that_a_knob_can_set() -> None:
     assert len(rows) == 6
     for part, names in rows:
         assert re.findall(r"`(\w+)`", names) == attributes_of(attrgetter(part)(robot)), part
+
+
+def test_of_many_names_a_dozen_is_listed() -> None:
+    many = [f"name{index}" for index in range(100)]
+    assert hint("?", many[:12]) == f"there are {', '.join(many[:12])}"
+    assert hint("?", many) == f"there are {', '.join(many[:12])} and 88 more"
+    assert hint("name9", many[:9]).startswith("did you mean name")
