@@ -247,6 +247,10 @@ def _toml(value: Value) -> str:
     return json.dumps(value) if isinstance(value, str) else repr(value)
 
 
+# Shares near the ends of an axis, where a number that must be whole is not: 0.999 of 100000..200000 is.
+LOW, HIGH = 0.00087655, 0.99912345
+
+
 def check_spec(spec: Spec) -> None:
     """Raise `LabError` for mistakes that show before flying: unknown names, values out of range.
 
@@ -255,10 +259,10 @@ def check_spec(spec: Spec) -> None:
     check_design(spec)
     width = len(axes(spec))
     for cell in range(len(spec.experiments) * len(spec.profiles)):
-        draw_at(spec, np.full(width, 0.999), 0, 0, cell).request()
+        draw_at(spec, np.full(width, HIGH), 0, 0, cell).request()
     for column, axis in enumerate(axes(spec)):
         count = len(axis.varies.choice) if axis.varies and axis.varies.choice else 1
-        for share in (0.001, *((part + 0.5) / count for part in range(count)), 0.999):
-            shares = np.full(width, 0.999)  # so that every fault occurs
+        for share in (LOW, *((part + 0.5) / count for part in range(count)), HIGH):
+            shares = np.full(width, HIGH)  # so that every fault occurs
             shares[column] = share
             draw_at(spec, shares, 0, 0, 0).request()

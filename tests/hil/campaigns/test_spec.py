@@ -42,6 +42,10 @@ def test_the_example_flies_the_hover_on_every_robot_that_the_table_allows() -> N
         (HOVER + '[parameters]\n"actuators.tau" = { normal = [0.05, 0] }', "expected a deviation above 0"),
         (HOVER + '[parameters]\n"actuators.tau" = { choice = [] }', "parameters.actuators.tau.choice"),
         (HOVER + '[parameters]\n"actuators.tau" = { uniform = [0.04, 0.9] }', "actuators.tau = 0.8"),
+        (
+            HOVER + '[parameters]\n"serial.baud" = { uniform = [100000, 200000] }',
+            "input should be a valid integer",
+        ),
         (HOVER + '[parameters]\n"actuators.tua" = { uniform = [0.04, 0.06] }', "did you mean tau?"),
         (
             HOVER + '[parameters]\n"plant.variant" = { choice = ["methods", "bent"] }',
