@@ -6,6 +6,7 @@ up with the core.
 """
 
 import mmap
+from collections.abc import Callable
 from enum import IntEnum
 from functools import cache
 from pathlib import Path
@@ -29,6 +30,7 @@ WINDOWS = (
     (0x4000_0000, 0x8_0000, "peripheral"), (0x5000_0000, 0x8_0000, "usb"), (0xE000_0000, 0x10_0000, "system"),
 )  # fmt: skip
 SOURCES = Path(__file__).parent / "native"
+NOWHERE = 0xFF  # no address on I2C
 # Causes of a reset in RCC_CSR, with the pin's.
 POWER_ON, SOFTWARE, WATCHDOG = 0x0C00_0000, 0x1400_0000, 0x2400_0000
 
@@ -49,6 +51,7 @@ class Why(IntEnum):
     DIVISION = 512  # the first integer division by zero
     WATCHPOINT = 1024  # an access that the debugger watches, at most a block of instructions ago
     LOW_WRITE = 2048  # the first write of an instruction near address 0
+    DEVICE = 4096  # a device was written to that acts on it
 
 
 def build_machine(folder: Path) -> Path:
@@ -114,6 +117,7 @@ class Chip:
         ]
         self._sent = self._ffi.new("uint8_t[]", self._library.LINE_BYTES)
         self._kept: list[NDArray[np.uint8]] = []  # memory of devices
+        self._acts: dict[int, Callable[[], object]] = {}  # of devices that act on what is written
         self.breakpoints: set[int] = set()  # of a debugger: a run stops before these instructions
         self.crash_points: set[int] = set()  # of the crash reports
         self._planted: set[int] = set()
@@ -204,13 +208,39 @@ class Chip:
 
     def add_device(
         self, bus: int, address: int, memory: NDArray[np.uint8], address_bytes: int = 1, pairs: bool = False
-    ) -> None:
-        """Add memory at a 7-bit address on I2C 1..3; `pairs`: every written byte follows its own address."""
+    ) -> int:
+        """Add memory at a 7-bit address on I2C 1..3, return its number. `pairs`: every byte follows its own address."""
         self._kept.append(memory)
-        place = self._pointer(memory)
-        at = bus - 1, address, place, memory.size, address_bytes, pairs
-        if not self._library.machine_device(self.state, *at):
-            raise LabError("more I2C devices than there is room for")
+        at = bus - 1, address, self._pointer(memory), memory.size, address_bytes, pairs
+        device: int = self._library.machine_device(self.state, *at)
+        if not device:
+            raise LabError("more devices on buses than there is room for")
+        return device - 1
+
+    def add_selected(self, bus: int, select: tuple[str, int], memory: NDArray[np.uint8]) -> int:
+        """Put memory on SPI 1..3 behind a pin that selects it when low; returns the device's number."""
+        port, number = select
+        return self.add_device(bus + self._library.BUSES, (ord(port) - ord("A")) * 16 + number, memory)
+
+    def on_write(self, device: int, act: Callable[[], object]) -> None:
+        """Call `act` (by `tell_devices`) whenever a transfer to a device has ended: a write on I2C, any on SPI."""
+        self.state.device[device].watched = 1
+        self._acts[device] = act
+
+    def move_device(self, device: int, address: int) -> None:
+        """Let a device on I2C answer to another address, to none if it is `NOWHERE`."""
+        self.state.device[device].address = address
+
+    def first_byte(self, device: int) -> int:
+        """Return the byte that the last transfer with a device on SPI began with."""
+        return int(self.state.device[device].first)
+
+    def tell_devices(self) -> None:
+        """Let the devices act that were written to: a run that ended so has `Why.DEVICE`."""
+        touched, self.state.touched = int(self.state.touched), 0
+        for device, act in self._acts.items():
+            if touched >> device & 1:
+                act()
 
     def set_system(self, address: int, contents: bytes) -> None:
         """Write the chip's own memory: OTP, unique id."""

@@ -60,6 +60,10 @@ class ChipProcessor:
         """Call something periodically by the chip's time."""
         self._own.every(period_us, self.chip.now_us + period_us, do)
 
+    def later(self, delay_us: int, do: Callable[[int], object]) -> None:
+        """Do something once, after a while by the chip's time."""
+        self._own.at(self.chip.now_us + delay_us, do)
+
     def begin(self, us: int) -> None:
         """Set the time from which the clock counts."""
         self.ahead_us += us

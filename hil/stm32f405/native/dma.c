@@ -106,6 +106,7 @@ void dma_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value)
             if (!stream->ndtr)
                 stream->cr &= ~(uint32_t)ENABLE;
             usart_kick(m);
+            spi_kick(m);
         } else if (was & ENABLE && !(value & ENABLE)) {
             raise_flag(m, n, s, 32); /* software has ended it: complete as well, chapter 10.3.14 */
         }

@@ -41,7 +41,7 @@ static struct device *device_at(struct machine *m, unsigned n, uint32_t address)
     return 0;
 }
 
-static void device_write(struct device *d, uint8_t byte)
+void device_write(struct device *d, uint8_t byte)
 {
     if (d->left) {
         d->pointer = (d->left == d->address_bytes ? 0 : d->pointer << 8) | byte;
@@ -50,11 +50,12 @@ static void device_write(struct device *d, uint8_t byte)
         d->memory[d->pointer % d->size] = byte;
         d->pointer++;
         d->writes++;
+        d->wrote = 1;
         d->left = d->pairs ? d->address_bytes : 0;
     }
 }
 
-static void device_begin(struct device *d, int reading)
+void device_begin(struct device *d, int reading)
 {
     if (!reading) {
         d->left = d->address_bytes;
@@ -65,7 +66,7 @@ static void device_begin(struct device *d, int reading)
     d->left = 0;
 }
 
-static uint8_t device_read(struct device *d)
+uint8_t device_read(struct device *d)
 {
     uint8_t byte = d->left < sizeof d->burst ? d->burst[d->left % d->size] : d->memory[d->pointer % d->size];
     d->left++;
@@ -73,8 +74,19 @@ static uint8_t device_read(struct device *d)
     return byte;
 }
 
-static void stopped(struct bus *b)
+/* A transfer is over: what was written acts. */
+void device_end(struct machine *m, struct device *d)
 {
+    if (d && d->watched && d->wrote) {
+        m->touched |= 1u << (d - m->device);
+        m->why |= WHY_DEVICE;
+        d->wrote = 0;
+    }
+}
+
+static void stopped(struct machine *m, struct bus *b)
+{
+    device_end(m, b->device);
     b->cr1 &= ~(uint32_t)STOP;
     b->sr1 &= ~(uint32_t)(SB | ADDR | BTF | TXE);
     b->sr2 = 0;
@@ -128,6 +140,7 @@ void bus_due(struct machine *m, unsigned n)
     switch (b->action) {
     case STARTING:
         act(m, n, NOTHING, 0);
+        device_end(m, b->device);
         b->cr1 &= ~(uint32_t)START;
         b->sr1 = (b->sr1 & ~(uint32_t)(BTF | TXE | RXNE | ADDR)) | SB;
         b->sr2 = MSL | BUSY;
@@ -149,7 +162,7 @@ void bus_due(struct machine *m, unsigned n)
         break;
     case RECEIVING: byte_received(m, n); break;
     case STOPPING:
-        stopped(b);
+        stopped(m, b);
         act(m, n, b->cr1 & START ? STARTING : NOTHING, 2);
         break;
     default: break;
@@ -205,7 +218,7 @@ static void write_control(struct machine *m, unsigned n, uint32_t value)
     uint32_t stopping = b->action == STOPPING;
     b->cr1 = value;
     if (!(value & PE)) {
-        stopped(b);
+        stopped(m, b);
         b->sr1 = 0;
         act(m, n, NOTHING, 0);
     } else if (stopping) {

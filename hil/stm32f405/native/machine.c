@@ -39,8 +39,10 @@ static void happen(struct machine *m, unsigned slot)
         tick_due(m);
     } else if (slot < DUE_BUS) {
         timer_due(m, slot - DUE_TIMER);
-    } else if (slot < DUE_SEND) {
+    } else if (slot < DUE_SPI) {
         bus_due(m, slot - DUE_BUS);
+    } else if (slot < DUE_SEND) {
+        spi_due(m, slot - DUE_SPI);
     } else if (slot < DUE_RECEIVE) {
         usart_send_due(m, slot - DUE_SEND);
     } else if (slot < DUE_WATCHDOG) {
@@ -306,6 +308,8 @@ void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause)
     m->next_due = NEVER;
     for (unsigned n = 0; n < USARTS; n++)
         m->usart[n].sr = 0xC0;
+    for (unsigned n = 0; n < SPIS; n++)
+        m->spi[n].sr = 2; /* TXE */
     for (unsigned n = 0; n < TIMERS; n++)
         m->timer[n].arr = n == 1 || n == 4 ? 0xFFFFFFFF : 0xFFFF;
     m->enabled[0] = 0xFFFF; /* the system's own exceptions */
@@ -518,6 +522,7 @@ int machine_watch(struct machine *m, uint32_t kind, uint32_t address, uint32_t s
     return 0;
 }
 
+/* Add a device; returns its number, from 1 on, 0 where there is no room. */
 int machine_device(struct machine *m, uint32_t bus, uint32_t address, uint8_t *memory, uint32_t size, uint32_t address_bytes,
                    uint32_t pairs)
 {
@@ -525,7 +530,7 @@ int machine_device(struct machine *m, uint32_t bus, uint32_t address, uint8_t *m
         return 0;
     m->device[m->devices++] = (struct device){.memory = memory, .size = size, .bus = bus, .address = address,
                                               .address_bytes = address_bytes, .pairs = pairs};
-    return 1;
+    return (int)m->devices;
 }
 
 /* Copy the bytes that a USART has sent; return their number. */

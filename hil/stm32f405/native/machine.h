@@ -18,9 +18,9 @@ enum {
     RAM_BASE = 0x20000000, RAM_SIZE = 0x20000,
     CCM_BASE = 0x10000000, CCM_SIZE = 0x10000,
     PERIPHERALS_SIZE = 0x80000, PAGE_SIZE = 1024, /* unicorn's pages of memory */
-    TIMERS = 14, BUSES = 3, USARTS = 6, PORTS = 9, DMAS = 2, STREAMS = 8,
+    TIMERS = 14, BUSES = 3, SPIS = 3, USARTS = 6, PORTS = 9, DMAS = 2, STREAMS = 8,
     EXCEPTIONS = 128, IRQ = 16, /* exception number of interrupt 0 */
-    DEVICES = 8, BREAKPOINTS = 64, LOW_WRITERS = 16, WATCHPOINTS = 8, LINE_BYTES = 4096, TASKS = 32, SWITCHES = 4096,
+    DEVICES = 16, BREAKPOINTS = 64, LOW_WRITERS = 16, WATCHPOINTS = 8, LINE_BYTES = 4096, TASKS = 32, SWITCHES = 4096,
 };
 
 /* Three sums in one number, from these bits on: cycles, instructions, and modulo 2^16 those that may lower a stack pointer. */
@@ -34,7 +34,8 @@ enum {
     DUE_SYSTICK,
     DUE_TIMER,
     DUE_BUS = DUE_TIMER + TIMERS,
-    DUE_SEND = DUE_BUS + BUSES,
+    DUE_SPI = DUE_BUS + BUSES,
+    DUE_SEND = DUE_SPI + SPIS,
     DUE_RECEIVE = DUE_SEND + USARTS,
     DUE_WATCHDOG = DUE_RECEIVE + USARTS,
     SLOTS,
@@ -44,7 +45,7 @@ enum {
 enum {
     WHY_SERIAL = 1, WHY_COMPARE = 2, WHY_RESET = 4, WHY_WATCHDOG = 8, WHY_BREAK = 16, WHY_LOCKUP = 32, WHY_STEP = 64,
     WHY_OVERFLOW = 128, WHY_LOW_READ = 256, WHY_DIVISION = 512, WHY_WATCHPOINT = 1024,
-    WHY_LOW_WRITE = 2048,
+    WHY_LOW_WRITE = 2048, WHY_DEVICE = 4096,
 };
 
 /* Registers by unicorn's numbers. */
@@ -79,16 +80,23 @@ struct timer {
     uint32_t others[32];
 };
 
-struct device { /* a memory as an I2C device: registers, or an EEPROM */
+struct device { /* a memory as a device on I2C or SPI: registers, or an EEPROM */
     uint8_t *memory;
     uint32_t size, pointer, address_bytes, left; /* `left`: missing bytes of the address */
     uint32_t bus, address, writes, pairs; /* `pairs`: every written byte follows its own address */
+    /* On SPI `bus` is BUSES + n, and `address` the pin that selects it, 16 port + number. */
+    uint32_t selected, reading, first; /* `first`: first byte of a transfer on SPI: address and direction */
+    uint32_t watched, wrote;           /* `watched`: the outside acts on what is written */
     uint8_t burst[256]; /* the data of a read in progress */
 };
 
 struct bus {
     uint32_t cr1, cr2, sr1, sr2, ccr, dr, shift, action, holding, others[10];
     struct device *device;
+};
+
+struct spi {
+    uint32_t cr1, cr2, sr, dr, held, shift, busy, others[6];
 };
 
 struct usart {
@@ -164,7 +172,7 @@ struct machine {
 
     uint32_t input[PORTS];
     struct device device[DEVICES];
-    uint32_t devices;
+    uint32_t devices, touched; /* `touched`: bits of the watched ones that the outside has not looked at since */
 
     /* From here on a reset clears everything. Exceptions: */
     uint64_t enabled[2], pending[2], active[2], line[2];
@@ -178,6 +186,7 @@ struct machine {
     uint32_t watchdog_prescaler, watchdog_reload, random;
     struct timer timer[TIMERS];
     struct bus bus[BUSES];
+    struct spi spi[SPIS];
     struct usart usart[USARTS];
     struct dma dma[DMAS];
     uint32_t plain[PERIPHERALS_SIZE / 4]; /* registers that only store values */
@@ -221,10 +230,19 @@ uint32_t timer_read(struct machine *m, unsigned n, uint32_t offset);
 void timer_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value);
 void timer_due(struct machine *m, unsigned n);
 
-/* i2c.c, usart.c */
+/* i2c.c, spi.c, usart.c */
 uint32_t bus_read(struct machine *m, unsigned n, uint32_t offset);
 void bus_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value);
 void bus_due(struct machine *m, unsigned n);
+void device_write(struct device *d, uint8_t byte);
+void device_begin(struct device *d, int reading);
+uint8_t device_read(struct device *d);
+void device_end(struct machine *m, struct device *d);
+uint32_t spi_read(struct machine *m, unsigned n, uint32_t offset);
+void spi_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value);
+void spi_due(struct machine *m, unsigned n);
+void spi_kick(struct machine *m);
+void spi_select(struct machine *m, unsigned port, uint32_t levels);
 uint32_t usart_read(struct machine *m, unsigned n, uint32_t offset);
 void usart_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value);
 void usart_send_due(struct machine *m, unsigned n);

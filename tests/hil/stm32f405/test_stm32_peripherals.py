@@ -11,7 +11,7 @@ from support.stm32_bench import Bench
 
 TIM3, TIM7, I2C1, IWDG = 0x4000_0400, 0x4000_1400, 0x4000_5400, 0x4000_3000
 USART6, DMA1, EXTI = 0x4001_1400, 0x4002_6000, 0x4001_3C00
-GPIOA, SYSCFG, SPI1, NVIC_PENDING = 0x4002_0000, 0x4001_3800, 0x4001_3000, 0xE000_E200
+GPIOA, SYSCFG, CAN1, NVIC_PENDING = 0x4002_0000, 0x4001_3800, 0x4000_6400, 0xE000_E200
 START, STOP, ACK, ENABLED = 1 << 8, 1 << 9, 1 << 10, 1
 SB, ADDR, BTF, RXNE, TXE, AF = 1, 2, 4, 1 << 6, 1 << 7, 1 << 10
 BYTE_US = 10  # of a USART at 1 Mbaud
@@ -203,9 +203,9 @@ def test_only_a_jump_that_is_taken_refills_the_pipeline() -> None:
 
 
 def test_an_unknown_peripheral_reads_as_0_and_is_named_once(bench: Bench) -> None:
-    bench[SPI1] = 0x55
-    assert bench[SPI1] == 0
-    assert list(bench.chip.state.unknown[0 : bench.chip.state.unknown_count]) == [SPI1]
+    bench[CAN1] = 0x55
+    assert bench[CAN1] == 0
+    assert list(bench.chip.state.unknown[0 : bench.chip.state.unknown_count]) == [CAN1]
 
 
 def test_where_nothing_is_nothing_can_be_read(bench: Bench) -> None:
