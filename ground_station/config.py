@@ -29,6 +29,9 @@ class PilotConfig(Section):
         description="written before the take-off, by group and name; stabilizer.estimator 2 is Kalman, "
         "stabilizer.controller 1 PID, 2 Mellinger, 3 INDI",
     )
+    poses: bool = Field(
+        True, description="whether the board gets the cameras' poses; false: it flies by its own decks"
+    )
     take_off_s: float = number(2.0, "[0.5, 20]", "from the floor to home [s]; cflib's examples")
     settle_s: float = number(2.0, "[0, 60]", "at home before the experiment's trajectory begins [s]; chosen")
     land_s: float = number(2.0, "[0.5, 20]", "from the last goal to the floor [s]; cflib's examples")

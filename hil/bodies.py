@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from hil.config import LabConfig
+from hil.crazyflie.decks import DECKS
 from hil.crazyflie.failures import MOTOR_FAILURES
 from hil.crazyflie.quadrotor import Quadrotor
 from hil.errors import LabError, blame, hint
@@ -15,7 +16,8 @@ from hil.floaty.paper_table import PAPER_TABLE
 from hil.floaty.plant import Plant
 from hil.own_files import load_file
 from hil.world.battery import open_circuit_voltage
-from hil.world.body import Body, Failure, Vector
+from hil.world.body import Body, Carrier, Failure, Vector
+from hil.world.room import Room
 
 Make = Callable[[LabConfig, np.random.Generator, Vector], Body]
 OWN = "Robot"  # what a file defines: a class or function that is called as a `Make`
@@ -43,8 +45,18 @@ def floaty(config: LabConfig, rng_gust: np.random.Generator, p_WB: Vector) -> Bo
 
 
 def crazyflie(config: LabConfig, rng: np.random.Generator, p_WB: Vector) -> Body:
-    """Return a Crazyflie 2.1+."""
-    return Quadrotor(config.quadrotor, config.tunnel, config.battery, rng, p_WB)
+    """Return a Crazyflie 2.1+ with its decks."""
+    mass = config.quadrotor.mass + sum(DECKS[name].mass for name in config.robot.decks)
+    quadrotor = config.quadrotor.model_copy(update={"mass": mass})
+    return Quadrotor(quadrotor, config.tunnel, config.battery, rng, p_WB)
+
+
+def carrier_of(config: LabConfig, body: Body, rng: np.random.Generator) -> Carrier:
+    """Return what carries the board: a body, the room around it, and the decks of the profile."""
+    room = Room(floor=config.plant.ground.height)
+    if config.robot.body == "crazyflie":
+        room = Room(0.0, config.quadrotor.room, config.quadrotor.ceiling)
+    return Carrier(body, rng, room, config.robot.decks)
 
 
 BODIES: dict[str, Make] = {"floaty": floaty, "crazyflie": crazyflie}

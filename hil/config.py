@@ -8,10 +8,10 @@ import json
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, field_validator
 from pydantic_core import ErrorDetails
 
 from firmware_py.config import FirmwareConfig, LogicConfig
@@ -54,6 +54,17 @@ class RobotConfig(Section):
         "floaty",
         description="floaty, crazyflie, or the file with a body of your own (docs/tutorials/your-own-robot.md)",
     )
+    decks: tuple[Literal["flow2", "multiranger"], ...] = Field(
+        (),
+        description="on the board, each once: flow2 (Flow deck v2), multiranger; the image's drivers use them",
+    )
+
+    @field_validator("decks")
+    @classmethod
+    def _each_once(cls, decks: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(decks)) < len(decks):
+            raise ValueError("each deck at most once")
+        return decks
 
     @property
     def has_plates(self) -> bool:
@@ -91,6 +102,14 @@ class LabConfig(FirmwareConfig):
     limits: dict[str, dict[str, float]] = Field(
         default_factory=dict, description="limits by experiment that replace the experiment's own"
     )
+
+    def check_decks(self, is_image: bool) -> None:
+        """Raise `LabError` for decks without the firmware that has drivers for them."""
+        if self.robot.decks and not (is_image and self.pilot.enabled):
+            raise LabError(
+                f"robot.decks = {', '.join(self.robot.decks)}: the drivers are in the Crazyflie's own firmware; "
+                "--profile crazyflie --board FILE"
+            )
 
     def reads(self, section: str) -> bool:
         """Whether a section affects this robot; a user's body may read them all."""

@@ -27,7 +27,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     ),
     "hil.stm32f405": ("hil", "firmware_py.export", "firmware_py.extras"),
     "hil.crazyflie": (
-        "hil", "firmware_py.wire.scalars", "firmware_py.elementary", "firmware_py.section", "firmware_py.compiling",
+        "hil", "firmware_py.wire.scalars", "firmware_py.wire.memories", "firmware_py.elementary", "firmware_py.section",
+        "firmware_py.compiling",
     ),
     "hil.learn": ("hil", "ground_station", "firmware_py"),
     "hil.demonstrations": ("hil", "firmware_py"),

@@ -110,7 +110,8 @@ class CrazyflieLink:
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
         """Send the unchanged pose, and the packets of the flight that are due."""
         self._now_us, self._goal = now_us, goal
-        self._transmit(now_us, encode_ext_pose(frame.p_WB, frame.q_WB, None))
+        if self._config.poses:
+            self._transmit(now_us, encode_ext_pose(frame.p_WB, frame.q_WB, None))
         self._logs.tend(now_us)
         self._tend(now_us)
         while not self._asked and now_us >= self._next_us:

@@ -134,6 +134,7 @@ def serve(asked: ServeOptions) -> int:
         () if asked.station == "corrections" else ("predictor.absolute=true",)
     )  # as Bitcraze's programs send them
     config = load_config(asked.profile, (*markers, *poses, *asked.overrides))
+    config.check_decks(asked.board is not None)
     station = _station_of(asked, config)
     ends = parse_addresses(asked.mavlink, asked.boards) if asked.mavlink is not None else []
     planned = [parse(text) for text in asked.faults]

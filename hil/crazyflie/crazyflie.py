@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from hil.crazyflie import barometer, syslink
+from hil.crazyflie.decks import Decks
 from hil.crazyflie.parts import RADIO_BUSY, SYSLINK_USART, Parts
 from hil.stm32f405.chip import SOFTWARE, WATCHDOG, Chip, Why
 from hil.stm32f405.crash import Crash, CrashReports
@@ -28,6 +29,8 @@ HANG_US, AT_CRASH_US = 1_000_000, 5_000
 # polls once per exchange, and more than one frame per tick overflows the queue of a Crazyflie that starts, whose firmware
 # switches to SYSLINK only at its tick after a transfer (its DMA interrupt gives a semaphore and does not yield).
 POLL_PERIOD_US = 2_000
+# With decks nobody polls at a start: the firmware's task that sets them up does not let the one that empties the queue run.
+DECKS_START_US = 3_000_000
 CONSOLE, CONSOLE_MASK = 0x00, 0xF3
 CLOCK_HIGH, TIM7_COUNT = "usecTimerHighCount", 0x4000_1424  # of the firmware's usec_time.c
 ASSERTION = "assertFail"
@@ -73,6 +76,7 @@ class Crazyflie:
         self.tasks = FreeRtos.of(image, chip.read)
         run = chip.run if debugger is None else DebuggedChip(chip, debugger, self.tasks).run
         self.processor = ChipProcessor(chip, self.tasks, self._act, run)
+        self._decks = Decks(chip, self.processor, carrier)
         self.resets = {WATCHDOG: 0, SOFTWARE: 0}  # by cause, since power-on
         self._outside, self._outputs = outside, outputs
         self._crashes = CrashReports(image, chip, self.tasks, ASSERTION)
@@ -84,7 +88,8 @@ class Crazyflie:
         self._line = b""
         self._counts: tuple[int, ...] = ()
         self._unknown = 0
-        self._heard_us = 0  # the last packet of the radio, by the chip's time
+        self._silent_us = DECKS_START_US if carrier is not None and carrier.decks else 0  # after a start
+        self._heard_us = self._silent_us  # the last packet of the radio, by the chip's time
         self.processor.every(BATTERY_PERIOD_US, self._report_battery)
         self.processor.every(barometer.PERIOD_US, lambda now_us: self.parts.measure_pressure())
         self.processor.every(LOOK_PERIOD_US, lambda now_us: self._look_for_hang(HANG_US))
@@ -128,6 +133,8 @@ class Crazyflie:
         if why & Why.SERIAL:
             for kind, data in self._decoder.take(self.chip.sent(SYSLINK_USART)):
                 self._answer(kind, data)
+        if why & Why.DEVICE:
+            self.chip.tell_devices()
         if why & Why.COMPARE:
             counts = tuple(self.chip.state.compare[timer][channel] for timer, channel in self._outputs)
             if counts != self._counts:
@@ -170,6 +177,7 @@ class Crazyflie:
         self._hanging.clear()
         self.resets[cause] += 1
         self.chip.reset(cause)
+        self._heard_us = self.chip.now_us + self._silent_us
         self.chip.crash_points |= self._crashes.addresses
 
     def _answer(self, kind: int, data: bytes) -> None:
@@ -179,8 +187,8 @@ class Crazyflie:
                 self._print(data[1:])
             self._waiting.append(data)
             self._flush()
-        elif kind == syslink.SCAN_MEMORIES:
-            self.chip.feed(SYSLINK_USART, syslink.encode(kind, b"\0"))
+        elif syslink.SCAN_MEMORIES <= kind <= syslink.WRITE_MEMORY:
+            self.chip.feed(SYSLINK_USART, syslink.encode(kind, self._decks.answer(kind, data)))
         elif kind == syslink.VERSION:
             self.chip.feed(SYSLINK_USART, syslink.encode(kind, b"\0emulated\0"))
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 START = b"\xbc\xcf"
 RAW, RAW_BROADCAST = 0x00, 0x06  # radio packets
 BATTERY = 0x13  # flags, volts, amperes, degrees Celsius
-SCAN_MEMORIES = 0x20  # of decks; the answer is their number
+SCAN_MEMORIES, MEMORY_INFO, READ_MEMORY, WRITE_MEMORY = 0x20, 0x21, 0x22, 0x23  # of decks
 VERSION = 0x30
 OVERHEAD = 6
 EMPTY = b"\xff"  # a radio packet without contents

@@ -193,6 +193,7 @@ class Request:
         for override in self.overrides[len(self.experiment.settings) :]:
             if not self.config.reads(override.partition(".")[0].strip()):
                 raise LabError(f"--set {override}: has no effect on the robot of profile {self.profile}")
+        self.config.check_decks(self.bench.is_image)
         on_top = self.planned_faults[len(self.experiment.faults) :]
         check(on_top, self.duration_s, self.bench.link, self.config)
         check_limits(self.limits, self.experiment.metrics)

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from ground_station.mocap import MocapFrame
-from hil.bodies import make_body
+from hil.bodies import carrier_of, make_body
 from hil.config import LabConfig, load_config
 from hil.crazyflie.shockburst import Air
 from hil.devices.board import InjectFailure, KeptMemory, Thief, VirtualBoard, unsupported
@@ -30,7 +30,7 @@ from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
 from hil.events import EventQueue
 from hil.world.battery import Battery, open_circuit_voltage
-from hil.world.body import Body, Carrier
+from hil.world.body import Body
 
 IMU_PERIOD_US = 1_000
 # Share of a gyro's flight noise before the fans run, if it exceeds what the stock firmware accepts at rest: less than 100
@@ -118,7 +118,7 @@ class Robot:
         self.air, self.uart = ports.air, ports.uart
         self.executor = site.executor
         self._ports = ports
-        self._carrier = Carrier(self.body, streams.board)
+        self._carrier = carrier_of(config, self.body, streams.board)
         self._thief: Thief | None = None
         self._seen_by: list[See] = []
         self._resets = 0

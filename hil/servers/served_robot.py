@@ -12,6 +12,7 @@ from firmware_py.wire.memories import CONFIG_SIZE, decode_config, encode_config
 from firmware_py.wire.memories import RadioSettings as EepromSettings
 from firmware_py.wire.parameters import SetByName, encode_pose_kind, encode_set_by_name
 from ground_station.links.loopback import LoopbackLink
+from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation
 from ground_station.tracker import tracker_of
 from ground_station.trajectory import Goal, Hold
@@ -87,16 +88,21 @@ WORLD = Goal((0.0, 0.0, 0.0), 0.0)  # relative to this goal a pose is absolute
 
 
 class _PosesOnly(LoopbackLink):
-    """Carries corrections, or absolute poses; telemetry belongs to the clients."""
+    """Carries corrections, or absolute poses, or with `poses` false nothing; telemetry belongs to the clients."""
 
     def __init__(
         self,
         transmit: Callable[[int, bytes], object],
         latency_us: int,
         settings: Callable[[], Sequence[bytes]],
+        poses: bool,
     ) -> None:
         super().__init__(transmit, latency_us, dict)
-        self._settings = settings
+        self._settings, self._poses = settings, poses
+
+    def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
+        if self._poses:
+            super().send(now_us, frame, goal)
 
     def start_telemetry(self, now_us: int) -> None:
         """Send the settings instead."""
@@ -193,7 +199,7 @@ class ServedRobot:
         settings = (
             partial(self._pilot_settings, []) if config.pilot.enabled else partial(_pose_kind, absolute)
         )
-        link = _PosesOnly(self._wire, config.station.link_latency_us, settings)
+        link = _PosesOnly(self._wire, config.station.link_latency_us, settings, config.pilot.poses)
         tracker = tracker_of(config.tracker, config.mocap.period_us)
         goal = WORLD if absolute else Goal(config.flight.home, 0.0)
         ground = GroundStation(link, Hold(goal), None, config.station, tracker)

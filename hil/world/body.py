@@ -7,13 +7,14 @@ the centre of mass). Times are the laboratory's, in whole microseconds.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.scene import Look, Markers
+from hil.world.room import Room
 from hil.world.tunnel import Tunnel
 
 Vector = Sequence[float]
@@ -95,10 +96,12 @@ class Motion(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Carrier:
-    """The body that carries a board, and the random stream of its sensors."""
+    """The body that carries a board, the random stream of its sensors, the room that they see, and its decks, by name."""
 
     motion: Motion
     rng: np.random.Generator
+    room: Room = field(default_factory=Room)
+    decks: tuple[str, ...] = ()
 
 
 class Body(Motion, Protocol):
