@@ -16,7 +16,9 @@ PERIOD_US = 8_264  # of its images: 121 per second
 PRODUCT, MOTION, DELTAS, BURST, RESET, INVERSE = 0x00, 0x02, 0x03, 0x16, 0x3A, 0x5F  # registers
 IDENTITY, WRITE, RESETS = 0x49, 0x80, 0x5A
 MOVED, STILL = 0xB0, 0x30  # in MOTION
-FOCUS = 0.08  # [m] nearer the image is blurred; chosen: it follows the floor all the same, and counts fewer features
+# [m] Nearer the image is blurred. Chosen: features and shifts shrink in proportion. Bitcraze's Kalman filter takes no height
+# below 0.1 m: a sensor that followed the floor at 1 cm would be believed to move ten times as fast, and would not take off.
+FOCUS = 0.08
 FASTEST = 7.4  # [rad/s]
 # Per radian: 35 pixels over 0.717 rad, in tenths, by Bitcraze's measurement; PX4 has 385.
 COUNTS = 10.0 * 35.0 / 0.71674
@@ -43,7 +45,7 @@ class FlowSensor:
         self._device = chip.add_selected(bus, select, self._registers)
         chip.on_write(self._device, self._obey)
         self._spot_W: Vector | None = None  # on the floor, in the middle of the last image
-        self._distance = 0.0  # [m] to it
+        self._sharpness = 0.0  # 1: of what is far enough away
         self._shift = [0, 0]  # counts since the last read, along its own axes
         self._show()
 
@@ -52,16 +54,18 @@ class FlowSensor:
         p, q = self._motion.p_WB, self._motion.q_WB.tolist()
         place = tuple(float(a) + b for a, b in zip(p, to_world(q, self._place_B), strict=True))
         ahead = to_world(q, DOWN_B)
-        self._distance = (place[2] - self._room.floor) / -ahead[2] if ahead[2] < 0.0 else 0.0
-        if self._distance <= 0.0:
+        distance = (place[2] - self._room.floor) / -ahead[2] if ahead[2] < 0.0 else 0.0
+        self._sharpness = min(max(distance / FOCUS, 0.0), 1.0)
+        if self._sharpness == 0.0:
             self._spot_W = None
             return
         if self._spot_W is not None:
             x, y, z = to_body(q, tuple(a - b for a, b in zip(self._spot_W, place, strict=True)))
             most = COUNTS * FASTEST * PERIOD_US * 1e-6
             for axis, angle in enumerate((y / -z, x / -z)):  # its x axis is that of B's y
-                self._shift[axis] += round(min(max(COUNTS * angle, -most), most) + NOISE * self._draw())
-        self._spot_W = tuple(a + self._distance * b for a, b in zip(place, ahead, strict=True))
+                counts = self._sharpness * min(max(COUNTS * angle, -most), most)
+                self._shift[axis] += round(counts + NOISE * self._draw())
+        self._spot_W = tuple(a + distance * b for a, b in zip(place, ahead, strict=True))
         self._show()
 
     def _obey(self) -> None:
@@ -76,8 +80,12 @@ class FlowSensor:
         x, y = (min(max(shift, -0x8000), 0x7FFF) for shift in self._shift)
         motion = MOVED if x or y else STILL
         deltas = x.to_bytes(2, "little", signed=True) + y.to_bytes(2, "little", signed=True)
-        quality = round(TEXTURE * min(max(self._distance / FOCUS, 0.0), 1.0))
-        burst = bytes((motion, 0)) + deltas + bytes((quality, 80, 120, 40)) + SHUTTER.to_bytes(2)
+        burst = (
+            bytes((motion, 0))
+            + deltas
+            + bytes((round(TEXTURE * self._sharpness), 80, 120, 40))
+            + SHUTTER.to_bytes(2)
+        )
         self._registers[BURST : BURST + len(burst)] = np.frombuffer(burst, np.uint8)
         self._registers[MOTION : DELTAS + 4] = np.frombuffer(bytes((motion,)) + deltas, np.uint8)
         self._registers[[PRODUCT, INVERSE]] = IDENTITY, IDENTITY ^ 0xFF
