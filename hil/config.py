@@ -42,9 +42,20 @@ class FlightConfig(Section):
     start_offset: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0), description="start relative to home, W [m]"
     )
+    spacing: float = number(
+        0.0,
+        "[0, 10]",
+        "along y, between the starts of robots that `floaty serve --boards` has in one room [m]",
+    )
     release_us: int = number(
         1_000_000, "[0, 60_000_000]", "the robot is held until then: gyro zero, first poses [us]"
     )
+
+    def beside(self, number: int) -> "FlightConfig":
+        """Return that of robot 1, 2, 3, ...: the first is in the middle, the others to the left and right of it in turn."""
+        x, y, z = self.start_offset
+        places = number // 2 if number % 2 == 0 else -(number // 2)
+        return self.model_copy(update={"start_offset": (x, y + places * self.spacing, z)})
 
 
 class RobotConfig(Section):

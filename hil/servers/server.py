@@ -178,7 +178,8 @@ class Server:
         self._plan, self._say, self._onlooker = plan, say, onlooker
         self._shown: Shown | None = None
         for number in range(1, plan.count + 1):
-            own = with_system(config, config.mavlink.system + number - 1) if plan.mavlink else config
+            own = config.model_copy(update={"flight": config.flight.beside(number)})
+            own = with_system(own, config.mavlink.system + number - 1) if plan.mavlink else own
             self._add(number, own, Streams.of_seed(plan.seed + number - 1))
 
     def _add(self, number: int, config: LabConfig, streams: Streams) -> None:
