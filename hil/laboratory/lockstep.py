@@ -34,6 +34,7 @@ from hil.laboratory.laboratory import Laboratory
 from hil.laboratory.recorder import SETTINGS
 from hil.laboratory.request import MAVLINK, Request, check_image
 from hil.laboratory.robot import PYTHON_BOARD, Ports, Robot, Site
+from hil.stm32f405.chip import SOURCES
 from hil.stm32f405.gdb import GdbServer
 from hil.world.body import Channel
 
@@ -237,11 +238,13 @@ def image_at(board: str, elf: Path | None, debugger: GdbServer | None = None) ->
 
 
 def _folder_of_machines() -> Path:
-    """Return where the emulated chip is compiled: once for all of a user's projects, if there is a place for that."""
-    kept = Path.home() / ".cache" / "floaty"
-    with suppress(OSError):
-        kept.mkdir(parents=True, exist_ok=True)
-    return kept if os.access(kept, os.W_OK) else BUILD
+    """Return where the emulated chip is compiled, once for all flights: beside its sources, else in the user's cache."""
+    for kept in (SOURCES / "__pycache__", Path.home() / ".cache" / "floaty"):
+        with suppress(OSError):
+            kept.mkdir(parents=True, exist_ok=True)
+        if os.access(kept, os.W_OK):
+            return kept
+    return BUILD
 
 
 def debugger(port: int | None, image: Path, stack: ExitStack) -> GdbServer | None:

@@ -11,10 +11,12 @@ from hil.commands.app import main
 from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
+from hil.laboratory import lockstep
 from hil.laboratory.lockstep import image_at
 from hil.laboratory.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.result import Result
+from hil.stm32f405.chip import SOURCES
 from support.flights import hover
 from support.stm32_firmware import build
 
@@ -122,11 +124,22 @@ def test_the_emulated_chip_is_compiled_once_for_all_folders(
     image = str(build())
     (tmp_path / "file").touch()
     places = []
-    for home, folder in (("home", "one"), ("home", "two"), ("file/none", "three")):
-        (tmp_path / folder).mkdir()
-        monkeypatch.chdir(tmp_path / folder)
-        monkeypatch.setenv("HOME", str(tmp_path / home))
-        places.append(image_at(image, None).library)
+    nowhere = tmp_path / "file" / "none"
+    for sources, home in (
+        (SOURCES, nowhere),
+        (SOURCES, nowhere),
+        (nowhere, tmp_path / "home"),
+        (nowhere, nowhere),
+    ):
+        folder = tmp_path / str(len(places))
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        monkeypatch.setenv("HOME", str(home))
+        monkeypatch.setattr(lockstep, "SOURCES", sources)
+        places.append(image_at(image, None).library.resolve())
     assert places[0] == places[1]
-    assert places[0].is_relative_to(tmp_path / "home" / ".cache" / "floaty")
-    assert places[2].is_relative_to(tmp_path / "three")  # nothing can be kept: it stays in the project
+    assert places[0].is_relative_to(SOURCES)  # beside the sources, as other compiled code
+    assert places[2].is_relative_to(
+        tmp_path / "home" / ".cache" / "floaty"
+    )  # of an installation that nobody may write
+    assert places[3].is_relative_to(tmp_path / "3")
