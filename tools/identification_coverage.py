@@ -8,6 +8,7 @@ are called identified although their error exceeds twice their interval. Flights
 robot takes one to two minutes of one core per condition.
 """
 
+import argparse
 import sys
 from math import isfinite
 from pathlib import Path
@@ -113,8 +114,11 @@ def main(count: int, folder: Path, first: int) -> None:
 
 
 if __name__ == "__main__":
-    main(
-        int(sys.argv[1]) if len(sys.argv) > 1 else 20,
-        Path(sys.argv[2] if len(sys.argv) > 2 else "runs/identification"),
-        int(sys.argv[3]) if len(sys.argv) > 3 else FIRST_SEED,
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("robots", type=int, nargs="?", default=20)
+    parser.add_argument("folder", type=Path, nargs="?", default=Path("runs/identification"))
+    parser.add_argument("seed", type=int, nargs="?", default=FIRST_SEED)
+    options = parser.parse_args()
+    main(options.robots, options.folder, options.seed)

@@ -24,7 +24,7 @@ from firmware_py.core.observation import ACTIONS, OBSERVATIONS
 from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner
 from firmware_py.geometry import rotation_matrix, to_euler_zyx, wrap_angle
 from ground_station.trajectory import Goal, Offsets, Sine, Trajectory
-from hil.arguments import checked
+from hil.arguments import checked, shown
 from hil.campaigns.config import find_spec, read_spec
 from hil.campaigns.sampling import draw
 from hil.config import DEFAULT_PROFILE, Overrides, load_config, settings_of
@@ -96,6 +96,14 @@ class Setup:
         return [(*settings_of(options.get("overrides", ())), *own) for options in drawn]
 
 
+def _checked(actions: Actions, count: int) -> Actions:
+    """Return a copy of actions as (count, 4). Raises `LabError` for numbers of another count, or that are not finite."""
+    copied = np.array(actions, np.float32)
+    if copied.size != count * ACTIONS or not np.isfinite(copied).all():
+        raise LabError(f"action = {shown(actions)}: expected {count} x {ACTIONS} finite numbers")
+    return copied.reshape(count, ACTIONS)
+
+
 def make_env(task: str, fidelity: Fidelity = "fast", **setup: Any) -> gymnasium.Env[Actions, Actions]:
     """Return the environment of a task with one robot; the keywords are those of `Setup`. Raises `LabError`."""
     if fidelity not in ("fast", "firmware"):
@@ -147,7 +155,7 @@ class FastVectorEnv(VectorEnv[Actions, Actions, NDArray[Any]]):
         self, actions: Actions
     ) -> tuple[Actions, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Info]:
         """Advance all robots by 10 ms."""
-        limited = np.array(actions, np.float32).reshape(self.num_envs, ACTIONS)
+        limited = _checked(actions, self.num_envs)
         self._fleet.advance(limited, self.np_random, self._observations, self._rewards)
         np.clip(self._observations, -REACH, REACH, out=self._observations)
         self._steps += 1
@@ -187,7 +195,7 @@ class FastEnv(gymnasium.Env[Actions, Actions]):
 
     def step(self, action: Actions) -> tuple[Actions, float, bool, bool, Info]:
         """Advance the robot by 10 ms."""
-        limited = np.array(action, np.float32).reshape(1, ACTIONS)
+        limited = _checked(action, 1)
         self._fleet.advance(limited, self.np_random, self._observation, self._reward)
         self._steps += 1
         lost = bool(self._fleet.lost[0])
@@ -240,7 +248,7 @@ class FirmwareEnv(gymnasium.Env[Actions, Actions]):
         flight = self.flight
         if flight is None or self._blocks is None or flight.robot.body.lost is not None:
             raise gymnasium.error.ResetNeeded("step: call reset first; a flight ends with the robot's loss")
-        limited = np.clip(np.asarray(action, np.float32).reshape(ACTIONS), -1.0, 1.0)
+        limited = np.clip(_checked(action, 1)[0], -1.0, 1.0)
         own: Any = self._blocks.named["controller_own"].fields
         own.u1, own.u2, own.u3, own.u4 = limited
         change = float(((limited - self._previous) ** 2).sum())

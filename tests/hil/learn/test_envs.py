@@ -1,5 +1,6 @@
 """The environments: spaces, seeds, agreement of the two fidelities, and what the law on board sees."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,15 @@ def test_a_lost_robot_ends_its_episode_and_begins_another_in_the_same_step() -> 
         assert not observations[n, 16:].any(), "a new episode has no previous action"
     for n in np.flatnonzero(~lost):
         np.testing.assert_array_equal(info["final_obs"][n], observations[n])
+
+
+@pytest.mark.parametrize("fidelity", ["fast", "firmware"])
+@pytest.mark.parametrize("action", [[0.0, 0.0, math.nan, 0.0], [0.0, math.inf, 0.0, 0.0], [0.0, 0.0, 0.0]])
+def test_an_action_that_is_not_four_finite_numbers_is_refused(fidelity: str, action: list[float]) -> None:
+    env = make_env("Hover", fidelity, duration_s=0.07)  # type: ignore[arg-type]
+    env.reset(seed=1)
+    with pytest.raises(LabError, match="expected 1 x 4 finite numbers"):
+        env.step(np.array(action, np.float32))
 
 
 @pytest.mark.parametrize("fidelity", ["fast", "firmware"])
