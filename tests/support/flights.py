@@ -1,12 +1,17 @@
 """Flights that tests ask for in a line."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Unpack
 
+from hil.config import load_config
 from hil.experiments import Experiment, find_experiment
+from hil.laboratory.lockstep import image_at
 from hil.laboratory.request import Options, Request
 from hil.laboratory.result import Result
 from hil.laboratory.run import fly
+from hil.servers.server import Server, Service
 
 
 def flown(folder: Path, experiment: str | Experiment, *overrides: str, **options: Unpack[Options]) -> Result:
@@ -23,3 +28,16 @@ def hover(folder: Path, *overrides: str, **options: Unpack[Options]) -> Result:
 def explain(result: Result) -> str:
     """Say why a flight that should have passed has not."""
     return f"{result.outcome} {result.cause}: {[str(v) for v in result.verdicts if not v.holds]}, {result.folder}"
+
+
+@contextmanager
+def served_image(elf: str, profile: str) -> Iterator[Server]:
+    """Serve an image in lockstep with poses of the cameras; it has run for a second."""
+    server = Server(Service(load_config(profile), executor=image_at(elf, None)), lambda text: None)
+    try:
+        server.ends.robots[0].fly(absolute=True)
+        server.lab.end_at(1_000_000)
+        server.lab.run()
+        yield server
+    finally:
+        server.ends.close()

@@ -13,25 +13,13 @@ from hil.devices.config import ImuConfig
 from hil.devices.imu import VirtualImu
 from hil.errors import LabError
 from hil.floaty.plant import Plant
-from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
+from support.still_plant import still_plant
 
 GYRO_LSB = math.radians(2000 / 32768)  # [rad/s] data sheet
 ACCEL_LSB = 24 * 9.81 / 32768  # [m/s2] data sheet
 SILENT = ImuConfig(gyro_noise=0, accel_noise=0, gyro_bias=0, accel_bias=0)
 HOME = (0.0, 0.0, 1.15)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
-
-
-def make_plant() -> Plant:
-    plant = Plant(
-        GeometryConfig(),
-        PlantConfig(),
-        TunnelConfig(turbulence="none"),
-        PlantServoConfig(),
-        np.random.default_rng(1),
-    )
-    plant.hold()
-    return plant
 
 
 def settled(imu: VirtualImu, plant: Plant) -> tuple[int, ...]:
@@ -42,7 +30,7 @@ def settled(imu: VirtualImu, plant: Plant) -> tuple[int, ...]:
 
 def test_original_firmware_reads_body_rates_and_forces_from_the_counts() -> None:
     """The author's firmware: p = .7071 (gx + gy), q = .7071 (gy - gx), r = gz; on (1, 2, 3)."""
-    plant = make_plant()
+    plant = still_plant()
     tilt = Rotation.from_euler("ZYX", [0.3, -0.5, 0.7])
     plant.place(HOME, tilt.as_quat(scalar_first=True), omega_B=(1, 2, 3))
     counts = settled(VirtualImu(SILENT, np.random.default_rng(1)), plant)
@@ -55,7 +43,7 @@ def test_original_firmware_reads_body_rates_and_forces_from_the_counts() -> None
 
 
 def test_sensor_mounted_along_the_body_reads_body_rates_and_forces() -> None:
-    plant = make_plant()
+    plant = still_plant()
     tilt = Rotation.from_euler("ZYX", [0.3, -0.5, 0.7])
     plant.place(HOME, tilt.as_quat(scalar_first=True), omega_B=(1, 2, 3))
     imu = VirtualImu(SILENT.model_copy(update={"azimuth": 0.0}), np.random.default_rng(1))
@@ -68,7 +56,7 @@ def test_sensor_mounted_along_the_body_reads_body_rates_and_forces() -> None:
 
 
 def test_low_pass_is_second_order_butterworth_at_the_sample_instants() -> None:
-    plant, imu = make_plant(), VirtualImu(SILENT, np.random.default_rng(1))
+    plant, imu = still_plant(), VirtualImu(SILENT, np.random.default_rng(1))
     turning = np.random.default_rng(2).uniform(-3, 3, 300)
     tilting = np.random.default_rng(3).uniform(-1, 1, 300)
     counts = []
@@ -82,7 +70,7 @@ def test_low_pass_is_second_order_butterworth_at_the_sample_instants() -> None:
 
 
 def test_mean_of_ten_samples_has_the_noise_of_the_specification() -> None:
-    plant = make_plant()
+    plant = still_plant()
     imu = VirtualImu(ImuConfig(gyro_bias=0, accel_bias=0), np.random.default_rng(1))
     counts = np.array([imu.sample(plant) for _ in range(20_000)])[50:-50].reshape(-1, 10, 6)
     means = counts.mean(axis=1)
@@ -93,7 +81,7 @@ def test_mean_of_ten_samples_has_the_noise_of_the_specification() -> None:
 
 
 def test_every_specimen_has_its_own_constant_bias() -> None:
-    plant = make_plant()
+    plant = still_plant()
     quiet = ImuConfig(gyro_noise=0, accel_noise=0, gyro_bias=0.03, accel_bias=0.2)
     rests = []
     for seed in range(300):
@@ -103,7 +91,7 @@ def test_every_specimen_has_its_own_constant_bias() -> None:
 
 
 def test_counts_saturate() -> None:
-    plant = make_plant()
+    plant = still_plant()
     plant.place(HOME, LEVEL, omega_B=(0, 0, 60))
     imu = VirtualImu(SILENT, np.random.default_rng(1))
     assert settled(imu, plant)[2] == 32767
@@ -112,7 +100,7 @@ def test_counts_saturate() -> None:
 
 
 def test_a_moved_zero_is_a_rate_in_the_body_frame_and_heals() -> None:
-    plant, imu = make_plant(), VirtualImu(SILENT, np.random.default_rng(1))
+    plant, imu = still_plant(), VirtualImu(SILENT, np.random.default_rng(1))
     before = np.array(settled(imu, plant))
     imu.set_rate_bias(1.0, 2.0, 3.0)
     gx, gy, gz = (np.array(settled(imu, plant)) - before)[:3] * GYRO_LSB
@@ -122,7 +110,7 @@ def test_a_moved_zero_is_a_rate_in_the_body_frame_and_heals() -> None:
 
 
 def test_a_smaller_range_bounds_the_gyro_alone() -> None:
-    plant, imu = make_plant(), VirtualImu(SILENT, np.random.default_rng(1))
+    plant, imu = still_plant(), VirtualImu(SILENT, np.random.default_rng(1))
     plant.place(HOME, LEVEL, omega_B=(0, 0, -2))
     free = settled(imu, plant)
     imu.set_rate_range(1.0)
@@ -136,7 +124,7 @@ def test_a_smaller_range_bounds_the_gyro_alone() -> None:
 
 
 def test_a_frozen_sensor_repeats_itself_until_it_thaws() -> None:
-    plant, imu = make_plant(), VirtualImu(SILENT, np.random.default_rng(1))
+    plant, imu = still_plant(), VirtualImu(SILENT, np.random.default_rng(1))
     before = settled(imu, plant)
     imu.freeze(True)
     plant.place(HOME, (0.0, 1.0, 0.0, 0.0), omega_B=(1, 2, 3))
@@ -148,7 +136,7 @@ def test_a_frozen_sensor_repeats_itself_until_it_thaws() -> None:
 
 
 def test_noise_can_be_scaled_but_not_to_nonsense() -> None:
-    plant, imu = make_plant(), VirtualImu(ImuConfig(), np.random.default_rng(1))
+    plant, imu = still_plant(), VirtualImu(ImuConfig(), np.random.default_rng(1))
     settled(imu, plant)
     plain = np.array([imu.sample(plant) for _ in range(2000)]).std(axis=0)
     imu.set_noise_scale(3.0)

@@ -10,22 +10,15 @@ from ground_station.mocap import MocapFrame
 from hil.devices.cameras import VirtualMocap
 from hil.devices.config import MocapConfig
 from hil.floaty.plant import Plant
-from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
+from support.still_plant import still_plant
 
 TURN = Rotation.from_euler("ZYX", [1.0, 0.2, -0.3])
 PLACE = (0.1, 0.2, 0.3)
 
 
 def make_plant() -> Plant:
-    plant = Plant(
-        GeometryConfig(),
-        PlantConfig(),
-        TunnelConfig(turbulence="none"),
-        PlantServoConfig(),
-        np.random.default_rng(1),
-    )
+    plant = still_plant()
     plant.place(PLACE, TURN.as_quat(scalar_first=True))
-    plant.hold()
     return plant
 
 

@@ -7,13 +7,11 @@ from pathlib import Path
 import pytest
 
 from hil.api import column, fly
-from hil.config import load_config
 from hil.crazyflie.log_table import log_table
 from hil.errors import LabError
 from hil.experiments.hover import HOVER
-from hil.laboratory.lockstep import image_at
 from hil.laboratory.request import Request
-from hil.servers.server import Server, Service
+from support.flights import served_image
 
 ELF = os.environ.get("FLOATY_STOCK_ELF", "")
 needs_image = pytest.mark.skipif(
@@ -58,12 +56,8 @@ def test_without_decks_and_without_poses_it_does_not_hold_its_place(tmp_path: Pa
 
 @needs_image
 def test_drivers_read_the_walls_and_the_floor_where_they_are() -> None:
-    server = Server(Service(load_config(PROFILE), executor=image_at(ELF, None)), lambda text: None)
-    try:
+    with served_image(ELF, PROFILE) as server:
         served = server.ends.robots[0]
-        served.fly(absolute=True)
-        server.lab.end_at(1_000_000)
-        server.lab.run()
         served.robot.body.put_back((0.6, -0.5, 1.0))
         server.lab.end_at(1_600_000)
         server.lab.run()
@@ -78,5 +72,3 @@ def test_drivers_read_the_walls_and_the_floor_where_they_are() -> None:
         for name in ("bcFlow2", "bcMultiranger"):
             assert firmware.flashed is not None
             assert firmware.flashed.parameters[f"deck.{name}"].read() == 1
-    finally:
-        server.ends.close()

@@ -18,6 +18,7 @@ from hil.laboratory.recorder import (
     load_log,
 )
 from hil.world.body import Channel, Quantity
+from support.watching import Watcher
 
 
 def make(folder: Path, values: np.ndarray, onlooker: Onlooker | None = None) -> Recorder:
@@ -66,19 +67,6 @@ def test_a_long_log_is_read_without_memory_for_all_of_it(
     assert sorted(tmp_path.iterdir()) == files
 
 
-class Watcher:
-    """Keeps the rows that a recorder passes on."""
-
-    def __init__(self) -> None:
-        self.batches: list[pa.RecordBatch] = []
-
-    def rows(self, batch: pa.RecordBatch) -> None:
-        self.batches.append(batch)
-
-    def note(self, t_us: int, source: str, text: str) -> None:
-        raise AssertionError("nothing was noted")
-
-
 def test_rows_that_an_onlooker_keeps_stay_as_they_were_recorded(tmp_path: Path) -> None:
     watcher, values = Watcher(), np.zeros(2)
     recorder = make(tmp_path, values, watcher)
@@ -87,6 +75,7 @@ def test_rows_that_an_onlooker_keeps_stay_as_they_were_recorded(tmp_path: Path) 
         recorder.row(row)
     recorder.close()
     assert pa.Table.from_batches(watcher.batches).equals(load_log(tmp_path))
+    assert watcher.notes == []
 
 
 def test_memory_of_a_long_log_is_given_back_and_the_log_still_read(

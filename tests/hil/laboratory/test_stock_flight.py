@@ -15,9 +15,8 @@ from hil.devices.crazyflie_signals import stock_signals
 from hil.errors import LabError
 from hil.experiments.hover import HOVER
 from hil.laboratory.fault_kinds import KINDS
-from hil.laboratory.lockstep import image_at
 from hil.laboratory.request import why_left
-from hil.servers.server import Server, Service
+from support.flights import served_image
 
 ELF = os.environ.get("FLOATY_STOCK_ELF", "")
 needs_image = pytest.mark.skipif(
@@ -154,12 +153,8 @@ def test_same_seed_has_the_same_hash_and_an_unknown_parameter_one_line(tmp_path:
 
 @needs_image
 def test_served_robot_stands_on_the_floor_with_the_profiles_parameters_and_feels_its_height() -> None:
-    server = Server(Service(load_config(PROFILE), executor=image_at(ELF, None)), lambda text: None)
-    try:
+    with served_image(ELF, PROFILE) as server:
         served = server.ends.robots[0]
-        served.fly(absolute=True)
-        server.lab.end_at(1_000_000)
-        server.lab.run()
         robot = served.robot
         assert robot.free
         assert robot.firmware.flashed is not None
@@ -177,5 +172,3 @@ def test_served_robot_stands_on_the_floor_with_the_profiles_parameters_and_feels
             heights.append(asl.read())
         assert heights[0] == pytest.approx(0.0, abs=0.5)
         assert heights[1] - heights[0] == pytest.approx(2.0, abs=0.5)
-    finally:
-        server.ends.close()

@@ -1,24 +1,10 @@
 """What a server shows of its first robot."""
 
-import pyarrow as pa
-
 from hil.config import load_config
 from hil.laboratory.recorder import stored_in
 from hil.scene import Look
 from hil.servers.server import Server, Service
-
-
-class Watcher:
-    """Keeps the rows that it is shown."""
-
-    def __init__(self) -> None:
-        self.batches: list[pa.RecordBatch] = []
-
-    def rows(self, batch: pa.RecordBatch) -> None:
-        self.batches.append(batch)
-
-    def note(self, t_us: int, source: str, text: str) -> None:
-        pass
+from support.watching import Watcher
 
 
 def test_rows_of_a_served_robot_say_what_it_looks_like() -> None:

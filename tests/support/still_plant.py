@@ -1,0 +1,13 @@
+"""A plant held in calm air."""
+
+import numpy as np
+
+from hil.floaty.plant import Plant
+from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
+
+
+def still_plant() -> Plant:
+    calm = TunnelConfig(turbulence="none")
+    plant = Plant(GeometryConfig(), PlantConfig(), calm, PlantServoConfig(), np.random.default_rng(1))
+    plant.hold()
+    return plant
