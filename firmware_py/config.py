@@ -91,7 +91,7 @@ class ExcitationConfig(Declared):
     """The signal added to the inputs for identification, once `excite.signal` on board switches it on."""
 
     signal: Literal["multisine", "chirp"] = Field(
-        description="multisine: all inputs at once, each with lines of its own; chirp: one input"
+        description="multisine: all inputs at once, each at separate frequencies; chirp: one input"
     )
 
     @property

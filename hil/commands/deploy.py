@@ -49,7 +49,11 @@ def deploy() -> None:
 @click.argument("experiment", required=False)
 @click.option("--all", "every", is_flag=True, help="Every experiment, the first minute of each.")
 @click.option(
-    "--seed", type=click.IntRange(0, 2**63 - 1), default=1, show_default=True, help="Of everything random."
+    "--seed",
+    type=click.IntRange(0, 2**63 - 1),
+    default=1,
+    show_default=True,
+    help="Seed of all random numbers.",
 )
 @click.option(
     "--duration",

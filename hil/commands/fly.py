@@ -81,7 +81,7 @@ SEEDS_MAX = 10_000
     "--out",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="Run folder [runs/EXPERIMENT-SEED, or -2, -3, … where another request was flown].",
+    help="Run folder [runs/EXPERIMENT-SEED; -2, -3, … is added if that holds another flight].",
 )
 @runner_options
 def fly(

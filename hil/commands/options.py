@@ -36,7 +36,7 @@ def wide_console(width: int = 150) -> Console:
 
 run_folder = click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
 seed_option = click.option(
-    "--seed", type=click.IntRange(0, 2**62), default=1, show_default=True, help="Of everything random."
+    "--seed", type=click.IntRange(0, 2**62), default=1, show_default=True, help="Seed of all random numbers."
 )
 fault_option = click.option(
     "--fault", "faults", multiple=True, metavar="KIND@START[:DURATION][=SIZE]",

@@ -86,7 +86,7 @@ class ServeOptions:
 @click.option("--boards", type=click.IntRange(1, BOARDS_MAX), default=1, show_default=True, metavar="N")
 @click.option(
     "--station", type=click.Choice(["corrections", "poses"]), is_flag=False, flag_value="corrections",
-    help="Fly at home with the built-in ground station; poses: it sends absolute poses, and clients say where to fly. "
+    help="Fly at home with the built-in ground station; poses: it sends absolute poses, and clients send the goal. "
     "Of the profile crazyflie: always poses.",
 )  # fmt: skip
 @click.option(
