@@ -1,4 +1,4 @@
-"""The decks on a Crazyflie: what stands in their one-wire memories, and their chips on the board's buses.
+"""The decks on a Crazyflie: the contents of their one-wire memories, and their chips on the board's buses.
 
 The radio chip reads the memories and hands them on over syslink. Products and pins: Bitcraze's drivers and deck memory
 format; weights: its data sheets. Where a sensor is on a deck is chosen, to about 5 mm.
@@ -41,7 +41,7 @@ RANGERS: tuple[tuple[int, Vector, Vector], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class DeckHost:
-    """What decks are connected to: the microcontroller, its time, and what they measure."""
+    """The microcontroller to which decks are connected, its time, and the quantities that they measure."""
 
     chip: Chip
     processor: ChipProcessor
@@ -100,7 +100,7 @@ DECKS = {
 
 
 class Decks:
-    """Those on one board, connected."""
+    """The connected decks of one board."""
 
     def __init__(self, chip: Chip, processor: ChipProcessor, carrier: Carrier | None) -> None:
         decks = [] if carrier is None else [DECKS[name] for name in carrier.decks]
@@ -112,7 +112,7 @@ class Decks:
                 deck.connect(DeckHost(chip, processor, carrier))
 
     def answer(self, kind: int, data: bytes) -> bytes:
-        """Return what the radio chip answers to a syslink packet about the memories."""
+        """Return the radio chip's answer to a syslink packet about the memories."""
         if kind == syslink.SCAN_MEMORIES:
             return bytes((len(self._memories),))
         number, at = data[0], int.from_bytes(data[1:3], "little")

@@ -136,7 +136,7 @@ class RigidBody(InTunnel):
 
     @property
     def lost(self) -> str | None:
-        """The first reason why the flight is over, including errors of its own code; None while it flies."""
+        """Return why the flight ended first, including errors in the user's code; None while it flies."""
         return self._failed or super().lost
 
     def _given(self, name: str, ask: Callable[[], Any], count: int) -> list[float]:
