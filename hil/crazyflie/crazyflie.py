@@ -3,16 +3,16 @@
 It uses only what all of Bitcraze's firmware has: a console, the clock of usec_time.c, `assertFail`.
 """
 
-import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from hil.crazyflie import barometer, syslink
+from hil.crazyflie import barometer
 from hil.crazyflie.decks import Decks
-from hil.crazyflie.parts import RADIO_BUSY, SYSLINK_USART, Parts
+from hil.crazyflie.parts import Parts
+from hil.crazyflie.radio_line import Outside, RadioLine
 from hil.stm32f405.chip import SOFTWARE, WATCHDOG, Chip, Why
 from hil.stm32f405.crash import Crash, CrashReports
 from hil.stm32f405.freertos import FreeRtos
@@ -21,37 +21,20 @@ from hil.stm32f405.image import Image
 from hil.stm32f405.processor import ChipProcessor
 from hil.world.body import Carrier
 
-BATTERY_PERIOD_US = 100_000
 LOOK_PERIOD_US = 100_000  # for tasks that do not wait
 # So long is a hang (a start waits busily for 0.2 s); so long explains a crash.
 HANG_US, AT_CRASH_US = 1_000_000, 5_000
-# On an idle radio link; the nRF51 passes every packet on, also an empty one. Not between the packets of a busy link: a host
-# polls once per exchange, and more than one frame per tick overflows the queue of a Crazyflie that starts, whose firmware
-# switches to SYSLINK only at its tick after a transfer (its DMA interrupt gives a semaphore and does not yield).
-POLL_PERIOD_US = 2_000
-# With decks nobody polls at a start: the firmware's task that sets them up does not let the one that empties the queue run.
-DECKS_START_US = 3_000_000
-CONSOLE, CONSOLE_MASK = 0x00, 0xF3
 CLOCK_HIGH, TIM7_COUNT = "usecTimerHighCount", 0x4000_1424  # of the firmware's usec_time.c
 ASSERTION = "assertFail"
 
 
-class Surroundings(Protocol):
+class Surroundings(Outside, Protocol):
     """Where the board's pins lead to."""
 
     eeprom: bytearray
 
-    def read_battery_mv(self) -> int:
-        """Return the supply voltage."""
-
     def write_compare(self, counts: Sequence[int]) -> None:
         """Take the compare counts of the timers that drive the robot."""
-
-    def radio_send(self, data: bytes) -> bool:
-        """Take a packet to the host; False while the radio's queue is full."""
-
-    def debug_write(self, text: str) -> None:
-        """Take a line of the console, or what happened to the processor."""
 
 
 class Crazyflie:
@@ -76,36 +59,18 @@ class Crazyflie:
         self.tasks = FreeRtos.of(image, chip.read)
         run = chip.run if debugger is None else DebuggedChip(chip, debugger, self.tasks).run
         self.processor = ChipProcessor(chip, self.tasks, self._act, run)
-        self._decks = Decks(chip, self.processor, carrier)
+        decks = Decks(chip, self.processor, carrier)
+        self.radio = RadioLine(chip, self.processor, decks, outside, polls)
         self.resets = {WATCHDOG: 0, SOFTWARE: 0}  # by cause, since power-on
         self._outside, self._outputs = outside, outputs
         self._crashes = CrashReports(image, chip, self.tasks, ASSERTION)
         chip.crash_points |= self._crashes.addresses
         self._crashed = False  # since the reset
         self._hanging: set[int] = set()  # tasks, since the reset
-        self._decoder = syslink.Decoder()
-        self._waiting: list[bytes] = []  # for the nRF51, whose queue is full
-        self._line = b""
         self._counts: tuple[int, ...] = ()
         self._unknown = 0
-        self._silent_us = DECKS_START_US if carrier is not None and carrier.decks else 0  # after a start
-        self._heard_us = self._silent_us  # the last packet of the radio, by the chip's time
-        self.processor.every(BATTERY_PERIOD_US, self._report_battery)
         self.processor.every(barometer.PERIOD_US, lambda now_us: self.parts.measure_pressure())
         self.processor.every(LOOK_PERIOD_US, lambda now_us: self._look_for_hang(HANG_US))
-        if polls:
-            self.processor.every(POLL_PERIOD_US, self._poll_idle_link)
-
-    def radio_received(self, data: bytes, broadcast: bool = False) -> None:
-        """Deliver a packet of the radio chip over the serial line, and fetch one."""
-        self._flush()
-        self._heard_us = self.chip.now_us
-        kind = syslink.RAW_BROADCAST if broadcast else syslink.RAW
-        self.chip.feed(SYSLINK_USART, syslink.encode(kind, data))
-
-    def _poll_idle_link(self, now_us: int) -> None:
-        if now_us - self._heard_us >= POLL_PERIOD_US:
-            self.radio_received(syslink.EMPTY)
 
     def report_unknown(self) -> None:
         """Say which peripherals the image has used that are not there."""
@@ -131,8 +96,7 @@ class Crazyflie:
 
     def _act(self, why: int) -> None:
         if why & Why.SERIAL:
-            for kind, data in self._decoder.take(self.chip.sent(SYSLINK_USART)):
-                self._answer(kind, data)
+            self.radio.sent()
         if why & Why.DEVICE:
             self.chip.tell_devices()
         if why & Why.COMPARE:
@@ -177,34 +141,5 @@ class Crazyflie:
         self._hanging.clear()
         self.resets[cause] += 1
         self.chip.reset(cause)
-        self._heard_us = self.chip.now_us + self._silent_us
+        self.radio.reset(self.chip.now_us)
         self.chip.crash_points |= self._crashes.addresses
-
-    def _answer(self, kind: int, data: bytes) -> None:
-        """Do what the nRF51 does with a frame of the STM32."""
-        if kind == syslink.RAW and data:
-            if data[0] & CONSOLE_MASK == CONSOLE:
-                self._print(data[1:])
-            self._waiting.append(data)
-            self._flush()
-        elif syslink.SCAN_MEMORIES <= kind <= syslink.WRITE_MEMORY:
-            self.chip.feed(SYSLINK_USART, syslink.encode(kind, self._decks.answer(kind, data)))
-        elif kind == syslink.VERSION:
-            self.chip.feed(SYSLINK_USART, syslink.encode(kind, b"\0emulated\0"))
-
-    def _flush(self) -> None:
-        """Hand packets to the radio; while its queue is full it takes no more bytes of the STM32."""
-        while self._waiting and self._outside.radio_send(self._waiting[0]):
-            self._waiting.pop(0)
-        self.chip.pin(*RADIO_BUSY, bool(self._waiting))
-
-    def _print(self, text: bytes) -> None:
-        *lines, self._line = (self._line + text).split(b"\n")
-        for line in lines:
-            self._outside.debug_write(line.decode(errors="replace"))
-
-    def _report_battery(self, now_us: int) -> None:
-        volts = self._outside.read_battery_mv() / 1000
-        self.chip.feed(
-            SYSLINK_USART, syslink.encode(syslink.BATTERY, struct.pack("<Bfff", 0, volts, 0.0, 25.0))
-        )

@@ -3,19 +3,22 @@
 Every received packet is acknowledged with the head of a queue of 8. Safelink's counters are in the headers' two spare
 bits: a repeated packet is not passed on again, and an answer is repeated until the host's counter confirms it. With an
 empty queue the firmware acknowledges with its signal strength, the bootloader with an empty packet. The firmware also
-receives packets to all boards on its channel, which are not acknowledged. Facts: Bitcraze's nRF51 crazyflie2-nrf-firmware
-and crazyflie2-nrf-bootloader.
+receives packets to all boards on its channel, of a host or of another board, which are not acknowledged. Facts: Bitcraze's
+nRF51 crazyflie2-nrf-firmware and crazyflie2-nrf-bootloader.
 """
+
+from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum, auto
 from functools import partial
 from typing import Protocol
 
+from hil.crazyflie import syslink
 from hil.crazyflie.bootloader import HEADER, NRF51, Bootloader
-from hil.crazyflie.shockburst import Air, BoardEnd, Waiting, syslink_us
+from hil.crazyflie.shockburst import TURN_ROUND_US, Air, BoardEnd, Waiting, air_us, syslink_us
 from hil.events import EventQueue
 
 NULL, NULL_MASK = 0xF3, 0xF3  # an empty packet's header; the other bits are safelink's
@@ -23,6 +26,7 @@ SIGNAL_STRENGTH = 1  # type of the answer that carries it
 SIGNAL_DBM = 40  # below 0 dBm: a board in the same room
 SAFELINK = 5  # type of the packet that switches it
 RADIO = 3  # type of the packets that set channel, data rate and power of the radio itself
+PEERS, PEERS_MASK = 0x80, 0xF0  # type of the packets of other boards; its lower half is their port
 RESET_DELAY_US = 100_000
 RETUNE_DELAY_US = 1_000  # the answer leaves first
 BROADCAST = bytes.fromhex("FFE7E7E7E7")  # address of all boards
@@ -78,10 +82,32 @@ class PoweredProcessor(Protocol):
         """Note that a client has moved the radio to another channel or data rate."""
 
 
+class Band:
+    """The radio chips within reach of each other; `uniform` draws from 0..1 which packets between them are lost."""
+
+    def __init__(self, events: EventQueue, uniform: Callable[[], float]) -> None:
+        self.events = events
+        self.boards: list[Nrf51] = []
+        self._uniform = uniform
+
+    def send_to_peers(self, now_us: int, sender: Nrf51, packet: bytes) -> None:
+        """Send a packet once to all other boards on the sender's channel."""
+        own = sender.settings
+        settings = AirSettings(own.channel, own.bits_per_second, BROADCAST)
+        heard_us = now_us + TURN_ROUND_US + air_us(len(packet), own.bits_per_second)
+        for board in self.boards:
+            if board is not sender and self._uniform() >= board.air.lost_up(len(packet)):
+                self.events.at(heard_us, partial(self._arrive, board, settings, packet))
+
+    def _arrive(self, board: Nrf51, settings: AirSettings, packet: bytes, now_us: int) -> None:
+        if board.hears_all(settings):
+            board.overhear(now_us, packet)
+
+
 class Nrf51:
     """One board's radio chip; `settings` are those of its firmware, `chip` the 6 bytes of its factory address.
 
-    `air` has the losses of packets between it and its partner.
+    `air` has the losses of packets between it and its partner. It joins the `band`.
     """
 
     def __init__(
@@ -89,7 +115,7 @@ class Nrf51:
         settings: AirSettings,
         chip: bytes,
         queue: int,
-        events: EventQueue,
+        band: Band,
         processor: PoweredProcessor,
         air: Air,
         wire_us: Callable[[bytes], int] = syslink_us,
@@ -103,9 +129,10 @@ class Nrf51:
         self._bootloader_settings = AirSettings(0, 2_000_000, bytes((0xB1, *chip[3::-1])))
         self._chip = chip
         self._capacity = queue
-        self._events = events
+        self._band, self._events = band, band.events
         self._processor = processor
         self._forget()
+        band.boards.append(self)
 
     def _forget(self) -> None:
         """Clear the memory."""
@@ -117,6 +144,19 @@ class Nrf51:
     def tune(self, settings: AirSettings) -> None:
         """Set its radio, as a firmware that boots does."""
         self.settings = settings
+
+    def command(self, now_us: int, kind: int, data: bytes) -> None:
+        """Execute a command of the STM32, as in syslink."""
+        if kind == syslink.PEER_BROADCAST and data:
+            packet = bytes((NULL | 0x0C, PEERS | data[0] & 0x0F)) + data[1:]
+            self._band.send_to_peers(now_us, self, packet)
+        elif kind in (syslink.RADIO_CHANNEL, syslink.RADIO_RATE) and len(data) == 1:
+            self.settings = self._tuned(SET_CHANNEL if kind == syslink.RADIO_CHANNEL else SET_RATE, data[0])
+        elif kind == syslink.RADIO_ADDRESS and len(data) == 5:
+            self.settings = replace(self.settings, address=data[::-1])
+        elif kind in (syslink.SWITCH_OFF, syslink.STM32_OFF):
+            power = Power.OFF if kind == syslink.SWITCH_OFF else Power.RADIO_ONLY
+            self._events.at(now_us, partial(self._switch_off, power))
 
     def hears(self, settings: AirSettings) -> bool:
         """Whether a packet sent with these settings reaches this board."""
@@ -151,6 +191,9 @@ class Nrf51:
             answer = self._next_answer(now_us)
             self._command(now_us, data)
             return answer
+        if is_to_peers(data):
+            self._take(now_us, data, broadcast=False)
+            return b""
         if kind == SAFELINK and len(data) == 3:
             self._service = data
             answer = self._next_answer(now_us)
@@ -179,14 +222,18 @@ class Nrf51:
 
     def _retune(self, command: int, value: int, now_us: int) -> None:
         """Set the radio until the next start of the processor, which sets it to the values in its EEPROM."""
-        wanted = own = self.settings
-        if command == SET_CHANNEL and value <= CHANNEL_MAX:
-            wanted = AirSettings(value, own.bits_per_second, own.address)
-        elif command == SET_RATE and value < len(RATES):
-            wanted = AirSettings(own.channel, RATES[value], own.address)
-        if wanted != own:
+        wanted = self._tuned(command, value)
+        if wanted != self.settings:
             self.settings = wanted
             self._processor.retuned(now_us)
+
+    def _tuned(self, command: int, value: int) -> AirSettings:
+        """Return its settings after a command, unchanged by a wrong one."""
+        if command == SET_CHANNEL and value <= CHANNEL_MAX:
+            return replace(self.settings, channel=value)
+        if command == SET_RATE and value < len(RATES):
+            return replace(self.settings, bits_per_second=RATES[value])
+        return self.settings
 
     def _next_answer(self, now_us: int) -> bytes:
         """Return the answer after the one that has arrived."""
@@ -218,11 +265,9 @@ class Nrf51:
         elif command == RESET and len(data) == 4 and self._reset_armed:
             self._reset_later(now_us, data)
         elif command == ALL_OFF:
-            self._stop_processor(now_us)
-            self.power = Power.OFF
+            self._switch_off(Power.OFF, now_us)
         elif command == SYSTEM_OFF and self.power is Power.RUNNING:
-            self._stop_processor(now_us)
-            self.power = Power.RADIO_ONLY
+            self._switch_off(Power.RADIO_ONLY, now_us)
         elif command == SYSTEM_ON and self.power is Power.RADIO_ONLY:
             self._start(now_us)
         elif command == BATTERY:
@@ -253,6 +298,10 @@ class Nrf51:
         else:
             self._start(now_us)
 
+    def _switch_off(self, power: Power, now_us: int) -> None:
+        self._stop_processor(now_us)
+        self.power = power
+
     def _stop_processor(self, now_us: int) -> None:
         if self.power is Power.RUNNING:
             self._processor.stop(now_us)
@@ -277,3 +326,9 @@ class Nrf51:
 def _kind(data: bytes) -> int | None:
     """Return the type of a packet to the radio chip, None for one to the processor."""
     return data[1] if len(data) > 1 and data[0] & NULL_MASK == NULL else None
+
+
+def is_to_peers(data: bytes) -> bool:
+    """Whether a packet is one from board to board, which the radio chip passes on in its own kind of frame."""
+    kind = _kind(data)
+    return kind is not None and kind & PEERS_MASK == PEERS

@@ -7,7 +7,17 @@ from collections.abc import Iterator
 
 START = b"\xbc\xcf"
 RAW, RAW_BROADCAST = 0x00, 0x06  # radio packets
-BATTERY = 0x13  # flags, volts, amperes, degrees Celsius
+RADIO_CHANNEL, RADIO_RATE, SIGNAL, RADIO_ADDRESS, RADIO_POWER, RADIO_READY = (
+    0x01,
+    0x02,
+    0x04,
+    0x05,
+    0x07,
+    0x0B,
+)
+PEER, PEER_BROADCAST = 0x08, 0x0A  # port, signal strength (only to the STM32), data
+SWITCH_OFF, STM32_OFF = 0x11, 0x1A
+BATTERY, BATTERY_REPORTS = 0x13, 0x14  # flags, volts, amperes, degrees Celsius; start to report
 SCAN_MEMORIES, MEMORY_INFO, READ_MEMORY, WRITE_MEMORY = 0x20, 0x21, 0x22, 0x23  # of decks
 VERSION = 0x30
 OVERHEAD = 6

@@ -41,16 +41,31 @@ def stay_on(now_us: int) -> None:
     """Ignore a reset."""
 
 
+def ignore_command(now_us: int, kind: int, data: bytes) -> None:
+    """Ignore a command to the radio chip."""
+
+
 def unsupported(now_us: int, unit: int, failing: int, instance: int) -> CommandResult:
     """Refuse every failure."""
     return CommandResult.UNSUPPORTED
+
+
+@dataclass(frozen=True, slots=True)
+class Requests:
+    """The world's answers when the processor resets itself, commands its radio chip, or a client makes a part fail."""
+
+    reset: Callable[[int], None] = stay_on
+    radio_command: Callable[[int, int, bytes], None] = ignore_command  # (now_us, kind, data), as in syslink
+    fail: InjectFailure = unsupported
+
+
+NO_REQUESTS = Requests()
 
 
 class VirtualBoard:
     """Implements `firmware_py.board.Board`; the pins lead to `servo`, `radio`, `console` and `uart`.
 
     These get times of the hardware's clock. `run_on` sets the processor that keeps time and the queue of hardware events.
-    `reset` is called when the processor resets itself, `fail` when a client makes a part of the robot fail.
     """
 
     def __init__(
@@ -59,16 +74,14 @@ class VirtualBoard:
         radio: Callable[[int, bytes], bool],
         console: Callable[[int, str], None],
         uart: Uart | None = None,
-        reset: Callable[[int], None] = stay_on,
-        fail: InjectFailure = unsupported,
+        requests: Requests = NO_REQUESTS,
         memory: KeptMemory | None = None,
     ) -> None:
         self.imu: ImuCounts = STILL
         self.battery_mv = 3900
         memory = memory or KeptMemory()
         self.eeprom, self.deck_memory = memory.eeprom, memory.deck
-        self._reset = reset
-        self._fail = fail
+        self._requests = requests
         self._servo = servo
         self._radio = radio
         self._console = console
@@ -116,6 +129,11 @@ class VirtualBoard:
         self._let_hardware_go_first()
         return accepted
 
+    def radio_command(self, kind: int, data: bytes) -> None:
+        """Hand a command to the radio chip."""
+        self._requests.radio_command(self.now_us, kind, data)
+        self._let_hardware_go_first()
+
     @property
     def uart_overruns(self) -> int:
         return self._uart.overruns if self._uart else 0
@@ -141,12 +159,12 @@ class VirtualBoard:
 
     def reset(self) -> None:
         """Notify the owner, who reboots the processor before its tasks continue."""
-        self._reset(self.now_us)
+        self._requests.reset(self.now_us)
         self._let_hardware_go_first()
 
     def inject_failure(self, unit: int, failing: int, instance: int) -> CommandResult:
         """Pass a request for a failure to the world."""
-        result = self._fail(self.now_us, unit, failing, instance)
+        result = self._requests.fail(self.now_us, unit, failing, instance)
         self._let_hardware_go_first()
         return result
 

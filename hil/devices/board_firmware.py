@@ -30,6 +30,13 @@ Trace = Callable[
 ]  # (us, event, who, a, b), in the words of tests/vectors/README.md
 
 
+class Pins(Board, Protocol):
+    """A board's pins; a processor may also command its radio chip."""
+
+    def radio_command(self, kind: int, data: bytes) -> None:
+        """Take a command to the radio chip, as in syslink."""
+
+
 class BoardVariable(Protocol):
     @property
     def name(self) -> str:
@@ -236,7 +243,7 @@ class PowerOn:
     timer and channel, from 0, of the robot's actuators. `carrier` is what its other sensors measure.
     """
 
-    board: Board
+    board: Pins
     config: FirmwareConfig
     serial: bool
     polled: bool

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.board import Board, ImuCounts
+from firmware_py.board import ImuCounts
 from firmware_py.config import FirmwareConfig, parameters_of
 from firmware_py.rtos import TaskReport
 from firmware_py.signals import CONTROL, ESTIMATOR, Signals
@@ -25,7 +25,7 @@ from firmware_py.wire.supervisor import Cause, State
 from hil.crazyflie import syslink
 from hil.crazyflie.crazyflie import Crazyflie
 from hil.crazyflie.log_table import ImageVariable, log_numbers, log_table, parameter_table
-from hil.devices.board_firmware import ImageReport, PowerOn
+from hil.devices.board_firmware import ImageReport, Pins, PowerOn
 from hil.devices.crazyflie_signals import stock_signals
 from hil.errors import LabError
 from hil.stm32f405.chip import SOFTWARE, WATCHDOG, build_machine
@@ -117,7 +117,7 @@ class ImageFirmware:
     def __init__(
         self,
         flashed: ChipImage,
-        board: Board,
+        board: Pins,
         rest: Callable[[], ImuCounts] | None,
         polls: bool = True,
         outputs: Sequence[tuple[int, int]] = OUTPUTS,
@@ -166,7 +166,7 @@ class ImageFirmware:
         self.parts.sample(self._board.read_imu())
 
     def radio_received(self, data: bytes, broadcast: bool = False) -> None:
-        self._crazyflie.radio_received(data, broadcast)
+        self._crazyflie.radio.received(data, broadcast)
 
     def radio_polled(self) -> None:
         self.radio_received(syslink.EMPTY)

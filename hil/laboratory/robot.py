@@ -19,8 +19,9 @@ import numpy as np
 from ground_station.mocap import MocapFrame
 from hil.bodies import carrier_of, make_body
 from hil.config import LabConfig, load_config
+from hil.crazyflie import syslink
 from hil.crazyflie.shockburst import Air
-from hil.devices.board import InjectFailure, KeptMemory, Thief, VirtualBoard, unsupported
+from hil.devices.board import InjectFailure, KeptMemory, Requests, Thief, VirtualBoard, unsupported
 from hil.devices.board_firmware import Executor, PowerOn, PythonBoard
 from hil.devices.cameras import VirtualMocap
 from hil.devices.imu import GYRO_COUNTS, VirtualImu
@@ -78,7 +79,8 @@ class Ports:
     """The connections of a robot's board: the medium of its radio and its UART, None if missing, and the receivers.
 
     `polled`: a real host polls its radio, so empty polls need no model. `restart` boots the robot after a reset of its
-    processor; by default it does so itself. `fail` makes a part of it fail. `memory` may have contents.
+    processor; by default it does so itself. `radio_command` takes what the processor commands its radio chip; by default
+    only its power switch works. `fail` makes a part of it fail. `memory` may have contents.
     """
 
     send_packet: SendPacket
@@ -86,6 +88,7 @@ class Ports:
     uart: VirtualSerial | None = None
     polled: bool = False
     restart: Callable[[int], None] | None = None
+    radio_command: Callable[[int, int, bytes], None] | None = None
     fail: InjectFailure = unsupported
     memory: KeptMemory = field(default_factory=KeptMemory)
 
@@ -127,8 +130,7 @@ class Robot:
             ports.send_packet,
             self._console,
             self.uart,
-            self._reset,
-            ports.fail,
+            Requests(self._reset, ports.radio_command or self._radio_command, ports.fail),
             ports.memory,
         )
         self.board.supply(self.battery.millivolts)
@@ -271,6 +273,11 @@ class Robot:
                 (self._ports.restart or self.boot)(now_us)
 
         self.events.at(now_us, restart)
+
+    def _radio_command(self, now_us: int, kind: int, data: bytes) -> None:
+        if kind in (syslink.SWITCH_OFF, syslink.STM32_OFF):
+            self.say("board", "switched off by its firmware")
+            self.events.at(now_us, lambda _: self.cut_power())
 
     def _console(self, now_us: int, text: str) -> None:
         self.say("board", text)

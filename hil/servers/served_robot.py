@@ -18,8 +18,8 @@ from ground_station.tracker import tracker_of
 from ground_station.trajectory import Goal, Hold
 from hil.clock import Readers
 from hil.config import LabConfig
-from hil.crazyflie.crazyflie import POLL_PERIOD_US
-from hil.crazyflie.nrf51 import RATES, AirSettings, Nrf51
+from hil.crazyflie.nrf51 import RATES, AirSettings, Band, Nrf51
+from hil.crazyflie.radio_line import POLL_PERIOD_US
 from hil.crazyflie.shockburst import Air
 from hil.devices.board import InjectFailure, KeptMemory, unsupported
 from hil.devices.board_firmware import BoardFirmware
@@ -121,6 +121,7 @@ class ServedRobot:
         mavlink: bool = False,
         state: Path | None = None,
         fail: InjectFailure = unsupported,
+        band: Band | None = None,
     ) -> None:
         config, events, rng = site.config, site.events, site.streams.radio
         memory = self._memory = KeptMemory()
@@ -135,13 +136,16 @@ class ServedRobot:
         self.udp_radio = VirtualRadio(patient, events, rng, air, wire_us)
         settings = AirSettings(CHANNEL, config.radio.bits_per_second, address_of(number))
         chip = bytes((number, 0x10, 0xA7, 0xF1, 0x0A, 0xC0))
-        self.nrf51 = Nrf51(settings, chip, config.radio.downlink_queue, events, self, air, wire_us)
+        band = band or Band(events, rng.random)
+        self.nrf51 = Nrf51(settings, chip, config.radio.downlink_queue, band, self, air, wire_us)
         memory.eeprom[:CONFIG_SIZE] = _factory_config(number, config)
         self._files = BoardFiles(state, number, memory) if state is not None else None
         if self._files is not None:
             self._files.load()
         self.nrf51.tune(self._settings_at_boot())
-        self.robot = Robot(site, Ports(self._send, air, uart, True, self.start, fail, memory))
+        self.robot = Robot(
+            site, Ports(self._send, air, uart, True, self.start, self.nrf51.command, fail, memory)
+        )
         self.udp_radio.connect(self.robot.packet_received, self._to_udp)
         if uart is not None:
             uart.connect(self.robot.uart_ready, self._from_line)

@@ -11,7 +11,7 @@ from firmware_py.wire.mavlink_numbers import CommandResult
 from ground_station.trajectory import Goal, Hold
 from hil.clock import Paced, Readers
 from hil.config import LabConfig
-from hil.crazyflie.nrf51 import Power
+from hil.crazyflie.nrf51 import Band, Power
 from hil.devices.board_firmware import Executor
 from hil.devices.dongle import VirtualDongle
 from hil.devices.markers import NO_POINTS
@@ -53,6 +53,7 @@ class Ends:
         self._readers = readers
         self._config = config
         self._seed = seed + DONGLE_SEED
+        self.band = Band(lab.events, Streams.of_seed(self._seed).radio.random)
         self._dongles: DongleServer | None = None
 
     def serve_radio(self, port: int) -> str:
@@ -102,7 +103,7 @@ class Ends:
         at_real_host = radio.model_copy(
             update={"usb_us": max(0, radio.usb_us - HOST_SHARE_US), "usb_jitter_us": 0}
         )
-        return VirtualDongle(at_real_host, self._lab.events, rng, [robot.nrf51 for robot in self.robots])
+        return VirtualDongle(at_real_host, self._lab.events, rng, self.band.boards)
 
 
 def name_of(number: int) -> str:
@@ -192,7 +193,9 @@ class Server:
             return Failures(robot, switchboard).inject(now_us, unit, failing, instance)
 
         site = Site(config, self.lab.events, streams, say, self._plan.executor)
-        served = ServedRobot(number, site, self._say, self._plan.mavlink, self._plan.state, fail)
+        served = ServedRobot(
+            number, site, self._say, self._plan.mavlink, self._plan.state, fail, self.ends.band
+        )
         robot = served.robot
         robot.body.hold()
         self.lab.robots.append(robot)

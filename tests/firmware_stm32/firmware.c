@@ -59,6 +59,8 @@ struct SNAPSHOT_DATA {
 };
 
 KEPT volatile uint32_t planted, scenario;
+KEPT volatile uint32_t outbox_size; /* bytes of `outbox` to send instead of the next line */
+volatile uint8_t outbox[64], inbox[1024];
 KEPT struct SNAPSHOT_DATA snapshot;
 
 TCB_t *volatile pxCurrentTCB;
@@ -224,7 +226,7 @@ void DMA1_Stream0_Handler(void) {
 void USART6_Handler(void) {
   if (USART6_SR & (1u << 5)) {
     last_received = USART6_DR;
-    bytes_received++;
+    inbox[bytes_received++ % sizeof inbox] = last_received;
   }
 }
 
@@ -321,9 +323,10 @@ __attribute__((noinline)) static void send_line(void) {
   }
   DMA_HIFCR(DMA2) = 0x3Du << 22;
   DMA_PAR(DMA2, 7) = (uint32_t)&USART6_DR;
-  DMA_M0AR(DMA2, 7) = (uint32_t)line;
-  DMA_NDTR(DMA2, 7) = sizeof line - 1;
+  DMA_M0AR(DMA2, 7) = outbox_size ? (uint32_t)outbox : (uint32_t)line;
+  DMA_NDTR(DMA2, 7) = outbox_size ? outbox_size : sizeof line - 1;
   DMA_CR(DMA2, 7) = 5u << 25 | 1u << 10 | 1u << 6 | 1u; /* channel 5, memory counts up, to the peripheral */
+  outbox_size = 0;
   lines_sent++;
 }
 

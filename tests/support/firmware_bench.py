@@ -7,7 +7,7 @@ from firmware_py.wire import WireError, crtp
 from firmware_py.wire.telemetry import Sample
 from ground_station.links.log_blocks import LogBlocks
 from hil.config import load_config
-from hil.devices.board import VirtualBoard
+from hil.devices.board import Requests, VirtualBoard
 from hil.events import EventQueue
 
 HOVER_COUNTS = [
@@ -29,7 +29,7 @@ class FirmwareBench(VirtualBoard):
             lambda now_us, counts: self.writes.append((self.now_us, list(counts))),
             lambda now_us, data: True,
             lambda now_us, text: self.console.append(text),
-            reset=lambda now_us: self.resets_us.append(self.now_us),
+            requests=Requests(reset=lambda now_us: self.resets_us.append(self.now_us)),
         )
         self.events = EventQueue()
         self.measure((3, -2, 1, 0, 0, 1365))

@@ -8,8 +8,9 @@ import pytest
 from cflib.crtp.radiodriver import _RadioDriverThread
 from cflib.drivers.crazyradio import _radio_ack
 
+from hil.crazyflie import syslink
 from hil.crazyflie.config import RadioConfig
-from hil.crazyflie.nrf51 import RESET_DELAY_US, AirSettings, Nrf51, Power
+from hil.crazyflie.nrf51 import RESET_DELAY_US, AirSettings, Band, Nrf51, Power
 from hil.crazyflie.shockburst import Air, air_us, exchange_us, syslink_us
 from hil.devices.dongle import VirtualDongle
 from hil.events import EventQueue
@@ -62,13 +63,14 @@ class DongleWithBoards:
             {"uplink_loss": 0.0, "downlink_loss": 0.0, "usb_jitter_us": 0, **radio}
         )
         self.events = EventQueue()
+        band = Band(self.events, np.random.default_rng(seed).random)
         self.stms = [Stm() for _ in range(boards)]
         self.boards = [
             Nrf51(
                 AirSettings(80, 2_000_000, ADDRESS[:4] + bytes((0xE7 - n,))),
                 CHIP,
                 8,
-                self.events,
+                band,
                 stm,
                 Air.of(config),
             )
@@ -415,3 +417,56 @@ def test_the_battery_voltage_is_answered() -> None:
     bench = DongleWithBoards()
     bench.exchange(b"\xf3\xfe\x04")
     assert bench.exchange(NULL)[1:] == b"\xff\xfe\x04" + struct.pack("<f", 3.75)
+
+
+def test_a_packet_to_peers_reaches_all_other_boards_on_the_channel() -> None:
+    bench = DongleWithBoards(boards=4)
+    bench.boards[3].command(0, syslink.RADIO_CHANNEL, b"\x51")
+    bench.boards[0].command(0, syslink.PEER_BROADCAST, b"\x03hello")
+    bench.wait(2_000)
+    heard = [stm.broadcasts for stm in bench.stms]
+    assert heard == [[], [b"\xff\x83hello"], [b"\xff\x83hello"], []]
+
+
+def test_packets_to_peers_are_lost_like_others() -> None:
+    bench = DongleWithBoards(boards=2, uplink_loss=0.25)
+    for _ in range(400):
+        bench.boards[0].command(bench.events.now_us, syslink.PEER_BROADCAST, b"\x00x")
+        bench.wait(1_000)
+    assert len(bench.stms[1].broadcasts) == pytest.approx(300, abs=4 * (400 * 0.25 * 0.75) ** 0.5)
+
+
+def test_a_peer_packet_of_a_host_is_passed_on_and_answered_at_once_without_contents() -> None:
+    bench = DongleWithBoards()
+    assert bench.exchange(b"\xf3\x81hi") == b"\x01"
+    bench.wait(1_000)
+    assert bench.stms[0].packets == [b"\xf3\x81hi"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "data", "settings"),
+    [
+        (syslink.RADIO_CHANNEL, b"\x7d", AirSettings(125, 2_000_000, ADDRESS)),
+        (syslink.RADIO_CHANNEL, b"\x7e", AirSettings(80, 2_000_000, ADDRESS)),
+        (syslink.RADIO_RATE, b"\x00", AirSettings(80, 250_000, ADDRESS)),
+        (syslink.RADIO_RATE, b"\x03", AirSettings(80, 2_000_000, ADDRESS)),
+        (syslink.RADIO_ADDRESS, bytes((5, 4, 3, 2, 1)), AirSettings(80, 2_000_000, bytes((1, 2, 3, 4, 5)))),
+        (syslink.RADIO_ADDRESS, b"\x05", AirSettings(80, 2_000_000, ADDRESS)),
+    ],
+)
+def test_the_processor_tunes_its_radio(kind: int, data: bytes, settings: AirSettings) -> None:
+    bench = DongleWithBoards()
+    bench.boards[0].command(0, kind, data)
+    assert bench.boards[0].settings == settings
+
+
+@pytest.mark.parametrize(
+    ("kind", "power"), [(syslink.SWITCH_OFF, Power.OFF), (syslink.STM32_OFF, Power.RADIO_ONLY)]
+)
+def test_the_processor_switches_the_board_off(kind: int, power: Power) -> None:
+    bench = DongleWithBoards()
+    bench.boards[0].command(500, kind, b"")
+    assert bench.stms[0].stops == []  # not within the processor's own step
+    bench.wait(1_000)
+    assert bench.stms[0].stops == [500]
+    assert bench.boards[0].power is power

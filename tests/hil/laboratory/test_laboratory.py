@@ -7,6 +7,7 @@ import pytest
 from firmware_py.wire.crtp import PORT_CONSOLE
 from hil.clock import FreeRunning, Paced
 from hil.config import load_config
+from hil.crazyflie import syslink
 from hil.crazyflie.nrf51 import Power
 from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
@@ -284,3 +285,14 @@ def test_a_rebooted_board_talks_on_its_serial_line_by_the_laboratorys_clock() ->
     assert sum(now_us < 2 * SECOND_US for now_us in heard) > 20
     assert [now_us for now_us in heard if 2_010_000 < now_us < 3 * SECOND_US] == []
     assert sum(now_us > 3 * SECOND_US for now_us in heard) > 20
+
+
+@pytest.mark.parametrize(("kind", "powered"), [(syslink.SWITCH_OFF, False), (syslink.RADIO_POWER, True)])
+def test_a_firmware_without_a_client_can_switch_its_board_off(kind: int, powered: bool) -> None:
+    lab = Laboratory(FreeRunning())
+    robot = Robot(site_in(lab), Ports(nobody_listens))
+    lab.robots.append(robot)
+    lab.events.at(SECOND_US, lambda _: robot.board.radio_command(kind, b""))
+    lab.end_at(2 * SECOND_US)
+    lab.run()
+    assert robot.powered is powered
