@@ -21,8 +21,7 @@ from hil.laboratory.metrics import METRICS, SHOWN
 from hil.laboratory.request import Options
 from hil.studies.catalogue import PROFILES
 from hil.studies.paper_rows import ROWS, PaperRow
-from hil.studies.study import Study
-from hil.studies.study_run import StudyResult, distance, flights_of, summarise
+from hil.studies.study import Study, StudyResult, distance, flights_of, summarise
 
 
 @dataclass(frozen=True, slots=True)

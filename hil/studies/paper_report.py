@@ -30,8 +30,8 @@ from hil.studies.drag_model import MountedRow
 from hil.studies.paper import Paper, Spread, Trials
 from hil.studies.paper_identification import COLUMNS, WHY, PaperConstant
 from hil.studies.paper_rows import PaperRow
+from hil.studies.study import StudyResult
 from hil.studies.study_figures import picture
-from hil.studies.study_run import StudyResult
 
 REPORT = "report.html"
 # Names of the pages beside those of the experiments.

@@ -11,7 +11,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from hil.pictures import curves
 from hil.pictures.drawing import WIDTH, png
-from hil.studies.study_run import OUTCOMES, StudyResult
+from hil.studies.study import OUTCOMES, StudyResult
 
 COLOURS = dict(zip(OUTCOMES, (curves.GREEN, curves.YELLOW, curves.SKY, curves.RED, curves.GREY), strict=True))
 SHORT = {"holds": "holds", "degrades": "degr.", "failsafe": "f-safe", "lost": "lost", "error": "error"}

@@ -27,7 +27,7 @@ from hil.identify.robots import FLAP_RATE, Robots, robots_of
 from hil.laboratory.request import Options
 from hil.laboratory.result import read_result
 from hil.laboratory.robot import Streams
-from hil.studies.study_run import distance
+from hil.studies.study import distance
 from hil.world.config import ConstantName
 
 HOVER_S = 60.0

@@ -22,8 +22,7 @@ from hil.studies.catalogue import PROFILES
 from hil.studies.paper import Paper, Spread, Trials
 from hil.studies.paper_report import write_paper
 from hil.studies.paper_rows import OUTSIDE, ROWS, MetricClaim, PaperRow
-from hil.studies.study import Change, Expected, Study, Variant
-from hil.studies.study_run import Curve, StudyResult, VariantOutcome
+from hil.studies.study import Curve, Expected, Study, StudyResult, Variant, VariantOutcome
 from support.command import Cli, floaty
 from support.html_page import Page
 
@@ -167,7 +166,7 @@ def test_the_badges_say_which_kind_of_verdict_they_are(result: Row, tmp_path: Pa
         Study("s", "q", "a", "", (0.0, 1.0), ()),
         (
             Curve(
-                Variant("v", lambda size: Change(), Expected(holds_to=1.0)),
+                Variant("v", lambda size: Options(), Expected(holds_to=1.0)),
                 (VariantOutcome(0.0, ("degrades",), (0.1,)),),
             ),
         ),

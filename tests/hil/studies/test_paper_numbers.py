@@ -10,7 +10,7 @@ from hil.config import load_config
 from hil.design.tune import GainTask, refuse_late
 from hil.errors import LabError
 from hil.studies.paper import Spread, Trials
-from hil.studies.study_run import outcome_of
+from hil.studies.study import outcome_of
 from hil.studies.tuning import Round, rms
 
 
