@@ -148,7 +148,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
 # stay out of all that flies; these files look at what was flown, or are done before.
 AFTER_THE_FLIGHT = (
     "hil/laboratory/metrics.py", "hil/pictures/", "hil/experiments/measures.py", "hil/experiments/take_off.py",
-    "hil/design/", "hil/identify/", "hil/campaigns/findings.py", "hil/studies/paper_scaling.py",
+    "hil/design/", "hil/identify/", "hil/campaigns/findings.py", "hil/studies/paper_identification.py",
 )  # fmt: skip
 BY_PROCESSOR = """
     math.sin math.cos math.tan math.asin math.acos math.atan math.atan2 math.exp math.expm1 math.log math.log1p math.log2

@@ -96,9 +96,8 @@ def _fly(
     from hil.design.sweeps import point_of
     from hil.studies import drag_model
     from hil.studies.paper import fly_paper
-    from hil.studies.paper_identification import fly_identification
+    from hil.studies.paper_identification import fly_identification, fly_scaling
     from hil.studies.paper_report import write_paper
-    from hil.studies.paper_scaling import fly_scaling
 
     announce_compilation()
     with writing("--out", out), Runner(notices, **crew) as runner:
@@ -191,7 +190,7 @@ def drag_model(seed: int, profile: str, overrides: tuple[str, ...], out: Path) -
     """Measure forces and torques on the mounted robot over flap angles, against the paper's simplified model."""
 
     from hil.config import load_config
-    from hil.studies import drag_model, drag_model_report
+    from hil.studies import drag_model
 
     config = load_config(profile, overrides)
     config.robot.need_plates(profile, "floaty drag-model")
@@ -200,5 +199,5 @@ def drag_model(seed: int, profile: str, overrides: tuple[str, ...], out: Path) -
     announce_compilation()
     measured = drag_model.measure(config, seed)
     rows = list(track(measured, "mounted robot", drag_model.ROWS, console=notices, transient=True))
-    page, _ = drag_model_report.write(rows, math.degrees(config.plant.hover_angle), out)
+    page = drag_model.write(rows, math.degrees(config.plant.hover_angle), out)
     console.print(f"report  {page}")

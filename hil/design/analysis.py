@@ -14,8 +14,7 @@ from hil.design.claims import Claim, claims, robot_lines
 from hil.design.linear import calm_plates
 from hil.design.sweeps import Point, authorities, hover_angles, scaling, stability
 from hil.floaty.shape import SIGNS
-from hil.pictures.drawing import png
-from hil.pictures.pages import PageFigure, data_uri, write_page
+from hil.pictures.pages import saved, write_page
 from hil.world import layout as at
 from hil.world.motion import evaluate
 
@@ -28,7 +27,7 @@ class Analysis:
     robot: list[tuple[str, str]]
     inputs: list[tuple[str, str, str]]  # input, alone, about the hover
     claims: list[Claim]
-    pictures: list[tuple[PageFigure, bytes]]  # with the figure's PNG
+    pictures: list[tuple[str, str, str, Callable[[], Figure]]]  # name, title, caption
 
 
 def model_error(point: Point) -> float:
@@ -61,35 +60,31 @@ def analyse(point: Point) -> Analysis:
         for index, name in enumerate(QUANTITIES)
     ]
 
-    def picture(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> tuple[PageFigure, bytes]:
-        content = png(draw)
-        return PageFigure(name, title, caption, data_uri(content)), content
-
     pictures = [
-        picture(
+        (
             "shape", "The robot at its hover",
             "Centre of mass: black dot. The paper's Fig. control_concept d, e: V along y (pitch); along x (roll) Λ with "
             "flat flaps, _Λ_ with the kink.",
             lambda: figures.shape(point),
         ),
-        picture(
+        (
             "stability", "Kink and centre of mass (Fig. robustness f)",
             "Left: f_αα, black line where it is zero, star: this robot, dot: flat flaps with the centre of mass in their "
             "plane. Middle and right: over the kink at this robot's centre of mass. Dashed: its kink. The inertia is kept.",
             lambda: figures.stability(point, stable),
         ),
-        picture(
+        (
             "hover_angle", "Hover angle (Fig. robustness g)",
             "Left: input constants, each by its largest. Right: three readings of authority over all axes, with the best "
             "angle. Green: the paper's 20 to 25°; dashed: this robot.",
             lambda: figures.hover(point, angles),
         ),
-        picture(
+        (
             "attainable", "Attainable set",
             "All combinations of openings inside the flaps' range; orange: lift equal to the weight. Cross: hover.",
             lambda: figures.reach(point, reached),
         ),
-        picture(
+        (
             "scaling", "Size and mass (eqs. airflow_proportionality, Reynold_numbers)",
             "Similar robots at the same hover angle; the legend has the fitted exponent.",
             lambda: figures.scale(laws),
@@ -101,8 +96,7 @@ def analyse(point: Point) -> Analysis:
 
 def write(analysis: Analysis, folder: Path) -> Path:
     """Write `design.html`, `design.json` and the pictures; return the page."""
-    for one, content in analysis.pictures:
-        (folder / f"{one.name}.png").write_bytes(content)
+    pictures = [saved(folder, *one) for one in analysis.pictures]
     result = {
         "geometry": analysis.point.geometry.model_dump(),
         "constants": asdict(analysis.point.linear.constants),
@@ -110,4 +104,4 @@ def write(analysis: Analysis, folder: Path) -> Path:
         "claims": [asdict(claim) for claim in analysis.claims],
     }
     (folder / "design.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    return write_page(folder / "design.html", "design.html.j2", analysis=analysis)
+    return write_page(folder / "design.html", "design.html.j2", analysis=analysis, pictures=pictures)

@@ -6,6 +6,7 @@ row, on a held-out flight if there is one. For the paper's method one picture ex
 """
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +23,8 @@ from hil.identify.response import response
 from hil.identify.spectra import PERIOD_S
 from hil.identify.two_controllers import SIGMAS, closed_loop
 from hil.pictures import curves
-from hil.pictures.drawing import WIDTH, png
-from hil.pictures.pages import data_uri, write_page
+from hil.pictures.drawing import WIDTH
+from hil.pictures.pages import saved, write_page
 
 OUTPUTS = {"roll": "roll rate", "pitch": "pitch rate", "yaw": "yaw rate", "height": "height"}
 HERTZ = (0.5, 1, 2, 4, 8)
@@ -39,20 +40,11 @@ def write_pages(out: Path, found: Identification, held_out: Record | None) -> Pa
         fitted = [one for one in found.excited if one.axis is axis]
         shown = [one for one in new if one.axis is axis]
         flights = found.records if held_out is None or not shown else (held_out,)
-        picture = png(
-            lambda fitted=fitted, shown=shown, flights=flights: _axis(found, fitted, shown, flights)
-        )
-        (out / f"identify_{axis.name}.png").write_bytes(picture)
-        figures.append({"title": f"{axis.name}, from u{axis.input + 1}", "image": data_uri(picture)})
+        title, draw = f"{axis.name}, from u{axis.input + 1}", partial(_axis, found, fitted, shown, flights)
+        figures.append(saved(out, f"identify_{axis.name}", title, "", draw))
     if found.free:
-        picture = png(lambda: _identity(found.free))
-        (out / "identify_paper.png").write_bytes(picture)
-        figures.append(
-            {
-                "title": "why the paper's equations contain no information about the robot",
-                "image": data_uri(picture),
-            }
-        )
+        title = "why the paper's equations contain no information about the robot"
+        figures.append(saved(out, "identify_paper", title, "", partial(_identity, found.free)))
     rows = [
         {
             "name": one.name, "unit": one.unit, "verdict": f"{one.verdict}: {one.why}",

@@ -6,7 +6,7 @@ youplot), whose script is embedded once per file. A panel's curves are thinned t
 """
 
 import base64
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,16 @@ def data_uri(content: bytes, kind: str = "png") -> str:
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
-def draw(picture: Picture, marks: Marks, *flights: "pa.Table") -> PageFigure:
+def saved(folder: Path, name: str, title: str, caption: str, draw: Callable[[], Any]) -> PageFigure:
+    """Write the matplotlib figure that `draw` returns as `name.png` into a folder, and return it for a page."""
+    from hil.pictures.drawing import png
+
+    content = png(draw)
+    (folder / f"{name}.png").write_bytes(content)
+    return PageFigure(name, title, caption, data_uri(content))
+
+
+def draw(picture: Picture, marks: Marks, *flights: pa.Table) -> PageFigure:
     """Return a picture of flights for a page."""
     acted = {spell.text.partition(".")[0] for spell in marks.spells if spell.kind == "fault"}
     figure = PageFigure(

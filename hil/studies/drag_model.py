@@ -6,17 +6,19 @@ and its gusts, for 10 s at each angle: means and standard deviations. The plant'
 effect at extreme angles, flaps in each other's wake, does not occur here.
 
 Torques are about the centre of mass. Two sweeps as in the paper's figure drag_model_evaluation: (a) flaps 2 and 3 turned by
-the same angle in opposite directions, (b) flaps 1 and 3 in the same direction; the others stay at the hover angle.
+the same angle in opposite directions, (b) flaps 1 and 3 in the same direction.
 """
 
 import csv
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hil.config import LabConfig
@@ -24,6 +26,9 @@ from hil.design.authority import pressure_at, wrenches
 from hil.floaty.plant import Plant
 from hil.floaty.shape import SIGNS
 from hil.laboratory.robot import Streams
+from hil.pictures import curves
+from hil.pictures.drawing import WIDTH
+from hil.pictures.pages import saved, write_page
 from hil.world.fixed_order import normal
 from hil.world.layout import STEP_US
 
@@ -35,30 +40,29 @@ SAMPLES = 1_000_000 // STEP_US * SECONDS  # paper: 35000; here on the grid of th
 # [N, N m] resolution of an ATI mini40; assumed white.
 SENSOR_NOISE = (0.01, 0.01, 0.02, 0.00025, 0.00025, 0.00025)
 QUANTITIES = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
+LABELS = ("$F_x$ [N]", "$F_y$ [N]", "$F_z$ [N]", "$T_x$ [N m]", "$T_y$ [N m]", "$T_z$ [N m]")
+OPERATIONAL_DEG = 50  # flap angles of flight, in the steps of the test
 
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """One sequence of flap angles; `turn` sets them from the angle in radians, starting from the hover angles."""
+    """One sequence of flap angles: the signs of the turned flaps, by index; the others stay at the hover angle."""
 
     name: str
     title: str
-    turn: Callable[[NDArray[np.float64], float], None]
+    signs: Mapping[int, float]
 
-
-def _adjacent(flaps: NDArray[np.float64], angle: float) -> None:
-    flaps[1], flaps[2] = -angle, angle
-
-
-def _opposite(flaps: NDArray[np.float64], angle: float) -> None:
-    flaps[0] = flaps[2] = angle
+    def turn(self, flaps: NDArray[np.float64], angle: float) -> None:
+        """Set the turned ones of the angles (4,) [rad]."""
+        for flap, sign in self.signs.items():
+            flaps[flap] = sign * angle
 
 
 SWEEPS = (
-    Sweep("adjacent", "(a) flaps 2 and 3, opposite directions", _adjacent),
-    Sweep("opposite", "(b) flaps 1 and 3, same direction", _opposite),
+    Sweep("adjacent", "(a) flaps 2 and 3, opposite directions", {1: -1.0, 2: 1.0}),
+    Sweep("opposite", "(b) flaps 1 and 3, same direction", {0: 1.0, 2: 1.0}),
 )
-ROBOTS = ("flat", "kinked")
+ROBOTS = {"flat": "flat flaps, as in the paper's test", "kinked": "kinked flaps, as flown"}
 ROWS = len(ROBOTS) * len(SWEEPS) * len(ANGLES_DEG)
 
 
@@ -116,3 +120,42 @@ def write_csv(rows: Sequence[MountedRow], path: Path) -> None:
         for row in rows:
             values = np.stack([row.model, row.mean, row.deviation], axis=1).ravel()
             writer.writerow([row.robot, row.sweep, row.angle_deg, *(f"{value:.6g}" for value in values)])
+
+
+def _draw(rows: Sequence[MountedRow], hover_deg: float) -> Figure:
+    """Draw the rows of one robot and one sweep: forces above, torques below."""
+    figure = Figure(figsize=(WIDTH, 4.2), layout="constrained")
+    angles = [row.angle_deg for row in rows]
+    model, mean, deviation = (
+        np.array([getattr(row, name) for row in rows]) for name in ("model", "mean", "deviation")
+    )
+    for index, axes in enumerate(figure.subplots(2, 3, sharex=True).flat):
+        low, high = mean[:, index] - deviation[:, index], mean[:, index] + deviation[:, index]
+        axes.fill_between(angles, low, high, color=curves.BLUE, alpha=0.2, linewidth=0)
+        axes.plot(angles, mean[:, index], "+", color=curves.BLUE, label="measured")
+        axes.plot(angles, model[:, index], ".", color="red", markersize=4, label="model")
+        axes.axvline(hover_deg, color="black", linestyle="--", linewidth=0.7)
+        axes.set_ylabel(LABELS[index])
+        if index > 2:
+            axes.set_xlabel("flap angle [deg]")
+    figure.axes[0].legend()
+    return figure
+
+
+def write(rows: Sequence[MountedRow], hover_deg: float, folder: Path) -> Path:
+    """Write the table, a PNG per robot and sweep and the page that holds them; return the page."""
+    write_csv(rows, folder / "drag_model.csv")
+    figures, worst = [], []
+    for (robot, robot_text), sweep in product(ROBOTS.items(), SWEEPS):
+        chosen = [row for row in rows if (row.robot, row.sweep) == (robot, sweep.name)]
+        misses = np.abs([row.model - row.mean for row in chosen])
+        worst.append((f"{sweep.title}; {robot_text}", [f"{value:.4f}" for value in misses.max(axis=0)]))
+        flown = misses[[0 <= row.angle_deg <= OPERATIONAL_DEG for row in chosen]].max(axis=0)
+        caption = (
+            f"{sweep.title}. From 0 to {OPERATIONAL_DEG} degrees model and measurement differ by at most "
+            f"{flown[:3].max():.2f} N and {flown[3:].max():.3f} N m."
+        )
+        name, title = f"drag_model_{robot}_{sweep.name}", f"Drag model, {robot_text}"
+        figures.append(saved(folder, name, title, caption, partial(_draw, chosen, hover_deg)))
+    page = folder / "drag_model.html"
+    return write_page(page, "drag_model.html.j2", figures=figures, worst=worst, quantities=QUANTITIES)

@@ -2,16 +2,23 @@
 
 Methods, eq. (roll_dynamics_input_const): c* of two flights with gains on roll of 0.2 and 0.15 gives a and c. The same two
 flights are flown here, and one with an excitation of u1 for the methods that need it: four minutes of flight.
+
+Agility against size, also from flights: the paper's robot, half and twice as long, each in its own updraft. The masses
+grow with the cube of the length, so that the updraft grows with its root (eq. airflow_proportionality). All three fly
+excitations of u3 and u1, and `floaty identify` estimates the acceleration per input from telemetry alone.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from hil.campaigns.jobs import Row
 from hil.campaigns.run import Runner
-from hil.config import DEFAULT_PROFILE
+from hil.config import DEFAULT_PROFILE, load_config
 from hil.design.axes import ROLL
+from hil.design.claims import AGREES, DIFFERS, SCALING, Claim
 from hil.errors import LabError
 from hil.identify.identify import Identification, identify, interval_text
 from hil.identify.record import load_record
@@ -32,6 +39,13 @@ WHY = (
     "the derivative of the same spectrum: jωȦ = -ω²A for any robot. So c* is a mean of -ω², and b* is near 0."
 )
 
+SIZES = ("design-half", "design-paper", "design-double")
+SCALED = {"yaw_u3": "identify-u3", "roll_u1": "identify-u1"}
+# [rad] rms, half of what the default robot withstands; the smallest one drifts by 20 cm with it.
+AMPLITUDES = {"identify-u3": 0.03, "identify-u1": 0.025}
+DURATION_S = 113.0  # five realisations
+EXPONENT, NEAR = -1.0, 0.15  # exponent over the length, and the deviation that "goes with" allows
+AGAINST = "At the same hover angle; with servos that are as slow at every size."
 
 COLUMNS = ("constant", "paper", "its arithmetic", "truth", "its method here", "instruments", "joint fit")
 
@@ -88,3 +102,45 @@ def constants(found: Identification) -> tuple[PaperConstant, ...]:
             )
         )  # fmt: skip
     return tuple(rows)
+
+
+def fly_scaling(out: Path, runner: Runner) -> list[Claim]:
+    """Fly and identify; empty after Ctrl-C. Raises `LabError` for a lost or unidentified robot."""
+    rows = runner.log(
+        "scaling",
+        {
+            f"{profile}-{name}": (
+                name,
+                Options(
+                    profile=profile, overrides=(f"excitation.{name[-2:]}={AMPLITUDES[name]}",), seed=1,
+                    duration_s=DURATION_S,
+                ),
+            )
+            for profile in SIZES
+            for name in SCALED.values()
+        },
+        out,
+    )  # fmt: skip
+    if not rows:
+        return []
+    of_each = len(SCALED)
+    found = {
+        profile: identified(rows[of_each * number : of_each * (number + 1)])
+        for number, profile in enumerate(SIZES)
+    }
+    length = np.array([load_config(profile).geometry.footprint for profile in SIZES])
+    claims = []
+    for constant in SCALED:
+        values, halves = np.array([found[profile].constant(constant).joint for profile in SIZES]).T
+        (exponent, _), covariance = np.polyfit(
+            np.log(length), np.log(values), 1, w=values / halves, cov="unscaled"
+        )
+        listed = ", ".join(f"{value:.0f} ± {half:.0f}" for value, half in zip(values, halves, strict=True))
+        claims.append(
+            Claim(
+                f"{constant.split('_')[0]} acceleration per input over l, flown and identified", SCALING,
+                f"exponent {EXPONENT:g}", f"{exponent:.2f} ± {np.sqrt(covariance[0, 0]):.2f} ({listed} 1/s²)",
+                AGREES if abs(exponent - EXPONENT) < NEAR else DIFFERS, AGAINST,
+            )
+        )  # fmt: skip
+    return claims

@@ -1,13 +1,15 @@
 """The report of the paper: `report.html` with its pages for readers, `result.json` for programs.
 
 `report.html` has the table and the contents, `EXPERIMENT.html` the figures of one experiment as in the paper (every trial
-light, the one with the median error dark) beside the paper's numbers, `drag-model.html` and `studies.html` the rest.
+light, the one with the median error dark) beside the paper's numbers, `drag-model/drag_model.html`, `design/design.html` and
+`studies.html` the rest.
 """
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, astuple, replace
+from functools import partial
 from math import degrees
 from pathlib import Path
 from typing import Any
@@ -22,9 +24,9 @@ from hil.laboratory.recorder import load_log
 from hil.laboratory.result import RESULT
 from hil.pictures.figures import PICTURES, TRACK
 from hil.pictures.gallery import pictures_of
-from hil.pictures.pages import PageFigure, data_uri, draw, write_page, zoomable
+from hil.pictures.pages import PageFigure, draw, saved, write_page, zoomable
 from hil.pictures.panels import marks_of_flight
-from hil.studies import drag_model_report
+from hil.studies import drag_model
 from hil.studies.catalogue import PROFILES
 from hil.studies.drag_model import MountedRow
 from hil.studies.paper import Paper, Spread, Trials
@@ -35,7 +37,7 @@ from hil.studies.study_figures import picture
 
 REPORT = "report.html"
 # Names of the pages beside those of the experiments.
-DRAG_MODEL, STUDIES, DESIGN = "drag-model", "studies", "design/design"
+DRAG_MODEL, STUDIES, DESIGN = "drag-model/drag_model", "studies", "design/design"
 OF_EVERY_FLIGHT = (TRACK, PICTURES[0])  # for an experiment without own pictures
 
 
@@ -46,54 +48,56 @@ def write_paper(
     shape: Analysis | None = None,
     constants: Sequence[PaperConstant] = (),
 ) -> Path:
-    """Write `result.json`, `report.html` and the pictures of the studies; return the report.
+    """Write `result.json`, `report.html`, its pages and their pictures; return the report.
 
-    `mounted`, the test of the drag model, is also written into `drag-model`. `shape`, the analysis of the design, is
-    written as page and pictures into `design`. `constants` are the rows of the identification.
+    `mounted` is the test of the drag model, `shape` the analysis of the design; each has a folder of its own. `constants`
+    are the rows of the identification.
     """
     content = _content(paper) | ({"design": [asdict(claim) for claim in shape.claims]} if shape else {})
     if constants:
         content["identification"] = [asdict(one) for one in constants]
     (out / RESULT).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    if shape:
-        (out / "design").mkdir(exist_ok=True)
-        write_design(shape, out / "design")
-    studies = []
-    for result in paper.studies:
-        if result.curves:
-            png = picture(result)
-            (out / f"study-{result.study.name}.png").write_bytes(png)
-            studies.append((result, data_uri(png)))
-    bench: list[PageFigure] = []
+    pages = [(name, row.title) for name, row, _ in paper.rows]
     if mounted:
-        (out / DRAG_MODEL).mkdir(exist_ok=True)
-        hover_deg = degrees(load_config().plant.hover_angle)
-        _, bench = drag_model_report.write(mounted, hover_deg, out / DRAG_MODEL)
-    pages = [
-        *((name, row.title) for name, row, _ in paper.rows),
-        *([(DRAG_MODEL, "Drag model")] if bench else []),
-        *([(DESIGN, "Design")] if shape else []),
-        *([(STUDIES, "Robustness beyond the paper")] if studies else []),
-    ]
+        pages.append((DRAG_MODEL, "Drag model"))
+        drag_model.write(mounted, degrees(load_config().plant.hover_angle), _folder_of(out, DRAG_MODEL))
+    if shape:
+        pages.append((DESIGN, "Design"))
+        write_design(shape, _folder_of(out, DESIGN))
+    studies = [
+        (one, saved(out, f"study-{one.study.name}", one.study.question, one.study.remark, partial(picture, one)))
+        for one in paper.studies
+        if one.curves
+    ]  # fmt: skip
+    if studies:
+        pages.append((STUDIES, "Robustness beyond the paper"))
     common = {"pages": pages, "metrics": METRICS, "spread": Spread.of, "profile": PROFILES[0]}
     for name, row, trials in paper.rows:
-        figures = _figures(row, trials)
-        shown = [one for _, pictures in figures for one in pictures]
-        kinds = dict.fromkeys(kind for one in shown for kind in one.marks.kinds)
-        write_page(
-            out / f"{name}.html", "paper_experiment.html.j2", name=name, row=row, both=trials, figures=figures,
-            kinds=kinds, zoomable=zoomable(shown), **common,
-        )  # fmt: skip
-    if bench:
-        write_page(
-            out / f"{DRAG_MODEL}.html", "paper_drag_model.html.j2", name=DRAG_MODEL, bench=bench, **common
-        )
+        _write_experiment(out, name, row, trials, common)
     if studies:
         write_page(out / f"{STUDIES}.html", "paper_studies.html.j2", name=STUDIES, studies=studies, **common)
     return write_page(
         out / REPORT, "paper.html.j2", paper=paper, rows=paper.rows, missing=[row for row, _, _ in paper.misses],
-        studies=studies, bench=bench, shape=shape, constants=[astuple(one) for one in constants], columns=COLUMNS,
+        studies=studies, shape=shape, constants=[astuple(one) for one in constants], columns=COLUMNS,
         why=WHY, commit=commit(), versions=versions(), **common,
+    )  # fmt: skip
+
+
+def _folder_of(out: Path, page: str) -> Path:
+    """Make the folder of a page that has one, and return it."""
+    folder = (out / page).parent
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+def _write_experiment(
+    out: Path, name: str, row: PaperRow, trials: tuple[Trials, ...], common: Mapping[str, Any]
+) -> None:
+    figures = _figures(row, trials)
+    shown = [one for _, pictures in figures for one in pictures]
+    write_page(
+        out / f"{name}.html", "paper_experiment.html.j2", name=name, row=row, both=trials, figures=figures,
+        kinds=dict.fromkeys(kind for one in shown for kind in one.marks.kinds), zoomable=zoomable(shown), **common,
     )  # fmt: skip
 
 

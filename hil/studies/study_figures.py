@@ -10,7 +10,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from hil.pictures import curves
-from hil.pictures.drawing import WIDTH, png
+from hil.pictures.drawing import WIDTH
 from hil.studies.study import OUTCOMES, StudyResult
 
 COLOURS = dict(zip(OUTCOMES, (curves.GREEN, curves.YELLOW, curves.SKY, curves.RED, curves.GREY), strict=True))
@@ -18,12 +18,8 @@ SHORT = {"holds": "holds", "degrades": "degr.", "failsafe": "f-safe", "lost": "l
 STYLES = ("-", "--", ":")
 
 
-def picture(result: StudyResult) -> bytes:
-    """Return the picture of a study as PNG."""
-    return png(lambda: _draw(result))
-
-
-def _draw(result: StudyResult) -> Figure:
+def picture(result: StudyResult) -> Figure:
+    """Draw a study."""
     study, flown = result.study, result.curves
     strip = 0.27 * len(flown) + 0.6
     figure = Figure(figsize=(WIDTH, 2.3 + strip), layout="constrained")

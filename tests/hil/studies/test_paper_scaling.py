@@ -11,7 +11,7 @@ from hil.config import load_config
 from hil.design.claims import AGREES
 from hil.design.sweeps import point_of
 from hil.floaty.geometry import weigh
-from hil.studies.paper_scaling import PROFILES, fly_scaling
+from hil.studies.paper_identification import SIZES, fly_scaling
 
 
 @pytest.mark.long
@@ -26,7 +26,7 @@ def test_flights_of_three_sizes_show_that_agility_goes_with_one_over_the_length(
 
 
 def test_the_sizes_are_similar_robots_each_in_the_updraft_that_carries_it() -> None:
-    configs = [load_config(profile) for profile in PROFILES]
+    configs = [load_config(profile) for profile in SIZES]
     lengths = np.array([config.geometry.footprint for config in configs])
     masses = np.array([weigh(config.geometry).mass for config in configs])
     speeds = np.array([config.tunnel.speed for config in configs])
