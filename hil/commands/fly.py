@@ -140,17 +140,17 @@ def _fly_one(request: Request, folder: Path, target: str | None) -> int:
 
     from hil.api import maker_of
     from hil.laboratory.run import fly
-    from hil.live.hand import Hand
+    from hil.live.panel_commands import PanelCommands
 
     view = open_live(target)
     with progress_bar(TextColumn("{task.fields[now]}"), TimeRemainingColumn()) as progress:
         bar = progress.add_task(f"{request.experiment.name} seed {request.seed}", total=None, now="")
 
-        hands: list[Hand] = []
+        hands: list[PanelCommands] = []
 
         def show(now_us: int, flight: Flight) -> None:
             if view is not None and not hands:
-                hands.append(Hand(view, flight, request.bench.in_lockstep))
+                hands.append(PanelCommands(view, flight, request.bench.in_lockstep))
             progress.update(bar, completed=now_us, total=flight.end_us, now=f"{now_us * 1e-6:6.1f} s")
 
         with writing("--out", folder):

@@ -84,7 +84,7 @@ class LiveView:
         self.offered = self.taken = 0  # rows
         self.address = ""  # of a picture that is served until it ends
         self._texts: deque[dict[str, Any]] = deque(maxlen=LINES)
-        self._heard = threading.Event()  # a line came, or the picture has ended
+        self._line_arrived = threading.Event()  # a line came, or the picture has ended
         self._typed: deque[str] = deque(maxlen=LINES)
         self._parameters: deque[tuple[str, float]] = deque()  # not yet sent to the picture
         self._schema: pa.Schema | None = None
@@ -132,8 +132,8 @@ class LiveView:
     def wait(self) -> list[str]:
         """Wait until something is typed, and return it; nothing when the picture has ended."""
         while not self._typed and self._answers.is_alive():
-            self._heard.wait(WAIT_S)
-            self._heard.clear()
+            self._line_arrived.wait(WAIT_S)
+            self._line_arrived.clear()
         return self.lines()
 
     def answer(self, t_us: int, text: str) -> None:
@@ -217,7 +217,7 @@ class LiveView:
                 self.taken = int(text)
             elif word == TYPED:
                 self._typed.append(text)
-                self._heard.set()
+                self._line_arrived.set()
         if not self._up.is_set():
             self._failure = self._failure or "the viewer's process ended without a message"
             self._up.set()

@@ -54,7 +54,7 @@ class PanelScreen:
     """`hil.live.picture.Screen` of `web`; `program` chooses the commands, `typed` takes a line."""
 
     def __init__(self, program: str, typed: Callable[[str], None]) -> None:
-        self._viewer: RerunScreen | None = None  # rerun's, once somebody wants it
+        self._viewer: RerunScreen | None = None  # rerun's, once it is requested
         self.wants_viewer = False
         self._past: list[pa.Table] = []  # the rows of the last seconds
         self._goals: list[Points] = []  # (3,) [m] each, of the whole flight: the picture shows them all
@@ -149,7 +149,7 @@ class PanelScreen:
 
 
 class _Guarded(RequestHandler):
-    """Refuses who does not know the token or comes by another name of this computer."""
+    """Refuses a request without the token, or by another name of this computer."""
 
     def initialize(self, panel: PanelScreen) -> None:
         self.panel = panel
@@ -166,7 +166,6 @@ class _Guarded(RequestHandler):
 
 class _Page(_Guarded):
     def get(self) -> None:
-        """Answer with the page."""
         self.set_header("Content-Security-Policy", (
             "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
             f"connect-src ws://{self.request.host}; frame-src http://{LOOPBACK}:*; frame-ancestors 'none'"
@@ -182,14 +181,13 @@ class _Socket(_Guarded, WebSocketHandler):
         return origin == self.panel.origin
 
     def open(self, *_: str) -> None:
-        """Send what is known so far."""
         self._sending = False
         self._late: dict[str, Any] = {}
         self.panel.pages.add(self)
         self.tell({"texts": self.panel.texts, "values": self.panel.values})
 
     def on_message(self, message: str | bytes) -> None:
-        """Hand on a line."""
+        """Pass a line on."""
         line = message if isinstance(message, str) else ""
         if line == "viewer":
             self.panel.wants_viewer = True

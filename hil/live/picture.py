@@ -39,7 +39,7 @@ class Screen(Protocol):
 
 
 def open_screen(target: str, program: str, typed: Callable[[str], None]) -> Screen:
-    """Return the screen of a target; `typed` takes lines for who flies. Raises `LabError`."""
+    """Return the screen of a target; `typed` takes the typed lines. Raises `LabError`."""
     if target == "web":
         try:
             from hil.live.panel import PanelScreen

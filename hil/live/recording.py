@@ -63,7 +63,6 @@ class _Visit(BaseHTTPRequestHandler):
     server: Links
 
     def do_GET(self) -> None:
-        """Answer one link."""
         found, report = ROUTE.fullmatch(self.path), self.server.run / REPORT
         if found is not None and found[1] == self.server.key:
             self.send_response(HTTPStatus.FOUND)

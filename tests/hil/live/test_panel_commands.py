@@ -15,7 +15,7 @@ from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import Request
 from hil.laboratory.result import read_result
 from hil.laboratory.run import fly
-from hil.live.hand import Hand
+from hil.live.panel_commands import PanelCommands
 from hil.pictures.curves import since_release, with_marks
 from hil.pictures.panels import marks_of_flight
 from hil.pictures.report import fault_rows
@@ -52,11 +52,11 @@ class Script:
 
 
 def flown(folder: Path, view: Script | None, lockstep: bool = True) -> str:
-    hands: list[Hand] = []
+    panels: list[PanelCommands] = []
 
     def progress(now_us: int, flight: Flight) -> None:
-        if view is not None and not hands:
-            hands.append(Hand(view, flight, lockstep))
+        if view is not None and not panels:
+            panels.append(PanelCommands(view, flight, lockstep))
 
     return fly(Request.of(EXPERIMENTS["hover"], duration_s=1.0), folder, progress, view).hash
 
@@ -138,7 +138,7 @@ def test_a_flight_whose_station_is_another_program_does_not_pause(tmp_path: Path
     view = Script({100: ["pause", "step 50"]})
     flown(tmp_path / "run", view, lockstep=False)
     assert [answer.partition(":")[0] for answer in view.answers] == ["pause", "step"]
-    assert "does not stand still" in view.answers[0]
+    assert "which cannot pause" in view.answers[0]
 
 
 def test_a_panel_that_is_closed_lets_a_paused_flight_go_on(tmp_path: Path) -> None:

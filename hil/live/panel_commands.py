@@ -6,14 +6,8 @@ A line takes effect at the next row of the log and is an operator's event: such 
 from math import isfinite, radians
 
 from firmware_py.table import OF_PROFILE, CoreParameter
+from firmware_py.wire import parameters
 from firmware_py.wire.crtp import PORT_PARAMETERS, Packet, decode
-from firmware_py.wire.parameters import (
-    ENOENT,
-    OK,
-    SetByName,
-    encode_set_by_name,
-    encode_set_by_name_reply,
-)
 from ground_station.controls import ControlsError, Dialogue, Exchange, Script
 from ground_station.operator import REACH
 from ground_station.trajectory import Goal, Hold
@@ -27,8 +21,8 @@ from hil.live.feed import LiveView
 STEP_MS_MOST = 60_000
 
 
-class Hand:
-    """Carries out the lines of a panel at a flight that flies; at the instants of its rows, which changes nothing else."""
+class PanelCommands:
+    """Executes the lines of a panel during a flight, at the instants of its rows, which changes nothing else."""
 
     def __init__(self, view: LiveView, flight: Flight, lockstep: bool = True) -> None:
         self._view, self._flight, self._lockstep = view, flight, lockstep
@@ -42,7 +36,7 @@ class Hand:
         view.know([*board_values(flight.config).items()])
 
     def _look(self, now_us: int) -> None:
-        """Do what was pressed, and stand still while the flight is paused."""
+        """Execute the new lines, and wait while the flight is paused."""
         if self._until_us is not None and now_us >= self._until_us:
             self._paused, self._until_us = True, None
         for line in self._view.lines():
@@ -54,9 +48,9 @@ class Hand:
             else:
                 self._flight.note(OPERATOR, self._asked)
         if self._paused:
-            self._flight.lab.clock.pause(lambda: self._stand(now_us))
+            self._flight.lab.clock.pause(lambda: self._wait_paused(now_us))
 
-    def _stand(self, now_us: int) -> None:
+    def _wait_paused(self, now_us: int) -> None:
         self._flight.show()
         while self._paused:
             lines = self._view.wait()
@@ -83,7 +77,7 @@ class Hand:
 
     def _do(self, word: str, rest: str, now_us: int) -> None:
         if word in ("pause", "step") and not self._lockstep:
-            raise LabError(f"{word}: the ground station is a program of its own, which does not stand still")
+            raise LabError(f"{word}: the ground station is a program of its own, which cannot pause")
         if word in ("pause", "go"):
             self._paused = word == "pause"
         elif word == "step":
@@ -122,26 +116,28 @@ class Hand:
         if self._dialogue.busy:
             raise LabError(f"{line}: the board has not answered {self._asked!r} yet")
         if not self._listens:
-            self._flight.line.listen(self._hear)
+            self._flight.line.listen(self._receive)
             self._listens = True
         self._asked = line
         self._dialogue.begin(now_us, self._written(one, wanted))
 
-    def _hear(self, now_us: int, data: bytes) -> None:
+    def _receive(self, now_us: int, data: bytes) -> None:
         if self._dialogue.busy:
             self._dialogue.hear(now_us, decode(data))
 
     def _written(self, one: CoreParameter, value: float) -> Script[Packet]:
         """Set it by its name, which every board with CRTP understands, and return the value."""
-        request = encode_set_by_name(SetByName(one.name, one.scalar, value))
-        begin = encode_set_by_name_reply(one.name, OK)[:-1]
+        request = parameters.encode_set_by_name(parameters.SetByName(one.name, one.scalar, value))
+        begin = parameters.encode_set_by_name_reply(one.name, parameters.OK)[:-1]
 
         def status(got: Packet) -> int | None:
             return got.data[-1] if got.port == PORT_PARAMETERS and got.data[:-1] == begin else None
 
         code = yield Exchange(lambda now_us: self._flight.line.command(now_us, request), status)
-        if code != OK:
-            raise ControlsError(f"the board has no {one.name}" if code == ENOENT else "the board refuses it")
+        if code != parameters.OK:
+            raise ControlsError(
+                f"the board has no {one.name}" if code == parameters.ENOENT else "the board refuses it"
+            )
         return ((one.name, value),)
 
 
