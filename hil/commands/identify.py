@@ -58,8 +58,8 @@ def identify(
     from hil.identify.identify import IDENTIFIED, check_held_out
     from hil.identify.identify import identify as identify_records
     from hil.identify.pages import write_pages
-    from hil.identify.profile_out import write_profile
     from hil.identify.record import load_record, profile_of
+    from hil.identify.robots import write_profile
 
     _check_profile("--profile-out", profile_out)
     profile = profile or profile_of(runs[0])
@@ -89,25 +89,13 @@ def _check_profile(option: str, path: Path | None) -> None:
 
 
 def _print_constants(found: "Identification") -> None:
-
-    from hil.identify.identify import interval_text
-
-    cells = {
-        "constant": [one.name for one in found.constants],
-        "paper": [interval_text(*one.paper) for one in found.constants],
-        "truth": [interval_text(one.truth) for one in found.constants],
-        "paper's method": [interval_text(*one.two_controllers) for one in found.constants],
-        "instruments": [interval_text(*one.instrumental) for one in found.constants],
-        "joint fit": [interval_text(*one.joint) for one in found.constants],
-        "unit": [one.unit for one in found.constants],
-        "verdict": [f"{one.verdict}: {one.why}" for one in found.constants],
-    }
-    shown = {heading: column for heading, column in cells.items() if any(column)}
+    rows = [one.cells for one in found.constants]
+    shown = [heading for heading in rows[0] if any(row[heading] for row in rows)]
     table = Table(title="constants, with the half width of their 95 % interval")
     for heading in shown:
         table.add_column(heading, no_wrap=heading != "verdict")
-    for row in zip(*shown.values(), strict=True):
-        table.add_row(*row)
+    for row in rows:
+        table.add_row(*(row[heading] for heading in shown))
     wide_console().print(table)
     if found.excited:
         periods = ", ".join(

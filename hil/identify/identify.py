@@ -53,8 +53,17 @@ class IdentifiedConstant:
 
     @property
     def best(self) -> float:
-        """The joint fit's value."""
         return self.joint[0]
+
+    @property
+    def cells(self) -> dict[str, str]:
+        """The texts of a table's row, by heading."""
+        return {
+            "constant": self.name, "paper": interval_text(*self.paper), "truth": interval_text(self.truth),
+            "paper's method": interval_text(*self.two_controllers),
+            "instruments": interval_text(*self.instrumental), "joint fit": interval_text(*self.joint),
+            "unit": self.unit, "verdict": f"{self.verdict}: {self.why}",
+        }  # fmt: skip
 
     @property
     def differs(self) -> bool:
@@ -69,8 +78,6 @@ class IdentifiedConstant:
 
 @dataclass(frozen=True, slots=True)
 class Identification:
-    """The estimated constants of a robot."""
-
     constants: tuple[IdentifiedConstant, ...]
     excited: tuple[Excited, ...]
     estimate: Estimate  # of the joint fit
@@ -78,7 +85,6 @@ class Identification:
     free: tuple[Record, ...]  # without
 
     def constant(self, name: str) -> IdentifiedConstant:
-        """Return a constant by its name."""
         return next(constant for constant in self.constants if constant.name == name)
 
 
@@ -166,7 +172,6 @@ def _truths(record: Record, rich: Sequence[Record], excited: Sequence[Excited]) 
 
 
 def operating_point(record: Record) -> OperatingPoint:
-    """Return a robot's mean operating point."""
     u, attitude = record.u.mean(axis=0).tolist(), record.pose[:, 3:].mean(axis=0).tolist()
     return OperatingPoint((*u,), (*attitude,), record.config.tunnel.side_wind)
 

@@ -171,9 +171,7 @@ class JointFit:
     records: Sequence[int]
     scale: Array
     lag: float  # [s] of the profile
-    known: Callable[
-        [Mapping[str, float]], list[float]
-    ]  # returns the differences of constants from prior knowledge, in its units
+    known: Callable[[Mapping[str, float]], list[float]]  # differences from prior knowledge, in its units
 
     def parted(self, x: Array) -> tuple[dict[str, float], dict[int, float]]:
         """Return constants by name, and the lateness of poses by record [s]."""

@@ -15,11 +15,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from hil.design.axes import ROLL
-from hil.identify.identify import Identification, interval_text
-from hil.identify.joint import Excited, excited_axes, whitened
-from hil.identify.prediction import one_step
+from hil.identify.identify import Identification
+from hil.identify.joint import Estimate, Excited, excited_axes, whitened
 from hil.identify.record import Record
-from hil.identify.response import response
+from hil.identify.response import one_step, response
 from hil.identify.spectra import PERIOD_S
 from hil.identify.two_controllers import SIGMAS, closed_loop
 from hil.pictures import curves
@@ -45,16 +44,7 @@ def write_pages(out: Path, found: Identification, held_out: Record | None) -> Pa
     if found.free:
         title = "why the paper's equations contain no information about the robot"
         figures.append(saved(out, "identify_paper", title, "", partial(_identity, found.free)))
-    rows = [
-        {
-            "name": one.name, "unit": one.unit, "verdict": f"{one.verdict}: {one.why}",
-            "cells": [
-                interval_text(*one.paper), interval_text(one.truth), interval_text(*one.two_controllers),
-                interval_text(*one.instrumental), interval_text(*one.joint),
-            ],
-        }
-        for one in found.constants
-    ]  # fmt: skip
+    rows = [one.cells for one in found.constants]
     names = ", ".join(record.name for record in (*found.records, *found.free))
     return write_page(out / "identify.html", "identify.html.j2", rows=rows, figures=figures, names=names)
 
@@ -63,13 +53,24 @@ def _axis(
     found: Identification, fitted: list[Excited], held_out: list[Excited], records: tuple[Record, ...]
 ) -> Figure:
     """Draw one axis; `records` belong to the shown response."""
-    axis = fitted[0].axis
-    values = found.estimate.values
     figure = Figure(figsize=(WIDTH, 8.0), layout="constrained")
     panels = figure.subplot_mosaic([["gain", "phase"], ["errors", "step"], ["answer", "answer"]])
     gain, phase, errors, step, answer = panels.values()
+    _responses(gain, phase, errors, fitted, found.estimate)
+    seen, late = (held_out or fitted)[0], found.estimate.late
+    _period(answer, seen, found.estimate.values)
+    answer.set_title(
+        "a flight that was not fitted" if held_out else "the fitted flight; --validate RUN: another"
+    )
+    _one_step(step, records[seen.record], seen, found.estimate.values, late[0 if held_out else seen.record])
+    return figure
+
+
+def _responses(gain: Axes, phase: Axes, errors: Axes, fitted: list[Excited], found: Estimate) -> None:
+    """Draw the measured and the fitted response of one axis, and the errors of the fit."""
+    axis = fitted[0].axis
     grid = np.geomspace(fitted[0].spectra.w[0], fitted[0].spectra.w[-1], 200)
-    model = response(axis, values, grid)[:, 0]
+    model = response(axis, found.values, grid)[:, 0]
     gain.loglog(grid / 2 / np.pi, np.abs(model), color=curves.BLUE, label="joint fit")
     phase.semilogx(grid / 2 / np.pi, np.degrees(np.unwrap(np.angle(model))), color=curves.BLUE)
     together = gain.twinx()
@@ -77,13 +78,13 @@ def _axis(
     for one in fitted:
         Z, hertz = one.spectra.Z, one.spectra.w / 2 / np.pi
         measured = Z[:, 1] / Z[:, 0]
-        expected = response(axis, values, one.spectra.w)[:, 0]
+        expected = response(axis, found.values, one.spectra.w)[:, 0]
         turned = np.angle(measured / expected) + np.interp(one.spectra.w, grid, np.unwrap(np.angle(model)))
         gain.loglog(hertz, np.abs(measured), "+", color=curves.RED, label="measured")
         phase.semilogx(hertz, np.degrees(turned), "+", color=curves.RED)
         together.semilogx(hertz, one.spectra.coherence[:, 1], ":", color=curves.GREY)
-        late = found.estimate.late[one.record] if one.record < len(found.estimate.late) else 0.0
-        left = whitened(one, values, late).reshape(2, len(hertz), -1)[:, :, 0]
+        late = found.late[one.record] if one.record < len(found.late) else 0.0
+        left = whitened(one, found.values, late).reshape(2, len(hertz), -1)[:, :, 0]
         errors.plot(hertz, left[0], ".", color=curves.RED)
         errors.plot(hertz, left[1], ".", color=curves.SKY)
         correlation = np.mean([np.corrcoef(part[:-1], part[1:])[0, 1] for part in left])
@@ -96,22 +97,19 @@ def _axis(
     phase.set(xlabel="frequency [Hz]", ylabel="phase [deg]")
     errors.axhspan(-2, 2, color=curves.GREY, alpha=0.2)
     errors.set(xlabel="frequency [Hz]")
-    seen = (held_out or fitted)[0]
-    t = np.linspace(0.0, PERIOD_S, 1001)
+
+
+def _period(answer: Axes, seen: Excited, values: Mapping[str, float]) -> None:
+    """Draw the response over one period."""
+    t, axis = np.linspace(0.0, PERIOD_S, 1001), seen.axis
     Z = seen.spectra.Z * seen.spectra.excitation[:, None]
     predicted = response(axis, values, seen.spectra.w)[:, 0] * Z[:, 0]
     wave = np.exp(1j * np.outer(t, seen.spectra.w))
     answer.plot(t, (wave @ Z[:, 1]).real, color=curves.RED, label="measured")
     answer.plot(t, (wave @ predicted).real, color=curves.BLUE, label="simulated from the input")
-    answer.set(
-        xlim=(0, 5), xlabel="time in the period [s]", ylabel=f"{OUTPUTS[axis.name]} [{UNITS[axis.name]}]"
-    )
-    answer.set_title(
-        "a flight that was not fitted" if held_out else "the fitted flight; --validate RUN: another"
-    )
+    label = f"{OUTPUTS[axis.name]} [{UNITS[axis.name]}]"
+    answer.set(xlim=(0, 5), xlabel="time in the period [s]", ylabel=label)
     answer.legend(loc="upper right")
-    _one_step(step, records[seen.record], seen, values, found.estimate.late[0 if held_out else seen.record])
-    return figure
 
 
 def _one_step(axes: Axes, record: Record, seen: Excited, values: Mapping[str, float], late: float) -> None:
@@ -137,20 +135,11 @@ def _identity(records: tuple[Record, ...]) -> Figure:
     panels = figure.subplots(1, min(2, len(records)), squeeze=False)[0]
     for axes, record in zip(panels, records, strict=False):
         loop = closed_loop(record, ROLL)
-        axes.plot(
-            loop.w**2,
-            (loop.acceleration / loop.angle).real,
-            ".",
-            color=curves.RED,
-            markersize=2,
-            label="every bin",
-        )
+        bins = (loop.acceleration / loop.angle).real
+        axes.plot(loop.w**2, bins, ".", color=curves.RED, markersize=2, label="every bin")
         axes.plot(np.sort(loop.w**2), -np.sort(loop.w**2), color="black", label="−ω², for any robot")
-        axes.axhline(
-            loop.starred[1],
-            color=curves.BLUE,
-            label=f"c* = {loop.starred[1]:.1f} ± {SIGMAS * loop.errors[1]:.1f}",
-        )
+        estimated = f"c* = {loop.starred[1]:.1f} ± {SIGMAS * loop.errors[1]:.1f}"
+        axes.axhline(loop.starred[1], color=curves.BLUE, label=estimated)
         axes.set(xlabel="ω² [1/s²]", ylabel="jωȦ / A, real part [1/s²]", ylim=(-1000, 100))
         axes.set_title(f"{record.name}: b* = {loop.starred[0]:.2f}")
         axes.legend(loc="lower left")

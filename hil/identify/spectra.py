@@ -43,7 +43,6 @@ class Spectra:
 
     @property
     def periods(self) -> int:
-        """The number of realisations."""
         return len(self.each)
 
 

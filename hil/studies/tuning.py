@@ -21,9 +21,8 @@ from hil.errors import LabError, writing
 from hil.floaty.plant import Plant
 from hil.identify.flow import flow_of
 from hil.identify.identify import identify
-from hil.identify.profile_out import write_profile
 from hil.identify.record import load_record
-from hil.identify.robots import FLAP_RATE, Robots, robots_of
+from hil.identify.robots import FLAP_RATE, Robots, robots_of, write_profile
 from hil.laboratory.request import Options
 from hil.laboratory.result import read_result
 from hil.laboratory.robot import Streams
@@ -62,7 +61,6 @@ class TuningFlights:
         )  # fmt: skip
 
     def excitations(self, profile: str) -> list[Row]:
-        """Fly an excitation of each input."""
         return self._fly(
             "excitations",
             {

@@ -13,9 +13,9 @@ from hil.config import load_config
 from hil.design.axes import PITCH as PITCH_AXIS
 from hil.errors import LabError
 from hil.identify.identify import IDENTIFIED, UNKNOWN, Identification, check_held_out, identify
-from hil.identify.prediction import one_step
-from hil.identify.profile_out import write_profile
 from hil.identify.record import BOARD_COLUMN, EXCITATIONS, INPUTS, RATES, load_record
+from hil.identify.response import one_step
+from hil.identify.robots import write_profile
 from hil.identify.two_controllers import closed_loop
 from support.command import Cli
 
