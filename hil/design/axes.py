@@ -46,9 +46,7 @@ class Axis:
     name: str
     coordinate: str  # x, y or z that it moves; empty for yaw
     input: int
-    states: tuple[
-        str, ...
-    ]  # the first is the controlled one: the integral of the next, without effect on others
+    states: tuple[str, ...]  # first the controlled one: the integral of the next, without effect on others
     gains: tuple[str, ...]  # by state, then of the first one's integral, if any
     constants: tuple[str, ...]  # in the order of UNITS
 
@@ -89,7 +87,6 @@ ROLL, PITCH, YAW, HEIGHT = AXES
 
 
 def robot_of(config: LabConfig, delay_s: float = OWN_DELAY_S) -> dict[str, float]:
-    """Return a profile's model as a robot."""
     return {**config.model.model_dump(), DELAY: delay_s}
 
 

@@ -10,20 +10,10 @@ from math import degrees
 
 import numpy as np
 
+from hil.design import sweeps
 from hil.design.authority import wrenches
 from hil.design.axes import AXES, PITCH, ROLL
 from hil.design.linear import places
-from hil.design.sweeps import (
-    OPENINGS,
-    RESERVE,
-    HoverAngles,
-    Point,
-    PowerLaw,
-    Stability,
-    flat_high,
-    reynolds,
-    updrafts,
-)
 from hil.design.trim import balanced, changed
 from hil.floaty.geometry import weigh
 from hil.floaty.paper_table import PAPER_TABLE
@@ -70,7 +60,6 @@ def _holds(whether: bool) -> str:
 
 
 def text_of(poles: list[complex]) -> str:
-    """Return poles as text."""
     found = []
     for pole in poles:
         if pole.imag > 1e-9:
@@ -81,10 +70,15 @@ def text_of(poles: list[complex]) -> str:
 
 
 def claims(
-    point: Point, stability: Stability, angles: HoverAngles, laws: tuple[PowerLaw, ...], model_error: float
+    point: sweeps.Point,
+    stability: sweeps.Stability,
+    angles: sweeps.HoverAngles,
+    laws: tuple[sweeps.PowerLaw, ...],
+    model_error: float,
 ) -> list[Claim]:
     """Return every claim of the design sections, with the figures of one robot."""
     return [
+        *_flat_high(point),
         *_stable(point, stability),
         *_authority(point, angles),
         *_scale(point, laws),
@@ -92,19 +86,18 @@ def claims(
     ]
 
 
-def _stable(point: Point, sweep: Stability) -> Iterator[Claim]:
-    first = flat_high(point)
-    linear, high = point.linear, first.linear
+def _flat_high(point: sweeps.Point) -> Iterator[Claim]:
+    """Yield the claims about flat flaps with the centre of mass in their plane."""
+    high = sweeps.flat_high(point).linear
     lowered = balanced(changed(point.geometry, kink_angle=0.0), 0.0)
     moved = replace(point, geometry=lowered).linear.constants.roll_roll
-    f, g = linear.constants, high.constants
+    unstable, growth = high.constants.roll_roll, high.growth(ROLL)
     yield Claim(
-        "flat flaps, centre of mass in their plane: f_αα", DESIGN, "≈ +100 1/s²", f"{g.roll_roll:+.1f} 1/s²",
-        _near(g.roll_roll, 100.0),
+        "flat flaps, centre of mass in their plane: f_αα", DESIGN, "≈ +100 1/s²", f"{unstable:+.1f} 1/s²",
+        _near(unstable, 100.0),
         f"At the inertia of the robot as it is; with masses moved up it is smaller, and f_αα {moved:+.0f}. The paper gives "
         "neither the inertia nor the height of its first robot.",
     )  # fmt: skip
-    growth = high.growth(ROLL)
     yield Claim(
         "the same: unstable pole", DESIGN, "p₁ ≈ 9.5 1/s", f"{growth:.2f} 1/s", _near(growth, 9.5),
         "√f_αα would be the pole without damping and without the drift in y.",
@@ -113,6 +106,10 @@ def _stable(point: Point, sweep: Stability) -> Iterator[Claim]:
         "flat flaps: pitch is stable by its V", DESIGN, "stable", text_of(high.poles(PITCH)),
         _holds(high.growth(PITCH) < 0.0),
     )  # fmt: skip
+
+
+def _stable(point: sweeps.Point, sweep: sweeps.Stability) -> Iterator[Claim]:
+    linear, f = point.linear, point.linear.constants
     ours = f"{f.roll_roll:+.1f} 1/s²"
     yield Claim("kink and low centre of mass: f_αα", DESIGN, "≈ -16 1/s²", ours, _near(f.roll_roll, -16.0))
     first_pole = linear.poles(ROLL)[0]
@@ -126,13 +123,8 @@ def _stable(point: Point, sweep: Stability) -> Iterator[Claim]:
         f"stable from {degrees(sweep.crossing):.1f}° on: {degrees(point.geometry.kink_angle - sweep.crossing):+.1f}°",
         _holds(point.geometry.kink_angle > sweep.crossing),
     )  # fmt: skip
-    yield Claim(
-        "pitch stays stable by its V",
-        DESIGN,
-        "stable",
-        text_of(linear.poles(PITCH)),
-        _holds(linear.growth(PITCH) < 0),
-    )
+    ours, holds = text_of(linear.poles(PITCH)), _holds(linear.growth(PITCH) < 0)
+    yield Claim("pitch stays stable by its V", DESIGN, "stable", ours, holds)
     yield Claim(
         "rates are damped in roll and pitch", DESIGN, "both < 0", f"{f.roll_rate:.2f}, {f.pitch_rate:.2f} 1/s",
         _holds(f.roll_rate < 0 and f.pitch_rate < 0),
@@ -141,14 +133,11 @@ def _stable(point: Point, sweep: Stability) -> Iterator[Claim]:
     for states in [*map(places, AXES), [5, 8]]:
         own[np.ix_(states, states)] = True
     foreign = float(np.abs(linear.A[~own]).max())
-    yield Claim(
-        "dynamics decouple into roll, pitch, yaw and height", DESIGN, "four parts",
-        f"largest entry between parts {foreign:.0e}",
-        _holds(foreign < 1e-6),
-    )  # fmt: skip
+    ours, holds = f"largest entry between parts {foreign:.0e}", _holds(foreign < 1e-6)
+    yield Claim("dynamics decouple into roll, pitch, yaw and height", DESIGN, "four parts", ours, holds)
 
 
-def _authority(point: Point, angles: HoverAngles) -> Iterator[Claim]:
+def _authority(point: sweeps.Point, angles: sweeps.HoverAngles) -> Iterator[Claim]:
     for criterion in angles.criteria:
         best, low, high = (degrees(angle) for angle in angles.best(criterion))
         yield Claim(
@@ -162,7 +151,7 @@ def _authority(point: Point, angles: HoverAngles) -> Iterator[Claim]:
         "a smaller hover angle: more yaw, less pitch, roll and height", DESIGN, "so", "so up to 35°" if trend else "not so",
         _holds(trend), f"Pitch is lost first: {_sign_change(angles)}",
     )  # fmt: skip
-    low, high = updrafts(point, RESERVE)
+    low, high = sweeps.updrafts(point)
     yield Claim(
         "updrafts that the flaps hold", "Robustness", "8 to 11 m/s", f"{low:.2f} to {high:.2f} m/s",
         _holds(low <= 8 and high >= 11),
@@ -170,23 +159,21 @@ def _authority(point: Point, angles: HoverAngles) -> Iterator[Claim]:
     )  # fmt: skip
 
 
-def _sign_change(angles: HoverAngles) -> str:
+def _sign_change(angles: sweeps.HoverAngles) -> str:
     pitch = angles.constants["pitch"]
     changes = np.flatnonzero(pitch[:-1] * pitch[1:] < 0.0)
-    return (
-        f"its input constant changes sign at {degrees(OPENINGS[changes[0]]):.1f}°."
-        if len(changes)
-        else "never."
-    )
+    if not len(changes):
+        return "never."
+    return f"its input constant changes sign at {degrees(sweeps.OPENINGS[changes[0]]):.1f}°."
 
 
-def _scale(point: Point, laws: tuple[PowerLaw, ...]) -> Iterator[Claim]:
+def _scale(point: sweeps.Point, laws: tuple[sweeps.PowerLaw, ...]) -> Iterator[Claim]:
     for law in laws:
         yield Claim(
             f"{law.quantity} over {law.cause}", SCALING, f"exponent {law.paper:g}", f"{round(law.exponent, 6) + 0.0:.4f}",
             _holds(abs(law.exponent - law.paper) < 1e-6),
         )  # fmt: skip
-    number = reynolds(point)
+    number = sweeps.reynolds(point)
     yield Claim(
         "Reynolds number", SCALING, "≈ 2e5", f"{number:.3g}", _near(number, 2e5),
         "With the side of the footprint; 2.2e5 with its diagonal. The formula needs the dynamic viscosity, which the main "
@@ -194,7 +181,7 @@ def _scale(point: Point, laws: tuple[PowerLaw, ...]) -> Iterator[Claim]:
     )  # fmt: skip
 
 
-def _forces(point: Point, model_error: float) -> Iterator[Claim]:
+def _forces(point: sweeps.Point, model_error: float) -> Iterator[Claim]:
     yield Claim(
         "plant and the Supplement's plate equations", FORCES, "the same", f"differ by at most {model_error:.0e} N, N m",
         _holds(model_error < 1e-9),
@@ -202,13 +189,8 @@ def _forces(point: Point, model_error: float) -> Iterator[Claim]:
     hover = np.full((1, 4), point.opening)
     force = wrenches(point.geometry, hover, 1.0)[0]
     aside = float(np.abs(np.delete(force, 2)).max() / force[2])
-    yield Claim(
-        "at hover neither lateral force nor torque",
-        FORCES,
-        "zero",
-        f"{aside:.0e} of the lift",
-        _holds(aside < 1e-9),
-    )
+    ours, holds = f"{aside:.0e} of the lift", _holds(aside < 1e-9)
+    yield Claim("at hover neither lateral force nor torque", FORCES, "zero", ours, holds)
     f = point.linear.constants
     yield Claim(
         "lateral forces cancel under u1 and u2", FORCES, "zero", f"y/u1 {f.y_u1:.2f}, x/u2 {f.x_u2:.2f} m/s²",
@@ -224,11 +206,11 @@ def _forces(point: Point, model_error: float) -> Iterator[Claim]:
         )  # fmt: skip
 
 
-def robot_lines(point: Point) -> list[tuple[str, str]]:
+def robot_lines(point: sweeps.Point) -> list[tuple[str, str]]:
     """Return a description of the robot, in words and figures."""
     weight, linear = weigh(point.geometry), point.linear
     ix, iy, iz = (1e3 * moment for moment in weight.inertia)
-    low, high = updrafts(point, RESERVE)
+    low, high = sweeps.updrafts(point)
     return [
         ("mass, centre of mass below the flaps", f"{weight.mass:.3f} kg, {100 * weight.axis_height:.1f} cm"),
         ("inertia about x, y, z", f"{ix:.3f}, {iy:.3f}, {iz:.3f} g m²"),

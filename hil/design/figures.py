@@ -1,5 +1,6 @@
 """Pictures of a design: the robot itself, its stability, its hover angle, its reach, and its scaling laws."""
 
+from itertools import product
 from math import degrees
 
 import numpy as np
@@ -15,21 +16,11 @@ from hil.design.sweeps import FACTORS, HEIGHTS, KINKS, OPENINGS, HoverAngles, Po
 from hil.floaty.drawing import look_of
 from hil.floaty.geometry import weigh
 from hil.floaty.shape import SIGNS
-from hil.pictures import scene
-from hil.pictures.curves import (
-    AXIS_COLOURS,
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PINK,
-    RED,
-    SERIES_COLOURS,
-)
+from hil.pictures import curves, scene
 from hil.pictures.drawing import WIDTH
 from hil.world.config import NetConfig
 
-COLOURS = dict(zip(QUANTITIES, (*AXIS_COLOURS, ORANGE), strict=True))
+COLOURS = dict(zip(QUANTITIES, (*curves.AXIS_COLOURS, curves.ORANGE), strict=True))
 PAPER_BAND_DEG = (20.0, 25.0)
 Points = NDArray[np.float64]
 
@@ -43,7 +34,7 @@ def shape(point: Point) -> Figure:
         opening = SIGNS[int(part.label) - 1] * point.opening if part.label else 0.0
         q = scene.turn_quaternion(np.array(part.axis), np.array([opening]))
         turned = scene.rotated(q, part.triangles.reshape(-1, 3)) + np.array(part.place)
-        parts.append((turned.reshape(-1, 3, 3), part.colour if part.label else GREY))
+        parts.append((turned.reshape(-1, 3, 3), part.colour if part.label else curves.GREY))
     views = (("from above", 1, 0), ("along x: roll", 1, 2), ("along y: pitch", 0, 2))
     for axes, (title, across, up) in zip(figure.subplots(1, 3), views, strict=True):
         for triangles, colour in parts:
@@ -51,15 +42,15 @@ def shape(point: Point) -> Figure:
                 plan = 100 * triangle[:, [across, up]]
                 axes.add_patch(Polygon(plan, facecolor=colour, alpha=0.35, edgecolor=colour, linewidth=0.4))
         if up == 2:
-            axes.plot([0, 0], [0, 100 * height], color=GREY)
+            axes.plot([0, 0], [0, 100 * height], color=curves.GREY)
             axes.plot(0, 0, "o", color="black", markersize=4)
         half = 60 * point.geometry.footprint
         axes.set_xlim((half, -half) if across == 1 else (-half, half))  # y is to the left of x
         axes.set_ylim((-half, half) if up == 0 else (-0.35 * half, 1.3 * half))
         axes.set_aspect("equal")
-        axes.set_title(title)
-        axes.set_xlabel(("y" if across else "x") + " [cm]")
-        axes.set_ylabel(("z" if up else "x") + " [cm]")
+        axes.set(
+            title=title, xlabel=("y" if across else "x") + " [cm]", ylabel=("z" if up else "x") + " [cm]"
+        )
     return figure
 
 
@@ -75,31 +66,22 @@ def stability(point: Point, sweep: Stability) -> Figure:
     left.contour(kinks, 100 * HEIGHTS, sweep.stiffness, [0.0], colors="black", linewidths=1.5)
     left.plot(own, 100 * weigh(point.geometry).axis_height, "*", color="black", markersize=10)
     left.plot(0.0, 0.0, "o", color="black", clip_on=False)
-    left.set_xlabel("kink [deg]")
-    left.set_ylabel("centre of mass below the flaps [cm]")
+    left.set(xlabel="kink [deg]", ylabel="centre of mass below the flaps [cm]")
     figure.colorbar(surface, ax=left, label="f_αα [1/s²]: red: falls over")
-    middle.plot(kinks, sweep.along, color=BLUE)
-    middle.axhline(0.0, color=GREY)
+    middle.plot(kinks, sweep.along, color=curves.BLUE)
+    middle.axhline(0.0, color=curves.GREY)
     middle.axvline(own, color="#ff5733", linestyle="--")
     if np.isfinite(sweep.crossing):
-        middle.plot(degrees(sweep.crossing), 0.0, "o", color=RED)
-        middle.annotate(
-            f"{degrees(sweep.crossing):.1f}°",
-            (degrees(sweep.crossing), 0.0),
-            (4, 6),
-            textcoords="offset points",
-        )
-    middle.set_xlabel("kink [deg]")
-    middle.set_ylabel("f_αα [1/s²]")
-    for index in range(3):
-        right.plot(kinks, sweep.poles[:, index].real, ".", color=BLUE, label="real" if index == 0 else None)
-        right.plot(
-            kinks, sweep.poles[:, index].imag, ".", color=ORANGE, label="imaginary" if index == 0 else None
-        )
-    right.axhline(0.0, color=GREY)
+        middle.plot(degrees(sweep.crossing), 0.0, "o", color=curves.RED)
+        text = f"{degrees(sweep.crossing):.1f}°"
+        middle.annotate(text, (degrees(sweep.crossing), 0.0), (4, 6), textcoords="offset points")
+    middle.set(xlabel="kink [deg]", ylabel="f_αα [1/s²]")
+    parts = ((sweep.poles.real, curves.BLUE, "real"), (sweep.poles.imag, curves.ORANGE, "imaginary"))
+    for index, (part, colour, name) in product(range(3), parts):
+        right.plot(kinks, part[:, index], ".", color=colour, label="" if index else name)
+    right.axhline(0.0, color=curves.GREY)
     right.axvline(own, color="#ff5733", linestyle="--")
-    right.set_xlabel("kink [deg]")
-    right.set_ylabel("roll poles [1/s]")
+    right.set(xlabel="kink [deg]", ylabel="roll poles [1/s]")
     right.legend()
     return figure
 
@@ -112,17 +94,17 @@ def hover(point: Point, sweep: HoverAngles) -> Figure:
     for name in QUANTITIES:
         values = sweep.constants[name]
         left.plot(angles, values / np.abs(values).max(), color=COLOURS[name], label=name)
-    left.axhline(0.0, color=GREY)
+    left.axhline(0.0, color=curves.GREY)
     left.set_ylabel("input constant / its largest")
     left.legend()
     for index, (name, curve) in enumerate(sweep.criteria.items()):
         best = degrees(sweep.best(name)[0])
-        right.plot(angles, curve, color=SERIES_COLOURS[index], label=f"{name}: {best:.1f}°")
-        right.plot(best, 1.0, "o", color=SERIES_COLOURS[index])
+        right.plot(angles, curve, color=curves.SERIES_COLOURS[index], label=f"{name}: {best:.1f}°")
+        right.plot(best, 1.0, "o", color=curves.SERIES_COLOURS[index])
     right.set_ylabel("share of the best")
     right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0))
     for axes in (left, right):
-        axes.axvspan(*PAPER_BAND_DEG, color=GREEN, alpha=0.12)
+        axes.axvspan(*PAPER_BAND_DEG, color=curves.GREEN, alpha=0.12)
         axes.axvline(degrees(point.opening), color="#2ecc71", linestyle="--")
         axes.set_xlabel("hover angle [deg]")
     return figure
@@ -133,13 +115,9 @@ def reach(point: Point, found: Attainable) -> Figure:
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     pairs = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
     for axes, (a, b) in zip(figure.subplots(2, 3).flat, pairs, strict=True):
-        for points, colour, label in (
-            (found.all, BLUE, "any lift"),
-            (found.level, ORANGE, "lift = weight ± 2 %"),
-        ):
-            if b == 3 and colour == ORANGE:
-                continue
-            _outline(axes, points[:, [a, b]], colour, label)
+        _outline(axes, found.all[:, [a, b]], curves.BLUE, "any lift")
+        if b != 3:
+            _outline(axes, found.level[:, [a, b]], curves.ORANGE, "lift = weight ± 2 %")
         axes.plot(0.0, 1.0 if b == 3 else 0.0, "+", color="black")
         for setter, index in ((axes.set_xlabel, a), (axes.set_ylabel, b)):
             setter("lift [weights]" if index == 3 else f"{QUANTITIES[index]} [rad/s²]")
@@ -166,8 +144,8 @@ def scale(laws: tuple[PowerLaw, ...]) -> Figure:
             order = np.argsort(law.x)
             own = len(FACTORS) // 2
             axes.loglog(
-                law.x[order] / law.x[own], law.y[order] / law.y[own], marker="o", markersize=3, color=SERIES_COLOURS[index],
-                linestyle=("-", "--", ":")[index % 3],
+                law.x[order] / law.x[own], law.y[order] / law.y[own], marker="o", markersize=3,
+                color=curves.SERIES_COLOURS[index], linestyle=("-", "--", ":")[index % 3],
                 label=f"{law.quantity}: {round(law.exponent, 6) + 0.0:+.3f} (paper {law.paper:+g})",
             )  # fmt: skip
         axes.set_xlabel(f"{cause}, relative")
@@ -187,11 +165,10 @@ def pareto(
     """Draw an optimisation's shapes (N, 2), the Pareto front (M, 2), and robots by name."""
     figure = Figure(figsize=(0.7 * WIDTH, 3.6), layout="constrained")
     axes = figure.subplots()
-    axes.plot(*found.T, ".", color=GREY, markersize=2, alpha=0.5, label="tried")
-    axes.plot(*front.T, "-", color=BLUE, label="Pareto front")
-    for (name, place), colour in zip(marks.items(), (RED, GREEN, PINK), strict=False):
+    axes.plot(*found.T, ".", color=curves.GREY, markersize=2, alpha=0.5, label="tried")
+    axes.plot(*front.T, "-", color=curves.BLUE, label="Pareto front")
+    for (name, place), colour in zip(marks.items(), (curves.RED, curves.GREEN, curves.PINK), strict=False):
         axes.plot(*place, "*", color=colour, markersize=11, label=name)
-    axes.set_xlabel(names[0])
-    axes.set_ylabel(names[1])
+    axes.set(xlabel=names[0], ylabel=names[1])
     axes.legend()
     return figure

@@ -27,7 +27,6 @@ class Linear:
 
     @property
     def constants(self) -> Constants:
-        """The constants by the paper's names."""
         return Constants(**{name: value for name, value in self.robot.items() if name not in NUISANCES})
 
     @property

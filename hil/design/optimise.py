@@ -27,9 +27,8 @@ from hil.design.trim import balanced, changed, opening_at, speed_at
 from hil.errors import LabError
 from hil.floaty.geometry import weigh
 
-BOUNDS = {  # shares of the footprint, except the kink
-    "kink": (0.0, math.radians(80.0)), "height": (0.0, 0.5), "base": (0.15, 0.5), "strip": (0.02, 0.2),
-}  # fmt: skip
+# Shares of the footprint, except the kink.
+BOUNDS = {"kink": (0.0, math.radians(80.0)), "height": (0.0, 0.5), "base": (0.15, 0.5), "strip": (0.02, 0.2)}
 LOW, HIGH = np.array(list(BOUNDS.values())).T
 POPULATION, GENERATIONS = 40, 25
 NEAR = 0.1  # of the bounds, standard deviation of the reference's neighbours
@@ -50,6 +49,10 @@ class Tried:
     stiffness: float  # f_αα [1/s2]
     authority: float  # the smallest over the axes, as a share of the reference's
     ratio: float  # of its largest to its smallest updraft; 0: not evaluated
+
+    def reached(self, figure: str) -> float:
+        """Return the figure, one of FIGURES."""
+        return self.ratio if figure == "speed-range" else self.authority
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +211,7 @@ def optimise(reference: Point, figure: str, seed: int, generations: int = GENERA
             f"no robot of {size} is stable and steers at {reference.speed:.3g} m/s with openings of "
             f"{math.degrees(reference.low):.0f} to {math.degrees(reference.high):.0f} deg"
         )
-    best = max(tried, key=lambda one: one.ratio if figure == "speed-range" else one.authority)
+    best = max(tried, key=lambda one: one.reached(figure))
     share = shapes.share
     own = _look(reference, share, speed_range(reference, share))
     return Optimum(best, own, all(map(_flies, around(reference))), tuple(tried))
@@ -231,9 +234,7 @@ def front(tried: tuple[Tried, ...], figure: str) -> NDArray[np.float64]:
 
 def placed(tried: tuple[Tried, ...], figure: str) -> NDArray[np.float64]:
     """Return stability -f_αα [1/s2] and figure of each robot, (N, 2)."""
-    return np.array(
-        [(-one.stiffness, one.ratio if figure == "speed-range" else one.authority) for one in tried]
-    )
+    return np.array([(-one.stiffness, one.reached(figure)) for one in tried])
 
 
 def exercise(optimum: Optimum, low: float, high: float) -> list[str]:

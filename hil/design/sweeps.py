@@ -12,6 +12,7 @@ from hil.design.authority import QUANTITIES, authority, reach
 from hil.design.axes import ROLL
 from hil.design.linear import Linear, linear, stiffness
 from hil.design.trim import balanced, changed, coefficient_of, scaled, speed_at
+from hil.floaty.correction import Constants
 from hil.floaty.geometry import weigh
 from hil.floaty.shape import AIR_DENSITY
 from hil.world.config import GeometryConfig
@@ -22,6 +23,7 @@ OPENINGS = np.radians(np.arange(10.0, 45.1, 0.5))
 FACTORS = np.array([0.5, 0.7, 1.0, 1.4, 2.0])  # on length or mass
 VISCOSITY = 1.81e-5  # [Pa s] of air at 15 deg C, dynamic
 NEAR_BEST = 0.95  # share of the best figure at which hover angles count as equally good
+RESERVE = radians(8.0)  # of the opening, for attitude: 95 % of the hover's time (hil/experiments/airspeed.py)
 Curve = NDArray[np.float64]
 
 
@@ -42,20 +44,13 @@ class Point:
 
     @property
     def linear(self) -> Linear:
-        """Its dynamics."""
         return linear(self.geometry, self.speed, self.opening)
 
 
 def point_of(config: LabConfig) -> Point:
     """Return a profile's robot at its design hover."""
-    limits = config.allocation
-    return Point(
-        config.geometry,
-        coefficient_of(config),
-        config.plant.hover_angle,
-        limits.opening_min,
-        limits.opening_max,
-    )
+    opening, limits = config.plant.hover_angle, config.allocation
+    return Point(config.geometry, coefficient_of(config), opening, limits.opening_min, limits.opening_max)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,19 +139,16 @@ def scaling(point: Point) -> tuple[PowerLaw, ...]:
         y = np.array([abs(of(one)) for one in points])
         return PowerLaw(quantity, cause, x, y, float(np.polyfit(np.log(x), np.log(y), 1)[0]), paper)
 
+    def f(point: Point) -> Constants:
+        return point.linear.constants
+
     return (
-        law("roll acceleration per input", "l", sizes, lambda p: p.linear.constants.roll_u1, -1.0),
-        law("pitch acceleration per input", "l", sizes, lambda p: p.linear.constants.pitch_u2, -1.0),
-        law("yaw acceleration per input", "l", sizes, lambda p: p.linear.constants.yaw_u3, -1.0),
-        law("lift acceleration per input", "l", sizes, lambda p: p.linear.constants.z_u4, 0.0),
-        law(
-            "lift acceleration / l per input",
-            "l",
-            sizes,
-            lambda p: p.linear.constants.z_u4 / _length(p),
-            -1.0,
-        ),
-        law("roll acceleration per input", "m", masses, lambda p: p.linear.constants.roll_u1, 0.0),
+        law("roll acceleration per input", "l", sizes, lambda p: f(p).roll_u1, -1.0),
+        law("pitch acceleration per input", "l", sizes, lambda p: f(p).pitch_u2, -1.0),
+        law("yaw acceleration per input", "l", sizes, lambda p: f(p).yaw_u3, -1.0),
+        law("lift acceleration per input", "l", sizes, lambda p: f(p).z_u4, 0.0),
+        law("lift acceleration / l per input", "l", sizes, lambda p: f(p).z_u4 / _length(p), -1.0),
+        law("roll acceleration per input", "m", masses, lambda p: f(p).roll_u1, 0.0),
         law("airspeed", "m / l²", [*sizes, *masses], lambda p: p.speed, 0.5),
         law("Reynolds number", "l", sizes, reynolds, 0.0),
         law("Reynolds number", "m", masses, reynolds, 0.5),
@@ -179,15 +171,10 @@ _CAUSES: Mapping[str, Callable[[Point], float]] = {
 }
 
 
-def updrafts(point: Point, reserve: float) -> tuple[float, float]:
-    """Return the smallest and largest updraft [m/s] for the flaps with `reserve` [rad] to both limits."""
-    return (
-        speed_at(point.geometry, point.coefficient, point.low + reserve),
-        speed_at(point.geometry, point.coefficient, point.high - reserve),
-    )
-
-
-RESERVE = radians(8.0)  # of the opening, for attitude: 95 % of the hover's time (hil/experiments/airspeed.py)
+def updrafts(point: Point) -> tuple[float, float]:
+    """Return the smallest and largest updraft [m/s] for the flaps with `RESERVE` to both limits."""
+    slow, fast = (replace(point, opening=one) for one in (point.low + RESERVE, point.high - RESERVE))
+    return slow.speed, fast.speed
 
 
 def flat_high(point: Point) -> Point:

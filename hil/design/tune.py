@@ -74,8 +74,6 @@ class GainTask:
 
 @dataclass(frozen=True, slots=True)
 class PredictedMotion:
-    """The predicted motion of a robot."""
-
     main: float  # [m] or [rad] rms of the main state's error
     input: float  # [rad] rms of the input's variation
 

@@ -61,9 +61,9 @@ def test_an_input_alone_takes_no_flap_beyond_its_limits() -> None:
 
 
 def test_the_updrafts_are_those_whose_hover_leaves_the_reserve() -> None:
-    low, high = sweeps.updrafts(PAPER, 0.1)
-    assert opening_at(G0, COEFFICIENT, low) == pytest.approx(0.1, abs=1e-6)
-    assert opening_at(G0, COEFFICIENT, high) == pytest.approx(0.8, abs=1e-6)
+    low, high = sweeps.updrafts(PAPER)
+    assert opening_at(G0, COEFFICIENT, low) == pytest.approx(PAPER.low + sweeps.RESERVE, abs=1e-6)
+    assert opening_at(G0, COEFFICIENT, high) == pytest.approx(PAPER.high - sweeps.RESERVE, abs=1e-6)
 
 
 @pytest.mark.parametrize("scale", [1.0, 2.5])
