@@ -36,8 +36,6 @@ SETTINGS = ("experiment", "profile", "overrides", "faults", "seed", "duration_s"
 
 @dataclass(frozen=True, slots=True)
 class FlownRun:
-    """A run folder's log and result."""
-
     log: pa.Table
     result: Result
 

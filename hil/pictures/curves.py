@@ -108,6 +108,13 @@ def plain(*names: str, scale: float = 1.0) -> Read:
     return lambda rows: scale * column(rows, *names).reshape(-1, len(names))
 
 
+def logged(
+    names: tuple[str, ...], colours: tuple[str, ...], unit: str, *columns: str, scale: float = 1.0
+) -> Curves:
+    """Return the curves of columns, of which a log has all or none."""
+    return Curves(names, colours, unit, plain(*columns, scale=scale), needs=columns[0])
+
+
 def _degrees(*names: str) -> Read:
     return lambda rows: np.degrees(column(rows, *names))
 
@@ -133,64 +140,43 @@ POSITION_MISS = Curves(
     _XYZ, AXIS_COLOURS, "cm", lambda rows: POSITION_ESTIMATE.read(rows) - POSITION.read(rows)
 )
 ATTITUDE_MISS = Curves(
-    _RPY,
-    AXIS_COLOURS,
-    "deg",
-    lambda rows: (ATTITUDE_ESTIMATE.read(rows) - ATTITUDE.read(rows) + 180) % 360 - 180,
-)
+    _RPY, AXIS_COLOURS, "deg", lambda rows: (ATTITUDE_ESTIMATE.read(rows) - ATTITUDE.read(rows) + 180) % 360 - 180
+)  # fmt: skip
 FLAPS = Curves(_four("flap "), FLAP_COLOURS, "deg", _flaps, needs="truth.flap_1 telemetry.flap_1")
-ROTORS = Curves(
-    _four("M"), FLAP_COLOURS, "mN", plain(*_four("rotor.thrust_"), scale=1e3), needs="rotor.thrust_1"
-)
+ROTORS = logged(_four("M"), FLAP_COLOURS, "mN", *_four("rotor.thrust_"), scale=1e3)
 MOTORS = Curves(
     _four("M"), FLAP_COLOURS, "%", plain(*_four("motor.m"), scale=100 / 65535), needs="rotor.thrust_1"
 )
 FLAPS_COMMAND = Curves(
     _four("command "), FLAP_COLOURS, "deg", _degrees(*_four("control.flap_")), needs="control.flap_1"
 )
-ROTORS_COMMAND = Curves(
-    _four("command "), FLAP_COLOURS, "mN", plain(*_four("rotor.command_"), scale=1e3), needs="rotor.command_1"
-)
+ROTORS_COMMAND = logged(_four("command "), FLAP_COLOURS, "mN", *_four("rotor.command_"), scale=1e3)
 INPUTS = Curves(
-    ("u1 roll", "u2 pitch", "u3 yaw", "u4 height"),
-    FLAP_COLOURS,
-    "deg",
-    _degrees(*_four("control.u")),
-    needs="control.u1",
-)
-AGE = Curves(
-    ("age of the pose",),
-    (BLUE,),
-    "ms",
-    plain("estimator.pose_age_us", scale=1e-3),
-    needs="estimator.pose_age_us",
-)
-HORIZON = Curves(
-    ("horizon",), (ORANGE,), "ms", plain("estimator.horizon", scale=TICK_MS), needs="estimator.horizon"
-)
+    ("u1 roll", "u2 pitch", "u3 yaw", "u4 height"), FLAP_COLOURS, "deg", _degrees(*_four("control.u")), needs="control.u1"
+)  # fmt: skip
+AGE = logged(("age of the pose",), (BLUE,), "ms", "estimator.pose_age_us", scale=1e-3)
+HORIZON = logged(("horizon",), (ORANGE,), "ms", "estimator.horizon", scale=TICK_MS)
 SINCE_FUSION = Curves(("since the last fused pose",), (RED,), "ms", since_fusion, needs="estimator.fused")
-PACKETS = Curves(
+PACKETS = logged(
     ("lost up", "lost down", "sent again"), (RED, ORANGE, BLUE), "packets",
-    plain("link.up_dropped", "link.down_dropped", "link.retried"), needs="link.retried",
+    "link.up_dropped", "link.down_dropped", "link.retried",
 )  # fmt: skip
-SERIAL_FAULTS = Curves(
+SERIAL_FAULTS = logged(
     ("overrun", "no room", "bad up", "bad down"), (RED, ORANGE, BLUE, SKY), "so far",
-    plain("serial.overrun", "serial.no_room", "serial.up_bad", "serial.down_bad"), needs="serial.overrun",
+    "serial.overrun", "serial.no_room", "serial.up_bad", "serial.down_bad",
 )  # fmt: skip
-STATION = Curves(
+STATION = logged(
     ("poses late", "poses unusable", "telemetry malformed"), (RED, ORANGE, BLUE), "so far",
-    plain("link.late", "station.unusable", "station.malformed"), needs="link.late",
+    "link.late", "station.unusable", "station.malformed",
 )  # fmt: skip
-QUEUE = Curves(
+QUEUE = logged(
     ("longest so far", "dropped"), (BLUE, RED), "measurements",
-    plain("rtos.measurements_high_water", "rtos.measurements_dropped"), needs="rtos.measurements_dropped",
+    "rtos.measurements_high_water", "rtos.measurements_dropped",
 )  # fmt: skip
 # The states of firmware_py.wire.supervisor.State, and one for a board that has not reported its state.
 SUPERVISOR = States(
-    "supervisor.state",
-    ("calibrating", "waiting", "flying", "failsafe", "unknown"),
-    (ORANGE, SKY, GREEN, RED, GREY),
-)
+    "supervisor.state", ("calibrating", "waiting", "flying", "failsafe", "unknown"), (ORANGE, SKY, GREEN, RED, GREY)
+)  # fmt: skip
 RELEASE = States("flight.free", ("held", "free"), (GREY, BLUE))
 JUDGED = States("flight.free", ("not judged", "judged"), (GREY, BLUE))  # for a real flight
 

@@ -14,25 +14,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hil.laboratory.metrics import column
-from hil.pictures import panels
-from hil.pictures.curves import (
-    ATTITUDE,
-    BLUE,
-    GREY,
-    PINK,
-    POSITION,
-    RED,
-    SERIES_COLOURS,
-    YELLOW,
-    actuators,
-    since_release,
-)
+from hil.pictures import curves, panels
 from hil.pictures.panels import INK, Marks, Panel, Plot, Series, marks_of_flight
 
 MARK_LENGTH = 28  # letters
 WIDTH, DPI = 9.2, 115  # [in], 1/in
-SPELL_COLOURS = {"held": GREY, "fault": RED, "failsafe": PINK, "limit": YELLOW}
-INSTANT_COLOURS = {"operator": BLUE, "lost": INK}
+SPELL_COLOURS = {"held": curves.GREY, "fault": curves.RED, "failsafe": curves.PINK, "limit": curves.YELLOW}
+INSTANT_COLOURS = {"operator": curves.BLUE, "lost": INK}
 SHADE = 0.18  # opacity
 STRIP = 0.04  # of the axes' height: commands at their limits
 STYLE: Any = {
@@ -61,13 +49,13 @@ def png(draw: Callable[..., Plot | Figure], *flights: pa.Table) -> bytes:
 
 def plotted(log: pa.Table, names: Sequence[str]) -> Figure:
     """Return a figure of columns of a log, a panel for each unit; without names, of errors and flaps."""
-    moving = ((plot, name) for name, plot in actuators(log))
-    shown = ((POSITION, "position error"), (ATTITUDE, "attitude error"), *moving)
-    times, by_unit = since_release(log), dict[str, list[Series]]()
+    moving = ((plot, name) for name, plot in curves.actuators(log))
+    shown = ((curves.POSITION, "position error"), (curves.ATTITUDE, "attitude error"), *moving)
+    times, by_unit = curves.since_release(log), dict[str, list[Series]]()
     for index, name in enumerate(names):
         values = column(log, name)  # raises for a name that the log lacks
         unit = (log.schema.field(name).metadata or {}).get(b"unit", b"").decode()
-        line = Series(name, SERIES_COLOURS[index % len(SERIES_COLOURS)], times, values)
+        line = Series(name, curves.SERIES_COLOURS[index % len(curves.SERIES_COLOURS)], times, values)
         by_unit.setdefault(unit, []).append(line)
     chosen = [Panel(f"[{unit or '1'}]", tuple(lines), height=2.2) for unit, lines in by_unit.items()]
     standard = [panels.panel(curve, log, label, height=1.9) for curve, label in shown] if not names else []
@@ -126,7 +114,7 @@ def draw_marks(axes: Sequence[Axes], marks: Marks) -> None:
             one.axvspan(
                 spell.begin_s, spell.end_s, 0.0, high, color=SPELL_COLOURS[spell.kind], alpha=alpha, linewidth=0
             )  # fmt: skip
-    faults = [(spell.begin_s, spell.text, RED) for spell in marks.spells if spell.kind == "fault"]
+    faults = [(spell.begin_s, spell.text, curves.RED) for spell in marks.spells if spell.kind == "fault"]
     for instant in marks.instants:
         colour = INSTANT_COLOURS[instant.kind]
         for one in axes:

@@ -3,8 +3,10 @@
 Axes have cm, degrees, ms and seconds from the release. Figures over time are panels, which a page can zoom.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -18,9 +20,22 @@ from hil.laboratory.recorder import release_of
 from hil.laboratory.schedule import runs
 from hil.pictures import curves, monitor
 from hil.pictures.curves import since_release
-from hil.pictures.panels import INK, Bar, Panel, Plot, Series, Still, lanes, panel
+from hil.pictures.panels import (
+    INK,
+    KNOWN,
+    LINK,
+    PROCESSOR,
+    WHAT,
+    Bar,
+    Panel,
+    Picture,
+    Plot,
+    Series,
+    Still,
+    lanes,
+    panel,
+)
 from hil.pictures.path import FlownPath, path_of
-from hil.pictures.picture import KNOWN, LINK, PROCESSOR, WHAT, Picture
 
 TENTH, SECOND = 10, 100  # rows
 BUSY_PERCENT = 0.02  # of the processor, above which a task gets a colour
@@ -55,10 +70,7 @@ def course(rows: pa.Table) -> Plot:
             Series(f"goal {name}", colour, times, shown.goal[:, axis], dashed=True),
         ]
     yaw, wanted = (np.degrees(angle) for angle in yaw_and_goal(flight))
-    turns = (
-        Series("yaw", curves.BLUE, times, yaw, width=1.2),
-        Series("goal", INK, times, wanted, dashed=True),
-    )
+    turns = Series("yaw", curves.BLUE, times, yaw, width=1.2), Series("goal", INK, times, wanted, dashed=True)
     return Plot((Panel("position [cm]", tuple(lines), height=2.1), Panel("yaw [deg]", turns)))
 
 
@@ -68,17 +80,19 @@ def goal_moves(rows: pa.Table) -> bool:
     return len(goal) > 1 and bool(np.ptp(goal, axis=0).any())
 
 
+def curves_of(*shown: tuple[curves.Curves, str], **look: Any) -> Callable[[pa.Table], Plot]:
+    """Return what draws curves, each with its label, one above the other."""
+    return lambda rows: Plot(tuple(panel(curve, rows, label, **look) for curve, label in shown))
+
+
 def errors(rows: pa.Table) -> Plot:
     """Draw position and attitude errors over time with the paper's limits."""
-    near, level = (
-        (-curves.NEAR_CM, curves.NEAR_CM),
-        (-curves.ATTITUDE_DEG, curves.ATTITUDE_DEG),
+    shown = (
+        (curves.POSITION, "position error", curves.NEAR_CM),
+        (curves.ATTITUDE, "attitude error", curves.ATTITUDE_DEG),
     )
     return Plot(
-        (
-            panel(curves.POSITION, rows, "position error", height=2.1, limits=near),
-            panel(curves.ATTITUDE, rows, "attitude error", height=2.1, limits=level),
-        )
+        tuple(panel(one, rows, label, height=2.1, limits=(-bound, bound)) for one, label, bound in shown)
     )
 
 
@@ -93,13 +107,6 @@ def flaps(rows: pa.Table) -> Plot:
         command = () if commands is None else (Series("command", INK, times, commands[:, index], width=0.6),)
         panels.append(Panel(f"{name} [deg]", (*command, angle), height=1.3))
     return Plot(tuple(panels))
-
-
-def rotors(rows: pa.Table) -> Plot:
-    """Draw the thrust of the rotors and what the firmware commands."""
-    return Plot(
-        (panel(curves.ROTORS, rows, "thrust", height=1.8), panel(curves.MOTORS, rows, "command", height=1.8))
-    )
 
 
 def age(rows: pa.Table) -> Plot:
@@ -124,32 +131,22 @@ def latency_budget(ages: pa.Table) -> Plot:
     """Draw where the poses of `ages.ages_in_time_of` spent their time, stage on stage."""
     columns = {name: ages.column(name).to_numpy() for name in STAGES}
     times = since_release(ages)
-    stages = [
-        Series(name, curves.STAGE_COLOURS[name], times, columns[name]) for name in reported_stages(columns)
-    ]
-    return Plot((Panel("age [ms]", tuple(stages), height=1.8, stacked=True, least=0.0),))
+    names = reported_stages(columns)
+    stages = tuple(Series(name, curves.STAGE_COLOURS[name], times, columns[name]) for name in names)
+    return Plot((Panel("age [ms]", stages, height=1.8, stacked=True, least=0.0),))
 
 
 def radio(rows: pa.Table) -> Plot:
     """Draw the time in the air and the packets that were lost."""
-    return Plot(
-        (
-            _up_and_down(rows, SECOND, curves.latency, "mean latency [ms]"),
-            panel(curves.PACKETS, rows, "so far"),
-        )
-    )
+    air = _up_and_down(rows, SECOND, curves.latency, "mean latency [ms]")
+    return Plot((air, panel(curves.PACKETS, rows, "so far")))
 
 
 def serial_line(rows: pa.Table) -> Plot:
     """Draw the load of the line, the time on it and what was lost or damaged."""
-    load = _up_and_down(rows, TENTH, curves.line_load, "load of the line [%]")
-    return Plot(
-        (
-            replace(load, least=0.0, most=105.0),
-            _up_and_down(rows, SECOND, curves.latency, "mean latency [ms]"),
-            panel(curves.SERIAL_FAULTS, rows, "bytes or frames"),
-        )
-    )
+    load = replace(_up_and_down(rows, TENTH, curves.line_load, "load of the line [%]"), least=0.0, most=105.0)
+    air = _up_and_down(rows, SECOND, curves.latency, "mean latency [ms]")
+    return Plot((load, air, panel(curves.SERIAL_FAULTS, rows, "bytes or frames")))
 
 
 def _up_and_down(
@@ -158,13 +155,8 @@ def _up_and_down(
     """Draw the curves of `read` on every `step`-th row, for both directions of the link."""
     thinned = _every(step, rows, "link.", "serial.")
     times, values = since_release(thinned)[1:], read(thinned)
-    return Panel(
-        label,
-        tuple(
-            Series(name, curves.FLAP_COLOURS[index], times, values[:, index])
-            for index, name in enumerate(("up", "down"))
-        ),
-    )
+    lines = zip(("up", "down"), curves.FLAP_COLOURS, values.T, strict=False)
+    return Panel(label, tuple(Series(name, colour, times, share) for name, colour, share in lines))
 
 
 def _every(step: int, rows: pa.Table, *groups: str) -> pa.Table:
@@ -189,17 +181,8 @@ def board(rows: pa.Table) -> Plot:
     times, shares = since_release(tenths)[1:], load.read(tenths).T
     busy = [index for index, share in enumerate(shares) if share.max(initial=0.0) >= BUSY_PERCENT] or [0]
     tasks = tuple(Series(load.names[index], load.colours[index], times, shares[index]) for index in busy)
-    return Plot(
-        (
-            Panel("processor [%]", tasks, height=1.8, stacked=True, least=0.0),
-            panel(curves.QUEUE, rows, "queue", height=1.1),
-        )
-    )
-
-
-def states(rows: pa.Table) -> Plot:
-    """Draw the states of supervisor and robot, or real flight, as bars."""
-    return Plot((lanes_of_states(rows),))
+    shares_of_tasks = Panel("processor [%]", tasks, height=1.8, stacked=True, least=0.0)
+    return Plot((shares_of_tasks, panel(curves.QUEUE, rows, "queue", height=1.1)))
 
 
 def lanes_of_states(rows: pa.Table) -> Panel:
@@ -213,24 +196,11 @@ def lanes_of_states(rows: pa.Table) -> Panel:
     return Panel("states", height=0.8, bars=lanes(rows_of_bars, float(end_s[0]) if len(end_s) else 0.0))
 
 
-def estimate(rows: pa.Table) -> Plot:
-    """Draw the estimate less the truth, in the goal frame."""
+def own(group: str, rows: pa.Table) -> Plot:
+    """Draw what the user's own `logic` or `robot` logs, one axis for each unit."""
     return Plot(
-        (
-            panel(curves.POSITION_MISS, rows, "position", height=1.8),
-            panel(curves.ATTITUDE_MISS, rows, "attitude", height=1.8),
-        )
+        tuple(panel(plot, rows, OWN[group].title.lower()) for plot in curves.own_columns(rows, group))
     )
-
-
-def own_logic(rows: pa.Table) -> Plot:
-    """Draw what the user's own logic logs, one axis for each unit."""
-    return Plot(tuple(panel(plot, rows, "own logic") for plot in curves.own_columns(rows, "logic")))
-
-
-def own_robot(rows: pa.Table) -> Plot:
-    """Draw what the user's own robot logs, one axis for each unit."""
-    return Plot(tuple(panel(plot, rows, "robot") for plot in curves.own_columns(rows, "robot")))
 
 
 def schedule(table: pa.Table) -> Plot:
@@ -264,20 +234,20 @@ PICTURES = (
         "Rotors",
         "Thrust of each rotor: M1 front right, M2 back right, M3 back left, M4 front left. The words that the firmware "
         "sends to their timers, as shares of the whole.",
-        rotors,
+        curves_of((curves.ROTORS, "thrust"), (curves.MOTORS, "command"), height=1.8),
         needs=curves.ROTORS.needs,
         question=WHAT,
     ),
     Picture(
         "States",
         "What the supervisor on board decided, and whether the robot was free.",
-        states,
+        lambda rows: Plot((lanes_of_states(rows),)),
         question=KNOWN,
     ),
     Picture(
         "Estimate",
         "The board's estimate less the truth, in the goal frame; of a real flight, less the cameras' poses.",
-        estimate,
+        curves_of((curves.POSITION_MISS, "position"), (curves.ATTITUDE_MISS, "attitude"), height=1.8),
         question=KNOWN,
     ),
     Picture(
@@ -336,8 +306,12 @@ COURSE = Picture(
     "Flown (solid) and wanted (dashed) position from the first goal in W, and yaw.",
     course,
 )
-OWN_ROBOT = Picture("Robot", "What your own robot logs of itself.", own_robot, question=WHAT)
-OWN_LOGIC = Picture("Own logic", "What your own modules log of their memory.", own_logic, question=KNOWN)
+OWN: Mapping[str, Picture] = {  # by the group of columns
+    "robot": Picture("Robot", "What your own robot logs of itself.", partial(own, "robot"), question=WHAT),
+    "logic": Picture(
+        "Own logic", "What your own modules log of their memory.", partial(own, "logic"), question=KNOWN
+    ),
+}
 LATENCY_BUDGET = Picture(
     "Latency budget",
     "Where poses spent their time from the exposure to the board, as the ground station reported for each that it sent.",

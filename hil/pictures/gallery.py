@@ -1,33 +1,91 @@
 """The experiments' own pictures, by the names that experiments use."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import Any
+
+import pyarrow as pa
 
 from hil.errors import LabError, blame
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.metrics import free_flight
-from hil.pictures import trials
-from hil.pictures.picture import Picture, painted
-from hil.pictures.power import COMPARISON, DISCHARGE
+from hil.pictures import power, trials
+from hil.pictures.panels import Picture, Still
 
-if TYPE_CHECKING:
-    import pyarrow as pa
-    from matplotlib.figure import Figure
+
+def painted(draw: Callable[..., Any], *flights: pa.Table) -> Still:
+    """Return the figure that `draw` makes of flights with matplotlib, which is slow to load."""
+    from hil.pictures.drawing import png
+
+    return Still(png(draw, *flights), "png")
+
 
 GALLERY: dict[str, Picture] = {
-    "yaw-step": trials.YAW_STEP,
-    "yaw-sine": trials.YAW_SINE,
-    "height-sine": trials.HEIGHT_SINE,
-    "y-square": trials.Y_SQUARE,
-    "side-wind": trials.SIDE_WIND,
-    "disturbances": trials.DISTURBED,
-    "airspeed": trials.AIRSPEED,
-    "overload": trials.OVERLOAD,
-    "take-off": trials.TAKE_OFF_LANDING,
-    "specific-power": COMPARISON,
-    "discharge": DISCHARGE,
+    "yaw-step": Picture(
+        "Step in yaw",
+        "Yaw and its target, as in the paper's figure of tracking, a; and the loss of height.",
+        partial(trials.follow, (trials.YAW, trials.Z), (0.5, 4.0)),
+    ),
+    "yaw-sine": Picture(
+        "Sine in yaw",
+        "Yaw and its target, as in the paper's figure of tracking, b.",
+        partial(trials.follow, (trials.YAW,), (0.0, 60.0)),
+    ),
+    "height-sine": Picture(
+        "Sine in height",
+        "Height and its target, W, as in the paper's figure of tracking, c.",
+        partial(trials.follow, (trials.Z,), (0.0, 60.0)),
+    ),
+    "y-square": Picture(
+        "Square in y",
+        "y and its target, W, as in the paper's figure of tracking, d.",
+        partial(trials.follow, (trials.Y,), (0.0, 60.0)),
+    ),
+    "side-wind": Picture(
+        "Side wind",
+        "Position, W, while a fan beside the tunnel blows (red, darker with every step of its speed), as in the paper's "
+        "figure of robustness, e; the loss of height from leaning.",
+        partial(trials.follow, (trials.X, trials.Y, trials.Z), (0.0, 60.0)),
+    ),
+    "disturbances": Picture(
+        "Disturbances",
+        "Position error with each disturbance (red) and its size. Dashed: the 20 cm box.",
+        trials.disturbed,
+    ),
+    "airspeed": Picture(
+        "Airspeed",
+        "Height, and the mean opening of the flaps (target: the commanded one), over 0.1 s.",
+        partial(trials.follow, (trials.Z, trials.OPENING), (0.0, 60.0)),
+        needs="control.flap_1",
+    ),
+    "take-off": Picture(
+        "Take-off and landing",
+        "Height over the net, vertical speed and the air at the robot.",
+        trials.take_off_and_landing,
+        needs="flow.z",
+    ),
+    "overload": Picture(
+        "Overload",
+        "Missed deadlines per second and largest position error while a task above all others takes a share of every tick. "
+        "Dashed: the 20 cm box. A starved task completes no activation, late or not.",
+        partial(painted, trials.overload),
+        needs="cpu.THIEF",
+    ),
+    "specific-power": Picture(
+        "Specific power",
+        "Left: power in hover per mass. Right: power over mass; grey: 100 to 250 W/kg, which the paper calls typical. "
+        "Stars: in an updraft. Bars on helicopters: the paper's range of hover power, as a share of the rated one. Red: "
+        "this flight.",
+        partial(painted, power.compare),
+        needs="battery.power",
+    ),
+    "discharge": Picture(
+        "Battery",
+        "Voltage of one cell under load, with the supervisor's limit; power, mean over 1 s, and over the flight; charge "
+        "left.",
+        power.discharge,
+        needs="battery.power",
+    ),
 }
 
 
@@ -44,11 +102,11 @@ def pictures_of(experiment: Experiment) -> tuple[Picture, ...]:
     return (*shared, Picture(title, experiment.summary, partial(painted, partial(_draw, experiment))))
 
 
-def _draw(experiment: Experiment, log: pa.Table) -> Figure:
+def _draw(experiment: Experiment, log: pa.Table) -> Any:
     """Call an experiment's own `draw`. Raises `LabError` for its errors."""
     assert experiment.draw is not None
     try:
-        figure: Figure = experiment.draw(free_flight(log))
+        figure = experiment.draw(free_flight(log))
     except Exception as error:
         raise LabError(f"experiment {experiment.name}: draw: {blame(error)}") from error
     if not hasattr(figure, "savefig"):

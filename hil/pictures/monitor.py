@@ -4,14 +4,13 @@ Rates are per second, over the previous second. Marks are the times of refusals.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from hil.laboratory.metrics import column
-from hil.pictures.curves import BLUE, GREEN, ORANGE, PINK, RED, SKY, Curves, plain
+from hil.pictures.curves import BLUE, GREEN, ORANGE, PINK, RED, SKY, Curves, logged
 
 SECOND_US = 1_000_000
 ROWS_OF_A_SECOND = 100
@@ -30,58 +29,34 @@ AGE_STAGES = Curves(
     ("camera", "+ processing", "+ network", "+ station", "+ link: on board"), (BLUE, SKY, GREEN, ORANGE, PINK), "ms",
     _stages, needs="age.link",
 )  # fmt: skip
-BATTERY = Curves(("a cell",), (GREEN,), "V", plain("battery.voltage"), needs="battery.voltage")
-LOAD = Curves(("all tasks",), (BLUE,), "%", plain("board.load"), needs="board.load")
-AIR = Curves(
-    ("link quality [%]", "RSSI [-dBm]"),
-    (BLUE, ORANGE),
-    "",
-    plain("link.quality", "link.rssi"),
-    needs="link.rssi",
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Rates:
-    """Counters whose rates the viewer shows."""
-
-    names: tuple[str, ...]
-    colours: tuple[str, ...]
-    columns: tuple[str, ...]
-
-
-RATES: Mapping[str, Rates] = {
-    "link/rate/radio": Rates(
-        ("packets up", "packets down"), (BLUE, GREEN), ("link.up_delivered", "link.down_delivered")
+BATTERY = logged(("a cell",), (GREEN,), "V", "battery.voltage")
+LOAD = logged(("all tasks",), (BLUE,), "%", "board.load")
+AIR = logged(("link quality [%]", "RSSI [-dBm]"), (BLUE, ORANGE), "", "link.quality", "link.rssi")
+# Counters whose rates the viewer shows.
+RATES: Mapping[str, Curves] = {
+    "link/rate/radio": logged(
+        ("packets up", "packets down"), (BLUE, GREEN), "1/s", "link.up_delivered", "link.down_delivered"
     ),
-    "link/rate/station": Rates(
-        ("poses sent", "frames seen", "telemetry blocks"), (BLUE, GREEN, PINK),
-        ("link.sent", "station.frames", "station.samples"),
+    "link/rate/station": logged(
+        ("poses sent", "frames seen", "telemetry blocks"), (BLUE, GREEN, PINK), "1/s",
+        "link.sent", "station.frames", "station.samples",
     ),
 }  # fmt: skip
-# The name of a mark, and its counters, of which the log may lack some.
-REFUSALS: Mapping[str, tuple[str, ...]] = {
+# The colour of a mark, and the counters of a refusal, of which the log may lack some.
+MARKS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "pose refused on board": (
-        "estimator.refused",
-        "estimator.too_old",
-        "estimator.invalid",
-        "estimator.rejected",
+        RED, ("estimator.refused", "estimator.too_old", "estimator.invalid", "estimator.rejected"),
     ),
-    "pose refused by the tracker": ("tracker.refused",),
-    "pose too late for the link": ("link.late",),
-}
-MARK_COLOURS = {
-    "pose refused on board": RED,
-    "pose refused by the tracker": ORANGE,
-    "pose too late for the link": SKY,
-    "fault": PINK,
-    "operator": BLUE,
-}
+    "pose refused by the tracker": (ORANGE, ("tracker.refused",)),
+    "pose too late for the link": (SKY, ("link.late",)),
+    "fault": (PINK, ()),
+    "operator": (BLUE, ()),
+}  # fmt: skip
 
 
-def rates(rows: pa.Table, names: tuple[str, ...], at: NDArray[np.int64]) -> NDArray[np.float64]:
+def rates(rows: pa.Table, counters: Curves, at: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the rates of counters [1/s] at rows `at`, over the second before or its recorded part; (len(at), names)."""
-    times, counts = column(rows, "t"), column(rows, *names).reshape(-1, len(names))
+    times, counts = column(rows, "t"), counters.read(rows)
     since = np.searchsorted(times, times[at] - SECOND_US)
     passed = 1e-6 * (times[at] - times[since])[:, None]
     return np.asarray((counts[at] - counts[since]) / np.where(passed > 0, passed, np.nan))

@@ -17,8 +17,7 @@ from jinja2 import Environment, FileSystemBytecodeCache, FileSystemLoader, Stric
 from numpy.typing import NDArray
 from youplot.vendor import uplot_css, uplot_js
 
-from hil.pictures.panels import Marks, Panel, Plot, Series, Signal, Still
-from hil.pictures.picture import Picture
+from hil.pictures.panels import Marks, Panel, Picture, Plot, Series, Signal, Still
 
 STRETCHES = 1500  # of a thinned line
 NOTHING = Marks()

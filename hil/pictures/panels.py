@@ -3,7 +3,7 @@
 Times are seconds from the release.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,14 @@ from hil.pictures.curves import GREY, MOTORS, Curves, marks_of, since_release
 Signal = NDArray[np.float64]  # (N,)
 ROUNDING = 1e-6  # [rad] float32 of a command at its limit
 TOGETHER_S = 0.1  # a flap that leaves its limit for less is drawn as staying there
+WHERE, WHAT, KNOWN, LINK, PROCESSOR = (
+    "Where was it?",
+    "What did it do?",
+    "What did the board know?",
+    "What did the link do?",
+    "What did the processor do?",
+)
+QUESTIONS = (WHERE, WHAT, KNOWN, LINK, PROCESSOR)
 INK = "black"  # of the page: in dark mode it is white
 
 
@@ -107,6 +115,24 @@ class Marks:
         return tuple(
             dict.fromkeys([*(one.kind for one in self.spells), *(one.kind for one in self.instants)])
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A figure of the report. An experiment's own takes several flights, the trials, and emphasises the first."""
+
+    title: str
+    caption: str
+    draw: Callable[..., Plot | Still]  # of the log of a flight, of several, or of a schedule
+    needs: str = "t"  # columns of which it needs one at least
+    alone: bool = False  # panels with a time axis of their own
+    question: str = WHERE  # that it answers, in whose part of the report it is
+    folded: bool = False  # until a reader opens it, or a fault of the groups `about` was injected
+    about: tuple[str, ...] = ()
+
+    def fits(self, columns: Iterable[str]) -> bool:
+        """Whether it can be drawn of a log with these columns."""
+        return not set(self.needs.split()).isdisjoint(columns)
 
 
 def panel(curves: Curves, rows: pa.Table, label: str, **look: float | tuple[float, ...]) -> Panel:

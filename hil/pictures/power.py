@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,15 +9,14 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from hil.experiments.measures import seconds
-from hil.experiments.power import power
+from hil.experiments.power import power as mean_power
 from hil.experiments.specific_power import CONVENTIONAL_W_PER_KG, VEHICLES
 from hil.laboratory.metrics import column, free_flight
 from hil.laboratory.recorder import stored_in
 from hil.pictures import curves
 from hil.pictures.figures import SECOND
 from hil.pictures.panels import Panel, Plot, Series
-from hil.pictures.picture import Picture, painted
-from hil.pictures.trials import DARK, LIGHT
+from hil.pictures.trials import lines_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,17 +26,13 @@ KIND_COLOURS = {"quadcopter": curves.SKY, "drone": curves.BLUE, "helicopter": cu
 
 def compare(*flights: pa.Table) -> Figure:
     """Draw specific power as bars, and power over mass, with this flight's Floaty in red."""
-    means = [power(free_flight(flight)) for flight in flights]
-    mean, specific = (
-        float(np.mean([values[name] for values in means])) for name in ("power", "specific_power")
-    )
-    return _beside_others(mean, mean / specific)
-
-
-def _beside_others(power: float, mass: float) -> Figure:
-    """Draw the comparison with `power` [W] and `mass` [kg] of Floaty."""
     from hil.pictures.drawing import beside
 
+    means = [mean_power(free_flight(flight)) for flight in flights]
+    power, specific = (
+        float(np.mean([values[name] for values in means])) for name in ("power", "specific_power")
+    )
+    mass = power / specific
     figure, (bars, scatter) = beside(1.15, 1.0)
     names = ["Floaty", *(vehicle.name for vehicle in VEHICLES)]
     values = [power / mass, *(vehicle.specific_power for vehicle in VEHICLES)]
@@ -79,22 +73,23 @@ def _beside_others(power: float, mass: float) -> Figure:
 
 def discharge(*flights: pa.Table) -> Plot:
     """Draw voltage, power and charge; the first flight dark, further ones light."""
-    voltages, powers, charges = [], [], []
-    for index, flight in reversed(list(enumerate(map(free_flight, flights)))):
-        times, power = seconds(flight), column(flight, "battery.power")
-        name, colour = ("" if index > 1 else "trials", LIGHT) if index else ("flight", DARK)
-        voltages.append(Series(name, colour, times, column(flight, "battery.voltage")))
-        powers.append(Series(name, colour, *_seconds_mean(times, power)))
-        charges.append(Series(name, colour, times, 100 * column(flight, "battery.charge")))
-    whole = np.array([0.0, times.max(initial=0.0)])
-    mean = Series(f"mean {power.mean():.2f} W", curves.GREY, whole, np.full(2, power.mean()))
+    free = [*map(free_flight, flights)]
+    times = [seconds(flight) for flight in free]
+
+    def lines(name: str, scale: float = 1.0) -> tuple[Series, ...]:
+        return lines_of(zip(times, (scale * column(flight, name) for flight in free), strict=True))
+
+    powers = [column(flight, "battery.power") for flight in free]
+    whole = np.array([0.0, times[0].max(initial=0.0)])
+    mean = Series(f"mean {powers[0].mean():.2f} W", curves.GREY, whole, np.full(2, powers[0].mean()))
     config = stored_in(flights[0].schema.metadata, "config")
     low = (1e-3 * config["supervisor"]["low_battery_mv"],) if config else ()
+    shown = lines_of(map(_seconds_mean, times, powers))
     return Plot(
         (
-            Panel("cell [V]", tuple(voltages), height=1.6, limits=low),
-            Panel("power [W]", (*powers, mean), height=1.6, least=0.0),
-            Panel("charge [%]", tuple(charges), height=1.2),
+            Panel("cell [V]", lines("battery.voltage"), height=1.6, limits=low),
+            Panel("power [W]", (*shown, mean), height=1.6, least=0.0),
+            Panel("charge [%]", lines("battery.charge", 100.0), height=1.2),
         )
     )
 
@@ -105,18 +100,3 @@ def _seconds_mean(
     """Return means over whole seconds: times and values, (N // 100,)."""
     rows = len(times) // SECOND * SECOND
     return times[:rows].reshape(-1, SECOND).mean(axis=1), values[:rows].reshape(-1, SECOND).mean(axis=1)
-
-
-COMPARISON = Picture(
-    "Specific power",
-    "Left: power in hover per mass. Right: power over mass; grey: 100 to 250 W/kg, which the paper calls typical. Stars: in "
-    "an updraft. Bars on helicopters: the paper's range of hover power, as a share of the rated one. Red: this flight.",
-    partial(painted, compare),
-    needs="battery.power",
-)
-DISCHARGE = Picture(
-    "Battery",
-    "Voltage of one cell under load, with the supervisor's limit; power, mean over 1 s, and over the flight; charge left.",
-    discharge,
-    needs="battery.power",
-)

@@ -19,22 +19,12 @@ from hil.laboratory.metrics import METRICS, SHOWN, short_of
 from hil.laboratory.recorder import forget_read_columns, load_events, load_log, release_of, stored_in
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.schedule import load_schedule
+from hil.pictures import figures
 from hil.pictures.curves import own_columns, with_marks
-from hil.pictures.figures import (
-    COURSE,
-    LATENCY_BUDGET,
-    OWN_LOGIC,
-    OWN_ROBOT,
-    PICTURES,
-    SCHEDULE,
-    TRACK,
-    goal_moves,
-)
 from hil.pictures.gallery import pictures_of
 from hil.pictures.links import link_to
 from hil.pictures.pages import PageFigure, draw, write_page, zoomable
-from hil.pictures.panels import marks_of_flight
-from hil.pictures.picture import QUESTIONS
+from hil.pictures.panels import QUESTIONS, marks_of_flight
 from hil.pictures.story import close_ups, failures_of, story_of
 
 REPORT = "report.html"
@@ -73,20 +63,23 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     log = with_marks(load_log(folder), events)
     experiment = experiment or result.request.experiment
     ages, schedule = ages_in_time_of(iter([log]), folder), load_schedule(folder)
-    drawn = [
-        (picture, log)
-        for picture in [*([COURSE] if goal_moves(log) else []), *pictures_of(experiment), *PICTURES]
+    pictures = [
+        *([figures.COURSE] if figures.goal_moves(log) else []),
+        *pictures_of(experiment),
+        *figures.PICTURES,
     ]
-    for group, picture in (("robot", OWN_ROBOT), ("logic", OWN_LOGIC)):
-        drawn += [(picture, log)] if own_columns(log, group) else []
-    drawn += [(LATENCY_BUDGET, ages)] if ages.num_rows else []
-    drawn += [(SCHEDULE, schedule.replace_schema_metadata(log.schema.metadata))] if schedule.num_rows else []
+    pictures += [picture for group, picture in figures.OWN.items() if own_columns(log, group)]
+    drawn = [(picture, log) for picture in pictures]
+    if ages.num_rows:
+        drawn.append((figures.LATENCY_BUDGET, ages))
+    if schedule.num_rows:
+        drawn.append((figures.SCHEDULE, schedule.replace_schema_metadata(log.schema.metadata)))
     marks = marks_of_flight(log, result.cause or "lost" if result.outcome == "lost" else None)
-    figures: dict[str, list[PageFigure]] = {question: [] for question in QUESTIONS}
+    answers: dict[str, list[PageFigure]] = {question: [] for question in QUESTIONS}
     for picture, rows in drawn:
         forget_read_columns()
         if picture.fits(rows.column_names):
-            figures[picture.question].append(draw(picture, marks, rows))
+            answers[picture.question].append(draw(picture, marks, rows))
     failures = failures_of(log, result)
     close = close_ups(log, marks, failures[0].at_s if failures else None)
     config = stored_in(log.schema.metadata, "config")
@@ -101,13 +94,13 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
         release_us=release_of(log.schema.metadata),
         failures=failures,
         story=story_of(log, result, events),
-        track=draw(TRACK, marks, log),
+        track=draw(figures.TRACK, marks, log),
         marked=marks.kinds,
-        figures=figures,
+        figures=answers,
         close_ups=close,
         link_to=link_to,
         zoomable=zoomable(
-            [*(one.figure for one in close), *(one for part in figures.values() for one in part)]
+            [*(one.figure for one in close), *(one for part in answers.values() for one in part)]
         ),
         latency_bounds=LATENCY_BOUNDS_US,
         log_rows=log.num_rows,

@@ -14,25 +14,15 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from firmware_py.wire.supervisor import State
+from hil.laboratory import metrics
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Span, spans_of
-from hil.laboratory.metrics import (
-    BOX,
-    METRICS,
-    NEAR,
-    attitude_error,
-    column,
-    free_flight,
-    is_real,
-    position_error,
-    rows_where,
-)
 from hil.laboratory.recorder import release_of, stored_in
 from hil.laboratory.result import Result
 from hil.pictures import curves
 from hil.pictures.curves import Curves, since_release
 from hil.pictures.figures import lanes_of_states, without_a_pose
-from hil.pictures.monitor import REFUSALS
+from hil.pictures.monitor import MARKS
 from hil.pictures.pages import PageFigure, embedded
 from hil.pictures.panels import Marks, Panel, Plot, Series, Spell, panel, saturated
 
@@ -57,10 +47,10 @@ def story_of(log: pa.Table, result: Result, events: Iterable[Mapping[str, Any]] 
     loss, in order; `events` are those of the run, which have the causes of failsafes.
     """
     release_us = release_of(log.schema.metadata)
-    free = free_flight(log)
+    free = metrics.free_flight(log)
     if free.num_rows == 0:
         return []
-    seconds = 1e-6 * (column(free, "t") - release_us)
+    seconds = 1e-6 * (metrics.column(free, "t") - release_us)
     moments = [Moment(0.0, "released")]
     for span in spans_of(log.schema.metadata):
         begin_s, end_s = (1e-6 * (us - release_us) for us in (span.begin_us, span.end_us))
@@ -76,7 +66,7 @@ def story_of(log: pa.Table, result: Result, events: Iterable[Mapping[str, Any]] 
     for row, names in first.items():
         verb = "saturate" if len(names) > 1 else "saturates"
         moments.append(Moment(seconds[row], f"{', '.join(names)} {verb} for the first time"))
-    failsafe = column(free, "supervisor.state") == State.FAILSAFE
+    failsafe = metrics.column(free, "supervisor.state") == State.FAILSAFE
     causes = {1e-6 * (one["t_us"] - release_us): one["text"].partition(FAILSAFE)[2] for one in events}
     for row in np.flatnonzero(np.diff(failsafe, prepend=False)).tolist():
         why = [cause for at_s, cause in causes.items() if cause and abs(at_s - seconds[row]) < ROW_S]
@@ -89,14 +79,16 @@ def story_of(log: pa.Table, result: Result, events: Iterable[Mapping[str, Any]] 
 
 def _away(flight: pa.Table) -> Iterator[Moment]:
     """Yield when the robot was farthest from its goal, and since when it stayed near it to the end."""
-    seconds, error = since_release(flight), np.abs(position_error(flight))
+    seconds, error = since_release(flight), np.abs(metrics.position_error(flight))
     if not np.isfinite(error).all():
         return
     row, axis = np.unravel_index(np.argmax(error), error.shape)
     yield Moment(seconds[row], f"farthest from the goal: {100 * error[row, axis]:.1f} cm ({'xyz'[axis]})")
-    far = np.flatnonzero((error > NEAR).any(axis=1))
+    far = np.flatnonzero((error > metrics.NEAR).any(axis=1))
     if len(far) and far[-1] + 1 < len(seconds):
-        yield Moment(seconds[far[-1] + 1], f"within {100 * NEAR:.0f} cm of the goal from here to the end")
+        yield Moment(
+            seconds[far[-1] + 1], f"within {100 * metrics.NEAR:.0f} cm of the goal from here to the end"
+        )
 
 
 def _first(wrong: NDArray[np.bool_]) -> int:
@@ -105,13 +97,13 @@ def _first(wrong: NDArray[np.bool_]) -> int:
 
 def _passed(flight: pa.Table, result: Result) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """Yield the limits that failed and have an instant at which they were passed, and the rows beyond them."""
-    error, times = np.abs(position_error(flight)), since_release(flight)
-    open_loop = column(flight, "supervisor.state") != State.FLYING
+    error, times = np.abs(metrics.position_error(flight)), since_release(flight)
+    open_loop = metrics.column(flight, "supervisor.state") != State.FLYING
     beyond: Mapping[str, tuple[NDArray[np.float64], float | None]] = {
         **{f"max_{axis}": (error[:, index], None) for index, axis in enumerate("xyz")},
-        **{f"within_6cm_{axis}": (error[:, index], NEAR) for index, axis in enumerate("xyz")},
-        "in_box": (error.max(axis=1), BOX),
-        "attitude_max": (np.abs(attitude_error(flight)).max(axis=1), None),
+        **{f"within_6cm_{axis}": (error[:, index], metrics.NEAR) for index, axis in enumerate("xyz")},
+        "in_box": (error.max(axis=1), metrics.BOX),
+        "attitude_max": (np.abs(metrics.attitude_error(flight)).max(axis=1), None),
         "uncontrolled": (np.cumsum(open_loop * np.diff(times, prepend=times[0])), None),
     }
     for verdict in result.verdicts:
@@ -124,8 +116,6 @@ def _passed(flight: pa.Table, result: Result) -> Iterator[tuple[str, NDArray[np.
 
 @dataclass(frozen=True, slots=True)
 class FailedLimit:
-    """A limit that failed."""
-
     text: str  # the verdict
     at_s: float | None  # first passed; None: it has no such instant
     cause: str  # the fault that came before; empty where the instant is unknown
@@ -137,14 +127,14 @@ RECENT_S = 3.0  # a fault that ended longer ago is not named as the cause
 
 def failures_of(log: pa.Table, result: Result) -> list[FailedLimit]:
     """Return the limits that failed, those with an instant first and in the order of time."""
-    free = free_flight(log)
+    free = metrics.free_flight(log)
     times = since_release(free)
     passed = (
         {name: float(times[_first(wrong)]) for name, wrong in _passed(free, result)} if len(times) else {}
     )
     if result.outcome == "lost" and len(times):
         passed["lost"] = float(times[-1])
-    known = {**METRICS, **result.own_metrics}
+    known = {**metrics.METRICS, **result.own_metrics}
     found = [
         FailedLimit(
             str(one),
@@ -199,7 +189,7 @@ def close_ups(log: pa.Table, marks: Marks, passed_s: float | None = None) -> lis
     times = since_release(log)
     shown: list[CloseUp] = []
     for title, at_s, begin_s, end_s in _windows(marks, passed_s):
-        rows = rows_where(log, (times >= begin_s) & (times <= end_s))
+        rows = metrics.rows_where(log, (times >= begin_s) & (times <= end_s))
         if rows.num_rows > 1:
             plot = embedded(_plot(rows, (begin_s, end_s)))
             figure = PageFigure(f"close-up-{len(shown) + 1}", title, "", plot=plot, alone=True, marks=marks)
@@ -278,7 +268,7 @@ def evidence(rows: pa.Table) -> list[str]:
 
 
 def _robot(rows: pa.Table) -> Iterator[str]:
-    seen = "In truth" if not is_real(rows) else "By the cameras"
+    seen = "In truth" if not metrics.is_real(rows) else "By the cameras"
     far, turned = _largest(curves.POSITION, rows), _largest(curves.ATTITUDE, rows)
     if far and turned:
         yield f"{seen} the robot was up to {far} away from its goal, and {turned} from its attitude{_speed(rows)}."
@@ -286,9 +276,9 @@ def _robot(rows: pa.Table) -> Iterator[str]:
 
 def _speed(rows: pa.Table) -> str:
     """Return the highest speed with its instant; empty where it is unknown."""
-    if is_real(rows):
+    if metrics.is_real(rows):
         return ""
-    speed = np.linalg.norm(column(rows, "truth.vx", "truth.vy", "truth.vz"), axis=1)
+    speed = np.linalg.norm(metrics.column(rows, "truth.vx", "truth.vy", "truth.vz"), axis=1)
     row = int(np.argmax(speed))
     return f"; it moved at up to {speed[row]:.2f} m/s (at {since_release(rows)[row]:.2f} s)"
 
@@ -298,7 +288,7 @@ def _belief(rows: pa.Table) -> Iterator[str]:
     if off and tilted:
         yield f"The board's estimate was up to {off} and {tilted} wrong."
     begins, names = curves.changes(rows, curves.SUPERVISOR)
-    since = begins * 1e-6 + since_release(rows)[0] - column(rows, "t")[0] * 1e-6
+    since = begins * 1e-6 + since_release(rows)[0] - metrics.column(rows, "t")[0] * 1e-6
     if len(names) == 1:
         yield f"Its supervisor: {names[0]} all the time."
     else:
@@ -311,9 +301,9 @@ def _poses(rows: pa.Table) -> Iterator[str]:
         if np.isfinite(gaps).any() and (longest := float(np.nanmax(gaps))) > GAP_MS:
             end_s = since_release(rows)[np.nanargmax(gaps)]
             yield f"It fused no pose for {longest:.0f} ms, from {end_s - 1e-3 * longest:.2f} s on."
-    for text, names in REFUSALS.items():
+    for text, (_, names) in MARKS.items():
         known = [name for name in names if name in rows.column_names]
-        count = sum(float(np.ptp(column(rows, name))) for name in known)
+        count = sum(float(np.ptp(metrics.column(rows, name))) for name in known)
         if count > 0:
             yield f"{text.capitalize()}: {'once' if count == 1 else f'{count:.0f} times'}."
 
@@ -334,7 +324,7 @@ def _flaps(rows: pa.Table) -> Iterator[str]:
         return
     angles, times = curves.FLAPS.read(rows), since_release(rows)
     away = np.abs(angles - curves.FLAPS_COMMAND.read(rows))
-    deviations = column(rows, *(f"estimate.flap_{flap}" for flap in (1, 2, 3, 4)))
+    deviations = metrics.column(rows, *(f"estimate.flap_{flap}" for flap in (1, 2, 3, 4)))
     believed = np.degrees(OUTWARDS * hover + deviations)
     wrong = np.abs(angles - believed)
     # a flap that only lags behind its command is known to the board
@@ -343,7 +333,7 @@ def _flaps(rows: pa.Table) -> Iterator[str]:
         row = int(np.argmax(wrong[:, flap]))
         yield (
             f"Flap {flap + 1} was up to {away[:, flap].max():.0f} deg away from its command: at {times[row]:.2f} s it "
-            f"stood at {angles[row, flap]:z.0f} deg, and the board believed {believed[row, flap]:z.0f} deg."
+            f"was at {angles[row, flap]:z.0f} deg, and the board believed {believed[row, flap]:z.0f} deg."
         )
 
 

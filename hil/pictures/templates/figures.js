@@ -1,7 +1,7 @@
 /* Draws the figures of a page with uPlot: one time axis and one cursor for all that are not alone, all edges aligned. */
 (function () {
   "use strict";
-  const told = JSON.parse(document.getElementById("figures").textContent);
+  const content = JSON.parse(document.getElementById("figures").textContent);
   const SHADES = { held: "#8888882e", fault: "#d55e002e", failsafe: "#cc79a74d", limit: "#b8a900" };
   const MARKS = { operator: "#0072b2", lost: "#000000", paper: "#d04030" };
   const AXIS_PX = 84, INCH_PX = 88, TICKS_PX = 17, STRIP_PX = 4, RIGHT_PX = 10, TEXT = "11px system-ui, sans-serif";
@@ -121,7 +121,7 @@
   function optionsOf(figure, panel, data, first, last, key, whole) {
     const lines = panel.stacked ? [...panel.series].reverse() : panel.series;
     const lanes = [...new Set(panel.bars.map((bar) => bar.lane))];
-    const marks = told.marks[figure.marks];
+    const marks = content.marks[figure.marks];
     return {
       width: 300,
       height: Math.round(panel.height * INCH_PX) + (last ? 52 : 0),
@@ -186,14 +186,14 @@
   }
 
   function build() {
-    const prepared = told.figures.map((figure) => figure.panels.map((panel) => [panel, dataOf(panel)]));
+    const prepared = content.figures.map((figure) => figure.panels.map((panel) => [panel, dataOf(panel)]));
     const ends = (panels) => panels.flatMap(([panel, data]) => [
       data[0][0], data[0][data[0].length - 1], ...panel.bars.flatMap((bar) => [bar.begin_s, bar.end_s]),
     ]).filter((time) => time != null);
     const spanOf = (times) => (times.length ? [Math.min(...times), Math.max(...times)] : [0, 1]);
-    const shared = spanOf(prepared.filter((_, index) => !told.figures[index].alone).flatMap(ends));
+    const shared = spanOf(prepared.filter((_, index) => !content.figures[index].alone).flatMap(ends));
     prepared.forEach((panels, index) => {
-      const figure = told.figures[index], place = document.getElementById(figure.place);
+      const figure = content.figures[index], place = document.getElementById(figure.place);
       const whole = figure.window ?? (figure.alone ? spanOf(ends(panels)) : shared);
       const key = figure.alone ? figure.place : "flight";
       panels.forEach(([panel, data], at) => {
@@ -202,7 +202,7 @@
         label.textContent = panel.label;
         const last = at === panels.length - 1;
         if (panel.bars.length && data[0].length === 0) data = [whole];
-        moving = true; // until all stand, none moves another
+        moving = true; // until all are built, none moves another
         const u = new uPlot(optionsOf(figure, panel, data, at === 0, last, key, whole), data, place);
         if (panel.series.length) u.root.querySelector(".u-legend").prepend(label);
         else u.root.before(label);

@@ -14,7 +14,7 @@ from hil.laboratory.metrics import BOX, column
 from hil.laboratory.schedule import runs
 from hil.pictures import curves, monitor
 from hil.pictures.curves import Curves
-from hil.pictures.monitor import MARK_COLOURS, RATES, REFUSALS, Rates
+from hil.pictures.monitor import MARKS, RATES
 from hil.pictures.viewer.track import RecordingTrack, mark_path, rgba, rgba_array
 
 PLOTS: Mapping[str, Curves] = {
@@ -41,9 +41,8 @@ PLOTS: Mapping[str, Curves] = {
     "processor/all": monitor.LOAD,  # of a real board; a simulated one's is by task
 }
 PALE = ("flaps/command", "rotors/command")
-LIMITS = {  # they also keep the axes' scales fixed
-    "position/limit": curves.NEAR_CM, "position/box": 100 * BOX, "attitude/limit": curves.ATTITUDE_DEG,
-}  # fmt: skip
+# They also keep the axes' scales fixed.
+LIMITS = {"position/limit": curves.NEAR_CM, "position/box": 100 * BOX, "attitude/limit": curves.ATTITUDE_DEG}
 SLOW = 10  # rows between samples of slow quantities: 10 Hz
 STRETCHES_SHOWN = 2000  # of the schedule; the whole of it is for Perfetto
 
@@ -53,16 +52,15 @@ class ShownCurves:
     """The curves of a flight whose log has certain columns, by path."""
 
     plots: Mapping[str, Curves]
-    rates: Mapping[str, Rates]
+    rates: Mapping[str, Curves]  # of counters
     processor: Curves  # by task; without names: none
 
     @classmethod
     def of(cls, schema: pa.Schema) -> "ShownCurves":
-        """Return the curves of a log."""
         names = set(schema.names)
         return cls(
             {path: plot for path, plot in PLOTS.items() if plot.fits(names)},
-            {path: rate for path, rate in RATES.items() if set(rate.columns) <= names},
+            {path: plot for path, plot in RATES.items() if plot.fits(names)},
             curves.processor(schema.names),
         )
 
@@ -79,7 +77,7 @@ class Plots:
         self._track, self._known = track, ShownCurves.of(schema)
         self._states = curves.lanes_of(schema.names)
         self._refusals = {
-            name: columns for name, columns in REFUSALS.items() if set(columns) & set(schema.names)
+            name: columns for name, (_, columns) in MARKS.items() if set(columns) & set(schema.names)
         }
         self._slow = schema.empty_table()  # the last row that was a sample of slow quantities
         self._fusion = schema.empty_table()  # the row of the last fused pose
@@ -105,7 +103,7 @@ class Plots:
         for path, limit in LIMITS.items():
             self._track.curve(path, times, np.full((len(times), 2), (limit, -limit)))
         for path, rate in self._known.rates.items():
-            self._track.curve(path, times, monitor.rates(past, rate.columns, at))
+            self._track.curve(path, times, monitor.rates(past, rate, at))
         if self._known.processor.names:
             slow = pa.concat_tables([self._slow, chosen])
             self._track.curve("processor", column(slow, "t")[1:], self._known.processor.read(slow))
@@ -131,8 +129,7 @@ class Plots:
         self._track.curve(path, column(table, "t"), monitor.AGE_STAGES.read(table))
 
     def _name_all(self) -> None:
-        named: dict[str, Curves | Rates] = {**self._known.plots, **self._known.rates}
-        for path, plot in named.items():
+        for path, plot in {**self._known.plots, **self._known.rates}.items():
             self._name_curves(path, plot)
         if self._known.processor.names:
             self._name_curves("processor", self._known.processor)
@@ -140,7 +137,7 @@ class Plots:
             names = [path.rpartition("/")[2]] * 2
             limit = rr.SeriesLines(names=names, colors=rgba_array([curves.GREY] * 2), widths=[1.0] * 2)
             self._track.static(f"plot/{path}", limit)
-        for name, colour in MARK_COLOURS.items():
+        for name, (colour, _) in MARKS.items():
             points = rr.SeriesPoints(names=name, colors=rgba(colour), markers="diamond", marker_sizes=5.0)
             self._track.static(f"plot/{mark_path(name)}", points)
         for path, states in self._states.items():
@@ -151,7 +148,7 @@ class Plots:
         lane = rr.StateConfiguration(values=names, colors=rgba_array(colours))
         self._track.static(f"state/{path}", lane)
 
-    def _name_curves(self, path: str, plot: Curves | Rates) -> None:
+    def _name_curves(self, path: str, plot: Curves) -> None:
         width, opacity = (1.0, 120) if path in PALE else (1.6, 255)
         colours, widths = rgba_array(plot.colours, opacity), [width] * len(plot.names)
         self._track.static(f"plot/{path}", rr.SeriesLines(names=plot.names, colors=colours, widths=widths))

@@ -47,7 +47,6 @@ class RerunFlight:
         self._count = 0  # rows so far
 
     def add_rows(self, rows: pa.Table) -> None:
-        """Log the next rows in time."""
         if rows.num_rows == 0:
             return
         past = pa.concat_tables([self._past, rows])

@@ -98,7 +98,6 @@ class Scene:
         self._track.at(t_us + shown_us, path, rr.Clear(recursive=False))
 
     def _add_forces(self, rows: pa.Table, p_WB: NDArray[np.float64], q_WB: NDArray[np.float64]) -> None:
-        """Draw the forces on parts."""
         times, parts = column(rows, "t"), self._forced
         forces = column(rows, *(f"{part.force}_{axis}" for part in parts for axis in "xyz"))
         origins = [
@@ -211,5 +210,4 @@ class Scene:
 
 
 def goal_of(rows: pa.Table) -> NDArray[np.float64]:
-    """Return the goal, (N, 3) [m] in W."""
     return column(rows, "goal.x", "goal.y", "goal.z")

@@ -28,8 +28,7 @@ from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.pictures.gallery import pictures_of
-from hil.pictures.panels import Plot, Still
-from hil.pictures.picture import Picture
+from hil.pictures.panels import Picture, Plot, Still
 from hil.world.config import TunnelConfig
 from support.flights import explain, flown
 

@@ -13,7 +13,7 @@ import pytest
 from mcap.reader import make_reader
 from pymavlink import mavutil
 
-import hil.pictures.report
+import hil.pictures.figures
 from firmware_py.wire.supervisor import State
 from firmware_py.wire.telemetry import BATTERY, Sample, state_in
 from ground_station.config import StationConfig
@@ -43,9 +43,9 @@ from hil.pictures.compare import _judged, compare, load_flown
 from hil.pictures.curves import with_marks
 from hil.pictures.drawing import figure_of
 from hil.pictures.figures import PICTURES
+from hil.pictures.gallery import GALLERY
 from hil.pictures.panels import marks_of_flight
 from hil.pictures.report import write_report
-from hil.pictures.trials import YAW_STEP
 from support.command import Cli
 from support.full_disk import small_files
 from support.html_page import Page
@@ -189,7 +189,7 @@ def test_what_an_operator_did_is_marked_in_the_figures_at_its_time(both: tuple[P
         {"t_us": 2_000_000, "source": "station", "text": "poses 963"},
     ]
     log = with_marks(load_log(both[0]), events)
-    for draw in (figures.errors, figures.flaps, YAW_STEP.draw):
+    for draw in (figures.errors, figures.flaps, GALLERY["yaw-step"].draw):
         drawn = figure_of(draw(log), marks_of_flight(log)).axes
         named = [text.get_text() for axes in drawn for text in axes.texts]
         assert any(text.startswith("set controller.gain_y -2") for text in named)
@@ -266,7 +266,7 @@ def test_what_is_judged_begins_with_the_trajectory_and_ends_with_its_experiment(
         pytest.approx(-1.0, abs=0.05),
         pytest.approx(0.0, abs=0.05),
     )
-    bars = [bar.name for bar in figures.states(log).panels[0].bars if bar.lane == "flight"]
+    bars = [bar.name for bar in figures.lanes_of_states(log).bars if bar.lane == "flight"]
     assert bars == ["not judged", "judged", "not judged"]
 
 
@@ -350,7 +350,7 @@ def test_whatever_ends_a_flight_its_result_is_written(
 def test_a_killed_station_leaves_all_but_the_last_second_and_can_be_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(hil.pictures.report, "PICTURES", PICTURES[:1])
+    monkeypatch.setattr(hil.pictures.figures, "PICTURES", PICTURES[:1])
     bench = StationBench(tmp_path / "run")
     bench.plan.start(bench.now_us)
     bench.fly(4.5)

@@ -95,7 +95,7 @@ def test_curves_and_states_stand_at_seconds_from_the_release() -> None:
     }
     states = {"supervisor.state": [2, 2, 3, 3], "flight.free": [0, 1, 1, 1]}
     rows = log([0, 0, 0, 0], **counts, **states)
-    (_, queue), (lanes,) = figures.board(rows).panels, figures.states(rows).panels
+    (_, queue), lanes = figures.board(rows).panels, figures.lanes_of_states(rows)
     assert queue.series[0].times == pytest.approx([0.0, 0.01, 0.02, 0.03])
     assert queue.label == "queue [measurements]", "poses"
     shown = [(bar.lane, bar.name, bar.begin_s, bar.end_s) for bar in lanes.bars]

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-import hil.pictures.report
+import hil.pictures.figures
 from firmware_py.wire.supervisor import State
 from ground_station.latency import STAGES
 from ground_station.telemetry_log import TELEMETRY
@@ -40,7 +40,7 @@ from support.html_page import Page, lines_of
 def report(folder: Path) -> Page:
     page = Page(write_report(folder).read_text(encoding="utf-8"))
     drawn = [
-        picture for picture in hil.pictures.report.PICTURES if picture.fits(load_log(folder).column_names)
+        picture for picture in hil.pictures.figures.PICTURES if picture.fits(load_log(folder).column_names)
     ]
     others = [table for table in (ages.reported_ages(folder), load_schedule(folder)) if table.num_rows]
     close_ups = [name for name in page.plots if name.startswith("close-up")]
@@ -69,7 +69,7 @@ def folder(flown: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """For pages whose figures are another test's subject."""
-    monkeypatch.setattr(hil.pictures.report, "PICTURES", PICTURES[:1])
+    monkeypatch.setattr(hil.pictures.figures, "PICTURES", PICTURES[:1])
 
 
 def change_result(folder: Path, **changes: Any) -> None:

@@ -364,7 +364,8 @@ def test_the_goal_has_a_path_where_it_moves(tmp_path: Path) -> None:
 
 def test_rates_are_those_of_the_second_before() -> None:
     rows = pa.table({"t": 10_000 * np.arange(300), "n": np.arange(300) // 2, "m": 3 * np.arange(300)})
-    rates = monitor.rates(rows, ("n", "m"), np.array([0, 10, 100, 250]))
+    counters = curves.Curves(("n", "m"), ("", ""), "1/s", curves.plain("n", "m"))
+    rates = monitor.rates(rows, counters, np.array([0, 10, 100, 250]))
     assert np.isnan(rates[0]).all()
     np.testing.assert_allclose(rates[1:], [[50.0, 300.0]] * 3)
 
