@@ -276,17 +276,18 @@ def _explain(tree: Mapping[str, Any], detail: ErrorDetails) -> str:
         return f"{name}: missing; a profile without `base` states every constant that is flashed"
     value = detail["input"]
     if detail["type"] == "extra_forbidden":
-        allowed = _allowed(location[:-1])
+        allowed = keys_at(LabConfig, location[:-1])
         return f"{name} = {value!r}: unknown key{f' ({hint(location[-1], allowed)})' if allowed else ''}"
     return f"{name} = {value!r}: {detail['msg'][0].lower()}{detail['msg'][1:]}"
 
 
-def _allowed(location: list[str]) -> list[str]:
-    model: Any = LabConfig
+def keys_at(model: Any, location: list[str]) -> list[str]:
+    """Return the keys at a place in a model, past keys and indices of its own values; none where no model is."""
     for part in location:
-        annotation = model.model_fields[part].annotation
-        candidates = [annotation, *get_args(annotation)]
-        model = next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), None)
+        if part in model.model_fields:
+            annotation = model.model_fields[part].annotation
+            candidates = [annotation, *get_args(annotation)]
+            model = next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), None)
         if model is None:
             return []
     return list(model.model_fields)

@@ -15,7 +15,7 @@ from pydantic_core import ErrorDetails
 
 from firmware_py.export.boards import BOARDS, PYTHON
 from hil.bodies import MEASURED
-from hil.config import DEFAULT_PROFILE, read_toml
+from hil.config import DEFAULT_PROFILE, keys_at, read_toml
 from hil.errors import LabError, hint
 from hil.world.config import ConstantName
 
@@ -127,7 +127,7 @@ class Spec(_Part):
         if self.stop and self.sampling in DESIGNS:
             raise ValueError(f"stop: sampling {self.sampling} needs all its flights")
         if both := self.parameters.keys() & {name for name, _ in table_dimensions(self.table)}:
-            raise ValueError(f"{min(both)}: stands in [parameters] and in [table]")
+            raise ValueError(f"{min(both)}: is in both [parameters] and [table]")
         return self
 
     @property
@@ -200,20 +200,10 @@ def _explain(detail: ErrorDetails) -> str:
     if detail["type"] == "missing":
         return f"{where}: missing"
     if detail["type"] == "extra_forbidden":
-        return f"{where} = {value!r}: unknown key; {hint(names[-1], _keys_of(names[:-1]))}"
+        return f"{where} = {value!r}: unknown key; {hint(names[-1], keys_at(Spec, names[:-1]))}"
     message = detail["msg"].removeprefix("Value error, ").replace("valid tuple", "valid list")
     message = message[0].lower() + message[1:]
     return f"{where} = {value!r}: {message}" if where else message
-
-
-def _keys_of(names: list[str]) -> list[str]:
-    parts: dict[str, type[BaseModel]] = {
-        "parameters": Distribution, "table": TableConfig, "limits": FlightLimits, "faults": SampledFault,
-    }  # fmt: skip
-    part = parts.get(names[0], Spec) if names else Spec
-    if part is SampledFault and len(names) > 2:
-        part = Distribution
-    return list(part.model_fields)
 
 
 def spec_text(spec: Spec) -> dict[str, Any]:

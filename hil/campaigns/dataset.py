@@ -118,7 +118,6 @@ class Dataset:
         return table if len(first) == len(indices) else table.take(first)
 
     def rows(self) -> list[Row]:
-        """Return the rows in the order of the flights."""
         return [Row.of(self.plan.job(row["index"]), row) for row in self.table().to_pylist()]
 
 

@@ -23,19 +23,9 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from hil.api import command_of
+from hil.campaigns import sampling
 from hil.campaigns.config import Spec
 from hil.campaigns.run import Rate, Tally
-from hil.campaigns.sampling import (
-    LEVELS,
-    CubeAxis,
-    as_flown,
-    axes,
-    cluster_of,
-    draw,
-    points_of,
-    problem,
-    shuffled,
-)
 from hil.errors import LabError
 from hil.laboratory.metrics import METRICS, Metric
 from hil.laboratory.request import Options
@@ -44,10 +34,7 @@ Array = NDArray[np.float64]
 WORST = 10
 SLICES = 10
 MAPPED_FROM = 5  # failures, and flights that hold
-ORDERS, CHANCE = (
-    200,
-    0.95,
-)  # random orders of the flights, and their share below the threshold
+ORDERS, CHANCE = 200, 0.95  # random orders of the flights, and their share below the threshold
 SHARE_KNOWN = 1.0  # largest half interval of a shown share of the variance
 PULL = 1.0  # weight of the prior that pulls the logistic map towards no influence
 
@@ -108,7 +95,7 @@ class Influence:
 class FailureMap:
     """A logistic map from the cube to the chance of failing."""
 
-    axes: tuple[CubeAxis, ...]
+    axes: tuple[sampling.CubeAxis, ...]
     flights: NDArray[np.int64]  # (N,) their numbers
     points: Array  # (N, D) 0..1, as flown
     failed: NDArray[np.bool_]  # (N,)
@@ -138,8 +125,6 @@ class Worst:
 
 @dataclass(frozen=True, slots=True)
 class ProfileCell:
-    """An experiment on a profile."""
-
     experiment: str
     profile: str
     rate: Rate
@@ -162,13 +147,13 @@ def find(spec: Spec, flights: pa.Table) -> Findings:
     """Return the findings from a campaign's flights."""
     passed = flights["passed"].to_numpy(zero_copy_only=False).astype(bool)
     limits = _limits(spec, flights)
-    points = points_of(spec)
+    points = sampling.points_of(spec)
     which = flights["index"].to_numpy() // spec.cells
-    mapped = _failure_map(spec, flights["index"].to_numpy(), as_flown(spec, points)[which], ~passed)
+    mapped = _failure_map(spec, flights["index"].to_numpy(), sampling.as_flown(spec, points)[which], ~passed)
     influences = [*_influences(spec, points, which, flights, limits, ~passed)]
     if mapped is not None:
         influences.insert(0, mapped.influence)
-    size = cluster_of(spec)
+    size = sampling.cluster_of(spec)
     return Findings(
         _rate(flights, "passed", size, size), tuple(_cells(spec, flights)), _errors(flights), limits,
         tuple(influences), mapped, _worst(spec, flights, limits),
@@ -185,7 +170,7 @@ def _rate(flights: pa.Table, column: str, size: int, cluster: int) -> Rate:
 
 
 def _cells(spec: Spec, flights: pa.Table) -> Iterator[ProfileCell]:
-    size = cluster_of(spec)
+    size = sampling.cluster_of(spec)
     for experiment in spec.experiments:
         for profile in spec.profiles:
             rows = _of_cell(flights, experiment, profile)
@@ -208,9 +193,9 @@ def _errors(flights: pa.Table) -> tuple[str, ...]:
 
 
 def _limits(spec: Spec, flights: pa.Table) -> tuple[Limited, ...]:
-    found, cells, size = [], len(spec.experiments) * len(spec.profiles), cluster_of(spec)
+    found, cells, size = [], len(spec.experiments) * len(spec.profiles), sampling.cluster_of(spec)
     for cell in range(cells):
-        drawn = draw(spec, cell)
+        drawn = sampling.draw(spec, cell)
         profile = drawn.options["profile"]
         plain = Options(**{**drawn.options, "overrides": spec.settings, "faults": ()})
         request = replace(drawn, options=plain).request()
@@ -228,7 +213,7 @@ def _limits(spec: Spec, flights: pa.Table) -> tuple[Limited, ...]:
 def _failure_map(
     spec: Spec, flights: NDArray[np.int64], points: Array, failed: NDArray[np.bool_]
 ) -> FailureMap | None:
-    known = axes(spec)
+    known = sampling.axes(spec)
     if not known or min(failed.sum(), (~failed).sum()) < MAPPED_FROM:
         return None
     sign = np.where(failed, 1.0, -1.0)
@@ -250,7 +235,7 @@ def _influences(
     failed: NDArray[np.bool_],
 ) -> list[Influence]:  # fmt: skip
     """Return the influence of the axes on failing, and on the metric of every limit."""
-    names = [axis.name for axis in axes(spec)]
+    names = [axis.name for axis in sampling.axes(spec)]
     figures = {"failing": failed.astype(float)} | {
         name: flights[f"metric.{name}"].to_numpy() for name in dict.fromkeys(one.name for one in limits)
     }
@@ -270,8 +255,8 @@ def _influences(
 
 
 def _influence(spec: Spec, figure: str, points: Array, means: Array) -> Influence:
-    names = [axis.name for axis in axes(spec)]
-    cube = problem(points.shape[1])
+    names = [axis.name for axis in sampling.axes(spec)]
+    cube = sampling.problem(points.shape[1])
 
     def by_name(values: Array) -> dict[str, float]:
         return dict(zip(names, map(float, values), strict=True))
@@ -281,11 +266,11 @@ def _influence(spec: Spec, figure: str, points: Array, means: Array) -> Influenc
         halves = by_name(found["ST_conf"])
         return Influence(figure, "total Sobol index", by_name(found["ST"]), None, halves, SHARE_KNOWN)
     if spec.sampling == "morris":
-        found = morris.analyze(cube, points, means, num_levels=LEVELS, seed=spec.seed)
+        found = morris.analyze(cube, points, means, num_levels=sampling.LEVELS, seed=spec.seed)
         halves = by_name(found["mu_star_conf"])
         return Influence(figure, "Morris' mu*", by_name(found["mu_star"]), None, halves, float(np.ptp(means)))
     inside = slices(points)
-    orders = shuffled(spec, means, ORDERS)
+    orders = sampling.shuffled(spec, means, ORDERS)
     chance = np.quantile([pawn(inside, order).max() for order in orders], CHANCE)
     return Influence(figure, "PAWN", by_name(pawn(inside, means)), float(chance))
 
@@ -330,7 +315,7 @@ def _worst(spec: Spec, flights: pa.Table, limits: tuple[Limited, ...]) -> tuple[
 def again(spec: Spec, index: int) -> str:
     """Return the command that repeats a flight, or in parentheses why there is none."""
     try:
-        return command_of(draw(spec, index).request()) or "(an experiment that no command names)"
+        return command_of(sampling.draw(spec, index).request()) or "(an experiment that no command names)"
     except LabError as error:
         return f"({error})"
 

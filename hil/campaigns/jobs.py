@@ -44,9 +44,7 @@ class Job:
     options: Options  # of `Request.of`
     values: Mapping[str, Value]  # by axis
     folder: Path | None = None  # for its files; None: only the row is kept
-    files: tuple[str, ...] | None = (
-        None  # kept in the folder; None: all, and no other flight is replaced there
-    )
+    files: tuple[str, ...] | None = None  # kept in it; None: all, and no other flight is replaced there
     limits: FlightLimits | None = None  # None: no limit
     source: Source | None = None  # of the experiment when the plan was made
 
@@ -74,12 +72,10 @@ class Row:
 
     @property
     def seed(self) -> int:
-        """The seed of everything random."""
         return self.job.options.get("seed", 1)
 
     @property
     def folder(self) -> Path:
-        """The folder of the flight's files."""
         assert self.job.folder is not None
         return self.job.folder
 

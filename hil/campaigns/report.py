@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hil.campaigns.config import Spec, spec_text
 from hil.campaigns.dataset import Dataset, about
 from hil.campaigns.findings import FailureMap, Findings, Limited, again, find
+from hil.campaigns.run import Rate
 from hil.campaigns.sampling import CubeAxis, value_at
 from hil.laboratory.metrics import SHOWN
 from hil.pictures import curves
@@ -55,21 +56,15 @@ def _content(spec: Spec, found: Findings, complete: bool) -> dict[str, Any]:
     return {
         "spec": spec_text(spec),
         "complete": complete,
-        "failed": found.rate.failed,
-        "flown": found.rate.flown,
-        "interval_95": found.rate.interval,
+        **_counts(found.rate),
         "cells": [
-            {
-                "experiment": one.experiment, "profile": one.profile,
-                "failed": one.rate.failed, "flown": one.rate.flown, "interval_95": one.rate.interval,
-            }
-            for one in found.cells
+            {"experiment": one.experiment, "profile": one.profile, **_counts(one.rate)} for one in found.cells
         ],
         "errors": found.errors,
         "limits": [
             {
                 "experiment": one.experiment, "profile": one.profile, "metric": one.name, "bound": one.bound,
-                "failed": one.rate.failed, "flown": one.rate.flown, "interval_95": one.rate.interval,
+                **_counts(one.rate),
             }
             for one in found.limits
         ],
@@ -84,6 +79,10 @@ def _content(spec: Spec, found: Findings, complete: bool) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _counts(rate: Rate) -> dict[str, Any]:
+    return {"failed": rate.failed, "flown": rate.flown, "interval_95": rate.interval}
+
+
 def _histograms(limits: list[Limited]) -> Figure:
     rows = -(-len(limits) // IN_A_ROW)
     figure = Figure(figsize=(WIDTH, 1.9 * rows), layout="constrained")
@@ -93,9 +92,8 @@ def _histograms(limits: list[Limited]) -> Figure:
         count = len(one.values)
         width = np.ptp(one.values) / int(np.clip(2.0 * np.sqrt(count), *BINS))
         first, last = ((end - one.bound) / width for end in (one.values.min(), one.values.max()))
-        edges = one.bound + width * np.arange(
-            np.floor(first), np.ceil(last) + 1.5
-        )  # the limit is one of them
+        # the limit is one of them
+        edges = one.bound + width * np.arange(np.floor(first), np.ceil(last) + 1.5)
         fails = (one.values > one.bound) if one.metric.bound == "max" else (one.values < one.bound)
         parts = [one.values[~fails] * scale, one.values[fails] * scale]
         axes.hist(parts, bins=edges * scale, stacked=True, color=[curves.BLUE, curves.RED])
@@ -197,9 +195,8 @@ def _map(found: FailureMap) -> DrawnMap:
     for failed, colour, label in ((False, curves.BLUE, "holds"), (True, curves.RED, "fails")):
         flights = found.points[those & (found.failed == failed)]
         axes.plot(flights[:, across], flights[:, up], ".", color=colour, markersize=5, label=label)
-    axes.set_xlabel(found.axes[across].name)
+    axes.set(xlabel=found.axes[across].name, ylabel=found.axes[up].name)
     axes.set_xticks(*_ticks(found.axes[across]))
-    axes.set_ylabel(found.axes[up].name)
     axes.set_yticks(*_ticks(found.axes[up]))
     axes.legend(loc="upper left", bbox_to_anchor=(1.2, 1.0))
     return DrawnMap(

@@ -85,7 +85,6 @@ class Tally:
         self.failed = self.flown = self._squares = 0
 
     def add(self, cluster: int, passed: bool) -> None:
-        """Count a flight."""
         self.flown += 1
         if not passed:
             self.failed += 1
@@ -94,7 +93,6 @@ class Tally:
 
     @property
     def rate(self) -> Rate:
-        """The rate so far."""
         clusters, rare = self.flown / self._size, min(self.failed, self.flown - self.failed)
         if clusters <= 1.0 or not rare:
             return Rate(self.failed, self.flown, min(self._size, max(self.flown, 1)))
@@ -114,7 +112,6 @@ class Progress:
         self.end: int | None = None
 
     def add(self, index: int, passed: bool) -> None:
-        """Count a row."""
         self._all.add(index // self._plan.cluster, passed)
         self._waiting[index] = passed
         while self.end is None and (known := self._known.flown) in self._waiting:
@@ -131,7 +128,6 @@ class Progress:
 
     @property
     def standing(self) -> Standing:
-        """The current interim result."""
         tally = self._all if self.end is None else self._known
         planned = self._plan.flights if self.end is None else self.end
         return Standing(**asdict(tally.rate), planned=planned, complete=self.end is not None)

@@ -4,13 +4,13 @@ A campaign is a cube: one axis for every varied number, 0..1. A sampling gives p
 distribution that turns its coordinate into a value. Values have nine digits, so that they do not depend on the
 processor's logarithm.
 
-    random            independent points; any number of flights sobol             fills the cube evenly at any number of
-    flights, best at a power of two latin             every axis evenly, for the number of flights in the spec saltelli,
-    morris  the designs that Sobol's and Morris' indices need (SALib): N (D + 2) and N (D + 1) points of D axes,
+    random            independent points; any number of flights
+    sobol             fills the cube evenly at any number of flights, best at a power of two
+    latin             every axis evenly, for the number of flights in the spec
+    saltelli, morris  the designs that Sobol's and Morris' indices need (SALib): N (D + 2) and N (D + 1) points of D axes,
                       of which those of a base row have the same seed
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -23,6 +23,7 @@ from scipy.stats import qmc
 
 from hil.campaigns.config import DESIGNS, Distribution, SampledFault, Spec, Value, spec_text, table_dimensions
 from hil.campaigns.jobs import Job, Plan
+from hil.config import settings_of
 from hil.errors import LabError
 from hil.experiments import find_experiment
 from hil.laboratory.request import Options
@@ -57,7 +58,6 @@ def axes_of(text: str) -> tuple[CubeAxis, ...]:
 
 
 def axes(spec: Spec) -> tuple[CubeAxis, ...]:
-    """Return the axes of a campaign."""
     return axes_of(spec.model_dump_json())
 
 
@@ -202,7 +202,7 @@ def draw_at(spec: Spec, shares: NDArray[np.float64], index: int, point: int, cel
     faults = (_fault_at(number, fault, share) for number, fault in enumerate(spec.faults))
     options = Options(
         profile=spec.profiles[profile], seed=spec.seed + base * spec.seeds + repetition,
-        overrides=(*spec.settings, *(f"{name}={_toml(value)}" for name, value in parameters.items())),
+        overrides=(*spec.settings, *settings_of(parameters)),
         faults=tuple(filter(None, faults)), duration_s=spec.duration_s, link=spec.link,
         board=spec.board,
     )  # fmt: skip
@@ -239,12 +239,6 @@ def value_at(varies: Distribution, share: float) -> Value:
         tail = 1e-12  # a design has points at the ends of its axes
         value = mean + deviation * float(ndtri(min(max(below + share * (above - below), tail), 1.0 - tail)))
     return float(f"{value:.{DIGITS}g}")
-
-
-def _toml(value: Value) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return json.dumps(value) if isinstance(value, str) else repr(value)
 
 
 # Shares near the ends of an axis, where a number that must be whole is not: 0.999 of 100000..200000 is.

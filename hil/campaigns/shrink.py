@@ -8,6 +8,7 @@ combination may still exist.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 from hil.campaigns.config import Spec
 from hil.campaigns.jobs import Job, fly_within
@@ -37,9 +38,12 @@ def shrink(trial: Trial, duration_s: float, fails: Fails) -> Trial:
     if not fails(trial):
         raise LabError("--shrink: the flight does not fail; there is nothing to shrink")
     trial = _fewer(trial, fails)
-    for number in range(len(trial.faults)):
-        trial = _smaller(trial, number, fails)
-        trial = _shorter(trial, number, duration_s, fails)
+    for number, fault in enumerate(trial.faults):
+        mildest = harmless(fault.kind)
+        if mildest is not None and mildest != fault.size:
+            trial = _halved(trial, number, "size", (mildest, fault.size), fails)
+        whole_s = min(fault.duration_s, duration_s - fault.start_s)
+        trial = _halved(trial, number, "duration_s", (SHORTEST_S, whole_s), fails)
     return trial
 
 
@@ -64,38 +68,26 @@ def _one_less(trial: Trial) -> Iterator[Trial]:
         yield replace(trial, settings=trial.settings[:n] + trial.settings[n + 1 :])
 
 
-def _smaller(trial: Trial, number: int, fails: Fails) -> Trial:
-    fault = trial.faults[number]
-    none = harmless(fault.kind)
-    if none is None or none == fault.size:
-        return trial
-    return _halved(none, fault.size, lambda size: _with(trial, number, replace(fault, size=size)), fails)
-
-
-def _shorter(trial: Trial, number: int, duration_s: float, fails: Fails) -> Trial:
-    fault = trial.faults[number]
-    whole_s = min(fault.duration_s, duration_s - fault.start_s)
-    return _halved(
-        SHORTEST_S, whole_s, lambda span: _with(trial, number, replace(fault, duration_s=span)), fails, trial
-    )
-
-
 def _halved(
-    passing: float, failing: float, made: Callable[[float], Trial], fails: Fails, before: Trial | None = None
+    trial: Trial,
+    number: int,
+    field: Literal["size", "duration_s"],
+    between: tuple[float, float],
+    fails: Fails,
 ) -> Trial:
-    """Return the failing trial nearest to `passing`; `before` when no reduced one fails."""
-    whole = failing
+    """Return the trial that fails with a fault's field nearest to the first of two values; the second one is the drawn."""
+    passing, failing = between
+    reduced = trial
     for _ in range(HALVINGS):
         middle = float(f"{(passing + failing) / 2.0:.6g}")
-        if fails(made(middle)):
-            failing = middle
+        changed: dict[str, Any] = {field: middle}
+        fault = replace(trial.faults[number], **changed)
+        tried = replace(trial, faults=(*trial.faults[:number], fault, *trial.faults[number + 1 :]))
+        if fails(tried):
+            reduced, failing = tried, middle
         else:
             passing = middle
-    return before if before is not None and failing == whole else made(failing)
-
-
-def _with(trial: Trial, number: int, fault: Fault) -> Trial:
-    return replace(trial, faults=(*trial.faults[:number], fault, *trial.faults[number + 1 :]))
+    return reduced
 
 
 def harmless(name: str) -> float | None:
@@ -111,10 +103,10 @@ def harmless(name: str) -> float | None:
 
 
 class Reflight:
-    """Flies reduced versions of one flight of a campaign; calls `said` with a line per flight."""
+    """Flies reduced versions of one flight of a campaign; calls `report` with a line per flight."""
 
-    def __init__(self, spec: Spec, drawn: Job, said: Callable[[str], None]) -> None:
-        self._spec, self._drawn, self._said = spec, drawn, said
+    def __init__(self, spec: Spec, drawn: Job, report: Callable[[str], None]) -> None:
+        self._spec, self._drawn, self._report = spec, drawn, report
         self._outcome: str | None = None  # of the whole
 
     @property
@@ -127,7 +119,6 @@ class Reflight:
         )
 
     def request(self, trial: Trial) -> Request:
-        """Return the request of a trial."""
         reduced = Options(overrides=(*self._spec.settings, *trial.settings), faults=trial.faults)
         return replace(self._drawn, options=self._drawn.options | reduced).request()
 
@@ -137,7 +128,7 @@ class Reflight:
         self._outcome = self._outcome or result.outcome
         failed = not result.passed and result.outcome == self._outcome
         verdict = "fails" if failed else "holds" if result.passed else "fails otherwise"
-        self._said(f"{verdict}: {_text(trial)}{_why(result)}")
+        self._report(f"{verdict}: {_text(trial)}{_why(result)}")
         return failed
 
 

@@ -33,7 +33,7 @@ BOARD, STATION = (1, 1), (255, 190)  # system and component
 INFO = 6  # severity of a text
 SLOW = 100  # rows between heartbeats, and between voltages: 1 Hz
 ROWS = 2  # between motions: 50 Hz, MAVLink's usual best
-Said = tuple[int, tuple[int, int], Any]  # time [us], sender, message
+Sent = tuple[int, tuple[int, int], Any]  # time [us], sender, message
 
 
 def write_tlog(folder: Path) -> Path:
@@ -47,12 +47,12 @@ def write_tlog(folder: Path) -> Path:
     senders = {who: FrameSender(*who) for who in (BOARD, STATION)}
     path = folder / FILE
     with path.open("wb") as file:
-        for us, who, message in sorted((*_flown(log), *texts), key=lambda said: said[0]):
+        for us, who, message in sorted((*_flown(log), *texts), key=lambda sent: sent[0]):
             file.write(us.to_bytes(8, "big") + senders[who].encode(us, message))
     return path
 
 
-def _flown(log: pa.Table) -> Iterator[Said]:
+def _flown(log: pa.Table) -> Iterator[Sent]:
     log = known(log)
     columns = {name: log.column(name).to_pylist() for name in log.column_names}
     truth = body(log, "x", "y", "z", "qw", "qx", "qy", "qz").tolist()

@@ -60,7 +60,7 @@ def test_the_example_flies_the_hover_on_every_robot_that_the_table_allows() -> N
         ),
         (
             HOVER + '[table]\n[parameters]\n"plant.constant_factors.roll_u1" = { uniform = [1, 2] }',
-            "in [table]",
+            "in both [parameters] and [table]",
         ),
         (HOVER + '[[faults]]\nkind = "push.w"\nstart_s = 1', "fault 'push.w@1.0': unknown kind 'push.w'"),
         (HOVER + '[[faults]]\nkind = "push.y"\nstart_s = 1\nsize = 99', "size 99: expected -20..20 N"),
