@@ -36,17 +36,7 @@ from hil.laboratory.faults import Fault
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
-from hil.learn import law
-from hil.learn.batch import (
-    CONTROL_US,
-    DELAY_MAX,
-    Actions,
-    EstimateErrors,
-    Fleet,
-    observe_board,
-    reward_of,
-    tilt_of,
-)
+from hil.learn import batch, law
 from hil.learn.tasks import AXES, PUSH_KINDS, PUSH_S, Episode, EpisodeTask, draw_episode, find_task
 
 Fidelity = Literal["fast", "firmware"]
@@ -70,20 +60,24 @@ class Setup:
     duration_s: float = 10.0
     faults: Sequence[Fault | str] = ()  # of every episode; fidelity firmware only
     pose_delay_us: int = 0  # not compensated by the board; fidelity fast only
-    errors: EstimateErrors = field(default_factory=EstimateErrors)  # of the estimate; fidelity fast only
+    errors: batch.EstimateErrors = field(
+        default_factory=batch.EstimateErrors
+    )  # of the estimate; fidelity fast only
 
     def __post_init__(self) -> None:
         if not 0.0 < self.duration_s <= 3600.0:
             raise LabError(f"duration_s = {self.duration_s!r}: expected seconds, above 0 and up to 3600")
-        if not 0 <= self.pose_delay_us <= DELAY_MAX * CONTROL_US:
-            raise LabError(f"pose_delay_us = {self.pose_delay_us!r}: expected 0..{DELAY_MAX * CONTROL_US}")
+        if not 0 <= self.pose_delay_us <= batch.DELAY_MAX * batch.CONTROL_US:
+            raise LabError(
+                f"pose_delay_us = {self.pose_delay_us!r}: expected 0..{batch.DELAY_MAX * batch.CONTROL_US}"
+            )
         if self.robot_count < 1:
             raise LabError(f"robot_count = {self.robot_count!r}: expected 1 or more")
 
     @property
     def steps(self) -> int:
         """Control steps of an episode."""
-        return round(self.duration_s * 1e6 / CONTROL_US)
+        return round(self.duration_s * 1e6 / batch.CONTROL_US)
 
     def settings(self) -> list[tuple[str, ...]]:
         """Return the settings of every robot that an episode may draw."""
@@ -96,7 +90,7 @@ class Setup:
         return [(*settings_of(options.get("overrides", ())), *own) for options in drawn]
 
 
-def _checked(actions: Actions, count: int) -> Actions:
+def _checked(actions: batch.Actions, count: int) -> batch.Actions:
     """Return a copy of actions as (count, 4). Raises `LabError` for numbers of another count, or that are not finite."""
     copied = np.array(actions, np.float32)
     if copied.size != count * ACTIONS or not np.isfinite(copied).all():
@@ -104,7 +98,9 @@ def _checked(actions: Actions, count: int) -> Actions:
     return copied.reshape(count, ACTIONS)
 
 
-def make_env(task: str, fidelity: Fidelity = "fast", **setup: Any) -> gymnasium.Env[Actions, Actions]:
+def make_env(
+    task: str, fidelity: Fidelity = "fast", **setup: Any
+) -> gymnasium.Env[batch.Actions, batch.Actions]:
     """Return the environment of a task with one robot; the keywords are those of `Setup`. Raises `LabError`."""
     if fidelity not in ("fast", "firmware"):
         raise LabError(f"fidelity = {fidelity!r}: expected fast or firmware")
@@ -124,7 +120,7 @@ def make_vec(task: str, num_envs: int = 1, fidelity: Fidelity = "fast", **setup:
     return FastVectorEnv(find_task(task), num_envs, Setup(**setup))
 
 
-class FastVectorEnv(VectorEnv[Actions, Actions, NDArray[Any]]):
+class FastVectorEnv(VectorEnv[batch.Actions, batch.Actions, NDArray[Any]]):
     """Many robots at once; an ended episode is replaced in the same step (`info["final_obs"]` has its last observation)."""
 
     def __init__(self, task: EpisodeTask, num_envs: int, setup: Setup) -> None:
@@ -141,7 +137,7 @@ class FastVectorEnv(VectorEnv[Actions, Actions, NDArray[Any]]):
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: Info | None = None
-    ) -> tuple[Actions, Info]:
+    ) -> tuple[batch.Actions, Info]:
         """Begin all episodes; robot n has the seed + n."""
         seeds = [seed + n for n in range(self.num_envs)] if isinstance(seed, int) else seed
         if seeds is not None or not self._streams:
@@ -152,8 +148,8 @@ class FastVectorEnv(VectorEnv[Actions, Actions, NDArray[Any]]):
         return self._observations.copy(), {}
 
     def step(
-        self, actions: Actions
-    ) -> tuple[Actions, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Info]:
+        self, actions: batch.Actions
+    ) -> tuple[batch.Actions, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Info]:
         """Advance all robots by 10 ms."""
         limited = _checked(actions, self.num_envs)
         self._fleet.advance(limited, self.np_random, self._observations, self._rewards)
@@ -175,7 +171,7 @@ class FastVectorEnv(VectorEnv[Actions, Actions, NDArray[Any]]):
         self._steps[n] = 0
 
 
-class FastEnv(gymnasium.Env[Actions, Actions]):
+class FastEnv(gymnasium.Env[batch.Actions, batch.Actions]):
     """One robot in the fast model."""
 
     def __init__(self, task: EpisodeTask, setup: Setup) -> None:
@@ -185,16 +181,14 @@ class FastEnv(gymnasium.Env[Actions, Actions]):
         self._observation, self._reward = np.zeros((1, OBSERVATIONS), np.float32), np.zeros(1)
         self._steps = 0
 
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Actions, Info]:
-        """Begin an episode."""
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[batch.Actions, Info]:
         super().reset(seed=seed)
         episode = draw_episode(self._task, self.np_random, self._setup.duration_s)
         self._fleet.begin(0, episode, self.np_random, self._observation[0])
         self._steps = 0
         return self._observation[0].copy(), {}
 
-    def step(self, action: Actions) -> tuple[Actions, float, bool, bool, Info]:
-        """Advance the robot by 10 ms."""
+    def step(self, action: batch.Actions) -> tuple[batch.Actions, float, bool, bool, Info]:
         limited = _checked(action, 1)
         self._fleet.advance(limited, self.np_random, self._observation, self._reward)
         self._steps += 1
@@ -214,14 +208,14 @@ class FastEnv(gymnasium.Env[Actions, Actions]):
         return truth
 
 
-class FirmwareEnv(gymnasium.Env[Actions, Actions]):
+class FirmwareEnv(gymnasium.Env[batch.Actions, batch.Actions]):
     """One robot in the laboratory: emulated board, estimator, radio, cameras, faults. Flies its action as user logic.
 
     `flight` is the current episode's.
     """
 
     def __init__(self, task: EpisodeTask, setup: Setup) -> None:
-        if setup.pose_delay_us or setup.errors != EstimateErrors():
+        if setup.pose_delay_us or setup.errors != batch.EstimateErrors():
             raise LabError(
                 'pose_delay_us, errors: need fidelity="fast"; the laboratory has its own, and faults'
             )
@@ -232,7 +226,7 @@ class FirmwareEnv(gymnasium.Env[Actions, Actions]):
         self._blocks: CoreBlocks | None = None
         self.flight: Flight | None = None
 
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Actions, Info]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[batch.Actions, Info]:
         """Boot the board and fly up to the release."""
         super().reset(seed=seed)
         self.close()
@@ -243,7 +237,7 @@ class FirmwareEnv(gymnasium.Env[Actions, Actions]):
         self._run_until(self.flight.release_us - JUST_BEFORE_US)
         return self._observe(), {}
 
-    def step(self, action: Actions) -> tuple[Actions, float, bool, bool, Info]:
+    def step(self, action: batch.Actions) -> tuple[batch.Actions, float, bool, bool, Info]:
         """Hand the action to the control law, and fly up to its next step."""
         flight = self.flight
         if flight is None or self._blocks is None or flight.robot.body.lost is not None:
@@ -253,18 +247,17 @@ class FirmwareEnv(gymnasium.Env[Actions, Actions]):
         own.u1, own.u2, own.u3, own.u4 = limited
         change = float(((limited - self._previous) ** 2).sum())
         self._previous[:] = limited
-        self._run_until(flight.now_us + CONTROL_US)
+        self._run_until(flight.now_us + batch.CONTROL_US)
         body, goal = flight.robot.body, flight.line.trajectory.at(flight.now_us)
         flight.robot.look(flight.now_us)
         distance = math.dist(body.p_WB.tolist(), goal.p_WG)
         up_B = rotation_matrix(tuple(body.q_WB.tolist()))[2].tolist()
         yaw = to_euler_zyx(tuple(body.q_WB.tolist()))[2]
-        reward = reward_of(distance, tilt_of(*up_B), wrap_angle(yaw - goal.yaw), change)
-        over = flight.now_us - flight.release_us >= (self._setup.steps - 0.5) * CONTROL_US
+        reward = batch.reward_of(distance, batch.tilt_of(*up_B), wrap_angle(yaw - goal.yaw), change)
+        over = flight.now_us - flight.release_us >= (self._setup.steps - 0.5) * batch.CONTROL_US
         return self._observe(), reward, body.lost is not None, over, {}
 
     def close(self) -> None:
-        """End the flight."""
         if self.flight is not None:
             self.flight.close()
             self.flight = None
@@ -274,10 +267,10 @@ class FirmwareEnv(gymnasium.Env[Actions, Actions]):
         self.flight.lab.end_at(us)
         self.flight.lab.run()
 
-    def _observe(self) -> Actions:
+    def _observe(self) -> batch.Actions:
         assert self._blocks is not None
         out = np.zeros(OBSERVATIONS, np.float32)
-        observe_board(self._blocks.parameters.arg, self._blocks.estimator.arg, self._previous, out)
+        batch.observe_board(self._blocks.parameters.arg, self._blocks.estimator.arg, self._previous, out)
         return np.clip(out, -REACH, REACH)
 
     def _runner(self, blocks: CoreBlocks) -> CoreRunner:
@@ -315,7 +308,7 @@ def pushes_of(episode: Episode) -> tuple[Fault, ...]:
     return tuple(Fault(PUSH_KINDS[kind], at, PUSH_S, size) for at, kind, size in drawn if at < np.inf)
 
 
-def fleet_of(setup: Setup, count: int) -> Fleet:
+def fleet_of(setup: Setup, count: int) -> batch.Fleet:
     """Return the fast robots of a setup. Raises `LabError` for features of the whole laboratory only."""
     if setup.faults:
         raise LabError(f'faults = {setup.faults!r}: need fidelity="firmware"')
@@ -329,4 +322,4 @@ def fleet_of(setup: Setup, count: int) -> Fleet:
         Plant(world.geometry, world.plant, world.tunnel, world.actuators, unused, world.flight.home)
         for world in (load_config(setup.profile, settings) for settings in setup.settings())
     ]
-    return Fleet(board, worlds, count, setup.pose_delay_us, setup.errors)
+    return batch.Fleet(board, worlds, count, setup.pose_delay_us, setup.errors)

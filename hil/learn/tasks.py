@@ -15,14 +15,7 @@ from numpy.typing import NDArray
 from hil.errors import LabError, hint
 
 AXES = ("x", "y", "z", "yaw")  # of the goal's path, W
-PUSH_KINDS = (
-    "push.x",
-    "push.y",
-    "push.z",
-    "push.roll",
-    "push.pitch",
-    "push.yaw",
-)  # faults: [N] in W, [N m] in B
+PUSH_KINDS = ("push.x", "push.y", "push.z", "push.roll", "push.pitch", "push.yaw")  # [N] in W, [N m] in B
 PUSHES = 3  # of an episode
 PUSH_S = 0.1
 

@@ -67,7 +67,6 @@ class Trials:
 
     @property
     def holds(self) -> bool:
-        """Whether all flights passed."""
         return self.passed == len(self.results) > 0
 
     @property
@@ -78,7 +77,6 @@ class Trials:
 
     @property
     def lost(self) -> int:
-        """The number of lost flights."""
         return sum(result.outcome == "lost" for result in self.results)
 
     def missed(self, row: PaperRow, metric: str) -> str:
@@ -100,8 +98,6 @@ class Trials:
 
 @dataclass(frozen=True, slots=True)
 class Paper:
-    """All flights."""
-
     rows: tuple[tuple[str, PaperRow, tuple[Trials, ...]], ...]  # experiment, row, per profile
     studies: tuple[StudyResult, ...]
     interrupted: bool

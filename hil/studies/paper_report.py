@@ -149,26 +149,18 @@ def _trials(shown: PaperRow, trials: Trials) -> dict[str, Any]:
         },
         "flights": [
             {
-                "seed": row.seed,
-                "outcome": row.outcome,
-                "cause": row.error or None,
-                "passed": row.passed,
-                "failed": row.failed,
-                "hash": row.hash,
-                "folder": row.folder.name,
+                "seed": row.seed, "outcome": row.outcome, "cause": row.error or None, "passed": row.passed,
+                "failed": row.failed, "hash": row.hash, "folder": row.folder.name,
             }
             for row in trials.results
         ],
-    }
+    }  # fmt: skip
 
 
 def _study(result: StudyResult) -> dict[str, Any]:
     study = result.study
     return {
-        "name": study.name,
-        "axis": study.axis,
-        "unit": study.unit,
-        "sizes": study.sizes,
+        **{name: getattr(study, name) for name in ("name", "axis", "unit", "sizes")},
         "as_expected": result.holds,
         "variants": [
             {

@@ -49,8 +49,6 @@ class Variant:
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """One axis, several variants."""
-
     name: str
     question: str
     axis: str  # meaning of the sizes

@@ -19,7 +19,6 @@ STYLES = ("-", "--", ":")
 
 
 def picture(result: StudyResult) -> Figure:
-    """Draw a study."""
     study, flown = result.study, result.curves
     strip = 0.27 * len(flown) + 0.6
     figure = Figure(figsize=(WIDTH, 2.3 + strip), layout="constrained")

@@ -24,11 +24,7 @@ from hil.pictures.curves import since_release
 COUNTS = tuple(f"motor.m{servo}" for servo in range(1, 5))
 GYRO, RATES = ("imu.gx", "imu.gy", "imu.gz"), ("estimate.p", "estimate.q", "estimate.r")
 STEP_US = 10_000  # of the estimator
-ESTIMATING = (
-    "KALMAN",
-    "STABILIZER",
-    "STABILIZE",
-)  # its possible tasks: the first that runs for so long
+ESTIMATING = ("KALMAN", "STABILIZER", "STABILIZE")  # its possible tasks: the first that runs for so long
 LONG_US = 200  # longer than any step without an estimate
 SAME_ZERO = 1e-6  # [rad/s] a count over 512 samples is 2e-6
 CLOCK = "clock.board_us"
