@@ -3,7 +3,7 @@
 Without fast maths LLVM neither reorders nor fuses, so every processor computes the same bits. A call on memory that does not
 move (`bound`) is kept as machine code, which a later process loads without numba: loading numba takes longer than a
 short flight. Every other call goes through numba's dispatcher and its own cache. Kept code is valid for the content of all
-sources, wherever it lies (`__pycache__`, `NUMBA_CACHE_DIR`). Stale code is overwritten.
+sources, wherever it lies (`kept_folders`). Stale code is overwritten.
 """
 
 import ctypes
@@ -103,7 +103,7 @@ class Compiled:
     def files(self, kinds: str = "*") -> list[Path]:
         """Return the files of kept code for arguments of certain kinds, in each folder where it may lie."""
         name = f"{self.__wrapped__.__module__}.{self.__name__}-{kinds}-{self.stamp[:24]}{SUFFIX}"
-        return [folder / name for folder in _folders(Path(inspect.getfile(self.__wrapped__)))]
+        return [folder / name for folder in kept_folders(Path(inspect.getfile(self.__wrapped__)).parent)]
 
 
 def bound(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
@@ -133,11 +133,26 @@ def _stays(argument: Any) -> bool:
     return isinstance(argument, np.ndarray) and argument.flags.c_contiguous
 
 
-def _folders(source: Path) -> list[Path]:
-    """Return where code may be kept, the first choice first."""
+def kept_folders(sources: Path) -> list[Path]:
+    """Return where the compiled code of a folder may be kept, the first choice first: beside it, or the user's cache."""
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         return [Path(chosen)]
-    return [source.parent / "__pycache__", Path.home() / ".cache" / "floaty"]
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    hashed = hashlib.sha256(str(sources).encode()).hexdigest()[:16]
+    return [sources / "__pycache__", home / "floaty" / hashed]
+
+
+def keep(files: list[Path], content: bytes) -> Path | None:
+    """Write the first of these files that can be written, which may be read meanwhile; None: no folder allows it."""
+    for path in files:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            partial_file = path.with_name(f"{path.name}.{os.getpid()}")
+            partial_file.write_bytes(content)
+            return partial_file.replace(path)
+        except OSError:
+            continue
+    return None
 
 
 class _Method(ctypes.Structure):
@@ -166,25 +181,12 @@ def _kept(function: Compiled, arguments: tuple[NDArray[Any], ...]) -> _Method | 
             content = _machine_code(function, arguments)
             if not content:
                 return None
-            _keep(files, content)
+            if path := keep(files, content):
+                for older in path.parent.glob(f"{path.name.rsplit('-', 1)[0]}-*{SUFFIX}"):
+                    if older != path:
+                        older.unlink(missing_ok=True)
         _LOADED[key] = _load(function.__name__, content)
     return _LOADED[key][0]
-
-
-def _keep(files: list[Path], content: bytes) -> None:
-    """Write kept code into the first folder that allows it, and remove the code that it replaces."""
-    for path in files:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            partial_file = path.with_name(f"{path.name}.{os.getpid()}")
-            partial_file.write_bytes(content)
-            partial_file.replace(path)
-        except OSError:
-            continue
-        for older in path.parent.glob(f"{path.name.rsplit('-', 1)[0]}-*{SUFFIX}"):
-            if older != path:
-                older.unlink(missing_ok=True)
-        return
 
 
 @cache

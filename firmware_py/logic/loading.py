@@ -6,15 +6,16 @@ one process nor in numba's cache on disk.
 
 import difflib
 import hashlib
-import os
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from firmware_py.compiling import keep, kept_folders
 from firmware_py.config import LogicConfig
 from firmware_py.core.budget import CALL_CYCLES, LoopBudget
 from firmware_py.core.guard import Guard
@@ -210,22 +211,15 @@ def _run(name: str, path: Path, text: str) -> ModuleType:
 
 
 def _written(folder: Path, name: str, text: str) -> Path:
-    """Write a text where compiled code of that folder is cached, or else in the user's cache; return its path."""
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    hashed = hashlib.sha256(str(folder).encode()).hexdigest()[:16]
-    places = (folder / "__pycache__", home / "floaty" / hashed)
-    for place in places:
-        path, partial = place / name, place / f"{name}.{os.getpid()}"
-        try:
-            if path.is_file() and path.read_text(encoding="utf-8") == text:
+    """Write a text where compiled code of that folder is kept, if it is not there already; return its path."""
+    content, paths = text.encode(), [place / name for place in kept_folders(folder)]
+    for path in paths:
+        with suppress(OSError):
+            if path.read_bytes() == content:
                 return path
-            place.mkdir(parents=True, exist_ok=True)
-            partial.write_text(text, encoding="utf-8")
-            partial.replace(path)
-        except OSError:
-            continue
-        return path
-    raise LogicError(f"{places[0]}, {places[1]}: neither can be written")
+    if path_written := keep(paths, content):
+        return path_written
+    raise LogicError(f"{' and '.join(str(path.parent) for path in paths)}: cannot be written")
 
 
 def _shown(file: str) -> str:

@@ -7,6 +7,7 @@ from contextlib import ExitStack, closing, suppress
 from functools import partial
 from pathlib import Path
 
+from firmware_py.compiling import kept_folders
 from firmware_py.errors import FirmwareError
 from firmware_py.export.boards import runner_of
 from firmware_py.wire.telemetry import ALL_BLOCKS, CRAZYFLIE_BLOCKS
@@ -238,8 +239,8 @@ def image_at(board: str, elf: Path | None, debugger: GdbServer | None = None) ->
 
 
 def _folder_of_machines() -> Path:
-    """Return where the emulated chip is compiled, once for all flights: beside its sources, else in the user's cache."""
-    for kept in (SOURCES / "__pycache__", Path.home() / ".cache" / "floaty"):
+    """Return where the emulated chip is compiled, once for all flights."""
+    for kept in kept_folders(SOURCES):
         with suppress(OSError):
             kept.mkdir(parents=True, exist_ok=True)
         if os.access(kept, os.W_OK):
