@@ -15,30 +15,6 @@ NO_DEADLINE_US: Final = 1 << 62
 class ControlBlock:
     """One task. Its fields, but for the name and the priorities, belong to the kernel."""
 
-    __slots__ = (
-        "activations",
-        "base_priority",
-        "deadline_misses",
-        "deadline_us",
-        "event_priority",
-        "fresh",
-        "latencies",
-        "mutexes_held",
-        "name",
-        "notification",
-        "notify_waiting",
-        "place",
-        "priority",
-        "ready_bit",
-        "released_us",
-        "ring",
-        "step",
-        "waiting_in",
-        "work_left_us",
-        "work_us",
-        "worst_response_us",
-    )
-
     def __init__(
         self, name: str, priority: int, body: Generator[int, None, object], ring: list[Any], now_us: int
     ) -> None:

@@ -6,7 +6,7 @@ which means "nothing came". Waiting tasks are served by priority, first come fir
 
 from collections import deque
 from collections.abc import Generator, Iterable
-from typing import Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 from firmware_py.rtos.control_block import ControlBlock
 from firmware_py.rtos.errors import KernelError
@@ -18,21 +18,11 @@ T = TypeVar("T")
 class Queue(Generic[T]):
     """A queue of at most `length` items; made by `Kernel.create_queue`."""
 
-    __slots__ = (
-        "_items",
-        "_kernel",
-        "_receivers",
-        "_senders",
-        "dropped",
-        "high_water",
-        "length",
-        "name",
-        "number",
-    )
+    kind: ClassVar[str] = "queue"
 
     def __init__(self, kernel: Scheduler, length: int, name: str) -> None:
         if length < 1:
-            raise KernelError(f"queue {name}: length {length}, a queue holds at least one item")
+            raise KernelError(f"{self.kind} {name}: length {length}, it must be at least 1")
         self._kernel = kernel
         self._items: deque[T] = deque()
         self._receivers: list[ControlBlock] = []
@@ -81,7 +71,7 @@ class Queue(Generic[T]):
         if item is None:
             raise self._null_item()
         if kernel.context == IN_INTERRUPT:
-            raise kernel.misplaced(f"queue {self.name}: send_nowait")
+            raise kernel.misplaced(f"{self.kind} {self.name}: sending without waiting")
         if len(items) >= self.length:
             self.dropped += 1
             kernel.failed("Q_SEND_FAIL", self.number)
@@ -102,7 +92,8 @@ class Queue(Generic[T]):
         if items:
             kernel.count_call()
         else:
-            deadline = kernel.deadline(timeout)
+            # Written out, not called, because this is the hot loop.
+            deadline = timeout if timeout < 0 else kernel.tick_count + timeout
             while not items:
                 if not kernel.wait_in(self._receivers, deadline, "Q_RECV", self.number):
                     return None
@@ -157,7 +148,7 @@ class Queue(Generic[T]):
             raise self._null_item()
         kernel = self._kernel
         if kernel.context == IN_TASK:
-            raise kernel.misplaced(f"queue {self.name}: send_from_isr")
+            raise kernel.misplaced(f"{self.kind} {self.name}: sending from an interrupt")
         items = self._items
         if len(items) >= self.length:
             if kernel.trace is not None:

@@ -1,99 +1,46 @@
 """Semaphores, binary and counting, and mutexes with priority inheritance.
 
-To the trace they are queues, as they are in FreeRTOS: take is Q_RECV, give is Q_SEND.
+They are queues, as in FreeRTOS, a mutex to the trace only: take is Q_RECV, give is Q_SEND.
 """
 
 from collections.abc import Generator, Iterable
+from typing import ClassVar
 
 from firmware_py.rtos.control_block import ControlBlock
 from firmware_py.rtos.errors import KernelError
-from firmware_py.rtos.scheduler import FOREVER, GO_ON, IN_INTERRUPT, IN_TASK, Scheduler
+from firmware_py.rtos.queue import Queue
+from firmware_py.rtos.scheduler import FOREVER, IN_TASK, Scheduler
 
 
-class Semaphore:
-    """A count between 0 and `maximum`; made by `Kernel.create_binary_semaphore` or `create_counting_semaphore`."""
+class Semaphore(Queue[bool]):
+    """A count from 0 to `length`, the number of tokens in the queue that it is; as a queue counts what it `dropped`.
 
-    __slots__ = ("_kernel", "_takers", "count", "maximum", "name", "number", "overruns")
+    Made by `Kernel.create_binary_semaphore` or `create_counting_semaphore`. Calls return what those of the queue do.
+    """
+
+    kind: ClassVar[str] = "semaphore"
 
     def __init__(self, kernel: Scheduler, maximum: int, initial: int, name: str) -> None:
-        if maximum < 1:
-            raise KernelError(f"semaphore {name}: maximum {maximum}, it must be at least 1")
+        super().__init__(kernel, maximum, name)
         if not 0 <= initial <= maximum:
             raise KernelError(f"semaphore {name}: initial count {initial} is outside 0..{maximum}")
-        self._kernel = kernel
-        self._takers: list[ControlBlock] = []
-        self.count = initial
-        self.maximum = maximum
-        self.overruns = 0  # gives that found the count at its maximum: the taker did not keep up
-        self.name = name
-        self.number = 0  # how the trace calls it
+        self._items.extend([True] * initial)
 
-    def take(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
-        """Lower the count by one, waiting up to `timeout` ticks until it is above zero; False when it never was."""
-        kernel = self._kernel
-        if timeout and kernel.suspended:
-            kernel.check_may_wait()
-        if self.count:
-            kernel.count_call()
-        else:
-            deadline = timeout if timeout < 0 else kernel.tick_count + timeout
-            while self.count == 0:
-                if not kernel.wait_in(self._takers, deadline, "Q_RECV", self.number):
-                    return False
-                yield 0
-        if kernel.trace is not None:
-            kernel.record("Q_RECV", self.number, self.count)
-        self.count -= 1
-        return True
+    def take(self, timeout: int = FOREVER) -> Generator[int, None, bool | None]:
+        """Lower the count by one, waiting up to `timeout` ticks until it is above zero; None when it never was."""
+        return self.receive(timeout)
 
     def give(self) -> Generator[int, None, bool]:
         """Raise the count by one and wake the first taker; False when the count is at its maximum."""
-        kernel = self._kernel
-        if self.count >= self.maximum:
-            self.overruns += 1
-            kernel.failed("Q_SEND_FAIL", self.number)
-            return False
-        if kernel.trace is not None:
-            kernel.record("Q_SEND", self.number, self.count)
-        self.count += 1
-        if self._takers and kernel.wake(self._takers.pop(0)) and kernel.preemption:
-            yield 0
-        return True
+        return self.send(True, 0)
 
     def give_nowait(self) -> Iterable[int]:
-        """Raise the count by one and wake the first taker, unless the count is at its maximum.
-
-        `yield from` it lets a taker of higher priority run at once; after the plain call it runs at the caller's next
-        `yield from` that blocks, yields or works, at the latest at `Kernel.yield_if_pending`.
-        """
-        kernel = self._kernel
-        if kernel.context == IN_INTERRUPT:
-            raise kernel.misplaced(f"semaphore {self.name}: give_nowait")
-        if self.count >= self.maximum:
-            self.overruns += 1
-            kernel.failed("Q_SEND_FAIL", self.number)
-            return GO_ON
-        if kernel.trace is not None:
-            kernel.record("Q_SEND", self.number, self.count)
-        self.count += 1
-        return kernel.wake_first(self._takers) if self._takers else GO_ON
+        """Do the same as `Queue.send_nowait`; a taker that waits runs at the latest at `Kernel.yield_if_pending`."""
+        return self.send_nowait(True)
 
     def give_from_isr(self) -> bool:
         """Like `give`, from an interrupt."""
-        kernel = self._kernel
-        if kernel.context == IN_TASK:
-            raise kernel.misplaced(f"semaphore {self.name}: give_from_isr")
-        if self.count >= self.maximum:
-            self.overruns += 1
-            if kernel.trace is not None:
-                kernel.trace(kernel.now_us, "Q_SEND_ISR_FAIL", "isr", self.number, 0)
-            kernel.interrupted(False)
-            return False
-        if kernel.trace is not None:
-            kernel.trace(kernel.now_us, "Q_SEND_ISR", "isr", self.number, self.count)
-        self.count += 1
-        kernel.interrupted(bool(self._takers) and kernel.wake(self._takers.pop(0)))
-        return True
+        return self.send_from_isr(True)
 
 
 class Mutex:
@@ -101,8 +48,6 @@ class Mutex:
 
     Made by `Kernel.create_mutex`; free at first. Only the holder may give it, and it may not take it twice.
     """
-
-    __slots__ = ("_kernel", "_takers", "holder", "name", "number")
 
     def __init__(self, kernel: Scheduler, name: str) -> None:
         self._kernel = kernel

@@ -14,8 +14,6 @@ from firmware_py.rtos.scheduler import GO_ON, IN_TASK, MAX_PRIORITIES, SWITCH, S
 class Task(ControlBlock):
     """One task; made by `Kernel.create_task`."""
 
-    __slots__ = ("kernel",)
-
     def __init__(
         self, kernel: Scheduler, name: str, priority: int, body: Generator[int, None, object]
     ) -> None:

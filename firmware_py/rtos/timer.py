@@ -28,8 +28,6 @@ class Timer:
     the service task and are False when there was none.
     """
 
-    __slots__ = ("_service", "active", "autoreload", "callback", "expiry_tick", "name", "period_ticks")
-
     def __init__(
         self, service: TimerService, name: str, period_ticks: int, autoreload: bool, callback: Callback
     ) -> None:
@@ -99,7 +97,7 @@ class TimerService:
                 self._wait(now)
                 yield 0
             while (command := (yield from self.commands.receive(0))) is not None:
-                yield from self._obey(command)
+                yield from self._execute(command)
 
     def _wait(self, now: int) -> None:
         if len(self.commands):
@@ -118,7 +116,7 @@ class TimerService:
                 yield from self._reload(timer, expired)
         yield from timer.callback(timer)
 
-    def _obey(self, command: _Command) -> Generator[int, None, None]:
+    def _execute(self, command: _Command) -> Generator[int, None, None]:
         timer = command.timer
         if timer.active:
             self._running.remove(timer)
