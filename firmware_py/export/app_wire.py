@@ -6,7 +6,7 @@ from firmware_py.wire import core_port, crtp, localisation
 from firmware_py.wire.core_port import HEALTH, LAYOUTS, LOOP, Call, Hil, Message, PacketLayout, Refusal
 from firmware_py.wire.supervisor import Cause, State
 
-C_TYPES = {"B": "uint8_t", "b": "int8_t", "H": "uint16_t", "h": "int16_t", "I": "uint32_t"}
+C_TYPES = {"B": "uint8_t", "?": "uint8_t", "b": "int8_t", "H": "uint16_t", "h": "int16_t", "I": "uint32_t"}
 
 OF_CORE = {  # fields of layouts that show the core's memory
     "state": "supervisor.state", "cause": "supervisor.cause", "calibrated": "sampling.calibrated",

@@ -39,7 +39,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise, takewhile
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 from firmware_py.wire import WireError
 from firmware_py.wire.crtp import MAX_DATA
@@ -108,55 +108,111 @@ class PacketLayout:
     name: str
     fields: tuple[tuple[str, str], ...]
 
+    @classmethod
+    def of(cls, kind: type[Any]) -> "PacketLayout":
+        """Return the layout of a class whose fields have their codes as annotations."""
+        return cls(
+            kind.__name__, tuple((name, one.__metadata__[0]) for name, one in kind.__annotations__.items())
+        )
+
     @property
     def struct(self) -> struct.Struct:
         """The `struct` that packs it."""
         return struct.Struct("<" + "".join(code for _, code in self.fields))
 
 
+I8 = Annotated[int, "b"]
+I16 = Annotated[int, "h"]
+U8 = Annotated[int, "B"]
+U16 = Annotated[int, "H"]
+U32 = Annotated[int, "I"]
+Flag = Annotated[bool, "?"]
+Name = Annotated[str, f"{NAME_SIZE}s"]  # how a hash begins
+
+
+class About(NamedTuple):
+    """The board on the port."""
+
+    version: U8  # VERSION
+    state: U8  # of the supervisor: firmware_py.wire.supervisor.State
+    size: U16  # [B] of the memory
+    done: U16  # requests of this session that were executed
+    clock_mhz: U16  # of the processor, whose cycles are counted
+    core: Name  # of the core's sources
+    profile: Name  # of the parameters in the app
+
+
+class Called(NamedTuple):
+    """The result of a call."""
+
+    answer: I8  # 0 of calls without an answer
+    cycles: U32  # that the call took, with the interrupts in it; no other task runs meanwhile
+    digest: U32  # CRC-32 of the whole memory afterwards, as zlib.crc32
+
+
+class Health(NamedTuple):
+    """The state of a board."""
+
+    gyro_x: I16  # [counts] now, of the board's own gyro
+    gyro_y: I16
+    gyro_z: I16
+    calibrated: Flag  # the gyro's zero is known
+    battery_mv: U16
+    heap_free: U32  # [B] of RAM
+    m1: U16  # timer counts of the servos
+    m2: U16
+    m3: U16
+    m4: U16
+
+    @property
+    def counts(self) -> tuple[int, int, int, int]:
+        """The timer counts of the servos."""
+        return self.m1, self.m2, self.m3, self.m4
+
+
+class Loop(NamedTuple):
+    """The board's report in the loop."""
+
+    used: U16  # number of the next sample, when the controller ran
+    waiting: U8  # samples in the buffer then
+    state: U8  # of the supervisor
+    cause: U8
+    fresh: Flag  # the controller has just run; otherwise the flight is held
+    held: U16
+    late: U16
+    lost: U16
+    doubled: U16
+    m1: U16  # timer counts that the controller puts out
+    m2: U16
+    m3: U16
+    m4: U16
+    fused: U16  # poses
+    refused: U16
+    age: U16  # [0.1 ms] of the last one
+
+    @property
+    def received(self) -> int:
+        """Number of the next sample for the board, modulo 65536."""
+        return (self.used + self.waiting) & 0xFFFF
+
+    @property
+    def counts(self) -> tuple[int, int, int, int]:
+        """The timer counts of the servos."""
+        return self.m1, self.m2, self.m3, self.m4
+
+
 HEAD = PacketLayout("Head", (("kind", "B"), ("session", "B"), ("number", "H")))
-ABOUT = PacketLayout("About", (
-    ("version", "B"),  # VERSION
-    ("state", "B"),  # of the supervisor: firmware_py.wire.supervisor.State
-    ("size", "H"),  # [B] of the memory
-    ("done", "H"),  # requests of this session that were executed
-    ("clock_mhz", "H"),  # of the processor, whose cycles are counted
-    ("core", f"{NAME_SIZE}s"),  # how the hash of the core's sources begins
-    ("profile", f"{NAME_SIZE}s"),  # and that of the parameters in the app
-))  # fmt: skip
 PLACE = PacketLayout("Place", (("offset", "H"),))
 PLACE_SIZE = PacketLayout("PlaceSize", (("offset", "H"), ("size", "B")))
 CALL = PacketLayout("Call", (("call", "B"),))
-CALLED = PacketLayout("Called", (
-    ("answer", "b"),  # 0 of calls without an answer
-    ("cycles", "I"),  # that the call took, with the interrupts in it; no other task runs meanwhile
-    ("digest", "I"),  # CRC-32 of the whole memory afterwards, as zlib.crc32
-))  # fmt: skip
 WHY = PacketLayout("Why", (("reason", "B"),))
-HEALTH = PacketLayout("Health", (
-    ("gyro_x", "h"), ("gyro_y", "h"), ("gyro_z", "h"),  # [counts] now, of the board's own gyro
-    ("calibrated", "B"),  # 1: the gyro's zero is known
-    ("battery_mv", "H"),
-    ("heap_free", "I"),  # [B] of RAM
-    ("m1", "H"), ("m2", "H"), ("m3", "H"), ("m4", "H"),  # timer counts of the servos
-))  # fmt: skip
 MODE = PacketLayout("Mode", (("mode", "B"),))
 SAMPLES = PacketLayout("Samples", (
     ("number", "H"),  # of the first sample
     ("width", "B"),  # [B] of a difference: NARROW or WIDE
     ("x", "h"), ("y", "h"), ("z", "h"),  # [counts] of the gyro, sensor frame
 ))  # fmt: skip
-LOOP = PacketLayout("Loop", (
-    ("used", "H"),  # number of the next sample, when the controller ran
-    ("waiting", "B"),  # samples in the buffer then
-    ("state", "B"),  # of the supervisor
-    ("cause", "B"),
-    ("fresh", "B"),  # 1: the controller has just run; 0: the flight is held
-    ("held", "H"), ("late", "H"), ("lost", "H"), ("doubled", "H"),
-    ("m1", "H"), ("m2", "H"), ("m3", "H"), ("m4", "H"),  # timer counts that the controller puts out
-    ("fused", "H"), ("refused", "H"),  # poses
-    ("age", "H"),  # [0.1 ms] of the last one
-))  # fmt: skip
+ABOUT, CALLED, HEALTH, LOOP = map(PacketLayout.of, (About, Called, Health, Loop))
 LAYOUTS = (HEAD, ABOUT, PLACE, PLACE_SIZE, CALL, CALLED, WHY, HEALTH, MODE, SAMPLES, LOOP)
 
 _HEAD, _ABOUT, _PLACE, _PLACE_SIZE, _CALL, _CALLED, _WHY, _HEALTH, _MODE, _SAMPLES, _LOOP = (
@@ -172,39 +228,6 @@ SAMPLES_MAX = 1 + _BEHIND_FIRST[NARROW]  # in a packet, when the rate changes li
 
 
 @dataclass(frozen=True, slots=True)
-class About:
-    """The board on the port."""
-
-    version: int
-    state: int
-    size: int
-    done: int
-    clock_mhz: int
-    core: str
-    profile: str
-
-
-@dataclass(frozen=True, slots=True)
-class Called:
-    """The result of a call."""
-
-    answer: int
-    cycles: int
-    digest: int
-
-
-@dataclass(frozen=True, slots=True)
-class Health:
-    """The state of a board."""
-
-    gyro: tuple[int, ...]  # [counts] sensor frame
-    calibrated: bool
-    battery_mv: int
-    heap_free: int  # [B]
-    counts: tuple[int, int, int, int]  # of the servos
-
-
-@dataclass(frozen=True, slots=True)
 class CoreAnswer:
     """An answer; `body` is what follows its head."""
 
@@ -215,18 +238,16 @@ class CoreAnswer:
 
     def about(self) -> About:
         """Read the answer to HELLO."""
-        version, state, size, done, clock_mhz, *names = _unpack(_ABOUT, self.body)
-        core, profile = (name.decode("ascii", "replace") for name in names)
-        return About(version, state, size, done, clock_mhz, core, profile)
+        *numbers, core, profile = _unpack(_ABOUT, self.body)
+        return About._make((*numbers, core.decode("ascii", "replace"), profile.decode("ascii", "replace")))
 
     def called(self) -> Called:
         """Read the answer to CALL."""
         return Called(*_unpack(_CALLED, self.body))
 
-    def health(self) -> "Health":
+    def health(self) -> Health:
         """Read the answer to HEALTH."""
-        *gyro, calibrated, battery_mv, heap_free, m1, m2, m3, m4 = _unpack(_HEALTH, self.body)
-        return Health(tuple(gyro), bool(calibrated), battery_mv, heap_free, (m1, m2, m3, m4))
+        return Health(*_unpack(_HEALTH, self.body))
 
     def refusal(self) -> int:
         """Read the reason of a refusal."""
@@ -262,30 +283,6 @@ def loop(mode: Hil) -> tuple[Message, bytes]:
     return Message.LOOP, _MODE.pack(mode)
 
 
-@dataclass(frozen=True, slots=True)
-class Looped:
-    """The board's report in the loop."""
-
-    used: int
-    waiting: int
-    state: int
-    cause: int
-    fresh: bool
-    held: int
-    late: int
-    lost: int
-    doubled: int
-    counts: tuple[int, int, int, int]
-    fused: int
-    refused: int
-    age_us: int
-
-    @property
-    def received(self) -> int:
-        """Number of the next sample for the board, modulo 65536."""
-        return (self.used + self.waiting) & 0xFFFF
-
-
 def encode_samples(number: int, samples: Sequence[Sequence[int]]) -> tuple[bytes, int]:
     """Return the data of a packet with the first of these gyro samples, and how many of them it holds.
 
@@ -314,14 +311,9 @@ def _narrow(x: int, y: int, z: int) -> bytes:
     return _NARROW.pack((x & mask) | (y & mask) << NARROW_BITS | (z & mask) << 2 * NARROW_BITS)
 
 
-def decode_looped(data: bytes) -> Looped:
+def decode_loop(data: bytes) -> Loop:
     """Read the board's report; `WireError` when it is too short."""
-    *head, m1, m2, m3, m4, fused, refused, age = _unpack(_LOOP, data)
-    used, waiting, state, cause, fresh, held, late, lost, doubled = head
-    return Looped(
-        used, waiting, state, cause, bool(fresh), held, late, lost, doubled, (m1, m2, m3, m4), fused,
-        refused, 100 * age,
-    )  # fmt: skip
+    return Loop(*_unpack(_LOOP, data))
 
 
 def encode_request(kind: Message, body: bytes, session: int, number: int) -> bytes:

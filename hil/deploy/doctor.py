@@ -22,8 +22,8 @@ from firmware_py.wire.core_port import (
     WRITE_MAX,
     About,
     Hil,
-    Looped,
-    decode_looped,
+    Loop,
+    decode_loop,
     health,
     loop,
     read,
@@ -147,7 +147,7 @@ def _health(client: CoreClient) -> Iterator[Finding]:
     low, high = BATTERY_MV
     yield Finding("battery", f"{last.battery_mv / 1000:.2f} V", low <= last.battery_mv <= high)
     yield Finding("RAM", f"{last.heap_free} B free")
-    counts = np.array([look.gyro for look in looks], float)
+    counts = np.array([(look.gyro_x, look.gyro_y, look.gyro_z) for look in looks], float)
     zero, noise = counts.mean(axis=0), counts.std(axis=0)
     known = "" if last.calibrated else ", zero not found yet"
     told = f"zero at {zero[0]:.0f} {zero[1]:.0f} {zero[2]:.0f} counts, noise {noise.max():.1f}{known}"
@@ -204,11 +204,11 @@ def _loop(client: CoreClient) -> Finding:
     return Finding("loop", f"carries {rate:.0f} samples/s of 1000: {counts}", window.used >= LOOP_SAMPLES)
 
 
-def _told(client: CoreClient, window: SampleWindow) -> Looped | None:
+def _told(client: CoreClient, window: SampleWindow) -> Loop | None:
     """Pass the board's reports to the window and return the last; wait for one if the window is full."""
     told = None
     for packet in map(crtp.decode, client.packets.received(LOOK_S if window.full else 0.0)):
         if (packet.port, packet.channel) == (PORT_CORE, CHANNEL_LOOP):
-            told = decode_looped(packet.data)
+            told = decode_loop(packet.data)
             window.hear(told, clock_us())
     return told

@@ -31,8 +31,8 @@ from firmware_py.wire.core_port import (
     HIL_WAITING,
     PORT_CORE,
     Hil,
-    Looped,
-    decode_looped,
+    Loop,
+    decode_loop,
     loop,
 )
 from firmware_py.wire.crtp import Packet, decode_ext_pose, encode_ext_pose
@@ -124,7 +124,7 @@ class RealFirmware:
 
     def __init__(self, real: RealBoard, board: Board) -> None:
         self.kernel = self.statistics = _Clock()
-        self._told: Looped | None = None  # last
+        self._told: Loop | None = None  # last
         self._delay_us = 0  # recent mean, from a sample to the counts it caused
         self._added_us = 0  # the link's latency, which corrections add to their age
         self._stood_us = 0  # total pause of simulated time because the board was late
@@ -219,20 +219,20 @@ class RealFirmware:
         packet = crtp.decode(raw)
         if packet.port != PORT_CORE or packet.channel != CHANNEL_LOOP:
             return
-        told = self._told = decode_looped(packet.data)
+        told = self._told = decode_loop(packet.data)
         self._heard_us = self.kernel.now_us
         supervisor = self._supervisor
         supervisor.state, supervisor.cause = State(told.state), Cause(told.cause)
         counters = self.signals.counters
         counters[COUNTERS.index("fused")] = told.fused
         counters[COUNTERS.index("refused")] = told.refused
-        counters[COUNTERS.index("pose_age_us")] = told.age_us
+        counters[COUNTERS.index("pose_age_us")] = 100 * told.age
         self.signals.count[:] = told.counts
         self._board.write_compare(told.counts)
         if self._window.hear(told, self._wall.wall_us()) and told.fresh:
             self._measure(told)
 
-    def _measure(self, told: Looped) -> None:
+    def _measure(self, told: Loop) -> None:
         """Measure the age of the sample behind these counts, and keep as many waiting as the board wants."""
         window = self._window
         batch_us = (window.batch - 1) * SAMPLE_US // 2  # a sample's mean wait for its packet

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Sequence
 from itertools import islice
 
-from firmware_py.wire.core_port import SAMPLES_MAX, Looped, encode_samples
+from firmware_py.wire.core_port import SAMPLES_MAX, Loop, encode_samples
 
 # samples: the ten between two steps of the controller, and twenty for which the tuned hover holds its limits
 WINDOW = 30
@@ -41,7 +41,7 @@ class SampleWindow:
         self._samples.append(sample)
         self.count += 1
 
-    def hear(self, told: Looped, now_us: int) -> bool:
+    def hear(self, told: Loop, now_us: int) -> bool:
         """Take a report of the board; return whether it has taken more samples."""
         taken = told.used - self.used & 0xFFFF
         acknowledged = self.count - len(self._samples)

@@ -4,12 +4,12 @@ from itertools import count
 
 import pytest
 
-from firmware_py.wire.core_port import SAMPLES, SAMPLES_MAX, Looped
+from firmware_py.wire.core_port import SAMPLES, SAMPLES_MAX, Loop
 from hil.devices.sample_window import PACKETS, REPEAT_US, SAMPLES_MIN, WINDOW, SampleWindow
 
 
-def told(used: int, waiting: int, lost: int = 0) -> Looped:
-    return Looped(used & 0xFFFF, waiting, 2, 0, True, 0, 0, lost, 0, (0, 0, 0, 0), 0, 0, 0)
+def told(used: int, waiting: int, lost: int = 0) -> Loop:
+    return Loop(used & 0xFFFF, waiting, 2, 0, True, 0, 0, lost, *(0,) * 8)
 
 
 def number(data: bytes | None) -> int | None:
