@@ -21,7 +21,7 @@ from hil.errors import LabError, require, writing
 
 if TYPE_CHECKING:
     from hil.design.analysis import Analysis
-    from hil.design.sweeps import Point
+    from hil.design.linear import Point
 
 SPEED_MAX = 60.0  # [m/s] the largest that a profile allows
 
@@ -166,7 +166,7 @@ def write_profile(point: "Point", path: Path, about: str, length: float = 1.0) -
 def point_of(robot: DesignOptions) -> "Point":
     """Return a profile's robot, or a similar one, in its design hover or at another speed or angle."""
     from hil.config import load_config
-    from hil.design.sweeps import point_of as own_point_of
+    from hil.design.linear import point_of as own_point_of
     from hil.design.trim import opening_at, scaled
 
     speed, angle = robot.speed, robot.angle

@@ -93,7 +93,7 @@ def _fly(
     from hil.campaigns.run import Runner
     from hil.config import load_config
     from hil.design.analysis import analyse
-    from hil.design.sweeps import point_of
+    from hil.design.linear import point_of
     from hil.studies import drag_model
     from hil.studies.paper import fly_paper
     from hil.studies.paper_identification import fly_identification, fly_scaling

@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from hil.design import figures
-from hil.design.authority import QUANTITIES, attainable, pressure_at, single, wrenches
+from hil.design.authority import QUANTITIES, attainable, authorities, pressure_at, single, wrenches
 from hil.design.claims import Claim, claims, robot_lines
-from hil.design.linear import calm_plates
-from hil.design.sweeps import Point, authorities, hover_angles, scaling, stability
+from hil.design.linear import Point, calm_plates
+from hil.design.sweeps import hover_angles, scaling, stability
 from hil.floaty.shape import SIGNS
 from hil.pictures.pages import saved, write_page
 from hil.world import layout as at
@@ -48,8 +48,8 @@ def model_error(point: Point) -> float:
 def analyse(point: Point) -> Analysis:
     """Return trim, linear dynamics, authority, sweeps and the paper's claims of a robot, with their pictures."""
     stable, angles, laws = stability(point), hover_angles(point), scaling(point)
-    reached = attainable(point.geometry, point.opening, point.low, point.high)
-    alone, about = single(point.geometry, point.opening, point.low, point.high), authorities(point)
+    reached = attainable(point)
+    alone, about = single(point), authorities(point)
     units = dict(zip(QUANTITIES, ("rad/s²", "rad/s²", "rad/s²", "weights"), strict=True))
     inputs = [
         (

@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.design.linear import Linear
+from hil.design.linear import Point
 from hil.floaty.geometry import axis_of, weigh
 from hil.floaty.shape import MIRRORS, MIX, SIGNS, flap_plates
 from hil.world.config import GeometryConfig
@@ -19,6 +19,7 @@ from hil.world.motion import GRAVITY
 GRID = 11  # openings of each flap between its limits
 LEVEL_SHARE = 0.02  # of the weight: a lift within it holds the height
 QUANTITIES = ("roll", "pitch", "yaw", "lift")  # [rad/s2] three times, then in weights
+INPUT_CONSTANTS = dict(zip(QUANTITIES, ("roll_u1", "pitch_u2", "yaw_u3", "z_u4"), strict=True))
 Wrenches = NDArray[np.float64]  # (N, 6) force [N] and torque [N m] in B
 
 
@@ -55,49 +56,38 @@ def pressure_at(geometry: GeometryConfig, opening: float) -> float:
     return float(weigh(geometry).mass * GRAVITY / lift)
 
 
-def _accelerations(
-    geometry: GeometryConfig, opening: float, openings: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return (N, 4) in the order of QUANTITIES, at the hover with `opening`."""
-    weight = weigh(geometry)
-    found = wrenches(geometry, openings, pressure_at(geometry, opening))
+def _accelerations(point: Point, openings: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (N, 4) in the order of QUANTITIES, at the hover."""
+    weight = weigh(point.geometry)
+    found = wrenches(point.geometry, openings, pressure_at(point.geometry, point.opening))
     return np.column_stack((found[:, 3:] / weight.inertia, found[:, 2] / (weight.mass * GRAVITY)))
 
 
-def attainable(geometry: GeometryConfig, opening: float, low: float, high: float) -> Attainable:
-    """Return the accelerations that the flaps attain between two openings [rad], at the hover with `opening`."""
-    grid = np.linspace(low, high, GRID)
-    every = _accelerations(geometry, opening, np.array(list(product(grid, repeat=4))))
+def attainable(point: Point) -> Attainable:
+    """Return the accelerations that the flaps attain between their limits, at the hover."""
+    grid = np.linspace(point.low, point.high, GRID)
+    every = _accelerations(point, np.array(list(product(grid, repeat=4))))
     level = every[np.abs(every[:, 3] - 1.0) < LEVEL_SHARE]
     return Attainable(every, level)
 
 
-def reach(opening: float, low: float, high: float) -> float:
-    """Return the angle [rad] that every flap can turn in both directions from the hover."""
-    return max(min(opening - low, high - opening), 0.0)
-
-
-def single(
-    geometry: GeometryConfig, opening: float, low: float, high: float
-) -> dict[str, tuple[float, float]]:
+def single(point: Point) -> dict[str, tuple[float, float]]:
     """Return each input's smallest and largest own quantity, reached alone inside the flaps' range."""
     found = {}
     for index, name in enumerate(QUANTITIES):
         towards = SIGNS * MIX[:, index]  # of u on the openings: theta = SIGNS * opening
-        ends = [(limit - opening) / t for t in towards for limit in (low, high)]
+        ends = [(limit - point.opening) / t for t in towards for limit in (point.low, point.high)]
         least, most = max(e for e in ends if e <= 0), min(e for e in ends if e >= 0)
         u = np.linspace(least, most, 81)
-        values = _accelerations(geometry, opening, opening + u[:, None] * towards)[:, index]
+        values = _accelerations(point, point.opening + u[:, None] * towards)[:, index]
         found[name] = (float(values.min()), float(values.max()))
     return found
 
 
-def authority(linear: Linear, opening: float, low: float, high: float) -> dict[str, float]:
+def authorities(point: Point) -> dict[str, float]:
     """Return each input's authority about the hover: |input constant| times the reach; [1/s2] of angles, [m/s2] of lift."""
-    f, far = linear.constants, reach(opening, low, high)
-    return {
-        "roll": abs(f.roll_u1) * far, "pitch": abs(f.pitch_u2) * far, "yaw": abs(f.yaw_u3) * far, "lift": abs(f.z_u4) * far,
-    }  # fmt: skip
+    f = point.linear.constants
+    return {name: abs(getattr(f, constant)) * point.reach for name, constant in INPUT_CONSTANTS.items()}
 
 
 def least(authorities: dict[str, float], of: dict[str, float]) -> float:

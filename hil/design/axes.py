@@ -86,8 +86,8 @@ AXES = (
 ROLL, PITCH, YAW, HEIGHT = AXES
 
 
-def robot_of(config: LabConfig, delay_s: float = OWN_DELAY_S) -> dict[str, float]:
-    return {**config.model.model_dump(), DELAY: delay_s}
+def robot_of(config: LabConfig) -> dict[str, float]:
+    return {**config.model.model_dump(), DELAY: OWN_DELAY_S}
 
 
 def gains_in(config: LabConfig, axis: Axis) -> Matrix:

@@ -13,7 +13,7 @@ import numpy as np
 from hil.design import sweeps
 from hil.design.authority import wrenches
 from hil.design.axes import AXES, PITCH, ROLL
-from hil.design.linear import places
+from hil.design.linear import Point, places
 from hil.design.trim import balanced, changed
 from hil.floaty.geometry import weigh
 from hil.floaty.paper_table import PAPER_TABLE
@@ -70,7 +70,7 @@ def text_of(poles: list[complex]) -> str:
 
 
 def claims(
-    point: sweeps.Point,
+    point: Point,
     stability: sweeps.Stability,
     angles: sweeps.HoverAngles,
     laws: tuple[sweeps.PowerLaw, ...],
@@ -86,7 +86,7 @@ def claims(
     ]
 
 
-def _flat_high(point: sweeps.Point) -> Iterator[Claim]:
+def _flat_high(point: Point) -> Iterator[Claim]:
     """Yield the claims about flat flaps with the centre of mass in their plane."""
     high = sweeps.flat_high(point).linear
     lowered = balanced(changed(point.geometry, kink_angle=0.0), 0.0)
@@ -108,7 +108,7 @@ def _flat_high(point: sweeps.Point) -> Iterator[Claim]:
     )  # fmt: skip
 
 
-def _stable(point: sweeps.Point, sweep: sweeps.Stability) -> Iterator[Claim]:
+def _stable(point: Point, sweep: sweeps.Stability) -> Iterator[Claim]:
     linear, f = point.linear, point.linear.constants
     ours = f"{f.roll_roll:+.1f} 1/s²"
     yield Claim("kink and low centre of mass: f_αα", DESIGN, "≈ -16 1/s²", ours, _near(f.roll_roll, -16.0))
@@ -137,7 +137,7 @@ def _stable(point: sweeps.Point, sweep: sweeps.Stability) -> Iterator[Claim]:
     yield Claim("dynamics decouple into roll, pitch, yaw and height", DESIGN, "four parts", ours, holds)
 
 
-def _authority(point: sweeps.Point, angles: sweeps.HoverAngles) -> Iterator[Claim]:
+def _authority(point: Point, angles: sweeps.HoverAngles) -> Iterator[Claim]:
     for criterion in angles.criteria:
         best, low, high = (degrees(angle) for angle in angles.best(criterion))
         yield Claim(
@@ -167,7 +167,7 @@ def _sign_change(angles: sweeps.HoverAngles) -> str:
     return f"its input constant changes sign at {degrees(sweeps.OPENINGS[changes[0]]):.1f}°."
 
 
-def _scale(point: sweeps.Point, laws: tuple[sweeps.PowerLaw, ...]) -> Iterator[Claim]:
+def _scale(point: Point, laws: tuple[sweeps.PowerLaw, ...]) -> Iterator[Claim]:
     for law in laws:
         yield Claim(
             f"{law.quantity} over {law.cause}", SCALING, f"exponent {law.paper:g}", f"{round(law.exponent, 6) + 0.0:.4f}",
@@ -181,7 +181,7 @@ def _scale(point: sweeps.Point, laws: tuple[sweeps.PowerLaw, ...]) -> Iterator[C
     )  # fmt: skip
 
 
-def _forces(point: sweeps.Point, model_error: float) -> Iterator[Claim]:
+def _forces(point: Point, model_error: float) -> Iterator[Claim]:
     yield Claim(
         "plant and the Supplement's plate equations", FORCES, "the same", f"differ by at most {model_error:.0e} N, N m",
         _holds(model_error < 1e-9),
@@ -206,7 +206,7 @@ def _forces(point: sweeps.Point, model_error: float) -> Iterator[Claim]:
         )  # fmt: skip
 
 
-def robot_lines(point: sweeps.Point) -> list[tuple[str, str]]:
+def robot_lines(point: Point) -> list[tuple[str, str]]:
     """Return a description of the robot, in words and figures."""
     weight, linear = weigh(point.geometry), point.linear
     ix, iy, iz = (1e3 * moment for moment in weight.inertia)

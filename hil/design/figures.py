@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from hil.design.authority import QUANTITIES, Attainable
-from hil.design.sweeps import FACTORS, HEIGHTS, KINKS, OPENINGS, HoverAngles, Point, PowerLaw, Stability
+from hil.design.linear import Point
+from hil.design.sweeps import FACTORS, HEIGHTS, KINKS, OPENINGS, HoverAngles, PowerLaw, Stability
 from hil.floaty.drawing import look_of
 from hil.floaty.geometry import weigh
 from hil.floaty.shape import SIGNS

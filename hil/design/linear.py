@@ -8,7 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hil.config import LabConfig
 from hil.design.axes import ANGLE, AXES, FLAP, NUISANCES, PITCH, RATE, ROLL, VELOCITY, Axis, Matrix
+from hil.design.trim import coefficient_of, speed_at
 from hil.floaty.correction import DIFFERENCE, Constants, accelerations, calm, slope
 from hil.floaty.plant import assemble
 from hil.world.config import GeometryConfig, PlantConfig, TunnelConfig
@@ -94,3 +96,34 @@ def stiffness(geometry: GeometryConfig, speed: float, opening: float) -> float:
     c = calm_plates(geometry, speed, opening)
     change = accelerations(c, "qx", DIFFERENCE) - accelerations(c, "qx", -DIFFERENCE)
     return float(change[3]) / (2 * DIFFERENCE)
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A robot at its hover."""
+
+    geometry: GeometryConfig
+    coefficient: float  # of drag
+    opening: float  # [rad]
+    low: float  # [rad] smallest and largest opening
+    high: float
+
+    @property
+    def speed(self) -> float:
+        """The updraft [m/s]."""
+        return speed_at(self.geometry, self.coefficient, self.opening)
+
+    @property
+    def reach(self) -> float:
+        """The angle [rad] that every flap can turn in both directions from the hover."""
+        return max(min(self.opening - self.low, self.high - self.opening), 0.0)
+
+    @property
+    def linear(self) -> Linear:
+        return linear(self.geometry, self.speed, self.opening)
+
+
+def point_of(config: LabConfig) -> Point:
+    """Return a profile's robot at its design hover."""
+    opening, limits = config.plant.hover_angle, config.allocation
+    return Point(config.geometry, coefficient_of(config), opening, limits.opening_min, limits.opening_max)

@@ -19,10 +19,10 @@ from scipy.optimize import differential_evolution, minimize
 from scipy.special import ndtri
 from scipy.stats import qmc
 
-from hil.design.authority import QUANTITIES, least
+from hil.design.authority import QUANTITIES, authorities, least
 from hil.design.axes import PITCH, ROLL
-from hil.design.linear import Linear, places
-from hil.design.sweeps import RESERVE, Point, authorities
+from hil.design.linear import Linear, Point, places
+from hil.design.sweeps import RESERVE
 from hil.design.trim import balanced, changed, opening_at, speed_at
 from hil.errors import LabError
 from hil.floaty.geometry import weigh

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from hil.design.sweeps import Point
+from hil.design.linear import Point
 from hil.world.config import GeometryConfig
 
 

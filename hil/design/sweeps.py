@@ -7,11 +7,10 @@ from math import radians
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.config import LabConfig
-from hil.design.authority import QUANTITIES, authority, reach
+from hil.design.authority import INPUT_CONSTANTS, QUANTITIES
 from hil.design.axes import ROLL
-from hil.design.linear import Linear, linear, stiffness
-from hil.design.trim import balanced, changed, coefficient_of, scaled, speed_at
+from hil.design.linear import Point, stiffness
+from hil.design.trim import balanced, changed, scaled, speed_at
 from hil.floaty.correction import Constants
 from hil.floaty.geometry import weigh
 from hil.floaty.shape import AIR_DENSITY
@@ -25,32 +24,6 @@ VISCOSITY = 1.81e-5  # [Pa s] of air at 15 deg C, dynamic
 NEAR_BEST = 0.95  # share of the best figure at which hover angles count as equally good
 RESERVE = radians(8.0)  # of the opening, for attitude: 95 % of the hover's time (hil/experiments/airspeed.py)
 Curve = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class Point:
-    """A robot at its hover."""
-
-    geometry: GeometryConfig
-    coefficient: float  # of drag
-    opening: float  # [rad]
-    low: float  # [rad] smallest and largest opening
-    high: float
-
-    @property
-    def speed(self) -> float:
-        """The updraft [m/s]."""
-        return speed_at(self.geometry, self.coefficient, self.opening)
-
-    @property
-    def linear(self) -> Linear:
-        return linear(self.geometry, self.speed, self.opening)
-
-
-def point_of(config: LabConfig) -> Point:
-    """Return a profile's robot at its design hover."""
-    opening, limits = config.plant.hover_angle, config.allocation
-    return Point(config.geometry, coefficient_of(config), opening, limits.opening_min, limits.opening_max)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,12 +74,12 @@ class HoverAngles:
 
 def hover_angles(point: Point) -> HoverAngles:
     """Return the sweep over the hover angle; the updraft follows."""
-    found = [replace(point, opening=opening).linear.constants for opening in OPENINGS.tolist()]
-    names = dict(zip(QUANTITIES, ("roll_u1", "pitch_u2", "yaw_u3", "z_u4"), strict=True))
-    constants = {key: np.array([getattr(f, name) for f in found]) for key, name in names.items()}
+    points = [replace(point, opening=opening) for opening in OPENINGS.tolist()]
+    found = [one.linear.constants for one in points]
+    constants = {key: np.array([getattr(f, name) for f in found]) for key, name in INPUT_CONSTANTS.items()}
     sizes = {key: np.maximum(values, 0.0) for key, values in constants.items()}
     shares = np.array([sizes[key] / sizes[key].max() for key in QUANTITIES])
-    reaches = np.array([reach(opening, point.low, point.high) for opening in OPENINGS.tolist()])
+    reaches = np.array([one.reach for one in points])
     criteria = {
         "√(yaw · lift)": np.sqrt(sizes["yaw"] * sizes["lift"]),
         "mean of four × flaps' reach": np.prod(shares, axis=0) ** 0.25 * reaches,
@@ -180,8 +153,3 @@ def updrafts(point: Point) -> tuple[float, float]:
 def flat_high(point: Point) -> Point:
     """Return the paper's first idea: flat flaps, the centre of mass in their plane, the same inertia."""
     return replace(point, geometry=balanced(changed(point.geometry, kink_angle=0.0), 0.0, keep_inertia=True))
-
-
-def authorities(point: Point) -> dict[str, float]:
-    """Return the authority of each input about the hover."""
-    return authority(point.linear, point.opening, point.low, point.high)

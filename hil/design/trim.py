@@ -54,31 +54,16 @@ def changed(geometry: GeometryConfig, **changes: Any) -> GeometryConfig:
 
 def scaled(geometry: GeometryConfig, length: float, mass: float) -> GeometryConfig:
     """Return the similar robot: all lengths times `length`, all masses times `mass`."""
-    masses = [
-        one.model_dump()
-        | {
-            "mass": mass * one.mass,
-            "place": tuple(length * x for x in one.place),
-            "size": tuple(length * x for x in one.size),
-        }
-        for one in geometry.masses
-    ]
-    inertia = geometry.inertia
-    if inertia != "masses":
-        inertia = (*(mass * length * length * moment for moment in inertia),)  # type: ignore[assignment]
-    lengths = {
-        name: length * getattr(geometry, name)
-        for name in ("footprint", "base_side", "strip_width", "flow_point")
-    }
-    outline = tuple((length * x, length * y) for x, y in geometry.outline)
-    return changed(
-        geometry,
-        **lengths,
-        outline=outline,
-        flap_mass=mass * geometry.flap_mass,
-        masses=masses,
-        inertia=inertia,
-    )
+    masses = []
+    for one in geometry.masses:
+        longer = {name: tuple(length * x for x in getattr(one, name)) for name in ("place", "size")}
+        masses.append(one.model_dump() | longer | {"mass": mass * one.mass})
+    lengths = ("footprint", "base_side", "strip_width", "flow_point")
+    changes: dict[str, Any] = {name: length * getattr(geometry, name) for name in lengths}
+    changes["outline"] = tuple((length * x, length * y) for x, y in geometry.outline)
+    if geometry.inertia != "masses":
+        changes["inertia"] = tuple(mass * length * length * moment for moment in geometry.inertia)
+    return changed(geometry, **changes, flap_mass=mass * geometry.flap_mass, masses=masses)
 
 
 def balanced(geometry: GeometryConfig, height: float, keep_inertia: bool = False) -> GeometryConfig:

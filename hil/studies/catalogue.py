@@ -15,7 +15,8 @@ from functools import cache
 import numpy as np
 
 from hil.config import DEFAULT_PROFILE, load_config
-from hil.design.sweeps import RESERVE, Point, point_of
+from hil.design.linear import Point, point_of
+from hil.design.sweeps import RESERVE
 from hil.design.trim import opening_at
 from hil.errors import LabError, hint
 from hil.laboratory.request import Options

@@ -14,8 +14,7 @@ from hil.design import sweeps
 from hil.design.authority import attainable, pressure_at, single, wrenches
 from hil.design.axes import ROLL
 from hil.design.claims import claims
-from hil.design.linear import Linear, linear
-from hil.design.sweeps import Point
+from hil.design.linear import Linear, Point, linear
 from hil.design.trim import balanced, changed, coefficient_of, opening_at, scaled, speed_at
 from hil.errors import LabError
 from hil.floaty.geometry import weigh
@@ -151,7 +150,7 @@ def test_inputs_alone_end_at_the_flaps_limits() -> None:
         force, torque = plant.mounted_wrench((SIGNS * openings).tolist())
         return np.array([*(torque / weigh(G0).inertia), force[2] / (0.34 * 9.81)])
 
-    alone = single(G0, HOVER, 0.0, 0.9)
+    alone = single(PAPER)
     assert alone["lift"][0] == pytest.approx(at(*4 * (0.9,))[3])
     # Bent strips lie level then.
     assert alone["lift"][1] == pytest.approx(at(*4 * (math.radians(3.6),))[3], rel=1e-3)
@@ -163,8 +162,8 @@ def test_inputs_alone_end_at_the_flaps_limits() -> None:
 
 
 def test_the_attainable_set_contains_what_single_inputs_do_and_is_mirror_symmetric() -> None:
-    found = attainable(G0, HOVER, 0.0, 0.9)
-    alone = single(G0, HOVER, 0.0, 0.9)
+    found = attainable(PAPER)
+    alone = single(PAPER)
     for index, (least, most) in enumerate(alone.values()):
         assert found.all[:, index].min() <= least + 1e-9
         assert found.all[:, index].max() >= 0.95 * most  # on a grid

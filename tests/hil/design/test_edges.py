@@ -1,15 +1,17 @@
 """Edges of trim, authority, sweeps and margins: two trims at one speed, ends of ranges, phases beyond half a turn."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hil.config import load_config
 from hil.design import sweeps
-from hil.design.authority import reach, single
+from hil.design.authority import single
+from hil.design.linear import Point
 from hil.design.margins import Margins, margins_of, worst
-from hil.design.sweeps import HoverAngles, Point
+from hil.design.sweeps import HoverAngles
 from hil.design.trim import OPENINGS, balanced, changed, coefficient_of, opening_at, scaled, speed_at
 from hil.floaty.geometry import weigh
 from support.geometries import geometries
@@ -50,12 +52,12 @@ def test_a_similar_robot_has_the_inertia_of_its_masses_and_lengths(geometry) -> 
     [(0.4, 0.4), (0.45, 0.45), (0.6, 0.3), (0.0, 0.0), (0.9, 0.0), (1.0, 0.0), (-0.1, 0.0)],
 )
 def test_the_reach_is_to_the_nearer_limit(opening: float, far: float) -> None:
-    assert reach(opening, 0.0, 0.9) == pytest.approx(far)
+    assert replace(PAPER, opening=opening).reach == pytest.approx(far)
 
 
 def test_an_input_alone_takes_no_flap_beyond_its_limits() -> None:
-    least, most = single(G0, math.radians(25.0), math.radians(15.0), math.radians(30.0))["lift"]
-    wide_least, wide_most = single(G0, math.radians(25.0), 0.0, 0.9)["lift"]
+    least, most = single(replace(PAPER, low=math.radians(15.0), high=math.radians(30.0)))["lift"]
+    wide_least, wide_most = single(PAPER)["lift"]
     assert wide_least < least < 1.0 < most < wide_most
     assert most - 1.0 > 1.0 - least, "10 degrees to close and 5 to open"
 

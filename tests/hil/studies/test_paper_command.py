@@ -13,7 +13,7 @@ import pytest
 from hil.campaigns.jobs import Job, Row, fly_job
 from hil.config import load_config
 from hil.design.analysis import analyse
-from hil.design.sweeps import point_of
+from hil.design.linear import point_of
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import METRICS
 from hil.laboratory.request import Options

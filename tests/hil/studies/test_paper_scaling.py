@@ -9,7 +9,7 @@ from rich.console import Console
 from hil.campaigns.run import Runner
 from hil.config import load_config
 from hil.design.claims import AGREES
-from hil.design.sweeps import point_of
+from hil.design.linear import point_of
 from hil.floaty.geometry import weigh
 from hil.studies.paper_identification import SIZES, fly_scaling
 
