@@ -97,11 +97,7 @@ def _write_poses(log: pa.Table, context: foxglove.Context) -> None:
     tf = channels.FrameTransformsChannel("/tf", context=context)
     for us, truth, goal, estimate in _places(log):
         time, log_time = _timestamp(us), NS_PER_US * us
-        for name, frame, place in (
-            (eyes, WORLD, truth),
-            ("goal", WORLD, goal),
-            ("estimate", GOAL, estimate),
-        ):
+        for name, frame, place in ((eyes, WORLD, truth), ("goal", WORLD, goal), ("estimate", GOAL, estimate)):
             pose = messages.Pose(position=_vector(place), orientation=_turn(place))
             shown[name].log(
                 messages.PoseInFrame(timestamp=time, frame_id=frame, pose=pose), log_time=log_time

@@ -33,6 +33,7 @@ BOARD, STATION = (1, 1), (255, 190)  # system and component
 INFO = 6  # severity of a text
 SLOW = 100  # rows between heartbeats, and between voltages: 1 Hz
 ROWS = 2  # between motions: 50 Hz, MAVLink's usual best
+ESTIMATED = ("x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw", "p", "q", "r")
 Sent = tuple[int, tuple[int, int], Any]  # time [us], sender, message
 
 
@@ -57,13 +58,7 @@ def _flown(log: pa.Table) -> Iterator[Sent]:
     columns = {name: log.column(name).to_pylist() for name in log.column_names}
     truth = body(log, "x", "y", "z", "qw", "qx", "qy", "qz").tolist()
     goal = column(log, "goal.x", "goal.y", "goal.z", "goal.yaw").tolist()
-    estimate = column(
-        log,
-        *(
-            f"estimate.{name}"
-            for name in ("x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw", "p", "q", "r")
-        ),
-    ).tolist()
+    estimate = column(log, *(f"estimate.{name}" for name in ESTIMATED)).tolist()
     sent_goal = None
     for row, us in enumerate(columns["t"]):
         if goal[row] != sent_goal:

@@ -195,12 +195,11 @@ def advance_all(
         observe(parameters[0], estimator[0], previous[n], observations[n])
         dx, dy, dz = s[at.P] - goal[0], s[at.P + 1] - goal[1], s[at.P + 2] - goal[2]
         turned = wrapped(rings[n, newest, 8] - goal[3])
-        rewards[n] = reward_of(
+        distance, tilt = (
             math.sqrt(dx * dx + dy * dy + dz * dz),
             tilt_of(s[at.R + 6], s[at.R + 7], s[at.R + 8]),
-            turned,
-            change,
         )
+        rewards[n] = reward_of(distance, tilt, turned, change)
 
 
 @compiled

@@ -192,14 +192,8 @@ class FastEnv(gymnasium.Env[batch.Actions, batch.Actions]):
         limited = _checked(action, 1)
         self._fleet.advance(limited, self.np_random, self._observation, self._reward)
         self._steps += 1
-        lost = bool(self._fleet.lost[0])
-        return (
-            np.clip(self._observation[0], -REACH, REACH),
-            float(self._reward[0]),
-            lost,
-            self._steps >= self._setup.steps,
-            {},
-        )
+        lost, late = bool(self._fleet.lost[0]), self._steps >= self._setup.steps
+        return np.clip(self._observation[0], -REACH, REACH), float(self._reward[0]), lost, late, {}
 
     @property
     def truth(self) -> NDArray[np.float64]:

@@ -194,13 +194,8 @@ class _Socket(_Guarded, WebSocketHandler):
         elif line.isprintable() and 0 < len(line) <= LINE_MOST:
             self.panel.typed(line)
         else:
-            self.tell(
-                {
-                    "texts": [
-                        f"panel: a line of {len(message)} characters: expected 1..{LINE_MOST} printable ones"
-                    ]
-                }
-            )
+            text = f"panel: a line of {len(message)} characters: expected 1..{LINE_MOST} printable ones"
+            self.tell({"texts": [text]})
 
     def on_close(self) -> None:
         self.panel.pages.discard(self)
@@ -210,13 +205,7 @@ class _Socket(_Guarded, WebSocketHandler):
         texts = [*self._late.get("texts", ()), *message.get("texts", ())]
         values = {**self._late.get("values", {}), **message.get("values", {})}
         rows = [*self._late.get("curves", ()), *message.get("curves", ())]
-        self._late = {
-            **self._late,
-            **message,
-            "texts": texts[-TEXTS_MOST:],
-            "values": values,
-            "curves": rows[-ROWS_MOST:],
-        }
+        self._late |= message | {"texts": texts[-TEXTS_MOST:], "values": values, "curves": rows[-ROWS_MOST:]}
         if not self._sending:
             IOLoop.current().add_callback(self._send)
 
@@ -267,11 +256,7 @@ def _state(row: pa.Table) -> dict[str, Any]:
 def _curves(rows: pa.Table) -> dict[str, Any]:
     """Return the title and names of each graph, and time [s] and all values of every fifth row; None where unknown."""
     some = rows.take(np.arange(0, rows.num_rows, DRAWN_EVERY))
-    shown = (
-        ("position error", curves.POSITION),
-        ("attitude error", curves.ATTITUDE),
-        *curves.actuators(some),
-    )
+    shown = curves.errors_and_actuators(some)
     table = np.round(
         np.column_stack((curves.since_release(some), *(curve.read(some) for _, curve in shown))), 3
     )

@@ -181,12 +181,8 @@ def difference(a: pa.Table, b: pa.Table) -> Plot | None:
         times, miss = _miss(a, b, curve)
         if len(times) > 1:
             lines = zip(curve.names, curve.colours, miss.T, strict=True)
-            panels.append(
-                Panel(
-                    f"{label} [{curve.unit}]",
-                    tuple(Series(name, colour, times, values) for name, colour, values in lines),
-                )
-            )
+            series = tuple(Series(name, colour, times, values) for name, colour, values in lines)
+            panels.append(Panel(f"{label} [{curve.unit}]", series))
     return Plot(tuple(panels)) if panels else None
 
 

@@ -72,6 +72,11 @@ def actuators(log: pa.Table) -> tuple[tuple[str, Curves], ...]:
     return tuple((name, plot) for name, plot in moving if plot.fits(log.column_names))
 
 
+def errors_and_actuators(log: pa.Table) -> tuple[tuple[str, Curves], ...]:
+    """Return the errors of position and attitude, and what moves the robot, with their names."""
+    return (("position error", POSITION), ("attitude error", ATTITUDE), *actuators(log))
+
+
 def command_of(plot: Curves, log: pa.Table) -> Curves | None:
     """Return the commands of actuators in their own unit; None where the log has none."""
     command = FLAPS_COMMAND if plot is FLAPS else ROTORS_COMMAND if plot is ROTORS else None

@@ -49,8 +49,7 @@ def png(draw: Callable[..., Plot | Figure], *flights: pa.Table) -> bytes:
 
 def plotted(log: pa.Table, names: Sequence[str]) -> Figure:
     """Return a figure of columns of a log, a panel for each unit; without names, of errors and flaps."""
-    moving = ((plot, name) for name, plot in curves.actuators(log))
-    shown = ((curves.POSITION, "position error"), (curves.ATTITUDE, "attitude error"), *moving)
+    shown = () if names else curves.errors_and_actuators(log)
     times, by_unit = curves.since_release(log), dict[str, list[Series]]()
     for index, name in enumerate(names):
         values = column(log, name)  # raises for a name that the log lacks
@@ -58,7 +57,7 @@ def plotted(log: pa.Table, names: Sequence[str]) -> Figure:
         line = Series(name, curves.SERIES_COLOURS[index % len(curves.SERIES_COLOURS)], times, values)
         by_unit.setdefault(unit, []).append(line)
     chosen = [Panel(f"[{unit or '1'}]", tuple(lines), height=2.2) for unit, lines in by_unit.items()]
-    standard = [panels.panel(curve, log, label, height=1.9) for curve, label in shown] if not names else []
+    standard = [panels.panel(curve, log, label, height=1.9) for label, curve in shown]
     with matplotlib.rc_context(STYLE):
         return figure_of(Plot((*chosen, *standard)), marks_of_flight(log))
 

@@ -264,7 +264,6 @@ PICTURES = (
         radio,
         needs="link.retried",
         question=LINK,
-        folded=True,
         about=("radio",),
     ),
     Picture(
@@ -275,7 +274,6 @@ PICTURES = (
         serial_line,
         needs="serial.up_busy",
         question=LINK,
-        folded=True,
         about=("serial",),
     ),
     Picture(
@@ -317,7 +315,6 @@ LATENCY_BUDGET = Picture(
     "Where poses spent their time from the exposure to the board, as the ground station reported for each that it sent.",
     latency_budget,
     question=LINK,
-    folded=True,
     about=("mocap", "radio", "serial"),
 )
 SCHEDULE = Picture(
@@ -327,6 +324,5 @@ SCHEDULE = Picture(
     needs="us",
     alone=True,
     question=PROCESSOR,
-    folded=True,
     about=("cpu",),
 )

@@ -67,7 +67,7 @@ def draw(picture: Picture, marks: Marks, *flights: pa.Table) -> PageFigure:
     acted = {spell.text.partition(".")[0] for spell in marks.spells if spell.kind == "fault"}
     figure = PageFigure(
         picture.title.lower().replace(" ", "-"), picture.title, picture.caption,
-        folded=picture.folded and not acted.intersection(picture.about),
+        folded=bool(picture.about) and not acted.intersection(picture.about),
     )  # fmt: skip
     shown = picture.draw(*flights)
     if isinstance(shown, Still):
@@ -117,12 +117,7 @@ def _panel(panel: Panel) -> dict[str, Any]:
         else:
             tables.append((line.times, [line]))
     return {
-        "label": panel.label,
-        "height": panel.height,
-        "limits": panel.limits,
-        "least": panel.least,
-        "most": panel.most,
-        "stacked": panel.stacked,
+        **{name: getattr(panel, name) for name in ("label", "height", "limits", "least", "most", "stacked")},
         "bars": [asdict(bar) for bar in panel.bars],
         "series": [
             {"name": line.name, "colour": line.colour, "width": line.width, "dashed": line.dashed}

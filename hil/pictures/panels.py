@@ -19,14 +19,9 @@ from hil.pictures.curves import GREY, MOTORS, Curves, marks_of, since_release
 Signal = NDArray[np.float64]  # (N,)
 ROUNDING = 1e-6  # [rad] float32 of a command at its limit
 TOGETHER_S = 0.1  # a flap that leaves its limit for less is drawn as staying there
-WHERE, WHAT, KNOWN, LINK, PROCESSOR = (
-    "Where was it?",
-    "What did it do?",
-    "What did the board know?",
-    "What did the link do?",
-    "What did the processor do?",
-)
-QUESTIONS = (WHERE, WHAT, KNOWN, LINK, PROCESSOR)
+QUESTIONS = WHERE, WHAT, KNOWN, LINK, PROCESSOR = (
+    "Where was it?", "What did it do?", "What did the board know?", "What did the link do?", "What did the processor do?"
+)  # fmt: skip
 INK = "black"  # of the page: in dark mode it is white
 
 
@@ -127,8 +122,7 @@ class Picture:
     needs: str = "t"  # columns of which it needs one at least
     alone: bool = False  # panels with a time axis of their own
     question: str = WHERE  # that it answers, in whose part of the report it is
-    folded: bool = False  # until a reader opens it, or a fault of the groups `about` was injected
-    about: tuple[str, ...] = ()
+    about: tuple[str, ...] = ()  # folded, unless a fault of these groups was injected; empty: never folded
 
     def fits(self, columns: Iterable[str]) -> bool:
         """Whether it can be drawn of a log with these columns."""
@@ -167,10 +161,17 @@ def marks_of_flight(log: pa.Table, lost: str | None = None) -> Marks:
     return Marks(tuple(spells), tuple(instants))
 
 
+def spans(acts: NDArray[np.bool_]) -> list[list[int]]:
+    """Return first and last row + 1 of every run of true values."""
+    edges: list[list[int]] = (
+        np.flatnonzero(np.diff(acts, prepend=False, append=False)).reshape(-1, 2).tolist()
+    )
+    return edges
+
+
 def _spells(kind: str, times: Signal, acts: NDArray[np.bool_], text: str = "") -> Iterator[Spell]:
-    edges = np.flatnonzero(np.diff(acts, prepend=False, append=False)).reshape(-1, 2).tolist()
     joined: list[list[float]] = []
-    for begin, end in edges:
+    for begin, end in spans(acts):
         begin_s, end_s = float(times[begin]), float(times[min(end, len(times) - 1)])
         if joined and begin_s - joined[-1][1] < TOGETHER_S:
             joined[-1][1] = end_s

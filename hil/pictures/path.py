@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hil.pictures import scene
 from hil.pictures.curves import BLUE, RED
-from hil.pictures.panels import Still
+from hil.pictures.panels import Still, spans
 
 Points = NDArray[np.float64]
 
@@ -86,14 +86,6 @@ def path_of(course: FlownPath) -> Still:
         f'font-family="sans-serif"><rect width="{WIDTH}" height="{HEIGHT}" fill="white"/>{"".join(parts)}</svg>'
     )
     return Still(svg.encode(), "svg+xml")
-
-
-def spans(acts: NDArray[np.bool_]) -> list[list[int]]:
-    """Return first and last row + 1 of every run of true values."""
-    edges: list[list[int]] = (
-        np.flatnonzero(np.diff(acts, prepend=False, append=False)).reshape(-1, 2).tolist()
-    )
-    return edges
 
 
 def _ends(view: Points, course: FlownPath) -> Iterator[str]:

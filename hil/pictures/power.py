@@ -55,14 +55,9 @@ def compare(*flights: pa.Table) -> Figure:
     low, high = CONVENTIONAL_W_PER_KG
     scatter.fill_between(masses, low * masses, high * masses, color=curves.GREY, alpha=0.3, linewidth=0)
     for vehicle in VEHICLES:
-        marker = "*" if vehicle.updraft else "o"
-        scatter.plot(
-            vehicle.mass,
-            vehicle.power,
-            marker,
-            color=KIND_COLOURS[vehicle.kind],
-            markersize=9 if vehicle.updraft else 5,
-        )
+        marker, size = ("*", 9) if vehicle.updraft else ("o", 5)
+        colour = KIND_COLOURS[vehicle.kind]
+        scatter.plot(vehicle.mass, vehicle.power, marker, color=colour, markersize=size)
     for kind, colour in KIND_COLOURS.items():
         scatter.plot([], [], "o", color=colour, markersize=5, label=kind)
     scatter.plot(mass, power, "*", color=curves.RED, markersize=13, label="Floaty")

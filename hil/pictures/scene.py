@@ -52,15 +52,8 @@ def net_lines(radius: float, height: float) -> list[Points]:
 
 def box_lines(half: float) -> list[Points]:
     """Return the edges of a cube around the origin as five closed or straight lines."""
-    low, high = (
-        np.array(
-            [
-                (x, y, z)
-                for x, y in ((-half, -half), (half, -half), (half, half), (-half, half), (-half, -half))
-            ]
-        )
-        for z in (-half, half)
-    )
+    square = half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
+    low, high = (np.column_stack((square, np.full(5, z))) for z in (-half, half))
     return [low, high, *(np.array((low[i], high[i])) for i in range(4))]
 
 

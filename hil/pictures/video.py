@@ -165,12 +165,8 @@ class _Graph:
     """The curves, drawn once; at an instant, what is to come is pale."""
 
     def __init__(self, log: pa.Table, flight: pa.Table) -> None:
-        shown = (
-            (curves.POSITION, "position error"),
-            (curves.ATTITUDE, "attitude error"),
-            *((curve, name) for name, curve in curves.actuators(flight)),
-        )
-        plot = Plot(tuple(panel(curve, flight, label) for curve, label in shown))
+        shown = curves.errors_and_actuators(flight)
+        plot = Plot(tuple(panel(curve, flight, label) for label, curve in shown))
         with rc_context(STYLE | {"font.size": 7.0, "legend.fontsize": 6.5}):
             figure = figure_of(plot, marks_of_flight(log))
             figure.set_layout_engine("constrained", h_pad=0.1)

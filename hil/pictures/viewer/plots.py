@@ -76,9 +76,6 @@ class Plots:
     def __init__(self, track: RecordingTrack, schema: pa.Schema) -> None:
         self._track, self._known = track, ShownCurves.of(schema)
         self._states = curves.lanes_of(schema.names)
-        self._refusals = {
-            name: columns for name, (_, columns) in MARKS.items() if set(columns) & set(schema.names)
-        }
         self._slow = schema.empty_table()  # the last row that was a sample of slow quantities
         self._fusion = schema.empty_table()  # the row of the last fused pose
         self._name_all()
@@ -93,7 +90,7 @@ class Plots:
         for path, states in self._states.items():
             begins, names = curves.changes(joined, states)
             self._track.send(f"state/{path}", begins[fresh:], rr.StateChange.columns(state=names[fresh:]))
-        for name, columns in self._refusals.items():
+        for name, (_, columns) in MARKS.items():
             self._track.mark(name, column(joined, "t")[monitor.refused(joined, columns)])
 
     def add_slow(self, past: pa.Table, at: NDArray[np.int64]) -> None:
