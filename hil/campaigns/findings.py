@@ -13,6 +13,7 @@ The samplings that each measure of influence needs:
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 import pyarrow as pa
@@ -171,11 +172,10 @@ def _rate(flights: pa.Table, column: str, size: int, cluster: int) -> Rate:
 
 def _cells(spec: Spec, flights: pa.Table) -> Iterator[ProfileCell]:
     size = sampling.cluster_of(spec)
-    for experiment in spec.experiments:
-        for profile in spec.profiles:
-            rows = _of_cell(flights, experiment, profile)
-            own = size // len(spec.experiments) // len(spec.profiles)
-            yield ProfileCell(experiment, profile, _rate(rows, "passed", own, size))
+    own = size // len(spec.experiments) // len(spec.profiles)
+    for experiment, profile in product(spec.experiments, spec.profiles):
+        rows = _of_cell(flights, experiment, profile)
+        yield ProfileCell(experiment, profile, _rate(rows, "passed", own, size))
 
 
 def _of_cell(flights: pa.Table, experiment: str, profile: str) -> pa.Table:

@@ -9,7 +9,6 @@ from shlex import quote
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
@@ -39,12 +38,15 @@ def write_report(named: str, spec: Spec, dataset: Dataset, complete: bool) -> tu
     """Write report and result of a campaign's dataset, under the user's name for it; return report and findings."""
     folder, findings = dataset.folder, find(spec, dataset.table())
     histograms = [one for one in findings.limits if len(one.values) > 1 and np.ptp(one.values) > 0.0]
-    drawn = None if findings.failure_map is None else _map(findings.failure_map)
-    image = data_uri(png(lambda: drawn.figure)) if drawn is not None else ""  # this places its axes
+    image, cells = "", []
+    if (fitted := findings.failure_map) is not None:
+        drawn = _map(fitted)
+        image = data_uri(png(lambda: drawn.figure))  # this places its axes
+        cells = sorted(_cells(spec, fitted, drawn), key=lambda cell: -cell.failed / cell.flown)
     page = write_page(
         folder / REPORT, "campaign.html.j2", spec=spec, found=findings, complete=complete,
         histograms=data_uri(png(lambda: _histograms(histograms))) if histograms else "",
-        failure_map=image, map_cells=sorted(drawn.cells(spec), key=MapCell.holds) if drawn is not None else [],
+        failure_map=image, map_cells=cells,
         named=quote(named), begun=about(dataset.plan)["commit"], folder=quote(str(folder)),
     )  # fmt: skip
     text = json.dumps(_content(spec, findings, complete), indent=2)
@@ -57,26 +59,25 @@ def _content(spec: Spec, found: Findings, complete: bool) -> dict[str, Any]:
         "spec": spec_text(spec),
         "complete": complete,
         **_counts(found.rate),
-        "cells": [
-            {"experiment": one.experiment, "profile": one.profile, **_counts(one.rate)} for one in found.cells
-        ],
+        "cells": [_fields(one, "experiment", "profile") | _counts(one.rate) for one in found.cells],
         "errors": found.errors,
         "limits": [
-            {
-                "experiment": one.experiment, "profile": one.profile, "metric": one.name, "bound": one.bound,
-                **_counts(one.rate),
-            }
+            _fields(one, "experiment", "profile")
+            | {"metric": one.name, "bound": one.bound}
+            | _counts(one.rate)
             for one in found.limits
         ],
         "influences": [
-            {
-                "figure": one.figure, "method": one.method, "chance": one.chance, "by_axis": dict(one.by_axis),
-                "half_interval_95": dict(one.halves),
-            }
+            _fields(one, "figure", "method", "chance")
+            | {"by_axis": dict(one.by_axis), "half_interval_95": dict(one.halves)}
             for one in found.influences
         ],
-        "worst": [{"index": one.index, "why": one.why, "command": one.command} for one in found.worst],
-    }  # fmt: skip
+        "worst": [_fields(one, "index", "why", "command") for one in found.worst],
+    }
+
+
+def _fields(one: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(one, name) for name in names}
 
 
 def _counts(rate: Rate) -> dict[str, Any]:
@@ -123,40 +124,35 @@ class MapCell:
     flown: int
     flights: tuple[tuple[int, bool, str], ...]  # number, whether it failed, command that repeats it
 
-    def holds(self) -> float:
-        """Return the share of its flights that held."""
-        return 1.0 - self.failed / self.flown
-
 
 @dataclass(frozen=True, slots=True)
 class DrawnMap:
-    """A failure map as a figure, and its flights."""
-
     figure: Figure
-    axes: Axes
-    across: CubeAxis
-    up: CubeAxis
-    points: NDArray[np.float64]  # (N, 2) on those axes
-    flights: NDArray[np.int64]  # (N,) their numbers
-    failed: NDArray[np.bool_]  # (N,)
+    shown: tuple[int, int]  # the axes' numbers, across and up
+    flights: NDArray[np.bool_]  # which are drawn
 
-    def cells(self, spec: Spec) -> Iterator[MapCell]:
-        """Yield the cells with flights, after the figure was written."""
-        which = np.minimum((self.points * CELLS).astype(int), np.array(CELLS) - 1)
-        for row, column in product(range(CELLS[1]), range(CELLS[0])):
-            inside = np.flatnonzero((which == (column, row)).all(axis=1))
-            if not len(inside):
-                continue
-            low, high = (np.array([column + n, row + n]) / CELLS for n in (0, 1))
-            corners = 100.0 * self.axes.transData.transform(np.array([low, high])) / self.figure.bbox.size
-            first = inside[np.argsort(~self.failed[inside], kind="stable")][:NAMED]
-            yield MapCell(
-                (*corners[0].tolist(), *np.diff(corners, axis=0)[0].tolist()),
-                f"{_range(self.across, low[0], high[0])}, {_range(self.up, low[1], high[1])}",
-                int(self.failed[inside].sum()),
-                len(inside),
-                tuple((n := int(self.flights[at]), bool(self.failed[at]), again(spec, n)) for at in first),
-            )
+
+def _cells(spec: Spec, found: FailureMap, drawn: DrawnMap) -> Iterator[MapCell]:
+    """Yield the cells with flights, after the figure was written."""
+    numbers, failed = found.flights[drawn.flights], found.failed[drawn.flights]
+    across, up = (found.axes[column] for column in drawn.shown)
+    points = found.points[drawn.flights][:, drawn.shown]
+    which = np.minimum((points * CELLS).astype(int), np.array(CELLS) - 1)
+    for row, column in product(range(CELLS[1]), range(CELLS[0])):
+        inside = np.flatnonzero((which == (column, row)).all(axis=1))
+        if not len(inside):
+            continue
+        low, high = (np.array([column + n, row + n]) / CELLS for n in (0, 1))
+        to_pixels = drawn.figure.axes[0].transData.transform
+        corners = 100.0 * to_pixels(np.array([low, high])) / drawn.figure.bbox.size
+        first = inside[np.argsort(~failed[inside], kind="stable")][:NAMED]
+        yield MapCell(
+            (*corners[0].tolist(), *np.diff(corners, axis=0)[0].tolist()),
+            f"{_range(across, low[0], high[0])}, {_range(up, low[1], high[1])}",
+            int(failed[inside].sum()),
+            len(inside),
+            tuple((n := int(numbers[at]), bool(failed[at]), again(spec, n)) for at in first),
+        )
 
 
 def _range(axis: CubeAxis, low: float, high: float) -> str:
@@ -199,10 +195,7 @@ def _map(found: FailureMap) -> DrawnMap:
     axes.set_xticks(*_ticks(found.axes[across]))
     axes.set_yticks(*_ticks(found.axes[up]))
     axes.legend(loc="upper left", bbox_to_anchor=(1.2, 1.0))
-    return DrawnMap(
-        figure, axes, found.axes[across], found.axes[up],
-        found.points[those][:, (across, up)], found.flights[those], found.failed[those],
-    )  # fmt: skip
+    return DrawnMap(figure, (across, up), those)
 
 
 def _ticks(axis: CubeAxis) -> tuple[list[float], list[str]]:

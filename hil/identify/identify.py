@@ -20,14 +20,12 @@ from hil.design.axes import AXES, NUISANCES
 from hil.errors import LabError
 from hil.floaty.correction import OperatingPoint
 from hil.floaty.paper_table import PAPER_TABLE
-from hil.floaty.plant import Plant
 from hil.identify.joint import Estimate, Excited, excited_axes, identities, instrumental, joint
-from hil.identify.plates import turns_of
+from hil.identify.plates import plant_of, turns_of
 from hil.identify.record import Record
 from hil.identify.response import DELAY, LAG, UNIT
 from hil.identify.spectra import windows
 from hil.identify.two_controllers import two_controllers
-from hil.laboratory.robot import Streams
 
 IDENTIFIED, WEAK, UNKNOWN = "identified", "weak", "not identifiable"
 NARROW, KNOWN = 0.25, 0.7  # half width of the interval over the value
@@ -181,8 +179,8 @@ def truth_of(record: Record) -> dict[str, float]:
     config = record.config
     if not record.simulated or not config.robot.has_plates:
         return {}
-    plant = Plant(config.geometry, config.plant, config.tunnel, config.actuators, Streams.of_seed(1).gusts)
-    return {**asdict(plant.linearise(operating_point(record))), LAG: config.actuators.tau}
+    truth = plant_of(config).linearise(operating_point(record))
+    return {**asdict(truth), LAG: config.actuators.tau}
 
 
 @dataclass(frozen=True, slots=True)

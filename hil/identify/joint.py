@@ -242,13 +242,9 @@ def joint(
     spread = np.sqrt(np.diag(covariance))[: len(names)]
     spread = np.hypot(spread, [0.0 if name == DELAY else BENT * abs(values[name]) for name in names])
     half = SIGMAS * spread
-    return Estimate(
-        values,
-        dict(zip(names, half.tolist(), strict=True)),
-        float(misfit),
-        tuple((found.x * scale).tolist()[len(names) :]),
-        covariance[: len(names), : len(names)],
-    )
+    errors, lateness = dict(zip(names, half.tolist(), strict=True)), (found.x * scale).tolist()[len(names) :]
+    own = covariance[: len(names), : len(names)]
+    return Estimate(values, errors, float(misfit), tuple(lateness), own)
 
 
 def identities(values: Mapping[str, float], speed: float, turns: Mapping[str, float]) -> list[float]:

@@ -93,6 +93,11 @@ def turns_of(record: Record) -> dict[str, float]:
     return {"y_rate": float(about_x[1]) / (2 * STEP), "x_rate": float(about_y[0]) / (2 * STEP)}
 
 
+def plant_of(config: LabConfig) -> Plant:
+    """Return a profile's plant, whose gusts are not used."""
+    return Plant(config.geometry, config.plant, config.tunnel, config.actuators, Streams.of_seed(1).gusts)
+
+
 def _plates(config: LabConfig) -> Callable[..., Array]:
     """Return a function from inputs, roll, velocity along y and rates to specific force (W) and angular acceleration (B).
 
@@ -100,7 +105,7 @@ def _plates(config: LabConfig) -> Callable[..., Array]:
     """
     plain = config.plant.model_copy(update={"variant": "plate", "constant_factors": {}, "mass_factor": 1.0})
     air = config.tunnel.model_copy(update={"side_wind": (0.0, 0.0, 0.0)})
-    plates = Plant(config.geometry, plain, air, config.actuators, Streams.of_seed(1).gusts)
+    plates = plant_of(config.model_copy(update={"plant": plain, "tunnel": air}))
     hover = SIGNS * config.allocation.hover_angle
     place = (0.0, 0.0, config.tunnel.hover_height)
 

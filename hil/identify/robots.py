@@ -60,8 +60,8 @@ def write_profile(path: Path, profile: str, found: Identification) -> str:
         f"# Identified by `floaty identify` from {', '.join(record.name for record in found.records)}.",
         f'base = "{base_name(profile)}"',
         "",
+        "[model]                   # value, half width of the 95 % interval, verdict",
     ]
-    lines.append("[model]                   # value, half width of the 95 % interval, verdict")
     for axis in AXES:
         if all(found.constant(name).verdict == UNKNOWN for name in axis.constants):
             continue
@@ -81,8 +81,7 @@ def write_profile(path: Path, profile: str, found: Identification) -> str:
     lines += ["", *trim]
     with writing("--profile-out", path):
         path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
-    config = load_config(str(path))  # an invalid profile is an error now, not at the next flight
-    with writing("--profile-out", path):
+        config = load_config(str(path))  # an invalid profile is an error now, not at the next flight
         _write_known(path, config, found, fitted.values[INPUT_TO_GYRO])
     return f"servo trim changed: {trim[1].partition('# ')[2]}" if trim else ""
 
@@ -136,16 +135,16 @@ def robots_of(profile: str, config: LabConfig, count: int) -> Robots:
         )
     nominal = robot_of(config)
     if known is None:
-        names = [name for name in nominal if name != DELAY]
-        spread = np.diag([(UNKNOWN_SHARE * nominal[name] / SIGMAS) ** 2 for name in names])
-        return Robots(
-            nominal, _draw(nominal, names, spread, count), f"every constant within {UNKNOWN_SHARE:.0%}"
+        names, about = (
+            [name for name in nominal if name != DELAY],
+            f"every constant within {UNKNOWN_SHARE:.0%}",
         )
-    nominal[DELAY] = max(known.delay - TICK_DELAYS_S, 0.0)
-    names = list(known.half_widths)
-    return Robots(
-        nominal, _draw(nominal, names, np.array(known.covariance), count), f"the intervals in {file}"
-    )
+        covariance = np.diag([(UNKNOWN_SHARE * nominal[name] / SIGMAS) ** 2 for name in names])
+    else:
+        names, about = list(known.half_widths), f"the intervals in {file}"
+        covariance = np.array(known.covariance)
+        nominal[DELAY] = max(known.delay - TICK_DELAYS_S, 0.0)
+    return Robots(nominal, _draw(nominal, names, covariance, count), about)
 
 
 def _read(file: Path) -> KnownModel:

@@ -10,6 +10,7 @@ excitations of u3 and u1, and `floaty identify` estimates the acceleration per i
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -106,21 +107,12 @@ def constants(found: Identification) -> tuple[PaperConstant, ...]:
 
 def fly_scaling(out: Path, runner: Runner) -> list[Claim]:
     """Fly and identify; empty after Ctrl-C. Raises `LabError` for a lost or unidentified robot."""
-    rows = runner.log(
-        "scaling",
-        {
-            f"{profile}-{name}": (
-                name,
-                Options(
-                    profile=profile, overrides=(f"excitation.{name[-2:]}={AMPLITUDES[name]}",), seed=1,
-                    duration_s=DURATION_S,
-                ),
-            )
-            for profile in SIZES
-            for name in SCALED.values()
-        },
-        out,
-    )  # fmt: skip
+    flights = {}
+    for profile, name in product(SIZES, SCALED.values()):
+        excited = (f"excitation.{name[-2:]}={AMPLITUDES[name]}",)
+        options = Options(profile=profile, overrides=excited, seed=1, duration_s=DURATION_S)
+        flights[f"{profile}-{name}"] = (name, options)
+    rows = runner.log("scaling", flights, out)
     if not rows:
         return []
     of_each = len(SCALED)

@@ -14,6 +14,12 @@ from math import degrees
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
 from hil.config import load_config
 from hil.design.analysis import Analysis
 from hil.design.analysis import write as write_design
@@ -22,6 +28,8 @@ from hil.installation import commit, versions
 from hil.laboratory.metrics import METRICS
 from hil.laboratory.recorder import load_log
 from hil.laboratory.result import RESULT
+from hil.pictures import curves
+from hil.pictures.drawing import WIDTH
 from hil.pictures.figures import PICTURES, TRACK
 from hil.pictures.gallery import pictures_of
 from hil.pictures.pages import PageFigure, draw, saved, write_page, zoomable
@@ -32,13 +40,15 @@ from hil.studies.drag_model import MountedRow
 from hil.studies.paper import Paper, Spread, Trials
 from hil.studies.paper_identification import COLUMNS, WHY, PaperConstant
 from hil.studies.paper_rows import PaperRow
-from hil.studies.study import StudyResult
-from hil.studies.study_figures import picture
+from hil.studies.study import OUTCOMES, StudyResult
 
 REPORT = "report.html"
 # Names of the pages beside those of the experiments.
 DRAG_MODEL, STUDIES, DESIGN = "drag-model/drag_model", "studies", "design/design"
 OF_EVERY_FLIGHT = (TRACK, PICTURES[0])  # for an experiment without own pictures
+COLOURS = dict(zip(OUTCOMES, (curves.GREEN, curves.YELLOW, curves.SKY, curves.RED, curves.GREY), strict=True))
+SHORT = {"holds": "holds", "degrades": "degr.", "failsafe": "f-safe", "lost": "lost", "error": "error"}
+STYLES = ("-", "--", ":")
 
 
 def write_paper(
@@ -65,7 +75,7 @@ def write_paper(
         pages.append((DESIGN, "Design"))
         write_design(shape, _folder_of(out, DESIGN))
     studies = [
-        (one, saved(out, f"study-{one.study.name}", one.study.question, one.study.remark, partial(picture, one)))
+        (one, saved(out, f"study-{one.study.name}", one.study.question, one.study.remark, partial(study_picture, one)))
         for one in paper.studies
         if one.curves
     ]  # fmt: skip
@@ -172,3 +182,49 @@ def _study(result: StudyResult) -> dict[str, Any]:
             for curve in result.curves
         ],
     }
+
+
+def study_picture(result: StudyResult) -> Figure:
+    """Draw the error over the sizes, a curve per variant, and below it the outcome of every cell.
+
+    A curve is the mean over the surviving seeds, its band their range; it ends where all are lost.
+    """
+    study, flown = result.study, result.curves
+    strip = 0.27 * len(flown) + 0.6
+    figure = Figure(figsize=(WIDTH, 2.3 + strip), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2.3, strip))
+    for index, curve in enumerate(flown):
+        alive = [cell for cell in curve.cells if cell.errors]
+        places = [study.sizes.index(cell.size) for cell in alive]
+        colour = curves.SERIES_COLOURS[index % len(curves.SERIES_COLOURS)]
+        errors = [100 * np.array(cell.errors) for cell in alive]
+        above.plot(
+            places, [e.mean() for e in errors], "o" + STYLES[index % 3], color=colour, markersize=3,
+            label=curve.variant.name,
+        )  # fmt: skip
+        above.fill_between(
+            places, [e.min() for e in errors], [e.max() for e in errors], color=colour, alpha=0.12, linewidth=0
+        )  # fmt: skip
+    above.set_yscale("log")
+    above.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    above.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    above.yaxis.set_minor_formatter(NullFormatter())
+    above.set_ylabel("rms distance\nfrom the goal [cm]")
+    above.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    for row, curve in enumerate(flown):
+        for cell in curve.cells:
+            place = study.sizes.index(cell.size)
+            typical = cell.typical
+            below.add_patch(
+                Rectangle((place - 0.48, row - 0.45), 0.96, 0.9, color=to_rgba(COLOURS[typical], 0.75))
+            )
+            count = cell.outcomes.count(typical)
+            of_all = "" if count == len(cell.outcomes) else f" {count}/{len(cell.outcomes)}"
+            below.text(place, row, SHORT[typical] + of_all, ha="center", va="center", fontsize=7.5)
+    below.set_ylim(len(flown) - 0.4, -0.6)
+    below.set_yticks(range(len(flown)), [curve.variant.name for curve in flown])
+    below.grid(visible=False)
+    below.set_xlim(-0.55, len(study.sizes) - 0.45)
+    below.set_xticks(range(len(study.sizes)), [f"{size:g}" for size in study.sizes])
+    below.set_xlabel(f"{study.axis} [{study.unit}]" if study.unit else study.axis)
+    return figure

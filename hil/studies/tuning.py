@@ -18,14 +18,13 @@ from hil.design.margins import peak_of
 from hil.design.profile import changes, toml_text
 from hil.design.tune import GainTask, TunedAxis, by_regulator, design, judged, refuse_late
 from hil.errors import LabError, writing
-from hil.floaty.plant import Plant
 from hil.identify.flow import flow_of
 from hil.identify.identify import identify
+from hil.identify.plates import plant_of
 from hil.identify.record import load_record
 from hil.identify.robots import FLAP_RATE, Robots, robots_of, write_profile
 from hil.laboratory.request import Options
 from hil.laboratory.result import read_result
-from hil.laboratory.robot import Streams
 from hil.studies.study import distance
 from hil.world.config import ConstantName
 
@@ -47,30 +46,24 @@ class TuningFlights:
 
     def hover(self, name: str, profile: str, *others: tuple[str, ...]) -> list[Row]:
         """Fly a hover of a profile's robot, and of robots that differ by settings. Raises `LabError` for an error."""
-        return self._fly(
-            name,
-            {
-                f"{name}-{number}" if number else name: (
-                    "hover",
-                    Options(
-                        profile=profile, overrides=settings, seed=self.seed, duration_s=HOVER_S, board=self.board
-                    ),
-                )
-                for number, settings in enumerate([(), *others])
-            },
-        )  # fmt: skip
+        flights = {}
+        for number, settings in enumerate([(), *others]):
+            options = Options(profile=profile, overrides=settings, seed=self.seed, duration_s=HOVER_S)
+            flights[f"{name}-{number}" if number else name] = ("hover", options)
+        return self._fly(name, flights)
 
     def excitations(self, profile: str) -> list[Row]:
-        return self._fly(
-            "excitations",
-            {
-                name: (name, Options(profile=profile, seed=self.seed + number, board=self.board))
-                for number, name in enumerate(EXCITATIONS)
-            },
-        )
+        flights = {
+            name: (name, Options(profile=profile, seed=self.seed + number))
+            for number, name in enumerate(EXCITATIONS)
+        }
+        return self._fly("excitations", flights)
 
     def _fly(self, name: str, flights: Mapping[str, tuple[str, Options]]) -> list[Row]:
-        rows = self.runner.log(name, flights, self.folder)
+        on_board = {
+            folder: (one, options | Options(board=self.board)) for folder, (one, options) in flights.items()
+        }
+        rows = self.runner.log(name, on_board, self.folder)
         if not rows:
             raise KeyboardInterrupt
         return rows
@@ -144,8 +137,7 @@ def worst_settings(tuned: Tuned, config: LabConfig) -> list[tuple[str, ...]]:
     """Return the settings that make the plant the worst drawn robot, as far as it can represent it."""
     if config.plant.variant == "plate" or not config.robot.has_plates:
         return []
-    plant = Plant(config.geometry, config.plant, config.tunnel, config.actuators, Streams.of_seed(1).gusts)
-    truth, factors = asdict(plant.linearise()), config.plant.constant_factors
+    truth, factors = asdict(plant_of(config).linearise()), config.plant.constant_factors
     timing = Timing.of(config, tuned.age_s)
     ranked = []
     for robot in tuned.robots.drawn:

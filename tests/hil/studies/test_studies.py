@@ -13,6 +13,7 @@ from hil.config import load_config
 from hil.laboratory.request import Options
 from hil.pictures.drawing import png
 from hil.studies.catalogue import STUDIES
+from hil.studies.paper_report import study_picture
 from hil.studies.study import (
     OUTCOMES,
     Curve,
@@ -25,7 +26,6 @@ from hil.studies.study import (
     outcome_of,
     summarise,
 )
-from hil.studies.study_figures import picture
 
 
 def flight(settings: tuple[str, ...], fault: str, seconds: float) -> Row:
@@ -158,7 +158,7 @@ def test_a_study_that_was_cut_short_has_a_picture_and_does_not_hold() -> None:
     result = summarise(study, [(job, fly_job(job))])
     assert [len(curve.cells) for curve in result.curves] == [1]
     assert not result.holds
-    assert png(lambda: picture(result)).startswith(b"\x89PNG")
+    assert png(lambda: study_picture(result)).startswith(b"\x89PNG")
 
 
 @pytest.mark.long
