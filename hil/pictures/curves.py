@@ -134,6 +134,15 @@ def _flaps(rows: pa.Table) -> NDArray[np.float64]:
     return np.degrees(column(rows, *_four(known)))
 
 
+def _stages(rows: pa.Table) -> NDArray[np.float64]:
+    """Return the ages of the newest pose behind each stage [ms], (N, 5); NaN where that is not reported."""
+    camera, processing, mocap, station, link = column(
+        rows, "age.camera", "age.processing", "age.mocap", "age.station", "age.link"
+    ).T
+    behind = (camera, camera + processing, mocap, mocap + station, mocap + station + link)
+    return np.asarray(1e-3 * np.stack(behind, axis=1))
+
+
 _XYZ, _RPY = ("x", "y", "z"), ("roll", "pitch", "yaw")
 POSITION = Curves(_XYZ, AXIS_COLOURS, "cm", lambda rows: 100 * position_error(rows))
 ATTITUDE = Curves(_RPY, AXIS_COLOURS, "deg", lambda rows: np.degrees(attitude_error(rows)))
@@ -178,6 +187,23 @@ QUEUE = logged(
     ("longest so far", "dropped"), (BLUE, RED), "measurements",
     "rtos.measurements_high_water", "rtos.measurements_dropped",
 )  # fmt: skip
+AGE_STAGES = Curves(
+    ("camera", "+ processing", "+ network", "+ station", "+ link: on board"), (BLUE, SKY, GREEN, ORANGE, PINK), "ms",
+    _stages, needs="age.link",
+)  # fmt: skip
+BATTERY = logged(("a cell",), (GREEN,), "V", "battery.voltage")
+LOAD = logged(("all tasks",), (BLUE,), "%", "board.load")
+AIR = logged(("link quality [%]", "RSSI [-dBm]"), (BLUE, ORANGE), "", "link.quality", "link.rssi")
+# The colour of a mark, and the counters of a refusal, of which the log may lack some.
+MARK_KINDS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "pose refused on board": (
+        RED, ("estimator.refused", "estimator.too_old", "estimator.invalid", "estimator.rejected"),
+    ),
+    "pose refused by the tracker": (ORANGE, ("tracker.refused",)),
+    "pose too late for the link": (SKY, ("link.late",)),
+    "fault": (PINK, ()),
+    "operator": (BLUE, ()),
+}  # fmt: skip
 # The states of firmware_py.wire.supervisor.State, and one for a board that has not reported its state.
 SUPERVISOR = States(
     "supervisor.state", ("calibrating", "waiting", "flying", "failsafe", "unknown"), (ORANGE, SKY, GREEN, RED, GREY)

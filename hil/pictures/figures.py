@@ -18,7 +18,7 @@ from hil.laboratory.faults import spans_of
 from hil.laboratory.metrics import BOX, body, column, free_flight
 from hil.laboratory.recorder import release_of
 from hil.laboratory.schedule import runs
-from hil.pictures import curves, monitor
+from hil.pictures import curves
 from hil.pictures.curves import since_release
 from hil.pictures.panels import (
     INK,
@@ -169,7 +169,7 @@ def station(rows: pa.Table) -> Plot:
     """Draw what a real link and its station could not use, reported battery and load."""
     health = [
         panel(plot, rows, label, height=1.2)
-        for plot, label in ((monitor.BATTERY, "battery"), (monitor.LOAD, "processor"))
+        for plot, label in ((curves.BATTERY, "battery"), (curves.LOAD, "processor"))
         if plot.needs in rows.column_names and np.isfinite(plot.read(rows)).any()
     ]
     return Plot((panel(curves.STATION, rows, "not used"), *health))

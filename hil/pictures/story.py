@@ -22,7 +22,6 @@ from hil.laboratory.result import Result
 from hil.pictures import curves
 from hil.pictures.curves import Curves, since_release
 from hil.pictures.figures import lanes_of_states, without_a_pose
-from hil.pictures.monitor import MARKS
 from hil.pictures.pages import PageFigure, embedded
 from hil.pictures.panels import Marks, Panel, Plot, Series, Spell, panel, saturated
 
@@ -301,7 +300,7 @@ def _poses(rows: pa.Table) -> Iterator[str]:
         if np.isfinite(gaps).any() and (longest := float(np.nanmax(gaps))) > GAP_MS:
             end_s = since_release(rows)[np.nanargmax(gaps)]
             yield f"It fused no pose for {longest:.0f} ms, from {end_s - 1e-3 * longest:.2f} s on."
-    for text, (_, names) in MARKS.items():
+    for text, (_, names) in curves.MARK_KINDS.items():
         known = [name for name in names if name in rows.column_names]
         count = sum(float(np.ptp(metrics.column(rows, name))) for name in known)
         if count > 0:

@@ -85,10 +85,13 @@ class Trials:
         if bound is None or not spread.count:
             return ""
         scale, unit = SHOWN.get(METRICS[metric].unit, (1.0, METRICS[metric].unit))
-        beyond = (
-            spread.mean - bound * scale if METRICS[metric].bound == "max" else bound * scale - spread.mean
-        )
+        above = METRICS[metric].bound == "max"
+        beyond = spread.mean - bound * scale if above else bound * scale - spread.mean
         return f"misses by {beyond:.2g} {unit}".strip() if beyond > 1e-9 else ""
+
+    def gaps(self, row: PaperRow) -> dict[str, str]:
+        """Return how far the means miss the paper's values, by metric."""
+        return {metric: gap for metric in row.claims if (gap := self.missed(row, metric))}
 
     def representative_first(self) -> list[Row]:
         """Return the flights, the one with the median error first."""
@@ -108,21 +111,16 @@ class Paper:
         found = []
         for _, row, both in self.rows:
             for trials in both:
-                gaps = [f"{metric} {gap}" for metric in row.claims if (gap := trials.missed(row, metric))]
-                if gaps or trials.failed:
-                    failed = [f"limits fail: {', '.join(trials.failed)}"] if trials.failed else []
-                    found.append((row, trials.profile, [*gaps, *failed]))
+                why = [f"{metric} {gap}" for metric, gap in trials.gaps(row).items()]
+                why += [f"limits fail: {', '.join(trials.failed)}"] if trials.failed else []
+                if why:
+                    found.append((row, trials.profile, why))
         return found
 
     @property
     def values_missed(self) -> int:
         """The number of values of the paper that are missed, over both profiles."""
-        return sum(
-            bool(trials.missed(row, metric))
-            for _, row, both in self.rows
-            for trials in both
-            for metric in row.claims
-        )
+        return sum(len(trials.gaps(row)) for _, row, both in self.rows for trials in both)
 
     @property
     def surprises(self) -> int:

@@ -149,7 +149,7 @@ def _content(paper: Paper) -> dict[str, Any]:
 def _trials(shown: PaperRow, trials: Trials) -> dict[str, Any]:
     return {
         "holds": trials.holds,
-        "missed": {name: gap for name in shown.claims if (gap := trials.missed(shown, name))},
+        "missed": trials.gaps(shown),
         "metrics": {
             name: {
                 key: value if not isinstance(value, float) or math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""The curves below `/plot` and the lanes of states below `/state`."""
+"""The curves below `/plot`, the rates of counters and the lanes of states below `/state`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from ground_station.latency import STAGES
 from hil.laboratory.metrics import BOX, column
 from hil.laboratory.schedule import runs
-from hil.pictures import curves, monitor
+from hil.pictures import curves
 from hil.pictures.curves import Curves
-from hil.pictures.monitor import MARKS, RATES
 from hil.pictures.viewer.track import RecordingTrack, mark_path, rgba, rgba_array
 
 PLOTS: Mapping[str, Curves] = {
@@ -31,18 +30,29 @@ PLOTS: Mapping[str, Curves] = {
     "age/pose": curves.AGE,
     "age/horizon": curves.HORIZON,
     "age/without": curves.SINCE_FUSION,
-    "age/stages": monitor.AGE_STAGES,
+    "age/stages": curves.AGE_STAGES,
     "link/loss/radio": curves.PACKETS,
     "link/loss/serial": curves.SERIAL_FAULTS,
     "link/loss/station": curves.STATION,
-    "link/air": monitor.AIR,
-    "battery": monitor.BATTERY,
+    "link/air": curves.AIR,
+    "battery": curves.BATTERY,
     "queue": curves.QUEUE,
-    "processor/all": monitor.LOAD,  # of a real board; a simulated one's is by task
+    "processor/all": curves.LOAD,  # of a real board; a simulated one's is by task
 }
+# Counters whose rates the viewer shows.
+RATES: Mapping[str, Curves] = {
+    "link/rate/radio": curves.logged(
+        ("packets up", "packets down"), (curves.BLUE, curves.GREEN), "1/s", "link.up_delivered", "link.down_delivered"
+    ),
+    "link/rate/station": curves.logged(
+        ("poses sent", "frames seen", "telemetry blocks"), (curves.BLUE, curves.GREEN, curves.PINK), "1/s",
+        "link.sent", "station.frames", "station.samples",
+    ),
+}  # fmt: skip
 PALE = ("flaps/command", "rotors/command")
 # They also keep the axes' scales fixed.
 LIMITS = {"position/limit": curves.NEAR_CM, "position/box": 100 * BOX, "attitude/limit": curves.ATTITUDE_DEG}
+SECOND_US, ROWS_OF_A_SECOND = 1_000_000, 100
 SLOW = 10  # rows between samples of slow quantities: 10 Hz
 STRETCHES_SHOWN = 2000  # of the schedule; the whole of it is for Perfetto
 
@@ -90,8 +100,8 @@ class Plots:
         for path, states in self._states.items():
             begins, names = curves.changes(joined, states)
             self._track.send(f"state/{path}", begins[fresh:], rr.StateChange.columns(state=names[fresh:]))
-        for name, (_, columns) in MARKS.items():
-            self._track.mark(name, column(joined, "t")[monitor.refused(joined, columns)])
+        for name, (_, columns) in curves.MARK_KINDS.items():
+            self._track.mark(name, column(joined, "t")[refused(joined, columns)])
 
     def add_slow(self, past: pa.Table, at: NDArray[np.int64]) -> None:
         """Draw slow quantities of rows `at`, with those of a second before them."""
@@ -100,7 +110,7 @@ class Plots:
         for path, limit in LIMITS.items():
             self._track.curve(path, times, np.full((len(times), 2), (limit, -limit)))
         for path, rate in self._known.rates.items():
-            self._track.curve(path, times, monitor.rates(past, rate, at))
+            self._track.curve(path, times, rates(past, rate, at))
         if self._known.processor.names:
             slow = pa.concat_tables([self._slow, chosen])
             self._track.curve("processor", column(slow, "t")[1:], self._known.processor.read(slow))
@@ -122,8 +132,8 @@ class Plots:
         path = "age/stages"
         if path in self._known.plots or table.num_rows == 0:  # they are in the log
             return
-        self._name_curves(path, monitor.AGE_STAGES)
-        self._track.curve(path, column(table, "t"), monitor.AGE_STAGES.read(table))
+        self._name_curves(path, curves.AGE_STAGES)
+        self._track.curve(path, column(table, "t"), curves.AGE_STAGES.read(table))
 
     def _name_all(self) -> None:
         for path, plot in {**self._known.plots, **self._known.rates}.items():
@@ -134,7 +144,7 @@ class Plots:
             names = [path.rpartition("/")[2]] * 2
             limit = rr.SeriesLines(names=names, colors=rgba_array([curves.GREY] * 2), widths=[1.0] * 2)
             self._track.static(f"plot/{path}", limit)
-        for name, (colour, _) in MARKS.items():
+        for name, (colour, _) in curves.MARK_KINDS.items():
             points = rr.SeriesPoints(names=name, colors=rgba(colour), markers="diamond", marker_sizes=5.0)
             self._track.static(f"plot/{mark_path(name)}", points)
         for path, states in self._states.items():
@@ -149,3 +159,20 @@ class Plots:
         width, opacity = (1.0, 120) if path in PALE else (1.6, 255)
         colours, widths = rgba_array(plot.colours, opacity), [width] * len(plot.names)
         self._track.static(f"plot/{path}", rr.SeriesLines(names=plot.names, colors=colours, widths=widths))
+
+
+def rates(rows: pa.Table, counters: Curves, at: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the rates of counters [1/s] at rows `at`, over the second before or its recorded part; (len(at), names)."""
+    times, counts = column(rows, "t"), counters.read(rows)
+    since = np.searchsorted(times, times[at] - SECOND_US)
+    passed = 1e-6 * (times[at] - times[since])[:, None]
+    return np.asarray((counts[at] - counts[since]) / np.where(passed > 0, passed, np.nan))
+
+
+def refused(rows: pa.Table, names: tuple[str, ...]) -> NDArray[np.int64]:
+    """Return the rows, except the first, at which any of some counters is larger than in the row before."""
+    known = [name for name in names if name in rows.column_names]
+    if not known:
+        return np.empty(0, np.int64)
+    counts = column(rows, *known).reshape(-1, len(known)).sum(axis=1)
+    return np.asarray(1 + np.flatnonzero(np.diff(counts) > 0))

@@ -17,10 +17,9 @@ from hil.errors import LabError
 from hil.laboratory.ages import ages_in_time_of
 from hil.laboratory.recorder import OPERATOR, load_events, log_pieces, stored_in
 from hil.laboratory.schedule import load_schedule
-from hil.pictures import monitor
 from hil.pictures.links import HOST
 from hil.pictures.viewer.layout import LEGEND, blueprint
-from hil.pictures.viewer.plots import SLOW, Plots
+from hil.pictures.viewer.plots import ROWS_OF_A_SECOND, SLOW, Plots
 from hil.pictures.viewer.scene import Scene
 from hil.pictures.viewer.track import RecordingTrack, timeline_of
 
@@ -60,7 +59,7 @@ class RerunFlight:
             self.plots.add_slow(past, at)
             self._scene.add_tether(past.take(at))
         self._count += rows.num_rows
-        self._past = past.slice(max(0, past.num_rows - monitor.ROWS_OF_A_SECOND))
+        self._past = past.slice(max(0, past.num_rows - ROWS_OF_A_SECOND))
 
     def add_events(self, events: Iterable[Mapping[str, Any]]) -> None:
         """Log texts: `t_us`, `source`, `text`, and the faults and actions of an operator in them."""

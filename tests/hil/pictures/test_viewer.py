@@ -37,9 +37,9 @@ from hil.laboratory.run import fly
 from hil.laboratory.schedule import SCHEMA
 from hil.live import window
 from hil.live.feed import open_view
-from hil.pictures import curves, monitor, scene
+from hil.pictures import curves, scene
 from hil.pictures.viewer.layout import views_of
-from hil.pictures.viewer.plots import PLOTS
+from hil.pictures.viewer.plots import PLOTS, rates
 from hil.pictures.viewer.recording import RerunFlight, write_rrd, write_run_rrd
 from hil.pictures.viewer.scene import HIDDEN, METRES_PER_NEWTON, PUSH_SHOWN_US, SEEN
 from hil.pictures.viewer.track import FROM_RELEASE, FROM_START, timeline_of
@@ -365,9 +365,9 @@ def test_the_goal_has_a_path_where_it_moves(tmp_path: Path) -> None:
 def test_rates_are_those_of_the_second_before() -> None:
     rows = pa.table({"t": 10_000 * np.arange(300), "n": np.arange(300) // 2, "m": 3 * np.arange(300)})
     counters = curves.Curves(("n", "m"), ("", ""), "1/s", curves.plain("n", "m"))
-    rates = monitor.rates(rows, counters, np.array([0, 10, 100, 250]))
-    assert np.isnan(rates[0]).all()
-    np.testing.assert_allclose(rates[1:], [[50.0, 300.0]] * 3)
+    found = rates(rows, counters, np.array([0, 10, 100, 250]))
+    assert np.isnan(found[0]).all()
+    np.testing.assert_allclose(found[1:], [[50.0, 300.0]] * 3)
 
 
 def test_the_stages_of_the_age_lie_on_one_another(folder: Path) -> None:
@@ -382,7 +382,7 @@ def test_the_stages_of_the_age_lie_on_one_another(folder: Path) -> None:
         }
     )
     table = ages.rename_columns([f"age.{name}" for name in ages.column_names])
-    np.testing.assert_allclose(monitor.AGE_STAGES.read(table), [[20.0, 38.0, 39.0, 39.1, 41.1]])
+    np.testing.assert_allclose(curves.AGE_STAGES.read(table), [[20.0, 38.0, 39.0, 39.1, 41.1]])
     counted = rows_by_entity(write_run_rrd(folder))
     assert counted["/plot/age/stages"] > 60  # by the station's own record, and their names
 
