@@ -154,8 +154,7 @@ def optimise(asked: Search) -> None:
 
 def write_profile(point: "Point", path: Path, about: str, length: float = 1.0) -> None:
     """Write a profile that flies the robot."""
-    from hil.design.gains import gains_of
-    from hil.design.profile import profile_text
+    from hil.design.gains import gains_of, profile_text
 
     text = profile_text(point, gains_of(point.linear), about, length)
     with writing("--write", path):

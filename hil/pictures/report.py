@@ -7,7 +7,10 @@ import json
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
+
+import pyarrow as pa
 
 from firmware_py.rtos.statistics import LATENCY_BOUNDS_US
 from hil.experiments import find_again
@@ -24,11 +27,10 @@ from hil.pictures.curves import own_columns, with_marks
 from hil.pictures.gallery import pictures_of
 from hil.pictures.links import link_to
 from hil.pictures.pages import PageFigure, draw, write_page, zoomable
-from hil.pictures.panels import QUESTIONS, marks_of_flight
+from hil.pictures.panels import QUESTIONS, Marks, marks_of_flight
 from hil.pictures.story import close_ups, failures_of, story_of
 
 REPORT = "report.html"
-TEMPLATE = "report.html.j2"
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,37 +63,20 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     """
     result, events = read_result(folder, find_again), load_events(folder)
     log = with_marks(load_log(folder), events)
-    experiment = experiment or result.request.experiment
-    ages, schedule = ages_in_time_of(iter([log]), folder), load_schedule(folder)
-    pictures = [
-        *([figures.COURSE] if figures.goal_moves(log) else []),
-        *pictures_of(experiment),
-        *figures.PICTURES,
-    ]
-    pictures += [picture for group, picture in figures.OWN.items() if own_columns(log, group)]
-    drawn = [(picture, log) for picture in pictures]
-    if ages.num_rows:
-        drawn.append((figures.LATENCY_BUDGET, ages))
-    if schedule.num_rows:
-        drawn.append((figures.SCHEDULE, schedule.replace_schema_metadata(log.schema.metadata)))
+    experiment, release_us = experiment or result.request.experiment, release_of(log.schema.metadata)
     marks = marks_of_flight(log, result.cause or "lost" if result.outcome == "lost" else None)
-    answers: dict[str, list[PageFigure]] = {question: [] for question in QUESTIONS}
-    for picture, rows in drawn:
-        forget_read_columns()
-        if picture.fits(rows.column_names):
-            answers[picture.question].append(draw(picture, marks, rows))
+    answers = _answers(folder, log, experiment, marks)
     failures = failures_of(log, result)
     close = close_ups(log, marks, failures[0].at_s if failures else None)
-    config = stored_in(log.schema.metadata, "config")
     return write_page(
         folder / REPORT,
-        TEMPLATE,
+        "report.html.j2",
         result=result,
         found=experiment.is_known,
         rows=metric_rows(result),
-        faults=fault_rows(spans_of(log.schema.metadata), release_of(log.schema.metadata)),
+        faults=fault_rows(spans_of(log.schema.metadata), release_us),
         events=events,
-        release_us=release_of(log.schema.metadata),
+        release_us=release_us,
         failures=failures,
         story=story_of(log, result, events),
         track=draw(figures.TRACK, marks, log),
@@ -99,13 +84,32 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
         figures=answers,
         close_ups=close,
         link_to=link_to,
-        zoomable=zoomable(
-            [*(one.figure for one in close), *(one for part in answers.values() for one in part)]
-        ),
+        zoomable=zoomable([*(one.figure for one in close), *chain(*answers.values())]),
         latency_bounds=LATENCY_BOUNDS_US,
         log_rows=log.num_rows,
-        config=json.dumps(config, indent=2),
+        config=json.dumps(stored_in(log.schema.metadata, "config"), indent=2),
     )
+
+
+def _answers(
+    folder: Path, log: pa.Table, experiment: Experiment, marks: Marks
+) -> dict[str, list[PageFigure]]:
+    """Return the figures of a flight by the question that they answer."""
+    ages, schedule = ages_in_time_of(iter([log]), folder), load_schedule(folder)
+    pictures = [figures.COURSE] if figures.goal_moves(log) else []
+    pictures += [*pictures_of(experiment), *figures.PICTURES]
+    pictures += [picture for group, picture in figures.OWN.items() if own_columns(log, group)]
+    drawn = [(picture, log) for picture in pictures]
+    if ages.num_rows:
+        drawn.append((figures.LATENCY_BUDGET, ages))
+    if schedule.num_rows:
+        drawn.append((figures.SCHEDULE, schedule.replace_schema_metadata(log.schema.metadata)))
+    answers: dict[str, list[PageFigure]] = {question: [] for question in QUESTIONS}
+    for picture, rows in drawn:
+        forget_read_columns()
+        if picture.fits(rows.column_names):
+            answers[picture.question].append(draw(picture, marks, rows))
+    return answers
 
 
 def metric_rows(result: Result) -> list[MetricRow]:

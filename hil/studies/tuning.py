@@ -13,9 +13,9 @@ from hil.campaigns.jobs import Row
 from hil.campaigns.run import Runner
 from hil.config import LabConfig, base_name, load_config
 from hil.design.axes import AXES, gains_in
+from hil.design.gains import changes, toml_text
 from hil.design.loop import Timing, build
 from hil.design.margins import peak_of
-from hil.design.profile import changes, toml_text
 from hil.design.tune import GainTask, TunedAxis, by_regulator, design, judged, refuse_late
 from hil.errors import LabError, writing
 from hil.identify.flow import flow_of

@@ -26,6 +26,9 @@ AXIS = 0.08  # [m] length of drawn axes
 MARKERS_SEEN = "markers.visible"
 SEEN, HIDDEN = 0xFFFFFFFF, 0xFF3030FF  # colours of markers
 STEEL = 0x707880FF
+# Colour and radius [m].
+ARROWS = {"drag": (0xF0E442FF, 0.0035), "flow": (0x56B4E9FF, 0.005), "wind": (0xA6DDF5FF, 0.005)}
+LINES = {"tether": (0x99A3ADFF, 0.0015), "trail": (0xFFFFFFC0, 0.0018), "wanted": (0xD55E00C0, 0.0018)}
 
 
 class Scene:
@@ -194,17 +197,9 @@ class Scene:
             static(f"{path}/number", number)
 
     def _build_arrows(self) -> None:
-        for name, colour, radius in (
-            ("drag", 0xF0E442FF, 0.0035),
-            ("flow", 0x56B4E9FF, 0.005),
-            ("wind", 0xA6DDF5FF, 0.005),
-        ):
+        for name, (colour, radius) in ARROWS.items():
             self._track.static(f"world/{name}", rr.Arrows3D.from_fields(colors=[colour], radii=[radius]))
-        for name, colour, radius in (
-            ("tether", 0x99A3ADFF, 0.0015),
-            ("trail", 0xFFFFFFC0, 0.0018),
-            ("wanted", 0xD55E00C0, 0.0018),
-        ):
+        for name, (colour, radius) in LINES.items():
             line = rr.LineStrips3D.from_fields(colors=[colour], radii=[radius])
             self._track.static(f"world/{name}", line)
 

@@ -13,9 +13,8 @@ from hil.config import load_config
 from hil.design import optimise as search
 from hil.design.authority import authorities
 from hil.design.axes import AXES, PITCH, ROLL, Axis
-from hil.design.gains import gains_of
+from hil.design.gains import gains_of, profile_text
 from hil.design.linear import Linear, Point
-from hil.design.profile import profile_text
 from hil.design.sweeps import flat_high
 from hil.design.trim import coefficient_of, scaled
 from hil.errors import LabError
