@@ -9,7 +9,7 @@ import pyarrow as pa
 from hil.errors import LabError, blame
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.metrics import free_flight
-from hil.pictures import power, trials
+from hil.pictures import trials
 from hil.pictures.panels import Picture, Still
 
 
@@ -18,6 +18,13 @@ def painted(draw: Callable[..., Any], *flights: pa.Table) -> Still:
     from hil.pictures.drawing import png
 
     return Still(png(draw, *flights), "png")
+
+
+def chart(name: str, *flights: pa.Table) -> Still:
+    """Return a picture of `hil.pictures.charts`."""
+    from hil.pictures import charts
+
+    return painted(getattr(charts, name), *flights)
 
 
 GALLERY: dict[str, Picture] = {
@@ -68,7 +75,7 @@ GALLERY: dict[str, Picture] = {
         "Overload",
         "Missed deadlines per second and largest position error while a task above all others takes a share of every tick. "
         "Dashed: the 20 cm box. A starved task completes no activation, late or not.",
-        partial(painted, trials.overload),
+        partial(chart, "overload"),
         needs="cpu.THIEF",
     ),
     "specific-power": Picture(
@@ -76,14 +83,14 @@ GALLERY: dict[str, Picture] = {
         "Left: power in hover per mass. Right: power over mass; grey: 100 to 250 W/kg, which the paper calls typical. "
         "Stars: in an updraft. Bars on helicopters: the paper's range of hover power, as a share of the rated one. Red: "
         "this flight.",
-        partial(painted, power.compare),
+        partial(chart, "compare"),
         needs="battery.power",
     ),
     "discharge": Picture(
         "Battery",
         "Voltage of one cell under load, with the supervisor's limit; power, mean over 1 s, and over the flight; charge "
         "left.",
-        power.discharge,
+        trials.discharge,
         needs="battery.power",
     ),
 }

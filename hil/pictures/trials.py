@@ -3,28 +3,23 @@
 Time counts from the release.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 
 from hil.experiments import measures, take_off
-from hil.experiments.overload import ROWS_PER_SECOND, thief_load
 from hil.laboratory.metrics import BOX, column, free_flight, position_error
-from hil.pictures.curves import AXIS_COLOURS, BLUE, GREEN, GREY, ORANGE, SKY, task_colour
+from hil.laboratory.recorder import stored_in
+from hil.pictures.curves import AXIS_COLOURS, BLUE, GREEN, GREY, ORANGE, SKY
 from hil.pictures.panels import INK, Panel, Plot, Series, Signal, lanes
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-    from matplotlib.figure import Figure
 
 # Colours of the paper's figure experiments_fig: all trials, one of them, the target.
 LIGHT, DARK, WANTED = "#9dbac6", "#1381b2", "#d04030"
 HEIGHT = 2.6  # [in] of one axis
+SECOND = 100  # rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +68,13 @@ def lines_of(
     return (*reversed(light), Series("flight", colour, *first, width=width))
 
 
+def column_of(
+    trials: Sequence[pa.Table], name: str, scale: float = 1.0, zero: float = 0.0
+) -> tuple[Series, ...]:
+    """Return the lines of a column of flights, scaled from its zero."""
+    return lines_of((measures.seconds(one), scale * (column(one, name) - zero)) for one in trials)
+
+
 def follow(quantities: tuple[TrialCurve, ...], window_s: tuple[float, float], *flights: pa.Table) -> Plot:
     """Draw quantities and their goals, one panel each, of one flight or of several trials, inside a window of time."""
     panels = []
@@ -99,64 +101,52 @@ def disturbed(*flights: pa.Table) -> Plot:
 def take_off_and_landing(*flights: pa.Table) -> Plot:
     """Draw height, vertical speed and the air at the robot over time; the first flight dark, further ones light."""
     free = [*map(free_flight, flights)]
-    times = [measures.seconds(flight) for flight in free]
-
-    def lines(name: str, scale: float, zero: float = 0.0) -> tuple[Series, ...]:
-        return lines_of(zip(times, (scale * (column(flight, name) - zero) for flight in free), strict=True))
-
+    times = measures.seconds(free[0])
     height = 100 * (column(free[0], "goal.z") - take_off.STANDING_Z)
-    goal = Series("goal", INK, times[0], height, width=0.8, dashed=True)
+    goal = Series("goal", INK, times, height, width=0.8, dashed=True)
     fans = [
         (take_off.SPIN_UP, f"take-off {take_off.TAKE_OFF:.0%}"),
         (take_off.FLIGHT_FROM, f"flight {take_off.FLIGHT:.0%}"),
     ]
     fans += [(take_off.LANDING_FROM, f"landing {take_off.LANDING:.0%}"), (take_off.FANS_OFF, "off")]
     begins = np.array([begin for begin, _ in fans])
-    end_s = float(times[0].max(initial=take_off.FANS_OFF))
+    end_s = float(times.max(initial=take_off.FANS_OFF))
     names = [name for _, name in fans]
     colours = dict(zip(names, (SKY, BLUE, ORANGE, GREY), strict=True))
-    controller = (
-        np.array([take_off.CONTROLLER_ON, take_off.FANS_OFF]),
-        ["on", "off"],
-        {"on": GREEN, "off": GREY},
-    )
-    stages = lanes((("controller", *controller), ("fans", begins, names, colours)), end_s)
+    switched = np.array([take_off.CONTROLLER_ON, take_off.FANS_OFF])
+    controller = ("controller", switched, ["on", "off"], {"on": GREEN, "off": GREY})
+    stages = lanes((controller, ("fans", begins, names, colours)), end_s)
+    heights = column_of(free, "truth.z", 100.0, take_off.STANDING_Z)
     return Plot(
         (
-            Panel(
-                "height over the net [cm]", (*lines("truth.z", 100.0, take_off.STANDING_Z), goal), height=2.2
-            ),
-            Panel("climb [cm/s]", lines("truth.vz", 100.0)),
-            Panel("air, upwards [m/s]", lines("flow.z", 1.0)),
+            Panel("height over the net [cm]", (*heights, goal), height=2.2),
+            Panel("climb [cm/s]", column_of(free, "truth.vz", 100.0)),
+            Panel("air, upwards [m/s]", column_of(free, "flow.z")),
             Panel("stages", height=0.8, bars=stages),
         )
     )
 
 
-def overload(rows: pa.Table, *trials: pa.Table) -> Figure:
-    """Draw late tasks and position error over the thief's share, of the first flight."""
-    from hil.pictures.drawing import stack
+def discharge(*flights: pa.Table) -> Plot:
+    """Draw voltage, power and charge; the first flight dark, further ones light."""
+    free = [*map(free_flight, flights)]
+    times = measures.seconds(free[0])
+    powers = [column(flight, "battery.power") for flight in free]
+    whole = np.array([0.0, times.max(initial=0.0)])
+    mean = Series(f"mean {powers[0].mean():.2f} W", GREY, whole, np.full(2, powers[0].mean()))
+    config = stored_in(flights[0].schema.metadata, "config")
+    low = (1e-3 * config["supervisor"]["low_battery_mv"],) if config else ()
+    shown = lines_of(map(_seconds_mean, map(measures.seconds, free), powers))
+    return Plot(
+        (
+            Panel("cell [V]", column_of(free, "battery.voltage"), height=1.6, limits=low),
+            Panel("power [W]", (*shown, mean), height=1.6, least=0.0),
+            Panel("charge [%]", column_of(free, "battery.charge", 100.0), height=1.2),
+        )
+    )
 
-    flight = free_flight(rows)
-    load = 5 * np.round(20 * thief_load(flight)).astype(int)  # the steps of the experiment
-    shares = np.unique(load)
-    figure, axes = stack((2.1, 2.1))
-    late = [name for name in flight.column_names if name.startswith("late.")]
-    for name in late:
-        misses = np.diff(column(flight, name), prepend=0.0)
-        per_second = [misses[load == share].mean() * ROWS_PER_SECOND for share in shares]
-        task = name.removeprefix("late.")
-        axes[0].plot(shares, per_second, "o-", color=task_colour(task), label=task)
-    axes[0].set_ylabel("missed deadlines [1/s]")
-    axes[0].set_yscale("symlog", linthresh=1.0)
-    axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    error = 100 * np.abs(position_error(flight))
-    for axis, name, colour in zip(range(3), "xyz", AXIS_COLOURS, strict=True):
-        worst = [error[load == share, axis].max() for share in shares]
-        axes[1].plot(shares, worst, "o-", color=colour, label=name)
-    axes[1].axhline(100 * BOX, color="black", linestyle="--", linewidth=0.8)
-    axes[1].set_ylabel("largest error [cm]")
-    axes[1].set_yscale("log")
-    axes[1].set_xlabel("share of every tick that the thief takes [%]")
-    axes[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return figure
+
+def _seconds_mean(times: Signal, values: Signal) -> tuple[Signal, Signal]:
+    """Return means over whole seconds: times and values, (N // 100,)."""
+    rows = len(times) // SECOND * SECOND
+    return times[:rows].reshape(-1, SECOND).mean(axis=1), values[:rows].reshape(-1, SECOND).mean(axis=1)

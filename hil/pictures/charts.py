@@ -1,33 +1,51 @@
-"""Figures of power: the comparison of vehicles (paper, figure robustness a and b) and the discharge of the battery."""
+"""The experiments' pictures that are not over time, by matplotlib: deadlines over load, the power of vehicles over mass.
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+The comparison of vehicles is the paper's, figure robustness a and b.
+"""
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
 
-from hil.experiments.measures import seconds
+from hil.experiments.overload import ROWS_PER_SECOND, thief_load
 from hil.experiments.power import power as mean_power
 from hil.experiments.specific_power import CONVENTIONAL_W_PER_KG, VEHICLES
-from hil.laboratory.metrics import column, free_flight
-from hil.laboratory.recorder import stored_in
+from hil.laboratory.metrics import BOX, column, free_flight, position_error
 from hil.pictures import curves
-from hil.pictures.figures import SECOND
-from hil.pictures.panels import Panel, Plot, Series
-from hil.pictures.trials import lines_of
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from hil.pictures.drawing import beside, stack
 
 KIND_COLOURS = {"quadcopter": curves.SKY, "drone": curves.BLUE, "helicopter": curves.GREEN}
 
 
+def overload(rows: pa.Table, *trials: pa.Table) -> Figure:
+    """Draw late tasks and position error over the thief's share, of the first flight."""
+    flight = free_flight(rows)
+    load = 5 * np.round(20 * thief_load(flight)).astype(int)  # the steps of the experiment
+    shares = np.unique(load)
+    figure, axes = stack((2.1, 2.1))
+    late = [name for name in flight.column_names if name.startswith("late.")]
+    for name in late:
+        misses = np.diff(column(flight, name), prepend=0.0)
+        per_second = [misses[load == share].mean() * ROWS_PER_SECOND for share in shares]
+        task = name.removeprefix("late.")
+        axes[0].plot(shares, per_second, "o-", color=curves.task_colour(task), label=task)
+    axes[0].set_ylabel("missed deadlines [1/s]")
+    axes[0].set_yscale("symlog", linthresh=1.0)
+    axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    error = 100 * np.abs(position_error(flight))
+    for axis, name, colour in zip(range(3), "xyz", curves.AXIS_COLOURS, strict=True):
+        worst = [error[load == share, axis].max() for share in shares]
+        axes[1].plot(shares, worst, "o-", color=colour, label=name)
+    axes[1].axhline(100 * BOX, color="black", linestyle="--", linewidth=0.8)
+    axes[1].set_ylabel("largest error [cm]")
+    axes[1].set_yscale("log")
+    axes[1].set_xlabel("share of every tick that the thief takes [%]")
+    axes[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
 def compare(*flights: pa.Table) -> Figure:
     """Draw specific power as bars, and power over mass, with this flight's Floaty in red."""
-    from hil.pictures.drawing import beside
-
     means = [mean_power(free_flight(flight)) for flight in flights]
     power, specific = (
         float(np.mean([values[name] for values in means])) for name in ("power", "specific_power")
@@ -64,34 +82,3 @@ def compare(*flights: pa.Table) -> Figure:
     scatter.set(xscale="log", yscale="log", xlim=masses, xlabel="mass [kg]", ylabel="power in hover [W]")
     scatter.legend(loc="upper left")
     return figure
-
-
-def discharge(*flights: pa.Table) -> Plot:
-    """Draw voltage, power and charge; the first flight dark, further ones light."""
-    free = [*map(free_flight, flights)]
-    times = [seconds(flight) for flight in free]
-
-    def lines(name: str, scale: float = 1.0) -> tuple[Series, ...]:
-        return lines_of(zip(times, (scale * column(flight, name) for flight in free), strict=True))
-
-    powers = [column(flight, "battery.power") for flight in free]
-    whole = np.array([0.0, times[0].max(initial=0.0)])
-    mean = Series(f"mean {powers[0].mean():.2f} W", curves.GREY, whole, np.full(2, powers[0].mean()))
-    config = stored_in(flights[0].schema.metadata, "config")
-    low = (1e-3 * config["supervisor"]["low_battery_mv"],) if config else ()
-    shown = lines_of(map(_seconds_mean, times, powers))
-    return Plot(
-        (
-            Panel("cell [V]", lines("battery.voltage"), height=1.6, limits=low),
-            Panel("power [W]", (*shown, mean), height=1.6, least=0.0),
-            Panel("charge [%]", lines("battery.charge", 100.0), height=1.2),
-        )
-    )
-
-
-def _seconds_mean(
-    times: NDArray[np.float64], values: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return means over whole seconds: times and values, (N // 100,)."""
-    rows = len(times) // SECOND * SECOND
-    return times[:rows].reshape(-1, SECOND).mean(axis=1), values[:rows].reshape(-1, SECOND).mean(axis=1)
