@@ -4,7 +4,6 @@ It needs nothing of the laboratory. `floaty station` runs the same session and a
 """
 
 import argparse
-import signal
 import sys
 import tomllib
 from collections.abc import Callable
@@ -14,10 +13,8 @@ from pydantic import ValidationError
 
 from ground_station.config import GroundConfig
 from ground_station.controls import ControlsError
-from ground_station.errors import LinkError, MocapError
-from ground_station.operator import COMMANDS, Operator
-from ground_station.program import Cockpit, Session, fly, run_until, why
-from ground_station.terminal import Terminal
+from ground_station.operator import Operator, fly_with
+from ground_station.program import Session
 from ground_station.trajectory import Goal, Hold, Trajectory
 
 
@@ -50,23 +47,8 @@ def main(arguments: list[str] | None = None) -> int:
         return _refuse(f"--settings {asked.settings}: {error}")
     session = Session(asked.link, asked.mocap, lambda home, _: Hold(home), log=asked.log, record=asked.record)
     operator = Operator(_no_experiment, print, lambda _: None)
-    terminal = Terminal(lambda: (*COMMANDS, *operator.known))
-    stops: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda received, _: stops.append(received))
-
-    def steer(cockpit: Cockpit, now_us: int) -> None:
-        for line in terminal.lines():
-            operator.take(line)
-        operator.turn(cockpit, now_us)
-
-    try:
-        fly(settings, session, print, run_until(lambda: bool(stops), asked.duration), [steer])
-    except (LinkError, MocapError, OSError, ImportError) as error:
-        return _refuse(why(error, asked.link))
-    finally:
-        terminal.close()
-    return 0
+    failure, _ = fly_with(operator, settings, session, print, asked.duration)
+    return _refuse(failure) if failure else 0
 
 
 def _no_experiment(name: str) -> Callable[[Goal, int], Trajectory]:

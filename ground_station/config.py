@@ -1,5 +1,7 @@
 """Every key of the ground station's sections of a profile, with unit and source."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Literal
 
 from pydantic import Field
@@ -68,8 +70,6 @@ class TrackerConfig(Section):
 
 
 System = Literal["optitrack", "vicon", "qualisys", "vrpn"]
-
-
 Axes = Literal["z-up", "y-up"]
 
 
@@ -114,6 +114,19 @@ class CaptureConfig(Section):
     )
 
 
+@dataclass(frozen=True, slots=True)
+class LinkSettings:
+    """The settings of links; each back end uses its own."""
+
+    corrections_hz: float
+    latency_us: int  # to the board, until it is measured
+    baud: int  # for URIs without one
+    signing_key: bytes = b""  # 32 bytes; empty: nothing is signed
+    signing_start: int = 0  # time stamp of MAVLink's signatures when the clock is 0 [10 us since 2015-01-01]
+    # Receives every MAVLink frame, in both directions.
+    note_frame: Callable[[int, bytes], object] | None = None
+
+
 class GroundConfig(Section):
     """All settings of a ground station, from a profile or a separate file."""
 
@@ -128,3 +141,13 @@ class GroundConfig(Section):
         pattern="^([0-9a-fA-F]{64})?$",
         description="MAVLink 2 signing, 32 bytes in hexadecimal; empty: unsigned",
     )
+
+    def links(self, note_frame: Callable[[int, bytes], object] | None = None) -> LinkSettings:
+        """Return the settings of links; a link never sends more poses than the cameras deliver."""
+        return LinkSettings(
+            corrections_hz=min(self.station.corrections_hz, 1e6 / self.frame_period_us),
+            latency_us=self.station.link_latency_us,
+            baud=self.baud,
+            signing_key=bytes.fromhex(self.signing_key),
+            note_frame=note_frame,
+        )

@@ -8,16 +8,14 @@ import re
 import struct
 from collections.abc import Callable
 
-import cflib.crtp
 from cflib.bootloader.boottypes import TargetTypes
 from cflib.bootloader.cloader import Cloader
 
 from ground_station.errors import LinkError
-from ground_station.links.crazyradio import quiet_cflib
+from ground_station.links.crazyradio import URIS, first_line, start_cflib
 
 Progress = Callable[[str, int, int], None]  # "writing" or "checking", bytes done, bytes in total
 
-URI = r"radio://\w+/\d{1,3}/(250K|1M|2M)(/[0-9A-Fa-f]{10})?"
 START = 0x0800_4000  # of the firmware in the flash of the STM32F405; the bootloader lies below
 FLASH_END = 0x0810_0000
 MEMORIES = ((0x2000_0000, 0x2002_0000), (0x1000_0000, 0x1001_0000))  # where the stack may begin
@@ -43,12 +41,10 @@ def flash(uri: str, image: bytes, progress: Progress) -> None:
     When that happens after the first page was written, the board stays in its bootloader until it is flashed again or
     its button is pressed.
     """
-    if not re.fullmatch(URI, uri):
+    if not re.fullmatch(URIS[0], uri):
         raise LinkError(f"{uri}: expected radio://0/80/2M/E7E7E7E7E7: the bootloader listens only to radio")
     check_image(image)
-    quiet_cflib()
-    if not cflib.crtp.CLASSES:
-        cflib.crtp.init_drivers()
+    start_cflib()
     loader = Cloader(uri)
     try:
         _enter(loader, uri)
@@ -59,8 +55,7 @@ def flash(uri: str, image: bytes, progress: Progress) -> None:
     except LinkError:
         raise
     except Exception as error:  # cflib raises bare exceptions
-        text = str(error).strip().splitlines() or [type(error).__name__]
-        raise LinkError(f"{uri}: {text[0]}") from error
+        raise LinkError(f"{uri}: {first_line(str(error))}") from error
     finally:
         loader.close()
 
@@ -81,14 +76,13 @@ def _write(loader: Cloader, image: bytes, progress: Progress) -> None:
     target = loader.targets[TargetTypes.STM32]
     size, pages = target.page_size, target.buffer_pages
     for first in range(0, len(image), size * pages):
-        parts = [image[at : at + size] for at in range(first, min(first + size * pages, len(image)), size)]
-        for number, part in enumerate(parts):
-            loader.upload_buffer(TargetTypes.STM32, number, 0, part)
-            progress("writing", first + number * size, len(image))
-        if not loader.write_flash(TargetTypes.STM32, 0, target.start_page + first // size, len(parts)):
-            raise LinkError(
-                f"{loader.uri}: writing at byte {first} failed (bootloader's code {loader.error_code})"
-            )
+        places = range(first, min(first + size * pages, len(image)), size)
+        for number, at in enumerate(places):
+            loader.upload_buffer(TargetTypes.STM32, number, 0, image[at : at + size])
+            progress("writing", at, len(image))
+        if not loader.write_flash(TargetTypes.STM32, 0, target.start_page + first // size, len(places)):
+            code = loader.error_code
+            raise LinkError(f"{loader.uri}: writing at byte {first} failed (bootloader's code {code})")
     progress("writing", len(image), len(image))
 
 
@@ -97,14 +91,11 @@ def _verify(loader: Cloader, image: bytes, progress: Progress) -> None:
     target = loader.targets[TargetTypes.STM32]
     size = target.page_size
     for at in range(0, len(image), size):
-        part = image[at : at + size]
-        if not any(
-            _read(loader, target.start_page + at // size)[: len(part)] == part for _ in range(READ_TRIES)
-        ):
-            raise LinkError(
-                f"{loader.uri}: the flash differs from the image in bytes {at}..{at + len(part) - 1}"
-            )
-        progress("checking", at + len(part), len(image))
+        part, page = image[at : at + size], target.start_page + at // size
+        end = at + len(part)
+        if not any(_read(loader, page)[: len(part)] == part for _ in range(READ_TRIES)):
+            raise LinkError(f"{loader.uri}: the flash differs from the image in bytes {at}..{end - 1}")
+        progress("checking", end, len(image))
 
 
 def _read(loader: Cloader, page: int) -> bytes:

@@ -13,8 +13,11 @@ from math import degrees, hypot, isfinite, radians
 
 from firmware_py.table import OF_PROFILE, on_board
 from firmware_py.wire.supervisor import State
+from ground_station.config import GroundConfig
 from ground_station.controls import Answer, ControlAction, ControlRequest, ControlsError, Settings
-from ground_station.program import Cockpit
+from ground_station.errors import LinkError, MocapError
+from ground_station.program import Cockpit, Hand, Session, fly, run_until, stop_signals, why
+from ground_station.terminal import Terminal
 from ground_station.trajectory import Goal, Hold, Trajectory
 
 HELP = """goal X Y Z [YAW]     fly to a place in W [m, deg]; without YAW it is unchanged
@@ -243,6 +246,37 @@ class Operator:
             self._well_since_us = now_us
         elif now_us - self._well_since_us >= WELL_US and self._talk is None:
             self._good.update(self._set)
+
+
+def fly_with(
+    operator: Operator,
+    settings: GroundConfig,
+    session: Session,
+    say: Callable[[str], None],
+    duration_s: float | None,
+    hands: Sequence[Hand] = (),
+    names: Sequence[str] = (),
+) -> tuple[str, bool]:
+    """Fly with an operator at the terminal, whose lines `names` complete, until Ctrl-C or for a duration.
+
+    Return why the flight failed, empty if it did not, and whether it was interrupted.
+    """
+    stops = stop_signals()
+    terminal = Terminal(lambda: (*COMMANDS, *names, *operator.known))
+
+    def steer(cockpit: Cockpit, now_us: int) -> None:
+        for line in terminal.lines():
+            operator.take(line)
+        operator.turn(cockpit, now_us)
+
+    failure = ""
+    try:
+        fly(settings, session, say, run_until(lambda: bool(stops), duration_s), [*hands, steer])
+    except (LinkError, MocapError, OSError, ImportError) as error:
+        failure = why(error, session.uri)
+    finally:
+        terminal.close()
+    return failure, bool(stops)
 
 
 def _words(words: list[str], usage: str, count: int) -> list[str]:

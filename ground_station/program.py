@@ -1,11 +1,14 @@
 """The ground station as a program: it connects cameras, link, tracker, trajectory and records, until stopped.
 
-It is independent of the laboratory: its part of a profile arrives as `GroundConfig`.
+It reconnects when the link is lost, shows the state of the link and the age of poses, and leaves the board with its
+flaps at hover: it stops the corrections first, and closes the link when the board is in failsafe. It is independent of the
+laboratory: its part of a profile arrives as `GroundConfig`.
 """
 
+import signal
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from contextlib import ExitStack, closing, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from firmware_py.extras import install_command
@@ -18,8 +21,7 @@ from ground_station.errors import LinkError, MocapError
 from ground_station.frame_rate import FrameRate
 from ground_station.links.frame_log import FrameLog
 from ground_station.links.live_link import LiveLink
-from ground_station.links.schemes import LinkSettings, find_link
-from ground_station.live import LiveStation
+from ground_station.links.schemes import SCHEMES, find_link
 from ground_station.mocap import MocapSource
 from ground_station.sources.address import find_source
 from ground_station.sources.replay import RecordingSource, ReplaySource
@@ -29,6 +31,11 @@ from ground_station.tracker import tracker_of
 from ground_station.trajectory import FlightPlan, Goal, Trajectory
 
 ASK_PERIOD_S = 0.002  # between two polls for an answer
+POSE_TIMEOUT_US = 5_000_000
+RECONNECT_TIMEOUT_US = 30_000_000
+RECONNECT_PERIOD_US = 500_000
+STATUS_PERIOD_US = 5_000_000
+FAILSAFE_TIMEOUT_US = 2_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +63,110 @@ class Cockpit:
 Hand = Callable[[Cockpit, int], None]  # called with the instant in every turn of the station's loop
 
 
+@dataclass(slots=True)
+class LiveStation:
+    """Runs a ground station; `say` gets lines for the user, `stopping` returns whether to end."""
+
+    link: LiveLink
+    station: GroundStation
+    source: MocapSource
+    rate: FrameRate
+    say: Callable[[str], None]
+    stopping: Callable[[], bool]
+    turn: Callable[[int], None]  # called again and again with the instant while the link holds
+
+    def run(self) -> None:
+        """Fly until stopped; raises `LinkError` when there are no poses or no board."""
+        self._report()
+        self._connect()
+        try:
+            while not self.stopping():
+                try:
+                    self._fly()
+                except LinkError as error:
+                    self.say(f"{error}; connecting again")
+                    self._reconnect(error)
+        finally:
+            self._leave()
+
+    def _connect(self) -> None:
+        self.link.open(self._drop_frames)
+        self.say(f"connected to {self.link.uri}")
+        self._report()
+
+    def _drop_frames(self) -> bool:
+        """Drop the frames that wait; return whether to end."""
+        while self.source.receive(0.0) is not None:
+            pass
+        return self.stopping()
+
+    def _reconnect(self, cause: LinkError) -> None:
+        """Retry until it succeeds or takes too long."""
+        deadline_us = clock_us() + RECONNECT_TIMEOUT_US
+        self.link.close()
+        while not self.stopping():
+            try:
+                self._connect()
+                return
+            except LinkError:
+                if clock_us() > deadline_us:
+                    raise cause from None
+                again_us = clock_us() + RECONNECT_PERIOD_US
+                while clock_us() < again_us:
+                    self.source.receive(0.02)
+
+    def _fly(self) -> None:
+        """Forward poses and telemetry while the link holds."""
+        self._drop_frames()
+        pose_us = status_us = clock_us()
+        while not self.stopping():
+            frame = self.source.receive(0.02)
+            now_us = clock_us()
+            if frame is not None:
+                self.station.on_frame(frame, now_us)
+                pose_us = now_us
+                if notice := self.rate.on_frame(frame.t_us):
+                    self.say(notice)
+            elif now_us - pose_us > POSE_TIMEOUT_US:
+                self.say(f"no poses for {POSE_TIMEOUT_US * 1e-6:.0f} s")
+                pose_us = now_us
+            self._take_telemetry()
+            self.turn(now_us)
+            self._report()
+            self.link.check()
+            if now_us - status_us >= STATUS_PERIOD_US:
+                status_us = now_us
+                self._show()
+
+    def _take_telemetry(self) -> None:
+        for t_us, packet in self.link.received():
+            self.station.on_packet(t_us, packet)
+
+    def _report(self) -> None:
+        for notice in self.source.notices() + self.station.notices() + self.link.notices():
+            self.say(notice)
+
+    def _show(self) -> None:
+        counters, tracker = self.station.counters, self.station.tracker
+        track = f"track {tracker.summary()}  " if tracker is not None else ""
+        self.say(
+            f"poses {counters.frames} ({counters.invalid} unusable)  {self.source.summary()}  {track}"
+            f"{self.link.summary()}  telemetry {counters.samples}"
+        )
+        self.say(str(self.station.budget))
+
+    def _leave(self) -> None:
+        """Stop correcting, wait until the board has put its flaps to hover, disconnect."""
+        self.link.mute()
+        deadline_us = clock_us() + FAILSAFE_TIMEOUT_US
+        while clock_us() < deadline_us and self.link.supervisor_state != State.FAILSAFE:
+            self.source.receive(0.02)
+            self._take_telemetry()
+        if self.link.supervisor_state == State.FAILSAFE:
+            self.say("the board is in failsafe, flaps at hover")
+        self.link.close()
+
+
 def fly(
     settings: GroundConfig,
     session: Session,
@@ -69,19 +180,12 @@ def fly(
     written, `ImportError` for a package that is missing.
     """
     with ExitStack() as opened:
-        note_frame = None
-        if session.tlog is not None:
-            frames = FrameLog(session.tlog, epoch_us())
-            opened.callback(frames.close)
-            note_frame = frames.note
-        link = find_link(session.uri, replace(link_settings(settings), note_frame=note_frame))
+        frames = opened.enter_context(closing(FrameLog(session.tlog, epoch_us()))) if session.tlog else None
+        link = find_link(session.uri, settings.links(frames.note if frames else None))
         tracker = tracker_of(settings.tracker, settings.frame_period_us)
         played = source = _open_source(session.mocap, settings.capture)
         opened.callback(lambda: source.close())
-        telemetry = None
-        if session.log is not None:
-            telemetry = TelemetryLog(session.log)
-            opened.callback(telemetry.close)
+        telemetry = opened.enter_context(closing(TelemetryLog(session.log))) if session.log else None
         source = RecordingSource(source, session.record) if session.record else source
         plan = FlightPlan(Goal(settings.home, 0.0), session.trajectory)
         ground = GroundStation(link, plan, telemetry, settings.station, tracker)
@@ -112,20 +216,18 @@ def ask(link: LiveLink, request: ControlRequest) -> Answer:
     return answer
 
 
+def stop_signals() -> list[int]:
+    """Return a list that receives the signals for an orderly end."""
+    stops: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda received, _: stops.append(received))
+    return stops
+
+
 def run_until(stopping: Callable[[], bool], duration_s: float | None) -> Callable[[], bool]:
     """Return the function that returns whether to end: when stopped, or after a duration from now on."""
     start_us = clock_us()
     return lambda: stopping() or (duration_s is not None and clock_us() - start_us > duration_s * 1e6)
-
-
-def link_settings(settings: GroundConfig) -> LinkSettings:
-    """Return the links' settings; a link never sends more poses than the cameras deliver."""
-    return LinkSettings(
-        corrections_hz=min(settings.station.corrections_hz, 1e6 / settings.frame_period_us),
-        latency_us=settings.station.link_latency_us,
-        baud=settings.baud,
-        signing_key=bytes.fromhex(settings.signing_key),
-    )
 
 
 def why(error: Exception, uri: str) -> str:
@@ -135,7 +237,7 @@ def why(error: Exception, uri: str) -> str:
     if isinstance(error, OSError):
         return f"{error.filename}: {error.strerror or error}"
     if isinstance(error, ImportError):
-        extra = "mavlink" if uri.startswith("mavlink") else "radio"
+        extra = SCHEMES[uri.partition(":")[0]][2]
         return f"--link {uri}: {error}: {install_command(extra)}"
     return str(error)
 

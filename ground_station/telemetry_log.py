@@ -26,29 +26,12 @@ POSE_COLUMNS = (
 )  # fmt: skip
 AGE_COLUMNS = tuple(f"age.{stage} [s]" for stage in STAGES)
 
+MOTION_COLUMNS = (
+    "mocap.vx [m/s]", "mocap.vy [m/s]", "mocap.vz [m/s]", "mocap.p [rad/s]", "mocap.q [rad/s]", "mocap.r [rad/s]",
+)  # fmt: skip
 _GROUND_COLUMNS = (
-    TIME_COLUMN,
-    *GOAL_COLUMNS,
-    *POSE_COLUMNS,
-    "mocap.vx [m/s]",
-    "mocap.vy [m/s]",
-    "mocap.vz [m/s]",
-    "mocap.p [rad/s]",
-    "mocap.q [rad/s]",
-    "mocap.r [rad/s]",
-    "mocap.quality []",
-    *AGE_COLUMNS,
-)
-
-
-def _columns_of(blocks: tuple[TelemetryBlock, ...]) -> tuple[list[str], dict[int, int]]:
-    """Return the telemetry columns' titles, and where each block begins among them."""
-    titles: list[str] = []
-    first: dict[int, int] = {}
-    for block in blocks:
-        first[block.id] = len(titles)
-        titles += [f"{variable.name} [{variable.unit}]" for variable in block.variables]
-    return titles, first
+    TIME_COLUMN, *GOAL_COLUMNS, *POSE_COLUMNS, *MOTION_COLUMNS, "mocap.quality []", *AGE_COLUMNS,
+)  # fmt: skip
 
 
 _TIMES = (TIME_COLUMN, POSE_COLUMNS[0])  # to the microsecond
@@ -58,7 +41,11 @@ class TelemetryLog:
     """Writes the CSV file at `path`, of samples of `blocks`; an unwritable path raises `OSError`."""
 
     def __init__(self, path: Path, blocks: tuple[TelemetryBlock, ...] = ALL_BLOCKS) -> None:
-        titles, self._first_column = _columns_of(blocks)
+        titles: list[str] = []
+        self._first_column: dict[int, int] = {}  # of each block, by its number
+        for block in blocks:
+            self._first_column[block.id] = len(titles)
+            titles += [f"{variable.name} [{variable.unit}]" for variable in block.variables]
         self._empty = [nan] * len(titles)
         formats = ["%.6f" if title in _TIMES else "%.7g" for title in (*_GROUND_COLUMNS, *titles)]
         self._row = ",".join(["%d", *formats]) + "\n"

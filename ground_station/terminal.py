@@ -37,10 +37,8 @@ class Terminal:
                 return
             if sys.stdout.isatty():
                 completer = WordCompleter(lambda: list(words()), WORD=True)
-                self._session, read = (
-                    PromptSession(completer=completer, complete_while_typing=False),
-                    self._prompt,
-                )
+                self._session = PromptSession(completer=completer, complete_while_typing=False)
+                read = self._prompt
         self._thread = threading.Thread(target=read, args=(descriptor,), name="terminal", daemon=True)
         self._thread.start()
 

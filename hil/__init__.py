@@ -4,32 +4,14 @@
 first use.
 """
 
+# ruff: noqa: F403, F405 - the names are those of `hil.api`
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from firmware_py import fast as fast  # lets compiled modules be found
 
 if TYPE_CHECKING:
-    from hil.api import (
-        Along,
-        Experiment,
-        Fault,
-        Goal,
-        Kind,
-        Knob,
-        LabError,
-        Metric,
-        Request,
-        RigidBody,
-        Run,
-        column,
-        declare,
-        fault,
-        fly,
-        knob,
-        load_run,
-        position_error,
-    )
+    from hil.api import *
 
 __all__ = [
     "Along", "Experiment", "Fault", "Goal", "Kind", "Knob", "LabError", "Metric", "Request", "RigidBody", "Run", "column",

@@ -158,14 +158,17 @@ def process_age_s() -> float:
 
 
 class Pace:
-    """Simulated over real time."""
+    """Simulated over real time, from the first `look` at or after an instant; before that, from the start."""
 
-    def __init__(self) -> None:
-        self.begin(0)
+    def __init__(self, from_us: int) -> None:
+        self._from_us: int | None = from_us
+        self._us, self._ns = 0, time.monotonic_ns()
 
-    def begin(self, now_us: int) -> None:
-        """Start counting."""
-        self._us, self._ns = now_us, time.monotonic_ns()
+    def look(self, now_us: int) -> None:
+        """Start counting when it is time."""
+        if self._from_us is not None and now_us >= self._from_us:
+            self._from_us = None
+            self._us, self._ns = now_us, time.monotonic_ns()
 
     def factor(self, now_us: int) -> float:
         """Return the factor up to now."""

@@ -18,7 +18,7 @@ from firmware_py.config import FirmwareConfig, LogicConfig
 from firmware_py.errors import FirmwareError
 from firmware_py.logic.loading import load_logic
 from firmware_py.section import Section, number
-from ground_station.config import CaptureConfig, PilotConfig, StationConfig, TrackerConfig
+from ground_station.config import CaptureConfig, GroundConfig, PilotConfig, StationConfig, TrackerConfig
 from hil.arguments import shown
 from hil.crazyflie.config import RadioConfig
 from hil.crazyflie.quadrotor import QuadrotorConfig
@@ -113,6 +113,19 @@ class LabConfig(FirmwareConfig):
     limits: dict[str, dict[str, float]] = Field(
         default_factory=dict, description="limits by experiment that replace the experiment's own"
     )
+
+    @property
+    def ground(self) -> GroundConfig:
+        """The ground station's settings."""
+        return GroundConfig(
+            station=self.station,
+            tracker=self.tracker,
+            capture=self.capture,
+            frame_period_us=self.mocap.period_us,
+            home=self.flight.home,
+            baud=self.serial.baud,
+            signing_key=self.mavlink.signing_key,
+        )
 
     def check_decks(self, is_image: bool) -> None:
         """Raise `LabError` for decks without the firmware that has drivers for them."""

@@ -25,12 +25,28 @@ def require(what: str, extra: str, *modules: str) -> None:
 
 
 @contextmanager
+def refusing(start: str, *kinds: type[Exception]) -> Iterator[None]:
+    """Turn errors of these kinds into a `LabError` whose text begins with `start`."""
+    try:
+        yield
+    except kinds as error:
+        raise LabError(f"{start}{getattr(error, 'strerror', None) or error}") from None
+
+
+@contextmanager
 def writing(option: str, path: Path | None) -> Iterator[None]:
     """Turn an `OSError` while writing to an option's path into a `LabError` that names the option."""
     try:
         yield
     except OSError as error:
         raise LabError(f"{option} {path}: cannot be written ({error.strerror or error})") from None
+
+
+def made_folder(option: str, path: Path) -> Path:
+    """Make an option's folder if it is missing, and return it. Raises `LabError`."""
+    with writing(option, path):
+        path.mkdir(parents=True, exist_ok=True)
+    return path
 
 
 LISTED = 12  # names in one line

@@ -22,6 +22,7 @@ from collections.abc import Callable
 from functools import partial
 from heapq import heapreplace
 from pathlib import Path
+from timeit import repeat
 
 import numpy as np
 from bench_kernel import kernel_run, simpy_run, us_per_activation
@@ -35,6 +36,7 @@ from firmware_py.core.structs import Control, Estimator, Input, Report, Sampling
 from firmware_py.extras import install_command
 from firmware_py.fast import STALE, STATE
 from hil.commands.app import COMMANDS
+from hil.commands.options import right
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
 from hil.floaty.plant import Plant
@@ -45,7 +47,7 @@ from hil.laboratory.run import fly
 
 ROOT = Path(__file__).parent.parent
 FLIGHT_S = 30.0
-REPEATS = 3
+REPEATS, CALLS = 3, 20_000
 IMAGE_S = 8.0  # of flight
 # Of the events of a hover: IMU, exposures, their frames, rows of the log, and radio events.
 EVENT_PERIODS_US = (1000, 5000, 5000, 10_000, 4000, 4000, 4000)
@@ -58,14 +60,8 @@ def best(measure: Callable[[], float]) -> float:
     return min(measure() for _ in range(REPEATS))
 
 
-def us_per_call(call: Callable[[], object], count: int) -> float:
-    def measure() -> float:
-        start = time.process_time()
-        for _ in range(count):
-            call()
-        return (time.process_time() - start) / count * 1e6
-
-    return best(measure)
+def us_per_call(call: Callable[[], object]) -> float:
+    return min(repeat(call, timer=time.process_time, number=CALLS, repeat=REPEATS)) / CALLS * 1e6
 
 
 def flight_s(recorded: bool) -> float:
@@ -110,7 +106,7 @@ def core_us() -> tuple[float, float]:
         tick()
 
     steer = bound(entry.control, parameters.arg, data.arg, estimator.arg, control.arg)
-    return us_per_call(estimate, 20_000), us_per_call(steer, 20_000)
+    return us_per_call(estimate), us_per_call(steer)
 
 
 def plant_us() -> float:
@@ -125,7 +121,7 @@ def plant_us() -> float:
         now_us += 1000
         plant.advance(now_us)
 
-    return us_per_call(step, 20_000)
+    return us_per_call(step)
 
 
 def command_s(*words: str, **environment: str) -> float:
@@ -153,9 +149,8 @@ def image_s(elf: str) -> float:
     """Processor time of one simulated second of an image."""
 
     def flown_s(duration_s: float) -> float:
-        return best(
-            lambda: command_s("-m", "hil.commands", *HOVER.split()[:-1], str(duration_s), "--board", elf)
-        )
+        words = ("-m", "hil.commands", *HOVER.split()[:-1], str(duration_s), "--board", elf)
+        return best(partial(command_s, *words))
 
     return (flown_s(IMAGE_S + 1.0) - flown_s(1.0)) / IMAGE_S
 
@@ -174,7 +169,7 @@ def empty_loop_us() -> float:
             heapreplace(heap, (now_us + period_us, period_us))
             nothing(now_us)
 
-    return us_per_call(millisecond, 20_000)
+    return us_per_call(millisecond)
 
 
 def rotorpy_s() -> float:
@@ -198,11 +193,8 @@ class Figures:
     """The measurements: a table for people, and the same for programs."""
 
     def __init__(self) -> None:
-        self.table = Table(title=f"floaty bench: {STATE}")
+        self.table = Table("what", *right("value", "compared"), title=f"floaty bench: {STATE}")
         self.values: dict[str, float | str] = {"code": STATE}
-        self.table.add_column("what")
-        self.table.add_column("value", justify="right")
-        self.table.add_column("compared", justify="right")
 
     def add(self, name: str, value: float, unit: str, compared: str = "", digits: int = 2) -> None:
         self.table.add_row(name, f"{value:.{digits}f} {unit}", compared)
@@ -235,28 +227,17 @@ def add_campaign(figures: Figures) -> None:
     figures.add("memory kept per flight of 0.1 s", growth_kb(), "kB")
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    arguments.add_argument("--compile", action="store_true", help="measure a first compilation too")
-    arguments.add_argument("--campaign", action="store_true", help="measure a campaign's workers too")
-    arguments.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
-    options = arguments.parse_args()
-    with tempfile.TemporaryDirectory() as folder:  # warm up
-        fly(Request.of(EXPERIMENTS["hover"], duration_s=1.0), Path(folder))
-
-    figures = Figures()
+def add_loop(figures: Figures) -> None:
+    """Add the real-time factor of whole flights, and the cost of their parts."""
     bare, recorded = flight_s(recorded=False), flight_s(recorded=True)
     simulated_s = FLIGHT_S + load_config().flight.release_us * 1e-6
     loop_us = recorded / simulated_s * 1e3
     figures.add("whole loop, recorded", simulated_s / recorded, "x real time", digits=0)
     figures.add("whole loop, not recorded", simulated_s / bare, "x real time", digits=0)
     try:
-        slower = simulated_s / recorded * (peer_s := rotorpy_s()) / ROTORPY_S
-        figures.add(
-            "RotorPy, a hover at 100 Hz", ROTORPY_S / peer_s, "x real time", f"{slower:.1f} x slower", 1
-        )
+        factor = ROTORPY_S / rotorpy_s()
+        slower = f"{simulated_s / recorded / factor:.1f} x slower"
+        figures.add("RotorPy, a hover at 100 Hz", factor, "x real time", slower, 1)
     except ImportError as error:
         print(f"RotorPy is left out ({error}): {install_command('bench')}", file=sys.stderr)
     figures.add("one simulated millisecond", loop_us, "us", "100 %")
@@ -274,6 +255,20 @@ def main() -> None:
     figures.add("simpy on the same scenario", simpy_us, "us", f"{simpy_us / kernel_us:.1f} x ours")
     part("recorder and telemetry log, per ms", (recorded - bare) / simulated_s * 1e3, 1.0)
     figures.add("start to first tick, warm", best(start_up_s), "s")
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    arguments.add_argument("--compile", action="store_true", help="measure a first compilation too")
+    arguments.add_argument("--campaign", action="store_true", help="measure a campaign's workers too")
+    arguments.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
+    options = arguments.parse_args()
+    with tempfile.TemporaryDirectory() as folder:  # warm up
+        fly(Request.of(EXPERIMENTS["hover"], duration_s=1.0), Path(folder))
+    figures = Figures()
+    add_loop(figures)
     add_commands(figures)
     if elf := os.environ.get("FLOATY_CF2_ELF"):
         figures.add("whole binary, from start to first tick", best(lambda: start_up_s(elf)), "s")
@@ -281,7 +276,7 @@ def main() -> None:
     if options.compile:
         with tempfile.TemporaryDirectory() as folder:
             first_s = start_up_s(NUMBA_CACHE_DIR=folder)
-            figures.add("start to first tick, first compilation ever", first_s, "s", digits=1)
+        figures.add("start to first tick, first compilation ever", first_s, "s", digits=1)
     if options.campaign:
         add_campaign(figures)
     Console(width=100).print(figures.table)

@@ -4,6 +4,7 @@ The flights are those of `floaty campaign table`, with a length given by the ben
 """
 
 import time
+from contextlib import closing
 
 import psutil
 
@@ -24,31 +25,25 @@ def nothing(job: Job) -> Row:
 
 def flights_per_s(flight_s: float, count: int) -> float:
     """Flights per second of wall time on `count` workers, after one warm-up flight of each."""
-    workers = Workers(count)
-    _timed(workers, flight_s, range(count), fly_job)
-    wall_s = _timed(workers, flight_s, range(count, count + FLIGHTS), fly_job)
-    workers.close()
-    return FLIGHTS / wall_s
+    with closing(Workers(count)) as workers:
+        _timed(workers, flight_s, range(count), fly_job)
+        return FLIGHTS / _timed(workers, flight_s, range(count, count + FLIGHTS), fly_job)
 
 
 def overhead_s() -> float:
     """Wall time per flight of one worker whose flights do nothing."""
-    workers = Workers(1)
-    _timed(workers, 1.0, range(10), nothing)
-    wall_s = _timed(workers, 1.0, range(EMPTY_FLIGHTS), nothing)
-    workers.close()
-    return wall_s / EMPTY_FLIGHTS
+    with closing(Workers(1)) as workers:
+        _timed(workers, 1.0, range(10), nothing)
+        return _timed(workers, 1.0, range(EMPTY_FLIGHTS), nothing) / EMPTY_FLIGHTS
 
 
 def growth_kb() -> float:
     """Memory that a worker and this process keep per short flight [kB]."""
-    workers = Workers(1)
-    _timed(workers, SHORT_S, range(SETTLED), fly_job)
-    before = _memory(workers)
-    _timed(workers, SHORT_S, range(SETTLED, SHORT_FLIGHTS), fly_job)
-    grown = _memory(workers) - before
-    workers.close()
-    return grown / 1e3 / (SHORT_FLIGHTS - SETTLED)
+    with closing(Workers(1)) as workers:
+        _timed(workers, SHORT_S, range(SETTLED), fly_job)
+        before = _memory()
+        _timed(workers, SHORT_S, range(SETTLED, SHORT_FLIGHTS), fly_job)
+        return (_memory() - before) / 1e3 / (SHORT_FLIGHTS - SETTLED)
 
 
 def _timed(workers: Workers, flight_s: float, indices: range, fly_one: FlyOne) -> float:
@@ -59,7 +54,7 @@ def _timed(workers: Workers, flight_s: float, indices: range, fly_one: FlyOne) -
     return time.perf_counter() - start
 
 
-def _memory(workers: Workers) -> float:
+def _memory() -> float:
     """Bytes of this process and of all workers."""
     here = psutil.Process()
     return sum(process.memory_info().rss for process in (here, *here.children(recursive=True)))

@@ -6,12 +6,12 @@ drains the queue: four activations. simpy has no priorities, so its version only
 """
 
 from collections.abc import Callable, Generator
-from time import perf_counter
+from timeit import repeat
 from typing import Any
 
 import simpy
 
-from firmware_py.rtos import TICK_US, Kernel, Queue, Semaphore
+from firmware_py.rtos import TICK_US, Kernel, Queue
 
 ACTIVATIONS_PER_TICK = 4
 IMU_PHASE_US = 300
@@ -50,21 +50,15 @@ def kernel_run(ticks: int) -> int:
     kernel.create_task("ESTIMATOR", 2, estimator)
     kernel.start()
     kernel.run(0)
-    _drive(kernel, imu_ready, ticks)
-    return arrived
-
-
-def _drive(kernel: Kernel, imu_ready: Semaphore, ticks: int) -> None:
-    """Run the harness's loop, with the IMU as the only hardware."""
     imu_us = IMU_PHASE_US
-    end_us = ticks * TICK_US
-    while imu_us < end_us:
+    while imu_us < ticks * TICK_US:  # the harness's loop, with the IMU as the only hardware
         wake_us = kernel.next_wake_us
         now_us = imu_us if wake_us is None or imu_us < wake_us else wake_us
         if now_us == imu_us:
             imu_ready.give_from_isr()
             imu_us += TICK_US
         kernel.run(now_us)
+    return arrived
 
 
 def simpy_run(ticks: int) -> int:
@@ -109,9 +103,4 @@ def simpy_run(ticks: int) -> int:
 
 def us_per_activation(run: Callable[[int], int], ticks: int = 20_000) -> float:
     """Return the best of three runs [us]."""
-    seconds = []
-    for _ in range(3):
-        start = perf_counter()
-        run(ticks)
-        seconds.append(perf_counter() - start)
-    return min(seconds) * 1e6 / (ticks * ACTIVATIONS_PER_TICK)
+    return min(repeat(lambda: run(ticks), number=1, repeat=3)) * 1e6 / (ticks * ACTIVATIONS_PER_TICK)

@@ -20,28 +20,18 @@ from cflib.crazyflie import Crazyflie
 from cflib.crazyflie.param import ParamTocElement
 from cflib.crtp.crtpstack import CRTPPacket, CRTPPort
 
-from firmware_py.wire.crtp import (
-    PORT_CONSOLE,
-    PORT_LOG,
-    decode,
-    encode_ext_pose,
-)
+from firmware_py.wire.crtp import PORT_CONSOLE, PORT_LOG, decode, encode_ext_pose
 from firmware_py.wire.parameters import ABSOLUTE
 from firmware_py.wire.scalars import PARAMETER_SCALARS
 from firmware_py.wire.telemetry import Sample, state_in
 from ground_station.clock import clock_us
+from ground_station.config import LinkSettings
 from ground_station.controls import Answer, ControlRequest
 from ground_station.corrections import correct
 from ground_station.errors import LinkError
 from ground_station.latency import LinkLatency
 from ground_station.links.crtp_controls import PORTS, CrtpControls, TocEntry
-from ground_station.links.live_link import (
-    ANSWER_TIMEOUT_US,
-    POLL_S,
-    SILENCE_TIMEOUT_US,
-    LiveLink,
-    seconds,
-)
+from ground_station.links.live_link import ANSWER_TIMEOUT_US, POLL_S, SILENCE_TIMEOUT_US, LiveLink, seconds
 from ground_station.links.log_blocks import LogBlocks
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
@@ -60,11 +50,11 @@ URIS = (r"radio://\w+/\d{1,3}/(250K|1M|2M)(/[0-9A-Fa-f]{10})?", r"udp://[\w.-]+:
 
 
 class CrazyradioLink(LiveLink):
-    """One board; `latency_us` is the link's assumed latency until half the round trip of echoed packets is known."""
+    """One board; the link's latency is assumed until half the round trip of echoed packets is known."""
 
-    def __init__(self, uri: str, latency_us: int) -> None:
+    def __init__(self, uri: str, settings: LinkSettings) -> None:
         self._medium = uri.partition(":")[0]
-        super().__init__(uri, LinkLatency(self._medium, latency_us, measured=False))
+        super().__init__(uri, LinkLatency(self._medium, settings.latency_us, measured=False))
         self._round_trips_us: deque[int] = deque(maxlen=ECHOES)
         self._echo_us = 0  # when to request the next one
         self._sent_us = 0  # the last correction
@@ -78,25 +68,18 @@ class CrazyradioLink(LiveLink):
         self._telemetry_us = 0  # arrival of the last packet of a log block
         self._rate = 0.0  # of exchanges [1/s], 0 over UDP
         self._controls = CrtpControls(partial(self._queue, 0), self._parameters)
-        quiet_cflib()
 
     def _open(self) -> None:
         if not any(re.fullmatch(pattern, self.uri) for pattern in URIS):
             raise LinkError(f"{self.uri}: expected radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:19850")
-        if not cflib.crtp.CLASSES:
-            cflib.crtp.init_drivers()
+        start_cflib()
         self._connected = connected = threading.Event()
         self._lost, self._logs = "", LogBlocks(self._queue, self._log_table)
         crazyflie = self._crazyflie = Crazyflie(rw_cache=self._cache)
         crazyflie.packet_received.add_callback(self._on_any_packet)
         crazyflie.connected.add_callback(lambda uri: connected.set())
-        lost = partial(self._on_lost, crazyflie)
-        for event in (
-            crazyflie.connection_failed,
-            crazyflie.connection_lost,
-            crazyflie.disconnected_link_error,
-        ):
-            event.add_callback(lost)
+        for event in ("connection_failed", "connection_lost", "disconnected_link_error"):
+            getattr(crazyflie, event).add_callback(partial(self._on_lost, crazyflie))
         crazyflie.open_link(self.uri)
 
     def _connect(self) -> bool:
@@ -105,10 +88,13 @@ class CrazyradioLink(LiveLink):
             return False
         crazyflie.add_port_callback(CRTPPort.LINKCTRL, self._on_echo)
         for port in (*PORTS, PORT_CONSOLE, PORT_LOG):
-            crazyflie.add_port_callback(port, self._on_packet)
-        crazyflie.link_statistics.link_quality_updated.add_callback(self._on_quality)
-        crazyflie.link_statistics.uplink_rssi_updated.add_callback(self._on_rssi)
-        crazyflie.link_statistics.uplink_rate_updated.add_callback(self._on_rate)
+            crazyflie.add_port_callback(
+                port, lambda packet: self._hear(bytes((packet.header,)) + bytes(packet.data))
+            )
+        statistics = crazyflie.link_statistics
+        statistics.link_quality_updated.add_callback(partial(setattr, self, "quality"))
+        statistics.uplink_rssi_updated.add_callback(partial(setattr, self, "rssi"))
+        statistics.uplink_rate_updated.add_callback(partial(setattr, self, "_rate"))
         if crazyflie.param.toc.get_element_by_complete_name(ABSOLUTE) is not None:
             crazyflie.param.set_value(ABSOLUTE, 0)  # it is corrections that follow
         self._telemetry_us = now_us = clock_us()
@@ -140,7 +126,10 @@ class CrazyradioLink(LiveLink):
             silence = seconds(SILENCE_TIMEOUT_US)
             raise LinkError(f"{self.uri}: lost: no telemetry for {silence}, it may have rebooted")
         self._logs.tend(now_us)
-        self._ask_for_echo(now_us)
+        # Echoes are requested well apart from corrections, which would delay both.
+        if now_us >= self._echo_us and now_us - self._sent_us >= ECHO_APART_US:
+            self._echo_us = now_us + ECHO_PERIOD_US
+            self._do(lambda: self._transmit(bytes((ECHO_HEADER,)) + ECHO.pack(OWN_ECHO, clock_us())))
 
     def _close(self) -> None:
         crazyflie, self._crazyflie = self._crazyflie, None
@@ -189,9 +178,6 @@ class CrazyradioLink(LiveLink):
         self._sent_us = now_us
         self._transmit(encode_ext_pose(*correct(frame, goal, now_us + self.latency.us)))
 
-    def _send_echo(self) -> None:
-        self._transmit(bytes((ECHO_HEADER,)) + ECHO.pack(OWN_ECHO, clock_us()))
-
     def _queue(self, now_us: int, data: bytes) -> None:
         self._do(partial(self._transmit, data))
 
@@ -224,16 +210,6 @@ class CrazyradioLink(LiveLink):
         if packet.header & NULL_MASK != NULL_HEADER:  # the radio chip answers even without a board behind it
             self.heard_us = clock_us()
 
-    def _on_packet(self, packet: CRTPPacket) -> None:
-        self._hear(bytes((packet.header,)) + bytes(packet.data))
-
-    def _ask_for_echo(self, now_us: int) -> None:
-        """Request an echo from the board, well apart from corrections, which would delay both."""
-        if now_us < self._echo_us or now_us - self._sent_us < ECHO_APART_US:
-            return
-        self._echo_us = now_us + ECHO_PERIOD_US
-        self._do(self._send_echo)
-
     def _on_echo(self, packet: CRTPPacket) -> None:
         if packet.channel or len(packet.data) != ECHO.size:
             return
@@ -242,26 +218,19 @@ class CrazyradioLink(LiveLink):
             self._round_trips_us.append(clock_us() - asked_us)
             self.latency = LinkLatency(self._medium, median_low(self._round_trips_us) // 2, measured=True)
 
-    def _on_quality(self, quality: float) -> None:
-        self.quality = float(quality)
-
-    def _on_rssi(self, rssi: float) -> None:
-        self.rssi = float(rssi)
-
-    def _on_rate(self, rate: float) -> None:
-        self._rate = float(rate)
-
     def summary(self) -> str:
         radio = f"  quality {self.quality:.0f} %  {self._rate:.0f} exchanges/s" if self._rate else ""
         return f"corrections {self.sent} sent, {self.late} late{radio}"
 
 
-def quiet_cflib() -> None:
-    """Keep cflib's own messages off the terminal: important ones become a `LinkError`."""
+def start_cflib() -> None:
+    """Load cflib's drivers, and keep its messages off the terminal: important ones become a `LinkError`."""
     logger = logging.getLogger("cflib")
     logger.propagate = False
     if not logger.handlers:
         logger.addHandler(logging.NullHandler())
+    if not cflib.crtp.CLASSES:
+        cflib.crtp.init_drivers()
 
 
 def first_line(text: str) -> str:

@@ -11,13 +11,13 @@ forgotten it.
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Signing
 from firmware_py.wire.mavlink_layouts import NUMBERS, Message
 from firmware_py.wire.telemetry import Sample, state_in
+from ground_station.config import LinkSettings
 from ground_station.latency import LinkLatency
 from ground_station.links.mavlink_budget import STANDING_GOAL_HZ, link_budget
 from ground_station.links.mavlink_controls import BOARD_COMPONENT, MavlinkControls
@@ -34,39 +34,24 @@ TEXT_PIECE = 50  # characters; a longer line is sent in pieces
 SET_MESSAGE_INTERVAL, ACCEPTED = 511, 0  # a command and its best result
 
 
-@dataclass(frozen=True, slots=True)
-class MavlinkLinkConfig:
-    """The line and its settings. `signing_start`: the time stamp of MAVLink's signatures when the clock is 0."""
-
-    baud: int
-    pose_hz: float
-    signing_key: bytes = b""  # 32 bytes; empty: nothing is signed
-    signing_start: int = 0  # [10 us since 2015-01-01]
-    latency_us: int = 0  # to the board, until it is measured
-
-
 class MavlinkLink:
     """One board at the other end of `transmit(now_us, bytes)`; implements `ground_station.station.Link`.
 
-    `note_frame` receives every frame, in both directions. Raises `LinkError` when the line cannot carry a flight.
+    Raises `LinkError` when the line cannot carry a flight.
     """
 
-    def __init__(
-        self,
-        transmit: Callable[[int, bytes], object],
-        config: MavlinkLinkConfig,
-        note_frame: Callable[[int, bytes], object] | None = None,
-    ) -> None:
-        signing = Signing(config.signing_key, start=config.signing_start) if config.signing_key else None
-        self.budget = link_budget(config.baud, config.pose_hz, signing is not None)
+    def __init__(self, transmit: Callable[[int, bytes], object], settings: LinkSettings) -> None:
+        key = settings.signing_key
+        signing = Signing(key, start=settings.signing_start) if key else None
+        self.budget = link_budget(settings.baud, settings.corrections_hz, signing is not None)
         self.texts: deque[str] = deque(maxlen=TEXTS)  # the board's, and its refusals
         self._text = ""  # incomplete text
         self.supervisor_state: int | None = None  # as last received
-        self._note_frame = note_frame
+        self._note_frame = settings.note_frame
         self.board: int | None = None  # its system id, None before the first heartbeat
         self.answered = False  # it has acknowledged a command
         self.heard_us = 0  # arrival of its last frame
-        self.latency = LinkLatency("serial", config.latency_us, measured=False)
+        self.latency = LinkLatency("serial", settings.latency_us, measured=False)
         self._carry = transmit
         self._sender = FrameSender(SYSTEM, COMPONENT, signing)
         self._receiver = FrameReceiver(signing)

@@ -17,10 +17,11 @@ import serial
 
 from firmware_py.wire.telemetry import Sample
 from ground_station.clock import clock_us, signing_start
+from ground_station.config import LinkSettings
 from ground_station.controls import Answer, ControlRequest
 from ground_station.errors import LinkError
 from ground_station.links.live_link import CLOSE_TIMEOUT_S, POLL_S, LiveLink
-from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
+from ground_station.links.mavlink import MavlinkLink
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
@@ -102,30 +103,24 @@ class _Port:
 
 
 class MavlinkSerialLink(LiveLink):
-    """One board; `config.baud` is for URIs without one, `note_frame` receives every frame, in both directions."""
+    """One board."""
 
-    def __init__(
-        self,
-        uri: str,
-        config: MavlinkLinkConfig,
-        note_frame: Callable[[int, bytes], object] | None = None,
-    ) -> None:
-        self._device, baud = parse_uri(uri, config.baud)
-        self._config = replace(config, baud=baud, signing_start=signing_start())
+    def __init__(self, uri: str, settings: LinkSettings) -> None:
+        self._device, baud = parse_uri(uri, settings.baud)
+        self._settings = replace(settings, baud=baud, signing_start=signing_start())
         self._port: _Port | None = None
         self._link_lock = threading.Lock()  # the sender's thread uses the link, too
-        self._note_frame = note_frame
-        self._link = MavlinkLink(self._carry, self._config, note_frame)
+        self._link = MavlinkLink(self._carry, self._settings)
         self._asked = False  # for telemetry
         super().__init__(uri, self._link.latency)
 
     def _open(self) -> None:
         try:
-            self._port = _Port(self._device, self._config.baud, self._hear)
+            self._port = _Port(self._device, self._settings.baud, self._hear)
         except (OSError, ValueError) as error:
             raise LinkError(f"{self.uri}: {reason(error)}") from None
         with self._link_lock:
-            self._link = MavlinkLink(self._carry, self._config, self._note_frame)
+            self._link = MavlinkLink(self._carry, self._settings)
         self._asked = False
 
     def _connect(self) -> bool:
@@ -143,7 +138,7 @@ class MavlinkSerialLink(LiveLink):
     def _why_no_connection(self, now_us: int, within: str) -> str:
         seen, count = self._link.counters, self._port.bytes if self._port is not None else 0
         if self._link.board is not None:
-            hint = "" if self._config.signing_key else ": does it want signed frames (mavlink.signing_key)?"
+            hint = "" if self._settings.signing_key else ": does it want signed frames (mavlink.signing_key)?"
             return f"system {self._link.board} answers no command {within}{hint}"
         if not count:
             return f"no heartbeat {within}: no bytes arrive"
@@ -196,11 +191,8 @@ class MavlinkSerialLink(LiveLink):
             samples = link.receive(now_us, data, clock_us())
             self._notices += link.texts
             link.texts.clear()
-        self.heard_us, self.latency, self.supervisor_state = (
-            link.heard_us,
-            link.latency,
-            link.supervisor_state,
-        )
+        self.heard_us, self.latency = link.heard_us, link.latency
+        self.supervisor_state = link.supervisor_state
         return samples
 
     def summary(self) -> str:

@@ -12,7 +12,7 @@ from firmware_py.wire.core_port import CHANNEL_CALLS, PORT_CORE
 from firmware_py.wire.crtp import header
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
-from ground_station.links.crazyradio import URIS, first_line, quiet_cflib
+from ground_station.links.crazyradio import URIS, first_line, start_cflib
 
 USB = r"usb://\d"
 HEADER = header(PORT_CORE, CHANNEL_CALLS)
@@ -24,11 +24,8 @@ class CflibPackets:
     def __init__(self, uri: str) -> None:
         if not any(re.fullmatch(pattern, uri) for pattern in (*URIS, USB)):
             raise LinkError(f"{uri}: expected radio://0/80/2M/E7E7E7E7E7, usb://0 or udp://127.0.0.1:19850")
-        quiet_cflib()
-        if not cflib.crtp.CLASSES:
-            cflib.crtp.init_drivers()
-        self._uri = uri
-        self._lost = ""
+        start_cflib()
+        self._uri, self._lost = uri, ""
         try:
             self._driver = cflib.crtp.get_link_driver(uri, lambda statistics: None, self._lose)
         except Exception as error:  # cflib raises bare exceptions
@@ -63,11 +60,11 @@ class CflibPackets:
         self._check()
 
     def received(self, timeout_s: float = 0.0) -> list[bytes]:
-        came: list[bytes] = []
-        while (packet := self._driver.receive_packet(0 if came else timeout_s)) is not None:
-            came.append(bytes((packet.header,)) + bytes(packet.data))
+        packets: list[bytes] = []
+        while (packet := self._driver.receive_packet(0 if packets else timeout_s)) is not None:
+            packets.append(bytes((packet.header,)) + bytes(packet.data))
         self._check()
-        return came
+        return packets
 
     def close(self) -> None:
         self._driver.close()

@@ -49,7 +49,11 @@ class RecordingSource:
             try:
                 self._write(self._file, frame, clock_us())
             except OSError as error:
-                self._end(self._file, error)
+                with suppress(OSError):
+                    self._file.close()
+                self._file = None
+                why = error.strerror or error
+                self._notices.append(f"{self._path}: {why}; frames are not recorded any more")
         return frame
 
     def notices(self) -> list[str]:
@@ -72,12 +76,6 @@ class RecordingSource:
         if now_us >= self._flush_us:
             file.flush()
             self._flush_us = now_us + FLUSH_PERIOD_US
-
-    def _end(self, file: TextIO, error: OSError) -> None:
-        with suppress(OSError):
-            file.close()
-        self._notices.append(f"{self._path}: {error.strerror or error}; frames are not recorded any more")
-        self._file = None
 
 
 TELEMETRY_COLUMNS = (TIME_COLUMN, *POSE_COLUMNS)
@@ -140,7 +138,8 @@ def read_frames(path: Path) -> list[Arrived]:
     """Return the frames of a record or a telemetry log, at least one; `MocapError` for other files."""
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            frames = list(_frames(csv.DictReader(_whole_lines(file), strict=True)))
+            whole_lines = (line for line in file if line.endswith("\n"))  # the last one may be cut off
+            frames = list(_frames(csv.DictReader(whole_lines, strict=True)))
     except OSError as error:
         raise MocapError(f"{path}: {error.strerror or error}") from None
     except (csv.Error, UnicodeDecodeError, MocapError) as error:
@@ -151,11 +150,6 @@ def read_frames(path: Path) -> list[Arrived]:
         if next_us < t_us:
             raise MocapError(f"{path}: frames go back in time, from {t_us} to {next_us} us")
     return frames
-
-
-def _whole_lines(lines: Iterator[str]) -> Iterator[str]:
-    """Yield all lines but a last one that was cut off."""
-    return (line for line in lines if line.endswith("\n"))
 
 
 def _frames(rows: "csv.DictReader[str]") -> Iterator[Arrived]:

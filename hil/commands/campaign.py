@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hil.commands.options import INTERRUPTED, announce_compilation, console, notices, runner_options
+from hil.commands.options import INTERRUPTED, PATH, announce_compilation, notices, runner_options, say, warn
 from hil.errors import LabError, require
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("spec")
-@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="[runs/campaign-SPEC]")
+@click.option("--out", type=PATH, metavar="DIR", help="[runs/campaign-SPEC]")
 @runner_options
 @click.option(
     "--shrink", type=click.IntRange(0), metavar="FLIGHT",
@@ -50,20 +50,20 @@ def campaign(
     with Runner(notices, workers, cluster, resume) as runner:
         dataset, standing = runner.campaign(plan_of(read), out or Path("runs") / f"campaign-{file.stem}")
     page, findings = write_report(spec, read, dataset, standing.complete)
-    console.print(f"failed: {findings.rate}", soft_wrap=True)
+    say(f"failed: {findings.rate}")
     if len(findings.cells) > 1:
         for cell in findings.cells:
-            console.print(f"  {cell.experiment}, {cell.profile}: {cell.rate}", soft_wrap=True, markup=False)
+            say(f"  {cell.experiment}, {cell.profile}: {cell.rate}")
     for one in findings.limits:
         where = f"{one.experiment}, {one.profile}" if len(findings.cells) > 1 else one.profile
-        console.print(f"  {where}, {one.name}: {one.rate}", soft_wrap=True, markup=False)
+        say(f"  {where}, {one.name}: {one.rate}")
     for text in findings.errors:
-        console.print(f"  did not end: {text}", soft_wrap=True, markup=False)
+        say(f"  did not end: {text}")
     for worst in findings.worst[:3]:
-        console.print(f"  flight {worst.index}: {worst.command}", soft_wrap=True, markup=False)
-    console.print(f"  {page}", soft_wrap=True)
+        say(f"  flight {worst.index}: {worst.command}")
+    say(f"  {page}")
     if runner.interrupted:
-        notices.print(f"interrupted: {standing.flown} flights are kept; --resume flies the others")
+        warn(f"interrupted: {standing.flown} flights are kept; --resume flies the others")
         return INTERRUPTED
     return 0
 
@@ -72,9 +72,9 @@ def _shrink(spec: Spec, drawn: Job) -> int:
     from hil.api import command_of
     from hil.campaigns.shrink import Reflight, shrink
 
-    reflight = Reflight(spec, drawn, lambda text: notices.print(text, soft_wrap=True, markup=False))
+    reflight = Reflight(spec, drawn, lambda text: warn(text))
     whole = reflight.request(reflight.whole)
     least = shrink(reflight.whole, whole.duration_s, reflight.fails)
-    console.print(f"flight {drawn.index} still fails with", soft_wrap=True)
-    console.print(f"  {command_of(reflight.request(least))}", soft_wrap=True, markup=False)
+    say(f"flight {drawn.index} still fails with")
+    say(f"  {command_of(reflight.request(least))}")
     return 0

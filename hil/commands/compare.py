@@ -7,24 +7,20 @@ from typing import TYPE_CHECKING
 import click
 from rich.table import Table
 
-from hil.commands.options import console, wide_console
+from hil.commands.options import PATH, console, right, say, wide_console
 
 if TYPE_CHECKING:
     from hil.pictures.compare import Comparison
     from hil.studies.two_boards import Seed
 
 NAMED = 5  # columns that only one run has
-folder_type = click.Path(path_type=Path)
 
 
 @click.command()
-@click.argument("first", metavar="RUN", type=folder_type)
-@click.argument("second", metavar="RUN", type=folder_type)
+@click.argument("first", metavar="RUN", type=PATH)
+@click.argument("second", metavar="RUN", type=PATH)
 @click.option(
-    "--out",
-    type=folder_type,
-    metavar="DIR",
-    help="For compare.png and compare.html [the second run's folder].",
+    "--out", type=PATH, metavar="DIR", help="For compare.png and compare.html [the second run's folder]."
 )
 def compare(first: Path, second: Path, out: Path | None) -> int:
     """Compare one flight with another: first difference, metrics, settings, both in one plot.
@@ -47,69 +43,53 @@ def compare(first: Path, second: Path, out: Path | None) -> int:
     page = write_comparison(out or second, a, b, comparison, why)
     _print_comparison(first, second, comparison)
     for line in why:
-        console.print(line, soft_wrap=True)
-    console.print(f"  {page}", soft_wrap=True)
+        say(line)
+    say(f"  {page}")
     return 0 if comparison.identical else 1
 
 
 def _print_comparison(first: Path, second: Path, comparison: "Comparison") -> None:
-
-    table = Table(title=f"{first} | {second}")
-    table.add_column("metric")
-    for heading in ("first", "second", "difference"):
-        table.add_column(heading, justify="right")
-    table.add_column("unit")
+    table = Table("metric", *right("first", "second", "difference"), "unit", title=f"{first} | {second}")
     differing = [pair for pair in comparison.metrics if pair.difference != 0]
     for pair in differing:
         numbers = (*pair.values, pair.difference)
         shown = ("–" if math.isnan(number) else f"{number:.4g}" for number in numbers)
         table.add_row(pair.name, *shown, pair.unit)
     for name, x, y in comparison.settings:
-        console.print(f"{name}: {x} | {y}", soft_wrap=True)
+        say(f"{name}: {x} | {y}")
     if differing:
         console.print(table)
-    console.print(
-        f"{len(comparison.metrics) - len(differing)} metrics are equal. {comparison.span}", soft_wrap=True
-    )
+    say(f"{len(comparison.metrics) - len(differing)} metrics are equal. {comparison.span}")
     if comparison.apart:
-        apart = Table(title="distance at the same time since the release")
-        for heading in ("", "rms", "largest", "unit"):
-            apart.add_column(heading, justify="right" if heading in ("rms", "largest") else "left")
+        title = "distance at the same time since the release"
+        apart = Table("", *right("rms", "largest"), "unit", title=title)
         for one in comparison.apart:
             apart.add_row(one.name, f"{one.rms:.3g}", f"{one.largest:.3g}", one.unit)
         console.print(apart)
     for folder, missing in zip((first, second), comparison.missing, strict=True):
         if missing:
             more = f" and {len(missing) - NAMED} more, which the page names" if len(missing) > NAMED else ""
-            console.print(f"not in {folder}: {', '.join(missing[:NAMED])}{more}", soft_wrap=True)
+            say(f"not in {folder}: {', '.join(missing[:NAMED])}{more}")
     if comparison.one_is_real:
-        console.print("one flight is real, the other simulated: they share no rows")
+        say("one flight is real, the other simulated: they share no rows")
     elif comparison.first is not None:
-        console.print(f"first difference: {comparison.first}", soft_wrap=True)
+        say(f"first difference: {comparison.first}")
     elif comparison.identical:
-        console.print("identical")
+        say("identical")
     else:
-        console.print("identical in the columns that both have")
+        say("identical in the columns that both have")
 
 
 def _print_seeds(first: Path, second: Path, seeds: list["Seed"]) -> int:
     """Print a row per seed; return the exit code."""
-    table = Table(title=f"{first} | {second}")
-    for heading in (
-        "seed",
-        "rms x y z [cm]",
-        "rms x y z [cm]",
-        "apart [mm]",
-        "poses",
-        "first servo count",
-        "why",
-    ):
-        table.add_column(heading, justify="right")
+    rms = "rms x y z [cm]"
+    headings = right("seed", rms, rms, "apart [mm]", "poses", "first servo count", "why")
+    table = Table(*headings, title=f"{first} | {second}")
     for one in seeds:
         place = "equal" if one.first is None else f"{one.first.t_s:.3f} s {one.first.servo}"
         table.add_row(
             str(one.seed),
-            *(" ".join(f"{100 * value:.3f}" for value in rms) for rms in one.rms_m),
+            *(" ".join(f"{100 * value:.3f}" for value in each) for each in one.rms_m),
             f"{1000 * one.apart_m:.2f}",
             "{} | {}".format(*one.fused),
             place,
@@ -118,8 +98,7 @@ def _print_seeds(first: Path, second: Path, seeds: list["Seed"]) -> int:
     wide_console(140).print(table)
     worst = max(float(abs(b / a - 1).max()) for a, b in (one.rms_m for one in seeds))
     apart = max(one.apart_m for one in seeds)
-    console.print(
-        f"{len(seeds)} seeds: rms errors within {100 * worst:.1f} % of the first's, bodies within {1000 * apart:.2f} mm",
-        soft_wrap=True,
+    say(
+        f"{len(seeds)} seeds: rms errors within {100 * worst:.1f} % of the first's, bodies within {1000 * apart:.2f} mm"
     )
     return int(any(one.first is not None for one in seeds))

@@ -6,13 +6,13 @@ And `floaty board doctor`: the state of a connected board, within a minute.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
 
 import click
-from rich.console import Console
 from rich.progress import TimeRemainingColumn
 
 from firmware_py.export.errors import ExportError
@@ -20,15 +20,15 @@ from firmware_py.export.usage import CLOCK_MHZ
 from firmware_py.extras import install_command
 from ground_station.errors import LinkError
 from hil.commands.options import (
+    FILE,
     INTERRUPTED,
     announce_compilation,
     fault_option,
-    profile_option,
-    progress_bar,
+    profile_options,
+    progress_of_steps,
     say,
-    set_option,
 )
-from hil.errors import LabError
+from hil.errors import LabError, refusing
 
 if TYPE_CHECKING:
     from hil.deploy.check import Checked
@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from hil.deploy.targets import Loads, MachineCode
     from hil.laboratory.flight import Flight
     from hil.laboratory.request import Options
-
-console = Console(highlight=False, markup=False)
 
 
 @click.group()
@@ -62,8 +60,7 @@ def deploy() -> None:
     metavar="S",
     help="Free flight [s]; default: the experiment's.",
 )
-@profile_option
-@set_option
+@profile_options
 @fault_option
 @click.option(
     "--targets", "target_text", metavar="NAME,...",
@@ -71,11 +68,11 @@ def deploy() -> None:
     "[default: all but boards]",
 )  # fmt: skip
 @click.option(
-    "--source", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    "--source", type=FILE, metavar="FILE",
     help="Check this floaty_core.c, which was exported before, instead of a fresh export.",
 )  # fmt: skip
 @click.option(
-    "--elf", "firmware", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    "--elf", "firmware", type=FILE, metavar="FILE",
     help="Check this linked firmware, the build/cf2.elf that is flashed: its core as cortex-m4 (only that, unless --targets "
     "says otherwise), its parameters and a flight of it on the emulated board.",
 )  # fmt: skip
@@ -102,26 +99,26 @@ def check(
     names = target_names(CORTEX_M4 if firmware and target_text is None else target_text)
     fresh = not source and not firmware and set(names) <= set(TARGETS)
     flights = plan(experiment, every, fresh, **options)
-    toolbox = Toolbox(names, flights[0].config.logic, _read(source) if source else None, firmware)
-    failing = (
-        toolbox
-        if flights[-1].config.logic == flights[0].config.logic
-        else Toolbox(names, flights[-1].config.logic)
-    )
+    logic, last_logic = flights[0].config.logic, flights[-1].config.logic
+    with refusing(f"--source {source}: ", OSError, UnicodeDecodeError):
+        core = source.read_text(encoding="utf-8") if source else None
+    toolbox = Toolbox(names, logic, core, firmware)
+    last_toolbox = toolbox if last_logic == logic else Toolbox(names, last_logic)
     announce_compilation()
     checked: list[Checked] = []
     for request in flights:
-        with _progress(str(request.experiment.name)) as show:
-            tools = failing if request is flights[-1] else toolbox
-            checked.append(check_flight(request, tools.factories, show))
+        factories = (last_toolbox if request is flights[-1] else toolbox).factories
+        with progress_of_steps(TimeRemainingColumn()) as show:
+            show_flight = partial(_show_flight, show, request.experiment.name)
+            checked.append(check_flight(request, factories, show_flight))
         _print_flight(checked[-1])
         if checked[-1].outcome == "interrupted" or checked[-1].failed:
             break
     _print_sum(checked)
     seen, missed = reached(checked)
-    console.print(f"supervisor: reached {seen}{f'; not {missed}' if missed else ''}", soft_wrap=True)
+    say(f"supervisor: reached {seen}{f'; not {missed}' if missed else ''}")
     if not fresh and "not finite" in missed:
-        console.print("            only a core with own logic has the guard that finds what is not finite")
+        say("            only a core with own logic has the guard that finds what is not finite")
     if toolbox.machine_code is not None:
         _print_machine_code(toolbox.machine_code)
     counted = {} if toolbox.machine_code is None else toolbox.machine_code.entries
@@ -137,26 +134,20 @@ def check(
 
 def _check_around(elf: Path, profile: str, overrides: tuple[str, ...]) -> bool:
     """Check an image around its core; print the findings, and what remains unproven."""
-
     from hil.deploy.image_check import UNPROVEN, check_image, check_memory, has_app
 
     app, memory = has_app(elf)
     well = True
     say_finding(check_memory(memory))  # only a warning
     if not app:
-        console.print(f"unproven: everything but the core: {elf} has no exported app", soft_wrap=True)
+        say(f"unproven: everything but the core: {elf} has no exported app")
         return True
-    with progress_bar() as progress:
-        bar = progress.add_task("", total=None)
-
-        def show(what: str, done: int, total: int) -> None:
-            progress.update(bar, description=what, completed=done, total=total)
-
+    with progress_of_steps() as show:
         for finding in check_image(elf, profile, overrides, show):
             say_finding(finding)
             well = well and finding.good
     for text in UNPROVEN:
-        console.print(f"unproven: {text}", soft_wrap=True)
+        say(f"unproven: {text}")
     return well
 
 
@@ -165,25 +156,17 @@ def say_finding(finding: Finding) -> None:
     say(f"{'  ' if finding.good else '! '}{finding.subject:<10}{finding.text}")
 
 
-@contextmanager
-def _progress(name: str) -> Iterator[Callable[[int, Flight], None]]:
-    """Show the progress of a flight."""
-    with progress_bar(TimeRemainingColumn()) as progress:
-        bar = progress.add_task(name, total=None)
-        yield lambda now_us, flight: progress.update(bar, completed=now_us, total=flight.end_us)
+def _show_flight(show: Callable[[str, int, int], None], name: str, now_us: int, flight: Flight) -> None:
+    show(name, now_us, flight.end_us)
 
 
 def _print_flight(checked: Checked) -> None:
     request = checked.request
     faults = f", {len(request.faults)} faults" if request.faults else ""
-    console.print(
-        f"{request.experiment.name}, seed {request.seed}{faults}: {checked.outcome}", soft_wrap=True
-    )
+    say(f"{request.experiment.name}, seed {request.seed}{faults}: {checked.outcome}")
     for target in checked.targets:
         verdict = "equal" if target.divergence is None else f"DIFFERS first in {target.divergence}"
-        console.print(
-            f"  {target.name:<10}{target.ticks:>7} ticks {target.calls:>7} calls  {verdict}", soft_wrap=True
-        )
+        say(f"  {target.name:<10}{target.ticks:>7} ticks {target.calls:>7} calls  {verdict}")
 
 
 def _print_sum(checked: list[Checked]) -> None:
@@ -192,28 +175,23 @@ def _print_sum(checked: list[Checked]) -> None:
     ticks = min(sum(target.ticks for target in every if target.name == name) for name in names)
     different = [name for name in names if any(target.divergence for target in every if target.name == name)]
     verdict = f"{', '.join(different)} DIFFERS" if different else "no bit differs"
-    console.print(f"{ticks} ticks, numba beside {', '.join(names)}: {verdict}", soft_wrap=True)
+    say(f"{ticks} ticks, numba beside {', '.join(names)}: {verdict}")
 
 
 def _print_machine_code(code: MachineCode) -> None:
-
     ticks = code.ticks
     flash = "" if code.flash_bytes is None else f"flash {code.flash_bytes} B, "
-    console.print(
-        f"Cortex-M4 code: {flash}RAM {code.ram_bytes} B, stack {code.stack_bytes} B",
-        soft_wrap=True,
-    )
+    say(f"Cortex-M4 code: {flash}RAM {code.ram_bytes} B, stack {code.stack_bytes} B")
     mean, worst = code.loads
-    console.print(
+    say(
         f"instructions per tick: mean {ticks.instructions / max(ticks.calls, 1):.0f}, worst {ticks.worst_instructions}; "
-        f"load at {CLOCK_MHZ} MHz: mean {mean:.1%}, worst tick {worst:.1%} ({ticks.worst_us:.0f} us of 10 ms)",
-        soft_wrap=True,
+        f"load at {CLOCK_MHZ} MHz: mean {mean:.1%}, worst tick {worst:.1%} ({ticks.worst_us:.0f} us of 10 ms)"
     )
 
 
 def _print_measured(board: str, measured: Loads, counted: Loads) -> None:
     """Print a board's measured cycles beside those counted for the machine code."""
-    console.print(f"{board}: cycles per call, mean and worst, as measured on the board", soft_wrap=True)
+    say(f"{board}: cycles per call, mean and worst, as measured on the board")
     for name, load in measured.items():
         if load.calls == 0:
             continue
@@ -221,23 +199,14 @@ def _print_measured(board: str, measured: Loads, counted: Loads) -> None:
         if name in counted and counted[name].calls:
             one = counted[name]
             beside = f"   counted {one.cycles / one.calls:9.0f} {one.worst_cycles:9}"
-        console.print(
-            f"  {name:<10}{load.calls:>7} calls {load.cycles / load.calls:9.0f} {load.worst_cycles:9}{beside}",
-            soft_wrap=True,
+        say(
+            f"  {name:<10}{load.calls:>7} calls {load.cycles / load.calls:9.0f} {load.worst_cycles:9}{beside}"
         )
-
-
-def _read(source: Path) -> str:
-    try:
-        return source.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise LabError(f"--source {source}: {getattr(error, 'strerror', None) or error}") from None
 
 
 @deploy.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
-@profile_option
-@set_option
+@profile_options
 def write(folder: Path, profile: str, overrides: tuple[str, ...]) -> None:
     """Write the Crazyflie app with the flight core as C, and PROFILE's parameters in it, into the folder DIR."""
     from firmware_py.export.crazyflie import write_app
@@ -248,16 +217,13 @@ def write(folder: Path, profile: str, overrides: tuple[str, ...]) -> None:
         raise LabError(
             f"profile {profile}: its robot flies with the Crazyflie's own firmware, not with the app"
         )
-    try:
-        files = write_app(config, " ".join((profile, *overrides)), folder)
-    except ExportError as error:
-        raise LabError(str(error)) from None
-    for file in files:
-        console.print(file, soft_wrap=True)
+    with refusing("", ExportError):
+        for file in write_app(config, " ".join((profile, *overrides)), folder):
+            say(file)
 
 
 @deploy.command()
-@click.argument("image", metavar="IMAGE", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("image", metavar="IMAGE", type=FILE)
 @click.option("--uri", required=True, metavar="radio://…", help="The board, as in `floaty station`.")
 def flash(image: Path, uri: str) -> None:
     """Flash IMAGE, the .bin of a Crazyflie build, over the radio, read it back and start it."""
@@ -266,21 +232,11 @@ def flash(image: Path, uri: str) -> None:
     except ImportError as error:
         raise LabError(f"deploy flash: {error}: {install_command('radio')}") from None
 
-    try:
+    with refusing(f"{image}: ", OSError, LinkError):
         content = image.read_bytes()
-    except OSError as error:
-        raise LabError(f"{image}: {error.strerror or error}") from None
-    with progress_bar(TimeRemainingColumn()) as progress:
-        bar = progress.add_task("", total=None)
-
-        def show(what: str, done: int, size: int) -> None:
-            progress.update(bar, description=what, completed=done, total=size)
-
-        try:
+        with progress_of_steps(TimeRemainingColumn()) as show:
             flash_board(uri, content, show)
-        except LinkError as error:
-            raise LabError(f"{image}: {error}") from None
-    console.print(f"{len(content)} bytes written and read back; the board starts")
+    say(f"{len(content)} bytes written and read back; the board starts")
 
 
 @click.group()
@@ -290,8 +246,7 @@ def board() -> None:
 
 @board.command()
 @click.argument("link", metavar="LINK")
-@profile_option
-@set_option
+@profile_options
 def doctor(link: str, profile: str, overrides: tuple[str, ...]) -> int:
     """Examine the board at LINK (radio://0/80/2M/E7E7E7E7E7, usb://0, udp://HOST:PORT), and report its defects.
 
@@ -303,12 +258,8 @@ def doctor(link: str, profile: str, overrides: tuple[str, ...]) -> int:
 
     config = load_config(profile, overrides)
     well = True
-    with ExitStack() as stack:
-        client = open_real_core(link, "LINK", stack)
-        try:
-            for finding in examine(client, config):
-                say_finding(finding)
-                well = well and finding.good
-        except LinkError as error:
-            raise LabError(str(error)) from None
+    with ExitStack() as stack, refusing("", LinkError):
+        for finding in examine(open_real_core(link, "LINK", stack), config):
+            say_finding(finding)
+            well = well and finding.good
     return 0 if well else 1

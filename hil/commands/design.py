@@ -9,15 +9,15 @@ import click
 from rich.table import Table
 
 from hil.commands.options import (
+    PATH,
     announce_compilation,
     asked_as,
-    console,
-    profile_option,
+    profile_options,
+    say,
     seed_option,
-    set_option,
     wide_console,
 )
-from hil.errors import LabError, require, writing
+from hil.errors import LabError, made_folder, require, writing
 
 if TYPE_CHECKING:
     from hil.design.analysis import Analysis
@@ -51,21 +51,14 @@ class Search(DesignOptions):
 
 
 write_option = click.option(
-    "--write",
-    "write_to",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="A profile that flies this robot, with gains.",
-)  # fmt: skip
-out_option = click.option(
-    "--out", type=click.Path(path_type=Path), default=Path("runs/design"), show_default=True, metavar="DIR"
+    "--write", "write_to", type=PATH, metavar="FILE", help="A profile that flies this robot, with gains."
 )
+out_option = click.option("--out", type=PATH, default=Path("runs/design"), show_default=True, metavar="DIR")
 
 
 @click.group(invoke_without_command=True)
 @click.pass_context
-@profile_option
-@set_option
+@profile_options
 @click.option("--speed", type=click.FloatRange(1, 40), help="Updraft [m/s]: the hover angle follows.")
 @click.option("--angle", type=click.FloatRange(0, 70), help="Hover angle [deg]: the updraft follows.")
 @click.option(
@@ -90,14 +83,13 @@ def design(context: click.Context, robot: DesignOptions) -> None:
         about = f"The robot of {robot.profile}, lengths times {robot.length:g}, masses times {robot.mass:g}."
         write_profile(point, robot.write_to, about, robot.length)
     found = analyse(point)
-    page = write(found, folder_for(robot.out))
+    page = write(found, made_folder("--out", robot.out))
     show(found)
-    console.print(f"report  {page}", soft_wrap=True)
+    say(f"report  {page}")
 
 
 @design.command()
-@profile_option
-@set_option
+@profile_options
 @seed_option
 @click.option(
     "--figure",
@@ -141,15 +133,15 @@ def optimise(asked: Search) -> None:
         "stability: -f_αα [1/s²]",
         figure + (" / that of the profile's robot" if figure == "least-authority" else ""),
     )
-    picture = folder_for(asked.out) / f"pareto-{figure}.png"
+    picture = made_folder("--out", asked.out) / f"pareto-{figure}.png"
     picture.write_bytes(png(lambda: figures.pareto(axes, search.placed(found.tried, figure), front, marks)))
     for name, value in robot_lines(best.point):
-        console.print(f"{name:38} {value}", soft_wrap=True)
+        say(f"{name:38} {value}")
     own = f"{marks[profile][1]:.3f}" if found.reference_flies else "not stable and steering around its hover"
-    console.print(f"{figure}: {marks['best'][1]:.3f}; {profile}: {own}; {len(found.tried)} robots flew")
+    say(f"{figure}: {marks['best'][1]:.3f}; {profile}: {own}; {len(found.tried)} robots flew")
     for line in search.exercise(found, *updrafts):
-        console.print(line, soft_wrap=True)
-    console.print(f"picture  {picture}", soft_wrap=True)
+        say(line)
+    say(f"picture  {picture}")
 
 
 def write_profile(point: "Point", path: Path, about: str, length: float = 1.0) -> None:
@@ -159,7 +151,7 @@ def write_profile(point: "Point", path: Path, about: str, length: float = 1.0) -
     text = profile_text(point, gains_of(point.linear), about, length)
     with writing("--write", path):
         path.write_text(text, encoding="utf-8")
-    console.print(f"profile {path}", soft_wrap=True)
+    say(f"profile {path}")
 
 
 def point_of(robot: DesignOptions) -> "Point":
@@ -187,22 +179,14 @@ def point_of(robot: DesignOptions) -> "Point":
     return point
 
 
-def folder_for(out: Path) -> Path:
-    """Make the folder."""
-    with writing("--out", out):
-        out.mkdir(parents=True, exist_ok=True)
-    return out
-
-
 def show(found: "Analysis") -> None:
     """Print the tables."""
     for name, value in found.robot:
-        console.print(f"{name:38} {value}", soft_wrap=True)
+        say(f"{name:38} {value}")
     table = Table("input", "alone, inside the flaps' range", "linear, in both directions about the hover")
     for row in found.inputs:
         table.add_row(*row)
-    wide = wide_console()
-    wide.print(table)
+    wide_console().print(table)
     show_claims(found)
 
 

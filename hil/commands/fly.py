@@ -4,26 +4,28 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import click
 from rich.progress import TextColumn, TimeRemainingColumn
 
 from hil.commands.options import (
     INTERRUPTED,
+    PATH,
     announce_compilation,
     close_live,
-    console,
+    exit_code,
     fault_option,
     gdb_option,
     notices,
     open_live,
-    profile_option,
+    profile_options,
     progress_bar,
     runner_options,
+    say,
     seed_option,
-    set_option,
     view_option,
+    warn,
     write_pictures,
 )
 from hil.commands.tables import print_result, print_seeds
@@ -46,8 +48,7 @@ SEEDS_MAX = 10_000
 @click.option(
     "--duration", "duration_s", type=float, metavar="S", help="Free flight [s]; default: the experiment's."
 )
-@profile_option
-@set_option
+@profile_options
 @fault_option
 @click.option("--realtime", is_flag=True, help="Pace the flight to the wall clock.")
 @view_option
@@ -66,10 +67,7 @@ SEEDS_MAX = 10_000
     "radio://0/80/2M/E7E7E7E7E7, usb://0 or udp://HOST:PORT.",
 )  # fmt: skip
 @click.option(
-    "--elf",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="With a .bin as --board: the ELF that it was made from.",
+    "--elf", type=PATH, metavar="FILE", help="With a .bin as --board: the ELF that it was made from."
 )
 @gdb_option
 @click.option(
@@ -79,7 +77,7 @@ SEEDS_MAX = 10_000
 )  # fmt: skip
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="DIR",
     help="Run folder [runs/EXPERIMENT-SEED; -2, -3, … is added if that holds another flight].",
 )
@@ -109,15 +107,13 @@ def fly(
         raise LabError("--workers, --cluster and --resume are for several --seeds")
     announce_compilation()
     if seeds > 1:
-        first = request.seed
-        requests = [replace(request, seed=first + index) for index in range(seeds)]
-        crew = {"workers": workers, "cluster": cluster, "resume": resume}
-        return _fly_many(requests, options, out or Path("runs"), crew)
+        requests = [replace(request, seed=request.seed + index) for index in range(seeds)]
+        return _fly_many(requests, options, out or Path("runs"), (workers, cluster, resume))
     from hil.laboratory.folder import folder_of, moved, reserved
 
     folder = out or folder_of(request)
     if out is None and (why := moved(request, folder)):
-        notices.print(why, soft_wrap=True)
+        warn(why)
     with reserved(request, folder):
         return _fly_one(request, folder, target)
 
@@ -137,7 +133,6 @@ def _check_seeds(seeds: int, request: Request, target: str | None) -> None:
 
 def _fly_one(request: Request, folder: Path, target: str | None) -> int:
     """Fly one seed with all its pictures; return the exit code."""
-
     from hil.api import maker_of
     from hil.laboratory.run import fly
     from hil.live.panel_commands import PanelCommands
@@ -145,7 +140,6 @@ def _fly_one(request: Request, folder: Path, target: str | None) -> int:
     view = open_live(target)
     with progress_bar(TextColumn("{task.fields[now]}"), TimeRemainingColumn()) as progress:
         bar = progress.add_task(f"{request.experiment.name} seed {request.seed}", total=None, now="")
-
         hands: list[PanelCommands] = []
 
         def show(now_us: int, flight: Flight) -> None:
@@ -163,36 +157,34 @@ def _fly_one(request: Request, folder: Path, target: str | None) -> int:
             write_perfetto(folder)
     print_result(result)
     if view is not None and view.address and notices.is_terminal:
-        notices.print("the flight can be viewed until Ctrl-C")
+        warn("the flight can be viewed until Ctrl-C")
         view.stay()
     close_live(view, result)
     if result.stood_still_ms:
-        console.print(f"this machine was too slow: time stood still for {result.stood_still_ms:.0f} ms")
-    if result.outcome == "interrupted":
-        return INTERRUPTED
-    return 0 if result.passed else 1
+        say(f"this machine was too slow: time stood still for {result.stood_still_ms:.0f} ms")
+    return exit_code(result)
 
 
-def _fly_many(requests: list[Request], options: Options, parent: Path, crew: dict[str, Any]) -> int:
+def _fly_many(
+    requests: list[Request], options: Options, parent: Path, crew: tuple[int | None, str, bool]
+) -> int:
     """Fly seeds in parallel processes; print one row per seed and a summary; return the exit code."""
     from hil.campaigns.jobs import Job
     from hil.campaigns.run import Runner
     from hil.laboratory.folder import folder_of, moved
 
-    jobs: list[Job] = []
-    whys: list[str] = []
-    for request in requests:
-        folder = folder_of(request, parent)
-        whys += filter(None, [moved(request, folder)])
-        jobs.append(Job(0, request.experiment.reference, options | {"seed": request.seed}, {}, folder))
-    for why in whys[:1]:
-        more = f", and so on: {len(whys)} of {len(jobs)}" if whys[1:] else ""
-        notices.print(f"{why}{more}", soft_wrap=True)
+    placed = [(request, folder_of(request, parent)) for request in requests]
+    jobs = [
+        Job(0, request.experiment.reference, options | {"seed": request.seed}, {}, folder)
+        for request, folder in placed
+    ]
+    if whys := [why for one in placed if (why := moved(*one))]:
+        warn(whys[0] + (f", and so on: {len(whys)} of {len(jobs)}" if whys[1:] else ""))
     name = f"{requests[0].experiment.name}-{requests[0].seed}-{requests[-1].seed}"
-    with Runner(notices, **crew) as runner:
+    with Runner(notices, *crew) as runner:
         rows = runner.fly(name, jobs, parent)
     print_seeds(rows)
     if runner.interrupted:
-        notices.print(f"interrupted: {len(rows)} of {len(requests)} seeds are complete")
+        warn(f"interrupted: {len(rows)} of {len(requests)} seeds are complete")
         return INTERRUPTED
     return 0 if all(row.passed for row in rows) else 1

@@ -9,39 +9,37 @@ import click
 from rich.table import Table
 
 from hil.commands.options import (
+    PATH,
     announce_compilation,
-    console,
     notices,
     profile_option,
     runner_options,
+    say,
     seed_option,
+    warn,
     wide_console,
 )
-from hil.errors import LabError, require, writing
+from hil.errors import LabError, made_folder, require, writing
 
 if TYPE_CHECKING:
     from hil.design.margins import Margins
     from hil.identify.identify import Identification
     from hil.studies.tuning import Round
 
-folder_type = click.Path(path_type=Path)
-
 
 @click.command()
-@click.argument("runs", metavar="RUN...", type=folder_type, nargs=-1, required=True)
+@click.argument("runs", metavar="RUN...", type=PATH, nargs=-1, required=True)
 @click.option(
     "--profile", metavar="NAME|FILE",
     help="With which a bare telemetry.csv was flown, and the base of a written profile  [default: the first RUN's].",
 )  # fmt: skip
+@click.option("--validate", type=PATH, metavar="RUN", help="A flight to be predicted, which is not fitted.")
 @click.option(
-    "--validate", type=folder_type, metavar="RUN", help="A flight to be predicted, which is not fitted."
-)
-@click.option(
-    "--profile-out", type=folder_type, metavar="FILE.toml", help="A profile with the identified constants."
+    "--profile-out", type=PATH, metavar="FILE.toml", help="A profile with the identified constants."
 )
 @click.option(
     "--out",
-    type=folder_type,
+    type=PATH,
     default=Path("runs/identify"),
     show_default=True,
     metavar="DIR",
@@ -70,13 +68,12 @@ def identify(
     found = identify_records(records)
     _print_constants(found)
     if found.excited or found.free:
-        with writing("--out", out):
-            out.mkdir(parents=True, exist_ok=True)
-            console.print(f"  {write_pages(out, found, held_out)}", soft_wrap=True)
+        with writing("--out", made_folder("--out", out)):
+            say(f"  {write_pages(out, found, held_out)}")
     if profile_out is not None:
         if notice := write_profile(profile_out, profile, found):
-            console.print(f"  {notice}", soft_wrap=True)
-        console.print(f"  {profile_out}   (floaty fly hover --profile {profile_out})", soft_wrap=True)
+            say(f"  {notice}")
+        say(f"  {profile_out}   (floaty fly hover --profile {profile_out})")
     return 0 if any(constant.verdict == IDENTIFIED for constant in found.constants) else 1
 
 
@@ -102,10 +99,9 @@ def _print_constants(found: "Identification") -> None:
             f"u{one.axis.input + 1}: {one.spectra.periods} at {degrees(found.records[one.record].flap_angle):.1f} deg"
             for one in found.excited
         )
-        console.print(
+        say(
             f"realisations and mean flap angles, to which the constants refer: {periods}; the model misses the log by "
-            f"{found.estimate.misfit**0.5:.2f} of its scatter",
-            soft_wrap=True,
+            f"{found.estimate.misfit**0.5:.2f} of its scatter"
         )
 
 
@@ -123,12 +119,12 @@ def _print_constants(found: "Identification") -> None:
 @click.option("--board", metavar="BOARD", default="python", show_default=True, help="As for `floaty fly`.")
 @click.option(
     "--out",
-    type=folder_type,
+    type=PATH,
     metavar="FILE.toml",
     help="A profile with the gains; of rounds, of the last one that gained.",
 )
 @click.option(
-    "--runs", type=folder_type, default=Path("runs/tune"), show_default=True, metavar="DIR", help="Of all flights."
+    "--runs", type=PATH, default=Path("runs/tune"), show_default=True, metavar="DIR", help="Of all flights."
 )  # fmt: skip
 @runner_options
 def tune(
@@ -152,8 +148,7 @@ def tune(
     from hil.studies.tuning import TuningFlights, fly_round, rounds, write_tuned
 
     _check_profile("--out", out)
-    with writing("--runs", runs):
-        runs.mkdir(parents=True, exist_ok=True)
+    made_folder("--runs", runs)
     announce_compilation()
     best: Round | None = None
     with Runner(notices, **crew) as runner:
@@ -166,73 +161,72 @@ def tune(
         try:
             for number, one in enumerate(flown, 1):
                 if repeat is not None:
-                    console.print(f"round {number}")
+                    say(f"round {number}")
                 _print_round(one)
                 if best is None or one.better:
                     best = one
         except LabError as error:
             if best is None:
                 raise
-            notices.print(f"{error}; the best earlier round counts", soft_wrap=True)
+            warn(f"{error}; the best earlier round counts")
     assert best is not None
     if out is not None:
         write_tuned(out, profile, load_config(best.profile), "Model and gains by floaty tune.")
-        console.print(f"  {out}   (floaty fly hover --profile {out})", soft_wrap=True)
+        say(f"  {out}   (floaty fly hover --profile {out})")
     return 0 if repeat is not None or best.better else 1
 
 
 def _print_round(one: "Round") -> None:
     """Print a round: gains, margins, predicted and flown motion."""
-
     from hil.studies.tuning import rms
 
     tuned = one.tuned
-    wide = wide_console()
-    gains = Table(
-        "axis",
-        "gains, old",
-        "gains, new",
-        title="u = gain (target - estimate) - gains (velocity, angle, rate)",
+    for table in (_gains(one), _edges(one), _motion(one)):
+        wide_console().print(table)
+    say(
+        f"robots: {len(tuned.robots.drawn)} drawn, {tuned.robots.about}; poses are {1e3 * tuned.age_s:.1f} ms old, one in a "
+        f"hundred {1e3 * tuned.jitter_s:.1f} ms older; the least delay margin is {1e3 * tuned.least_delay_s:.1f} ms"
     )
-    edge = Table(
-        "axis", "", "gain up", "gain down", "phase", "delay", "late poses", "peak of 1/(1+L)",
-        title="margins, with the loop opened between command and servo",
-    )  # fmt: skip
-    moved = Table(
-        "axis", "old, predicted", "old, flown", "new, predicted", "new, flown", "worst robots, flown",
-        title="rms of the hover",
-    )  # fmt: skip
-    for axis in tuned.axes:
+    say(
+        f"rms distance from the goal: {_distance(rms(tuned.before))}, with the new gains {_distance(rms(one.flown[0]))}"
+        + ("" if one.better else ": the old gains are kept")
+    )
+
+
+def _gains(one: "Round") -> Table:
+    title = "u = gain (target - estimate) - gains (velocity, angle, rate)"
+    table = Table("axis", "gains, old", "gains, new", title=title)
+    for axis in one.tuned.axes:
         old, new = (", ".join(f"{gain:.4g}" for gain in own) for own in (axis.old, axis.new))
-        gains.add_row(axis.axis.label, f"{', '.join(axis.axis.gains)} = {old}", new)
-        edge.add_row(axis.axis.label, "old", *_margins(axis.old_margins), end_section=False)
-        edge.add_row("", "new", *_margins(axis.margins, axis.late))
-        edge.add_row(
-            "",
-            f"least of {1 + len(tuned.robots.drawn)}",
-            *_margins(axis.least, axis.least_late),
-            end_section=True,
-        )
+        table.add_row(axis.axis.label, f"{', '.join(axis.axis.gains)} = {old}", new)
+    return table
+
+
+def _edges(one: "Round") -> Table:
+    headings = ("axis", "", "gain up", "gain down", "phase", "delay", "late poses", "peak of 1/(1+L)")
+    table = Table(*headings, title="margins, with the loop opened between command and servo")
+    least = f"least of {1 + len(one.tuned.robots.drawn)}"
+    for axis in one.tuned.axes:
+        table.add_row(axis.axis.label, "old", *_margins(axis.old_margins), end_section=False)
+        table.add_row("", "new", *_margins(axis.margins, axis.late))
+        table.add_row("", least, *_margins(axis.least, axis.least_late), end_section=True)
+    return table
+
+
+def _motion(one: "Round") -> Table:
+    headings = ("old, predicted", "old, flown", "new, predicted", "new, flown", "worst robots, flown")
+    table = Table("axis", *headings, title="rms of the hover")
+    for axis in one.tuned.axes:
         scale, unit = (100.0, "cm") if axis.metric else (degrees(1.0), "deg")
         flown = [
             "lost" if result.outcome != "completed" else f"{scale * result.metrics[axis.metric]:.2f} {unit}"
-            for result in (tuned.before, *one.flown)
+            for result in (one.tuned.before, *one.flown)
             if axis.metric
         ] or ["", ""]
         before = "not stable" if axis.old_motion is None else f"{scale * axis.old_motion.main:.2f} {unit}"
         after = f"{scale * axis.motion.main:.2f} {unit}"
-        moved.add_row(axis.axis.label, before, flown[0], after, flown[1], ", ".join(flown[2:]))
-    for table in (gains, edge, moved):
-        wide.print(table)
-    console.print(
-        f"robots: {len(tuned.robots.drawn)} drawn, {tuned.robots.about}; poses are {1e3 * tuned.age_s:.1f} ms old, one in a "
-        f"hundred {1e3 * tuned.jitter_s:.1f} ms older; the least delay margin is {1e3 * tuned.least_delay_s:.1f} ms",
-        soft_wrap=True,
-    )
-    console.print(
-        f"rms distance from the goal: {_distance(rms(tuned.before))}, with the new gains {_distance(rms(one.flown[0]))}"
-        + ("" if one.better else ": the old gains are kept")
-    )
+        table.add_row(axis.axis.label, before, flown[0], after, flown[1], ", ".join(flown[2:]))
+    return table
 
 
 def _margins(found: "Margins", late: float | None = None) -> list[str]:

@@ -11,7 +11,7 @@ import click
 from rich.markup import escape
 from rich.table import Table
 
-from hil.commands.options import console, wide_console
+from hil.commands.options import PATH, console, say, wide_console
 from hil.errors import LabError
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ HASH_DIGITS = 12
 
 
 @click.command("list")
-@click.argument("file", metavar="[FILE.py]", required=False, type=click.Path(path_type=Path))
+@click.argument("file", metavar="[FILE.py]", required=False, type=PATH)
 @click.option("--faults", is_flag=True, help="List the kinds of faults for `floaty fly --fault`.")
 def list_experiments(file: Path | None, faults: bool) -> None:
     """List the experiments, the robustness studies and the profiles, or the kinds of faults.
@@ -38,30 +38,29 @@ def list_experiments(file: Path | None, faults: bool) -> None:
         return _list_faults()
     if file:
         for name, experiment in own.items():
-            console.print(f"{file}:{name}  {experiment.summary}", soft_wrap=True, markup=False)
+            say(f"{file}:{name}  {experiment.summary}")
         return None
 
     width = max(map(len, EXPERIMENTS))
     for experiment in EXPERIMENTS.values():
-        console.print(f"{experiment.name:{width}}  {experiment.summary}", soft_wrap=True)
+        say(f"{experiment.name:{width}}  {experiment.summary}")
     for entry in entries().values():
         try:
             text = in_package(entry).summary
         except LabError as error:
             text = str(error)
-        console.print(f"{entry.name:{width}}  {text} ({package_of(entry)})", soft_wrap=True, markup=False)
+        say(f"{entry.name:{width}}  {text} ({package_of(entry)})")
     bench = "forces and torques on the mounted robot over flap angles; not a flight: `floaty drag-model`"
-    console.print(f"{'drag-model':{width}}  {bench}", soft_wrap=True)
-    console.print("\nrobustness, for `floaty study`:")
+    say(f"{'drag-model':{width}}  {bench}")
+    say("\nrobustness, for `floaty study`:")
     for one in STUDIES.values():
-        console.print(f"{one.name:{width}}  {one.question}", soft_wrap=True)
+        say(f"{one.name:{width}}  {one.question}")
     names = (f"{name} (default)" if name == DEFAULT_PROFILE else name for name in profile_names())
-    console.print(f"\nprofiles: {', '.join(names)}", soft_wrap=True)
-    console.print("faults: floaty list --faults")
+    say(f"\nprofiles: {', '.join(names)}")
+    say("faults: floaty list --faults")
 
 
 def _list_faults() -> None:
-
     from hil.laboratory.fault_kinds import KINDS
 
     table = Table(box=None, pad_edge=False)
@@ -78,7 +77,7 @@ def _list_faults() -> None:
 
 
 @click.command()
-@click.argument("folder", default="runs", type=click.Path(path_type=Path))
+@click.argument("folder", default="runs", type=PATH)
 def runs(folder: Path) -> None:
     """List the run folders below FOLDER [runs], the latest last: date, request, verdict and hash."""
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from firmware_py.errors import FirmwareError
-from hil.commands.options import console
+from hil.commands.options import FILE, PATH, say
 from hil.errors import LabError, require
 
 if TYPE_CHECKING:
@@ -31,23 +31,20 @@ ROOM = 0.9  # of the control slot: the cycles are from one compiler, for some st
 
 
 @click.command()
-@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.argument("folder", metavar="DIR", type=PATH)
 @click.option(
     "--robot", is_flag=True, help="A robot of your own: robot.py, its controller, profile and tests."
 )
 def new(folder: Path, robot: bool) -> None:
     """Make a project in DIR, a new or empty folder: controller.py, profile.toml, experiments.py, tests, README.md."""
     write_project("new", ROBOT_TEMPLATES if robot else TEMPLATES, folder, name=project_name("new", folder))
-    console.print(
-        f"cd {folder}; floaty fly hover --profile profile.toml; pytest; see README.md for more",
-        soft_wrap=True, markup=False,
-    )  # fmt: skip
+    say(f"cd {folder}; floaty fly hover --profile profile.toml; pytest; see README.md for more")  # fmt: skip
 
 
 @click.command()
-@click.argument("file", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("file", metavar="FILE", type=FILE)
 @click.option(
-    "--out", "folder", required=True, metavar="DIR", type=click.Path(path_type=Path),
+    "--out", "folder", required=True, metavar="DIR", type=PATH,
     help="The folder to write, new or empty: controller.py, profile.toml, README.md, tests.",
 )  # fmt: skip
 def policy(file: Path, folder: Path) -> None:
@@ -86,11 +83,9 @@ def policy(file: Path, folder: Path) -> None:
         text = f"the law's actions differ by {figures.difference:.2g} from the file's: at most {TOLERANCE:g}"
         raise LabError(f"policy {file}: {text}")
     write_project("policy", POLICY_TEMPLATES, folder, **values, figures=figures)
-    console.print(f"{network.shape}, {network.numbers} constants: {figures}", soft_wrap=True)
-    console.print(
-        f"largest difference from {file.name}: {figures.difference:.1e} of an action", soft_wrap=True
-    )
-    console.print(f"floaty fly hover --profile {folder / 'profile.toml'}", soft_wrap=True, markup=False)
+    say(f"{network.shape}, {network.numbers} constants: {figures}")
+    say(f"largest difference from {file.name}: {figures.difference:.1e} of an action")
+    say(f"floaty fly hover --profile {folder / 'profile.toml'}")
 
 
 def project_name(command: str, folder: Path) -> str:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
+from rich.table import Column
 
 from hil.errors import LabError
 
@@ -24,9 +24,11 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 Asked = TypeVar("Asked")
+Command = TypeVar("Command", bound=Callable[..., Any])
 
 console = Console(highlight=False)
 notices = Console(stderr=True, highlight=False)
+PATH, FILE = click.Path(path_type=Path), click.Path(path_type=Path, dir_okay=False)
 
 
 def wide_console(width: int = 150) -> Console:
@@ -34,7 +36,12 @@ def wide_console(width: int = 150) -> Console:
     return Console(highlight=False, width=max(console.width, width))
 
 
-run_folder = click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
+def right(*headings: str) -> list[Column]:
+    """Return the columns of a table whose cells are numbers."""
+    return [Column(heading, justify="right") for heading in headings]
+
+
+run_folder = click.argument("run", metavar="RUN", type=PATH)
 seed_option = click.option(
     "--seed", type=click.IntRange(0, 2**62), default=1, show_default=True, help="Seed of all random numbers."
 )
@@ -56,21 +63,22 @@ set_option = click.option(
     metavar="SECTION.KEY=VALUE",
     help="Override a value of the profile; repeatable.",
 )
-
-
 view_option = click.option(
     "--view", "target", is_flag=False, flag_value="window", metavar="[web|connect:HOST:PORT|foxglove]",
     help="Watch live: in the rerun viewer, in a browser, in a viewer that is open somewhere, in Foxglove.",
 )  # fmt: skip
-
-
 gdb_option = click.option(
     "--gdb", type=click.IntRange(0, 65535), metavar="PORT",
     help="With an image as --board: wait for GDB on this port of 127.0.0.1 (0: any); time stands still at its breakpoints.",
 )  # fmt: skip
 
 
-def runner_options(command: Callable[..., int]) -> Callable[..., int]:
+def profile_options(command: Command) -> Command:
+    """Add --profile and --set."""
+    return profile_option(set_option(command))
+
+
+def runner_options(command: Command) -> Command:
     """Add the options of a command that flies many flights."""
     for option in (
         click.option("--resume", is_flag=True, help="Continue what was begun in the folder; no flight is flown twice."),
@@ -107,13 +115,17 @@ def announce_compilation() -> None:
     from hil.devices.imu import channels
 
     if not is_kept(channels):
-        notices.print(COMPILING, soft_wrap=True)
+        warn(COMPILING)
 
 
-def say(text: str) -> None:
+def say(text: object) -> None:
     """Print a line and flush it: a program may read it."""
-    print(text)
-    sys.stdout.flush()
+    print(text, flush=True)
+
+
+def warn(text: str) -> None:
+    """Print a line on standard error."""
+    print(text, file=sys.stderr)
 
 
 def progress_bar(*columns: ProgressColumn) -> Progress:
@@ -122,12 +134,17 @@ def progress_bar(*columns: ProgressColumn) -> Progress:
     return Progress(*shown, console=notices, transient=True, disable=not notices.is_terminal)
 
 
-def stop_signals() -> list[int]:
-    """Return a list that receives the signals for an orderly end."""
-    stops: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda received, _: stops.append(received))
-    return stops
+@contextmanager
+def progress_of_steps(*columns: ProgressColumn) -> Iterator[Callable[[str, int, int], None]]:
+    """Show the progress of work that reports it as (what, done, total)."""
+    with progress_bar(*columns) as progress:
+        bar = progress.add_task("", total=None)
+        yield lambda what, done, total: progress.update(bar, description=what, completed=done, total=total)
+
+
+def exit_code(result: Result) -> int:
+    """Return a flight's exit code."""
+    return INTERRUPTED if result.outcome == "interrupted" else 0 if result.passed else 1
 
 
 def open_live(target: str | None) -> LiveView | None:
@@ -164,4 +181,4 @@ def write_pictures(folder: Path, experiment: Experiment) -> None:
 
         write_run_rrd(folder)
     except LabError as error:
-        notices.print(f"floaty: no recording: {error}", soft_wrap=True)
+        warn(f"floaty: no recording: {error}")

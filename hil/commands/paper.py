@@ -13,23 +13,23 @@ from rich.table import Table
 from hil.commands.design import show_claims
 from hil.commands.options import (
     INTERRUPTED,
+    PATH,
     announce_compilation,
-    console,
     notices,
-    profile_option,
+    profile_options,
     runner_options,
+    say,
     seed_option,
-    set_option,
+    warn,
     wide_console,
-)  # fmt: skip
-from hil.errors import require, writing
+)
+from hil.errors import made_folder, require, writing
 
 if TYPE_CHECKING:
     from hil.studies.paper import Paper
     from hil.studies.paper_identification import PaperConstant
     from hil.studies.study import Study
 
-folder_type = click.Path(path_type=Path)
 seeds_option = click.option(
     "--seeds",
     type=click.IntRange(1, 1000),
@@ -43,12 +43,7 @@ seeds_option = click.option(
 @click.command()
 @seeds_option
 @click.option(
-    "--out",
-    type=folder_type,
-    metavar="DIR",
-    default=Path("runs/paper"),
-    show_default=True,
-    help="Report and logs.",
+    "--out", type=PATH, metavar="DIR", default=Path("runs/paper"), show_default=True, help="Report and logs."
 )
 @click.option("--only", metavar="PATTERN", help="Only these experiments, like hover or yaw-*.")
 @click.option("--no-studies", is_flag=True, help="Leave the robustness studies out.")
@@ -69,7 +64,7 @@ def paper(seeds: int, out: Path, only: str | None, no_studies: bool, **crew: Any
 @click.command()
 @click.argument("name")
 @seeds_option
-@click.option("--out", type=folder_type, metavar="DIR", help="Report and picture [runs/study-NAME].")
+@click.option("--out", type=PATH, metavar="DIR", help="Report and picture [runs/study-NAME].")
 @runner_options
 def study(name: str, seeds: int, out: Path | None, **crew: Any) -> int:
     """Fly one robustness study (see `floaty list`): faults of growing size, several variants, one picture.
@@ -100,8 +95,7 @@ def _fly(
     from hil.studies.paper_report import write_paper
 
     announce_compilation()
-    with writing("--out", out), Runner(notices, **crew) as runner:
-        out.mkdir(parents=True, exist_ok=True)
+    with writing("--out", made_folder("--out", out)), Runner(notices, **crew) as runner:
         flown = fly_paper(rows, studies, seeds, out, runner)
         bench = list(drag_model.measure(load_config(), 1)) if mounted and not runner.interrupted else []
         shape = analyse(point_of(load_config())) if bench else None
@@ -114,24 +108,22 @@ def _fly(
     if shape is not None:
         show_claims(shape)
     _print_constants(constants)
-    console.print(f"  {report}", soft_wrap=True)
+    say(f"  {report}")
     if runner.interrupted:
-        notices.print("interrupted: the report has the flights that were complete")
+        warn("interrupted: the report has the flights that were complete")
         return INTERRUPTED
     holds = flown.holds if rows else all(result.holds for result in flown.studies)
     return 0 if holds else 1
 
 
 def _print_rows(flown: "Paper") -> None:
-
     from hil.studies.catalogue import PROFILES
     from hil.studies.paper import Spread
 
     if not flown.rows:
         return
-    table = Table(title="paper and laboratory: mean ± deviation over the seeds")
-    for heading in ("result", "figure", "paper", *PROFILES):
-        table.add_column(heading)
+    title = "paper and laboratory: mean ± deviation over the seeds"
+    table = Table("result", "figure", "paper", *PROFILES, title=title)
     for _, row, both in flown.rows:
         table.add_section()
         for index, (metric, claim) in enumerate(row.claims.items()):
@@ -143,14 +135,12 @@ def _print_rows(flown: "Paper") -> None:
         table.add_row("", "limits held", "", *verdicts)
     wide_console(160).print(table)
     for row, profile, what in flown.misses:
-        console.print(f"{row.title}, {profile}: {'; '.join(what)}", soft_wrap=True)
-    whys = dict.fromkeys(row.why for row, _, _ in flown.misses if row.why)
-    for why in whys:
-        console.print(f"\n{why}", soft_wrap=True)
+        say(f"{row.title}, {profile}: {'; '.join(what)}")
+    for why in dict.fromkeys(row.why for row, _, _ in flown.misses if row.why):
+        say(f"\n{why}")
 
 
 def _print_constants(constants: "Sequence[PaperConstant]") -> None:
-
     from hil.studies.paper_identification import COLUMNS, WHY
 
     if not constants:
@@ -159,7 +149,7 @@ def _print_constants(constants: "Sequence[PaperConstant]") -> None:
     for one in constants:
         table.add_row(*astuple(one))
     wide_console(160).print(table)
-    console.print(WHY, soft_wrap=True)
+    say(WHY)
 
 
 def _marked(text: str) -> str:
@@ -172,20 +162,13 @@ def _print_studies(flown: "Paper") -> None:
             f"{curve.variant.name}: {one}" for curve in result.curves for one in result.surprises(curve)
         ]
         verdict = "as expected" if result.holds else "; ".join(surprises) or "not complete"
-        console.print(f"study {result.study.name}: {verdict}", soft_wrap=True)
+        say(f"study {result.study.name}: {verdict}")
 
 
 @click.command("drag-model")
 @seed_option
-@profile_option
-@set_option
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("runs/drag-model"),
-    show_default=True,
-    metavar="DIR",
-)
+@profile_options
+@click.option("--out", type=PATH, default=Path("runs/drag-model"), show_default=True, metavar="DIR")
 def drag_model(seed: int, profile: str, overrides: tuple[str, ...], out: Path) -> None:
     """Measure forces and torques on the mounted robot over flap angles, against the paper's simplified model."""
 
@@ -194,10 +177,9 @@ def drag_model(seed: int, profile: str, overrides: tuple[str, ...], out: Path) -
 
     config = load_config(profile, overrides)
     config.robot.need_plates(profile, "floaty drag-model")
-    with writing("--out", out):
-        out.mkdir(parents=True, exist_ok=True)
+    made_folder("--out", out)
     announce_compilation()
     measured = drag_model.measure(config, seed)
     rows = list(track(measured, "mounted robot", drag_model.ROWS, console=notices, transient=True))
     page = drag_model.write(rows, math.degrees(config.plant.hover_angle), out)
-    console.print(f"report  {page}")
+    say(f"report  {page}")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from hil.commands.options import console, run_folder, say
+from hil.commands.options import run_folder, say
 from hil.errors import LabError
 from hil.live.window import show
 
@@ -37,7 +37,7 @@ def report(run: Path) -> None:
     """Write the report of RUN, a run folder, again."""
     from hil.pictures.report import write_report
 
-    console.print(f"report  {write_report(run)}")
+    say(f"report  {write_report(run)}")
 
 
 @click.command()
@@ -56,20 +56,20 @@ def export(run: Path, as_csv: bool, as_mcap: bool, as_tlog: bool, as_video: bool
     if as_csv:
         from hil.exports.wide_csv import write_csv
 
-        console.print(f"  {write_csv(run)}", soft_wrap=True)
+        say(f"  {write_csv(run)}")
     if as_mcap:
         from hil.exports.mcap import write_mcap
 
-        console.print(f"  {write_mcap(run)}", soft_wrap=True)
+        say(f"  {write_mcap(run)}")
     if as_tlog:
         from hil.exports.tlog import write_tlog
 
-        console.print(f"  {write_tlog(run)}", soft_wrap=True)
+        say(f"  {write_tlog(run)}")
     if as_video:
         from hil.pictures.video import write_video
 
-        console.print(f"  {write_video(run)}", soft_wrap=True)
+        say(f"  {write_video(run)}")
     if as_gif:
         from hil.pictures.video import write_gif
 
-        console.print(f"  {write_gif(run)}", soft_wrap=True)
+        say(f"  {write_gif(run)}")

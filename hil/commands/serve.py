@@ -5,26 +5,24 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from hil.commands.options import (
+    PATH,
     announce_compilation,
     asked_as,
     close_live,
     fault_option,
     gdb_option,
     open_live,
-    profile_option,
+    profile_options,
     say,
     seed_option,
-    set_option,
-    stop_signals,
     view_option,
 )
 from hil.errors import LabError, require
@@ -32,7 +30,6 @@ from hil.errors import LabError, require
 if TYPE_CHECKING:
     from hil.config import LabConfig
     from hil.live.feed import LiveView
-    from hil.servers.motive import Streaming
     from hil.servers.serial_server import Address
     from hil.servers.server import Ends, Server
 
@@ -93,14 +90,13 @@ class ServeOptions:
     "--motive/--no-motive", default=True, show_default=True, help="Stream the cameras' poses over NatNet."
 )
 @click.option(
-    "--state", type=click.Path(path_type=Path), metavar="DIR",
+    "--state", type=PATH, metavar="DIR",
     help="Keep each board's EEPROM and deck memory in this folder, over restarts of the server.",
 )  # fmt: skip
 @view_option
 @fault_option
 @seed_option
-@profile_option
-@set_option
+@profile_options
 @asked_as(ServeOptions)
 def serve(asked: ServeOptions) -> int:
     """Serve robots in virtual tunnels, in real time, until Ctrl-C.
@@ -124,52 +120,58 @@ def serve(asked: ServeOptions) -> int:
     from hil.laboratory.faults import check, parse
     from hil.laboratory.lockstep import debugger, image_at
     from hil.laboratory.robot import PYTHON_BOARD
-    from hil.servers.live_faults import LiveFaults
-    from hil.servers.motive import streaming_of
     from hil.servers.serial_server import parse_addresses
     from hil.servers.server import Server, Service
 
     markers = (MARKERS_ON,) if asked.motive else ()
-    poses = (
-        () if asked.station == "corrections" else ("predictor.absolute=true",)
-    )  # as Bitcraze's programs send them
+    # Bitcraze's programs send absolute poses.
+    poses = () if asked.station == "corrections" else ("predictor.absolute=true",)
     config = load_config(asked.profile, (*markers, *poses, *asked.overrides))
     config.check_decks(asked.board is not None)
     station = _station_of(asked, config)
-    ends = parse_addresses(asked.mavlink, asked.boards) if asked.mavlink is not None else []
+    serial = parse_addresses(asked.mavlink, asked.boards) if asked.mavlink is not None else []
     planned = [parse(text) for text in asked.faults]
-    check(planned, float("inf"), "mavlink" if ends else "radio", config)
+    check(planned, float("inf"), "mavlink" if serial else "radio", config)
     announce_compilation()
     stack = click.get_current_context().with_resource(ExitStack())
     port = debugger(asked.gdb, Path(asked.board or ""), stack)
     executor = PYTHON_BOARD if asked.board is None else image_at(asked.board, None, port)
     view = open_live(asked.target)
-    plan = Service(config, asked.boards, asked.seed, bool(ends), planned, asked.state, executor)
+    plan = Service(config, asked.boards, asked.seed, bool(serial), planned, asked.state, executor)
     server = Server(plan, say, view)
-    try:
-        streaming = streaming_of(config.capture) if asked.motive else None
-        _open_ends(server.ends, asked.udp, asked.radio_port if asked.radio else None, ends, streaming)
+    with closing(server.ends) as ends:
+        _open_ends(ends, asked, serial, config)
         if station is not None:
-            for robot in server.ends.robots:
+            for robot in ends.robots:
                 robot.fly(station == "poses")
-        faults = LiveFaults(server, say if view is None else partial(_answer, view, server))
-        faults.listen(sys.stdin)
-        stops = stop_signals()
-        say("serving; Ctrl-C ends")
-
-        def stopping() -> bool:
-            for line in view.lines() if view is not None else ():
-                faults.take(line, server.lab.now_us)
-            return bool(stops)
-
-        server.run(stopping)
-    finally:
-        server.ends.close()
+        _run(server, view)
     close_live(view)
-    if server.ends.motive is not None and server.ends.motive.malformed:
-        say(f"motive could not read {server.ends.motive.malformed} packets")
+    if ends.motive is not None and ends.motive.malformed:
+        say(f"motive could not read {ends.motive.malformed} packets")
     say(f"stopped; time stood still for {server.clock.stood_still_us / 1000:.0f} ms")
     return 0
+
+
+def _run(server: Server, view: LiveView | None) -> None:
+    """Serve until Ctrl-C, with faults typed at the terminal or in the picture's panel."""
+    from ground_station.program import stop_signals
+    from hil.servers.live_faults import LiveFaults
+
+    def answer(text: str) -> None:
+        say(text)
+        if view is not None:
+            view.answer(server.lab.now_us, text)
+
+    def stopping() -> bool:
+        for line in view.lines() if view is not None else ():
+            faults.take(line, server.lab.now_us)
+        return bool(stops)
+
+    faults = LiveFaults(server, answer)
+    faults.listen(sys.stdin)
+    stops = stop_signals()
+    say("serving; Ctrl-C ends")
+    server.run(stopping)
 
 
 def _station_of(asked: ServeOptions, config: LabConfig) -> str | None:
@@ -188,12 +190,6 @@ def _station_of(asked: ServeOptions, config: LabConfig) -> str | None:
     return "poses"
 
 
-def _answer(view: LiveView, server: Server, text: str) -> None:
-    """Print an answer, and show it in the panel."""
-    say(text)
-    view.answer(server.lab.now_us, text)
-
-
 def _check_options(asked: ServeOptions) -> None:
     """Raise `LabError` for options that contradict each other."""
     udp, board, gdb, boards = asked.udp, asked.board, asked.gdb, asked.boards
@@ -205,18 +201,15 @@ def _check_options(asked: ServeOptions) -> None:
         raise LabError(f"--gdb {gdb}: needs one board and an image as --board")
 
 
-def _open_ends(
-    ends: Ends,
-    udp: int | None,
-    radio_port: int | None,
-    serial: Sequence[Address],
-    streaming: Streaming | None,
-) -> None:
-    """Open what programs connect to, and say where it is."""
-    if radio_port is not None:
-        say(radio_hint(ends.serve_radio(radio_port), [robot.uri for robot in ends.robots]))
-    if udp is not None:
-        say(f"udp    {' '.join(ends.serve_udp(udp))}")
+def _open_ends(ends: Ends, asked: ServeOptions, serial: Sequence[Address], config: LabConfig) -> None:
+    """Open what programs connect to, and print its addresses."""
+    from hil.servers.motive import streaming_of
+
+    streaming = streaming_of(config.capture) if asked.motive else None
+    if asked.radio:
+        say(radio_hint(ends.serve_radio(asked.radio_port), [robot.uri for robot in ends.robots]))
+    if asked.udp is not None:
+        say(f"udp    {' '.join(ends.serve_udp(asked.udp))}")
     if serial:
         say(f"mavlink {' '.join(ends.serve_mavlink(serial))}")
     if streaming is not None:

@@ -10,17 +10,16 @@ from typing import TYPE_CHECKING
 import click
 
 from ground_station.controls import ControlsError
-from ground_station.errors import LinkError, MocapError
 from ground_station.trajectory import Goal, Trajectory
 from hil.commands.options import (
-    INTERRUPTED,
+    FILE,
+    PATH,
     asked_as,
     close_live,
+    exit_code,
     open_live,
-    profile_option,
+    profile_options,
     say,
-    set_option,
-    stop_signals,
     view_option,
     write_pictures,
 )
@@ -28,8 +27,11 @@ from hil.commands.tables import print_result
 from hil.errors import LabError
 
 if TYPE_CHECKING:
-    from ground_station.config import GroundConfig
-    from hil.config import LabConfig
+    from ground_station.operator import Operator
+    from ground_station.program import Cockpit, Hand
+    from hil.laboratory.experiment import Experiment
+    from hil.laboratory.real_flight import RealFlight
+    from hil.live.feed import LiveView
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,24 +72,21 @@ class StationOptions:
 @click.option(
     "--duration", type=click.FloatRange(min=0, min_open=True), metavar="S", help="[default: until Ctrl-C]"
 )
+@click.option("--log", type=FILE, metavar="FILE", help="Telemetry as CSV.")
 @click.option(
-    "--log", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Telemetry as CSV."
-)
-@click.option(
-    "--record", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    "--record", type=FILE, metavar="FILE",
     help="Every frame of motion capture as CSV, for --mocap replay:FILE.",
 )  # fmt: skip
 @click.option(
-    "--tlog", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    "--tlog", type=FILE, metavar="FILE",
     help="Every MAVLink frame of the link, as a telemetry log; for --link mavlink:….",
 )  # fmt: skip
 @click.option(
-    "--out", type=click.Path(path_type=Path), metavar="DIR",
+    "--out", type=PATH, metavar="DIR",
     help="Run folder as `floaty fly` writes one: log, telemetry, events, result, report, recording.",
 )  # fmt: skip
 @view_option
-@profile_option
-@set_option
+@profile_options
 @asked_as(StationOptions)
 def station(asked: StationOptions) -> int:
     """Fly EXPERIMENT, by default hover, with a board, real or virtual: poses in, poses or corrections out at 50 Hz.
@@ -100,73 +99,82 @@ def station(asked: StationOptions) -> int:
 
     Exit code with --out: as for `floaty fly`, by the limits of EXPERIMENT on the cameras' poses.
     """
-    from ground_station.operator import COMMANDS, Operator
-    from ground_station.program import Cockpit, Session, fly, run_until, why
-    from ground_station.terminal import Terminal
+    from ground_station.operator import Operator, fly_with
+    from ground_station.program import Session
     from hil.config import load_config
     from hil.experiments import EXPERIMENTS, find_experiment
-    from hil.laboratory.real_flight import RealFlight
-    from hil.laboratory.recorder import OPERATOR
-    from hil.laboratory.request import REAL, Bench, Request
 
-    config = load_config(asked.profile, asked.overrides)
-    experiment = find_experiment(asked.named)
+    config, experiment = load_config(asked.profile, asked.overrides), find_experiment(asked.named)
     _check_files(asked)
-    uri, out = asked.uri, asked.out
     view = open_live(asked.target)
-    flight = None
-    if out is not None or view is not None:
-        bench = Bench(link=uri, board=REAL)
-        request = Request(experiment, asked.profile, asked.overrides, 0, experiment.duration_s, (), bench)
-        flight = RealFlight(out, request, say, onlooker=view)
-
-    def report(text: str) -> None:
-        say(text)
-        if flight is not None:
-            flight.note("station", text)
-
-    def note(text: str) -> None:
-        if flight is not None:
-            flight.note(OPERATOR, text)
-
-    def reply(text: str) -> None:
-        say(text)
-        if view is not None:
-            view.answer(0 if flight is None else flight.log_us, text)
-
-    operator = Operator(
-        _trajectory_of, reply, note, view.know if view is not None and asked.target == "foxglove" else None
-    )
-    terminal = Terminal(lambda: (*COMMANDS, *EXPERIMENTS, *operator.known))
-
-    def steer(cockpit: Cockpit, now_us: int) -> None:
-        for line in [*terminal.lines(), *(view.lines() if view is not None else ())]:
-            operator.take(line)
-        operator.turn(cockpit, now_us)
-
-    telemetry = flight.telemetry if flight is not None and out is not None else asked.log
+    flight = _recorded(asked, experiment, view)
+    desk = Desk(flight, view)
+    know = view.know if view is not None and asked.target == "foxglove" else None
+    operator = Operator(_trajectory_of, desk.reply, desk.note, know)
+    log = flight.telemetry if flight is not None and asked.out is not None else asked.log
     session = Session(
-        uri, asked.mocap, experiment.trajectory, asked.start_s, telemetry, asked.record, asked.tlog
+        asked.uri, asked.mocap, experiment.trajectory, asked.start_s, log, asked.record, asked.tlog
     )
-    stops = stop_signals()
-    hands = [steer] if flight is None else [steer, flight.turn]
-    failure = ""
-    try:
-        fly(settings_of(config), session, report, run_until(lambda: bool(stops), asked.duration), hands)
-    except (LinkError, MocapError, OSError, ImportError) as error:
-        failure = why(error, uri)
-    finally:
-        terminal.close()
-    result = flight.close(failure, bool(stops)) if flight is not None else None
+    failure, interrupted = fly_with(
+        operator, config.ground, session, desk.report, asked.duration, desk.hands(operator), [*EXPERIMENTS]
+    )
+    result = flight.close(failure, interrupted) if flight is not None else None
     if result is not None:
         write_pictures(result.folder, experiment)
         print_result(result)
     close_live(view, result)
     if failure:
         raise LabError(failure)
-    if result is None or result.passed:
-        return 0
-    return INTERRUPTED if result.outcome == "interrupted" else 1
+    return 0 if result is None else exit_code(result)
+
+
+def _recorded(asked: StationOptions, experiment: Experiment, view: LiveView | None) -> RealFlight | None:
+    """Return the record of the flight, None if nobody wants it."""
+    from hil.laboratory.real_flight import RealFlight
+    from hil.laboratory.request import REAL, Bench, Request
+
+    if asked.out is None and view is None:
+        return None
+    bench = Bench(link=asked.uri, board=REAL)
+    request = Request(experiment, asked.profile, asked.overrides, 0, experiment.duration_s, (), bench)
+    return RealFlight(asked.out, request, say, onlooker=view)
+
+
+@dataclass(frozen=True, slots=True)
+class Desk:
+    """The operator's output: the terminal, and the flight's record and picture if there are any."""
+
+    flight: RealFlight | None
+    view: LiveView | None
+
+    def report(self, text: str) -> None:
+        """Print and record a line of the station."""
+        say(text)
+        if self.flight is not None:
+            self.flight.note("station", text)
+
+    def note(self, text: str) -> None:
+        """Record an action of the operator."""
+        from hil.laboratory.recorder import OPERATOR
+
+        if self.flight is not None:
+            self.flight.note(OPERATOR, text)
+
+    def reply(self, text: str) -> None:
+        """Print and show an answer to the operator."""
+        say(text)
+        if self.view is not None:
+            self.view.answer(0 if self.flight is None else self.flight.log_us, text)
+
+    def hands(self, operator: Operator) -> list[Hand]:
+        """Return the parts of the picture and the record in every turn of the flight."""
+        view = self.view
+
+        def take_lines(cockpit: Cockpit, now_us: int) -> None:
+            for line in view.lines() if view is not None else ():
+                operator.take(line)
+
+        return [take_lines] if self.flight is None else [take_lines, self.flight.turn]
 
 
 def _check_files(asked: StationOptions) -> None:
@@ -189,18 +197,3 @@ def _trajectory_of(name: str) -> Callable[[Goal, int], Trajectory]:
         return find_experiment(name).trajectory
     except LabError as error:
         raise ControlsError(str(error)) from None
-
-
-def settings_of(config: LabConfig) -> GroundConfig:
-    """Return the ground station's settings of a profile."""
-    from ground_station.config import GroundConfig
-
-    return GroundConfig(
-        station=config.station,
-        tracker=config.tracker,
-        capture=config.capture,
-        frame_period_us=config.mocap.period_us,
-        home=config.flight.home,
-        baud=config.serial.baud,
-        signing_key=config.mavlink.signing_key,
-    )

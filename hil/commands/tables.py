@@ -9,7 +9,7 @@ from rich.table import Table
 
 from ground_station.latency import budget_line
 from hil.clock import process_age_s
-from hil.commands.options import console, wide_console
+from hil.commands.options import console, right, say, wide_console
 
 if TYPE_CHECKING:
     from hil.campaigns.jobs import Row
@@ -29,9 +29,8 @@ def print_seeds(rows: list[Row]) -> None:
     if not rows:
         return
     job = rows[0].job
-    table = Table(title=f"{job.experiment}, profile {job.options['profile']}")
-    for heading in ("seed", *(column[0] for column in SEED_COLUMNS), "hash", "verdict"):
-        table.add_column(heading, justify="right")
+    headings = right("seed", *(column[0] for column in SEED_COLUMNS), "hash", "verdict")
+    table = Table(*headings, title=f"{job.experiment}, profile {job.options['profile']}")
     for row in rows:
         table.add_row(
             str(row.seed),
@@ -42,12 +41,11 @@ def print_seeds(rows: list[Row]) -> None:
             row.hash[:12],
             "ok" if row.passed else row.error or f"fails: {', '.join(row.failed)}",
         )
-    wide = wide_console(140)
-    wide.print(table)
+    wide_console(140).print(table)
     completed = [row.metrics for row in rows if row.outcome == "completed"]
     lost = sum(row.outcome == "lost" for row in rows)
     passed = sum(row.passed for row in rows)
-    console.print(f"{len(rows)} seeds: {passed} hold all limits, {lost} lost")
+    say(f"{len(rows)} seeds: {passed} hold all limits, {lost} lost")
     if completed:
         shares, rms = (
             " ".join(
@@ -56,19 +54,16 @@ def print_seeds(rows: list[Row]) -> None:
             )
             for name, digits in (("within_6cm_", 1), ("rms_", 2))
         )
-        console.print(f"mean of the completed: rms {rms} cm; < 6 cm {shares} % of the time", soft_wrap=True)
+        say(f"mean of the completed: rms {rms} cm; < 6 cm {shares} % of the time")
 
 
 def print_result(result: Result) -> None:
     """Print one flight's verdicts and files."""
-
     from hil.laboratory.metrics import METRICS, short_of
     from hil.laboratory.recorder import SETTINGS, load_events
 
-    table = Table(title=f"{result.request.title}, profile {result.request.profile}")
-    table.add_column("metric")
-    for heading in ("value", "limit", "verdict"):
-        table.add_column(heading, justify="right")
+    title = f"{result.request.title}, profile {result.request.profile}"
+    table = Table("metric", *right("value", "limit", "verdict"), title=title)
     verdicts = {verdict.metric: verdict for verdict in result.verdicts}
     for name, value in result.metrics.items():
         if math.isnan(value) and name not in verdicts:
@@ -85,17 +80,17 @@ def print_result(result: Result) -> None:
     speed = "" if math.isnan(result.real_time_factor) else f"{result.real_time_factor:.0f} times real time; "
     taken_s = process_age_s()
     taken = "" if math.isnan(taken_s) else f"{taken_s:.1f} s from start to end; "
-    console.print(f"{result.outcome}{cause}; {speed}{taken}hash {result.hash[:16]}", soft_wrap=True)
+    say(f"{result.outcome}{cause}; {speed}{taken}hash {result.hash[:16]}")
     for event in load_events(result.folder):
         if event["source"] == SETTINGS:
-            console.print(f"  {event['text']}", soft_wrap=True)
+            say(f"  {event['text']}")
     if result.ages:
-        console.print(budget_line(result.ages), soft_wrap=True)
+        say(budget_line(result.ages))
     if result.usage is not None:
         for name, load in result.usage.entries.items():
             if load.calls:
-                console.print(f"  {result.request.bench.board} {name:11} {load}", soft_wrap=True)
+                say(f"  {result.request.bench.board} {name:11} {load}")
     for name in ("report.html", "flight.rrd", "flight.perfetto-trace", "log.parquet"):
         if (result.folder / name).is_file():
             hint = f"   (floaty view {result.folder})" if name == "flight.rrd" else ""
-            console.print(f"  {result.folder / name}{hint}", soft_wrap=True)
+            say(f"  {result.folder / name}{hint}")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ground_station.trajectory import Goal, Hold, Trajectory
 from hil.arguments import checked
 from hil.errors import LabError, blame
-from hil.laboratory.metrics import METRICS, Metric, check_limits
+from hil.laboratory.metrics import METRICS, Metric, check_limits, free_flight, measure
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -119,6 +119,13 @@ class Experiment:
                 f"experiment {self.name}: measure returned {min(unknown)!r}, which `metrics` does not declare"
             )
         return values
+
+    def metrics_of(self, log: pa.Table, lost: bool, resets: int | None = None) -> dict[str, float]:
+        """Return the metrics of every flight and its own; NaN where the flight was too short. Raises like `measured`."""
+        metrics = measure(log, lost, resets) | dict.fromkeys(self.metrics, math.nan)
+        if (free := free_flight(log)).num_rows > 1:
+            metrics.update(self.measured(free))
+        return metrics
 
     def check_goals(
         self, home: tuple[float, float, float], duration_s: float, left: Callable[[Sequence[float]], str]

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Literal
 
 from hil.arguments import checked, fits, shown
@@ -20,9 +20,6 @@ from hil.errors import LabError, blame, hint
 from hil.world.body import Failure
 
 if TYPE_CHECKING:
-    from hil.crazyflie.shockburst import Air
-    from hil.devices.rigid_body import VirtualMarkers
-    from hil.devices.uart import VirtualSerial
     from hil.laboratory.robot import Robot
 
 Outcome = Literal["holds", "degrades", "failsafe", "lost", ""]
@@ -123,6 +120,7 @@ def knob(owner: Callable[[Robot], object], name: str, blend: Blend) -> Knob:
     return _attribute(owner, name, blend)
 
 
+@cache
 def _attribute(owner: Callable[[Robot], object], name: str, blend: Blend) -> Knob:
     return Knob(
         lambda robot: float(getattr(owner(robot), name)),
@@ -131,43 +129,24 @@ def _attribute(owner: Callable[[Robot], object], name: str, blend: Blend) -> Kno
     )
 
 
-def _uart(robot: Robot) -> VirtualSerial:
-    assert robot.uart is not None  # given by the kind's link
-    return robot.uart
+# A kind states what it needs: its link, or markers.
+_mocap = partial(_attribute, lambda robot: robot.mocap)
+_markers = partial(_attribute, lambda robot: robot.mocap.markers)
+_radio = partial(_attribute, lambda robot: robot.air)
+_serial = partial(_attribute, lambda robot: robot.uart)
 
 
-def _of_robot(robot: Robot) -> VirtualMarkers:
-    assert robot.mocap.markers is not None  # required by the kind
-    return robot.mocap.markers
+def _component(
+    index: int, read: Callable[[Robot], Sequence[float]], write: Callable[[Robot, list[float]], object]
+) -> Knob:
+    """Return the knob for one component of a vector."""
 
-
-@cache
-def _markers(name: str, blend: Blend) -> tuple[Knob, ...]:
-    return (_attribute(_of_robot, name, blend),)
-
-
-@cache
-def _mocap(name: str, blend: Blend) -> Knob:
-    return _attribute(lambda robot: robot.mocap, name, blend)
-
-
-def _air(robot: Robot) -> Air:
-    assert robot.air is not None  # given by the kind's link
-    return robot.air
-
-
-@cache
-def _radio(name: str, blend: Blend = either) -> Knob:
-    return _attribute(_air, name, blend)
-
-
-def _bias(axis: int) -> Knob:
     def turn(robot: Robot, value: float) -> None:
-        bias = list(robot.imu.rate_bias)
-        bias[axis] = value
-        robot.imu.set_rate_bias(*bias)
+        values = list(map(float, read(robot)))
+        values[index] = value
+        write(robot, values)
 
-    return Knob(lambda robot: robot.imu.rate_bias[axis], turn, add)
+    return Knob(lambda robot: float(read(robot)[index]), turn, add)
 
 
 @cache
@@ -187,35 +166,29 @@ def _of_body(body: str, one: Failure) -> Kind:
     )  # fmt: skip
 
 
+def _bias(axis: int) -> Knob:
+    return _component(
+        axis, lambda robot: robot.imu.rate_bias, lambda robot, bias: robot.imu.set_rate_bias(*bias)
+    )
+
+
 def _side_wind(axis: int) -> Knob:
-    def turn(robot: Robot, value: float) -> None:
-        wind = list(robot.body.tunnel.side_wind)
-        wind[axis] = max(-20.0, min(value, 20.0))
+    def write(robot: Robot, wind: list[float]) -> None:
+        wind[axis] = max(-20.0, min(wind[axis], 20.0))
         robot.body.tunnel.set_side_wind(*wind)
 
-    return Knob(lambda robot: robot.body.tunnel.side_wind[axis], turn, add)
+    return _component(axis, lambda robot: robot.body.tunnel.side_wind, write)
 
 
 def _push(part: int) -> Knob:
-    def turn(robot: Robot, value: float) -> None:
-        pushes = robot.body.pushes.tolist()
-        pushes[part] = value
-        robot.body.push(pushes[:3], pushes[3:])
-
-    return Knob(lambda robot: float(robot.body.pushes[part]), turn, add)
+    return _component(
+        part, lambda robot: robot.body.pushes.tolist(), lambda robot, all: robot.body.push(all[:3], all[3:])
+    )
 
 
-UPLINK_LOSS, DOWNLINK_LOSS = _radio("uplink_loss"), _radio("downlink_loss")
-RADIO_BITS = (_radio("uplink_bit_error_rate"), _radio("downlink_bit_error_rate"))
-SERIAL_BITS = (
-    _attribute(_uart, "uplink_bit_error_rate", either),
-    _attribute(_uart, "downlink_bit_error_rate", either),
-)
-CABLE = Knob(
-    lambda robot: float(_uart(robot).connected),
-    lambda robot, value: setattr(_uart(robot), "connected", value > 0.5),
-    times,
-)
+UPLINK_LOSS, DOWNLINK_LOSS = (_radio(f"{way}_loss", either) for way in ("uplink", "downlink"))
+RADIO_BITS = tuple(_radio(f"{way}_bit_error_rate", either) for way in ("uplink", "downlink"))
+SERIAL_BITS = tuple(_serial(f"{way}_bit_error_rate", either) for way in ("uplink", "downlink"))
 GYRO_NOISE = Knob(
     lambda robot: robot.imu.noise_scale,
     lambda robot, value: robot.imu.set_noise_scale(min(value, 1000.0)),
@@ -268,19 +241,19 @@ KINDS: dict[str, Kind] = {
     ),
     "marker.hidden": Kind(
         "this many markers are covered, from the first one on", "", 4.0, 0.0, 8.0,
-        _markers("hidden", max), "holds", markers=True,
+        (_markers("hidden", max),), "holds", markers=True,
     ),
     "marker.swap": Kind(
         "markers 1 and 3 have each other's label: the pose is turned over, or missing where the fit is found bad",
-        "", 1.0, 1.0, 1.0, _markers("swapped", max), "holds", duration_s=GLIMPSE_S, markers=True,
+        "", 1.0, 1.0, 1.0, (_markers("swapped", max),), "holds", duration_s=GLIMPSE_S, markers=True,
     ),
     "marker.noise": Kind(
         "factor on the noise of every marker", "", 2.0, 0.0, 100.0,
-        _markers("noise_scale", times), "holds", markers=True,
+        (_markers("noise_scale", times),), "holds", markers=True,
     ),
     "marker.ghosts": Kind(
         "this many additional reflections, which are not markers", "", 5.0, 0.0, 50.0,
-        _markers("ghosts", add), "holds", markers=True,
+        (_markers("ghosts", add),), "holds", markers=True,
     ),
     "radio.loss": Kind(
         "packets lost on the air, per try, in both directions", "", 0.5, 0.0, 1.0,
@@ -308,7 +281,7 @@ KINDS: dict[str, Kind] = {
         "wrong bits on the line, in both directions", "", 1e-4, 0.0, 0.5, SERIAL_BITS, "holds", link="mavlink"
     ),
     "serial.cut": Kind(
-        "the cable is out", "", 0.0, 0.0, 0.0, (CABLE,), "holds", duration_s=GLIMPSE_S, link="mavlink"
+        "the cable is out", "", 0.0, 0.0, 0.0, (_serial("connected", times),), "holds", duration_s=GLIMPSE_S, link="mavlink"
     ),
     **{
         f"imu.bias.{name}": Kind(

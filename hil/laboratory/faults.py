@@ -105,16 +105,20 @@ def check(faults: Iterable[Fault], duration_s: float, link: str, config: LabConf
             raise LabError(
                 f"fault {fault}: the flight ends {duration_s:g} s after the release, before it begins"
             )
-        needed = KINDS[fault.kind].link
-        if needed and (needed == "mavlink") != link.startswith("mavlink"):
-            raise LabError(f"fault {fault}: acts with --link {needed} only; this flight has --link {link}")
-        if not KINDS[fault.kind].acts_on(config.robot.body):
-            flown = Path(config.robot.body).name
-            raise LabError(
-                f"fault {fault}: acts on a part of {KINDS[fault.kind].body} only; this flight is one of {flown}"
-            )
-        if KINDS[fault.kind].markers and not config.markers.enabled:
-            raise LabError(f"fault {fault}: needs --set {MARKERS_ON}")
+        if why := why_not(KINDS[fault.kind], "mavlink" if link.startswith("mavlink") else "radio", config):
+            raise LabError(f"fault {fault}: {why}")
+
+
+def why_not(kind: Kind, links: str, config: LabConfig) -> str:
+    """Return why a kind of fault cannot act on a robot with these links, by their names; empty when it can."""
+    if kind.link not in links:
+        missing = {"radio": "radio", "mavlink": "serial line"}[kind.link]
+        return f"acts with --link {kind.link} only; this robot has no {missing}"
+    if not kind.acts_on(config.robot.body):
+        return f"acts on a part of {kind.body} only; this flight is one of {Path(config.robot.body).name}"
+    if kind.markers and not config.markers.enabled:
+        return f"needs --set {MARKERS_ON}"
+    return ""
 
 
 def spans(faults: Iterable[Fault], release_us: int) -> list[Span]:
@@ -165,14 +169,14 @@ class Switchboard:
         """Create at the start whatever faults will need."""
         for fault in faults:
             kind = KINDS[fault.kind]
-            if not why_not(kind, self._robot):
+            if not self._why_not(kind):
                 for knob in kind.knobs:
                     knob.read(self._robot)
 
     def plan(self, faults: Iterable[Fault], release_us: int, end_us: int) -> None:
         """Plan begin and end of faults that begin before `end_us`; skip those that cannot act on the robot."""
         for span in spans(faults, release_us):
-            if why_not(KINDS[span.fault.kind], self._robot) or span.begin_us >= end_us:
+            if self._why_not(KINDS[span.fault.kind]) or span.begin_us >= end_us:
                 continue
             self._robot.events.at(int(span.begin_us), partial(self.begin, span.fault))
             if span.end_us < end_us:
@@ -180,7 +184,7 @@ class Switchboard:
 
     def act(self, fault: Fault, now_us: int) -> None:
         """Begin a fault now, ignoring its start. Raises `LabError` if it cannot act on this robot."""
-        if reason := why_not(KINDS[fault.kind], self._robot):
+        if reason := self._why_not(KINDS[fault.kind]):
             raise LabError(f"fault {fault.kind}: {reason}")
         self.begin(fault, now_us)
         if math.isfinite(fault.duration_s):
@@ -200,6 +204,9 @@ class Switchboard:
         remaining.remove(fault)
         self._switch(fault, remaining, now_us)
 
+    def _why_not(self, kind: Kind) -> str:
+        return why_not(kind, self._robot.links, self._robot.config)
+
     def _switch(self, fault: Fault, active: list[Fault], now_us: int) -> None:
         """Set the knobs of `fault` to the blend of the active faults."""
         robot = self._robot
@@ -213,19 +220,6 @@ class Switchboard:
             knob.turn(robot, value)
             if not turning:
                 del self._before[knob]
-
-
-def why_not(kind: Kind, robot: Robot) -> str:
-    """Return why a kind of fault cannot act on a robot, empty when it can."""
-    if kind.link == "mavlink" and robot.uart is None:
-        return "acts on a serial line; this robot has none"
-    if kind.link == "radio" and robot.air is None:
-        return "acts on a radio; this robot flies without"
-    if not kind.acts_on(robot.config.robot.body):
-        return f"acts on a part of {kind.body}; this robot is another"
-    if kind.markers and robot.mocap.markers is None:
-        return f"needs --set {MARKERS_ON}"
-    return ""
 
 
 def _kind(name: str, text: str) -> Kind:

@@ -28,7 +28,7 @@ from hil.devices.image_settings import ImageSettings
 from hil.devices.radio import Receiver, VirtualRadio
 from hil.devices.real_core import is_link, real_core
 from hil.devices.uart import VirtualSerial
-from hil.errors import LabError, hint
+from hil.errors import LabError, hint, refusing
 from hil.laboratory.channels import radio_channel, serial_channel, tracker_channel
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import Laboratory
@@ -145,19 +145,11 @@ class ModelledLine:
 
     def _serial(self, site: Site, uart: VirtualSerial, telemetry: Path | None) -> tuple[Link, Channel]:
         """Return the station's end of the serial line. Raises `LabError` when it is too slow for a flight."""
-        from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig  # its package is an extra
+        from ground_station.links.mavlink import MavlinkLink  # its package is an extra
 
-        config = site.config
-        settings = MavlinkLinkConfig(
-            config.serial.baud,
-            min(config.station.corrections_hz, 1e6 / config.mocap.period_us),
-            bytes.fromhex(config.mavlink.signing_key),
-            latency_us=config.station.link_latency_us,
-        )
-        try:
-            link = MavlinkLink(uart.uplink, settings, None if telemetry is None else self._note_frame)
-        except LinkError as error:
-            raise LabError(f"--link mavlink: {error}") from None
+        settings = site.config.ground.links(None if telemetry is None else self._note_frame)
+        with refusing("--link mavlink: ", LinkError):
+            link = MavlinkLink(uart.uplink, settings)
         if telemetry is not None:
             self._frames = FrameLog(telemetry.with_name(FRAME_LOG))
         site.events.at(0, lambda now_us: site.say("lab", link.budget.text))
@@ -211,10 +203,8 @@ def lockstep_flight(
 
 def in_lockstep(request: Request, telemetry: Path | None, stack: ExitStack) -> Flight:
     """Return a flight over a modelled link. Raises `LabError` if its board is not available."""
-    try:
+    with refusing("--board ", LinkError):
         return lockstep_flight(request, telemetry, _executor(request, stack))
-    except LinkError as error:
-        raise LabError(f"--board {error}") from None
 
 
 def _executor(request: Request, stack: ExitStack) -> Executor:
@@ -223,19 +213,15 @@ def _executor(request: Request, stack: ExitStack) -> Executor:
         return PythonBoard(real_core(bench.board, stack))
     if bench.is_image:
         return image_at(bench.board, bench.elf, debugger(bench.gdb, bench.elf or Path(bench.board), stack))
-    try:
+    with refusing(f"--board {bench.board}: ", FirmwareError):
         return PythonBoard(runner_of(bench.board, BUILD, request.config.logic))
-    except FirmwareError as error:
-        raise LabError(f"--board {bench.board}: {error}") from None
 
 
 def image_at(board: str, elf: Path | None, debugger: GdbServer | None = None) -> ChipImage:
     """Return the image that `--board` and `--elf` name. Raises `LabError` if it cannot run here."""
     check_image(board)
-    try:
+    with refusing(f"--board {board}: ", FirmwareError):
         return ChipImage.load(Path(board), elf, _folder_of_machines(), debugger)
-    except FirmwareError as error:
-        raise LabError(f"--board {board}: {error}") from None
 
 
 def _folder_of_machines() -> Path:

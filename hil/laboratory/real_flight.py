@@ -7,7 +7,7 @@ leaves the flow: metrics and limits cover this time.
 
 import shutil
 from collections.abc import Callable
-from math import nan, sqrt
+from math import nan
 from pathlib import Path
 
 from firmware_py.elementary import cos
@@ -17,16 +17,16 @@ from ground_station.mocap import MocapFrame
 from ground_station.program import Cockpit
 from ground_station.telemetry_log import TELEMETRY
 from hil.bodies import make_body
+from hil.config import LabConfig
 from hil.errors import LabError, writing
-from hil.laboratory.ages import STATION_START, ages_of, reported_ages
+from hil.laboratory.ages import STATION_START
 from hil.laboratory.channels import station_channels
 from hil.laboratory.flight import RECORD_PERIOD_US
-from hil.laboratory.metrics import check_limits, free_flight, judge, measure
+from hil.laboratory.metrics import check_limits, measure
 from hil.laboratory.recorder import Onlooker, Recorder, load_log
-from hil.laboratory.request import Request
-from hil.laboratory.result import Outcome, Program, Result, metadata_of, with_resets, write_result
+from hil.laboratory.request import Request, why_left
+from hil.laboratory.result import Outcome, Program, Result, judged, metadata_of, write_result
 from hil.laboratory.robot import Streams
-from hil.world.config import LimitsConfig
 
 
 class RealFlight:
@@ -137,7 +137,7 @@ class RealFlight:
             self._note(now_us, "lab", f"{self._experiment.name} is over; what follows is not judged")
         self._is_free = not self._whole and self._lost is None
         if self._is_free and frame is not None:
-            self._lost = why_lost(frame, self._config.plant.limits, self._config.flight.home)
+            self._lost = why_lost(frame, self._config)
             if self._lost is not None:
                 self._note(now_us, "lab", f"lost: {self._lost}; what follows is not judged")
 
@@ -163,31 +163,16 @@ class RealFlight:
     def _result(self, folder: Path, digest: str, failure: str, interrupted: bool) -> Result:
         """Return the result, from the log."""
         log = load_log(folder)
-        own = self._experiment.metrics
-        metrics = measure(log, self._lost is not None) | dict.fromkeys(own, nan)
-        free = free_flight(log)
-        if free.num_rows > 1:
-            try:
-                metrics.update(self._experiment.measured(free))
-            except LabError as error:  # only a laboratory measures it
-                self._say(
-                    f"{self._experiment.name}: its own metrics need {error}, which a real flight has not"
-                )
+        lost = self._lost is not None
+        try:
+            metrics = self._experiment.metrics_of(log, lost)
+        except LabError as error:  # only a laboratory measures it
+            metrics = measure(log, lost) | dict.fromkeys(self._experiment.metrics, nan)
+            self._say(f"{self._experiment.name}: its own metrics need {error}, which a real flight lacks")
         cut_short: Outcome = "error" if failure else "interrupted" if interrupted else "completed"
         outcome: Outcome = "lost" if self._lost else "completed" if self._whole else cut_short
-        outcome, cause = with_resets(outcome, self._lost or failure or None, metrics["resets"])
-        return Result(
-            request=self._request,
-            program=self._program,
-            outcome=outcome,
-            cause=cause,
-            metrics=metrics,
-            own_metrics=own,
-            verdicts=tuple(judge(metrics, self._request.limits, own)),
-            ages=ages_of(reported_ages(folder), log, self._request.bench.link),
-            hash=digest,
-            folder=folder,
-        )
+        ended = outcome, self._lost or failure or None
+        return judged(self._request, self._program, ended, metrics, log, digest, folder)
 
 
 def _make(folder: Path) -> None:
@@ -199,17 +184,11 @@ def _make(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
 
 
-def why_lost(frame: MocapFrame, limits: LimitsConfig, home: tuple[float, float, float]) -> str | None:
+def why_lost(frame: MocapFrame, config: LabConfig) -> str | None:
     """Return why a flight is over at a pose, by the laboratory's limits; None while it is not."""
-    x, y, z = frame.p_WB
+    if why := why_left(config, frame.p_WB):
+        return f"left the flow: {why}"
     _, qx, qy, _ = frame.q_WB
+    tilt = config.plant.limits.tilt
     upright = 1.0 - 2.0 * (qx * qx + qy * qy)  # cosine of the tilt
-    if (radius := sqrt(x * x + y * y)) > limits.radius:
-        return f"left the flow: {radius:.2f} m from the axis"
-    if z > home[2] + limits.above:
-        return f"left the flow: {z - home[2]:.2f} m above the hover point"
-    if z < home[2] - limits.below:
-        return f"fell: {home[2] - z:.2f} m below the hover point"
-    if upright < cos(limits.tilt):
-        return f"tumbled: tilted beyond {limits.tilt:.2f} rad"
-    return None
+    return f"tumbled: tilted beyond {tilt:.2f} rad" if upright < cos(tilt) else None

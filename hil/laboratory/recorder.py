@@ -254,18 +254,13 @@ def release_of(metadata: Mapping[bytes, bytes] | None) -> int:
 
 def load_events(folder: Path) -> list[dict[str, Any]]:
     """Return the texts of a run: dicts with `t_us`, `source` and `text`."""
-    path = folder / EVENTS
-    if not path.is_file():
-        return []
-    return list(_complete_lines(path))
-
-
-def _complete_lines(path: Path) -> Iterator[dict[str, Any]]:
-    for line in path.read_text(encoding="utf-8").splitlines():
-        try:
-            yield json.loads(line)
-        except json.JSONDecodeError:  # the line that was being written when the process died
-            return
+    path, events = folder / EVENTS, []
+    with suppress(
+        FileNotFoundError, json.JSONDecodeError
+    ):  # the line that was being written when the process died
+        for line in path.read_text(encoding="utf-8").splitlines():
+            events.append(json.loads(line))
+    return events
 
 
 def _with_metadata(table: pa.Table, more: Mapping[bytes, bytes]) -> pa.Table:

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import pyarrow as pa
 from pydantic import Field, TypeAdapter, ValidationError, computed_field
 from pydantic_core import from_json
 
@@ -23,8 +24,9 @@ from hil.config import LabConfig
 from hil.devices.board_firmware import ImageReport
 from hil.errors import LabError
 from hil.installation import commit, versions
+from hil.laboratory.ages import ages_of, reported_ages
 from hil.laboratory.experiment import unknown
-from hil.laboratory.metrics import Figure, Metric, Verdict, measure
+from hil.laboratory.metrics import Figure, Metric, Verdict, judge, measure
 from hil.laboratory.recorder import load_log, stored_in
 from hil.laboratory.request import Find, Request, StoredRequest
 from hil.scene import Look
@@ -113,6 +115,32 @@ def with_resets(outcome: Outcome, cause: str | None, resets: float) -> tuple[Out
         return outcome, cause
     how = f"the board was reset {resets:.0f} time{'s' if resets > 1 else ''}"
     return "reset" if outcome == "completed" else outcome, "; ".join(filter(None, (cause, how)))
+
+
+def judged(
+    request: Request,
+    program: Program,
+    ended: tuple[Outcome, str | None],  # before resets are considered
+    metrics: Mapping[str, float],
+    log: pa.Table,
+    digest: str,
+    folder: Path,
+) -> Result:
+    """Return the result of a flight by the limits of its request."""
+    own = request.experiment.metrics
+    outcome, cause = with_resets(*ended, metrics["resets"])
+    return Result(
+        request=request,
+        program=program,
+        outcome=outcome,
+        cause=cause,
+        metrics=metrics,
+        own_metrics=own,
+        verdicts=tuple(judge(metrics, request.limits, own)),
+        ages=ages_of(reported_ages(folder), log, request.bench.link),
+        hash=digest,
+        folder=folder,
+    )
 
 
 _RESULT = TypeAdapter(Result)

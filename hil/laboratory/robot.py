@@ -128,7 +128,7 @@ class Robot:
         self.board = VirtualBoard(
             self.body.set_counts,
             ports.send_packet,
-            self._console,
+            lambda now_us, text: self.say("board", text),
             self.uart,
             Requests(self._reset, ports.radio_command or self._radio_command, ports.fail),
             ports.memory,
@@ -180,6 +180,13 @@ class Robot:
         if self.firmware.scheduler is None:
             raise LabError("--hil: the processor time of a real board cannot be taken")
         self.firmware.scheduler.occupy("THIEF", thief.taken_us)
+
+    @property
+    def links(self) -> str:
+        """The names of its links, radio and mavlink."""
+        return " ".join(
+            name for name, end in (("radio", self.air), ("mavlink", self.uart)) if end is not None
+        )
 
     @property
     def resets(self) -> int:
@@ -278,9 +285,6 @@ class Robot:
         if kind in (syslink.SWITCH_OFF, syslink.STM32_OFF):
             self.say("board", "switched off by its firmware")
             self.events.at(now_us, lambda _: self.cut_power())
-
-    def _console(self, now_us: int, text: str) -> None:
-        self.say("board", text)
 
 
 def with_system(config: LabConfig, system: int) -> LabConfig:

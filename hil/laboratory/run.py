@@ -5,36 +5,24 @@
 """
 
 import gc
-import math
 from collections.abc import Callable
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-
-import pyarrow as pa
 
 from firmware_py.rtos import WatchdogError
 from ground_station.errors import LinkError
 from ground_station.telemetry_log import TELEMETRY
 from hil.clock import Pace
-from hil.laboratory.ages import ages_of, reported_ages, with_goals_sent
-from hil.laboratory.experiment import Experiment
+from hil.laboratory.ages import with_goals_sent
 from hil.laboratory.flight import Flight
 from hil.laboratory.folder import bring_back, drop_older, prepare
 from hil.laboratory.laboratory import Progress
 from hil.laboratory.lockstep import in_lockstep
-from hil.laboratory.metrics import free_flight, judge, measure
 from hil.laboratory.recorder import Onlooker, Recorder, load_log
 from hil.laboratory.request import Request
-from hil.laboratory.result import (
-    Outcome,
-    Program,
-    QueueReport,
-    Result,
-    metadata_of,
-    with_resets,
-    write_result,
-)
+from hil.laboratory.result import Outcome, Program, QueueReport, Result, judged, metadata_of, write_result
 
 LOADED_US = 250_000  # every part of the core has run by then
 
@@ -66,16 +54,12 @@ def fly(
             raise
         drop_older(folder)
         program = Program.of(request.config)
-        recorder = Recorder(
-            folder, flight.channels(), metadata_of(request, program, flight.robot.body.look), onlooker
-        )
-        pace, loaded = Pace(), False
+        metadata = metadata_of(request, program, flight.robot.body.look)
+        recorder = Recorder(folder, flight.channels(), metadata, onlooker)
+        pace = Pace(LOADED_US)
 
         def on_progress(now_us: int) -> None:
-            nonlocal loaded
-            if not loaded and now_us >= LOADED_US:
-                loaded = True
-                pace.begin(now_us)
+            pace.look(now_us)
             if progress is not None:
                 progress(now_us, flight)
 
@@ -86,28 +70,15 @@ def fly(
             digest = _close(flight, recorder, folder)
     log, firmware = load_log(folder), flight.robot.firmware
     lost = outcome == "lost" or flight.lost is not None
-    own = request.experiment.metrics
-    metrics = _metrics_of(request.experiment, log, lost, flight.resets)
-    outcome, cause = with_resets(outcome, cause, flight.resets)
-    result = Result(
-        request=request,
-        program=program,
-        outcome=outcome,
-        cause=cause,
-        metrics=metrics,
-        own_metrics=own,
-        verdicts=tuple(judge(metrics, request.limits, own)),
+    metrics = request.experiment.metrics_of(log, lost, flight.resets)
+    queues = firmware.scheduler.queues if firmware.scheduler is not None else ()
+    result = replace(
+        judged(request, program, (outcome, cause), metrics, log, digest, folder),
         tasks=tuple(firmware.statistics.reports()),
-        queues=tuple(
-            QueueReport(one.name, one.length, one.high_water, one.dropped)
-            for one in (firmware.scheduler.queues if firmware.scheduler is not None else ())
-        ),
+        queues=tuple(QueueReport(one.name, one.length, one.high_water, one.dropped) for one in queues),
         usage=firmware.usage,
-        ages=ages_of(reported_ages(folder), log, request.bench.link),
-        hash=digest,
         real_time_factor=round(factor, 2),
         stood_still_ms=flight.lab.clock.stood_still_us / 1000,
-        folder=folder,
         image=None if firmware.flashed is None else firmware.flashed.report(),
     )
     write_result(result)
@@ -138,11 +109,3 @@ def _close(flight: Flight, recorder: Recorder, folder: Path) -> str:
         digest = recorder.close(None if record is None else partial(with_goals_sent, record))
     flight.write_schedule(folder)
     return digest
-
-
-def _metrics_of(experiment: Experiment, log: pa.Table, lost: bool, resets: int) -> dict[str, float]:
-    """Return the metrics of every flight and the experiment's own; NaN where the flight was too short."""
-    metrics = measure(log, lost, resets) | dict.fromkeys(experiment.metrics, math.nan)
-    if (free := free_flight(log)).num_rows > 1:
-        metrics.update(experiment.measured(free))
-    return metrics

@@ -68,7 +68,7 @@ class Failures:
         size = SIZES.get((Unit(unit), Failing(failing)))
         begin = [_fault(name, size) for name in self._names(kinds.get(Failing(failing), ()), instances)]
         none = failing != Failing.OK and not begin
-        if none or any(why_not(KINDS[fault.kind], self._robot) for fault in begin):
+        if none or any(why_not(KINDS[fault.kind], self._robot.links, self._robot.config) for fault in begin):
             return CommandResult.UNSUPPORTED
         end = {name for names in kinds.values() for name in self._names(names, instances)}
         delay_us = ANSWER_US if any(fault.kind == CUT for fault in begin) else 0

@@ -11,9 +11,10 @@ from firmware_py import table
 from firmware_py.firmware import Firmware
 from firmware_py.wire import crtp
 from firmware_py.wire.supervisor import Cause, State
+from ground_station.config import LinkSettings
 from ground_station.controls import PATIENCE_US, REPEAT_US, Answer, ControlAction, ControlRequest
 from ground_station.links.crtp_controls import CrtpControls
-from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
+from ground_station.links.mavlink import MavlinkLink
 from ground_station.links.mavlink_controls import MavlinkControls
 from hil.config import load_config
 from support.crtp_client import CrtpClient
@@ -72,7 +73,7 @@ class MavlinkBench(MavlinkClient):
         super().__init__()
         self.listed = self.ask("param_request_read", 1, 1, b"", 0)[0].param_count
         self.down.clear()
-        self.link = MavlinkLink(self._up, MavlinkLinkConfig(921_600, 50.0))
+        self.link = MavlinkLink(self._up, LinkSettings(50.0, 0, 921_600))
         self.controls = self.link.controls
         self.run(20_000)
 

@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_py.wire import WireError
-from ground_station.config import StationConfig
+from ground_station.config import LinkSettings, StationConfig
 from ground_station.links.loopback import LoopbackLink
-from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
+from ground_station.links.mavlink import MavlinkLink
 from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation, Link
 from ground_station.trajectory import Goal, Hold
@@ -80,7 +80,7 @@ class MavlinkBoard:
             self.codec.signing.secret_key = key
             self.codec.signing.sign_outgoing = True
         self.sent: list[bytes] = []
-        config = MavlinkLinkConfig(baud, 50.0, key, latency_us=LATENCY_US)
+        config = LinkSettings(50.0, LATENCY_US, baud, key)
         self.link = MavlinkLink(lambda now_us, data: self.sent.append(data), config)
 
     def errors(self) -> list[Place]:

@@ -7,6 +7,7 @@ import pytest
 
 from firmware_py.wire.crtp import PORT_CONSOLE, Packet, encode
 from ground_station.clock import clock_us
+from ground_station.config import LinkSettings
 from ground_station.errors import LinkError
 from ground_station.latency import LinkLatency, budget_of, columns_of
 from ground_station.links.crazyradio import ECHO, OWN_ECHO, CrazyradioLink
@@ -157,7 +158,7 @@ def test_what_nobody_fetches_is_bounded():
 
 
 def test_what_a_board_prints_is_a_notice_for_each_line():
-    link = CrazyradioLink("udp://127.0.0.1:19850", 0)
+    link = CrazyradioLink("udp://127.0.0.1:19850", LinkSettings(50.0, 0, 0))
     for piece in (b"imu: gyro ", b"zero found\nsuper", b"visor: flying\n\n"):
         assert link.receive(0, encode(Packet(PORT_CONSOLE, 0, piece))) == ()
     assert link.notices() == ["board: imu: gyro zero found", "board: supervisor: flying"]
@@ -165,7 +166,7 @@ def test_what_a_board_prints_is_a_notice_for_each_line():
 
 
 def test_half_the_median_round_trip_of_its_own_echoes_is_the_latency(monkeypatch):
-    link, now_us = CrazyradioLink("radio://0/80/2M", 1300), 5_000_000
+    link, now_us = CrazyradioLink("radio://0/80/2M", LinkSettings(50.0, 1300, 0)), 5_000_000
     monkeypatch.setattr("ground_station.links.crazyradio.clock_us", lambda: now_us)
 
     def echo(round_trip_us, kind=OWN_ECHO, channel=0, more=b""):

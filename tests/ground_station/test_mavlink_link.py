@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 from firmware_py.geometry import from_euler_zyx
 from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.telemetry import BLOCKS
-from ground_station.config import StationConfig
+from ground_station.config import LinkSettings, StationConfig
 from ground_station.controls import REPEAT_US, ControlAction, ControlRequest
 from ground_station.errors import LinkError
-from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
+from ground_station.links.mavlink import MavlinkLink
 from ground_station.links.mavlink_budget import TELEMETRY_HZ, link_budget
 from ground_station.links.mavlink_controls import REASON_US
 from ground_station.mocap import MocapFrame
@@ -51,7 +51,7 @@ class LinkWithCodec:
             self.codec.signing.sign_outgoing = True
         self.sent = []  # (now_us, message)
         self.bytes = 0
-        self.link = MavlinkLink(self._transmit, MavlinkLinkConfig(baud, pose_hz, key, latency_us=900))
+        self.link = MavlinkLink(self._transmit, LinkSettings(pose_hz, 900, baud, key))
 
     def _transmit(self, now_us, data):
         self.bytes += len(data)

@@ -12,9 +12,10 @@ import pytest
 from firmware_py.wire.supervisor import State
 from firmware_py.wire.telemetry import Sample
 from ground_station.clock import clock_us
+from ground_station.config import LinkSettings
 from ground_station.errors import LinkError
 from ground_station.links.live_link import SILENCE_TIMEOUT_US, LiveLink
-from ground_station.links.schemes import LinkSettings, find_link
+from ground_station.links.schemes import find_link
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 from support.plugged_dongle import plug

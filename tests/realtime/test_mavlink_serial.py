@@ -21,9 +21,9 @@ import serial
 from serial.rfc2217 import PortManager
 
 from ground_station.clock import clock_us
+from ground_station.config import LinkSettings
 from ground_station.errors import LinkError
 from ground_station.links import live_link
-from ground_station.links.mavlink import MavlinkLinkConfig
 from ground_station.links.mavlink_serial import MavlinkSerialLink, parse_uri
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
@@ -139,7 +139,7 @@ def peers() -> Iterator[Callable[..., Peer]]:
 
 
 def link_to(peer: Peer, key: str = "") -> MavlinkSerialLink:
-    return MavlinkSerialLink(peer.uri, MavlinkLinkConfig(921_600, 50.0, bytes.fromhex(key)))
+    return MavlinkSerialLink(peer.uri, LinkSettings(50.0, 0, 921_600, bytes.fromhex(key)))
 
 
 def test_a_line_on_which_nothing_comes_is_given_up_after_four_seconds(peers: Callable[..., Peer]) -> None:
@@ -257,7 +257,7 @@ def rfc2217_server(device: str) -> Iterator[str]:
 def test_a_port_of_another_computer_works_alike(peers: Callable[..., Peer]) -> None:
     peer = peers(board)
     with rfc2217_server(peer.uri.removeprefix("mavlink:")) as url:
-        link = MavlinkSerialLink(f"mavlink:{url}", MavlinkLinkConfig(115_200, 50.0))
+        link = MavlinkSerialLink(f"mavlink:{url}", LinkSettings(50.0, 0, 115_200))
         link.open(lambda: False)
         link.send(clock_us(), fresh(7), HOME)
         wait_until(lambda: any(message.get_type() == "ATT_POS_MOCAP" for message in list(peer.heard)))

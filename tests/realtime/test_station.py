@@ -13,8 +13,8 @@ from firmware_py.wire.telemetry import Sample
 from ground_station.config import CaptureConfig, StationConfig
 from ground_station.frame_rate import FrameRate
 from ground_station.latency import LinkLatency
-from ground_station.live import LiveStation
 from ground_station.mocap import MocapFrame
+from ground_station.program import LiveStation
 from ground_station.sources.address import find_source
 from ground_station.sources.replay import read_frames
 from ground_station.station import GroundStation

@@ -17,7 +17,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[ControlRequest]:
     """The requests that reach the board, whose parameters are 1.5 until they are set."""
     requests: list[ControlRequest] = []
 
-    def ask(uri: str, profile: str, overrides: Any, wanted: list[ControlRequest]) -> list[Any]:
+    def ask(wanted: list[ControlRequest], **board: Any) -> list[Any]:
         requests.extend(wanted)
         if wanted[0].action is ControlAction.LIST:
             return [[("extCtrl.y_P", 1.5), ("extCtrl.z_P", 2.0), ("motorShifts.m1", 3.0)]]

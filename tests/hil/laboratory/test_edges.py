@@ -84,7 +84,9 @@ def test_faults_that_together_leave_a_knobs_range_stop_at_its_end_and_give_it_ba
     flight = lockstep_flight(
         Request.of(EXPERIMENTS["hover"], overrides=[MARKERS_ON], duration_s=1.0, link=link)
     )
-    kinds = {name: kind for name, kind in KINDS.items() if not why_not(kind, flight.robot)}
+    kinds = {
+        name: kind for name, kind in KINDS.items() if not why_not(kind, flight.robot.links, flight.config)
+    }
     knobs = [knob for kind in kinds.values() for knob in kind.knobs]
     before = [knob.read(flight.robot) for knob in knobs]
     robot, board = flight.robot, flight.switchboard

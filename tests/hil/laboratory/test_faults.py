@@ -105,7 +105,7 @@ def test_every_default_is_a_size_that_its_kind_allows() -> None:
         ("motor.stop.1@1", "acts on a part of crazyflie only; this flight is one of floaty"),
         ("push.x@30", "the flight ends 30 s after the release, before it begins"),
         ("marker.swap@1", "fault marker.swap@1: needs --set markers.enabled=true"),
-        ("serial.cut@1", "acts with --link mavlink only; this flight has --link radio"),
+        ("serial.cut@1", "acts with --link mavlink only; this robot has no serial line"),
     ],
 )
 def test_a_wrong_fault_is_one_line_and_exit_code_two(

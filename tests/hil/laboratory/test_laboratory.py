@@ -216,7 +216,7 @@ def test_a_radio_that_a_client_has_moved_is_reported_where_it_stays_and_returns_
         ("status", "robot 1: held, calibrating; faults: none"),
         ("1 status", "robot 1: held"),
         ("3 push.y", "robot 3: expected 1..1"),
-        ("serial.cut", "acts on a serial line; this robot has none"),
+        ("serial.cut", "acts with --link mavlink only; this robot has no serial line"),
         ("marker.swap", "needs --set markers.enabled=true"),
         ("help", "lets a fault act on robot N"),
         ("kinds", "mocap.dropout"),
