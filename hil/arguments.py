@@ -3,7 +3,6 @@
 Subscripted types are checked element by element; any real number is a `float`, also numpy's, but a bool is not a number.
 """
 
-import builtins
 import inspect
 import reprlib
 import types
@@ -50,10 +49,10 @@ def _guarded(function: Checked, name: str) -> Checked:
     @cache
     def expected() -> dict[str, Any]:
         """Return the type of each argument by its name, after all modules have been loaded."""
-        found = {name: kind for name, kind in _hints_of(function).items() if name in own}
+        found = {name: kind for name, kind in get_type_hints(function).items() if name in own}
         for kind in list(found.values()):
             if get_origin(kind) is Unpack:
-                found |= _hints_of(get_args(kind)[0])
+                found |= get_type_hints(get_args(kind)[0])
         return found
 
     @wraps(function)
@@ -94,36 +93,10 @@ def shown(value: object) -> str:
     return " ".join(reprlib.repr(value).split()).encode(errors="backslashreplace").decode()
 
 
-class _Module(type):
-    """A module imported only for type checking: every type in it is any type."""
-
-    def __getattr__(cls, name: str) -> Any:
-        if name.startswith("_"):
-            raise AttributeError(name)
-        return Any
-
-
-class _Unloaded(metaclass=_Module):
-    """A type or a module imported only for type checking."""
-
-
-class _Names(dict[str, Any]):
-    """The names in a module's annotations."""
-
-    def __missing__(self, name: str) -> Any:
-        return getattr(builtins, name, _Unloaded)
-
-
-def _hints_of(annotated: Any) -> dict[str, Any]:
-    module = inspect.getmodule(annotated)
-    known = vars(module) if module else annotated.__globals__
-    return get_type_hints(annotated, known, _Names(known))
-
-
 def fits(value: Any, kind: Any) -> bool:
     """Whether a value matches an annotation."""
     origin, parts = get_origin(kind) or kind, get_args(kind)
-    if origin in (Any, _Unloaded) or is_typeddict(origin):
+    if origin is Any or is_typeddict(origin):
         return True
     if origin in (Union, types.UnionType):
         return any(fits(value, part) for part in parts)

@@ -31,17 +31,8 @@ def commit() -> str:
         return COMMIT.read_text(encoding="utf-8").strip()
     if not (ROOT / ".git").exists():
         return ""
-    return _output(
-        "git",
-        "-C",
-        str(ROOT),
-        "describe",
-        "--always",
-        "--abbrev=12",
-        "--exclude=*",
-        "--dirty=+",
-        timeout_s=10.0,
-    )
+    describe = ("describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+")
+    return _output("git", "-C", str(ROOT), *describe, timeout_s=10.0)
 
 
 def versions() -> dict[str, str]:

@@ -78,13 +78,8 @@ class Look:
             tuple(np.array(line).reshape(-1, 3) for line in stored.get(name, ()))
             for name in ("frame", "outline")
         )
-        return cls(
-            parts,
-            frame,
-            outline,
-            tuple(stored.get("knot", CENTRE)),
-            tuple(map(tuple, stored.get("markers", ()))),
-        )
+        knot, markers = tuple(stored.get("knot", CENTRE)), tuple(map(tuple, stored.get("markers", ())))
+        return cls(parts, frame, outline, knot, markers)
 
 
 def ball(radius: float, centre: Three = CENTRE, colour: str = PALE) -> Part:

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,6 @@ from firmware_py.rtos import TICK_US, Kernel, KernelError, Mutex, Queue, Semapho
 
 NOT_HELD = -2  # result of giving a mutex that the task does not hold
 
-Operation = tuple[str, list[Any]]
-Interrupt = tuple[int, Operation]  # time [us] and the operation called then
 Record = Callable[[int, str, str, int, int], None]
 Call = tuple[str, Callable[..., Any]]
 
@@ -83,8 +82,20 @@ class ScenarioError(Exception):
 
 
 @dataclass(slots=True)
+class Operation:
+    """A call in a scenario; its operands are words until a run replaces them by numbers and objects."""
+
+    line: int
+    name: str
+    operands: list[Any]
+
+
+Interrupt = tuple[int, Operation]  # time [us] and the operation called then
+
+
+@dataclass(slots=True)
 class Scenario:
-    """A parsed file. Operations hold words, which are resolved at the end."""
+    """A parsed file."""
 
     ticks: int = 0
     queues: dict[int, int] = field(default_factory=dict)  # id to length
@@ -95,32 +106,16 @@ class Scenario:
     # Name, priority, once, ...
     tasks: list[tuple[str, int, bool, list[Operation]]] = field(default_factory=list)
 
-    def kinds(self) -> dict[str, Any]:
-        """Return the allowed names of each operand."""
-        semaphores = set(self.semaphores)
-        return {
-            "q": set(self.queues),
-            "l": semaphores | set(self.mutexes),
-            "t": {name for name, *_ in self.tasks},
-            "T": set(range(len(self.timers))),
-        }
-
 
 def parse(text: str) -> Scenario:
     """Read a scenario; raise ScenarioError."""
     scenario = Scenario()
-    unchecked: list[tuple[int, Operation, dict[str, Call]]] = []
-    for line_number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(text.splitlines(), 1):
         words = line.split("#")[0].split()
-        if not words:
-            continue
         try:
-            unchecked += [(line_number, *found) for found in _parse_line(scenario, words)]
+            _parse_line(scenario, number, words)
         except (ValueError, IndexError):
-            raise ScenarioError(f"line {line_number}: cannot read {line.strip()!r}") from None
-    kinds = scenario.kinds()
-    for line_number, (name, operands), known in unchecked:
-        _check(line_number, name, operands, known, kinds)
+            raise ScenarioError(f"line {number}: cannot read {line.strip()!r}") from None
     if scenario.ticks <= 0:
         raise ScenarioError("no line `run TICKS` with at least one tick")
     for name, _, _, operations in scenario.tasks:
@@ -129,8 +124,8 @@ def parse(text: str) -> Scenario:
     return scenario
 
 
-def _parse_line(scenario: Scenario, words: list[str]) -> list[tuple[Operation, dict[str, Call]]]:
-    """Add one line to the scenario; return its operations, with the names allowed there."""
+def _parse_line(scenario: Scenario, line: int, words: list[str]) -> None:
+    """Add one line to the scenario."""
     match words:
         case ["run", ticks]:
             scenario.ticks = int(ticks)
@@ -140,44 +135,15 @@ def _parse_line(scenario: Scenario, words: list[str]) -> list[tuple[Operation, d
             scenario.mutexes.append(int(number))
         case ["sem", number, maximum, initial]:
             scenario.semaphores[int(number)] = int(maximum), int(initial)
-        case ["timer", name, period, autoreload, *operation]:
-            called = operation[0], operation[1:]
-            scenario.timers.append((name, int(period), bool(int(autoreload)), called))
-            return [(called, OPERATIONS)]
-        case ["at", instant_us, *operation]:
-            raised = operation[0], operation[1:]
-            scenario.interrupts.append((int(instant_us), raised))
-            return [(raised, INTERRUPTS)]
+        case ["timer", name, period, autoreload, called, *operands]:
+            operation = Operation(line, called, list(operands))
+            scenario.timers.append((name, int(period), bool(int(autoreload)), operation))
+        case ["at", instant_us, raised, *operands]:
+            scenario.interrupts.append((int(instant_us), Operation(line, raised, list(operands))))
         case ["task" | "once" as kind, name, priority]:
             scenario.tasks.append((name, int(priority), kind == "once", []))
         case [name, *operands]:
-            scripted: Operation = name, list(operands)
-            scenario.tasks[-1][3].append(scripted)
-            return [(scripted, OPERATIONS)]
-    return []
-
-
-def _check(line: int, name: str, operands: list[Any], known: dict[str, Call], kinds: dict[str, Any]) -> None:
-    """Check an operation and turn its numbers into ints, in place."""
-    if name not in known:
-        raise ScenarioError(f"line {line}: {name!r} is none of {', '.join(known)}")
-    signature = known[name][0].removesuffix("w")
-    if len(operands) != len(signature):
-        raise ScenarioError(f"line {line}: {name} takes {len(signature)} operands, not {len(operands)}")
-    for place, kind in enumerate(signature):
-        if kind != "t":
-            try:
-                operands[place] = int(operands[place])
-            except ValueError:
-                raise ScenarioError(f"line {line}: {operands[place]!r} is not a number") from None
-        if kind == "p" and operands[place] < 1:
-            raise ScenarioError(f"line {line}: {name} {operands[place]}: it must be at least 1")
-        if kind in kinds and operands[place] not in kinds[kind]:
-            raise ScenarioError(f"line {line}: {name} {operands[place]}: there is no such object for it")
-
-
-def _instant_us(interrupt: Interrupt) -> int:
-    return interrupt[0]
+            scenario.tasks[-1][3].append(Operation(line, name, list(operands)))
 
 
 class ScenarioRun:
@@ -187,52 +153,48 @@ class ScenarioRun:
         self.scenario = scenario
         self.record = record
         self.kernel = kernel = Kernel(preemption, record if traced else None)
-        self.objects: dict[int, Any] = {}
+        queues: dict[int, Any] = {}
+        locks: dict[int, Any] = {}
         for number, length in scenario.queues.items():
-            self.objects[number] = kernel.create_queue(length, f"queue {number}")
+            queues[number] = kernel.create_queue(length, f"queue {number}")
         for number, (maximum, initial) in scenario.semaphores.items():
-            self.objects[number] = kernel.create_counting_semaphore(maximum, initial, f"semaphore {number}")
+            locks[number] = kernel.create_counting_semaphore(maximum, initial, f"semaphore {number}")
         for number in scenario.mutexes:
-            self.objects[number] = kernel.create_mutex(f"mutex {number}")
-        for number, made in self.objects.items():
+            locks[number] = kernel.create_mutex(f"mutex {number}")
+        for number, made in (queues | locks).items():
             made.number = number
-        self.timers = [
+        timers = [
             kernel.create_timer(name, period, autoreload, self._timer_callback(operation))
             for name, period, autoreload, operation in scenario.timers
         ]
         self.tasks: dict[str, Task] = {}
         for name, priority, once, operations in scenario.tasks:
             self.tasks[name] = kernel.create_task(name, priority, self._scripted_task, name, operations, once)
+        kinds = {"q": queues, "l": locks, "t": self.tasks, "T": dict(enumerate(timers))}
+        called = [operation for *_, operations in scenario.tasks for operation in operations]
+        for operation in (*called, *(operation for *_, operation in scenario.timers)):
+            _resolve(operation, OPERATIONS, kinds)
+        for _, raised in scenario.interrupts:
+            _resolve(raised, INTERRUPTS, kinds)
 
     def run(self) -> None:
         """Run up to the end time, exclusive."""
         kernel = self.kernel
         end_us = self.scenario.ticks * TICK_US
         kernel.start()
-        interrupts = sorted(self.scenario.interrupts, key=_instant_us)
-        for instant_us, raised in groupby(interrupts, _instant_us):
+        interrupts = sorted(self.scenario.interrupts, key=itemgetter(0))
+        for instant_us, raised in groupby(interrupts, itemgetter(0)):
             if instant_us >= end_us:
                 break
             kernel.run(instant_us - 1)
             kernel.advance(instant_us)
-            for _, (name, operands) in raised:
-                self._interrupt(name, operands)
+            for _, operation in raised:
+                result = INTERRUPTS[operation.name][1](*operation.operands)
+                woken = int(kernel.task_woken)
+                self.record(kernel.now_us, "ISR", operation.name, int(result or 0), woken)
             kernel.run(instant_us)
         kernel.run(end_us - 1)
         self.record(end_us, "END", "-", 0, 0)
-
-    def _interrupt(self, name: str, operands: list[Any]) -> None:
-        signature, call = INTERRUPTS[name]
-        result = call(*self._meant(signature, operands))
-        self.record(self.kernel.now_us, "ISR", name, int(result or 0), int(self.kernel.task_woken))
-
-    def _meant(self, signature: str, operands: list[Any]) -> list[Any]:
-        """Return the objects named by operands."""
-        places: dict[str, Any] = {"q": self.objects, "l": self.objects, "t": self.tasks, "T": self.timers}
-        return [
-            places[kind][operand] if kind in places else operand
-            for kind, operand in zip(signature, operands, strict=False)
-        ]
 
     def _scripted_task(
         self, name: str, operations: list[Operation], once: bool
@@ -255,10 +217,31 @@ class ScenarioRun:
         return callback
 
     def _perform(self, operation: Operation, wake: PlannedWake) -> Generator[int, None, int]:
-        name, operands = operation
-        signature, call = OPERATIONS[name]
-        result = yield from call(self.kernel, *self._meant(signature, [*operands, wake][: len(signature)]))
+        signature, call = OPERATIONS[operation.name]
+        planned = [wake] if signature.endswith("w") else []
+        result = yield from call(self.kernel, *operation.operands, *planned)
         return int(result or 0)
+
+
+def _resolve(operation: Operation, known: dict[str, Call], kinds: dict[str, Any]) -> None:
+    """Replace the words of an operation by numbers and by the objects of each kind; raise ScenarioError."""
+    name, operands, start = operation.name, operation.operands, f"line {operation.line}: "
+    if name not in known:
+        raise ScenarioError(f"{start}{name!r} is none of {', '.join(known)}")
+    signature = known[name][0].removesuffix("w")
+    if len(operands) != len(signature):
+        raise ScenarioError(f"{start}{name} takes {len(signature)} operands, not {len(operands)}")
+    for place, kind in enumerate(signature):
+        word = operands[place]
+        try:
+            value: Any = word if kind == "t" else int(word)
+        except ValueError:
+            raise ScenarioError(f"{start}{word!r} is not a number") from None
+        if kind == "p" and value < 1:
+            raise ScenarioError(f"{start}{name} {word}: it must be at least 1")
+        if kind in kinds and value not in kinds[kind]:
+            raise ScenarioError(f"{start}{name} {word}: there is no such object for it")
+        operands[place] = kinds[kind][value] if kind in kinds else value
 
 
 def trace(text: str, preemption: bool, write: Callable[[str], Any]) -> None:

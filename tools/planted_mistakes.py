@@ -20,11 +20,15 @@ import tempfile
 import time
 import tomllib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
+
+Result = TypeVar("Result")
 
 ROOT = Path(__file__).parent.parent
 SHARE_CAUGHT = 0.95
@@ -117,16 +121,9 @@ def run_tests(copy: Path, tests: Sequence[str], limit_s: float | None = None) ->
 def check_clean(copy: Path, mistakes: Sequence[Mistake]) -> None:
     """Raise `TableError` unless a copy imports its own files and passes the table's tests; compile what they need."""
     for package in sorted({Path(mistake.path).parts[0].removesuffix(".py") for mistake in mistakes}):
-        code = f"import {package}; print({package}.__file__)"
-        ran = subprocess.run(
-            [sys.executable, "-c", code],
-            cwd=copy,
-            env=ENVIRONMENT,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        assert Path(ran.stdout.strip()).is_relative_to(copy), f"{package} comes from {ran.stdout.strip()}"
+        command = [sys.executable, "-c", f"import {package}; print({package}.__file__)"]
+        place = subprocess.check_output(command, cwd=copy, env=ENVIRONMENT, text=True).strip()
+        assert Path(place).is_relative_to(copy), f"{package} comes from {place}"
     tests = sorted({test for mistake in mistakes for test in mistake.tests})
     for some in ([test for test in tests if "::" in test], [test for test in tests if "::" not in test]):
         if some and (code := run_tests(copy, some)):
@@ -153,27 +150,26 @@ def check_build(mistake: Mistake, wrong: str, copy: Path) -> None:
     folder = copy / "runs" / "build" / function  # it keeps the compiler's cache between mistakes
     folder.mkdir(parents=True, exist_ok=True)
     code = f"from pathlib import Path; from {module} import {function}; {function}(Path({str(folder)!r}))"
+    environment = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join((str(copy), str(copy / "tests")))}
     with mistaken(mistake, wrong, copy):
         ran = subprocess.run(
-            [sys.executable, "-c", code],
-            cwd=copy,
-            env=ENVIRONMENT | {"PYTHONPATH": os.pathsep.join((str(copy), str(copy / "tests")))},
-            capture_output=True,
-            text=True,
+            [sys.executable, "-c", code], cwd=copy, env=environment, capture_output=True, text=True
         )
     if ran.returncode:
         why = next((line for line in ran.stderr.splitlines() if "error: " in line), ran.stderr.strip()[-200:])
         raise TableError(f"{mistake.path}: {mistake.new!r} does not build: {why}")
 
 
-def fate(mistake: Mistake, wrong: str, copy: Path) -> tuple[bool, str]:
-    """Plant a mistake in a copy and run its tests; return whether it was caught, and a word on how."""
+def fate(mistake: Mistake, wrong: str, copy: Path) -> tuple[bool, str, float]:
+    """Plant a mistake in a copy and run its tests; return whether it was caught, a word on how, and the time [s]."""
+    start_s = time.monotonic()
     with mistaken(mistake, wrong, copy):
         try:
-            code = run_tests(copy, mistake.tests, LIMIT_S)
+            caught = run_tests(copy, mistake.tests, LIMIT_S) in (FAILED, NOT_COLLECTED)
+            word = "caught" if caught else "SURVIVED"
         except subprocess.TimeoutExpired:
-            return mistake.hangs, "hangs" if mistake.hangs else f"no end in {LIMIT_S} s"
-    return (True, "caught") if code in (FAILED, NOT_COLLECTED) else (False, "SURVIVED")
+            caught, word = mistake.hangs, "hangs" if mistake.hangs else f"no end in {LIMIT_S} s"
+    return caught, word, time.monotonic() - start_s
 
 
 def plant_all(mistakes: Sequence[Mistake], root: Path, jobs: int) -> list[Mistake]:
@@ -188,26 +184,15 @@ def plant_all(mistakes: Sequence[Mistake], root: Path, jobs: int) -> list[Mistak
         for number in range(1, jobs):
             copies.put(shutil.copytree(clean, clean.with_name(str(number))))
 
-        @contextmanager
-        def free_copy() -> Iterator[Path]:
+        def on_a_copy(work: Callable[[Mistake, str, Path], Result], mistake: Mistake, wrong: str) -> Result:
             copy = copies.get()
             try:
-                yield copy
+                return work(mistake, wrong, copy)
             finally:
                 copies.put(copy)
 
-        def build(mistake: Mistake, source: str) -> None:
-            with free_copy() as copy:
-                check_build(mistake, source, copy)
-
-        def plant(mistake: Mistake, source: str) -> tuple[bool, str, float]:
-            with free_copy() as copy:
-                start_s = time.monotonic()
-                return *fate(mistake, source, copy), time.monotonic() - start_s
-
-        for _ in pool.map(build, mistakes, wrong):
-            pass  # raises if it does not build
-        runs = {pool.submit(plant, *both): both[0] for both in zip(mistakes, wrong, strict=True)}
+        list(pool.map(partial(on_a_copy, check_build), mistakes, wrong))  # raises if one does not build
+        runs = {pool.submit(on_a_copy, fate, *both): both[0] for both in zip(mistakes, wrong, strict=True)}
         survivors = []
         for number, run in enumerate(as_completed(runs), 1):
             caught, word, duration_s = run.result()

@@ -1,5 +1,6 @@
 """`floaty view | report | export`: the pictures of a run, and its export for other programs."""
 
+from importlib import import_module
 from pathlib import Path
 
 import click
@@ -51,25 +52,15 @@ def report(run: Path) -> None:
 @click.option("--gif", "as_gif", is_flag=True, help="flight.gif: the same for a page; at most a minute.")
 def export(run: Path, as_csv: bool, as_mcap: bool, as_tlog: bool, as_video: bool, as_gif: bool) -> None:
     """Write RUN, a run folder, in other formats, beside its log."""
-    if not (as_csv or as_mcap or as_tlog or as_video or as_gif):
+    wanted = {
+        "exports.wide_csv.write_csv": as_csv,
+        "exports.mcap.write_mcap": as_mcap,
+        "exports.tlog.write_tlog": as_tlog,
+        "pictures.video.write_video": as_video,
+        "pictures.video.write_gif": as_gif,
+    }
+    if not any(wanted.values()):
         raise LabError(f"export {run}: no format given: --csv, --mcap, --tlog, --video, --gif")
-    if as_csv:
-        from hil.exports.wide_csv import write_csv
-
-        say(f"  {write_csv(run)}")
-    if as_mcap:
-        from hil.exports.mcap import write_mcap
-
-        say(f"  {write_mcap(run)}")
-    if as_tlog:
-        from hil.exports.tlog import write_tlog
-
-        say(f"  {write_tlog(run)}")
-    if as_video:
-        from hil.pictures.video import write_video
-
-        say(f"  {write_video(run)}")
-    if as_gif:
-        from hil.pictures.video import write_gif
-
-        say(f"  {write_gif(run)}")
+    for place in (place for place, chosen in wanted.items() if chosen):
+        module, _, write = place.rpartition(".")
+        say(f"  {getattr(import_module(f'hil.{module}'), write)(run)}")

@@ -6,24 +6,20 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import pyarrow as pa
 
 from ground_station.trajectory import Goal, Hold, Trajectory
 from hil.arguments import checked
 from hil.errors import LabError, blame
+from hil.laboratory.faults import Fault
 from hil.laboratory.metrics import METRICS, Metric, check_limits, free_flight, measure
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from hil.laboratory.faults import Fault
-    from hil.laboratory.robot import Robot
-
+from hil.laboratory.robot import Robot
 
 LOOK_US = 20_000  # how often a goal is sent
-JUMP_MAX = (
-    0.2 + 1e-9
-)  # [m] sideways on an axis: y-square's; a jump of 0.2 m in x or 0.3 m in y loses the robot
+# [m] sideways on an axis: y-square's; a jump of 0.2 m in x or 0.3 m in y loses the robot.
+JUMP_MAX = 0.2 + 1e-9
 NAME = re.compile(r"\w[\w.-]*")
 
 

@@ -11,16 +11,14 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from hil.arguments import checked, fits, shown
 from hil.bodies import FAILURES
 from hil.config import DEFAULT_PROFILE
 from hil.errors import LabError, blame, hint
+from hil.laboratory.robot import LINKS, Robot, attributes_of, specimen
 from hil.world.body import Failure
-
-if TYPE_CHECKING:
-    from hil.laboratory.robot import Robot
 
 Outcome = Literal["holds", "degrades", "failsafe", "lost", ""]
 OCCLUSION_RADIUS = 0.3  # [m] around the axis: the shadow covers the robot anywhere in its box
@@ -28,8 +26,8 @@ PUSH_S = 0.1  # this and the sizes of pushes and shadow: what the default profil
 MARKERS_ON = "markers.enabled=true"
 GLIMPSE_S = 0.3  # shorter than the supervisor's patience of 0.5 s
 
-Read = Callable[["Robot"], float]
-Turn = Callable[["Robot", float], None]
+Read = Callable[[Robot], float]
+Turn = Callable[[Robot, float], None]
 Blend = Callable[[float, float], float]
 
 
@@ -109,8 +107,6 @@ def knob(owner: Callable[[Robot], object], name: str, blend: Blend) -> Knob:
 
     Raises `LabError` for an attribute that is missing or not a number.
     """
-    from hil.laboratory.robot import attributes_of, specimen
-
     try:
         part = owner(specimen("", markers=True))
     except Exception as error:
@@ -348,8 +344,6 @@ def declare(name: str, kind: Kind) -> Kind:
 
 def _try(name: str, kind: Kind) -> None:
     """Change and reset all knobs of a kind, on every robot that it affects. Raises `LabError` when that fails."""
-    from hil.laboratory.robot import LINKS, specimen
-
     for link in (kind.link,) if kind.link else LINKS:
         robot = specimen(link, kind.markers)
         for one in kind.knobs:

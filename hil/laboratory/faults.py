@@ -13,16 +13,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hil.arguments import checked
 from hil.config import LabConfig
 from hil.errors import LabError, hint
 from hil.laboratory.fault_kinds import KINDS, MARKERS_ON, Kind, Knob
 from hil.laboratory.recorder import release_of, stored_in
-
-if TYPE_CHECKING:
-    from hil.laboratory.robot import Robot
+from hil.laboratory.robot import Robot
 
 _LENGTH_AND_SIZE = r"(?::(?P<duration>[^@:=]+))?(?:=(?P<size>[^@:=]+))?"
 SHAPE = re.compile(rf"(?P<kind>[^@:=]+)@(?P<start>[^@:=]+){_LENGTH_AND_SIZE}")
