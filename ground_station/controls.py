@@ -85,7 +85,7 @@ class Dialogue(Generic[M]):
         self._script = script
         self._go_on(now_us, None)
 
-    def hear(self, now_us: int, message: M) -> bool:
+    def receive(self, now_us: int, message: M) -> bool:
         """Take a message; return whether it was the expected reply."""
         reply = None if self._exchange is None else self._exchange.take(message)
         if reply is not None:

@@ -86,7 +86,7 @@ class Operator:
         if self._talk is not None:
             answer = cockpit.link.answer(now_us)
             if answer is not None:
-                self._hear(cockpit, now_us, answer)
+                self._on_answer(cockpit, now_us, answer)
         elif self._lines:
             self._begin(self._lines.popleft(), cockpit, now_us)
         elif self._is_learning and cockpit.link.supervisor_state is not None:
@@ -129,7 +129,7 @@ class Operator:
             hint = f"did you mean {near[0]}?" if near else "help lists the commands"
             raise ControlsError(f"unknown; {hint}")
 
-    def _hear(self, cockpit: Cockpit, now_us: int, answer: Answer) -> None:
+    def _on_answer(self, cockpit: Cockpit, now_us: int, answer: Answer) -> None:
         try:
             if answer.error:
                 raise ControlsError(answer.error)

@@ -112,8 +112,8 @@ class CrazyflieLink:
         self._now_us, self._goal = now_us, goal
         if self._config.poses:
             self._transmit(now_us, encode_ext_pose(frame.p_WB, frame.q_WB, None))
-        self._logs.tend(now_us)
-        self._tend(now_us)
+        self._logs.repeat(now_us)
+        self._take_answer(now_us)
         while not self._asked and now_us >= self._next_us:
             self._next_us = next(self._steps)
 
@@ -121,8 +121,8 @@ class CrazyflieLink:
         """Return the telemetry in a packet from the board, empty for a packet of another service."""
         packet = decode(data)
         if packet.port in PORTS:
-            self._controls.hear(now_us, packet)
-        return self._logs.hear(now_us, packet) if packet.port == PORT_LOG else ()
+            self._controls.receive(now_us, packet)
+        return self._logs.receive(now_us, packet) if packet.port == PORT_LOG else ()
 
     def _fly(self) -> Iterator[int]:
         """Do what is due, and yield the next due instant [us]; the board's answers are awaited in between."""
@@ -165,7 +165,7 @@ class CrazyflieLink:
         self._asked = True
         self._controls.ask(self._now_us, request)
 
-    def _tend(self, now_us: int) -> None:
+    def _take_answer(self, now_us: int) -> None:
         answer = self._controls.answer(now_us) if self._asked else None
         if answer is not None:
             self._asked = False

@@ -89,7 +89,7 @@ class CrazyradioLink(LiveLink):
         crazyflie.add_port_callback(CRTPPort.LINKCTRL, self._on_echo)
         for port in (*PORTS, PORT_CONSOLE, PORT_LOG):
             crazyflie.add_port_callback(
-                port, lambda packet: self._hear(bytes((packet.header,)) + bytes(packet.data))
+                port, lambda packet: self._on_bytes(bytes((packet.header,)) + bytes(packet.data))
             )
         statistics = crazyflie.link_statistics
         statistics.link_quality_updated.add_callback(partial(setattr, self, "quality"))
@@ -102,12 +102,12 @@ class CrazyradioLink(LiveLink):
         return True
 
     def _why_no_connection(self, now_us: int, within: str) -> str:
-        if not self.heard_us or self._crazyflie is None:
+        if not self.received_us or self._crazyflie is None:
             return f"no answer {within}"
         version = self._crazyflie.platform.get_protocol_version()
         if version < MIN_PROTOCOL:
             return f"wrong protocol: version {version} answers, at least {MIN_PROTOCOL} is needed"
-        if now_us - self.heard_us > ANSWER_TIMEOUT_US:
+        if now_us - self.received_us > ANSWER_TIMEOUT_US:
             return f"answers stopped while connecting, for {seconds(ANSWER_TIMEOUT_US)}"
         return ""
 
@@ -125,7 +125,7 @@ class CrazyradioLink(LiveLink):
         if self._logs.requested and now_us - self._telemetry_us > SILENCE_TIMEOUT_US:
             silence = seconds(SILENCE_TIMEOUT_US)
             raise LinkError(f"{self.uri}: lost: no telemetry for {silence}, it may have rebooted")
-        self._logs.tend(now_us)
+        self._logs.repeat(now_us)
         # Echoes are requested well apart from corrections, which would delay both.
         if now_us >= self._echo_us and now_us - self._sent_us >= ECHO_APART_US:
             self._echo_us = now_us + ECHO_PERIOD_US
@@ -191,13 +191,13 @@ class CrazyradioLink(LiveLink):
         """Return the telemetry in a packet from the board, empty for a packet of another service."""
         packet = decode(data)
         if packet.port in PORTS:
-            self._controls.hear(now_us, packet)
+            self._controls.receive(now_us, packet)
         if packet.port == PORT_CONSOLE:
             *lines, self._console = (self._console + packet.data)[-CONSOLE_BYTES:].split(b"\n")
             self._notices += [f"board: {line.decode(errors='replace')}" for line in lines if line]
         if packet.port != PORT_LOG:
             return ()
-        samples = self._logs.hear(now_us, packet)
+        samples = self._logs.receive(now_us, packet)
         if samples:
             self._telemetry_us = now_us
         if (state := state_in(samples)) is not None:
@@ -208,7 +208,7 @@ class CrazyradioLink(LiveLink):
 
     def _on_any_packet(self, packet: CRTPPacket) -> None:
         if packet.header & NULL_MASK != NULL_HEADER:  # the radio chip answers even without a board behind it
-            self.heard_us = clock_us()
+            self.received_us = clock_us()
 
     def _on_echo(self, packet: CRTPPacket) -> None:
         if packet.channel or len(packet.data) != ECHO.size:

@@ -44,7 +44,7 @@ from ground_station.controls import (
     Settings,
 )
 
-PORTS = (PORT_PARAMETERS, PORT_PLATFORM, PORT_SUPERVISOR)  # whose packets `hear` takes
+PORTS = (PORT_PARAMETERS, PORT_PLATFORM, PORT_SUPERVISOR)  # whose packets `receive` takes
 
 
 @dataclass(frozen=True, slots=True)

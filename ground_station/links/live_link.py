@@ -43,11 +43,6 @@ class Sender:
         """Queue a job behind those before it."""
         self._jobs.put(job)
 
-    @property
-    def waiting(self) -> int:
-        """How many jobs are queued."""
-        return self._jobs.qsize()
-
     def close(self) -> None:
         """End the thread after the queued jobs; a job that hangs is left alone."""
         self._jobs.put(None)
@@ -61,7 +56,7 @@ class Sender:
 class LiveLink(ABC):
     """One board. `open` before use; it may be opened again after `close`.
 
-    The back end keeps `heard_us`, `latency` and `supervisor_state` up to date, and passes what it reads to `_hear`.
+    The back end keeps `received_us`, `latency` and `supervisor_state` up to date, and passes what it reads to `_on_bytes`.
     """
 
     def __init__(self, uri: str, latency: LinkLatency) -> None:
@@ -72,7 +67,7 @@ class LiveLink(ABC):
         self.sent = 0  # poses
         # Poses that a newer one replaced, or that were too old when they were to be sent.
         self.late = 0
-        self.heard_us = 0  # when the board was last received; 0: not yet
+        self.received_us = 0  # when the board was last received; 0: not yet
         # Of a radio: link quality, 100 % without retries, and signal strength at the board [-dBm].
         self.quality = self.rssi = nan
         self._notices: list[str] = []
@@ -132,7 +127,7 @@ class LiveLink(ABC):
 
     def open(self, give_up: Callable[[], bool]) -> None:
         """Connect and start telemetry; raises `LinkError`, also when `give_up` returns true."""
-        self.heard_us = 0
+        self.received_us = 0
         self._received = queue.Queue(PIECES)
         self._sender = Sender()
         try:
@@ -163,7 +158,7 @@ class LiveLink(ABC):
     def check(self) -> None:
         """Raise `LinkError` when the link is lost."""
         why = self._failure()
-        if not why and clock_us() - self.heard_us > SILENCE_TIMEOUT_US:
+        if not why and clock_us() - self.received_us > SILENCE_TIMEOUT_US:
             why = f"silent for {seconds(SILENCE_TIMEOUT_US)}"
         if why:
             raise LinkError(f"{self.uri}: lost: {why}")
@@ -216,7 +211,7 @@ class LiveLink(ABC):
 
     # Downlink
 
-    def _hear(self, data: bytes) -> None:
+    def _on_bytes(self, data: bytes) -> None:
         """Queue bytes that were just read; the back end's reader calls this."""
         with suppress(queue.Full):  # the user no longer reads
             self._received.put_nowait((clock_us(), data))

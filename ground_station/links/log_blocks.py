@@ -52,18 +52,18 @@ class LogBlocks:
         """Request all blocks, or go on requesting them."""
         if not self._dialogue.busy:
             self._dialogue.begin(now_us, self._script())
-        self.tend(now_us)
+        self.repeat(now_us)
 
-    def tend(self, now_us: int) -> None:
+    def repeat(self, now_us: int) -> None:
         """Repeat unanswered requests; call it again and again."""
         answer = self._dialogue.answer(now_us)
         if answer is not None and answer.error:
             self.notices.append(f"telemetry: {answer.error}")
 
-    def hear(self, now_us: int, packet: Packet) -> Sequence[Sample]:
+    def receive(self, now_us: int, packet: Packet) -> Sequence[Sample]:
         """Return the telemetry in a packet of the log port, empty for an answer; `WireError` if it is malformed."""
         if packet.channel != log.CHANNEL_DATA:
-            self._dialogue.hear(now_us, packet)
+            self._dialogue.receive(now_us, packet)
             return ()
         number, timestamp_ms, values = log.decode_data(packet.data)
         block = self._blocks.get(number)

@@ -33,9 +33,9 @@ class LoopbackLink:
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
         """Pass the correction to the carrier."""
         self._transmit(now_us, encode_ext_pose(*correct(frame, goal, now_us + self.latency.us)))
-        self._logs.tend(now_us)
+        self._logs.repeat(now_us)
 
     def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
         """Return the telemetry in a packet from the board, empty for a packet of another service."""
         packet = decode(data)
-        return self._logs.hear(now_us, packet) if packet.port == PORT_LOG else ()
+        return self._logs.receive(now_us, packet) if packet.port == PORT_LOG else ()

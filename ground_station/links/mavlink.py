@@ -50,7 +50,7 @@ class MavlinkLink:
         self._note_frame = settings.note_frame
         self.board: int | None = None  # its system id, None before the first heartbeat
         self.answered = False  # it has acknowledged a command
-        self.heard_us = 0  # arrival of its last frame
+        self.received_us = 0  # arrival of its last frame
         self.latency = LinkLatency("serial", settings.latency_us, measured=False)
         self._carry = transmit
         self._sender = FrameSender(SYSTEM, COMPONENT, signing)
@@ -140,7 +140,7 @@ class MavlinkLink:
             handler = self._handlers.get(message.get_type())
             if handler is None or not self._is_of_board(message):
                 continue
-            self.heard_us = now_us
+            self.received_us = now_us
             samples += handler(now_us, message)
         if self._read_us >= self._look_us:
             self._look_after(self._read_us)
@@ -169,18 +169,18 @@ class MavlinkLink:
 
     def _on_command_ack(self, now_us: int, message: Message) -> Sequence[Sample]:
         self.answered = True
-        if not self.controls.hear(self._read_us, message) and message.result != ACCEPTED:
+        if not self.controls.receive(self._read_us, message) and message.result != ACCEPTED:
             self.texts.append(services.refusal(message))
         return ()
 
     def _on_parameter(self, now_us: int, message: Message) -> Sequence[Sample]:
-        self.controls.hear(self._read_us, message)
+        self.controls.receive(self._read_us, message)
         return ()
 
     def _on_text(self, now_us: int, message: Message) -> Sequence[Sample]:
         self._text = self._text + message.text if message.chunk_seq else message.text
         continued = message.id and len(message.text) == TEXT_PIECE
-        if not self.controls.hear(self._read_us, message) and not continued:
+        if not self.controls.receive(self._read_us, message) and not continued:
             self.texts.append(f"board: {self._text}")
         return ()
 

@@ -48,16 +48,16 @@ def parse_uri(uri: str, default_baud: int) -> tuple[str, int]:
 
 
 class _Port:
-    """An open port, until reading or writing fails or it is closed; the reader's thread calls `hear` with
+    """An open port, until reading or writing fails or it is closed; the reader's thread calls `receive` with
     the bytes read.
 
     Raises `OSError` or `ValueError` like pyserial.
     """
 
-    def __init__(self, device: str, baud: int, hear: Callable[[bytes], None]) -> None:
+    def __init__(self, device: str, baud: int, receive: Callable[[bytes], None]) -> None:
         self.failure = ""  # why it has failed
         self.bytes = 0  # received
-        self._hear = hear
+        self._receive = receive
         self._closing = False
         remote = device.startswith("rfc2217:")  # cannot be polled, and has a fixed write timeout of 5 s
         self._polled = os.name == "posix" and not remote
@@ -93,7 +93,7 @@ class _Port:
         data = self._serial.read(READ_SIZE)
         if data:
             self.bytes += len(data)
-            self._hear(data)
+            self._receive(data)
 
     def _guard(self, work: Callable[[], object]) -> None:
         try:
@@ -116,7 +116,7 @@ class MavlinkSerialLink(LiveLink):
 
     def _open(self) -> None:
         try:
-            self._port = _Port(self._device, self._settings.baud, self._hear)
+            self._port = _Port(self._device, self._settings.baud, self._on_bytes)
         except (OSError, ValueError) as error:
             raise LinkError(f"{self.uri}: {reason(error)}") from None
         with self._link_lock:
@@ -191,7 +191,7 @@ class MavlinkSerialLink(LiveLink):
             samples = link.receive(now_us, data, clock_us())
             self._notices += link.texts
             link.texts.clear()
-        self.heard_us, self.latency = link.heard_us, link.latency
+        self.received_us, self.latency = link.received_us, link.latency
         self.supervisor_state = link.supervisor_state
         return samples
 

@@ -44,12 +44,12 @@ def encode_error(text: str) -> str:
 def decode_line(line: bytes) -> Arrival | str:
     """Return the content of a line, a text if it is an error's; `MocapError` for a malformed one."""
     try:
-        said = json.loads(line)
+        content = json.loads(line)
     except (ValueError, RecursionError):
         raise MocapError(f"not a line of the capture process: {line[:40]!r}") from None
-    if isinstance(said, str):
-        return said
-    match said:
+    if isinstance(content, str):
+        return content
+    match content:
         case [int(t_us), dict(bodies)] if 0 <= t_us < 2**63 and all(map(_is_body, bodies.values())):
             return Arrival(t_us, {name: tuple(body) for name, body in bodies.items()})
     raise MocapError(f"not a line of the capture process: {line[:40]!r}")

@@ -91,7 +91,7 @@ def check(
     also 1 when anything else in the firmware differs from PROFILE.
     """
     from hil.config import settings_of
-    from hil.deploy.check import check_flight, plan, reached
+    from hil.deploy.check import check_flight, plan
     from hil.deploy.targets import CORTEX_M4, TARGETS, Toolbox, target_names
 
     if source and firmware:
@@ -114,11 +114,7 @@ def check(
         _print_flight(checked[-1])
         if checked[-1].outcome == "interrupted" or checked[-1].failed:
             break
-    _print_sum(checked)
-    seen, missed = reached(checked)
-    say(f"supervisor: reached {seen}{f'; not {missed}' if missed else ''}")
-    if not fresh and "not finite" in missed:
-        say("            only a core with own logic has the guard that finds what is not finite")
+    _print_sum(checked, fresh)
     if toolbox.machine_code is not None:
         _print_machine_code(toolbox.machine_code)
     counted = {} if toolbox.machine_code is None else toolbox.machine_code.entries
@@ -169,13 +165,19 @@ def _print_flight(checked: Checked) -> None:
         say(f"  {target.name:<10}{target.ticks:>7} ticks {target.calls:>7} calls  {verdict}")
 
 
-def _print_sum(checked: list[Checked]) -> None:
+def _print_sum(checked: list[Checked], fresh: bool) -> None:
+    from hil.deploy.check import reached
+
     every = [target for one in checked for target in one.targets]
     names = list(dict.fromkeys(target.name for target in every))
     ticks = min(sum(target.ticks for target in every if target.name == name) for name in names)
     different = [name for name in names if any(target.divergence for target in every if target.name == name)]
     verdict = f"{', '.join(different)} DIFFERS" if different else "no bit differs"
     say(f"{ticks} ticks, numba beside {', '.join(names)}: {verdict}")
+    seen, missed = reached(checked)
+    say(f"supervisor: reached {seen}{f'; not {missed}' if missed else ''}")
+    if not fresh and "not finite" in missed:
+        say("            only a core with own logic has the guard that finds what is not finite")
 
 
 def _print_machine_code(code: MachineCode) -> None:

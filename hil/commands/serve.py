@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +30,7 @@ from hil.errors import LabError, require
 
 if TYPE_CHECKING:
     from hil.config import LabConfig
+    from hil.devices.board_firmware import Executor
     from hil.live.feed import LiveView
     from hil.servers.serial_server import Address
     from hil.servers.server import Ends, Server
@@ -118,8 +120,6 @@ def serve(asked: ServeOptions) -> int:
     from hil.config import load_config
     from hil.laboratory.fault_kinds import MARKERS_ON
     from hil.laboratory.faults import check, parse
-    from hil.laboratory.lockstep import debugger, image_at
-    from hil.laboratory.robot import PYTHON_BOARD
     from hil.servers.serial_server import parse_addresses
     from hil.servers.server import Server, Service
 
@@ -131,11 +131,9 @@ def serve(asked: ServeOptions) -> int:
     station = _station_of(asked, config)
     serial = parse_addresses(asked.mavlink, asked.boards) if asked.mavlink is not None else []
     planned = [parse(text) for text in asked.faults]
-    check(planned, float("inf"), "mavlink" if serial else "radio", config)
+    check(planned, inf, "mavlink" if serial else "radio", config)
     announce_compilation()
-    stack = click.get_current_context().with_resource(ExitStack())
-    port = debugger(asked.gdb, Path(asked.board or ""), stack)
-    executor = PYTHON_BOARD if asked.board is None else image_at(asked.board, None, port)
+    executor = _executor(asked)
     view = open_live(asked.target)
     plan = Service(config, asked.boards, asked.seed, bool(serial), planned, asked.state, executor)
     server = Server(plan, say, view)
@@ -146,10 +144,21 @@ def serve(asked: ServeOptions) -> int:
                 robot.fly(station == "poses")
         _run(server, view)
     close_live(view)
-    if ends.motive is not None and ends.motive.malformed:
-        say(f"motive could not read {ends.motive.malformed} packets")
+    if unread := 0 if ends.motive is None else ends.motive.malformed:
+        say(f"motive could not read {unread} packets")
     say(f"stopped; time stood still for {server.clock.stood_still_us / 1000:.0f} ms")
     return 0
+
+
+def _executor(asked: ServeOptions) -> Executor:
+    """Return what executes the boards' firmware."""
+    from hil.laboratory.lockstep import debugger, image_at
+    from hil.laboratory.robot import PYTHON_BOARD
+
+    if asked.board is None:
+        return PYTHON_BOARD
+    stack = click.get_current_context().with_resource(ExitStack())
+    return image_at(asked.board, None, debugger(asked.gdb, Path(asked.board), stack))
 
 
 def _run(server: Server, view: LiveView | None) -> None:

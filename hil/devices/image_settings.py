@@ -64,7 +64,7 @@ class ImageSettings:
 
     def hear(self, now_us: int, data: bytes) -> None:
         """Take a packet from the board; ignore all but answers."""
-        if self._left and (packet := decode(data)).port in PORTS and self._controls.hear(now_us, packet):
+        if self._left and (packet := decode(data)).port in PORTS and self._controls.receive(now_us, packet):
             self._go_on(now_us)
 
     def _turn(self, now_us: int) -> None:

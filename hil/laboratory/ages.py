@@ -87,20 +87,16 @@ def with_goals_sent(telemetry: Path, log: pa.Table) -> pa.Table:
         return log
     times_us, goals = sent
     latest = np.searchsorted(times_us, log.column(STATION_CLOCK).to_numpy(), side="right") - 1
+    columns = {}
     for index, name in enumerate(("goal.x", "goal.y", "goal.z", "goal.yaw")):
-        place = log.schema.get_field_index(name)
-        values = np.where(latest < 0, log.column(place).to_numpy(), goals[np.maximum(latest, 0), index])
-        log = log.set_column(place, log.schema.field(place), pa.array(values))
-    return log
+        columns[name] = np.where(latest < 0, log.column(name).to_numpy(), goals[np.maximum(latest, 0), index])
+    return _with(log, columns)
 
 
 def _read(telemetry: Path, titles: tuple[str, ...]) -> NDArray[np.float64]:
     """Return columns of a telemetry record, (N, columns); the last line of the file may be cut."""
-    convert = csv.ConvertOptions(
-        include_columns=titles,
-        column_types=dict.fromkeys(titles, pa.float64()),
-        include_missing_columns=True,
-    )
+    types = dict.fromkeys(titles, pa.float64())
+    convert = csv.ConvertOptions(include_columns=titles, column_types=types, include_missing_columns=True)
     parse = csv.ParseOptions(invalid_row_handler=lambda row: "skip")
     try:
         table = csv.read_csv(telemetry, parse_options=parse, convert_options=convert)
@@ -141,25 +137,13 @@ def at_exposure(log: pa.Table) -> pa.Table:
     for name in names:
         values = log.column(name).to_numpy()[fresh]
         columns[name] = np.where(known, (1 - share) * values[after - 1] + share * values[after], np.nan)
-    columns |= _rotations(log, fresh, after, share, known)
-    return _with(log, columns)
-
-
-def _rotations(
-    log: pa.Table,
-    fresh: NDArray[np.int64],
-    after: NDArray[np.int64],
-    share: NDArray[np.float64],
-    known: NDArray[np.bool_],
-) -> dict[str, NDArray[np.float64]]:
-    """Interpolate quaternions; neighbours may have opposite signs."""
     q = np.stack([log.column(name).to_numpy()[fresh] for name in ROTATION], axis=1)
     a, b = q[after - 1], q[after]
-    b = b * np.where((a * b).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+    b = b * np.where((a * b).sum(axis=1) < 0, -1.0, 1.0)[:, None]  # neighbours may have opposite signs
     between = (1 - share)[:, None] * a + share[:, None] * b
     between /= np.sqrt((between**2).sum(axis=1))[:, None]
     between[~known] = np.nan
-    return dict(zip(ROTATION, between.T, strict=True))
+    return _with(log, columns | dict(zip(ROTATION, between.T, strict=True)))
 
 
 def _with(log: pa.Table, columns: dict[str, NDArray[np.float64]]) -> pa.Table:

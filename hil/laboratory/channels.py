@@ -75,7 +75,7 @@ TELEMETRY = (
     quantity("estimator", "poses rejected"),
 )
 # The log variables of these columns, in their order.
-TOLD = [
+REPORTED = [
     name
     for listed in (
         "stateEstimate.x y z vx vy vz roll pitch yaw roll_rate pitch_rate yaw_rate flap_1 flap_2 flap_3 flap_4",
@@ -322,12 +322,12 @@ class StationView:
         newest = self._ground.telemetry
         if any(block.id not in newest for block in BLOCKS):
             return nan
-        told = {
+        reported = {
             variable.name: value
             for block in BLOCKS
             for variable, value in zip(block.variables, newest[block.id].values, strict=True)
         }
-        *measured, age, poses, rejected = (told[name] for name in TOLD)
+        *measured, age, poses, rejected = (reported[name] for name in REPORTED)
         return (*measured, AGE_UNIT_US * age, self._poses(poses), self._rejected(rejected))
 
     def slow(self) -> tuple[float, ...]:

@@ -71,7 +71,7 @@ class Line(Protocol):
         """Hand the board a CRTP packet of the operator."""
 
     def listen(self, receive: Callable[[int, bytes], object]) -> None:
-        """Let an operator hear what the board sends. Raises `LabError` where the ground station is another program."""
+        """Pass what the board sends to an operator. Raises `LabError` where the ground station is another program."""
 
     def look(self, now_us: int) -> list[tuple[str, str]]:
         """Return the messages since the last call: (source, text)."""

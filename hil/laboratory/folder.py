@@ -21,11 +21,15 @@ RUNS = Path("runs")
 OLDER = "older-run"  # in a run folder, until the next flight begins
 
 
-def prepare(folder: Path) -> None:
-    """Make a folder ready for a run: set an older one aside. Raises `LabError` when it holds something else."""
+@contextmanager
+def replacing_older(folder: Path) -> Iterator[None]:
+    """Make a folder ready for a run; the older one in it is deleted at the end, or restored after an error.
+
+    Raises `LabError` when the folder holds something else.
+    """
     with writing("--out", folder):
         folder.mkdir(parents=True, exist_ok=True)
-        bring_back(folder)  # from an attempt that never began
+        _bring_back(folder)  # from an attempt that never began
         if older := list(folder.iterdir()):
             if not any((folder / name).exists() for name in (RESULT, EVENTS)):
                 raise LabError(
@@ -34,10 +38,16 @@ def prepare(folder: Path) -> None:
             (folder / OLDER).mkdir()
             for path in older:
                 path.rename(folder / OLDER / path.name)
+    try:
+        yield
+    except BaseException:
+        _bring_back(folder)
+        raise
+    shutil.rmtree(folder / OLDER, ignore_errors=True)
 
 
-def bring_back(folder: Path) -> None:
-    """Restore the older run after `prepare`, and delete the files of a failed attempt."""
+def _bring_back(folder: Path) -> None:
+    """Restore the older run, and delete the files of a failed attempt."""
     if (folder / OLDER).exists():
         for path in folder.iterdir():
             if path.name != OLDER:
@@ -45,11 +55,6 @@ def bring_back(folder: Path) -> None:
         for path in (folder / OLDER).iterdir():
             path.rename(folder / path.name)
         (folder / OLDER).rmdir()
-
-
-def drop_older(folder: Path) -> None:
-    """Delete the older run: the flight begins."""
-    shutil.rmtree(folder / OLDER, ignore_errors=True)
 
 
 def folder_of(request: Request, parent: Path = RUNS) -> Path:

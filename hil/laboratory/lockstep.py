@@ -73,7 +73,7 @@ class ModelledLine:
         self.station = GroundStation(
             self._link, self.trajectory, self._telemetry, config.station, self.tracker
         )
-        self._hearing: list[Receiver] = [self.station.on_packet]  # receivers of the board's radio packets
+        self._receivers: list[Receiver] = [self.station.on_packet]  # receivers of the board's radio packets
         if self.robot.firmware.flashed is not None and not config.pilot.enabled:
             self._set_up(site, self.robot.firmware.flashed)
         self.radio.connect(self.robot.packet_received, self._on_ground, self.robot.polled)
@@ -82,23 +82,19 @@ class ModelledLine:
         self.robot.seen_by(lambda frame, now_us, _: self.station.on_frame(frame, now_us))
 
     def _on_ground(self, now_us: int, data: bytes) -> None:
-        for receive in self._hearing:
+        for receive in self._receivers:
             receive(now_us, data)
 
     def _set_up(self, site: Site, flashed: Flashed) -> None:
         """Send the flight's settings to the board; report firmware that may not drive this robot."""
         if APP_PARAMETER not in flashed.parameters:
             site.say(SETTINGS, NO_APP)
+        say, uplink = partial(site.say, SETTINGS), self.radio.uplink
         settings = ImageSettings(
-            flashed.parameters,
-            flashed.differences,
-            site.config,
-            site.events,
-            self.radio.uplink,
-            partial(site.say, SETTINGS),
+            flashed.parameters, flashed.differences, site.config, site.events, uplink, say
         )
         site.events.at(0, settings.begin)
-        self._hearing.append(settings.hear)
+        self._receivers.append(settings.hear)
 
     def begin(self, release: Callable[[int], None]) -> None:
         """Plan the release at the profile's time."""
@@ -110,12 +106,10 @@ class ModelledLine:
 
     def _radio(self, request: Request) -> tuple[Link, Channel]:
         latency_us = request.config.station.link_latency_us
-        channel = radio_channel(self.radio)
+        link: Link = LoopbackLink(self.radio.uplink, latency_us, lambda: self.robot.firmware.log_numbers)
         if request.times is not None:
-            self._pilot = pilot = self._crazyflie_link(request, request.times, latency_us)
-            return pilot, channel
-        link = LoopbackLink(self.radio.uplink, latency_us, lambda: self.robot.firmware.log_numbers)
-        return link, channel
+            link = self._pilot = self._crazyflie_link(request, request.times, latency_us)
+        return link, radio_channel(self.radio)
 
     def _crazyflie_link(self, request: Request, times: FlightTimes, latency_us: int) -> CrazyflieLink:
         """Return the link to the stock firmware. Raises `LabError` for a parameter that the image lacks."""
@@ -147,17 +141,12 @@ class ModelledLine:
         """Return the station's end of the serial line. Raises `LabError` when it is too slow for a flight."""
         from ground_station.links.mavlink import MavlinkLink  # its package is an extra
 
-        settings = site.config.ground.links(None if telemetry is None else self._note_frame)
+        self._frames = FrameLog(telemetry.with_name(FRAME_LOG)) if telemetry is not None else None
+        settings = site.config.ground.links(self._frames.note if self._frames else None)
         with refusing("--link mavlink: ", LinkError):
             link = MavlinkLink(uart.uplink, settings)
-        if telemetry is not None:
-            self._frames = FrameLog(telemetry.with_name(FRAME_LOG))
         site.events.at(0, lambda now_us: site.say("lab", link.budget.text))
         return link, serial_channel(uart, self.robot.firmware, link)
-
-    def _note_frame(self, now_us: int, data: bytes) -> None:
-        if self._frames is not None:
-            self._frames.note(now_us, data)
 
     def steer(self, trajectory: Trajectory) -> None:
         """Fly another trajectory from now on."""
@@ -171,7 +160,7 @@ class ModelledLine:
         """Also pass the board's radio packets to an operator."""
         if self.robot.uart is not None:
             raise LabError("over MAVLink a flight in lockstep has no operator who sets parameters")
-        self._hearing.append(receive)
+        self._receivers.append(receive)
 
     def look(self, now_us: int) -> list[tuple[str, str]]:
         lines = self.station.notices()

@@ -17,7 +17,7 @@ from ground_station.telemetry_log import TELEMETRY
 from hil.clock import Pace
 from hil.laboratory.ages import with_goals_sent
 from hil.laboratory.flight import Flight
-from hil.laboratory.folder import bring_back, drop_older, prepare
+from hil.laboratory.folder import replacing_older
 from hil.laboratory.laboratory import Progress
 from hil.laboratory.lockstep import in_lockstep
 from hil.laboratory.recorder import Onlooker, Recorder, load_log
@@ -43,16 +43,11 @@ def fly(
 
     `flight_of` assembles the flight. An error of the firmware ends in the outcome "error", Ctrl-C in "interrupted".
     """
-    prepare(folder)
     with ExitStack() as stack:
         stack.callback(gc.set_threshold, *gc.get_threshold())
         gc.set_threshold(*COLLECTIONS)
-        try:
+        with replacing_older(folder):
             flight = flight_of(request, folder / TELEMETRY, stack)
-        except BaseException:
-            bring_back(folder)
-            raise
-        drop_older(folder)
         program = Program.of(request.config)
         metadata = metadata_of(request, program, flight.robot.body.look)
         recorder = Recorder(folder, flight.channels(), metadata, onlooker)
@@ -64,16 +59,16 @@ def fly(
                 progress(now_us, flight)
 
         try:
-            outcome, cause = _fly_to_the_end(flight, on_progress, recorder)
+            ended = _fly_to_the_end(flight, on_progress, recorder)
         finally:
             factor = pace.factor(flight.now_us)
             digest = _close(flight, recorder, folder)
     log, firmware = load_log(folder), flight.robot.firmware
-    lost = outcome == "lost" or flight.lost is not None
+    lost = ended[0] == "lost" or flight.lost is not None
     metrics = request.experiment.metrics_of(log, lost, flight.resets)
     queues = firmware.scheduler.queues if firmware.scheduler is not None else ()
     result = replace(
-        judged(request, program, (outcome, cause), metrics, log, digest, folder),
+        judged(request, program, ended, metrics, log, digest, folder),
         tasks=tuple(firmware.statistics.reports()),
         queues=tuple(QueueReport(one.name, one.length, one.high_water, one.dropped) for one in queues),
         usage=firmware.usage,

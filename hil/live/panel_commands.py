@@ -123,7 +123,7 @@ class PanelCommands:
 
     def _receive(self, now_us: int, data: bytes) -> None:
         if self._dialogue.busy:
-            self._dialogue.hear(now_us, decode(data))
+            self._dialogue.receive(now_us, decode(data))
 
     def _written(self, one: CoreParameter, value: float) -> Script[Packet]:
         """Set it by its name, which every board with CRTP understands, and return the value."""

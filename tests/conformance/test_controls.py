@@ -59,7 +59,7 @@ class CrtpBench(CrtpClient):
         self.run(self.now_us + TURN_US)
         for _, data in self.sent:
             if not self.lossy():
-                self.controls.hear(self.now_us, crtp.decode(data))
+                self.controls.receive(self.now_us, crtp.decode(data))
         self.sent.clear()
 
     def name(self, name: str) -> str:

@@ -33,7 +33,7 @@ class Board(LiveLink):
 
     def _connect(self):
         self.steps -= 1
-        self.heard_us = clock_us()
+        self.received_us = clock_us()
         return self.steps == 0
 
     def _why_no_connection(self, now_us, within):
@@ -137,9 +137,9 @@ def test_who_cannot_or_may_not_connect_leaves_the_device_closed(stops, failure, 
 
 def test_a_board_that_is_silent_for_two_seconds_is_lost():
     board = opened()
-    board.heard_us = clock_us()
+    board.received_us = clock_us()
     board.check()
-    board.heard_us = clock_us() - 2_000_001
+    board.received_us = clock_us() - 2_000_001
     with pytest.raises(LinkError, match=r"^board:1: lost: silent for 2 s$"):
         board.check()
     board.failure = "pulled out"
@@ -151,7 +151,7 @@ def test_a_board_that_is_silent_for_two_seconds_is_lost():
 def test_what_nobody_fetches_is_bounded():
     board = opened()
     for _ in range(PIECES + 10):
-        board._hear(b"x")
+        board._on_bytes(b"x")
     assert len(board.received()) == PIECES
     assert board.received() == []
     board.close()

@@ -29,11 +29,11 @@ class Line:
         """Let the board answer until nothing is asked any more."""
         while self.waiting:
             reply = self.board.answer(self.waiting.pop(0))
-            self.logs.hear(now_us, crtp.decode(reply))
+            self.logs.receive(now_us, crtp.decode(reply))
 
     def hear(self, block, timestamp_ms, values=None):
         values = [1.0 if v.type.is_float else 1 for v in block.variables] if values is None else values
-        (sample,) = self.logs.hear(0, crtp.decode(data_packet(block, timestamp_ms, values)))
+        (sample,) = self.logs.receive(0, crtp.decode(data_packet(block, timestamp_ms, values)))
         return sample
 
 
@@ -75,7 +75,7 @@ def test_a_request_is_one_packet_and_the_next_one_waits_for_its_answer():
         assert len(line.waiting) <= 1
         assert all(len(packet) <= 31 for packet in line.waiting)
         if line.waiting:
-            line.logs.hear(0, crtp.decode(line.board.answer(line.waiting.pop())))
+            line.logs.receive(0, crtp.decode(line.board.answer(line.waiting.pop())))
     assert len(line.board.periods) == len(ALL_BLOCKS)
 
 
@@ -86,9 +86,9 @@ def test_a_lost_request_is_repeated_after_a_tenth_of_a_second(arrives):
     for arrived in [*arrives, *[True] * 40]:
         packets, line.waiting = line.waiting, []
         if arrived and packets:
-            line.logs.hear(now_us, crtp.decode(line.board.answer(packets[0])))
+            line.logs.receive(now_us, crtp.decode(line.board.answer(packets[0])))
         now_us += REPEAT_US
-        line.logs.tend(now_us)
+        line.logs.repeat(now_us)
         if line.logs.notices:  # twenty were lost in a row
             line.logs.notices.clear()
             line.logs.request(now_us)
@@ -110,8 +110,10 @@ def test_a_refusal_is_told_and_ends_the_script():
     line.talk()
     line.logs.request(0)
     command, number = crtp.decode(line.waiting.pop()).data[0], 0
-    line.logs.hear(0, crtp.Packet(crtp.PORT_LOG, log.CHANNEL_CONTROL, bytes((command, number, log.ENOMEM))))
-    line.logs.tend(0)
+    line.logs.receive(
+        0, crtp.Packet(crtp.PORT_LOG, log.CHANNEL_CONTROL, bytes((command, number, log.ENOMEM)))
+    )
+    line.logs.repeat(0)
     assert line.logs.notices == ["telemetry: log request 05: error 12"]
     assert line.waiting == []
 
@@ -120,7 +122,7 @@ def test_a_board_that_never_answers_is_given_up_and_may_be_asked_again():
     line = Line()
     line.logs.request(0)
     for now_us in range(0, PATIENCE_US + REPEAT_US, REPEAT_US):
-        line.logs.tend(now_us)
+        line.logs.repeat(now_us)
     assert line.logs.notices == ["telemetry: no answer within 2 s"]
     assert len(line.waiting) == PATIENCE_US // REPEAT_US
     line.waiting.clear()
@@ -162,7 +164,7 @@ def test_time_stamps_go_on_where_they_wrap(line):
 @pytest.mark.parametrize("data", [b"\x4d\0\0\0", bytes((MOTION.id, 0, 0, 0)) + bytes(23), b"\0\0"])
 def test_data_of_unknown_blocks_or_of_another_length_is_refused(line, data):
     with pytest.raises(WireError):
-        line.logs.hear(0, crtp.Packet(crtp.PORT_LOG, log.CHANNEL_DATA, data))
+        line.logs.receive(0, crtp.Packet(crtp.PORT_LOG, log.CHANNEL_DATA, data))
 
 
 def test_the_state_is_that_of_the_controllers_block(line):

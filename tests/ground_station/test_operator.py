@@ -49,7 +49,7 @@ class Bench(CrtpClient):
         while self.now_us < end_us:
             self.run(self.now_us + TURN_US)
             for _, data in self.sent:
-                self.controls.hear(self.now_us, crtp.decode(data))
+                self.controls.receive(self.now_us, crtp.decode(data))
             self.sent.clear()
             link = SimpleNamespace(
                 ask=self.controls.ask, answer=self.controls.answer, supervisor_state=self.state

@@ -85,5 +85,5 @@ class FirmwareBench(VirtualBoard):
                 packet = crtp.decode(self._to_station.pop(0))
                 if packet.port == crtp.PORT_LOG:
                     with suppress(WireError):  # blocks of another client
-                        self.samples += self._logs.hear(self.now_us, packet)
+                        self.samples += self._logs.receive(self.now_us, packet)
                     self.firmware.run(self.now_us)

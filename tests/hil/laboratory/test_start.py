@@ -13,11 +13,10 @@ import sys
 from pathlib import Path
 from hil.experiments import find_experiment
 from hil.laboratory.recorder import load_log
-from hil.laboratory.folder import prepare
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.pictures.report import write_report
-prepare(folder := Path(sys.argv[1]) / "run")
+folder = Path(sys.argv[1]) / "run"
 fly(Request.of(find_experiment("hover"), duration_s=0.2), folder)
 write_report(folder)
 print(sorted({"numba", "pandas", "scipy"} & set(sys.modules)), len(load_log(folder).to_pandas()))
