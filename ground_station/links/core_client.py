@@ -7,23 +7,11 @@ them.
 from collections.abc import Iterator, Sequence
 from typing import Protocol
 
-from firmware_py.wire import WireError
-from firmware_py.wire.core_port import (
-    READ_MAX,
-    VERSION,
-    About,
-    CoreAnswer,
-    Message,
-    Refusal,
-    decode_answer,
-    encode_request,
-    hello,
-    read,
-)
+from firmware_py.wire import WireError, core_port
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
 
-Request = tuple[Message, bytes]
+Request = tuple[core_port.Message, bytes]
 
 WINDOW = 4  # requests in flight; a board's queue has room for 5 packets, and it reboots when that overflows
 FIRST_WAIT_S = 0.1  # for an answer, before requests are repeated
@@ -31,10 +19,10 @@ LONGEST_WAIT_S = 0.4
 SILENCE_S = 3.0  # after which the board is given up
 SESSIONS = 255
 TEXTS: dict[int, str] = {
-    Refusal.NO_SESSION: "it has rebooted, or another program uses it",
-    Refusal.FLYING: "it may be in the air: disarm it (floaty.armed 0) and wait 5 s, or reboot it",
-    Refusal.LOOP: "it flies with hardware in the loop, and executes no calls meanwhile",
-    Refusal.OUTSIDE: "it refuses a request: its app is another version",
+    core_port.Refusal.NO_SESSION: "it has rebooted, or another program uses it",
+    core_port.Refusal.FLYING: "it may be in the air: disarm it (floaty.armed 0) and wait 5 s, or reboot it",
+    core_port.Refusal.LOOP: "it flies with hardware in the loop, and executes no calls meanwhile",
+    core_port.Refusal.OUTSIDE: "it refuses a request: its app is another version",
 }
 
 
@@ -79,37 +67,37 @@ class CoreClient:
         self._session = clock_us() % SESSIONS + 1
         self._number = 0  # of the next request
 
-    def begin(self) -> About:
+    def begin(self) -> core_port.About:
         """Begin a session, with all memory on the board zero."""
         for _ in range(SESSIONS):
             self._session, self._number = self._session % SESSIONS + 1, 0
             try:
-                about = self._exchange([hello()])[0].about()
+                about = self._exchange([core_port.hello()])[0].about()
             except WireError as error:
                 raise LinkError(f"{self.name}: {error}") from None
-            if about.version != VERSION:
-                raise LinkError(
-                    f"{self.name}: its app speaks version {about.version}, expected {VERSION}: export and flash it again"
-                )
+            if about.version != core_port.VERSION:
+                what = f"its app speaks version {about.version}, expected {core_port.VERSION}"
+                raise LinkError(f"{self.name}: {what}: export and flash it again")
             if about.done == 0:  # otherwise that number was an earlier program's
                 return about
         raise LinkError(f"{self.name}: it begins no session")
 
-    def execute(self, requests: Sequence[Request]) -> list[CoreAnswer]:
+    def execute(self, requests: Sequence[Request]) -> list[core_port.CoreAnswer]:
         """Execute requests in their order, at most one of them a call; return their answers."""
         answers = self._exchange(requests)
         self._number = (self._number + len(requests)) & 0xFFFF
         return answers
 
     def memory(self, size: int) -> bytes:
-        pieces = [read(offset, min(READ_MAX, size - offset)) for offset in range(0, size, READ_MAX)]
+        most = core_port.READ_MAX
+        pieces = [core_port.read(offset, min(most, size - offset)) for offset in range(0, size, most)]
         return b"".join(answer.body for answer in self.execute(pieces))
 
     def close(self) -> None:
         self.packets.close()
 
-    def _exchange(self, requests: Sequence[Request]) -> list[CoreAnswer]:
-        answers: dict[int, CoreAnswer] = {}
+    def _exchange(self, requests: Sequence[Request]) -> list[core_port.CoreAnswer]:
+        answers: dict[int, core_port.CoreAnswer] = {}
         sent = begin = 0  # requests sent, and those answered without a gap
         wait_s, silent_s = FIRST_WAIT_S, 0.0
         while begin < len(requests):
@@ -135,17 +123,17 @@ class CoreClient:
 
     def _send(self, request: Request, index: int) -> None:
         self.sent += 1
-        self.packets.send(encode_request(*request, self._session, self._number + index))
+        self.packets.send(core_port.encode_request(*request, self._session, self._number + index))
 
-    def _receive(self, timeout_s: float, count: int) -> CoreAnswer | None:
+    def _receive(self, timeout_s: float, count: int) -> core_port.CoreAnswer | None:
         """Return an answer to one of `count` requests; answers to earlier requests are skipped."""
         for data in iter(lambda: self.packets.receive(timeout_s), None):
             try:
-                answer = decode_answer(data)
+                answer = core_port.decode_answer(data)
             except WireError:
                 continue
             if answer.session == self._session and answer.number - self._number & 0xFFFF < count:
-                if answer.kind == Message.REFUSED:
+                if answer.kind == core_port.Message.REFUSED:
                     raise LinkError(f"{self.name}: {TEXTS.get(answer.refusal(), 'it refuses a request')}")
                 return answer
         return None

@@ -5,35 +5,9 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 
 from firmware_py.table import OF_PROFILE
-from firmware_py.wire.crtp import (
-    CHANNEL_GENERIC,
-    PORT_LOCALISATION,
-    PORT_PARAMETERS,
-    PORT_PLATFORM,
-    PORT_SUPERVISOR,
-    Packet,
-    encode,
-)
+from firmware_py.wire import crtp, parameters, supervisor
 from firmware_py.wire.localisation import EMERGENCY_STOP
-from firmware_py.wire.parameters import (
-    CHANNEL_MISC,
-    CHANNEL_READ,
-    CHANNEL_WRITE,
-    OK,
-    Misc,
-    decode_ident,
-    encode_ident,
-)
 from firmware_py.wire.scalars import Scalar
-from firmware_py.wire.supervisor import (
-    COMMAND_ARM,
-    COMMAND_RECOVER,
-    GET_BITS,
-    LOCKED,
-    PLATFORM_COMMAND,
-    REPLY,
-    SUPERVISOR_INFO,
-)
 from ground_station.controls import (
     ControlAction,
     ControlRequest,
@@ -44,7 +18,7 @@ from ground_station.controls import (
     Settings,
 )
 
-PORTS = (PORT_PARAMETERS, PORT_PLATFORM, PORT_SUPERVISOR)  # whose packets `receive` takes
+PORTS = (crtp.PORT_PARAMETERS, crtp.PORT_PLATFORM, crtp.PORT_SUPERVISOR)  # whose packets `receive` takes
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +31,7 @@ class TocEntry:
     persistent: bool
 
 
-class CrtpControls(Dialogue[Packet]):
+class CrtpControls(Dialogue[crtp.Packet]):
     """`transmit` takes packets' bytes; `table` is the board's table of contents, known once connected."""
 
     def __init__(
@@ -68,7 +42,7 @@ class CrtpControls(Dialogue[Packet]):
         self._table = table
 
     def ask(self, now_us: int, request: ControlRequest) -> None:
-        scripts: dict[ControlAction, Callable[[], Script[Packet]]] = {
+        scripts: dict[ControlAction, Callable[[], Script[crtp.Packet]]] = {
             ControlAction.LIST: lambda: self._list(request.name),
             ControlAction.READ: lambda: self._read(request.name),
             ControlAction.WRITE: lambda: self._write(request.name, request.value),
@@ -78,69 +52,74 @@ class CrtpControls(Dialogue[Packet]):
         }
         self.begin(now_us, scripts[request.action]())
 
-    def _list(self, group: str) -> Script[Packet]:
+    def _list(self, group: str) -> Script[crtp.Packet]:
         found: Settings = ()
         for name in self._table():
             if name.lower().startswith(group.lower()):
                 found += yield from self._read(name)
         return found
 
-    def _read(self, name: str) -> Script[Packet]:
+    def _read(self, name: str) -> Script[crtp.Packet]:
         entry = self._find(name)
-        reply = yield self._exchange_for(CHANNEL_READ, entry)
-        if reply.data[2] != OK:
+        reply = yield self._exchange_for(parameters.CHANNEL_READ, entry)
+        if reply.data[2] != parameters.OK:
             raise ControlsError(f"{name}: the board does not report it: error {reply.data[2]}")
         return ((name, entry.scalar.unpack(reply.data[3 : 3 + entry.scalar.size])),)
 
-    def _write(self, name: str, value: float) -> Script[Packet]:
+    def _write(self, name: str, value: float) -> Script[crtp.Packet]:
         entry = self._find(name)
         if not entry.writable:
             raise ControlsError(f"{name}: can only be read")
         wanted = entry.scalar.cast(value)
         if not (wanted == value or entry.scalar.is_float):
             raise ControlsError(f"{name} = {value:g}: not a value of type {entry.scalar.name}")
-        reply = yield self._exchange_for(CHANNEL_WRITE, entry, entry.scalar.pack(value))
+        reply = yield self._exchange_for(parameters.CHANNEL_WRITE, entry, entry.scalar.pack(value))
         in_force = entry.scalar.unpack(reply.data[2 : 2 + entry.scalar.size])
         if in_force != wanted:
             raise ControlsError(f"{name} = {value:g}: refused, it stays {in_force:g}")
         return ((name, in_force),)
 
-    def _save(self) -> Script[Packet]:
+    def _save(self) -> Script[crtp.Packet]:
         for name, entry in self._table().items():
             if not entry.persistent:
                 continue
-            head = bytes((Misc.STORE,)) + encode_ident(entry.number)
-            packet = Packet(PORT_PARAMETERS, CHANNEL_MISC, head)
+            head = bytes((parameters.Misc.STORE,)) + parameters.encode_ident(entry.number)
+            packet = crtp.Packet(crtp.PORT_PARAMETERS, parameters.CHANNEL_MISC, head)
             reply = yield self._until(packet, lambda got, head=head: got.data[:3] == head)  # type: ignore[misc]
-            if reply.data[3:4] != bytes((OK,)):
+            if reply.data[3:4] != bytes((parameters.OK,)):
                 raise ControlsError(f"{name}: the board cannot store it")
         return ()
 
-    def _arm(self) -> Script[Packet]:
+    def _arm(self) -> Script[crtp.Packet]:
         """Use Floaty's own parameters where they exist: the Crazyflie firmware's arming does not affect the flaps."""
         for name, value in (("floaty.stop", 0.0), ("floaty.armed", 1.0)):
             if name in self._table():
                 yield from self._write(name, value)
         locked = "arm; after an emergency stop it has to reboot first"
-        for what, command in (("recover", bytes((COMMAND_RECOVER,))), (locked, bytes((COMMAND_ARM, 1)))):
-            packet = Packet(PORT_PLATFORM, PLATFORM_COMMAND, command)
+        for what, command in (
+            ("recover", bytes((supervisor.COMMAND_RECOVER,))),
+            (locked, bytes((supervisor.COMMAND_ARM, 1))),
+        ):
+            packet = crtp.Packet(crtp.PORT_PLATFORM, supervisor.PLATFORM_COMMAND, command)
             reply = yield self._until(packet, lambda got, kind=command[:1]: got.data[:1] == kind)  # type: ignore[misc]
             if not any(reply.data[1:2]):
                 raise ControlsError(f"the board refuses to {what}")
         return ()
 
-    def _stop(self) -> Script[Packet]:
+    def _stop(self) -> Script[crtp.Packet]:
         """Send the stop of the localisation port, which every Crazyflie has; newer ones report that they are locked."""
-        stop = Packet(PORT_LOCALISATION, CHANNEL_GENERIC, bytes((EMERGENCY_STOP,)))
-        ask = Packet(PORT_SUPERVISOR, SUPERVISOR_INFO, bytes((GET_BITS,)))
+        stop = crtp.Packet(crtp.PORT_LOCALISATION, crtp.CHANNEL_GENERIC, bytes((EMERGENCY_STOP,)))
+        ask = crtp.Packet(crtp.PORT_SUPERVISOR, supervisor.SUPERVISOR_INFO, bytes((supervisor.GET_BITS,)))
 
         def send(now_us: int) -> None:
-            self._transmit(encode(stop))
-            self._transmit(encode(ask))
+            self._transmit(crtp.encode(stop))
+            self._transmit(crtp.encode(ask))
 
-        def take(got: Packet) -> Packet | None:
-            is_state = got.port == PORT_SUPERVISOR and got.data[:1] == bytes((REPLY | GET_BITS,))
-            return got if is_state and int.from_bytes(got.data[1:3], "little") & LOCKED else None
+        def take(got: crtp.Packet) -> crtp.Packet | None:
+            is_state = got.port == crtp.PORT_SUPERVISOR and got.data[:1] == bytes(
+                (supervisor.REPLY | supervisor.GET_BITS,)
+            )
+            return got if is_state and int.from_bytes(got.data[1:3], "little") & supervisor.LOCKED else None
 
         yield Exchange(send, take)
         return ()
@@ -151,21 +130,23 @@ class CrtpControls(Dialogue[Packet]):
             raise ControlsError(unknown(name, tuple(table)))
         return table[name]
 
-    def _exchange_for(self, channel: int, entry: TocEntry, value: bytes = b"") -> Exchange[Packet]:
+    def _exchange_for(self, channel: int, entry: TocEntry, value: bytes = b"") -> Exchange[crtp.Packet]:
         """Return the exchange whose reply has the request's channel and number, followed by a value."""
-        size = 1 if channel == CHANNEL_READ else entry.scalar.size  # a status, and a value if that is good
-        packet = Packet(PORT_PARAMETERS, channel, encode_ident(entry.number) + value)
+        size = (
+            1 if channel == parameters.CHANNEL_READ else entry.scalar.size
+        )  # a status, and a value if that is good
+        packet = crtp.Packet(crtp.PORT_PARAMETERS, channel, parameters.encode_ident(entry.number) + value)
 
-        def fits(got: Packet) -> bool:
-            return len(got.data) >= 2 + size and decode_ident(got.data) == entry.number
+        def fits(got: crtp.Packet) -> bool:
+            return len(got.data) >= 2 + size and parameters.decode_ident(got.data) == entry.number
 
         return self._until(packet, fits)
 
-    def _until(self, packet: Packet, fits: Callable[[Packet], bool]) -> Exchange[Packet]:
-        def take(got: Packet) -> Packet | None:
+    def _until(self, packet: crtp.Packet, fits: Callable[[crtp.Packet], bool]) -> Exchange[crtp.Packet]:
+        def take(got: crtp.Packet) -> crtp.Packet | None:
             return got if (got.port, got.channel) == (packet.port, packet.channel) and fits(got) else None
 
-        return Exchange(lambda now_us: self._transmit(encode(packet)), take)
+        return Exchange(lambda now_us: self._transmit(crtp.encode(packet)), take)
 
 
 def unknown(name: str, known: tuple[str, ...]) -> str:

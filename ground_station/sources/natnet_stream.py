@@ -13,19 +13,8 @@ from dataclasses import dataclass
 from firmware_py.geometry import Quaternion, Vector
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame
+from ground_station.sources import natnet
 from ground_station.sources.alignment import Alignment, choose_body
-from ground_station.sources.natnet import (
-    VERSIONS,
-    BodyPose,
-    Echo,
-    Frame,
-    MessageId,
-    ModelDefinition,
-    Response,
-    ServerInfo,
-    decode,
-    packet,
-)  # fmt: skip
 from ground_station.sources.natnet_reader import Version
 from ground_station.sources.silence import Silence
 
@@ -74,7 +63,7 @@ OLDEST_US = 1_000_000  # an older exposure is useless, or its time stamp is wron
 CALL_PERIOD_US = 500_000
 MODELS_CHANGED = 2  # bit of a frame's parameters
 # The command that changes the protocol version of the stream.
-BITSTREAM = f"Bitstream,{VERSIONS[-1][0]}.{VERSIONS[-1][1]}"
+BITSTREAM = f"Bitstream,{natnet.VERSIONS[-1][0]}.{natnet.VERSIONS[-1][1]}"
 NOWHERE: tuple[Vector, Quaternion] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
@@ -92,18 +81,18 @@ class NatnetStream:
 
     def __init__(self, name: str, alignment: Alignment) -> None:
         self.counters = StreamCounters()
-        self.server: ServerInfo | None = None
-        self.version = VERSIONS[0]  # of the server's packets
-        self.models: ModelDefinition | None = None
+        self.server: natnet.ServerInfo | None = None
+        self.version = natnet.VERSIONS[0]  # of the server's packets
+        self.models: natnet.ModelDefinition | None = None
         self.outgoing: list[bytes] = []
         self.notices: list[str] = []
         self._name = name
         self._alignment = alignment
-        self._newer: ServerInfo | None = None  # it was asked for an older version
+        self._newer: natnet.ServerInfo | None = None  # it was asked for an older version
         self._clock = ServerClock(1)
         self._id: int | None = None
         self._number: int | None = None
-        self._pose: BodyPose | None = None
+        self._pose: natnet.BodyPose | None = None
         self._repeated = 0
         self._mistimed = 0  # frames in sequence
         self._silence = Silence(self.notices)
@@ -115,16 +104,16 @@ class NatnetStream:
         `MocapError` when the server or its bodies are not the wanted ones; later changes become notices.
         """
         try:
-            message = decode(data, self.version)
+            message = natnet.decode(data, self.version)
         except MocapError:
             self.counters.malformed += 1
             return None
-        if isinstance(message, Frame):
+        if isinstance(message, natnet.Frame):
             return self._on_frame(message, now_us) if self.models is not None else None
-        if isinstance(message, Echo):
+        if isinstance(message, natnet.Echo):
             if 0 <= now_us - message.asked <= OLDEST_US:
                 self._clock.answered(message.asked, message.server, now_us)
-        elif isinstance(message, ServerInfo | ModelDefinition | Response):
+        elif isinstance(message, natnet.ServerInfo | natnet.ModelDefinition | natnet.Response):
             try:
                 self._on_answer(message)
             except MocapError as error:
@@ -144,11 +133,11 @@ class NatnetStream:
         self._call_us = now_us + CALL_PERIOD_US
         silent = not packets_wait and self._silence.lasts(now_us)
         if self.server is None or silent:
-            self.outgoing.append(packet(MessageId.CONNECT, b"Ping\0"))
+            self.outgoing.append(natnet.packet(natnet.MessageId.CONNECT, b"Ping\0"))
         elif self.models is None:
-            self.outgoing.append(packet(MessageId.REQUEST_MODELDEF, b"\0"))
-        self.outgoing.append(packet(MessageId.KEEPALIVE, b"\0"))
-        self.outgoing.append(packet(MessageId.ECHO_REQUEST, now_us.to_bytes(8, "little")))
+            self.outgoing.append(natnet.packet(natnet.MessageId.REQUEST_MODELDEF, b"\0"))
+        self.outgoing.append(natnet.packet(natnet.MessageId.KEEPALIVE, b"\0"))
+        self.outgoing.append(natnet.packet(natnet.MessageId.ECHO_REQUEST, now_us.to_bytes(8, "little")))
 
     def missing(self) -> str:
         """Return what the server has not answered yet, before there are models."""
@@ -156,43 +145,43 @@ class NatnetStream:
             return str(_unreadable(self._newer))
         return "no NatNet server answers" if self.server is None else "the server names no bodies"
 
-    def _on_answer(self, answer: ServerInfo | ModelDefinition | Response) -> None:
-        if isinstance(answer, ServerInfo):
+    def _on_answer(self, answer: natnet.ServerInfo | natnet.ModelDefinition | natnet.Response) -> None:
+        if isinstance(answer, natnet.ServerInfo):
             self._on_server(answer)
-        elif isinstance(answer, Response):
+        elif isinstance(answer, natnet.Response):
             self._on_response(answer)
         elif self.server is not None:
             names = [body.name for body in answer.bodies]
             self._id = answer.bodies[names.index(choose_body(self._name, names))].id
             self.models = answer
 
-    def _on_server(self, server: ServerInfo) -> None:
+    def _on_server(self, server: natnet.ServerInfo) -> None:
         version = server.natnet_version[:2]
-        if version in VERSIONS:
+        if version in natnet.VERSIONS:
             self._accept(server, version)
-        elif version > VERSIONS[-1] and not server.multicast:  # else all clients get the same
+        elif version > natnet.VERSIONS[-1] and not server.multicast:  # else all clients get the same
             self._newer = server
-            self.outgoing.append(packet(MessageId.REQUEST, BITSTREAM.encode() + b"\0"))
+            self.outgoing.append(natnet.packet(natnet.MessageId.REQUEST, BITSTREAM.encode() + b"\0"))
         else:
             raise _unreadable(server)
 
-    def _on_response(self, response: Response) -> None:
+    def _on_response(self, response: natnet.Response) -> None:
         """Take the answer to `BITSTREAM`, the only request."""
         server, self._newer = self._newer, None
         if server is None:
             return
         if response.code != 0 and not response.text.startswith(BITSTREAM):
             raise _unreadable(server)
-        self._accept(server, VERSIONS[-1])
+        self._accept(server, natnet.VERSIONS[-1])
 
-    def _accept(self, server: ServerInfo, version: Version) -> None:
+    def _accept(self, server: natnet.ServerInfo, version: Version) -> None:
         if self.server != server:
             self.version = version
             self._clock = ServerClock(server.clock_hz)
         self.server = server
-        self.outgoing.append(packet(MessageId.REQUEST_MODELDEF, b"\0"))
+        self.outgoing.append(natnet.packet(natnet.MessageId.REQUEST_MODELDEF, b"\0"))
 
-    def _on_frame(self, frame: Frame, now_us: int) -> MocapFrame | None:
+    def _on_frame(self, frame: natnet.Frame, now_us: int) -> MocapFrame | None:
         counters = self.counters
         if self._number is not None and 0 <= self._number - frame.number < LATE_FRAMES:
             counters.dropped += 1
@@ -200,7 +189,7 @@ class NatnetStream:
         self._number = frame.number
         self._silence.on_frame(now_us)
         if frame.parameters & MODELS_CHANGED:
-            self.outgoing.append(packet(MessageId.REQUEST_MODELDEF, b"\0"))
+            self.outgoing.append(natnet.packet(natnet.MessageId.REQUEST_MODELDEF, b"\0"))
         counters.frames += 1
         t_us = self._exposed_us(frame, now_us)
         pose = next((body for body in frame.bodies if body.id == self._id), None)
@@ -214,7 +203,7 @@ class NatnetStream:
         sent_us = max(received_us, min(sent_us, now_us))
         return MocapFrame(t_us, p, q, usable, received_us, sent_us, now_us)
 
-    def _exposed_us(self, frame: Frame, now_us: int) -> int | None:
+    def _exposed_us(self, frame: natnet.Frame, now_us: int) -> int | None:
         """Return the exposure on our clock, None if the server's time stamps make no sense."""
         self._clock.sent(frame.transmitted, now_us)
         # Cameras without a clock have no exposure, only an arrival.
@@ -229,7 +218,7 @@ class NatnetStream:
             self._clock = ServerClock(self.server.clock_hz)
         return None
 
-    def _usable(self, pose: BodyPose) -> bool:
+    def _usable(self, pose: natnet.BodyPose) -> bool:
         """Return whether a pose is tracked, and no repetition of the last."""
         last, self._pose = self._pose, pose
         same = last is not None and (last.p, last.q) == (pose.p, pose.q)
@@ -237,6 +226,6 @@ class NatnetStream:
         return pose.valid and self._repeated < FROZEN_FRAMES
 
 
-def _unreadable(server: ServerInfo) -> MocapError:
+def _unreadable(server: natnet.ServerInfo) -> MocapError:
     major, minor = server.natnet_version[:2]
     return MocapError(f"NatNet {major}.{minor} of {server.name}: 3.0, 3.1, 4.0 or 4.1 is needed")

@@ -19,15 +19,8 @@ from firmware_py.export.errors import ExportError
 from firmware_py.export.usage import CLOCK_MHZ
 from firmware_py.extras import install_command
 from ground_station.errors import LinkError
-from hil.commands.options import (
-    FILE,
-    INTERRUPTED,
-    announce_compilation,
-    fault_option,
-    profile_options,
-    progress_of_steps,
-    say,
-)
+from hil.commands import options as common
+from hil.commands.options import FILE, say
 from hil.errors import LabError, refusing
 
 if TYPE_CHECKING:
@@ -60,8 +53,8 @@ def deploy() -> None:
     metavar="S",
     help="Free flight [s]; default: the experiment's.",
 )
-@profile_options
-@fault_option
+@common.profile_options
+@common.fault_option
 @click.option(
     "--targets", "target_text", metavar="NAME,...",
     help="What to compare with numba: plain, c-O0, c-O2, cortex-m4, and real boards: radio://…, usb://0, udp://…  "
@@ -104,11 +97,11 @@ def check(
         core = source.read_text(encoding="utf-8") if source else None
     toolbox = Toolbox(names, logic, core, firmware)
     last_toolbox = toolbox if last_logic == logic else Toolbox(names, last_logic)
-    announce_compilation()
+    common.announce_compilation()
     checked: list[Checked] = []
     for request in flights:
         factories = (last_toolbox if request is flights[-1] else toolbox).factories
-        with progress_of_steps(TimeRemainingColumn()) as show:
+        with common.progress_of_steps(TimeRemainingColumn()) as show:
             show_flight = partial(_show_flight, show, request.experiment.name)
             checked.append(check_flight(request, factories, show_flight))
         _print_flight(checked[-1])
@@ -121,7 +114,7 @@ def check(
     for board, measured in toolbox.boards.items():
         _print_measured(board, measured, counted)
     if checked[-1].outcome == "interrupted":
-        return INTERRUPTED
+        return common.INTERRUPTED
     well = all(one.equal and not one.failed for one in checked)
     if firmware is not None:
         well = _check_around(firmware, options["profile"], settings_of(options["overrides"])) and well
@@ -138,7 +131,7 @@ def _check_around(elf: Path, profile: str, overrides: tuple[str, ...]) -> bool:
     if not app:
         say(f"unproven: everything but the core: {elf} has no exported app")
         return True
-    with progress_of_steps() as show:
+    with common.progress_of_steps() as show:
         for finding in check_image(elf, profile, overrides, show):
             say_finding(finding)
             well = well and finding.good
@@ -208,7 +201,7 @@ def _print_measured(board: str, measured: Loads, counted: Loads) -> None:
 
 @deploy.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
-@profile_options
+@common.profile_options
 def write(folder: Path, profile: str, overrides: tuple[str, ...]) -> None:
     """Write the Crazyflie app with the flight core as C, and PROFILE's parameters in it, into the folder DIR."""
     from firmware_py.export.crazyflie import write_app
@@ -236,7 +229,7 @@ def flash(image: Path, uri: str) -> None:
 
     with refusing(f"{image}: ", OSError, LinkError):
         content = image.read_bytes()
-        with progress_of_steps(TimeRemainingColumn()) as show:
+        with common.progress_of_steps(TimeRemainingColumn()) as show:
             flash_board(uri, content, show)
     say(f"{len(content)} bytes written and read back; the board starts")
 
@@ -248,7 +241,7 @@ def board() -> None:
 
 @board.command()
 @click.argument("link", metavar="LINK")
-@profile_options
+@common.profile_options
 def doctor(link: str, profile: str, overrides: tuple[str, ...]) -> int:
     """Examine the board at LINK (radio://0/80/2M/E7E7E7E7E7, usb://0, udp://HOST:PORT), and report its defects.
 

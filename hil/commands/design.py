@@ -8,15 +8,8 @@ from typing import TYPE_CHECKING
 import click
 from rich.table import Table
 
-from hil.commands.options import (
-    PATH,
-    announce_compilation,
-    asked_as,
-    profile_options,
-    say,
-    seed_option,
-    wide_console,
-)
+from hil.commands import options as common
+from hil.commands.options import PATH, say
 from hil.errors import LabError, made_folder, require, writing
 
 if TYPE_CHECKING:
@@ -58,7 +51,7 @@ out_option = click.option("--out", type=PATH, default=Path("runs/design"), show_
 
 @click.group(invoke_without_command=True)
 @click.pass_context
-@profile_options
+@common.profile_options
 @click.option("--speed", type=click.FloatRange(1, 40), help="Updraft [m/s]: the hover angle follows.")
 @click.option("--angle", type=click.FloatRange(0, 70), help="Hover angle [deg]: the updraft follows.")
 @click.option(
@@ -69,7 +62,7 @@ out_option = click.option("--out", type=PATH, default=Path("runs/design"), show_
 )
 @write_option
 @out_option
-@asked_as(DesignOptions)
+@common.asked_as(DesignOptions)
 def design(context: click.Context, robot: DesignOptions) -> None:
     """Compute trim, constants, poles, authority and sweeps of a profile's robot, and compare the paper's claims."""
     require("floaty design", "design", "scipy", "control")
@@ -78,7 +71,7 @@ def design(context: click.Context, robot: DesignOptions) -> None:
     from hil.design.analysis import analyse, write
 
     point = point_of(robot)
-    announce_compilation()
+    common.announce_compilation()
     if robot.write_to is not None:
         about = f"The robot of {robot.profile}, lengths times {robot.length:g}, masses times {robot.mass:g}."
         write_profile(point, robot.write_to, about, robot.length)
@@ -89,8 +82,8 @@ def design(context: click.Context, robot: DesignOptions) -> None:
 
 
 @design.command()
-@profile_options
-@seed_option
+@common.profile_options
+@common.seed_option
 @click.option(
     "--figure",
     type=click.Choice(["least-authority", "speed-range"]),
@@ -110,7 +103,7 @@ def design(context: click.Context, robot: DesignOptions) -> None:
 )
 @write_option
 @out_option
-@asked_as(Search)
+@common.asked_as(Search)
 def optimise(asked: Search) -> None:
     """Find the kink, centre of mass, base plate and strip with the largest figure, at the profile's span, mass and speed."""
     from hil.design import figures
@@ -121,7 +114,7 @@ def optimise(asked: Search) -> None:
     profile, figure, updrafts = asked.profile, asked.figure, asked.updrafts
     if updrafts[0] >= updrafts[1]:
         raise LabError(f"--updrafts {updrafts[0]:g} {updrafts[1]:g}: expected the least first")
-    announce_compilation()
+    common.announce_compilation()
     found = search.optimise(point_of(asked), figure, asked.seed, asked.generations)
     best, front = found.best, search.front(found.tried, figure)
     if asked.write_to is not None:
@@ -186,7 +179,7 @@ def show(found: "Analysis") -> None:
     table = Table("input", "alone, inside the flaps' range", "linear, in both directions about the hover")
     for row in found.inputs:
         table.add_row(*row)
-    wide_console().print(table)
+    common.wide_console().print(table)
     show_claims(found)
 
 
@@ -196,4 +189,4 @@ def show_claims(found: "Analysis") -> None:
     for claim in found.claims:
         colour = "green" if claim.verdict == "agrees" else "red"
         table.add_row(claim.title, claim.paper, claim.ours, f"[{colour}]{claim.verdict}[/{colour}]")
-    wide_console().print(table)
+    common.wide_console().print(table)

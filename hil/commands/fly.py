@@ -9,25 +9,8 @@ from typing import TYPE_CHECKING, Unpack
 import click
 from rich.progress import TextColumn, TimeRemainingColumn
 
-from hil.commands.options import (
-    INTERRUPTED,
-    PATH,
-    announce_compilation,
-    close_live,
-    exit_code,
-    fault_option,
-    gdb_option,
-    notices,
-    open_live,
-    profile_options,
-    progress_bar,
-    runner_options,
-    say,
-    seed_option,
-    view_option,
-    warn,
-    write_pictures,
-)
+from hil.commands import options as common
+from hil.commands.options import PATH, say, warn
 from hil.commands.tables import print_result, print_seeds
 from hil.errors import LabError, writing
 
@@ -40,7 +23,7 @@ SEEDS_MAX = 10_000
 
 @click.command()
 @click.argument("experiment")
-@seed_option
+@common.seed_option
 @click.option(
     "--seeds", type=click.IntRange(1, SEEDS_MAX), default=1, metavar="N",
     help="Fly N seeds from --seed on, in parallel; logs without pictures.",
@@ -48,10 +31,10 @@ SEEDS_MAX = 10_000
 @click.option(
     "--duration", "duration_s", type=float, metavar="S", help="Free flight [s]; default: the experiment's."
 )
-@profile_options
-@fault_option
+@common.profile_options
+@common.fault_option
 @click.option("--realtime", is_flag=True, help="Pace the flight to the wall clock.")
-@view_option
+@common.view_option
 @click.option(
     "--perfetto", "trace", is_flag=True, help="Trace the scheduler and write flight.perfetto-trace."
 )
@@ -69,7 +52,7 @@ SEEDS_MAX = 10_000
 @click.option(
     "--elf", type=PATH, metavar="FILE", help="With a .bin as --board: the ELF that it was made from."
 )
-@gdb_option
+@common.gdb_option
 @click.option(
     "--hil", "in_loop", type=click.Choice(["still", "moving"]), is_flag=False, flag_value="still",
     help="Let the board of --board fly by its own tasks and clock, with the gyro samples of the virtual IMU; its servos "
@@ -81,7 +64,7 @@ SEEDS_MAX = 10_000
     metavar="DIR",
     help="Run folder [runs/EXPERIMENT-SEED; -2, -3, … is added if that holds another flight].",
 )
-@runner_options
+@common.runner_options
 def fly(
     experiment: str,
     seeds: int,
@@ -105,7 +88,7 @@ def fly(
         _check_seeds(seeds, request, target)
     elif workers or cluster or resume:
         raise LabError("--workers, --cluster and --resume are for several --seeds")
-    announce_compilation()
+    common.announce_compilation()
     if seeds > 1:
         requests = [replace(request, seed=request.seed + index) for index in range(seeds)]
         return _fly_many(requests, options, out or Path("runs"), (workers, cluster, resume))
@@ -137,8 +120,8 @@ def _fly_one(request: Request, folder: Path, target: str | None) -> int:
     from hil.laboratory.run import fly
     from hil.live.panel_commands import PanelCommands
 
-    view = open_live(target)
-    with progress_bar(TextColumn("{task.fields[now]}"), TimeRemainingColumn()) as progress:
+    view = common.open_live(target)
+    with common.progress_bar(TextColumn("{task.fields[now]}"), TimeRemainingColumn()) as progress:
         bar = progress.add_task(f"{request.experiment.name} seed {request.seed}", total=None, now="")
         hands: list[PanelCommands] = []
 
@@ -150,19 +133,19 @@ def _fly_one(request: Request, folder: Path, target: str | None) -> int:
         with writing("--out", folder):
             result = fly(request, folder, show, view, maker_of(request))
         progress.update(bar, description="writing recording and report", total=None, now="")
-        write_pictures(folder, request.experiment)
+        common.write_pictures(folder, request.experiment)
         if request.bench.trace:
             from hil.exports.perfetto import write_perfetto
 
             write_perfetto(folder)
     print_result(result)
-    if view is not None and view.address and notices.is_terminal:
+    if view is not None and view.address and common.notices.is_terminal:
         warn("the flight can be viewed until Ctrl-C")
         view.stay()
-    close_live(view, result)
+    common.close_live(view, result)
     if result.stood_still_ms:
         say(f"this machine was too slow: time stood still for {result.stood_still_ms:.0f} ms")
-    return exit_code(result)
+    return common.exit_code(result)
 
 
 def _fly_many(
@@ -181,10 +164,10 @@ def _fly_many(
     if whys := [why for one in placed if (why := moved(*one))]:
         warn(whys[0] + (f", and so on: {len(whys)} of {len(jobs)}" if whys[1:] else ""))
     name = f"{requests[0].experiment.name}-{requests[0].seed}-{requests[-1].seed}"
-    with Runner(notices, *crew) as runner:
+    with Runner(common.notices, *crew) as runner:
         rows = runner.fly(name, jobs, parent)
     print_seeds(rows)
     if runner.interrupted:
         warn(f"interrupted: {len(rows)} of {len(requests)} seeds are complete")
-        return INTERRUPTED
+        return common.INTERRUPTED
     return 0 if all(row.passed for row in rows) else 1

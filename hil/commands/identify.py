@@ -8,17 +8,8 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.table import Table
 
-from hil.commands.options import (
-    PATH,
-    announce_compilation,
-    notices,
-    profile_option,
-    runner_options,
-    say,
-    seed_option,
-    warn,
-    wide_console,
-)
+from hil.commands import options as common
+from hil.commands.options import PATH, say, warn
 from hil.errors import LabError, made_folder, require, writing
 
 if TYPE_CHECKING:
@@ -93,7 +84,7 @@ def _print_constants(found: "Identification") -> None:
         table.add_column(heading, no_wrap=heading != "verdict")
     for row in rows:
         table.add_row(*(row[heading] for heading in shown))
-    wide_console().print(table)
+    common.wide_console().print(table)
     if found.excited:
         periods = ", ".join(
             f"u{one.axis.input + 1}: {one.spectra.periods} at {degrees(found.records[one.record].flap_angle):.1f} deg"
@@ -106,7 +97,7 @@ def _print_constants(found: "Identification") -> None:
 
 
 @click.command()
-@profile_option
+@common.profile_option
 @click.option(
     "--repeat", type=click.IntRange(1, 10), metavar="N",
     help="Fly the excitations, identify and tune until nothing improves, N times at most.",
@@ -115,7 +106,7 @@ def _print_constants(found: "Identification") -> None:
     "--robots", type=click.IntRange(0, 1000), default=100, show_default=True, metavar="N",
     help="Number of robots drawn from the intervals of the model; all must be stable.",
 )  # fmt: skip
-@seed_option
+@common.seed_option
 @click.option("--board", metavar="BOARD", default="python", show_default=True, help="As for `floaty fly`.")
 @click.option(
     "--out",
@@ -126,7 +117,7 @@ def _print_constants(found: "Identification") -> None:
 @click.option(
     "--runs", type=PATH, default=Path("runs/tune"), show_default=True, metavar="DIR", help="Of all flights."
 )  # fmt: skip
-@runner_options
+@common.runner_options
 def tune(
     profile: str,
     repeat: int | None,
@@ -149,9 +140,9 @@ def tune(
 
     _check_profile("--out", out)
     made_folder("--runs", runs)
-    announce_compilation()
+    common.announce_compilation()
     best: Round | None = None
-    with Runner(notices, **crew) as runner:
+    with Runner(common.notices, **crew) as runner:
         flights = TuningFlights(seed, board, runs, runner)
         flown: Iterable[Round] = (
             [fly_round(profile, flights, robots)]
@@ -182,7 +173,7 @@ def _print_round(one: "Round") -> None:
 
     tuned = one.tuned
     for table in (_gains(one), _edges(one), _motion(one)):
-        wide_console().print(table)
+        common.wide_console().print(table)
     say(
         f"robots: {len(tuned.robots.drawn)} drawn, {tuned.robots.about}; poses are {1e3 * tuned.age_s:.1f} ms old, one in a "
         f"hundred {1e3 * tuned.jitter_s:.1f} ms older; the least delay margin is {1e3 * tuned.least_delay_s:.1f} ms"

@@ -10,19 +10,9 @@ import click
 from rich.progress import track
 from rich.table import Table
 
+from hil.commands import options as common
 from hil.commands.design import show_claims
-from hil.commands.options import (
-    INTERRUPTED,
-    PATH,
-    announce_compilation,
-    notices,
-    profile_options,
-    runner_options,
-    say,
-    seed_option,
-    warn,
-    wide_console,
-)
+from hil.commands.options import PATH, say, warn
 from hil.errors import made_folder, require, writing
 
 if TYPE_CHECKING:
@@ -47,7 +37,7 @@ seeds_option = click.option(
 )
 @click.option("--only", metavar="PATTERN", help="Only these experiments, like hover or yaw-*.")
 @click.option("--no-studies", is_flag=True, help="Leave the robustness studies out.")
-@runner_options
+@common.runner_options
 def paper(seeds: int, out: Path, only: str | None, no_studies: bool, **crew: Any) -> int:
     """Fly the paper's experiments on both profiles, and the robustness studies; write one report.
 
@@ -65,7 +55,7 @@ def paper(seeds: int, out: Path, only: str | None, no_studies: bool, **crew: Any
 @click.argument("name")
 @seeds_option
 @click.option("--out", type=PATH, metavar="DIR", help="Report and picture [runs/study-NAME].")
-@runner_options
+@common.runner_options
 def study(name: str, seeds: int, out: Path | None, **crew: Any) -> int:
     """Fly one robustness study (see `floaty list`): faults of growing size, several variants, one picture.
 
@@ -94,8 +84,8 @@ def _fly(
     from hil.studies.paper_identification import fly_identification, fly_scaling
     from hil.studies.paper_report import write_paper
 
-    announce_compilation()
-    with writing("--out", made_folder("--out", out)), Runner(notices, **crew) as runner:
+    common.announce_compilation()
+    with writing("--out", made_folder("--out", out)), Runner(common.notices, **crew) as runner:
         flown = fly_paper(rows, studies, seeds, out, runner)
         bench = list(drag_model.measure(load_config(), 1)) if mounted and not runner.interrupted else []
         shape = analyse(point_of(load_config())) if bench else None
@@ -111,7 +101,7 @@ def _fly(
     say(f"  {report}")
     if runner.interrupted:
         warn("interrupted: the report has the flights that were complete")
-        return INTERRUPTED
+        return common.INTERRUPTED
     holds = flown.holds if rows else all(result.holds for result in flown.studies)
     return 0 if holds else 1
 
@@ -133,7 +123,7 @@ def _print_rows(flown: "Paper") -> None:
             f"{one.passed} of {len(one.results)}{'' if one.holds else _marked(' FAILS')}" for one in both
         )
         table.add_row("", "limits held", "", *verdicts)
-    wide_console(160).print(table)
+    common.wide_console(160).print(table)
     for row, profile, what in flown.misses:
         say(f"{row.title}, {profile}: {'; '.join(what)}")
     for why in dict.fromkeys(row.why for row, _, _ in flown.misses if row.why):
@@ -148,7 +138,7 @@ def _print_constants(constants: "Sequence[PaperConstant]") -> None:
     table = Table(*COLUMNS, title="identification of roll: the paper, and where the truth is known")
     for one in constants:
         table.add_row(*astuple(one))
-    wide_console(160).print(table)
+    common.wide_console(160).print(table)
     say(WHY)
 
 
@@ -166,8 +156,8 @@ def _print_studies(flown: "Paper") -> None:
 
 
 @click.command("drag-model")
-@seed_option
-@profile_options
+@common.seed_option
+@common.profile_options
 @click.option("--out", type=PATH, default=Path("runs/drag-model"), show_default=True, metavar="DIR")
 def drag_model(seed: int, profile: str, overrides: tuple[str, ...], out: Path) -> None:
     """Measure forces and torques on the mounted robot over flap angles, against the paper's simplified model."""
@@ -178,8 +168,8 @@ def drag_model(seed: int, profile: str, overrides: tuple[str, ...], out: Path) -
     config = load_config(profile, overrides)
     config.robot.need_plates(profile, "floaty drag-model")
     made_folder("--out", out)
-    announce_compilation()
+    common.announce_compilation()
     measured = drag_model.measure(config, seed)
-    rows = list(track(measured, "mounted robot", drag_model.ROWS, console=notices, transient=True))
+    rows = list(track(measured, "mounted robot", drag_model.ROWS, console=common.notices, transient=True))
     page = drag_model.write(rows, math.degrees(config.plant.hover_angle), out)
     say(f"report  {page}")

@@ -13,19 +13,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hil.commands.options import (
-    PATH,
-    announce_compilation,
-    asked_as,
-    close_live,
-    fault_option,
-    gdb_option,
-    open_live,
-    profile_options,
-    say,
-    seed_option,
-    view_option,
-)
+from hil.commands import options as common
+from hil.commands.options import PATH, say
 from hil.errors import LabError, require
 
 if TYPE_CHECKING:
@@ -81,7 +70,7 @@ class ServeOptions:
     metavar="FILE",
     help="The image of a Crazyflie's firmware, an ELF file, which every board executes whole.",
 )
-@gdb_option
+@common.gdb_option
 @click.option("--boards", type=click.IntRange(1, BOARDS_MAX), default=1, show_default=True, metavar="N")
 @click.option(
     "--station", type=click.Choice(["corrections", "poses"]), is_flag=False, flag_value="corrections",
@@ -95,11 +84,11 @@ class ServeOptions:
     "--state", type=PATH, metavar="DIR",
     help="Keep each board's EEPROM and deck memory in this folder, over restarts of the server.",
 )  # fmt: skip
-@view_option
-@fault_option
-@seed_option
-@profile_options
-@asked_as(ServeOptions)
+@common.view_option
+@common.fault_option
+@common.seed_option
+@common.profile_options
+@common.asked_as(ServeOptions)
 def serve(asked: ServeOptions) -> int:
     """Serve robots in virtual tunnels, in real time, until Ctrl-C.
 
@@ -132,9 +121,9 @@ def serve(asked: ServeOptions) -> int:
     serial = parse_addresses(asked.mavlink, asked.boards) if asked.mavlink is not None else []
     planned = [parse(text) for text in asked.faults]
     check(planned, inf, "mavlink" if serial else "radio", config)
-    announce_compilation()
+    common.announce_compilation()
     executor = _executor(asked)
-    view = open_live(asked.target)
+    view = common.open_live(asked.target)
     plan = Service(config, asked.boards, asked.seed, bool(serial), planned, asked.state, executor)
     server = Server(plan, say, view)
     with closing(server.ends) as ends:
@@ -143,7 +132,7 @@ def serve(asked: ServeOptions) -> int:
             for robot in ends.robots:
                 robot.fly(station == "poses")
         _run(server, view)
-    close_live(view)
+    common.close_live(view)
     if unread := 0 if ends.motive is None else ends.motive.malformed:
         say(f"motive could not read {unread} packets")
     say(f"stopped; time stood still for {server.clock.stood_still_us / 1000:.0f} ms")

@@ -11,18 +11,8 @@ import click
 
 from ground_station.controls import ControlsError
 from ground_station.trajectory import Goal, Trajectory
-from hil.commands.options import (
-    FILE,
-    PATH,
-    asked_as,
-    close_live,
-    exit_code,
-    open_live,
-    profile_options,
-    say,
-    view_option,
-    write_pictures,
-)
+from hil.commands import options as common
+from hil.commands.options import FILE, PATH, say
 from hil.commands.tables import print_result
 from hil.errors import LabError
 
@@ -85,9 +75,9 @@ class StationOptions:
     "--out", type=PATH, metavar="DIR",
     help="Run folder as `floaty fly` writes one: log, telemetry, events, result, report, recording.",
 )  # fmt: skip
-@view_option
-@profile_options
-@asked_as(StationOptions)
+@common.view_option
+@common.profile_options
+@common.asked_as(StationOptions)
 def station(asked: StationOptions) -> int:
     """Fly EXPERIMENT, by default hover, with a board, real or virtual: poses in, poses or corrections out at 50 Hz.
 
@@ -106,7 +96,7 @@ def station(asked: StationOptions) -> int:
 
     config, experiment = load_config(asked.profile, asked.overrides), find_experiment(asked.named)
     _check_files(asked)
-    view = open_live(asked.target)
+    view = common.open_live(asked.target)
     flight = _recorded(asked, experiment, view)
     desk = Desk(flight, view)
     know = view.know if view is not None and asked.target == "foxglove" else None
@@ -120,12 +110,12 @@ def station(asked: StationOptions) -> int:
     )
     result = flight.close(failure, interrupted) if flight is not None else None
     if result is not None:
-        write_pictures(result.folder, experiment)
+        common.write_pictures(result.folder, experiment)
         print_result(result)
-    close_live(view, result)
+    common.close_live(view, result)
     if failure:
         raise LabError(failure)
-    return 0 if result is None else exit_code(result)
+    return 0 if result is None else common.exit_code(result)
 
 
 def _recorded(asked: StationOptions, experiment: Experiment, view: LiveView | None) -> RealFlight | None:

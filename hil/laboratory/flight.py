@@ -14,14 +14,7 @@ from ground_station.trajectory import Trajectory
 from hil.clock import Clock
 from hil.devices.board_firmware import Executor
 from hil.events import EventQueue
-from hil.laboratory.channels import (
-    battery_channel,
-    board_channels,
-    excitation_channel,
-    fault_channel,
-    flight_channels,
-    marker_channel,
-)
+from hil.laboratory import channels
 from hil.laboratory.faults import Switchboard
 from hil.laboratory.laboratory import Laboratory, Progress
 from hil.laboratory.recorder import Recorder
@@ -160,16 +153,16 @@ class Flight:
         self.events.at(end_us if self._trace_all else start_us + WINDOW_US, self.schedule.end)
 
     def channels(self) -> tuple[Channel, ...]:
-        robot = self.robot
-        channels = flight_channels(robot, self.line.trajectory)
-        markers = (marker_channel(robot.mocap),) if robot.mocap.markers else ()
-        faults = (fault_channel(self.switchboard.active),) if self.faults else ()
-        line, tracker = self.line.channels()
-        excited = (excitation_channel(robot.firmware),) if any(self.config.excitation.rms) else ()
-        battery = battery_channel(robot.battery)
-        return (
-            *channels, *line, battery, *tracker, *markers, *faults, *excited, *board_channels(robot.firmware)
-        )  # fmt: skip
+        robot, (line, tracker) = self.robot, self.line.channels()
+        found = [*channels.flight_channels(robot, self.line.trajectory), *line]
+        found += channels.battery_channel(robot.battery), *tracker
+        if robot.mocap.markers:
+            found.append(channels.marker_channel(robot.mocap))
+        if self.faults:
+            found.append(channels.fault_channel(self.switchboard.active))
+        if any(self.config.excitation.rms):
+            found.append(channels.excitation_channel(robot.firmware))
+        return (*found, *channels.board_channels(robot.firmware))
 
     def run(self, progress: Progress | None = None, recorder: Recorder | None = None) -> Outcome:
         """Fly to the end, the crash, or Ctrl-C, into a log of `channels`; it is left open for the caller to close."""
