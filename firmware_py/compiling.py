@@ -107,7 +107,7 @@ class Compiled:
 
 
 def bound(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-    """Return the call of a function on these arguments; where all are arrays, on their present memory."""
+    """Return the call of a function on these arguments; where all are arrays or records of one, on their present memory."""
     if not isinstance(function, Compiled):
         return partial(function, *arguments)
     if not function.whole or not all(map(_stays, arguments)):
@@ -115,7 +115,7 @@ def bound(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
     method = _kept(function, arguments)
     if method is None:
         return partial(function.dispatcher, *arguments)
-    places = struct.pack(f"{len(arguments)}P", *(one.ctypes.data for one in arguments))
+    places = struct.pack(f"{len(arguments)}P", *(one.__array_interface__["data"][0] for one in arguments))
     # the unused last argument keeps the memory alive as long as the call
     return cast(
         Callable[[], Any], ctypes.pythonapi.PyCFunction_NewEx(ctypes.byref(method), places, arguments)
@@ -130,7 +130,7 @@ def is_kept(function: Callable[..., Any]) -> bool:
 
 
 def _stays(argument: Any) -> bool:
-    return isinstance(argument, np.ndarray) and argument.flags.c_contiguous
+    return isinstance(argument, np.void) or (isinstance(argument, np.ndarray) and argument.flags.c_contiguous)
 
 
 def kept_folders(sources: Path) -> list[Path]:
@@ -210,8 +210,12 @@ def _machine_code(function: Compiled, arguments: tuple[NDArray[Any], ...]) -> by
     names = [f"a{index}" for index in range(len(arguments))]
     scope: dict[str, Any] = {"function": function, "carray": numba.carray}
     for name, argument in zip(names, arguments, strict=True):
-        scope |= {f"{name}_shape": argument.shape, f"{name}_kind": argument.dtype}
-    call = f"function({', '.join(f'carray({name}, {name}_shape, {name}_kind)' for name in names)})"
+        scope |= {f"{name}_shape": argument.shape or (1,), f"{name}_kind": argument.dtype}
+    places = (
+        f"carray({name}, {name}_shape, {name}_kind)" + ("" if argument.shape else "[0]")
+        for name, argument in zip(names, arguments, strict=True)
+    )
+    call = f"function({', '.join(places)})"
     nothing = str(function.__wrapped__.__annotations__.get("return")) == "None"
     body = f"{call}\n    return 0" if nothing else f"return {call}"
     exec(f"def on_arrays({', '.join(names)}):\n    {body}", scope)

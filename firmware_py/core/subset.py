@@ -48,9 +48,7 @@ def constant(*rows: float | Sequence[float]) -> F32s:
     return array
 
 
-S = TypeVar("S", bound="Struct")
 S_co = TypeVar("S_co", bound="Struct", covariant=True)
-Memory: TypeAlias = Sequence[S]  # a one-element array of structs: what an entry kernel takes
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +105,8 @@ class Block(Generic[S_co]):
     """The memory of one instance of the struct class `kind`.
 
     `memory` is a structured array of shape (1,), `fields` gives attribute access to it from outside the core, as if it
-    were the struct (array fields are views), `arg` is what an entry kernel takes: the memory, or the fields when nothing
-    is compiled.
+    were the struct (array fields are views), `arg` is what a kernel takes from outside the core: the memory's one record,
+    or the fields when nothing is compiled.
     """
 
     __slots__ = ("arg", "fields", "kind", "memory")
@@ -117,7 +115,7 @@ class Block(Generic[S_co]):
         self.kind = kind
         self.memory: NDArray[Any] = np.zeros(1, kind.dtype)
         self.fields = cast(S_co, kind._view(self.memory))
-        self.arg = cast(Memory[S_co], [self.fields] if compiling.PLAIN else self.memory)
+        self.arg = cast(S_co, self.fields if compiling.PLAIN else self.memory[0])
 
     def cell(self, name: str) -> memoryview:
         """Return the memory of a number: `cell[0]` reads it in a fifth of the time of `fields`."""

@@ -300,7 +300,7 @@ def watch_control(data: Input, supervisor: Supervisor) -> i32:
 
 
 @kernel
-def begin_flight(supervisor: Supervisor) -> None:
+def forget_flight(supervisor: Supervisor) -> None:
     """Forget the last flight and its poses."""
     supervisor.pose_seen = i32(0)
     supervisor.flown = i32(0)

@@ -134,8 +134,6 @@ class Expressions:
     def _element(self, node: ast.Subscript) -> Value:
         array = self.value(node.value)
         indices = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
-        if array.kind.memory:
-            return Value(array.text, array.kind)
         if any(isinstance(index, ast.Slice) for index in indices):
             raise self.refuse(node, f"slice{instead(CONSTRUCTS, 'Slice')}")
         rank = array.kind.rank

@@ -150,7 +150,10 @@ class _Reader:
         if isinstance(node.value, ast.Attribute) and isinstance(node.value.value, ast.Name):
             source = self.module.names.get(node.value.value.id)
             if isinstance(source, Module) and node.value.attr in source.names:
-                self._take(name, source.names[node.value.attr], node)
+                thing = source.names[node.value.attr]
+                self._take(name, thing, node)
+                if isinstance(thing, Signature) and self.module.name == ENTRY and not name.startswith("_"):
+                    thing.c_name, thing.public = f"floaty_core_{name}", True
                 return
         literal = self._array(name, node.value) or constant_literal(node.value)
         if literal is None:
@@ -264,10 +267,6 @@ class _Reader:
                 return ValueType(ARRAYS[name], 1)
             case ast.Name(id=name) if isinstance(struct := self.module.names.get(name), StructType):
                 return ValueType(struct.name, struct=struct)
-            case ast.Subscript(value=ast.Name(id="Memory"), slice=ast.Name(id=name)) if isinstance(
-                struct := self.module.names.get(name), StructType
-            ):
-                return ValueType(struct.name, memory=True, struct=struct)
         raise refusal(
             self.module.path, argument, f"argument {argument.arg} of {node.name} has no type of the subset"
         )

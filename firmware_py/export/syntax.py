@@ -10,7 +10,7 @@ from firmware_py.core.subset import Logged, Settable, Tunable
 PACKAGE = "firmware_py.core"
 SUBSET = f"{PACKAGE}.subset"
 OWN = "own_logic"  # the package in which the entry module finds the user's modules
-ENTRY = "entry"  # the module whose kernels are the C API
+ENTRY = "entry"  # the module whose kernels are the C API, but for names that begin with `_`
 SHARED = "structs"  # the module whose constants and structs are in the header
 C_KEYWORDS = frozenset(
     {
@@ -26,13 +26,12 @@ C_KEYWORDS = frozenset(
 class ValueType:
     """A type: f32, i32, bool, void or a struct's name; an array of `rank` 1 or 2 when that is not 0.
 
-    `shape` is empty for an array argument until a call determines it; a `memory` argument is a struct that is passed on.
+    `shape` is empty for an array argument until a call determines it.
     """
 
     base: str
     rank: int = 0
     shape: tuple[int, ...] = ()
-    memory: bool = False
     struct: Union["StructType", None] = field(default=None, compare=False)
 
 

@@ -10,9 +10,11 @@ A hook is a kernel with a fixed name. It takes those of these arguments that it 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from inspect import signature
+from types import FunctionType
 
 import numpy as np
 
+from firmware_py.compiling import Compiled
 from firmware_py.core import entry
 from firmware_py.core.subset import Logged, Tunable
 from firmware_py.export.errors import ExportError
@@ -34,7 +36,7 @@ BLOCKS = CORE_STRUCTS | {
 _SIGNATURES = {
     name: signature(function)
     for name, function in vars(entry).items()
-    if not name.startswith("_") and getattr(function, "__module__", "") == entry.__name__
+    if isinstance(function, Compiled | FunctionType) and name != "kernel" and not name.startswith("_")
 }
 # The default core's entry points, and the blocks that they take; those that have an answer.
 CALLS: Mapping[str, tuple[str, ...]] = {name: tuple(one.parameters) for name, one in _SIGNATURES.items()}

@@ -88,7 +88,7 @@ class Call(IntEnum):
     SUPERVISE = 6
     REQUEST = 7
     WATCH_CONTROL = 8
-    BEGIN_AFRESH = 9
+    RESTART = 9
     ADMITS = 10
     FOLLOW = 11
 

@@ -85,7 +85,7 @@ def check_flight(
             end = flight.run(lambda now_us: progress(now_us, flight))
             outcome = "interrupted" if end.interrupted else f"lost: {end.lost}" if end.lost else "completed"
             made[0].blocks.data.fields.now_us += LATER_US
-            for name in ("watch_control", "begin_afresh"):
+            for name in ("watch_control", "restart"):
                 made[0].call(name)
         except WatchdogError as error:
             outcome = f"lost: {error}"

@@ -413,7 +413,7 @@ def test_nobody_misses_a_controller_that_has_not_begun() -> None:
 def test_a_flight_that_begins_afresh_waits_for_gyro_and_pose_and_is_not_armed_by_it() -> None:
     bench = in_flight(lambda bench: bench.fly(100_000))
     bench.view.arm(False)
-    bench.core.run.call("begin_afresh")
+    bench.core.run.call("restart")
     bench.look()
     assert (bench.view.calibrated, bench.view.armed) == (False, False)
     assert not bench.core.supervisor.fields.aloft

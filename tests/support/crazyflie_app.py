@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_py.core.structs import Estimator, Input, Sampling, Supervisor
-from firmware_py.core.subset import S
+from firmware_py.core.subset import S_co
 from firmware_py.export.compilers import compilers
 from firmware_py.export.crazyflie import write_app
 from hil.config import LabConfig, load_config
@@ -140,10 +140,10 @@ class App:
         self.params = {name: i for i, name in _names(c.stub_param_name)}
         self.logs = {name: i for i, name in _names(c.stub_log_name)}
 
-    def _struct(self, kind: type[S]) -> S:
+    def _struct(self, kind: type[S_co]) -> S_co:
         """Return a struct of the core's, as if it were one here."""
         memory = (ctypes.c_char * kind.dtype.itemsize).in_dll(self.c, f"floaty_{kind.__name__.lower()}")
-        view: S = kind._view(np.frombuffer(memory, kind.dtype))
+        view: S_co = kind._view(np.frombuffer(memory, kind.dtype))
         return view
 
     def boot(self, stored: Mapping[str, float] | None = None, absolute: bool = False) -> None:

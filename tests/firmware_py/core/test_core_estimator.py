@@ -143,14 +143,14 @@ def flight() -> list[Record]:
 
     def listen_pose(parameters, data, *others):
         answer = file_pose(parameters, data, *others)
-        poses.append((data["pose_position"][0].astype(float), data["pose_quaternion"][0].astype(float),
-                      int(data["pose_age_us"][0])))  # fmt: skip
+        poses.append((data["pose_position"].astype(float), data["pose_quaternion"].astype(float),
+                      int(data["pose_age_us"])))  # fmt: skip
         return answer
 
     def listen_tick(parameters, data, estimator, control, sampling, report):
         records.append(
-            Record(poses.copy(), data["gyro_sum"][0].tolist(), int(data["gyro_samples"][0]),
-                   data["gyro_bias"][0].astype(float), control["command"][0].astype(float))
+            Record(poses.copy(), data["gyro_sum"].tolist(), int(data["gyro_samples"]),
+                   data["gyro_bias"].astype(float), control["command"].astype(float))
         )  # fmt: skip
         poses.clear()
         estimate(parameters, data, estimator, control, sampling, report)

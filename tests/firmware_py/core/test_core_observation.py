@@ -26,7 +26,7 @@ def test_an_observation_is_the_error_and_the_motion_in_the_heading_frame(
     parameters, estimator = parameters_of(CONFIG), Estimator.allocate()
     estimator.fields.now[:], parameters.fields.target[:] = state, target
     out = np.full(OBSERVATIONS, np.nan, np.float32)
-    observe(parameters.arg[0], estimator.arg[0], np.array(previous, np.float32), out)
+    observe(parameters.arg, estimator.arg, np.array(previous, np.float32), out)
     yaw = state[8]
     R_HG = Rotation.from_euler("z", -yaw)
     error_H = R_HG.apply(np.subtract(target[:3], state[:3]))
@@ -41,12 +41,12 @@ def test_an_action_is_limited_and_means_a_share_of_each_input_s_limit() -> None:
     parameters, control = parameters_of(CONFIG), Control.allocate()
     parameters.fields.limit_u, parameters.fields.limit_u3 = 0.5, 0.25
     action = np.array([3.0, -0.5, 0.5, -math.inf], np.float32)
-    act(parameters.arg[0], action, control.arg[0])
+    act(parameters.arg, action, control.arg)
     assert action.tolist() == [1.0, -0.5, 0.5, -1.0]
     assert control.fields.u.tolist() == [0.5, -0.25, 0.125, -0.5]
 
 
 def test_an_action_that_is_no_number_stays_so_for_the_guard() -> None:
     parameters, control = parameters_of(CONFIG), Control.allocate()
-    act(parameters.arg[0], np.full(ACTIONS, np.nan, np.float32), control.arg[0])
+    act(parameters.arg, np.full(ACTIONS, np.nan, np.float32), control.arg)
     assert np.isnan(control.fields.u).all()

@@ -279,7 +279,7 @@ int main(void) {
         calls += floaty_core_request(&parameters, &data, &sampling, &supervisor);
         calls += floaty_core_admits(&parameters, &data) + floaty_core_follow(&parameters, &data);
         calls += floaty_core_watch_control(&data, &supervisor);
-        floaty_core_begin_afresh(&data, &sampling, &supervisor);
+        floaty_core_restart(&data, &sampling, &supervisor);
         floaty_core_control(&parameters, &data, &estimator, &control);
     }
 }

@@ -179,9 +179,9 @@ bool estimatorOutOfTreeTest(void) {
 }
 
 /* Start again for another gyro, and forget the last flight. */
-static void begin_afresh(void) {
+static void restart(void) {
   xQueueReset(pose_queue);
-  call_begin_afresh();
+  call_restart();
   call_reset();
   floaty_hover();
 }
@@ -195,7 +195,7 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
     return; /* without a gyro Floaty stays calibrating, flaps at hover */
   }
   if (floaty_hil_switched()) {
-    begin_afresh();
+    restart();
   }
   controlled = false;
   if (floaty_hil_holds()) {
