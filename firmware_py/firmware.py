@@ -47,11 +47,7 @@ if TYPE_CHECKING:
 
 MEASUREMENT_QUEUE = 20  # original firmware
 # Of each activation: a tick's work of the flight path ends before the next tick.
-DEADLINES_US = {
-    "SENSORS": 1000,
-    "STABILIZER": 1000,
-    "KALMAN": 1000,
-}
+DEADLINES_US = {"SENSORS": 1000, "STABILIZER": 1000, "KALMAN": 1000}
 WATCHDOG_US = 353_000  # the longest that the Crazyflie's independent watchdog may take
 DECK = (0xBC, 0xF1, "bcFloaty", "A")  # vendor, product, name, revision of the deck with the servo connectors
 
@@ -153,11 +149,7 @@ class Firmware:
         return MavlinkStack(self.kernel, config.cpu, config.mavlink, self._board)
 
     def _start_mavlink_services(
-        self,
-        stack: "MavlinkStack",
-        config: MavlinkConfig,
-        running: Running,
-        own: tuple[Parameter, ...],
+        self, stack: "MavlinkStack", config: MavlinkConfig, running: Running, own: tuple[Parameter, ...]
     ) -> None:
         """Create the services for MAVLink clients."""
         from firmware_py.links.mavlink_commands import CommandService, answer_for_what_is_not_there

@@ -18,11 +18,7 @@ class CoreSupervisor:
     """Requests to the core's supervisor, and a view on it."""
 
     def __init__(
-        self,
-        core: CoreBlocks,
-        announce: Callable[[str], None],
-        goals: Pilot,
-        connected: Callable[[], bool],
+        self, core: CoreBlocks, announce: Callable[[str], None], goals: Pilot, connected: Callable[[], bool]
     ) -> None:
         self.state = State.CALIBRATING
         self.cause = Cause.NONE

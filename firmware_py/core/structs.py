@@ -373,10 +373,7 @@ class Report(Struct):
     """The board's report: the state in the frame of the poses, and how many poses were received."""
 
     position: Annotated[
-        F32s,
-        3,
-        Logged("m", stock="stateEstimate.x y z"),
-        Logged("m", stock="kalman.stateX stateY stateZ"),
+        F32s, 3, Logged("m", stock="stateEstimate.x y z"), Logged("m", stock="kalman.stateX stateY stateZ")
     ]
     velocity: Annotated[F32s, 3, Logged("m/s", stock="stateEstimate.vx vy vz")]
     attitude: Annotated[F32s, 3]  # [rad] roll, pitch, yaw

@@ -12,15 +12,7 @@ from dataclasses import dataclass
 from firmware_py.export.errors import ExportError, refusal
 from firmware_py.export.hints import CONSTRUCTS, FUNCTIONS, instead
 from firmware_py.export.literals import constant_literal
-from firmware_py.export.syntax import (
-    BOOL,
-    F32,
-    I32,
-    Constant,
-    Module,
-    Signature,
-    ValueType,
-)
+from firmware_py.export.syntax import BOOL, F32, I32, Constant, Module, Signature, ValueType
 
 PRIMARY, UNARY, PRODUCT, SUM, COMPARISON, AND, OR = 9, 8, 7, 6, 5, 3, 2
 

@@ -30,7 +30,7 @@ FUNCTIONS: Mapping[str, str] = {  # of numpy and math, and of Python itself
 }
 OUTSIDE = ("numpy", "math")  # modules whose functions have equivalents in the core
 GUARDED: Mapping[str, str] = {  # what the user's own logic may not call, by its name in C
-    "controller_allocate": "allocate, from firmware_py.core.guard: it does not make a number of NaN",
+    "controller_allocate": "allocate, from firmware_py.core.guard: it does not make a number of NaN"
 }
 _OWN_LINE = "an assignment on a line of its own"
 CONSTRUCTS: Mapping[str, str] = {

@@ -50,12 +50,7 @@ class HighLevelService:
     """Hands paths to the pilot's planner."""
 
     def __init__(
-        self,
-        stack: CrtpStack,
-        pilot: Pilot,
-        supervisor: CoreSupervisor,
-        memory: bytearray,
-        notices: Notices,
+        self, stack: CrtpStack, pilot: Pilot, supervisor: CoreSupervisor, memory: bytearray, notices: Notices
     ) -> None:
         self.defaults = Defaults()
         self._stack = stack

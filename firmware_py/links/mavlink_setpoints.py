@@ -89,10 +89,7 @@ class SetpointService:
         p_WG, yaw = self._goal
         if target.p_WG is not None and not self._pilot.admits_place(target.p_WG, p_WG, absolute=True):
             raise WireError("target refused: outside the box, see BOX_RADIUS, BOX_BELOW and BOX_ABOVE")
-        self._goal = (
-            p_WG if target.p_WG is None else target.p_WG,
-            yaw if target.yaw is None else target.yaw,
-        )
+        self._goal = (p_WG if target.p_WG is None else target.p_WG, yaw if target.yaw is None else target.yaw)
         self._led_us = now_us
         if self._piloted:
             self._lead(now_us)

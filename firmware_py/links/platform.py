@@ -6,14 +6,7 @@ from firmware_py.planner import Phase
 from firmware_py.rtos import Queue
 from firmware_py.supervisor import CoreSupervisor
 from firmware_py.wire import WireError, check_size
-from firmware_py.wire.crtp import (
-    MAX_DATA,
-    PORT_LINK,
-    PORT_PLATFORM,
-    PORT_SUPERVISOR,
-    Packet,
-    encode,
-)
+from firmware_py.wire.crtp import MAX_DATA, PORT_LINK, PORT_PLATFORM, PORT_SUPERVISOR, Packet, encode
 from firmware_py.wire.supervisor import (
     ARM,
     COMMAND_ARM,
