@@ -50,21 +50,6 @@ class CoreBlocks:
     `named` has all blocks in their order, those of own logic last; `calls` lists the blocks of each entry point.
     """
 
-    __slots__ = (
-        "calls",
-        "control",
-        "data",
-        "estimator",
-        "logic",
-        "named",
-        "parameters",
-        "report",
-        "run",
-        "sampling",
-        "supervisor",
-        "watchdog_fed_us",
-    )
-
     def __init__(
         self, parameters: Block[Parameters], runner: RunnerFactory, logic: "Logic | None" = None
     ) -> None:
@@ -97,8 +82,6 @@ class CoreBlocks:
 class PythonRunner:
     """Runs the Python sources: compiled by numba, or plain with NUMBA_DISABLE_JIT=1."""
 
-    __slots__ = ("_calls",)
-
     def __init__(self, blocks: CoreBlocks) -> None:
         self._calls = _Calls(blocks)
 
@@ -123,7 +106,6 @@ class _Calls(dict[str, Callable[[], Any]]):
 class ConfiguredCosts:
     """The costs in the profile."""
 
-    __slots__ = ("_cpu",)
     usage: ClassVar[None] = None
 
     def __init__(self, cpu: CpuConfig) -> None:

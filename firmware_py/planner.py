@@ -7,7 +7,7 @@ Meaning of the commands: crazyflie-firmware 2a18fc29 (crtp_commander_high_level.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum, auto
 from math import comb
 
@@ -54,21 +54,16 @@ class Path:
 
     def at(self, t: float) -> PathPoint:
         """Return the motion at a time; the path rests before its beginning and after its end."""
-        stands = not 0.0 <= t < self.duration
+        rests = not 0.0 <= t < self.duration
         t = min(max(t, 0.0), self.duration) / self.timescale
         if self.reverse:
             t = self.duration / self.timescale - t
         motion = self._placed(_evaluate(*_find(self.pieces, t)))
-        if stands:
+        if rests:
             return PathPoint(motion.position, motion.yaw)
         rate = (-1.0 if self.reverse else 1.0) / self.timescale
-        return PathPoint(
-            motion.position,
-            motion.yaw,
-            _scaled(motion.velocity, rate),
-            _scaled(motion.acceleration, rate * rate),
-            motion.yaw_rate * rate,
-        )
+        velocity, acceleration = _scaled(motion.velocity, rate), _scaled(motion.acceleration, rate * rate)
+        return PathPoint(motion.position, motion.yaw, velocity, acceleration, motion.yaw_rate * rate)
 
     def places(self) -> Iterator[Vector]:
         """Yield positions along the path, `SAMPLES` per piece and the end."""
@@ -81,13 +76,7 @@ class Path:
 
     def _placed(self, motion: PathPoint) -> PathPoint:
         if self.turn == 0.0:
-            return PathPoint(
-                _sum(motion.position, self.shift),
-                motion.yaw,
-                motion.velocity,
-                motion.acceleration,
-                motion.yaw_rate,
-            )
+            return replace(motion, position=_sum(motion.position, self.shift))
         first, q = self._first(), yaw_quaternion(self.turn)
         offset = rotate(q, _sum(motion.position, _scaled(first, -1.0)))
         return PathPoint(
@@ -107,8 +96,7 @@ class Path:
         """Return the same path, moved to begin at a position and, if it is given, with a yaw."""
         begin = self.at(0.0)
         turn = 0.0 if yaw is None else wrap_angle(yaw - begin.yaw)
-        shift = _sum(position, _scaled(begin.position, -1.0))
-        return Path(self.pieces, self.timescale, self.reverse, turn, shift)
+        return replace(self, turn=turn, shift=_sum(position, _scaled(begin.position, -1.0)))
 
 
 class Phase(IntEnum):

@@ -54,10 +54,10 @@ def _declared(core: CoreBlocks, variable: CoreVariable) -> LogVariable:
     return LogVariable(variable.name, variable.scalar, variable.unit, read)
 
 
-def _fields(group: str, names: str, scalar: Scalar, unit: str, fields: object) -> Iterator[LogVariable]:
-    """Name attributes by their own names."""
+def _fields(group: str, names: str, counters: object) -> Iterator[LogVariable]:
+    """Name counters by their own names."""
     for name in names.split():
-        yield LogVariable(f"{group}.{name}", scalar, unit, partial(getattr, fields, name))
+        yield LogVariable(f"{group}.{name}", U32, "", partial(getattr, counters, name))
 
 
 def _parts(group: str, names: str, unit: str, read: Callable[[int], float]) -> Iterator[LogVariable]:
@@ -104,9 +104,10 @@ def _localisation(service: LocalisationService) -> Iterator[LogVariable]:
 
 def _counters(running: Running) -> Iterator[LogVariable]:
     """Yield counts of losses, and the load of the processor."""
-    yield from _fields("crtp", "malformed unserved dropped", U32, "", running.stack)
+    yield from _fields("crtp", "malformed unserved dropped", running.stack)
     if running.mavlink is not None:
-        yield from _fields("mavlink", "frames lost bad refused dropped overruns", U32, "", running.mavlink)
+        yield from _fields("mavlink", "frames lost bad", running.mavlink.counters)
+        yield from _fields("mavlink", "refused dropped overruns", running.mavlink)
     load = ProcessorLoad(running.stack.kernel, LOAD_US)
     yield LogVariable("system.load", F32, "%", lambda: 100 * load())
     yield LogVariable("sensors.dropped", U32, "", partial(getattr, running.measurements, "dropped"))

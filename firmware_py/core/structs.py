@@ -187,7 +187,6 @@ class Parameters(Struct):
     box_below: Annotated[f32, Settable("box", "box.below", "m", 0, 5, "below home", key="below")]
     box_above: Annotated[f32, Settable("box", "box.above", "m", 0, 5, "above home", key="above")]
     home: Annotated[F32s, 3]  # [m] W
-# fmt: on
 
 
 class Input(Struct):
@@ -201,18 +200,8 @@ class Input(Struct):
     gyro_samples: i32
     gyro_bias: Annotated[F32s, 3]  # [counts] the gyro's zero
     # the kind of poses over CRTP
-    absolute: Annotated[
-        i32,
-        Settable(
-            "predictor",
-            "extPose.absolute",
-            "",
-            0,
-            1,
-            "true: poses over CRTP are absolute; false: corrections",
-            type="U8",
-        ),
-    ]
+    absolute: Annotated[i32, Settable(
+        "predictor", "extPose.absolute", "", 0, 1, "true: poses over CRTP are absolute; false: corrections", type="U8")]
     poses_absolute: i32  # 1: the pose and the set-point are in W; 0: the pose is a correction
     pose_waited_us: i32  # since the pose's arrival
     pose_position: Annotated[F32s, 3]  # [m] of B; in G once it is filed
@@ -229,25 +218,16 @@ class Input(Struct):
     setpoint_velocity: Annotated[F32s, 3]
     request: i32  # REQUEST_...
     # MANUAL_...
-    manual_mode: Annotated[
-        i32, Settable("", "extCtrl.manual", "", MANUAL_OFF, MANUAL_HOVER, type="U8", persistent=False)
-    ]
+    manual_mode: Annotated[i32, Settable(
+        "", "extCtrl.manual", "", MANUAL_OFF, MANUAL_HOVER, type="U8", persistent=False)]
     mode: i32  # MODE_..., decided by the supervisor
     # flap angles of MODE_MANUAL
-    manual: Annotated[
-        F32s,
-        4,
-        Settable("", "extCtrl.m1 m2 m3 m4", "rad", -1.5707963267948966, 1.5707963267948966, persistent=False),
-    ]
+    manual: Annotated[F32s, 4, Settable(
+        "", "extCtrl.m1 m2 m3 m4", "rad", -1.5707963267948966, 1.5707963267948966, persistent=False)]
     # or servo words, which have priority
-    by_words: Annotated[
-        i32, Settable("", "", "", 0, 1, stock="motorPowerSet.enable", type="U8", persistent=False)
-    ]
-    words: Annotated[
-        I32s,
-        4,
-        Settable("", "", "words", 0, 65535, stock="motorPowerSet.m1 m2 m3 m4", type="U16", persistent=False),
-    ]
+    by_words: Annotated[i32, Settable("", "", "", 0, 1, stock="motorPowerSet.enable", type="U8", persistent=False)]
+    words: Annotated[I32s, 4, Settable(
+        "", "", "words", 0, 65535, stock="motorPowerSet.m1 m2 m3 m4", type="U16", persistent=False)]
 
 
 class Estimator(Struct):
@@ -255,9 +235,7 @@ class Estimator(Struct):
 
     x: Annotated[F32s, 16]  # at `filtered_tick`
     P: Annotated[
-        F32s,
-        16,
-        16,
+        F32s, 16, 16,
         Logged("m^2", stock="kalman.varX varY varZ", step=17),
         Logged("m^2/s^2", stock="kalman.varPX varPY varPZ", first=51, step=17),
         Logged("m^2", "Uncertainty.P_x_x"),
@@ -265,8 +243,7 @@ class Estimator(Struct):
         Logged("m^2/s^2", "Uncertainty.P_vx_vx", first=51),
     ]
     now: Annotated[  # at `tick`: what the controller reads
-        F32s,
-        16,
+        F32s, 16,
         Logged("rad/s", "stateEstimate.roll_rate pitch_rate yaw_rate", first=RATE),
         Logged("m/s", stock="kalman.statePX statePY statePZ", first=VELOCITY),
     ]
@@ -373,8 +350,7 @@ class Report(Struct):
     """The board's report: the state in the frame of the poses, and how many poses were received."""
 
     position: Annotated[
-        F32s, 3, Logged("m", stock="stateEstimate.x y z"), Logged("m", stock="kalman.stateX stateY stateZ")
-    ]
+        F32s, 3, Logged("m", stock="stateEstimate.x y z"), Logged("m", stock="kalman.stateX stateY stateZ")]
     velocity: Annotated[F32s, 3, Logged("m/s", stock="stateEstimate.vx vy vz")]
     attitude: Annotated[F32s, 3]  # [rad] roll, pitch, yaw
     quaternion: Annotated[F32s, 4, Logged("", stock="stateEstimate.qw qx qy qz")]
@@ -382,3 +358,4 @@ class Report(Struct):
     age: Annotated[i32, Logged("0.1 ms", "locSrv.age", type="U16")]  # of the last pose, 65535 at most
     poses: Annotated[i32, Logged("", "locSrv.poses", type="U16")]  # received, modulo 65536
     rejected: Annotated[i32, Logged("", "locSrv.rejected", type="U16")]  # of these, refused
+# fmt: on

@@ -109,8 +109,6 @@ class Block(Generic[S_co]):
     or the fields when nothing is compiled.
     """
 
-    __slots__ = ("arg", "fields", "kind", "memory")
-
     def __init__(self, kind: type[S_co]) -> None:
         self.kind = kind
         self.memory: NDArray[Any] = np.zeros(1, kind.dtype)

@@ -9,20 +9,14 @@ from dataclasses import dataclass, fields
 
 from firmware_py.config import FirmwareConfig
 from firmware_py.core.subset import f32
+from firmware_py.export.app_wire import C_TYPES
 from firmware_py.export.literals import float_literal
 from firmware_py.logic.loading import load_logic
 from firmware_py.table import CORE_PARAMETERS, CORE_VARIABLES, CoreParameter, Place, value_in
 from firmware_py.wire.parameters import ABSOLUTE
 from firmware_py.wire.scalars import Scalar
 
-TYPES = {  # in C, and what the macros of both tables call them
-    Scalar.F32: ("float", "FLOAT"),
-    Scalar.I32: ("int32_t", "INT32"),
-    Scalar.U32: ("uint32_t", "UINT32"),
-    Scalar.I16: ("int16_t", "INT16"),
-    Scalar.U16: ("uint16_t", "UINT16"),
-    Scalar.U8: ("uint8_t", "UINT8"),
-}
+TYPES = {"f": "float"} | C_TYPES  # by the code of a `Scalar`
 OBSERVED = (  # counted by the app itself
     ("floaty.malformed", Scalar.U32, "floaty_observed.malformed"),
     ("floaty.overflows", Scalar.U32, "floaty_observed.overflows"),
@@ -217,9 +211,7 @@ def toc_source(config: FirmwareConfig) -> str:
     variables = (*CORE_VARIABLES, *(() if logic is None else logic.loaded.variables))
     logged = [(one.name, one.scalar, _in_c(one.place)) for one in variables if not one.stock]
     params = [(one.name, _added(one)) for one in table]
-    logs = [
-        (name, f"LOG_ADD(LOG_{TYPES[scalar][1]}, NAME, &{c})") for name, scalar, c in (*logged, *OBSERVED)
-    ]
+    logs = [(name, f"LOG_ADD(LOG_{_macro(scalar)}, NAME, &{c})") for name, scalar, c in (*logged, *OBSERVED)]
     groups = (*_groups("PARAM", params), *_groups("LOG", logs))
     parts = {
         "@seen": "\n".join(map(_variable, table)),
@@ -251,7 +243,7 @@ def _row(parameter: AppParameter) -> str:
 def _variable(parameter: AppParameter) -> str:
     """Return the definition of the variable that clients read and write."""
     initial = number(parameter.initial) if parameter.scalar.is_float else str(int(parameter.initial))
-    return f"static {TYPES[parameter.scalar][0]} {_seen(parameter)} = {initial};"
+    return f"static {TYPES[parameter.scalar.format]} {_seen(parameter)} = {initial};"
 
 
 def _seen(parameter: CoreParameter) -> str:
@@ -260,7 +252,7 @@ def _seen(parameter: CoreParameter) -> str:
 
 
 def _added(parameter: CoreParameter) -> str:
-    flags = f"PARAM_{TYPES[parameter.scalar][1]}" + (" | PARAM_PERSISTENT" if parameter.persistent else "")
+    flags = f"PARAM_{_macro(parameter.scalar)}" + (" | PARAM_PERSISTENT" if parameter.persistent else "")
     return f"PARAM_ADD_WITH_CALLBACK({flags}, NAME, &{_seen(parameter)}, floaty_toc_apply)"
 
 
@@ -272,6 +264,11 @@ def _groups(kind: str, lines: Iterable[tuple[str, str]]) -> Iterator[str]:
         groups.setdefault(group, []).append(line.replace("NAME", name, 1))
     for group, added in groups.items():
         yield "\n".join((f"{kind}_GROUP_START({group})", *added, f"{kind}_GROUP_STOP({group})"))
+
+
+def _macro(scalar: Scalar) -> str:
+    """Return what the firmware's macros call a type."""
+    return TYPES[scalar.format].removesuffix("_t").upper()
 
 
 def number(value: float) -> str:

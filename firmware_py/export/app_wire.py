@@ -6,7 +6,15 @@ from firmware_py.wire import core_port, crtp, localisation
 from firmware_py.wire.core_port import HEALTH, LAYOUTS, LOOP, Call, Hil, Message, PacketLayout, Refusal
 from firmware_py.wire.supervisor import Cause, State
 
-C_TYPES = {"B": "uint8_t", "?": "uint8_t", "b": "int8_t", "H": "uint16_t", "h": "int16_t", "I": "uint32_t"}
+C_TYPES = {
+    "B": "uint8_t",
+    "?": "uint8_t",
+    "b": "int8_t",
+    "H": "uint16_t",
+    "h": "int16_t",
+    "I": "uint32_t",
+    "i": "int32_t",
+}
 
 OF_CORE = {  # fields of layouts that show the core's memory
     "state": "supervisor.state", "cause": "supervisor.cause", "calibrated": "sampling.calibrated",
@@ -17,24 +25,10 @@ OF_CORE = {  # fields of layouts that show the core's memory
 
 def wire_header() -> str:
     constants = (
-        "CHANNEL_GENERIC",
-        "EXT_POSE",
-        "AGE_UNIT_US",
-        "AGE_UNKNOWN_CODE",
-        "EMERGENCY_STOP",
-        "EMERGENCY_STOP_WATCHDOG",
-        "PORT_CORE",
-        "CHANNEL_CALLS",
-        "CHANNEL_LOOP",
-        "HIL_WAITING",
-        "HIL_HOLD",
-        "NARROW",
-        "WIDE",
-        "NARROW_BITS",
-        "VERSION",
-        "NAME_SIZE",
-        "READ_MAX",
-    )
+        "CHANNEL_GENERIC", "EXT_POSE", "AGE_UNIT_US", "AGE_UNKNOWN_CODE", "EMERGENCY_STOP", "EMERGENCY_STOP_WATCHDOG",
+        "PORT_CORE", "CHANNEL_CALLS", "CHANNEL_LOOP", "HIL_WAITING", "HIL_HOLD", "NARROW", "WIDE", "NARROW_BITS",
+        "VERSION", "NAME_SIZE", "READ_MAX",
+    )  # fmt: skip
     facts = vars(localisation) | vars(crtp) | vars(core_port)
     return "\n\n".join((
         "/* The packets of the core's port, as in firmware_py/wire/core_port.py. Written by `floaty deploy`. */\n"

@@ -35,8 +35,6 @@ def build(
 class NativeRunner:
     """Runs the compiled C on the blocks' own memory."""
 
-    __slots__ = ("_blocks", "_calls")
-
     def __init__(self, blocks: CoreBlocks, library: Path) -> None:
         self._blocks = blocks  # keeps the memory alive
         code = ctypes.CDLL(str(library.absolute()))

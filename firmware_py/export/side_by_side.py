@@ -34,8 +34,6 @@ class Divergence:
 class ComparedTarget:
     """One implementation beside the reference."""
 
-    __slots__ = ("blocks", "calls", "divergence", "name", "ticks")
-
     def __init__(self, name: str, reference: CoreBlocks, factory: RunnerFactory) -> None:
         self.name = name
         self.blocks = CoreBlocks(_copy_of(reference.parameters), factory, reference.logic)

@@ -63,18 +63,6 @@ class MavlinkStack:
         kernel.create_task("MAV-TX", 2, self._transmit_task)
 
     @property
-    def frames(self) -> int:
-        return self.counters.frames
-
-    @property
-    def lost(self) -> int:
-        return self.counters.lost
-
-    @property
-    def bad(self) -> int:
-        return self.counters.bad
-
-    @property
     def dropped(self) -> int:
         """Messages that the line was too slow for, or that fit no frame."""
         return self.unsent + self._transmit.dropped

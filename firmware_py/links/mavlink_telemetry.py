@@ -154,7 +154,7 @@ class FlightMessages:
     def _sys_status(self, tick: int) -> Messages:
         counters = self._stack.counters
         drop_rate = counters.lost / max(1, counters.frames + counters.lost)
-        errors = self._stack.bad + self._stack.refused + self._stack.overruns
+        errors = counters.bad + self._stack.refused + self._stack.overruns
         alive = not self._supervisor.imu_is_stale
         return (mavlink.sys_status(self._supervisor.battery_mv, drop_rate, errors, self._load(), alive),)
 

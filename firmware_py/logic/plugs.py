@@ -14,6 +14,7 @@ from types import FunctionType
 
 import numpy as np
 
+from firmware_py import table
 from firmware_py.compiling import Compiled
 from firmware_py.core import entry
 from firmware_py.core.subset import Logged, Tunable
@@ -26,13 +27,11 @@ from firmware_py.wire.toc import MAX_NAME
 GROUP = "logic"  # of parameters, log variables and columns of the log
 PARAMETER_ROOM = 12  # characters: MAVLink has 16, of which OWN_ takes four
 VARIABLE_ROOM = MAX_NAME - len(GROUP)
-CORE_STRUCTS = {"parameters": "Parameters", "data": "Input", "estimator": "Estimator", "control": "Control"}
+BLOCKS = {name: kind.__name__ for name, kind in table.BLOCKS.items()}  # of the core, in their order
+CORE_STRUCTS = {
+    name: BLOCKS[name] for name in ("parameters", "data", "estimator", "control")
+}  # that hooks may take
 OWN, MEMORY = "own", "memory"
-BLOCKS = CORE_STRUCTS | {
-    "sampling": "Sampling",
-    "supervisor": "Supervisor",
-    "report": "Report",
-}  # of the core, in their order
 _SIGNATURES = {
     name: signature(function)
     for name, function in vars(entry).items()

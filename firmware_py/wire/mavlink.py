@@ -296,15 +296,9 @@ def odometry(t_us: int, p_WB: Vector, q_WB: Quaternion, v_B: Vector, rates: Vect
 
 def imu(t_us: int, rates: Vector, acceleration: Vector) -> Message:
     """Return the measured rates [rad/s, B] and acceleration [g, B]; there are no other sensors."""
-    force = turn(
-        (
-            acceleration[0] * _STANDARD_GRAVITY,
-            acceleration[1] * _STANDARD_GRAVITY,
-            acceleration[2] * _STANDARD_GRAVITY,
-        )
-    )
+    x, y, z = (_STANDARD_GRAVITY * g for g in acceleration)
     return dialect.MAVLink_highres_imu_message(
-        max(0, t_us), *force, *turn(rates), 0, 0, 0, 0, 0, 0, 0, _GYRO_AND_ACCELEROMETER
+        max(0, t_us), *turn((x, y, z)), *turn(rates), 0, 0, 0, 0, 0, 0, 0, _GYRO_AND_ACCELEROMETER
     )
 
 

@@ -149,8 +149,6 @@ class FrameSender:
 class _Sequence:
     """Sequence numbers of one sender, modulo 256: half of them lie ahead, the others behind."""
 
-    __slots__ = ("after_late", "late_run", "newest")
-
     def __init__(self, number: int) -> None:
         self.newest = number
         self.late_run = 0

@@ -141,6 +141,12 @@ class FrameCounts(Protocol):
         """Missing frames, by gaps in the sequence."""
 
 
+class FrameReader(Protocol):
+    @property
+    def counters(self) -> FrameCounts:
+        """The counters of what it has read."""
+
+
 @dataclass(frozen=True, slots=True)
 class ImageReport:
     """The memory that an image never used in its flight, and its restarts."""
@@ -223,7 +229,7 @@ class BoardFirmware(Protocol):
         """The time of the board's clock [us]; None if it is the laboratory's."""
 
     @property
-    def mavlink(self) -> FrameCounts | None:
+    def mavlink(self) -> FrameReader | None:
         """The counters of its serial line, if it has one."""
 
     @property

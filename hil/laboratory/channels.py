@@ -109,8 +109,8 @@ def serial_channel(uart: VirtualSerial, firmware: BoardFirmware, link: "MavlinkL
 
     `link.*` counts chunks of the stream, `serial.*` bytes, bits and frames.
     """
-    up, down, board = uart.up, uart.down, firmware.mavlink
-    assert board is not None
+    assert firmware.mavlink is not None
+    up, down, board = uart.up, uart.down, firmware.mavlink.counters
 
     def counts() -> tuple[int, ...]:
         at_station = link.counters if link else None

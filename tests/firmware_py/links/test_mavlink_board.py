@@ -731,7 +731,7 @@ def test_with_a_key_nothing_unsigned_is_accepted_and_everything_sent_is_signed()
     assert [answer.command for answer in client.command(400, 0)] == [400]
     client.codec.signing.secret_key = bytes(32)
     assert client.command(400, 1) == []
-    assert client.stack.bad == 2
+    assert client.stack.counters.bad == 2
     client.run(2_100_000)
     assert len(client.of("HEARTBEAT")) == 2
     assert all(message.get_signed() for _, message in client.messages)
