@@ -25,6 +25,7 @@ from firmware_py.wire import WireError, check_size, high_level, setpoints
 from firmware_py.wire.crtp import PORT_COMMANDER, PORT_GENERIC_SETPOINT, Packet
 from firmware_py.wire.high_level import (
     Define,
+    Fields,
     GoTo,
     PathCommand,
     Start,
@@ -66,27 +67,25 @@ class HighLevelService:
     def answer(self, packet: Packet) -> tuple[bytes, ...]:
         """Execute a command and return the reply."""
         try:
-            status = self._obey(*decode(packet.data))
+            status = self._execute(*decode(packet.data))
         except WireError as error:
             number = packet.data[0] if packet.data else -1
             self._refuse(f"command {number}" if number in COMMANDS else "unknown command", str(error))
             status = ENOEXEC
         return (packet.data[:3].ljust(3, b"\0") + bytes((status,)),)
 
-    def _obey(self, command: PathCommand, fields: tuple[float, ...]) -> int:
-        if command is PathCommand.DEFINE:
-            definition = Define(*map(int, fields))
-            if definition.trajectory >= high_level.MAX_TRAJECTORIES:
+    def _execute(self, command: PathCommand, fields: Fields) -> int:
+        if isinstance(fields, Define):
+            if fields.trajectory >= high_level.MAX_TRAJECTORIES:
                 return ENOEXEC
-            self._definitions[definition.trajectory] = definition
+            self._definitions[fields.trajectory] = fields
             return OK
         if command is PathCommand.SET_GROUP_MASK:
-            self.defaults.groups = int(fields[0])
+            self.defaults.groups = fields.groups
             return OK
-        groups = int(fields[0])
         if command is not PathCommand.STOP and not self._supervisor.can_fly:
             return EBUSY
-        if groups and not groups & self.defaults.groups:
+        if fields.groups and not fields.groups & self.defaults.groups:
             return OK  # for others
         if command is PathCommand.STOP:
             self._pilot.abort()
@@ -97,34 +96,26 @@ class HighLevelService:
             return EBUSY
         return self._plan(command, fields, begin)
 
-    def _plan(self, command: PathCommand, fields: tuple[float, ...], begin: PathPoint) -> int:
+    def _plan(self, command: PathCommand, fields: Fields, begin: PathPoint) -> int:
         """Turn a flight command into a path."""
-        if command is PathCommand.GO_TO:
-            return self._go_to(GoTo._make(fields), begin)
-        if command is PathCommand.GO_TO_1:
-            groups, relative, *rest = fields
-            return self._go_to(GoTo(groups, relative, False, *rest), begin)  # type: ignore[arg-type]
-        if command is PathCommand.START:
-            return self._start(Start._make(fields), begin)
-        if command is PathCommand.START_1:
-            groups, relative, reverse, number, timescale = fields
-            return self._start(Start(groups, relative, False, reverse, number, timescale), begin)  # type: ignore[arg-type]
-        if command is PathCommand.SPIRAL:
-            self._refuse("spiral", "a spiral is not flown")
-            return ENOEXEC
         lands = command in (PathCommand.LAND, PathCommand.LAND_1, PathCommand.LAND_WITH_VELOCITY)
-        return self._climb(self._vertical(command, fields, begin, lands), begin, lands)
+        match fields:
+            case GoTo():
+                place = fields.x, fields.y, fields.z
+                return self._follow(
+                    go_to(begin, place, fields.yaw, fields.duration, fields.relative, fields.linear)
+                )
+            case Start():
+                return self._start(fields, begin)
+            case Vertical():
+                return self._climb(fields, begin, lands)
+            case VerticalWithVelocity():
+                return self._climb(self._timed(fields, begin, lands), begin, lands)
+        self._refuse("spiral", "a spiral is not flown")
+        return ENOEXEC
 
-    def _vertical(
-        self, command: PathCommand, fields: tuple[float, ...], begin: PathPoint, lands: bool
-    ) -> Vertical:
-        """Convert the three kinds of take-off and landing commands to one."""
-        if command in (PathCommand.TAKE_OFF, PathCommand.LAND):
-            return Vertical._make(fields)
-        if command in (PathCommand.TAKE_OFF_1, PathCommand.LAND_1):
-            groups, height, duration = fields
-            return Vertical(int(groups), height, 0.0, False, duration)
-        wish = VerticalWithVelocity._make(fields)
+    def _timed(self, wish: VerticalWithVelocity, begin: PathPoint, lands: bool) -> Vertical:
+        """Return the same command with its duration in place of the velocity."""
         z = begin.position[2]
         height = wish.height
         if wish.relative:
@@ -141,12 +132,6 @@ class HighLevelService:
         yaw = begin.yaw if wish.current_yaw else wish.yaw
         return self._follow(straight_up(begin, wish.height, yaw, wish.duration), lands)
 
-    def _go_to(self, wish: GoTo, begin: PathPoint) -> int:
-        path = go_to(
-            begin, (wish.x, wish.y, wish.z), wish.yaw, wish.duration, bool(wish.relative), bool(wish.linear)
-        )
-        return self._follow(path)
-
     def _start(self, wish: Start, begin: PathPoint) -> int:
         definition = self._definitions.get(wish.trajectory)
         if definition is None:
@@ -154,7 +139,7 @@ class HighLevelService:
         if wish.timescale <= 0.0:
             raise WireError(f"time scale {wish.timescale:g}: must be above 0")
         path = decode_trajectory(self._memory, definition)
-        path = replace(path, timescale=wish.timescale, reverse=bool(wish.reverse))
+        path = replace(path, timescale=wish.timescale, reverse=wish.reverse)
         if wish.relative:
             path = path.begun_at(begin.position, begin.yaw if wish.relative_yaw else None)
         return self._follow(path)

@@ -35,6 +35,12 @@ class PathCommand(IntEnum):
     START = 13
 
 
+class Groups(NamedTuple):
+    """SET_GROUP_MASK and STOP."""
+
+    groups: int
+
+
 class Vertical(NamedTuple):
     """TAKE_OFF and LAND."""
 
@@ -86,38 +92,44 @@ class Define(NamedTuple):
     pieces: int
 
 
-_LAYOUTS = {
-    PathCommand.SET_GROUP_MASK: struct.Struct("<B"),
-    PathCommand.TAKE_OFF_1: struct.Struct("<Bff"),
-    PathCommand.LAND_1: struct.Struct("<Bff"),
-    PathCommand.STOP: struct.Struct("<B"),
-    PathCommand.GO_TO_1: struct.Struct("<BBfffff"),
-    PathCommand.START_1: struct.Struct("<BBBBf"),
-    PathCommand.DEFINE: struct.Struct("<BBBIB"),
-    PathCommand.TAKE_OFF: struct.Struct("<Bff?f"),
-    PathCommand.LAND: struct.Struct("<Bff?f"),
-    PathCommand.TAKE_OFF_WITH_VELOCITY: struct.Struct("<Bf?f?f"),
-    PathCommand.LAND_WITH_VELOCITY: struct.Struct("<Bf?f?f"),
-    PathCommand.SPIRAL: struct.Struct("<BBBfffff"),
-    PathCommand.GO_TO: struct.Struct("<B??fffff"),
-    PathCommand.START: struct.Struct("<B???Bf"),
+Fields = Groups | Vertical | VerticalWithVelocity | GoTo | Start | Define
+# The fields of each command, their layout, and those behind the second that older commands lack. Of a spiral, which is not
+# flown, only the groups are read.
+_FORMS: dict[PathCommand, tuple[type[Fields], struct.Struct, tuple[float, ...]]] = {
+    command: (kind, struct.Struct(layout), tuple(lacking))
+    for command, kind, layout, *lacking in (
+        (PathCommand.SET_GROUP_MASK, Groups, "<B"),
+        (PathCommand.TAKE_OFF_1, Vertical, "<Bff", 0.0, False),
+        (PathCommand.LAND_1, Vertical, "<Bff", 0.0, False),
+        (PathCommand.STOP, Groups, "<B"),
+        (PathCommand.GO_TO_1, GoTo, "<B?fffff", False),
+        (PathCommand.START_1, Start, "<B??Bf", False),
+        (PathCommand.DEFINE, Define, "<BBBIB"),
+        (PathCommand.TAKE_OFF, Vertical, "<Bff?f"),
+        (PathCommand.LAND, Vertical, "<Bff?f"),
+        (PathCommand.TAKE_OFF_WITH_VELOCITY, VerticalWithVelocity, "<Bf?f?f"),
+        (PathCommand.LAND_WITH_VELOCITY, VerticalWithVelocity, "<Bf?f?f"),
+        (PathCommand.SPIRAL, Groups, "<BBBfffff"),
+        (PathCommand.GO_TO, GoTo, "<B??fffff"),
+        (PathCommand.START, Start, "<B???Bf"),
+    )
 }
 
 
-def decode(data: bytes) -> tuple[PathCommand, tuple[float, ...]]:
-    """Return the command and its fields as on the wire; `WireError` for an unknown one or a number that is not finite."""
+def decode(data: bytes) -> tuple[PathCommand, Fields]:
+    """Return the command and its fields; `WireError` for an unknown one or a number that is not finite."""
     try:
         command = PathCommand(data[0])
     except (IndexError, ValueError):
         raise WireError(f"high-level command {data.hex()}: unknown") from None
-    layout = _LAYOUTS[command]
+    kind, layout, lacking = _FORMS[command]
     check_size(f"high-level command {command.name.lower()}", data, 1 + layout.size)
     fields = layout.unpack_from(data, 1)
     if not all(isfinite(value) for value in fields):
         raise WireError(f"high-level command {command.name.lower()} {fields}: must be finite")
-    return command, fields
+    return command, kind._make((*fields[:2], *lacking, *fields[2:])[: len(kind._fields)])
 
 
 def encode(command: PathCommand, *fields: float) -> bytes:
     """Return the complete packet of a command with its fields, in the order on the wire."""
-    return bytes((header(PORT, 0), command)) + _LAYOUTS[command].pack(*fields)
+    return bytes((header(PORT, 0), command)) + _FORMS[command][1].pack(*fields)
