@@ -111,7 +111,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "subprocess": (
         "hil/installation.py", "hil/live/", "hil/servers/linked.py",
         "ground_station/sources/motioncapture_client.py",
-        "firmware_py/export/compilers.py", "firmware_py/export/plain.py",
+        "firmware_py/export/compilers.py",
     ),
     "socket": (
         "hil/clock.py", "hil/stm32f405/gdb.py",

@@ -38,6 +38,7 @@ class Loaded:
     digest: str  # of the modules' texts
     entry: ModuleType
     calls: Mapping[str, tuple[str, ...]]
+    texts: Mapping[str, str]  # of the core's modules and these, by module name
     translation: Translation
     structs: Mapping[str, type[Struct]]  # of the blocks that own logic adds to the core's
     files: Mapping[str, str]  # by plug point
@@ -144,9 +145,9 @@ def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
     flown = {plug.point.name: _with_budget(plug, texts, shown) for plug in plugs}
     plugs = tuple(plug for plug, _ in flown.values())
     entry = compose(plugs, PACKAGE)
+    texts |= {f"own_{name}": text for name, (_, text) in flown.items()} | {"entry": entry.text}
     if any(plug.charged for plug in plugs):
-        texts |= {f"own_{name}": text for name, (_, text) in flown.items()}
-        translation = translate(texts | {"entry": entry.text}, shown)
+        translation = translate(texts, shown)
     files = {name: file for name, file, _ in modules}
     modules = tuple((name, file, flown[name][1]) for name, file, _ in modules)
     package = f"{PACKAGE}_{digest[:16]}"  # of the text alone: equal modules share their machine code, wherever they lie
@@ -159,7 +160,7 @@ def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
             structs[plug.block(argument)] = getattr(module, name)
         if plug.charged:
             structs[plug.block(ARGUMENT)] = LoopBudget
-    return Loaded(plugs, digest, run, entry.calls, translation, structs, files)
+    return Loaded(plugs, digest, run, entry.calls, texts, translation, structs, files)
 
 
 def _with_budget(plug: Plug, texts: Mapping[str, str], shown: Mapping[str, str]) -> tuple[Plug, str]:

@@ -115,11 +115,6 @@ class Toolbox:
     def factories(self, stack: ExitStack) -> dict[str, RunnerFactory]:
         """Return functions that make the targets' runners, which end with the stack."""
 
-        def plain(blocks: CoreBlocks) -> CoreRunner:
-            runner = PlainRunner(blocks)
-            stack.callback(runner.close)
-            return runner
-
         def cortex_m4(blocks: CoreBlocks) -> CoreRunner:
             assert self.machine_code is not None
             runner = Metered(blocks, self._image, self._meter, self.machine_code.ticks)
@@ -136,7 +131,7 @@ class Toolbox:
 
             return runner_of
 
-        factories = {**self._native, PLAIN: plain, CORTEX_M4: cortex_m4}
+        factories = {**self._native, PLAIN: PlainRunner, CORTEX_M4: cortex_m4}
         return {name: board(name) if is_link(name) else factories[name] for name in self._names}
 
     def _measure(self, runner: Metered) -> None:

@@ -1,13 +1,11 @@
 """Laws of every `CoreRunner`: whatever executes the flight core gives the same bits and keeps nothing to itself."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 
 from firmware_py.config import LogicConfig, parameters_of
 from firmware_py.core.structs import POSE_INVALID, POSE_ON_TIME, POSE_TOO_OLD, Input, Parameters
-from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory
+from firmware_py.core_runner import CoreBlocks, PythonRunner, RunnerFactory
 from firmware_py.export.boards import BOARDS, runner_of
 from firmware_py.export.plain import PlainRunner
 from hil.config import load_config
@@ -24,20 +22,11 @@ def recording() -> Recording:
 
 
 @pytest.fixture(scope="module", params=[*BOARDS, PLAIN])
-def runner(request: pytest.FixtureRequest) -> Iterator[RunnerFactory]:
+def runner(request: pytest.FixtureRequest) -> RunnerFactory:
     """What makes a runner of each kind."""
-    if request.param != PLAIN:
-        yield runner_of(request.param, ROOT / "runs" / "build", LogicConfig())
-        return
-    children: list[PlainRunner] = []
-
-    def plain(blocks: CoreBlocks) -> CoreRunner:
-        children.append(PlainRunner(blocks))
-        return children[-1]
-
-    yield plain
-    for child in children:
-        child.close()
+    if request.param == PLAIN:
+        return PlainRunner
+    return runner_of(request.param, ROOT / "runs" / "build", LogicConfig())
 
 
 def core_at_start(recording: Recording, runner: RunnerFactory) -> CoreBlocks:

@@ -1,7 +1,6 @@
 """The budget of a call of own logic: loops that exceed it are refused, or stopped alike on every target."""
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -39,22 +38,17 @@ Make = Callable[..., CoreBlocks]
 
 
 @pytest.fixture
-def blocks_of(tmp_path: Path) -> Iterator[Make]:
+def blocks_of(tmp_path: Path) -> Make:
     """Return the memory of a core with own logic in flight, and what executes it on a board."""
-    with ExitStack() as stack:
 
-        def make(text: str, board: str = "python", estimator: str = "") -> CoreBlocks:
-            config = own_config(tmp_path, text, estimator)
-            runner = (
-                PlainRunner if board == "plain" else runner_of(board, ROOT / "runs" / "build", config.logic)
-            )
-            blocks = CoreBlocks(parameters_of(config), runner, load_logic(config.logic))
-            if isinstance(blocks.run, PlainRunner):
-                stack.callback(blocks.run.close)
-            blocks.data.fields.mode = MODE_FLY
-            return blocks
+    def make(text: str, board: str = "python", estimator: str = "") -> CoreBlocks:
+        config = own_config(tmp_path, text, estimator)
+        runner = PlainRunner if board == "plain" else runner_of(board, ROOT / "runs" / "build", config.logic)
+        blocks = CoreBlocks(parameters_of(config), runner, load_logic(config.logic))
+        blocks.data.fields.mode = MODE_FLY
+        return blocks
 
-        yield make
+    return make
 
 
 def overrun(blocks: CoreBlocks) -> str:

@@ -16,7 +16,6 @@ import pytest
 from firmware_py.core import structs
 from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory
 from firmware_py.export.c99 import translate
-from firmware_py.export.plain import PlainRunner
 from firmware_py.extras import install_command
 from firmware_py.logic.plugs import CALLS
 from hil.deploy.check import Checked, check_flight, plan, reached
@@ -229,21 +228,6 @@ def test_machine_code_that_leaves_its_memory_is_exit_one(
     options = ("--duration", "0.1", "--targets", "cortex-m4", "--source", "wild.c")
     assert cli("deploy", "check", "hover", *options) == 1
     assert "tick 23, in estimate: " in cli.out
-
-
-def test_a_plain_python_that_has_ended_is_a_difference() -> None:
-    runners: list[PlainRunner] = []
-
-    def factory(blocks: CoreBlocks) -> CoreRunner:
-        runners.append(PlainRunner(blocks))
-        runners[0]._child.kill()
-        runners[0]._child.wait()
-        return runners[0]
-
-    found = fly_beside(factory).targets[0].divergence
-    assert found is not None
-    assert (found.tick, found.call) == (0, "reset")
-    runners[0].close()
 
 
 @pytest.mark.parametrize("package", ["unicorn", "elftools.elf.elffile"])
