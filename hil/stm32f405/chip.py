@@ -116,7 +116,7 @@ class Chip:
             for base, size, name in WINDOWS
         ]
         self._sent = self._ffi.new("uint8_t[]", self._library.LINE_BYTES)
-        self._kept: list[NDArray[np.uint8]] = []  # memory of devices
+        self._kept: list[NDArray[Any]] = []  # memory of devices, and the speeds of motors
         self._acts: dict[int, Callable[[], object]] = {}  # of devices that act on what is written
         self.breakpoints: set[int] = set()  # of a debugger: a run stops before these instructions
         self.crash_points: set[int] = set()  # of the crash reports
@@ -221,6 +221,17 @@ class Chip:
         """Put memory on SPI 1..3 behind a pin that selects it when low; returns the device's number."""
         port, number = select
         return self.add_device(bus + self._library.BUSES, (ord(port) - ord("A")) * 16 + number, memory)
+
+    def add_esc(self, timer: int, channel: int, rpm: NDArray[np.float64], poles: int) -> None:
+        """Connect an ESC for DSHOT to an output, both from 0; `rpm` (1,) is the speed of its motor, of so many poles.
+
+        `state.compare` there is the throttle that it has taken: 0, or 48 to 2047.
+        """
+        self._kept.append(rpm)
+        if not self._library.machine_esc(
+            self.state, timer, channel, self._ffi.from_buffer("double[]", rpm), poles
+        ):
+            raise LabError("more ESCs than there is room for")
 
     def on_write(self, device: int, act: Callable[[], object]) -> None:
         """Call `act` (by `tell_devices`) whenever a transfer to a device has ended: a write on I2C, any on SPI."""

@@ -3,7 +3,8 @@
  * A kernel of its own keeps its tasks in structures with FreeRTOS's names, members in another order, so that what reads
  * them has to ask the debugging information. Two tasks of one priority fill all FP registers and look at them again;
  * one filters samples that an EXTI interrupt of 1 kHz puts into a queue, guarded by BASEPRI; one reads the EEPROM by
- * DMA, moves a servo's timer and reports over the USART by DMA. The word `planted` has one of them go wrong.
+ * DMA, moves a servo's timer, sends DSHOT by DMA and captures the answer, and reports over the USART by DMA. The word
+ * `planted` has one of them go wrong.
  * `scenario` runs one of the small experiments with exceptions (exceptions.c) instead.
  */
 #include "registers.h"
@@ -73,6 +74,8 @@ static TCB_t tasks[6];
 volatile uint32_t fp_errors, fp_rounds[2], samples_taken, samples_lost, i2c_reads, dma_interrupts, lines_sent, bytes_received;
 volatile uint32_t last_received;
 volatile uint8_t eeprom[4];
+volatile uint32_t throttle, edges[22], edge_count; /* of the last reply */
+static uint32_t pulses[17];
 volatile float filtered;
 static volatile uint32_t queue[8], queue_head, queue_tail;
 
@@ -221,6 +224,44 @@ void DMA1_Stream0_Handler(void) {
   DMA_LIFCR(DMA1) = 0x3D;
   I2C1_CR1 |= 1u << 9; /* STOP */
   dma_interrupts++;
+}
+
+/* The frame has left: capture both edges at the same channel. */
+void DMA1_Stream6_Handler(void) {
+  TIM_DIER(TIM2) = 0;
+  DMA_HIFCR(DMA1) = 0x3Du << 16;
+  TIM_CR1(TIM2) = 0;
+  TIM_CCER(TIM2) = 0;
+  TIM_ARR(TIM2) = 8400; /* 100 us */
+  TIM_CNT(TIM2) = 0;
+  TIM_CCMR1(TIM2) = 1u << 8;
+  TIM_CCER(TIM2) = 11u << 4;
+  DMA_M0AR(DMA1, 6) = (uint32_t)edges;
+  DMA_NDTR(DMA1, 6) = LENGTH(edges);
+  DMA_CR(DMA1, 6) = 3u << 25 | 2u << 13 | 2u << 11 | 1u << 10 | 1u;
+  TIM_DIER(TIM2) = 1u << 10;
+  TIM_CR1(TIM2) = 1;
+}
+
+static void send_frame(void) {
+  edge_count = LENGTH(edges) - DMA_NDTR(DMA1, 6);
+  TIM_DIER(TIM2) = TIM_CR1(TIM2) = DMA_CR(DMA1, 6) = 0;
+  DMA_HIFCR(DMA1) = 0x3Du << 16;
+  uint32_t data = throttle << 1, frame = data << 4 | (~(data ^ data >> 4 ^ data >> 8) & 15);
+  for (uint32_t i = 0; i < 16; i++) {
+    pulses[i] = frame >> (15 - i) & 1 ? 210 : 105;
+  }
+  TIM_ARR(TIM2) = 280; /* 300 kHz */
+  TIM_CNT(TIM2) = 0;
+  TIM_CCMR1(TIM2) = 6u << 12 | 1u << 11; /* PWM, preloaded */
+  TIM_CCER(TIM2) = 3u << 4;              /* inverted */
+  TIM_CCR2(TIM2) = 0;
+  DMA_PAR(DMA1, 6) = (uint32_t)&TIM_CCR2(TIM2);
+  DMA_M0AR(DMA1, 6) = (uint32_t)pulses;
+  DMA_NDTR(DMA1, 6) = LENGTH(pulses);
+  DMA_CR(DMA1, 6) = 3u << 25 | 2u << 13 | 2u << 11 | 1u << 10 | 1u << 6 | 1u << 4 | 1u;
+  TIM_DIER(TIM2) = 1u << 10; /* the request of channel 2 */
+  TIM_CR1(TIM2) = 1;
 }
 
 void USART6_Handler(void) {
@@ -397,6 +438,7 @@ static void report(void) {
   for (;;) {
     i2c_read_by_dma();
     send_line();
+    send_frame();
     TIM_CCR1(TIM3) = 1000 + xTickCount % 1000;
     if (planted != HUNGRY_WATCHDOG) {
       IWDG_KR = 0xAAAA;
@@ -442,7 +484,7 @@ static void set_up_clocks(void) {
 
 static void set_up_peripherals(void) {
   RCC_AHB1ENR |= 1u << 22 | 1u << 21 | 1u << 2 | 1u << 1; /* DMA2, DMA1, GPIOC, GPIOB */
-  RCC_APB1ENR |= 1u << 21 | 1u << 5 | 1u << 1;            /* I2C1, TIM7, TIM3 */
+  RCC_APB1ENR |= 1u << 21 | 1u << 5 | 1u << 1 | 1u;       /* I2C1, TIM7, TIM3, TIM2 */
   RCC_APB2ENR |= 1u << 14 | 1u << 5;                      /* SYSCFG, USART6 */
   GPIO_MODER(1) |= 2u << 14 | 2u << 12;                   /* PB6, PB7: I2C1 */
   GPIO_AFRL(1) |= 4u << 28 | 4u << 24;
@@ -470,7 +512,7 @@ static void set_up_peripherals(void) {
 
   SYSCFG_EXTICR4 = 2u << 8; /* EXTI14 from port C */
   EXTI_RTSR = EXTI_IMR = 1u << 14;
-  static const uint8_t irqs[] = {40, 11, 71};
+  static const uint8_t irqs[] = {40, 11, 71, 17};
   for (uint32_t i = 0; i < LENGTH(irqs); i++) {
     NVIC_IPR(irqs[i]) = (uint8_t)(MASK_PRIORITY + 0x10 * i);
     NVIC_ISER(irqs[i] / 32) = 1u << irqs[i] % 32;
@@ -552,6 +594,12 @@ __attribute__((section(".param_table"), used)) static const struct param_s param
     {U16, 0, "timeout", &timeout, 0, 0}, {END, 0, "wait", 0, 0, 0},
 };
 
+#ifdef DEVICE_TYPE /* of the board that it starts on, as Bitcraze's firmware has it */
+__attribute__((used)) const char *platformInit(void) {
+  return DEVICE_TYPE;
+}
+#endif
+
 void Stuck_Handler(void) {
   for (;;) {
   }
@@ -566,5 +614,5 @@ __attribute__((section(".isr_vector"), used)) static const Handler vectors[16 + 
     (Handler)main_stack_top, Reset_Handler, Stuck_Handler, Stuck_Handler, Stuck_Handler, Stuck_Handler, Stuck_Handler,
     0, 0, 0, 0, SVC_Handler, Stuck_Handler, 0, PendSV_Handler, SysTick_Handler,
     [16 + 0] = Order_Handler, [16 + 1] = Order_Handler, [16 + 2] = Masking_Handler, [16 + 3] = Order_Handler,
-    [16 + 11] = DMA1_Stream0_Handler, [16 + 40] = EXTI15_10_Handler, [16 + 71] = USART6_Handler,
+    [16 + 11] = DMA1_Stream0_Handler, [16 + 17] = DMA1_Stream6_Handler, [16 + 40] = EXTI15_10_Handler, [16 + 71] = USART6_Handler,
 };

@@ -20,9 +20,11 @@
 #define IWDG_PR REGISTER(0x40003004)
 #define IWDG_RLR REGISTER(0x40003008)
 
+#define TIM2 0x40000000
 #define TIM3 0x40000400
 #define TIM7 0x40001400
 #define TIM_CR1(timer) REGISTER((timer) + 0x00)
+#define TIM_DIER(timer) REGISTER((timer) + 0x0C)
 #define TIM_EGR(timer) REGISTER((timer) + 0x14)
 #define TIM_CCMR1(timer) REGISTER((timer) + 0x18)
 #define TIM_CCER(timer) REGISTER((timer) + 0x20)
@@ -30,6 +32,7 @@
 #define TIM_PSC(timer) REGISTER((timer) + 0x28)
 #define TIM_ARR(timer) REGISTER((timer) + 0x2C)
 #define TIM_CCR1(timer) REGISTER((timer) + 0x34)
+#define TIM_CCR2(timer) REGISTER((timer) + 0x38)
 
 #define I2C1_CR1 REGISTER(0x40005400)
 #define I2C1_CR2 REGISTER(0x40005404)

@@ -1,5 +1,7 @@
-/* The two DMA controllers (chapter 10), between byte-wide peripherals and RAM: a peripheral asks, one item moves at once. */
+/* The two DMA controllers (chapter 10) in direct mode: a peripheral asks, one item of PSIZE moves at once. */
 #include "machine.h"
+
+#include <string.h>
 
 enum { ENABLE = 1, TRANSFER_ERROR_IE = 4, COMPLETE_IE = 16, TO_PERIPHERAL = 64, CIRCULAR = 256, INCREMENT = 1024 };
 enum { FIRST_STREAM = 0x10, STREAM_SIZE = 0x18 };
@@ -20,13 +22,13 @@ static void raise_flag(struct machine *m, unsigned n, unsigned s, uint32_t flag)
     update_line(m, n, s);
 }
 
-static uint8_t *ram_byte(struct machine *m, uint32_t address) /* it cannot reach the CCM, chapter 2.3.1 */
+static uint8_t *ram_at(struct machine *m, uint32_t address, uint32_t size) /* it cannot reach the CCM, chapter 2.3.1 */
 {
-    return address - RAM_BASE < RAM_SIZE ? m->ram + (address - RAM_BASE) : 0;
+    return address - RAM_BASE <= RAM_SIZE - size ? m->ram + (address - RAM_BASE) : 0;
 }
 
-/* Move one byte between a peripheral's data register and memory; return 0 without a stream for it. `last`: the last one. */
-static int move(struct machine *m, uint32_t peripheral, uint32_t direction, uint8_t *byte, int *last)
+/* Move one item between a peripheral's data register and memory; return 0 without a stream for it. `last`: the last one. */
+static int move(struct machine *m, uint32_t peripheral, uint32_t direction, uint32_t *item, int *last)
 {
     for (unsigned n = 0; n < DMAS; n++)
         for (unsigned s = 0; s < STREAMS; s++) {
@@ -34,8 +36,9 @@ static int move(struct machine *m, uint32_t peripheral, uint32_t direction, uint
             if (!(stream->cr & ENABLE) || stream->par != peripheral || (stream->cr & 0xC0) != direction)
                 continue;
             uint32_t address = stream->m0ar + (stream->cr & INCREMENT ? stream->place : 0);
-            uint8_t *memory = ram_byte(m, address);
-            if (!memory && direction == TO_PERIPHERAL && address - FLASH_BASE < FLASH_SIZE)
+            uint32_t power = stream->cr >> 11 & 3, size = power < 2 ? power + 1 : 4; /* PSIZE */
+            uint8_t *memory = ram_at(m, address, size);
+            if (!memory && direction == TO_PERIPHERAL && address - FLASH_BASE <= FLASH_SIZE - size)
                 memory = m->flash + (address - FLASH_BASE);
             if (!memory) {
                 stream->cr &= ~(uint32_t)ENABLE;
@@ -43,10 +46,10 @@ static int move(struct machine *m, uint32_t peripheral, uint32_t direction, uint
                 return 0;
             }
             if (direction)
-                *byte = *memory;
+                memcpy(item, memory, size);
             else
-                *memory = *byte;
-            stream->place++;
+                memcpy(memory, item, size);
+            stream->place += size;
             stream->ndtr--;
             *last = !stream->ndtr;
             if (*last) {
@@ -63,15 +66,16 @@ static int move(struct machine *m, uint32_t peripheral, uint32_t direction, uint
     return 0;
 }
 
-int dma_put(struct machine *m, uint32_t peripheral, uint8_t byte, int *last)
+int dma_put(struct machine *m, uint32_t peripheral, uint32_t item, int *last)
 {
-    return move(m, peripheral, 0, &byte, last);
+    return move(m, peripheral, 0, &item, last);
 }
 
-int dma_take(struct machine *m, uint32_t peripheral, uint8_t *byte)
+int dma_take(struct machine *m, uint32_t peripheral, uint32_t *item)
 {
     int last;
-    return move(m, peripheral, TO_PERIPHERAL, byte, &last);
+    *item = 0;
+    return move(m, peripheral, TO_PERIPHERAL, item, &last);
 }
 
 uint32_t dma_read(struct machine *m, unsigned n, uint32_t offset)

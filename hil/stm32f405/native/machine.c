@@ -47,9 +47,11 @@ static void happen(struct machine *m, unsigned slot)
         usart_send_due(m, slot - DUE_SEND);
     } else if (slot < DUE_WATCHDOG) {
         usart_receive_due(m, slot - DUE_RECEIVE);
-    } else {
+    } else if (slot < DUE_ESC) {
         m->due[slot] = NEVER;
         m->why |= WHY_WATCHDOG;
+    } else {
+        esc_due(m, slot - DUE_ESC);
     }
 }
 
@@ -286,6 +288,8 @@ int machine_attach(struct machine *m, const struct engine *engine, uint8_t *flas
     m->ram = ram;
     m->ccm = ccm;
     m->before = before;
+    for (unsigned i = 0; i < ESCS; i++)
+        m->due[DUE_ESC + i] = NEVER;
     uc_engine *uc = engine->uc;
     int failed = engine->mmio_map(uc, 0x40000000, PERIPHERALS_SIZE, peripheral_read, m, peripheral_write, m);
     failed |= engine->mmio_map(uc, 0x50000000, PERIPHERALS_SIZE, usb_read, m, usb_write, m);
@@ -303,9 +307,9 @@ void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause)
 {
     uint32_t words[2];
     memset(&m->enabled, 0, sizeof *m - offsetof(struct machine, enabled));
-    for (unsigned slot = 0; slot < SLOTS; slot++)
+    for (unsigned slot = 0; slot < DUE_ESC; slot++)
         m->due[slot] = NEVER;
-    m->next_due = NEVER;
+    look_ahead(m);
     for (unsigned n = 0; n < USARTS; n++)
         m->usart[n].sr = 0xC0;
     for (unsigned n = 0; n < SPIS; n++)

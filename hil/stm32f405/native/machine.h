@@ -20,7 +20,7 @@ enum {
     PERIPHERALS_SIZE = 0x80000, PAGE_SIZE = 1024, /* unicorn's pages of memory */
     TIMERS = 14, BUSES = 3, SPIS = 3, USARTS = 6, PORTS = 9, DMAS = 2, STREAMS = 8,
     EXCEPTIONS = 128, IRQ = 16, /* exception number of interrupt 0 */
-    DEVICES = 16, BREAKPOINTS = 64, LOW_WRITERS = 16, WATCHPOINTS = 8, LINE_BYTES = 4096, TASKS = 32, SWITCHES = 4096,
+    DEVICES = 16, ESCS = 4, BREAKPOINTS = 64, LOW_WRITERS = 16, WATCHPOINTS = 8, LINE_BYTES = 4096, TASKS = 32, SWITCHES = 4096,
 };
 
 /* Three sums in one number, from these bits on: cycles, instructions, and modulo 2^16 those that may lower a stack pointer. */
@@ -38,7 +38,8 @@ enum {
     DUE_SEND = DUE_SPI + SPIS,
     DUE_RECEIVE = DUE_SEND + USARTS,
     DUE_WATCHDOG = DUE_RECEIVE + USARTS,
-    SLOTS,
+    DUE_ESC,
+    SLOTS = DUE_ESC + ESCS,
 };
 
 /* Why a run stopped before its time. */
@@ -88,6 +89,15 @@ struct device { /* a memory as a device on I2C or SPI: registers, or an EEPROM *
     uint32_t selected, reading, first; /* `first`: first byte of a transfer on SPI: address and direction */
     uint32_t watched, wrote;           /* `watched`: the outside acts on what is written */
     uint8_t burst[256]; /* the data of a read in progress */
+};
+
+struct esc { /* of a motor, at a timer's output */
+    const double *rpm;
+    uint32_t timer, channel, poles;
+    uint32_t bits, frame, refused, throttle; /* `refused`: frames with a wrong checksum */
+    uint32_t ready;                          /* it was told to stop since the last silence */
+    uint32_t reply, left, high;              /* the reply, how much of it has yet to leave, and the wire's level */
+    uint64_t reply_bit;                      /* [cycles] */
 };
 
 struct bus {
@@ -172,6 +182,8 @@ struct machine {
 
     uint32_t input[PORTS];
     struct device device[DEVICES];
+    struct esc esc[ESCS];
+    uint32_t escs;
     uint32_t devices, touched; /* `touched`: bits of the watched ones that the outside has not looked at since */
 
     /* From here on a reset clears everything. Exceptions: */
@@ -182,7 +194,7 @@ struct machine {
     uint32_t tick_ctrl, tick_load;
     uint64_t tick_since;
     uint32_t exti[6]; /* IMR EMR RTSR FTSR SWIER PR */
-    uint32_t output[PORTS], compare[TIMERS][4];
+    uint32_t output[PORTS], compare[TIMERS][4]; /* `compare`: an ESC's throttle where there is one */
     uint32_t watchdog_prescaler, watchdog_reload, random;
     struct timer timer[TIMERS];
     struct bus bus[BUSES];
@@ -198,6 +210,7 @@ int machine_attach(struct machine *m, const struct engine *engine, uint8_t *flas
                    uint64_t *before);
 int machine_device(struct machine *m, uint32_t bus, uint32_t address, uint8_t *memory, uint32_t size, uint32_t address_bytes,
                    uint32_t pairs);
+int machine_esc(struct machine *m, uint32_t timer, uint32_t channel, const double *rpm, uint32_t poles);
 void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause);
 uint32_t machine_run(struct machine *m, uint64_t until);
 uint32_t machine_step(struct machine *m);
@@ -229,6 +242,12 @@ void plan(struct machine *m, unsigned slot, uint64_t due);
 uint32_t timer_read(struct machine *m, unsigned n, uint32_t offset);
 void timer_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value);
 void timer_due(struct machine *m, unsigned n);
+void timer_edge(struct machine *m, unsigned n, unsigned channel, int high, uint64_t when);
+
+/* esc.c */
+struct esc *esc_at(struct machine *m, unsigned timer, unsigned channel);
+void esc_pulse(struct machine *m, struct esc *e, uint64_t width, uint64_t period, uint64_t tick, int inverted);
+void esc_due(struct machine *m, unsigned i);
 
 /* i2c.c, spi.c, usart.c */
 uint32_t bus_read(struct machine *m, unsigned n, uint32_t offset);
@@ -252,8 +271,8 @@ void usart_kick(struct machine *m);
 /* dma.c */
 uint32_t dma_read(struct machine *m, unsigned n, uint32_t offset);
 void dma_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value);
-int dma_put(struct machine *m, uint32_t peripheral, uint8_t byte, int *last);
-int dma_take(struct machine *m, uint32_t peripheral, uint8_t *byte);
+int dma_put(struct machine *m, uint32_t peripheral, uint32_t item, int *last);
+int dma_take(struct machine *m, uint32_t peripheral, uint32_t *item);
 
 /* peripherals.c */
 uint64_t peripheral_read(uc_engine *uc, uint64_t offset, unsigned size, void *user);

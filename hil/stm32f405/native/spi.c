@@ -83,7 +83,7 @@ void spi_kick(struct machine *m)
 {
     for (unsigned n = 0; n < SPIS; n++) {
         struct spi *s = &m->spi[n];
-        uint8_t byte;
+        uint32_t byte;
         while (s->cr1 & SPE && s->cr2 & TXDMAEN && s->sr & TXE && dma_take(m, BASE[n] + DR, &byte))
             write_data(m, n, byte);
         update_line(m, n);

@@ -47,7 +47,7 @@ void usart_kick(struct machine *m)
 {
     for (unsigned n = 0; n < USARTS; n++) {
         struct usart *u = &m->usart[n];
-        uint8_t byte;
+        uint32_t byte;
         while (u->cr3 & DMAT && u->sr & TXE && dma_take(m, BASE[n] + 4, &byte))
             write_data(m, n, byte);
         update_line(m, n);

@@ -2,9 +2,11 @@
 
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from hil.stm32f405.chip import Why
+from support.dshot import period_us
 from support.stm32_machine import FirmwareOnChip
 
 MS = 1000
@@ -71,6 +73,18 @@ def test_lines_leave_the_usart_by_dma_and_bytes_arrive_by_interrupt() -> None:
     ticks = [int(line.removeprefix(b"tick "), 16) for line in lines]
     assert all(10 <= later - earlier <= 13 for earlier, later in pairwise(ticks))
     assert (machine.peek("bytes_received"), machine.peek("last_received")) == (5, ord("o"))
+
+
+@COMPILERS
+def test_dshot_by_dma_moves_an_esc_and_its_answer_is_captured(compiler: str) -> None:
+    machine, rpm = FirmwareOnChip(compiler), np.array([2400.0])
+    machine.chip.add_esc(1, 1, rpm, 12)
+    run(machine, 0, 60)
+    machine.poke("throttle", 1046)
+    run(machine, 60, 100)
+    assert (machine.chip.state.compare[1][1], machine.chip.state.esc[0].refused) == (1046, 0)
+    edges = machine.peek_all("edges", machine.peek("edge_count"))
+    assert period_us(edges, 0.8 * 281) == pytest.approx(60e6 / (2400 * 6), rel=0.005)
 
 
 def test_a_hungry_watchdog_resets() -> None:
