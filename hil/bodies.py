@@ -45,7 +45,7 @@ def floaty(config: LabConfig, rng_gust: np.random.Generator, p_WB: Vector) -> Bo
 
 
 def crazyflie(config: LabConfig, rng: np.random.Generator, p_WB: Vector) -> Body:
-    """Return a Crazyflie 2.1+ with its decks."""
+    """Return a Crazyflie with its decks."""
     mass = config.quadrotor.mass + sum(DECKS[name].mass for name in config.robot.decks)
     quadrotor = config.quadrotor.model_copy(update={"mass": mass})
     return Quadrotor(quadrotor, config.tunnel, config.battery, rng, p_WB)
@@ -53,10 +53,10 @@ def crazyflie(config: LabConfig, rng: np.random.Generator, p_WB: Vector) -> Body
 
 def carrier_of(config: LabConfig, body: Body, rng: np.random.Generator) -> Carrier:
     """Return what carries the board: a body, the room around it, and the decks of the profile."""
-    room = Room(floor=config.plant.ground.height)
-    if config.robot.body == "crazyflie":
-        room = Room(0.0, config.quadrotor.room, config.quadrotor.ceiling)
-    return Carrier(body, rng, room, config.robot.decks)
+    room, escs = Room(floor=config.plant.ground.height), None
+    if isinstance(body, Quadrotor):
+        room, escs = Room(0.0, config.quadrotor.room, config.quadrotor.ceiling), body.escs
+    return Carrier(body, rng, room, config.robot.decks, escs)
 
 
 BODIES: dict[str, Make] = {"floaty": floaty, "crazyflie": crazyflie}

@@ -11,8 +11,9 @@ import numpy as np
 
 from hil.crazyflie import barometer
 from hil.crazyflie.decks import Decks
-from hil.crazyflie.parts import Parts
+from hil.crazyflie.parts import BRUSHED, BRUSHLESS, Parts
 from hil.crazyflie.radio_line import Outside, RadioLine
+from hil.errors import LabError
 from hil.stm32f405.chip import SOFTWARE, WATCHDOG, Chip, Why
 from hil.stm32f405.crash import Crash, CrashReports
 from hil.stm32f405.freertos import FreeRtos
@@ -26,6 +27,9 @@ LOOK_PERIOD_US = 100_000  # for tasks that do not wait
 HANG_US, AT_CRASH_US = 1_000_000, 5_000
 CLOCK_HIGH, TIM7_COUNT = "usecTimerHighCount", 0x4000_1424  # of the firmware's usec_time.c
 ASSERTION = "assertFail"
+PLATFORM = "platformInit"  # refuses to start on a board whose device type its table lacks
+PROFILES = {BRUSHED: "crazyflie", BRUSHLESS: "crazyflie-brushless"}  # that ship, by device type
+POLES = 12  # of a brushless motor; MOTORS_NBR_OF_POLES of Bitcraze's firmware
 
 
 class Surroundings(Outside, Protocol):
@@ -56,6 +60,10 @@ class Crazyflie:
         self.image = image
         self.chip = chip = Chip(image.code, image.base, library, image.constants)
         self.parts = Parts(chip, np.frombuffer(outside.eeprom, np.uint8), carrier)
+        _check_board(image, self.parts.device_type)
+        if carrier is not None and carrier.escs is not None:
+            for motor, (timer, channel) in enumerate(outputs):
+                chip.add_esc(timer, channel, carrier.escs[motor : motor + 1], POLES)
         self.tasks = FreeRtos.of(image, chip.read)
         run = chip.run if debugger is None else DebuggedChip(chip, debugger, self.tasks).run
         self.processor = ChipProcessor(chip, self.tasks, self._act, run)
@@ -143,3 +151,14 @@ class Crazyflie:
         self.chip.reset(cause)
         self.radio.reset(self.chip.now_us)
         self.chip.crash_points |= self._crashes.addresses
+
+
+def _check_board(image: Image, device_type: str) -> None:
+    """Raise `LabError` for Bitcraze's firmware that would not start on a board of this type."""
+    known = [one for one in PROFILES if f"{one}\0".encode() in image.code]
+    if image.has(PLATFORM) and device_type not in known:
+        fitting = "".join(f"; --profile {PROFILES[one]}" for one in known)
+        raise LabError(
+            f"{image.path}: built for boards of device type {' and '.join(known) or 'unknown here'}, but this robot's is "
+            f"{device_type}{fitting}"
+        )

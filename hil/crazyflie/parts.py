@@ -22,7 +22,7 @@ SYSLINK_USART = 6
 GYRO_ID, ACCEL_ID = 0x0F, 0x1E
 GYRO_RATES, GYRO_SELF_TEST, GYRO_FINE = 0x02, 0x3C, 0x12  # data sheet: rate_ok and bist_rdy
 ACCEL_STATUS, ACCEL_READY, ACCELERATIONS = 0x03, 0x80, 0x12
-DEVICE_TYPE = b"0;CF21\0"
+BRUSHED, BRUSHLESS = "CF21", "C21B"  # device types
 DATA_READY = ("C", 14)
 RADIO_BUSY = ("A", 4)  # the nRF51 holds it high while it takes no bytes
 
@@ -44,7 +44,8 @@ class Parts:
             chip.add_device(SENSOR_BUS, address, self.accel)
         chip.add_device(SENSOR_BUS, PRESSURE_ADDRESS, pressure, pairs=True)
         chip.add_device(DECK_BUS, EEPROM_ADDRESS, eeprom, address_bytes=2)
-        chip.set_system(OTP, DEVICE_TYPE)
+        self.device_type = BRUSHED if carrier is None or carrier.escs is None else BRUSHLESS
+        chip.set_system(OTP, f"0;{self.device_type}\0".encode())
         for port in "ABCDE":
             for number in range(16):
                 chip.pin(port, number, (port, number) not in (DATA_READY, RADIO_BUSY))

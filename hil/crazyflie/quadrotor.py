@@ -1,9 +1,9 @@
-"""A Crazyflie 2.1+ in the air of a room: four brushed motors on a rigid body, the floor below it, the walls around it.
+"""A Crazyflie in the air of a room: four motors on a rigid body, the floor below it, the walls around it.
 
 Frames: W world (z up, the floor at 0), B body (x forward, y left, z up, at the centre of mass). The motors count as in the
 firmware: M1 front right, M2 back right, M3 back left, M4 front left; seen from above M1 and M3 turn counter-clockwise.
-The keys of `QuadrotorConfig` name the sources of all constants; the firmware also uses one curve, `V_TO_THRUST`: both
-have it from Bitcraze's measurement.
+The keys of `QuadrotorConfig` name the sources of all constants; the firmware also uses one curve, `volts_to_thrust`: both
+have it from Bitcraze's measurement. Brushed motors take PWM; brushless ones have ESCs, which take DSHOT.
 
 The truth is computed per whole millisecond, as for every body.
 """
@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,28 +32,18 @@ from hil.world.plates import State
 from hil.world.tunnel import Tunnel
 
 ORANGE = "#e69f00"
-OUTPUTS = (
-    (1, 1),
-    (1, 3),
-    (1, 0),
-    (3, 3),
-)  # of M1 to M4: TIM2_CH2, TIM2_CH4, TIM2_CH1, TIM4_CH4, counted from 0
-
-# Thrust of one motor [N] over its voltage [V]: 2.1+ propellers; crazyflie-firmware 2a18fc29, platform_defaults_cf2.h, and
-# Bitcraze's report of October 2025, "Keeping thrust consistent as the battery drains".
-V_TO_THRUST = (-0.02476537915958403, 0.06523793527519485, -0.026792504967750107, 0.006776789303971145)
-# Thrust [N] and torque [N m] of one propeller over its speed [rpm], the same propellers; crazyflow 0.4, cf2x_P250.
-RPM_TO_THRUST = (-3.6200226530383495e-7, 1.6060924304100328e-10)  # linear, quadratic
-RPM_TO_TORQUE = (-2.2665265829562245e-9, 1.1149485566919186e-12)
-IDLE_RPM = -RPM_TO_THRUST[0] / RPM_TO_THRUST[1]  # up to here a propeller does not lift
-IDLE_V = 0.4558  # [V] where V_TO_THRUST begins to lift
+OUTPUTS = {  # of M1 to M4, timer and channel counted from 0: TIM2_CH2, TIM2_CH4, TIM2_CH1, and TIM4_CH4 or TIM2_CH3
+    "brushed": ((1, 1), (1, 3), (1, 0), (3, 3)),
+    "brushless": ((1, 1), (1, 3), (1, 0), (1, 2)),
+}
+# Of what the outputs carry: TIM2 and TIM4 count to 255, and DSHOT has 11 bits. The firmware's 16 bits lose their lower ones.
+STEPS = {"brushed": 256, "brushless": 2048}
 RADIANS_PER_RPM = 2.0 * math.pi / 60.0
-PWM_STEPS = 256  # TIM2 and TIM4 count to 255: the firmware's 16 bits lose their lower half
 FRONT, LEFT = (1.0, -1.0, -1.0, 1.0), (-1.0, -1.0, 1.0, 1.0)  # where the motors are
 TURN = (1.0, -1.0, 1.0, -1.0)  # of the propellers about z of B
 
 # Places of the array behind those that bodies share
-DUTY = at.SIZE  # (4,) share of the PWM period
+DUTY = at.SIZE  # (4,) share of the supply voltage that a motor gets
 RPM = DUTY + 4  # (4,) of the propellers
 SPIN_UP = RPM + 4  # (4,) [rpm/s]
 SUPPLY = SPIN_UP + 4  # [V] at the motors' drivers
@@ -73,7 +64,13 @@ IMPACT_MAX = ROTOR_ABOVE + 1
 TOUCHED = IMPACT_MAX + 1  # 1: the feet were on the floor a step before
 SINKING = TOUCHED + 1  # [m/s] when the step began
 SHAKING = SINKING + 1  # (2,) [rad/s, m/s2] per rms of the rotors' squared speeds [rpm2]
-SIZE = SHAKING + 2
+VOLTS_TO_THRUST = SHAKING + 2  # (4,) from the constant to the cubic
+RPM_TO_THRUST = VOLTS_TO_THRUST + 4  # (2,) linear, quadratic
+RPM_TO_TORQUE = RPM_TO_THRUST + 2  # (2,)
+CURVE_BEGIN = RPM_TO_TORQUE + 2  # [V]
+DEAD_VOLTS = CURVE_BEGIN + 1  # [V] up to here a motor stands
+SLOW_RPM = DEAD_VOLTS + 1  # [rpm/V] between the two
+SIZE = SLOW_RPM + 1
 
 LEFT_ROOM, TOO_HIGH, HIT_FLOOR, TUMBLED = 1, 2, 3, 4  # causes in LOST
 LOSS_TEXTS = {
@@ -84,8 +81,11 @@ LOSS_TEXTS = {
 }
 
 
+Positive = Annotated[float, Field(gt=0.0)]
+
+
 class QuadrotorConfig(Section):
-    """A Crazyflie 2.1+ with its battery of 250 mAh, no deck, and the room around it.
+    """A Crazyflie and the room around it; the defaults are a 2.1+ with its battery of 250 mAh and no deck.
 
     "Förster" is his bachelor's thesis, "System Identification of the Crazyflie 2.0 Nano Quadrocopter", ETH Zurich 2015;
     "crazyflow" the parameters of the simulator of the same name, 0.4 (Learning Systems and Robotics Lab, 2025), cf2x_P250.
@@ -96,6 +96,27 @@ class QuadrotorConfig(Section):
         (16.571710e-6, 16.655602e-6, 29.261652e-6), description="about x, y, z of B [kg m2]; Förster"
     )
     arm: float = number(0.046, "(0.01, 0.5]", "centre to motor [m]; ARM_LENGTH of Bitcraze's firmware")
+    motors: Literal["brushed", "brushless"] = Field(
+        "brushed",
+        description="brushed, on a board of device type CF21, or brushless with ESCs, on one of C21B",
+    )
+    volts_to_thrust: tuple[float, float, float, float] = Field(
+        (-0.02476537915958403, 0.06523793527519485, -0.026792504967750107, 0.006776789303971145),
+        description="thrust of one motor [N] over its voltage, from the constant to the cubic; crazyflie-firmware 2a18fc29, "
+        'platform_defaults_cf2.h, and Bitcraze\'s report of October 2025, "Keeping thrust consistent as the battery drains"',
+    )
+    curve_begin: float = number(0.4558, "(0, 5]", "the curve holds from here on [V]; its zero")
+    dead_share: float = number(
+        0.0, "[0, 0.9]", "share of curve_begin up to which motors stand, then linear in speed [1]; chosen"
+    )
+    rpm_to_thrust: tuple[float, Positive] = Field(
+        (-3.6200226530383495e-7, 1.6060924304100328e-10),
+        description="thrust of one propeller [N] over its speed, linear and quadratic; crazyflow",
+    )
+    rpm_to_torque: tuple[float, Positive] = Field(
+        (-2.2665265829562245e-9, 1.1149485566919186e-12),
+        description="torque of one propeller [N m] over its speed, linear and quadratic; crazyflow",
+    )
     rotor_lag: float = number(
         0.0647, "(0.001, 0.5]", "of a rotor's speed, first order [s]; Förster: pole 0.96954 at 500 Hz"
     )
@@ -138,27 +159,38 @@ class QuadrotorConfig(Section):
 
 
 @compiled
-def steady_rpm(volts: float) -> float:
-    """Return the speed [rpm] at which a propeller turns with a voltage at its motor."""
-    if volts <= IDLE_V:
-        return max(volts, 0.0) * (IDLE_RPM / IDLE_V)
-    c0, c1, c2, c3 = V_TO_THRUST
-    thrust = max(c0 + volts * (c1 + volts * (c2 + volts * c3)), 0.0)
-    a, b = RPM_TO_THRUST
+def thrust_at(s: State, rpm: float) -> float:
+    """Return the nominal thrust [N] of a propeller at a speed."""
+    return max(rpm * (float(s[RPM_TO_THRUST]) + rpm * float(s[RPM_TO_THRUST + 1])), 0.0)
+
+
+@compiled
+def rpm_for(s: State, thrust: float) -> float:
+    """Return the speed [rpm] at which a propeller has a thrust [N]."""
+    a, b = float(s[RPM_TO_THRUST]), float(s[RPM_TO_THRUST + 1])
     return (-a + math.sqrt(a * a + 4.0 * b * thrust)) / (2.0 * b)
 
 
-def hover_rpm(mass: float) -> float:
-    """Return the speed [rpm] of four rotors that carry a mass [kg]."""
-    a, b = RPM_TO_THRUST
-    return (-a + math.sqrt(a * a + b * mass * GRAVITY)) / (2.0 * b)
+@compiled
+def curve_rpm(s: State, volts: float) -> float:
+    """Return the speed [rpm] that the curve of thrust over voltage has at a voltage."""
+    c = VOLTS_TO_THRUST
+    return rpm_for(s, max(float(s[c] + volts * (s[c + 1] + volts * (s[c + 2] + volts * s[c + 3]))), 0.0))
+
+
+@compiled
+def steady_rpm(s: State, volts: float) -> float:
+    """Return the speed [rpm] at which a propeller turns with a voltage at its motor."""
+    if volts <= s[CURVE_BEGIN]:
+        return max(volts - float(s[DEAD_VOLTS]), 0.0) * float(s[SLOW_RPM])
+    return curve_rpm(s, volts)
 
 
 @compiled
 def spin(s: State, duration: float) -> None:
     """Bring the propellers towards the speeds of their voltages, for `duration` [s]."""
     for i in range(4):
-        wanted = steady_rpm(s[DUTY + i] * s[SUPPLY] * s[CURRENT + i])
+        wanted = steady_rpm(s, s[DUTY + i] * s[SUPPLY] * s[CURRENT + i])
         n = s[RPM + i]
         s[RPM + i] = wanted + (n - wanted) * exp(-duration / s[LAG])
         s[SPIN_UP + i] = (s[RPM + i] - n) / duration
@@ -180,8 +212,8 @@ def evaluate(s: State) -> None:
     gain = near_ground(s)
     for i in range(4):
         n = s[RPM + i]
-        thrust = gain * s[STRENGTH + i] * max(n * (RPM_TO_THRUST[0] + n * RPM_TO_THRUST[1]), 0.0)
-        torque = s[STRENGTH + i] * max(n * (RPM_TO_TORQUE[0] + n * RPM_TO_TORQUE[1]), 0.0)
+        thrust = gain * s[STRENGTH + i] * thrust_at(s, n)
+        torque = s[STRENGTH + i] * max(n * (s[RPM_TO_TORQUE] + n * s[RPM_TO_TORQUE + 1]), 0.0)
         torque += s[ROTOR_INERTIA] * RADIANS_PER_RPM * s[SPIN_UP + i]
         s[THRUST + i] = thrust
         lift += thrust
@@ -274,10 +306,8 @@ class Quadrotor(InTunnel):
     """The robot, its motors and the room, in the air of a tunnel whose fans may stand still.
 
     Beside the views of every body: truth (SIZE,) everything; acceleration_W, alpha_B (3,); rpm, thrust (4,) of the rotors
-    [rpm, N].
+    [rpm, N]; escs those speeds for the ESCs of brushless motors, None with brushed ones.
     """
-
-    outputs: Sequence[tuple[int, int]] = OUTPUTS
 
     def __init__(
         self,
@@ -295,7 +325,13 @@ class Quadrotor(InTunnel):
         s[ARM_XY] = config.arm * math.sqrt(0.5)
         s[LAG], s[ROTOR_INERTIA], s[MOTOR_POWER] = config.rotor_lag, config.rotor_inertia, config.motor_power
         s[ROTOR_DRAG : ROTOR_DRAG + 2] = config.rotor_drag
-        s[SHAKING : SHAKING + 2] = np.array(config.vibration) / (2.0 * hover_rpm(config.mass) ** 2)
+        s[VOLTS_TO_THRUST : VOLTS_TO_THRUST + 4] = config.volts_to_thrust
+        s[RPM_TO_THRUST : RPM_TO_THRUST + 2] = config.rpm_to_thrust
+        s[RPM_TO_TORQUE : RPM_TO_TORQUE + 2] = config.rpm_to_torque
+        begin, dead = config.curve_begin, config.curve_begin * config.dead_share
+        s[CURVE_BEGIN], s[DEAD_VOLTS], s[SLOW_RPM] = begin, dead, curve_rpm(s, begin) / (begin - dead)
+        hover_rpm = rpm_for(s, 0.25 * config.mass * GRAVITY)
+        s[SHAKING : SHAKING + 2] = np.array(config.vibration) / (2.0 * hover_rpm**2)
         s[GROUND_GAIN], s[ROTOR_RADIUS] = config.ground_effect, config.rotor_radius
         s[ROTOR_ABOVE] = config.rotor_above
         s[at.FOOT_SPREAD], s[at.FOOT_BELOW] = s[ARM_XY], config.foot_below
@@ -311,9 +347,11 @@ class Quadrotor(InTunnel):
         self.truth = self._view(0, SIZE)
         self.acceleration_W, self.alpha_B = self._view(at.ACC, 3), self._view(at.ALPHA, 3)
         self.rpm, self.thrust = self._view(RPM, 4), self._view(THRUST, 4)
+        self.outputs: Sequence[tuple[int, int]] = OUTPUTS[config.motors]
+        self.escs = self.rpm if config.motors == "brushless" else None
         self._electronics = self._power = battery.electronics_power
         self._drawn_us, self._drawn_J = 0, 0.0
-        self._commanded = np.zeros(4)  # share of the PWM period
+        self._commanded = np.zeros(4)  # share of the supply voltage
         self.settings: Mapping[str, Setting] = {
             f"motor.{name}.{i + 1}": self._setting(place + i)
             for name, place in (("strength", STRENGTH), ("current", CURRENT), ("obeys", OBEYS))
@@ -323,10 +361,11 @@ class Quadrotor(InTunnel):
         self.place((0.0, 0.0, config.foot_below - sunk) if p_WB is None else p_WB, UPRIGHT)
 
     def set_counts(self, now_us: int, counts: Sequence[int]) -> None:
-        """Take the compare counts of M1 to M4; a PWM period of 3 us is no delay."""
+        """Take the compare counts of M1 to M4, or their throttles; a PWM period of 3 us is no delay."""
         self.advance(now_us)
+        steps = STEPS[self._config.motors]
         for i, count in enumerate(counts):
-            self._commanded[i] = duty = min(max(count, 0), PWM_STEPS) / PWM_STEPS
+            self._commanded[i] = duty = min(max(count, 0), steps) / steps
             if self._s[OBEYS + i] != 0.0:
                 self._s[DUTY + i] = duty
 
@@ -355,8 +394,7 @@ class Quadrotor(InTunnel):
 
     def _commanded_thrust(self) -> NDArray[np.float64]:
         volts = self._commanded * self._s[SUPPLY]
-        c0, c1, c2, c3 = V_TO_THRUST
-        return np.where(volts > IDLE_V, c0 + volts * (c1 + volts * (c2 + volts * c3)), 0.0)
+        return np.array([thrust_at(self._s, steady_rpm(self._s, one)) for one in volts.tolist()])
 
     @property
     def lost(self) -> str | None:

@@ -96,12 +96,16 @@ class Motion(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Carrier:
-    """The body that carries a board, the random stream of its sensors, the room that they see, and its decks, by name."""
+    """The body that carries a board, the random stream of its sensors, the room that they see, and its decks, by name.
+
+    `escs` (4,) are the speeds [rpm] of motors whose ESCs take DSHOT at the board's outputs; None: it has no ESCs.
+    """
 
     motion: Motion
     rng: np.random.Generator
     room: Room = field(default_factory=Room)
     decks: tuple[str, ...] = ()
+    escs: View | None = None
 
 
 class Body(Motion, Protocol):

@@ -11,15 +11,15 @@ from hil.scene import Look
 from hil.world.body import Body
 from support.paths import ROOT
 
-PROFILES = {"floaty": "floaty", "crazyflie": "crazyflie"}
+PROFILES = ("crazyflie", "crazyflie-brushless", "floaty")
 OWN = ROOT / "hil" / "commands" / "robot_project"
 G = 9.81
 
 
-@pytest.fixture(params=[*sorted(PROFILES), OWN])
+@pytest.fixture(params=[*PROFILES, OWN])
 def config(request: pytest.FixtureRequest, tmp_path: Path) -> LabConfig:
     if request.param in PROFILES:
-        return load_config(PROFILES[request.param])
+        return load_config(request.param)
     for name in ("controller.py", "profile.toml", "robot.py"):
         (tmp_path / name).write_text((OWN / f"{name}.in").read_text(encoding="utf-8"), encoding="utf-8")
     return load_config(str(tmp_path / "profile.toml"))
@@ -36,7 +36,7 @@ def body(config: LabConfig) -> Body:
 
 
 def test_every_body_that_ships_is_tried() -> None:
-    assert set(PROFILES) == set(BODIES)
+    assert {load_config(profile).robot.body for profile in PROFILES} == set(BODIES)
 
 
 def test_held_it_stays_and_feels_its_weight(body: Body) -> None:

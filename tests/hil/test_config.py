@@ -16,6 +16,7 @@ def test_shipped_profiles_load() -> None:
         "as-flown",
         "cad",
         "crazyflie",
+        "crazyflie-brushless",
         "crazyflie-decks",
         "design-best",
         "design-double",

@@ -37,7 +37,7 @@ NOT_RUN = (
     (r"floaty compare runs/lab-1", BOARD),
     (r"floaty board doctor\b", BOARD),
     (r"floaty fly .*--board (radio|usb|udp):", BOARD),
-    (r"floaty (fly|deploy check) .*build/cf2\.elf", IMAGE),
+    (r"floaty (fly|deploy check) .*build/cf2(1bl)?\.elf", IMAGE),
     (r"gdb-multiarch ", IMAGE),
     (r"floaty fly .*--link (radio|udp|mavlink):", PACED),
     (r"env PYTHONPATH=\S+ FLOATY_DONGLE=", SERVER),

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from hil.config import load_config
 from hil.crazyflie.failures import MOTOR_FAILURES
-from hil.crazyflie.quadrotor import PWM_STEPS, Quadrotor, QuadrotorConfig, hover_rpm, steady_rpm
+from hil.crazyflie.quadrotor import STEPS, Quadrotor, QuadrotorConfig, rpm_for, steady_rpm
 from hil.errors import LabError
 from hil.laboratory.fault_kinds import KINDS
 from hil.world.config import BatteryConfig, TunnelConfig
@@ -33,7 +34,8 @@ def spun_up(duties: tuple[float, float, float, float], volts: float = 4.0, **con
     body = make(**config)
     body.hold()
     body.draw(0, volts)
-    body.set_counts(0, [round(PWM_STEPS * duty) for duty in duties])
+    steps = STEPS[str(config.get("motors", "brushed"))]
+    body.set_counts(0, [round(steps * duty) for duty in duties])
     body.advance(1_000_000)
     body.release()
     return body
@@ -99,7 +101,7 @@ def test_a_propeller_approaches_its_speed_with_foersters_pole() -> None:
     for ms in range(2, 202, 2):
         body.advance(1000 * ms)
         speeds.append(body.rpm[0])
-    left = steady_rpm(2.0) - np.array(speeds)
+    left = steady_rpm(body.truth, 2.0) - np.array(speeds)
     assert left[1:] / left[:-1] == pytest.approx(0.9695404, abs=1e-4)
 
 
@@ -298,7 +300,7 @@ def test_every_fault_of_a_motor_turns_a_setting_of_it() -> None:
 def test_vibration_grows_with_the_square_of_the_rotors_speeds() -> None:
     hovering = spun_up((0.625,) * 4, hover_volts() / 0.625)
     assert hovering.vibration == pytest.approx([0.02, 0.5], rel=0.005)
-    assert hover_rpm(0.029) == pytest.approx(hovering.rpm, rel=0.003)
+    assert rpm_for(hovering.truth, 0.029 * G / 4) == pytest.approx(hovering.rpm, rel=0.003)
     one = spun_up((0.625, 0.0, 0.0, 0.0), hover_volts() / 0.625)
     assert one.vibration == pytest.approx([0.01, 0.25], rel=0.005)
     slow = spun_up((0.4,) * 4)
@@ -317,3 +319,47 @@ def test_seeds_draw_other_motors() -> None:
 def test_cannot_be_placed_where_nothing_is() -> None:
     with pytest.raises(LabError, match="not a finite pose"):
         make().place((0.0, math.nan, 1.0), LEVEL)
+
+
+# The profile's Crazyflie 2.1 Brushless
+
+BRUSHLESS = load_config("crazyflie-brushless").quadrotor.model_dump() | {"motor_spread": 0.0, "ceiling": 3.0}
+# crazyflie-firmware 2a18fc29, platform_defaults_cf21bl.h
+BRUSHLESS_THRUST_OF_V = np.polynomial.Polynomial(
+    (-0.014058926705279723, 0.04265273261724981, 0.0018327760144017432, 0.0020576974784587178)
+)
+BRUSHLESS_THRUST2TORQUE, CF_MASS, THRUST_MIN, THRUST_MAX = 0.00569278844371417, 0.0393, 0.02136263, 0.2
+
+
+@pytest.mark.parametrize("volts", [1.5, 2.0, 3.0])
+def test_brushless_thrust_is_bitcrazes_measurement_and_torque_its_share(volts: float) -> None:
+    body = spun_up((0.75, 0.75, 0.75, 0.75), volts / 0.75, **BRUSHLESS)
+    assert body.thrust == pytest.approx(4 * [BRUSHLESS_THRUST_OF_V(volts)], rel=2e-4)
+    assert THRUST_MIN < body.thrust[0] < THRUST_MAX
+    only = spun_up((0.0, 0.75, 0.0, 0.0), volts / 0.75, **BRUSHLESS)
+    torque = only.alpha_B[2] * BRUSHLESS["inertia"][2]
+    assert torque / only.thrust[1] == pytest.approx(BRUSHLESS_THRUST2TORQUE, rel=0.12)  # crazyflow's fit
+
+
+def test_brushless_hovers_at_the_throttle_that_bitcrazes_curve_says() -> None:
+    roots = (BRUSHLESS_THRUST_OF_V - CF_MASS * G / 4).roots()
+    volts = float(next(root.real for root in roots if abs(root.imag) < 1e-9))
+    body = spun_up((0.52,) * 4, volts / 0.52, **BRUSHLESS)
+    assert body.acceleration_W == pytest.approx([0.0, 0.0, 0.0], abs=0.01)
+    assert volts / 3.87 == pytest.approx(0.52, abs=0.01)
+
+
+@pytest.mark.parametrize("volts", [3.5, 4.2])
+def test_idling_motors_turn_as_the_firmwares_arming_check_expects(volts: float) -> None:
+    body = make(**BRUSHLESS)
+    body.draw(0, volts)
+    body.set_counts(0, 4 * [7000 >> 5])
+    assert body.escs is not None
+    body.advance(250_000)  # of its 500 ms before the take-off it needs 200
+    assert body.escs.min() > 1000
+    body.advance(2_000_000)
+    assert body.escs.max() < 3500
+
+
+def test_brushed_motors_have_no_escs() -> None:
+    assert make().escs is None

@@ -1,0 +1,92 @@
+"""The Crazyflie 2.1 Brushless' own firmware, unmodified, flies by DSHOT: the ELF that FLOATY_BRUSHLESS_ELF names."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from hil.api import Request, column, fly
+from hil.crazyflie.log_table import log_table
+from hil.errors import LabError
+from hil.experiments.hover import HOVER
+from hil.laboratory.fault_kinds import KINDS
+from support.flights import served_image
+from support.stm32_firmware import build
+
+ELF = os.environ.get("FLOATY_BRUSHLESS_ELF", "")
+needs_image = pytest.mark.skipif(
+    not ELF, reason="FLOATY_BRUSHLESS_ELF names no build of platform cf21bl: no Brushless was flown"
+)
+PROFILE = "crazyflie-brushless"
+ARM = bytes((0xD0, 1, 1))
+
+
+@pytest.mark.parametrize(("profile", "board", "other"), [
+    ("crazyflie", "CF21", "C21B"), (PROFILE, "C21B", "CF21"),
+])  # fmt: skip
+def test_firmware_of_another_board_is_one_clear_line(
+    profile: str, board: str, other: str, tmp_path: Path
+) -> None:
+    flags = [("-g", f'-DDEVICE_TYPE="{name}"') for name in (other, board, "CF99")]
+    wrong, right, unknown = (str(build(flags=flag)) for flag in flags)
+    with pytest.raises(
+        LabError, match=f"elf: built for boards of device type {other}, .* is {board}; --profile crazyflie"
+    ):
+        fly("hover", tmp_path / "a", profile=profile, board=wrong)
+    with pytest.raises(
+        LabError, match=f"built for boards of device type unknown here, but this robot's is {board}$"
+    ):
+        fly("hover", tmp_path / "b", profile=profile, board=unknown)
+    with pytest.raises(LabError, match="the image has no such parameter"):  # the next thing that it lacks
+        fly("hover", tmp_path / "c", profile=profile, board=right)
+
+
+def test_flies_only_from_an_image() -> None:
+    with pytest.raises(LabError, match=r"^profile crazyflie-brushless: its robot flies with .* --board FILE"):
+        Request.of(HOVER, profile=PROFILE)
+
+
+@needs_image
+@pytest.mark.parametrize("controller", [1, 2, 3], ids=["pid", "mellinger", "indi"])
+def test_takes_off_holds_and_lands_with_each_controller(controller: int, tmp_path: Path) -> None:
+    settings = {"pilot.parameters.stabilizer.controller": controller, "pilot.land_s": 5.0}
+    run = fly("hover", tmp_path / "run", profile=PROFILE, board=ELF, overrides=settings, duration_s=14.0)
+    assert run.result.outcome == "completed"
+    held = [verdict for verdict in run.result.verdicts if verdict.metric in ("max_x", "max_y")]
+    assert all(verdict.holds for verdict in held), held
+    log = run.log
+    assert column(log, "truth.z").max() > 0.9
+    assert column(log, "truth.z")[-1] < 0.02
+    in_air = (column(log, "truth.z") > 0.9) & (abs(column(log, "truth.vz")) < 0.02)
+    share = column(log, "motor.m1", "motor.m2", "motor.m3", "motor.m4")[in_air].mean() / 65535
+    volts = column(log, "battery.voltage")[in_air].mean()
+    assert share * volts == pytest.approx(2.02, rel=0.03)  # [V] of Bitcraze's curve at a quarter of 39.3 g
+
+
+@needs_image
+@pytest.mark.parametrize("experiment", ["hover", "y-square", "figure-eight"])
+def test_experiments_hold_their_limits(experiment: str, tmp_path: Path) -> None:
+    result = fly(experiment, tmp_path / "run", profile=PROFILE, board=ELF).result
+    assert [str(verdict) for verdict in result.verdicts if not verdict.holds] == []
+
+
+@needs_image
+@pytest.mark.parametrize("kind", ["motor.weak.1", "motor.stop.2", "motor.stuck.3"])
+def test_hover_with_a_failed_motor_is_lost_where_that_is_stated(kind: str, tmp_path: Path) -> None:
+    run = fly("hover", tmp_path / "run", profile=PROFILE, board=ELF, duration_s=12.0, faults=[f"{kind}@4"])
+    assert (run.result.outcome == "lost") == (KINDS[kind].outcome == "lost"), run.result.cause
+
+
+@needs_image
+def test_armed_motors_idle_and_the_firmware_knows_their_speeds() -> None:
+    with served_image(ELF, PROFILE) as server:
+        robot = server.ends.robots[0].robot
+        robot.packet_received(1_000_000, ARM)
+        server.lab.end_at(2_000_000)
+        server.lab.run()
+        table = {v.name: v for v in log_table(robot.firmware.image, robot.firmware.chip)}
+        speeds = [table[f"motor.m{motor}_rpm"].read() for motor in (1, 2, 3, 4)]
+        assert speeds == pytest.approx(robot.body.rpm.tolist(), rel=0.01)
+        assert min(speeds) > 1000
+        assert max(speeds) < 3500
+        assert robot.firmware.chip.state.esc[0].refused == 0
