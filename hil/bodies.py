@@ -11,8 +11,8 @@ from hil.crazyflie.decks import DECKS
 from hil.crazyflie.failures import MOTOR_FAILURES
 from hil.crazyflie.quadrotor import Quadrotor
 from hil.errors import LabError, blame, hint
+from hil.floaty.correction import PAPER_TABLE
 from hil.floaty.failures import SERVO_FAILURES
-from hil.floaty.paper_table import PAPER_TABLE
 from hil.floaty.plant import Plant
 from hil.own_files import load_file
 from hil.world.battery import open_circuit_voltage

@@ -19,7 +19,7 @@ from rich.table import Table
 
 from hil.campaigns.run import Runner
 from hil.errors import LabError
-from hil.floaty.paper_table import PAPER_TABLE
+from hil.floaty.correction import PAPER_TABLE
 from hil.identify.identify import IDENTIFIED, IdentifiedConstant, identify
 from hil.identify.record import load_record
 from hil.laboratory.request import Options

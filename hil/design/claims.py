@@ -15,8 +15,8 @@ from hil.design.authority import wrenches
 from hil.design.axes import AXES, PITCH, ROLL
 from hil.design.linear import Point, places
 from hil.design.trim import balanced, changed
+from hil.floaty.correction import PAPER_TABLE
 from hil.floaty.geometry import weigh
-from hil.floaty.paper_table import PAPER_TABLE
 
 AGREES, DIFFERS, NOTHING = "agrees", "differs", "no value"
 ROUGHLY = 0.15  # relative deviation that "approximately" covers

@@ -4,8 +4,9 @@ The values that depend on the plate model (trim, its own constants L, its lift r
 compiled model itself; only the target constants T are typed, with their source.
 """
 
-import dataclasses
 import math
+from dataclasses import dataclass, fields, replace
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from firmware_py.compiling import bound
 from firmware_py.elementary import cos, sin
 from firmware_py.geometry import from_euler_zyx, multiply
 from hil.floaty.geometry import Weight
-from hil.floaty.paper_table import PAPER_TABLE
 from hil.floaty.shape import MIX
 from hil.world import layout as at
 from hil.world.config import PlantConfig
@@ -22,8 +22,26 @@ from hil.world.fixed_order import fit_polynomial
 from hil.world.motion import GRAVITY, evaluate
 from hil.world.plates import LIFT_U4_MAX, State
 
+# The paper's Table "Empirical estimation of dynamics constants": value and uncertainty, by the names of `Constants`.
+PAPER_TABLE: dict[str, tuple[float, float]] = {
+    "roll_u1": (230.0, 66.0),
+    "roll_roll": (-16.0, 10.0),
+    "roll_rate": (-40.0, 12.0),
+    "y_u1": (-4.8, 0.1),
+    "y_roll": (-6.5, 0.1),
+    "pitch_u2": (1100.0, 170.0),
+    "pitch_pitch": (-1560.0, 25.0),
+    "pitch_rate": (-29.0, 5.0),
+    "x_u2": (-0.8, 0.1),
+    "x_pitch": (2.5, 0.1),
+    "yaw_u3": (110.0, 1.8),
+    "yaw_rate": (-7.7, 0.1),
+    "z_u4": (2.3, 0.3),
+    "z_vz": (-2.0, 0.1),
+}
 
-@dataclasses.dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True, slots=True)
 class Constants:
     """The linearised dynamics at hover: f_{affected, cause}; SI, W axes for x y z, the paper's u1..u4 [rad]."""
 
@@ -54,6 +72,7 @@ PITCH_INPUT_METHODS = -1066.0
 
 LIFT_SAMPLES = np.linspace(-LIFT_U4_MAX, LIFT_U4_MAX, 45)  # [rad] u4 at which l is fitted, every 0.025
 LIFT_ORDER = 6
+AFFECTED = ("x", "y", "z", "roll", "pitch", "yaw")  # by the rows of `accelerations`
 DIFFERENCE = 1e-3  # [rad, rad/s, m/s] step of the five-point difference
 
 
@@ -72,7 +91,7 @@ def calm(s: State, speed: float) -> State:
     return c
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class OperatingPoint:
     """A robot's mean state in flight: inputs u1..u4 [rad], attitude roll, pitch, yaw [rad], side wind [m/s, W]."""
 
@@ -115,15 +134,14 @@ def linearise(s: State, speed: float, point: OperatingPoint = LEVEL) -> Constant
     c[at.FLAPS : at.FLAPS + 4] += sum(column * u for column, u in zip(MIX.T, point.inputs, strict=True))
     c[at.SIDE_WIND : at.SIDE_WIND + 3] = point.side_wind
     c[at.Q : at.Q + 4] = from_euler_zyx(*point.attitude)
-    u1, u2, u3, u4 = (slope(c, cause).tolist() for cause in ("u1", "u2", "u3", "u4"))
-    roll, pitch, vx, vy, vz = (slope(c, cause).tolist() for cause in ("qx", "qy", "vx", "vy", "vz"))
-    p, q, r = (slope(c, cause).tolist() for cause in ("ox", "oy", "oz"))
-    return Constants(
-        roll_u1=u1[3], roll_roll=roll[3], roll_rate=p[3], y_u1=u1[1], y_roll=roll[1],
-        pitch_u2=u2[4], pitch_pitch=pitch[4], pitch_rate=q[4], x_u2=u2[0], x_pitch=pitch[0],
-        yaw_u3=u3[5], yaw_rate=r[5], z_u4=u4[2],
-        z_vz=vz[2], y_vy=vy[1], x_vx=vx[0], roll_vy=vy[3], pitch_vx=vx[4],
-    )  # fmt: skip
+    slope_of = cache(partial(slope, c))
+    found = {}
+    for name in (field.name for field in fields(Constants)):
+        affected, cause = name.split("_")
+        row = AFFECTED.index(affected)
+        turn = {"roll": "qx", "pitch": "qy", "rate": f"o{'xyz'[row - 3]}"}.get(cause, cause)
+        found[name] = float(slope_of(turn)[row])
+    return Constants(**found)
 
 
 def target_constants(config: PlantConfig, plate: Constants) -> Constants:
@@ -133,9 +151,9 @@ def target_constants(config: PlantConfig, plate: Constants) -> Constants:
         changes["pitch_u2"] = PITCH_INPUT_METHODS
     if config.variant.endswith("_open"):
         changes |= {rate: getattr(plate, rate) for rate in ("roll_rate", "pitch_rate", "yaw_rate")}
-    target = dataclasses.replace(TABLE, **changes)
+    target = replace(TABLE, **changes)
     factors = config.constant_factors
-    return dataclasses.replace(target, **{name: factors[name] * getattr(target, name) for name in factors})
+    return replace(target, **{name: factors[name] * getattr(target, name) for name in factors})
 
 
 def trim_and_correct(s: State, config: PlantConfig, weight: Weight) -> None:

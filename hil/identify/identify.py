@@ -18,8 +18,7 @@ import numpy as np
 
 from hil.design.axes import AXES, NUISANCES
 from hil.errors import LabError
-from hil.floaty.correction import OperatingPoint
-from hil.floaty.paper_table import PAPER_TABLE
+from hil.floaty.correction import PAPER_TABLE, OperatingPoint
 from hil.identify.joint import Estimate, Excited, excited_axes, identities, instrumental, joint
 from hil.identify.plates import plant_of, turns_of
 from hil.identify.record import Record

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from firmware_py.config import ControllerConfig, ModelConfig
 from hil.config import load_config
-from hil.floaty.paper_table import PAPER_TABLE
+from hil.floaty.correction import PAPER_TABLE
 
 ROWS = PAPER_TABLE  # value, uncertainty
 METHODS_PITCH_U2 = -1066.0  # paper, Methods, "Data-driven estimation of dynamics constants"

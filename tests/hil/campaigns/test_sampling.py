@@ -12,7 +12,7 @@ from hil.campaigns.config import Distribution, Spec
 from hil.campaigns.sampling import axes, check_design, draw, points_of, value_at
 from hil.config import load_config
 from hil.errors import LabError
-from hil.floaty.paper_table import PAPER_TABLE
+from hil.floaty.correction import PAPER_TABLE
 from support.campaigns import spec_of
 
 # 3 axes: 8 (3+2), 10 (3+1).

@@ -17,8 +17,8 @@ from hil.design.claims import claims
 from hil.design.linear import Linear, Point, linear
 from hil.design.trim import balanced, changed, coefficient_of, opening_at, scaled, speed_at
 from hil.errors import LabError
+from hil.floaty.correction import PAPER_TABLE
 from hil.floaty.geometry import weigh
-from hil.floaty.paper_table import PAPER_TABLE
 from hil.floaty.plant import Plant
 from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 from support.command import Cli
