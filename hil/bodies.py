@@ -12,12 +12,10 @@ from hil.crazyflie.failures import MOTOR_FAILURES
 from hil.crazyflie.quadrotor import Quadrotor
 from hil.errors import LabError, blame, hint
 from hil.floaty.correction import PAPER_TABLE
-from hil.floaty.failures import SERVO_FAILURES
-from hil.floaty.plant import Plant
+from hil.floaty.plant import SERVO_FAILURES, Plant
 from hil.own_files import load_file
 from hil.world.battery import open_circuit_voltage
-from hil.world.body import Body, Carrier, Failure, Vector
-from hil.world.room import Room
+from hil.world.body import Body, Failure, Vector
 
 Make = Callable[[LabConfig, np.random.Generator, Vector], Body]
 OWN = "Robot"  # what a file defines: a class or function that is called as a `Make`
@@ -32,7 +30,7 @@ SIZES = {
     "vibration": 2,
 }
 PARTS = (
-    "outputs", "tunnel", "settings", "look", "markers", "lost", "advance", "set_counts", "draw", "hold", "release",
+    "outputs", "tunnel", "settings", "room", "escs", "look", "markers", "lost", "advance", "set_counts", "draw", "hold", "release",
     "put_back", "push", "channels",
 )  # fmt: skip
 
@@ -49,14 +47,6 @@ def crazyflie(config: LabConfig, rng: np.random.Generator, p_WB: Vector) -> Body
     mass = config.quadrotor.mass + sum(DECKS[name].mass for name in config.robot.decks)
     quadrotor = config.quadrotor.model_copy(update={"mass": mass})
     return Quadrotor(quadrotor, config.tunnel, config.battery, rng, p_WB)
-
-
-def carrier_of(config: LabConfig, body: Body, rng: np.random.Generator) -> Carrier:
-    """Return what carries the board: a body, the room around it, and the decks of the profile."""
-    room, escs = Room(floor=config.plant.ground.height), None
-    if isinstance(body, Quadrotor):
-        room, escs = Room(0.0, config.quadrotor.room, config.quadrotor.ceiling), body.escs
-    return Carrier(body, rng, room, config.robot.decks, escs)
 
 
 BODIES: dict[str, Make] = {"floaty": floaty, "crazyflie": crazyflie}

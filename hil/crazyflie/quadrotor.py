@@ -29,6 +29,7 @@ from hil.world.fixed_order import atan2, compiled, exp, normal
 from hil.world.in_tunnel import UPRIGHT, InTunnel
 from hil.world.motion import GRAVITY, accelerate, gust, rotate, surround
 from hil.world.plates import State
+from hil.world.room import Room
 from hil.world.tunnel import Tunnel
 
 ORANGE = "#e69f00"
@@ -343,6 +344,7 @@ class Quadrotor(InTunnel):
         s[CURRENT : CURRENT + 4] = s[OBEYS : OBEYS + 4] = 1.0
         s[STRENGTH : STRENGTH + 4] = 1.0 + config.motor_spread * normal(rng, 4)
         self._config = config
+        self.room = Room(0.0, config.room, config.ceiling)
         self._evaluate, self._advance = bound(evaluate, s), bound(advance, s, self._draws, self._now_us)
         self.truth = self._view(0, SIZE)
         self.acceleration_W, self.alpha_B = self._view(at.ACC, 3), self._view(at.ALPHA, 3)
@@ -352,11 +354,9 @@ class Quadrotor(InTunnel):
         self._electronics = self._power = battery.electronics_power
         self._drawn_us, self._drawn_J = 0, 0.0
         self._commanded = np.zeros(4)  # share of the supply voltage
-        self.settings: Mapping[str, Setting] = {
-            f"motor.{name}.{i + 1}": self._setting(place + i)
-            for name, place in (("strength", STRENGTH), ("current", CURRENT), ("obeys", OBEYS))
-            for i in range(4)
-        }
+        self.settings: Mapping[str, Setting] = self._settings(
+            {"motor.strength": STRENGTH, "motor.current": CURRENT, "motor.obeys": OBEYS}
+        )
         sunk = config.mass * GRAVITY / (4.0 * config.floor_stiffness)
         self.place((0.0, 0.0, config.foot_below - sunk) if p_WB is None else p_WB, UPRIGHT)
 
@@ -368,9 +368,6 @@ class Quadrotor(InTunnel):
             self._commanded[i] = duty = min(max(count, 0), steps) / steps
             if self._s[OBEYS + i] != 0.0:
                 self._s[DUTY + i] = duty
-
-    def _setting(self, place: int) -> Setting:
-        return Setting(lambda: float(self._s[place]), lambda value: self._s.__setitem__(place, value))
 
     def draw(self, now_us: int, cell_V: float) -> float:
         """Return the mean power [W] of electronics and motors since the last call; the motors run on `cell_V` [V]."""

@@ -13,7 +13,7 @@ from hil.floaty.geometry import weigh
 from hil.floaty.shape import SIGNS, place_plates
 from hil.scene import Look, Markers
 from hil.world import layout as at
-from hil.world.body import Channel, Quantity, Setting, Vector, View
+from hil.world.body import Channel, Failure, Quantity, Vector, View
 from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 from hil.world.in_tunnel import UPRIGHT, InTunnel
 from hil.world.motion import advance, evaluate
@@ -21,12 +21,34 @@ from hil.world.plates import State
 from hil.world.servos import OUTPUTS, commanded_angles, next_period_us
 from hil.world.tunnel import Tunnel
 
-SERVOS = 4
+NUMBERS = (1, 2, 3, 4)  # of the servos and their flaps
+DEG = math.radians(1.0)
 LOADS = BatteryConfig()
-FLAPS = tuple(f"truth.flap_{number}" for number in (1, 2, 3, 4))
+FLAPS = tuple(f"truth.flap_{number}" for number in NUMBERS)
 PLATES = tuple(
     f"force.{part}_{axis}" for part in ("base", "flap1", "flap2", "flap3", "flap4") for axis in "xyz"
 )
+SERVO_FAILURES: dict[str, Failure] = {
+    **{
+        f"servo.stuck.{number}": Failure(
+            f"flap {number} is stuck", "", 0.0, 0.0, 0.0, f"servo.pace.{number}", "times", "degrades"
+        )
+        for number in NUMBERS
+    },
+    **{
+        f"servo.slow.{number}": Failure(
+            f"factor on the pace of servo {number}", "", 0.5, 0.01, 4.0, f"servo.pace.{number}", "times", "holds"
+        )
+        for number in NUMBERS
+    },
+    **{
+        f"servo.trim.{number}": Failure(
+            f"flap {number} deviates this far from its command", "deg", 5.0, -45.0, 45.0, f"servo.trim.{number}", "add",
+            "holds", DEG,
+        )
+        for number in NUMBERS
+    },
+}  # fmt: skip
 
 
 def assemble(geometry: GeometryConfig, config: PlantConfig, tunnel: TunnelConfig) -> tuple[State, Tunnel]:
@@ -48,10 +70,12 @@ class Plant(InTunnel):
         truth (layout.SIZE,) everything; flaps (4,) [rad] signed flap angles;
         wrench_B (6,) force [N] and torque [N m] of the flow about the centre of mass;
         zero_offset (4,) [rad] of the servos' middle, for which the board was trimmed;
-        servo_trim (4,) [rad] and servo_speed (4,): the values last set;
+        servo_trim (4,) [rad] of the mounting and servo_speed (4,) times the usual one, 0: stuck;
         plate_forces_W (5, 3) base and four flaps as isolated plates (without the identified correction, so they do not add
         up to the whole force).
     """
+
+    outputs: Sequence[tuple[int, int]] = OUTPUTS
 
     def __init__(
         self,
@@ -73,13 +97,11 @@ class Plant(InTunnel):
         s[at.SERVO_TAU], s[at.SERVO_RATE], s[at.DEAD_BAND] = servos.tau, servos.rate_limit, servos.dead_band
         self.zero_offset = servos.zero_offset
         self.servo_trim, self.servo_speed = self._view(at.SERVO_TRIM, 4), self._view(at.SERVO_SPEED, 4)
-        self.settings = {
-            f"{what}.{servo + 1}": of(servo)
-            for servo in range(4)
-            for what, of in (("servo.trim", self._trim), ("servo.pace", self._pace))
-        }
-        for servo in range(4):
-            self.set_servo_fault(servo, servos.trim_error[servo], servos.speed[servo])
+        s[at.SERVO_TRIM : at.SERVO_TRIM + 4], s[at.SERVO_SPEED : at.SERVO_SPEED + 4] = (
+            servos.trim_error,
+            servos.speed,
+        )
+        self.settings = self._settings({"servo.trim": at.SERVO_TRIM, "servo.pace": at.SERVO_SPEED})
         self._counts: Sequence[int] = ()
         self._commanded = (SIGNS * config.hover_angle).tolist()
         s[at.COMMAND : at.COMMAND + 4] = self._commanded
@@ -89,14 +111,11 @@ class Plant(InTunnel):
         self.acceleration_W, self.alpha_B = self._view(at.ACC, 3), self._view(at.ALPHA, 3)
         self.wrench_B = self._view(at.DRAG, 6)
         self.plate_forces_W = self._view(at.PLATE_FORCES, 15).reshape(5, 3)
-        self.place(
-            (0.0, 0.0, tunnel.hover_height) if p_WB is None else p_WB,
-            UPRIGHT,
-            flaps=self._commanded,
-        )
-        self._at_rest = loads.electronics_power + SERVOS * loads.servo_power  # [W]
+        start = (0.0, 0.0, tunnel.hover_height) if p_WB is None else p_WB
+        self.place(start, UPRIGHT, flaps=self._commanded)
+        self._at_rest = loads.electronics_power + len(NUMBERS) * loads.servo_power  # [W]
         self._servo_energy, self._power = loads.servo_energy, self._at_rest
-        self._drawn_us, self._drawn_travel = 0, self.flap_travel
+        self._drawn_us, self._drawn_travel = 0, float(s[at.TRAVEL])
 
     def place(
         self,
@@ -133,19 +152,13 @@ class Plant(InTunnel):
 
     @property
     def markers(self) -> Markers:
-        """The eight markers of the cameras."""
         return markers_of(self._geometry, self._ground)
-
-    @property
-    def outputs(self) -> Sequence[tuple[int, int]]:
-        """The timer channels that the servos are connected to."""
-        return OUTPUTS
 
     def draw(self, now_us: int, cell_V: float) -> float:
         """Return the mean power [W] since the last call: electronics, servos at rest, and the flaps' travel."""
         duration = 1e-6 * (now_us - self._drawn_us)
         if duration > 0.0:
-            travel = self.flap_travel
+            travel = float(self._s[at.TRAVEL])
             turned, self._drawn_us, self._drawn_travel = travel - self._drawn_travel, now_us, travel
             self._power = self._at_rest + self._servo_energy * turned / duration
         return self._power
@@ -157,27 +170,6 @@ class Plant(InTunnel):
             Channel("float64", lambda: self.flaps, (Quantity(FLAPS, "rad", "B"),)),
             Channel("float32", lambda: plates, (Quantity(PLATES, "N", "W"),)),
         )
-
-    def set_servo_fault(self, servo: int, trim_error: float = 0.0, speed: float = 1.0) -> None:
-        """Give servo 0..3 a mounting error [rad] and `speed` times its usual speed, 0: stuck; the defaults restore it."""
-        self._s[at.SERVO_TRIM + servo], self._s[at.SERVO_SPEED + servo] = trim_error, speed
-
-    def _trim(self, servo: int) -> Setting:
-        return Setting(
-            lambda: float(self.servo_trim[servo]),
-            lambda value: self.set_servo_fault(servo, value, self.servo_speed[servo]),
-        )
-
-    def _pace(self, servo: int) -> Setting:
-        return Setting(
-            lambda: float(self.servo_speed[servo]),
-            lambda value: self.set_servo_fault(servo, self.servo_trim[servo], value),
-        )
-
-    @property
-    def flap_travel(self) -> float:
-        """The total travel of all flaps since the start [rad]."""
-        return float(self._s[at.TRAVEL])
 
     def linearise(self, point: OperatingPoint = LEVEL) -> Constants:
         """Return the linearised dynamics about a point, by default the level hover, in the uniform flow of the design."""

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from ground_station.mocap import MocapFrame
-from hil.bodies import carrier_of, make_body
+from hil.bodies import make_body
 from hil.config import LabConfig, load_config
 from hil.crazyflie import syslink
 from hil.crazyflie.shockburst import Air
@@ -31,7 +31,7 @@ from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
 from hil.events import EventQueue
 from hil.world.battery import Battery, open_circuit_voltage
-from hil.world.body import Body
+from hil.world.body import Body, Carrier
 
 IMU_PERIOD_US = 1_000
 # Share of a gyro's flight noise before the fans run, if it exceeds what the stock firmware accepts at rest: less than 100
@@ -121,7 +121,9 @@ class Robot:
         self.air, self.uart = ports.air, ports.uart
         self.executor = site.executor
         self._ports = ports
-        self._carrier = carrier_of(config, self.body, streams.board)
+        self._carrier = Carrier(
+            self.body, streams.board, self.body.room, config.robot.decks, self.body.escs
+        )
         self._thief: Thief | None = None
         self._seen_by: list[See] = []
         self._resets = 0

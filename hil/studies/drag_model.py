@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from hil.config import LabConfig
 from hil.design.authority import pressure_at, wrenches
-from hil.floaty.plant import Plant
+from hil.floaty.plant import NUMBERS, Plant
 from hil.floaty.shape import SIGNS
 from hil.laboratory.robot import Streams
 from hil.pictures import curves
@@ -87,8 +87,8 @@ def measure(config: LabConfig, seed: int) -> Iterator[MountedRow]:
         pressure = pressure_at(geometry, body.hover_angle)
         plant = Plant(geometry, body, config.tunnel, config.actuators, streams.gusts)
         plant.hold()
-        for servo in range(4):
-            plant.set_servo_fault(servo, speed=0.0)  # the flaps stay at the set angles
+        for servo in NUMBERS:
+            plant.settings[f"servo.pace.{servo}"].turn(0.0)  # the flaps stay at the set angles
         for index, (sweep, angle_deg) in enumerate(product(SWEEPS, ANGLES_DEG)):
             flaps = SIGNS * body.hover_angle
             sweep.turn(flaps, math.radians(angle_deg))

@@ -96,7 +96,7 @@ class Motion(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Carrier:
-    """The body that carries a board, the random stream of its sensors, the room that they see, and its decks, by name.
+    """What carries a board: a body's motion, the room around it, the random stream of the sensors, decks by name.
 
     `escs` (4,) are the speeds [rpm] of motors whose ESCs take DSHOT at the board's outputs; None: it has no ESCs.
     """
@@ -122,6 +122,14 @@ class Body(Motion, Protocol):
     @property
     def pushes(self) -> View:
         """The force [N, W] and torque [N m, B] of the last `push`, (6,)."""
+
+    @property
+    def room(self) -> Room:
+        """The surfaces around it that its distance sensors see."""
+
+    @property
+    def escs(self) -> View | None:
+        """The speeds of motors with ESCs that take DSHOT [rpm], (4,); None: it has none."""
 
     @property
     def look(self) -> Look:

@@ -6,17 +6,19 @@ compute flow and actuators: `hil.floaty.plant`, `hil.world.rigid`.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 
 from firmware_py.elementary import cos
 from hil.errors import LabError
 from hil.world import layout as at
-from hil.world.body import Vector, View
+from hil.world.body import Setting, Vector, View
 from hil.world.config import PlantConfig
 from hil.world.fixed_order import normal
 from hil.world.plates import State
+from hil.world.room import Room
 from hil.world.tunnel import Tunnel
 
 NOISE_ROWS = 2048  # steps of gusts drawn at once
@@ -35,12 +37,13 @@ class InTunnel:
 
     Attributes (read-only numpy views of the current truth, SI): state (13,) p_WB, v_WB, q_WB, omega_B in one piece; p_WB,
     v_WB (3,) in W; q_WB (4,) w x y z; omega_B (3,) in B; specific_force_B (3,) at the centre of mass; flow_W (3,) of the
-    air there; pushes (6,) force [N, W] and torque [N m, B] last set.
+    air there; pushes (6,) force [N, W] and torque [N m, B] last set; room: what its distance sensors see.
     """
 
     # Compute forces and accelerations from the state; do every step up to `_now_us`, True: the draws ran out before.
     _evaluate: Callable[[], object]
     _advance: Callable[[], bool]
+    escs: View | None = None  # the outputs drive no ESCs
 
     def __init__(self, s: State, tunnel: Tunnel, config: PlantConfig, rng_gust: np.random.Generator) -> None:
         self._s, self.tunnel = s, tunnel
@@ -57,6 +60,7 @@ class InTunnel:
         s[at.LIMIT_RADIUS], s[at.LIMIT_BELOW], s[at.LIMIT_ABOVE] = limits.radius, limits.below, limits.above
         s[at.LIMIT_COS_TILT] = cos(limits.tilt)
         s[at.NEXT_US] = s[at.AFTER_US] = math.inf
+        self.room = Room(floor=ground.height)
         self._rng = rng_gust
         self._draws = normal(rng_gust, (NOISE_ROWS, 14))
         self._now_us = np.zeros(1, np.int64)
@@ -71,6 +75,15 @@ class InTunnel:
         view = self._s[start : start + count]
         view.flags.writeable = False
         return view
+
+    def _settings(self, places: Mapping[str, int]) -> dict[str, Setting]:
+        """Return settings of the four actuators, NAME.1 to NAME.4, from the first place of each in the array."""
+        s = self._s
+        return {
+            f"{name}.{i + 1}": Setting(partial(s.item, place + i), partial(s.__setitem__, place + i))
+            for name, place in places.items()
+            for i in range(4)
+        }
 
     def place(
         self,

@@ -27,6 +27,8 @@ FLAPS = _take(4)  # [rad] signed flap angles
 GUSTS = _take(14)  # [m/s] fast u v w, slow u v w, four flaps fast, four flaps slow
 TRAVEL = _take()  # [rad] all flaps together have turned since the start
 NOISE_ROW = _take()  # next row of the block of normal draws
+BEFORE = _take(13)  # P to OMEGA at the start of the step
+DURATION = _take()  # [s] of the part of the step since then
 
 # Computed from the state by `drag`
 R = _take(9)  # R_WB, row by row

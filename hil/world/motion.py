@@ -1,4 +1,5 @@
-"""The plant's step of one millisecond: gusts, servos, rigid body by the midpoint rule, end of a flight; compiled."""
+"""The plant's step of one millisecond: gusts, servos, tether, net, rigid body by the midpoint rule, end of a flight;
+compiled."""
 
 import math
 
@@ -7,10 +8,10 @@ from numpy.typing import NDArray
 
 from hil.world import layout as at
 from hil.world.fixed_order import atan2, compiled, exp
-from hil.world.ground import stand
 from hil.world.plates import State, blow, drag, orient
 
 GRAVITY = 9.81  # [m/s2]
+CREEP = 0.02  # [m/s] below this speed a foot's friction fades
 
 
 @compiled
@@ -32,6 +33,41 @@ def pull(s: State) -> None:
         tension = max(s[at.TETHER_STIFFNESS] * stretch + s[at.TETHER_DAMPING] * away, 0.0)
     share = -tension / span
     s[at.PULL], s[at.PULL + 1], s[at.PULL + 2] = share * dx, share * dy, share * dz
+
+
+@compiled
+def stand(s: State) -> None:
+    """Write force and torque of the net on the body's four feet: GROUND, force [N] in W and torque [N m] in B.
+
+    A foot is a spring and a damper that only push, and dry friction, smooth at rest. Air blows through the net unhindered.
+    """
+    g, r = at.GROUND, at.R
+    for i in range(6):
+        s[g + i] = 0.0
+    if s[at.P + 2] > s[at.NET_HEIGHT] + s[at.FOOT_REACH]:
+        return
+    ox, oy, oz = s[at.OMEGA], s[at.OMEGA + 1], s[at.OMEGA + 2]
+    bz = -s[at.FOOT_BELOW]
+    for foot in range(4):
+        bx = s[at.FOOT_SPREAD] if foot < 2 else -s[at.FOOT_SPREAD]
+        by = s[at.FOOT_SPREAD] if foot % 2 == 0 else -s[at.FOOT_SPREAD]
+        depth = s[at.NET_HEIGHT] - (s[at.P + 2] + s[r + 6] * bx + s[r + 7] * by + s[r + 8] * bz)
+        if depth <= 0.0:
+            continue
+        wx, wy, wz = oy * bz - oz * by, oz * bx - ox * bz, ox * by - oy * bx  # omega x r, in B
+        vx = s[at.V] + s[r] * wx + s[r + 1] * wy + s[r + 2] * wz
+        vy = s[at.V + 1] + s[r + 3] * wx + s[r + 4] * wy + s[r + 5] * wz
+        vz = s[at.V + 2] + s[r + 6] * wx + s[r + 7] * wy + s[r + 8] * wz
+        up = max(s[at.NET_STIFFNESS] * depth - s[at.NET_DAMPING] * vz, 0.0)
+        drag = s[at.FRICTION] * up / max(math.sqrt(vx * vx + vy * vy), CREEP)
+        fx, fy = -drag * vx, -drag * vy
+        s[g], s[g + 1], s[g + 2] = s[g] + fx, s[g + 1] + fy, s[g + 2] + up
+        px = s[r] * fx + s[r + 3] * fy + s[r + 6] * up
+        py = s[r + 1] * fx + s[r + 4] * fy + s[r + 7] * up
+        pz = s[r + 2] * fx + s[r + 5] * fy + s[r + 8] * up
+        s[g + 3] += by * pz - bz * py
+        s[g + 4] += bz * px - bx * pz
+        s[g + 5] += bx * py - by * px
 
 
 @compiled
@@ -156,15 +192,15 @@ def gust(s: State, draws: NDArray[np.float64]) -> None:
 
 
 @compiled
-def move(s: State, before: State, duration: State) -> None:
-    """Set the state to that `before` (13,), moved for `duration[0]` [s] with the velocities and accelerations in `s`."""
-    h = duration[0]
+def move(s: State) -> None:
+    """Set the state to BEFORE, moved for DURATION [s] with the present velocities and accelerations."""
+    h, b = s[at.DURATION], at.BEFORE
     for i in range(3):
-        s[at.P + i] = before[i] + h * s[at.V + i]
-        s[at.V + i] = before[3 + i] + h * s[at.ACC + i]
-    rotate(s, before[6], before[7], before[8], before[9], h)
+        s[at.P + i] = s[b + i] + h * s[at.V + i]
+        s[at.V + i] = s[b + 3 + i] + h * s[at.ACC + i]
+    rotate(s, s[b + 6], s[b + 7], s[b + 8], s[b + 9], h)
     for i in range(3):
-        s[at.OMEGA + i] = before[10 + i] + h * s[at.ALPHA + i]
+        s[at.OMEGA + i] = s[b + 10 + i] + h * s[at.ALPHA + i]
 
 
 @compiled
@@ -181,18 +217,12 @@ def step(s: State, draws: NDArray[np.float64], step_us: float) -> None:
         return
 
     duration = step_us * 1e-6  # [s]
-    px, py, pz = s[at.P], s[at.P + 1], s[at.P + 2]
-    vx, vy, vz = s[at.V], s[at.V + 1], s[at.V + 2]
-    qw, qx, qy, qz = s[at.Q], s[at.Q + 1], s[at.Q + 2], s[at.Q + 3]
-    ox, oy, oz = s[at.OMEGA], s[at.OMEGA + 1], s[at.OMEGA + 2]
+    for i in range(13):
+        s[at.BEFORE + i] = s[at.P + i]
     # To the middle with the rates at the start, then to the end with those at the middle.
     for part in range(2):
-        h = 0.5 * duration if part == 0 else duration
-        s[at.P], s[at.P + 1], s[at.P + 2] = px + h * s[at.V], py + h * s[at.V + 1], pz + h * s[at.V + 2]
-        s[at.V], s[at.V + 1], s[at.V + 2] = vx + h * s[at.ACC], vy + h * s[at.ACC + 1], vz + h * s[at.ACC + 2]
-        rotate(s, qw, qx, qy, qz, h)
-        s[at.OMEGA], s[at.OMEGA + 1] = ox + h * s[at.ALPHA], oy + h * s[at.ALPHA + 1]
-        s[at.OMEGA + 2] = oz + h * s[at.ALPHA + 2]
+        s[at.DURATION] = 0.5 * duration if part == 0 else duration
+        move(s)
         if part == 1:
             drive_servos(s, middle_us, end_us)
         evaluate(s)

@@ -5,7 +5,7 @@ time grid are Floaty's. Only the elementary functions of `firmware_py.elementary
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar, Protocol
 
@@ -60,21 +60,17 @@ class RigidBody(InTunnel):
         """Start upright and at rest at a place [m]. Raises `LabError` for an invalid subclass."""
         s = np.zeros(at.SIZE)
         super().__init__(s, Tunnel(world.tunnel, s), world.plant, rng_gust)
-        self._check_masses()
-        s[at.MASS] = self.mass * world.plant.mass_factor
-        s[at.INERTIA : at.INERTIA + 3] = np.multiply(self.inertia, world.plant.inertia_factor)
+        s[at.MASS] = self._stated("mass", 1)[0] * world.plant.mass_factor
+        s[at.INERTIA : at.INERTIA + 3] = np.multiply(self._stated("inertia", 3), world.plant.inertia_factor)
         if world.plant.constant_factors or world.plant.drag_factor != 1.0:
             raise LabError("plant.constant_factors and plant.drag_factor act on floaty only")
         self.counts: tuple[int, ...] = (0, 0, 0, 0)
         self._electronics = world.battery.electronics_power
         self._failed: str | None = None
         self._row = 0
-        self._before, self._duration = np.zeros(13), np.zeros(1)
         self._draw = np.zeros(14)
-        self._surround, self._accelerate, self._watch = (
-            bound(kernel, s) for kernel in (surround, accelerate, watch)
-        )
-        self._gust, self._move = bound(gust, s, self._draw), bound(move, s, self._before, self._duration)
+        self._surround, self._accelerate = bound(surround, s), bound(accelerate, s)
+        self._gust, self._move, self._watch = bound(gust, s, self._draw), bound(move, s), bound(watch, s)
         self.place(p_WB, UPRIGHT)
         if self._failed is not None:
             raise LabError(self._failed)
@@ -139,48 +135,46 @@ class RigidBody(InTunnel):
         """Return why the flight ended first, including errors in the user's code; None while it flies."""
         return self._failed or super().lost
 
-    def _given(self, name: str, ask: Callable[[], Any], count: int) -> list[float]:
-        """Return the numbers that the subclass gives; where they are not that many, end the flight and return zeros."""
-        try:
-            given = ask()
-        except Exception as error:
-            self._fail(blame(error))
-            return [0.0] * count
-        numbers = list(_numbers(given if isinstance(given, Sequence | np.ndarray) else (given,)))
-        if len(numbers) != count:
-            what = "a number" if count == 1 else f"{count} numbers"
-            self._fail(f"{type(self).__name__}.{name} is {given!r}: expected {what}")
-            return [0.0] * count
+    def _stated(self, name: str, count: int) -> list[float]:
+        """Return the positive numbers of a class attribute. Raises `LabError` for anything else."""
+        value: Any = getattr(self, name, None)
+        numbers = _numbers(value, count)
+        if not numbers or not all(0.0 < number < math.inf for number in numbers):
+            what = "a number above 0" if count == 1 else f"{count} numbers above 0"
+            raise LabError(f"{type(self).__name__}.{name} = {value!r}: expected {what}")
         return numbers
 
-    def _check_masses(self) -> None:
-        for name, count in (("mass", 1), ("inertia", 3)):
-            value: Any = getattr(self, name, None)
-            numbers = list(_numbers(value)) if count > 1 else list(_numbers((value,)))
-            if len(numbers) != count or not all(0.0 < number < math.inf for number in numbers):
-                what = "a number above 0" if count == 1 else "three numbers above 0"
-                raise LabError(f"{type(self).__name__}.{name} = {value!r}: expected {what}")
+    def _asked(self, ask: Callable[..., Any], *given: Any) -> Any:
+        """Call a method of the subclass; an error there ends the flight, and the answer is None."""
+        try:
+            return ask(*given)
+        except Exception as error:
+            return self._fail(blame(error))
+
+    def _given(self, name: str, ask: Callable[[], Any], count: int) -> list[float]:
+        """Return the numbers that the subclass gives; where they are not that many, end the flight and return zeros."""
+        given = self._asked(ask)
+        numbers = _numbers(given, count)
+        if not numbers:
+            what = "a number" if count == 1 else f"{count} numbers"
+            self._fail(f"{type(self).__name__}.{name} is {given!r}: expected {what}")
+        return numbers or [0.0] * count
 
     def _evaluate(self) -> None:
         """Compute air, wrench and accelerations; an invalid wrench ends the flight with the body clamped."""
         self._surround()
         s = self._s
         if self._failed is None:
-            try:
-                given: Any = self.wrench(s[at.WIND : at.WIND + 3].tolist())
-            except Exception as error:
-                return self._fail(blame(error))
+            given = self._asked(self.wrench, s[at.WIND : at.WIND + 3].tolist())
             parts = list(given) if isinstance(given, tuple | list) else []
-            numbers = [number for part in parts for number in _numbers(part)]
-            if len(parts) != 2 or len(numbers) != 6:
-                return self._fail(f"{type(self).__name__}.wrench returned {given!r}: {EXPECTED}")
-            if not all(map(math.isfinite, numbers)):
-                return self._fail(
-                    f"{type(self).__name__}.wrench returned force {numbers[:3]} N, torque {numbers[3:]} N m"
-                )
-            s[at.DRAG : at.DRAG + 6] = numbers
+            force, torque = (_numbers(part, 3) for part in parts) if len(parts) == 2 else ([], [])
+            if not (force and torque):
+                self._fail(f"{type(self).__name__}.wrench returned {given!r}: {EXPECTED}")
+            elif not all(map(math.isfinite, force + torque)):
+                self._fail(f"{type(self).__name__}.wrench returned force {force} N, torque {torque} N m")
+            else:
+                s[at.DRAG : at.DRAG + 6] = force + torque
         self._accelerate()
-        return None
 
     def _fail(self, why: str) -> None:
         if self._failed is None:
@@ -206,23 +200,21 @@ class RigidBody(InTunnel):
         self._gust()
         s[at.TIME_US] += at.STEP_US
         if self._failed is None:
-            try:
-                self.actuate(STEP_S)
-            except Exception as error:
-                self._fail(blame(error))
+            self._asked(self.actuate, STEP_S)
         if s[at.HELD] != 0.0:
             self._evaluate()
             return
-        self._before[:] = self.state
+        s[at.BEFORE : at.BEFORE + 13] = self.state
         for duration in (0.5 * STEP_S, STEP_S):
-            self._duration[0] = duration
+            s[at.DURATION] = duration
             self._move()
             self._evaluate()
         if s[at.LOST] == 0.0:
             self._watch()
 
 
-def _numbers(part: Any) -> Iterator[float]:
-    """Yield the numbers of a vector; nothing for anything else."""
-    if isinstance(part, Sequence | np.ndarray) and not isinstance(part, str):
-        yield from (float(one) for one in part if isinstance(one, int | float | np.generic))
+def _numbers(value: Any, count: int) -> list[float]:
+    """Return a vector of so many numbers, or one; empty for anything else."""
+    parts = value if isinstance(value, Sequence | np.ndarray) and not isinstance(value, str) else (value,)
+    numbers = [float(one) for one in parts if isinstance(one, int | float | np.generic)]
+    return numbers if len(numbers) == count else []

@@ -121,7 +121,7 @@ def test_a_torque_turns_it_and_a_push_moves_it(tmp_path: Path) -> None:
         (FLOATING.replace("0.1,", "-1,"), "robot.body = robot.py: Robot.mass = -1: expected a number above 0"),
         (
             FLOATING.replace("(1e-3, 1e-3, 1e-3)", "1e-3"),
-            "robot.body = robot.py: Robot.inertia = 0.001: expected three numbers above 0",
+            "robot.body = robot.py: Robot.inertia = 0.001: expected 3 numbers above 0",
         ),
         (
             FLOATING.replace("(0.0, 0.0, 0.981)", "(0.0, 0.981)"),

@@ -144,7 +144,8 @@ def test_faults_act_on_their_servo_and_heal() -> None:
     assert moved[3] == pytest.approx(0.1 * (1 - math.exp(-0.0505 / TAU)), rel=0.01)
     plant.advance(1_000_000)
     assert plant.flaps == pytest.approx(np.add(HOVER, [0.15, 0, 0.1, 0.1]), abs=1e-4)
-    for servo in range(4):
-        plant.set_servo_fault(servo)
+    for servo in (1, 2, 3, 4):
+        plant.settings[f"servo.trim.{servo}"].turn(0.0)
+        plant.settings[f"servo.pace.{servo}"].turn(1.0)
     plant.advance(2_000_000)
     assert plant.flaps == pytest.approx(HOVER + 0.1, abs=1e-4)
