@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-import math
+from math import pi, radians
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -29,9 +29,7 @@ ConstantName = Literal[
 class TetherConfig(Section):
     """The safety line from an anchor above: slack in flight, a spring and damper that only pulls when taut."""
 
-    anchor_height: float = number(
-        1.5, "(0, 5]", "above the hover point [m]; chosen (paper: thread over pulleys)"
-    )
+    anchor_height: float = number(1.5, "(0, 5]", "above the hover point [m]; chosen (paper: over pulleys)")
     length: float = number(2.3, "(0, 8]", "to the base plate [m]; catches 0.87 m below hover; chosen")
     stiffness: float = number(100.0, "(0, 2000]", "[N/m]; chosen: 3 cm under the weight")
     damping: float = number(5.0, "[0, 50]", "[N s/m]; chosen: about critical with the counter-weight")
@@ -41,12 +39,8 @@ class NetConfig(Section):
     """The net over the tunnel's exit and the robot's four feet on it; the paper names neither: all chosen."""
 
     height: float = number(0.0, "[-2, 2]", "z of the net in W [m]; the tunnel's exit; chosen")
-    foot_spread: float = number(
-        0.06, "(0, 0.3]", "|x| = |y| of each foot in B [m]; beyond the base plate; chosen"
-    )
-    foot_below: float = number(
-        0.05, "(0, 0.3]", "feet below the centre of mass [m]; under the batteries; chosen"
-    )
+    foot_spread: float = number(0.06, "(0, 0.3]", "|x|, |y| of a foot [m]; beyond the base plate; chosen")
+    foot_below: float = number(0.05, "(0, 0.3]", "below the centre of mass [m]; under the batteries; chosen")
     stiffness: float = number(800.0, "(0, 5000]", "under one foot [N/m]; chosen: 1 mm under the weight")
     damping: float = number(8.0, "[0, 50]", "under one foot [N s/m]; chosen: half of critical")
     friction: float = number(0.5, "[0, 2]", "coefficient [1]; chosen")
@@ -56,11 +50,9 @@ class LimitsConfig(Section):
     """Where a flight counts as lost."""
 
     radius: float = number(0.45, "(0, 0.6]", "from the tunnel's axis [m]; half the flow is left")
-    below: float = number(
-        0.8, "(0, 1.2]", "below the hover point [m]; assumed: recoveries from 0.65 were flown"
-    )
+    below: float = number(0.8, "(0, 1.2]", "below the hover point [m]; assumed: recoveries flown from 0.65")
     above: float = number(0.85, "(0, 5]", "above the hover point [m]; paper: cameras see 2 m over the tunnel")
-    tilt: float = number(math.pi / 2, f"(0, {math.pi})", "of the body's z from the vertical [rad]; chosen")
+    tilt: float = number(pi / 2, f"(0, {pi})", "of the body's z from the vertical [rad]; chosen")
 
 
 class MassConfig(Section):
@@ -86,27 +78,13 @@ class GeometryConfig(Section):
         description="corners of the unfolded flap in turn, a convex trapezoid or the like [m]; "
         "without: its quadrant of the footprint less the base plate; paper, Setup specifications",
     )
-    strip_width: float = number(
-        0.0198,
-        "(0, 0.5]",
-        "width of the kinked strip at the flap's outer edge [m]; tuned to the Table's roll stiffness",
-    )
-    kink_angle: float = number(
-        math.radians(42.5), f"[0, {math.pi / 2}]", "upward bend of the strip [rad]; paper"
-    )
-    kink_side: Literal["x", "y"] = Field(
-        "y", description="edge with the strip: the one outwards in y or in x"
-    )
-    axis_azimuth: float = number(
-        math.radians(45), f"[0, {math.pi / 2}]", "of the flap's axis from x [rad]; original firmware"
-    )
-    dihedral: float = number(
-        0.0, "[-1.2, 1.2]", "by which axis and flap rise outwards [rad]; paper, Supplement: horizontal"
-    )
+    strip_width: float = number(0.0198, "(0, 0.5]", "kinked edge [m]; tuned to the Table's roll stiffness")
+    kink_angle: float = number(radians(42.5), f"[0, {pi / 2}]", "upward bend of the strip [rad]; paper")
+    kink_side: Literal["x", "y"] = Field("y", description="edge with the strip: the outward one in y or in x")
+    axis_azimuth: float = number(radians(45), f"[0, {pi / 2}]", "of a flap's axis [rad]; original firmware")
+    dihedral: float = number(0.0, "[-1.2, 1.2]", "outward rise of flaps and axes [rad]; paper: horizontal")
     flow_point: float = number(0.0627, "(0, 0.5]", "|x| = |y| where a flap's flow is taken [m]; assumed")
-    flap_mass: float = number(
-        0.025, "(0, 2]", "of each flap, even over its surface [kg]; paper, Setup specifications"
-    )
+    flap_mass: float = number(0.025, "(0, 2]", "of each, evenly spread [kg]; paper, Setup specifications")
     masses: tuple[MassConfig, ...] = Field(
         (MassConfig(mass=0.240, place=(0.0, 0.0, -0.0991666667), size=(0.0636, 0.0636, 0.0809)),),
         description="all the rest; paper: 0.340 kg, centre of mass 7 cm below the flaps; size: from the budget of masses",
@@ -129,12 +107,8 @@ class PlantConfig(Section):
         "methods",
         description="plate: isolated plates; else their linearisation is corrected to the paper's Table",
     )
-    airspeed: float = number(
-        10.0, "(1, 60]", "design airspeed of the hover [m/s]; paper, Setup specifications"
-    )
-    hover_angle: float = number(
-        math.radians(25), "(-0.5, 1.2]", "flap angle of the design hover [rad]; paper: 25 deg"
-    )
+    airspeed: float = number(10.0, "(1, 60]", "of the design hover [m/s]; paper, Setup specifications")
+    hover_angle: float = number(radians(25), "(-0.5, 1.2]", "flap angle in the design hover [rad]; paper")
     mass_factor: Factor = Field(1.0, description="true mass over design mass")
     inertia_factor: Factor = Field(1.0, description="true inertia over design inertia")
     drag_factor: Factor = Field(1.0, description="true force and torque of the flow over the design's")
@@ -164,16 +138,10 @@ class PlantServoConfig(Section):
         ),
         description="pulse of a level flap, from the middle pulse of 1.5 ms [rad]; original firmware, motorShifts",
     )
-    tau: float = number(
-        0.050, "(0.001, 0.5]", "first-order lag [s]; original firmware, flapTimeConst = 20 1/s"
-    )
+    tau: float = number(0.050, "(0.001, 0.5]", "first-order lag [s]; original firmware: flapTimeConst 20 1/s")
     rate_limit: float = number(10.5, "(0, 100]", "[rad/s]; assumed: 0.1 s for 60 deg")
-    dead_band: float = number(
-        math.radians(0.1), "[0, 0.1]", "error below which the servo does not move [rad]; assumed"
-    )
-    trim_error: Four = Field(
-        (0.0, 0.0, 0.0, 0.0), description="wrong mounting: flap angle minus intended angle [rad]"
-    )
+    dead_band: float = number(radians(0.1), "[0, 0.1]", "error that does not move it [rad]; assumed")
+    trim_error: Four = Field((0.0, 0.0, 0.0, 0.0), description="flap angle minus the intended one [rad]")
     speed: tuple[Annotated[float, Field(ge=0, le=4)], ...] = Field(
         (1.0, 1.0, 1.0, 1.0),
         min_length=4,
@@ -186,18 +154,12 @@ class TunnelConfig(Section):
     """The flow of one flight; where no source is named it is a choice (docs/explanation/plant.md, Tunnel)."""
 
     speed: float = number(10.0, "(0, 60]", "mean flow at the hover point [m/s]; paper, Setup specifications")
-    profile_radius: float = number(
-        0.45, "(0.05, 5]", "w(r) = speed / (1 + (r / profile_radius)^6) [m]; assumed"
-    )
+    profile_radius: float = number(0.45, "(0.05, 5]", "R in w(r) = speed / (1 + (r / R)^6) [m]; assumed")
     height_slope: float = number(0.05, "[0, 0.5]", "loss of speed with height [1/m]; assumed")
     hover_height: float = number(1.15, "(0, 3]", "hover point above the exit [m]; paper, Hover: 115 cm")
-    turbulence: Literal["none", "T0", "T1"] = Field(
-        "T0", description="gust level; T0 gives the paper's hover"
-    )
+    turbulence: Literal["none", "T0", "T1"] = Field("T0", description="gust level; T0: the paper's hover")
     gust_scale: float = number(1.0, "[0, 5]", "factor on the gusts of that level")
-    side_wind: tuple[float, float, float] = Field(
-        (0.0, 0.0, 0.0), description="added everywhere, x y z of W [m/s]"
-    )
+    side_wind: Three = Field((0.0, 0.0, 0.0), description="added everywhere, x y z of W [m/s]")
     fan_factor: float = number(1.0, "[0, 2]", "factor on everything that the fans blow")
 
 
@@ -210,16 +172,8 @@ class BatteryConfig(Section):
 
     cells: int = number(2, "[1, 6]", "in series; paper, Robot design and fabrication")
     capacity: float = number(900.0, "(1, 1e5]", "charge of a full cell [A s]; paper: 250 mAh, single cell")
-    resistance: float = number(
-        0.22, "[0, 2]", "of a cell with its leads [ohm]; chosen: 0.925 Wh per cell at 3.4 W"
-    )
+    resistance: float = number(0.22, "[0, 2]", "of a cell with leads [ohm]; chosen: 0.925 Wh each at 3.4 W")
     charge: float = number(1.0, "[0, 1]", "at the start, as a share of the capacity")
-    electronics_power: float = number(
-        0.3, "[0, 50]", "board and inertial sensors [W]; paper, Energy efficiency"
-    )
-    servo_power: float = number(
-        0.50, "[0, 10]", "of each servo at rest, holding [W]; calibrated on the paper's 3.4 W"
-    )
-    servo_energy: float = number(
-        0.33, "[0, 10]", "of each servo per angle turned [J/rad]; calibrated on the paper's 3.4 W"
-    )
+    electronics_power: float = number(0.3, "[0, 50]", "board and IMU [W]; paper, Energy efficiency")
+    servo_power: float = number(0.50, "[0, 10]", "of each, holding [W]; calibrated on the paper's 3.4 W")
+    servo_energy: float = number(0.33, "[0, 10]", "per angle turned [J/rad]; calibrated on the paper's 3.4 W")
