@@ -310,6 +310,8 @@ class Quadrotor(InTunnel):
     [rpm, N]; escs those speeds for the ESCs of brushless motors, None with brushed ones.
     """
 
+    loss_texts = LOSS_TEXTS
+
     def __init__(
         self,
         config: QuadrotorConfig,
@@ -392,12 +394,6 @@ class Quadrotor(InTunnel):
     def _commanded_thrust(self) -> NDArray[np.float64]:
         volts = self._commanded * self._s[SUPPLY]
         return np.array([thrust_at(self._s, steady_rpm(self._s, one)) for one in volts.tolist()])
-
-    @property
-    def lost(self) -> str | None:
-        """The first reason why the flight is over; None while it flies."""
-        cause = int(self._s[at.LOST])
-        return LOSS_TEXTS[cause].format(self._s[at.LOST_VALUE]) if cause else None
 
     @property
     def look(self) -> Look:

@@ -105,10 +105,16 @@ def triangles(corners: Points) -> Points:
     return np.stack([(corners[0], b, c) for b, c in pairwise(corners[1:])])
 
 
+def _doubled_areas(triangles: Points) -> Points:
+    """Return twice the areas of triangles (N, 3, 3), (N,)."""
+    a, b, c = triangles.swapaxes(0, 1)
+    return np.asarray(np.sqrt((np.cross(b - a, c - a) ** 2).sum(axis=1)))
+
+
 def area_and_centre(corners: Points) -> tuple[float, Points]:
     """Return area and centroid (3,) of a flat convex polygon."""
     parts = triangles(corners)
-    areas = np.sqrt((np.cross(parts[:, 1] - parts[:, 0], parts[:, 2] - parts[:, 0]) ** 2).sum(axis=1)) / 2
+    areas = _doubled_areas(parts) / 2
     area = math.fsum(areas.tolist())
     return area, np.array([math.fsum((areas * parts.mean(axis=1)[:, i]).tolist()) / area for i in range(3)])
 
@@ -141,11 +147,8 @@ def weigh(geometry: GeometryConfig) -> Weight:
         raise LabError(
             f"geometry.masses: product of inertia {products:.2g} kg m2: expected masses in mirror symmetry about x and y"
         )
-    if geometry.inertia != "masses":
-        return Weight(round(mass, 9), height, geometry.inertia)
-    return Weight(
-        round(mass, 9), height, (round(moments[0], 12), round(moments[1], 12), round(moments[2], 12))
-    )
+    ix, iy, iz = (round(one, 12) for one in moments) if geometry.inertia == "masses" else geometry.inertia
+    return Weight(round(mass, 9), height, (ix, iy, iz))
 
 
 def _points(geometry: GeometryConfig) -> list[tuple[float, Points, Points]]:
@@ -155,7 +158,7 @@ def _points(geometry: GeometryConfig) -> list[tuple[float, Points, Points]]:
     """
     pieces = []
     parts = np.concatenate([triangles(surface.unfolded) for surface in surfaces(geometry)])
-    areas = np.sqrt((np.cross(parts[:, 1] - parts[:, 0], parts[:, 2] - parts[:, 0]) ** 2).sum(axis=1))
+    areas = _doubled_areas(parts)
     shares = (geometry.flap_mass / 3.0 / math.fsum(areas.tolist()) * areas).tolist()
     mirrors = [np.array([x, y, 1.0]) for x in (1.0, -1.0) for y in (1.0, -1.0)]
     for share, part in zip(shares, parts, strict=True):
@@ -177,12 +180,11 @@ def check(geometry: GeometryConfig) -> None:
     outline = list(geometry.outline)
     if outline:
         _check_outline(outline, side, corner)
-    outer = max(y if geometry.kink_side == "y" else x for x, y in outline) if outline else side
-    inner = min(y if geometry.kink_side == "y" else x for x, y in outline) if outline else corner
-    if geometry.strip_width >= outer - inner:
+    across = [y if geometry.kink_side == "y" else x for x, y in outline or [(corner, corner), (side, side)]]
+    width = max(across) - min(across)
+    if geometry.strip_width >= width:
         raise LabError(
-            f"geometry.strip_width = {geometry.strip_width:g}: leaves no flat part of the flap, which is "
-            f"{outer - inner:g} wide"
+            f"geometry.strip_width = {geometry.strip_width:g}: leaves no flat part of the flap, which is {width:g} wide"
         )
     weigh(geometry)
 

@@ -15,7 +15,7 @@ from hil.scene import Look, Markers
 from hil.world import layout as at
 from hil.world.body import Channel, Failure, Quantity, Vector, View
 from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
-from hil.world.in_tunnel import UPRIGHT, InTunnel
+from hil.world.in_tunnel import AT_REST, UPRIGHT, InTunnel
 from hil.world.motion import advance, evaluate
 from hil.world.plates import State
 from hil.world.servos import OUTPUTS, commanded_angles, next_period_us
@@ -64,15 +64,12 @@ def assemble(geometry: GeometryConfig, config: PlantConfig, tunnel: TunnelConfig
 
 
 class Plant(InTunnel):
-    """Body, servos, tether and the air around them.
+    """Body, servos, tether and the air around them; these views of the truth besides those of `InTunnel`:
 
-    Attributes (read-only numpy views of the current truth, SI), besides those of `InTunnel`:
-        truth (layout.SIZE,) everything; flaps (4,) [rad] signed flap angles;
-        wrench_B (6,) force [N] and torque [N m] of the flow about the centre of mass;
-        zero_offset (4,) [rad] of the servos' middle, for which the board was trimmed;
-        servo_trim (4,) [rad] of the mounting and servo_speed (4,) times the usual one, 0: stuck;
-        plate_forces_W (5, 3) base and four flaps as isolated plates (without the identified correction, so they do not add
-        up to the whole force).
+    truth (layout.SIZE,) everything; flaps (4,) [rad] signed flap angles; wrench_B (6,) force [N] and torque [N m] of the
+    flow about the centre of mass; zero_offset (4,) [rad] of the servos' middle, for which the board was trimmed; servo_trim
+    (4,) [rad] of the mounting and servo_speed (4,) times the usual one, 0: stuck; plate_forces_W (5, 3) of base and four
+    flaps as isolated plates, without the identified correction, so they do not add up to the whole force.
     """
 
     outputs: Sequence[tuple[int, int]] = OUTPUTS
@@ -121,8 +118,8 @@ class Plant(InTunnel):
         self,
         p_WB: Vector,
         q_WB: Vector,
-        v_WB: Vector = (0.0, 0.0, 0.0),
-        omega_B: Vector = (0.0, 0.0, 0.0),
+        v_WB: Vector = AT_REST,
+        omega_B: Vector = AT_REST,
         flaps: Vector | None = None,
     ) -> None:
         """Set the state of the body, and the flaps' angles [rad]; None leaves them unchanged. Raises LabError."""

@@ -7,6 +7,7 @@ are A + B cos phi + C sin phi (Rodrigues), stated for flap 2 in the quadrant (+,
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,16 +46,14 @@ class Plate:
 @lru_cache(256)
 def flap_plates(geometry: GeometryConfig) -> tuple[Plate, Plate]:
     """Return the flat part and the kinked strip of flap 2."""
-    flat, strip = _outlined(geometry) if geometry.outline else _quadrant(geometry)
+    outlined = (
+        [area_and_centre(surface.corners) for surface in surfaces(geometry)] if geometry.outline else []
+    )
+    flat, strip = outlined or _quadrant(geometry)
     order = (1, 0, 2) if geometry.kink_side == "x" else (0, 1, 2)
     bend = np.array([0.0, -sin(geometry.kink_angle), cos(geometry.kink_angle)])[[*order]]
     normals = (raised(np.array([0.0, 0.0, 1.0]), geometry), raised(bend, geometry))
     return Plate(flat[0], normals[0], flat[1]), Plate(strip[0], normals[1], strip[1])
-
-
-def _outlined(geometry: GeometryConfig) -> list[tuple[float, NDArray[np.float64]]]:
-    """Return area and centre of the two parts of a flap of any outline."""
-    return [area_and_centre(surface.corners) for surface in surfaces(geometry)]
 
 
 def _quadrant(geometry: GeometryConfig) -> list[tuple[float, NDArray[np.float64]]]:
@@ -79,11 +78,8 @@ def drag_coefficient(geometry: GeometryConfig, airspeed: float, hover_angle: flo
         a, b, d = _turning(part.normal, axis_of(geometry))[:, 2].tolist()
         across = a + b * c + d * s
         lift += 4.0 * part.area * across * across * abs(across)
-    return (
-        2.0 * weigh(geometry).mass * GRAVITY / (AIR_DENSITY * airspeed * airspeed * lift)
-        if lift > 0.0
-        else math.inf
-    )
+    pressure = AIR_DENSITY * airspeed * airspeed
+    return 2.0 * weigh(geometry).mass * GRAVITY / (pressure * lift) if lift > 0.0 else math.inf
 
 
 def check_hover(geometry: GeometryConfig, plant: PlantConfig) -> None:
@@ -105,14 +101,10 @@ def place_plates(s: State, geometry: GeometryConfig, hover_angle: float) -> None
     s[at.AXIS_HEIGHT] = height
     s[at.HOVER_FLAPS : at.HOVER_FLAPS + 4] = SIGNS * hover_angle
     s[at.HOVER_TURN : at.HOVER_TURN + 2] = cos(hover_angle), -sin(hover_angle)
+    s[at.FLOW_POINTS : at.FLOW_POINTS + 8] = (geometry.flow_point * MIRRORS[:, :2]).ravel()
     lift = np.array([[0.0, 0.0, height], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    parts = flap_plates(geometry)
-    for flap in range(4):
-        s[at.FLOW_POINTS + 2 * flap : at.FLOW_POINTS + 2 * flap + 2] = geometry.flow_point * MIRRORS[flap, :2]
-        for index, part in enumerate(parts):
-            plate = 2 * flap + index
-            n = MIRRORS[flap] * _turning(part.normal, axis)
-            r = MIRRORS[flap] * _turning(part.centre, axis) + lift
-            s[at.AREA + plate] = part.area
-            s[at.NORMAL + 9 * plate : at.NORMAL + 9 * plate + 9] = n.ravel()
-            s[at.CENTRE + 9 * plate : at.CENTRE + 9 * plate + 9] = r.ravel()
+    for plate, (mirror, part) in enumerate(product(MIRRORS, flap_plates(geometry))):
+        normal, centre = at.NORMAL + 9 * plate, at.CENTRE + 9 * plate
+        s[at.AREA + plate] = part.area
+        s[normal : normal + 9] = (mirror * _turning(part.normal, axis)).ravel()
+        s[centre : centre + 9] = (mirror * _turning(part.centre, axis) + lift).ravel()

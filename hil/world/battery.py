@@ -56,11 +56,8 @@ class Battery:
     def _loaded(self) -> float:
         """Return the voltage V with V (OCV - V) / R equal to a cell's power; half of OCV when it cannot supply that."""
         open_circuit = open_circuit_voltage(self.charge)
-        per_cell = self.power / self._config.cells
-        return 0.5 * (
-            open_circuit
-            + math.sqrt(max(open_circuit * open_circuit - 4.0 * self._config.resistance * per_cell, 0.0))
-        )
+        drop = 4.0 * self._config.resistance * (self.power / self._config.cells)
+        return 0.5 * (open_circuit + math.sqrt(max(open_circuit * open_circuit - drop, 0.0)))
 
 
 def endurance(config: BatteryConfig, power: float, empty_V: float, step: float = 1.0) -> float:

@@ -20,9 +20,7 @@ SOURCES = (
 )
 compiled = compiling.compiler(*SOURCES)
 
-
 Matrix = NDArray[np.float64]
-
 SWEEPS_MAX = 50  # of Jacobi's method; 4 to 6 are usual
 NEGLIGIBLE = 1e-36  # sum of squares off the diagonal, as a share of all
 
@@ -47,9 +45,7 @@ def eigen(S: Matrix) -> tuple[Matrix, Matrix]:
     """Return eigenvalues (N,) and vectors (N, N), one a column, of a symmetric matrix; Jacobi's method, row by row."""
     A = S.copy()
     n = A.shape[0]
-    V = np.zeros((n, n))
-    for i in range(n):
-        V[i, i] = 1.0
+    V = np.eye(n)
     for _ in range(SWEEPS_MAX):
         beside, everything = 0.0, 0.0
         for p in range(n):

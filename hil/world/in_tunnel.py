@@ -8,6 +8,7 @@ compute flow and actuators: `hil.floaty.plant`, `hil.world.rigid`.
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from hil.world.tunnel import Tunnel
 
 NOISE_ROWS = 2048  # steps of gusts drawn at once
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+AT_REST = (0.0, 0.0, 0.0)
 LOSS_TEXTS = {
     at.LEFT_SIDEWAYS: "left the flow: {:.2f} m from the axis",
     at.ROSE: "left the flow: {:.2f} m above the hover point",
@@ -33,13 +35,12 @@ LOSS_TEXTS = {
 
 
 class InTunnel:
-    """The common part of all bodies in the tunnel. `s` is its array, including mass and inertia.
+    """The common part of all bodies in the tunnel: the views of `hil.world.body.Motion`, and v_WB (3,) [m/s].
 
-    Attributes (read-only numpy views of the current truth, SI): state (13,) p_WB, v_WB, q_WB, omega_B in one piece; p_WB,
-    v_WB (3,) in W; q_WB (4,) w x y z; omega_B (3,) in B; specific_force_B (3,) at the centre of mass; flow_W (3,) of the
-    air there; pushes (6,) force [N, W] and torque [N m, B] last set; room: what its distance sensors see.
+    `s` is the body's array, including mass and inertia.
     """
 
+    loss_texts: ClassVar[Mapping[int, str]] = LOSS_TEXTS  # by the cause in LOST, with its value
     # Compute forces and accelerations from the state; do every step up to `_now_us`, True: the draws ran out before.
     _evaluate: Callable[[], object]
     _advance: Callable[[], bool]
@@ -54,9 +55,8 @@ class InTunnel:
         s[at.NET_HEIGHT], s[at.FRICTION] = ground.height, ground.friction
         s[at.NET_STIFFNESS], s[at.NET_DAMPING] = ground.stiffness, ground.damping
         s[at.FOOT_SPREAD], s[at.FOOT_BELOW] = ground.foot_spread, ground.foot_below
-        s[at.FOOT_REACH] = math.sqrt(
-            2.0 * ground.foot_spread * ground.foot_spread + ground.foot_below * ground.foot_below
-        )
+        spread, below = ground.foot_spread, ground.foot_below
+        s[at.FOOT_REACH] = math.sqrt(2.0 * spread * spread + below * below)
         s[at.LIMIT_RADIUS], s[at.LIMIT_BELOW], s[at.LIMIT_ABOVE] = limits.radius, limits.below, limits.above
         s[at.LIMIT_COS_TILT] = cos(limits.tilt)
         s[at.NEXT_US] = s[at.AFTER_US] = math.inf
@@ -85,13 +85,7 @@ class InTunnel:
             for i in range(4)
         }
 
-    def place(
-        self,
-        p_WB: Vector,
-        q_WB: Vector,
-        v_WB: Vector = (0.0, 0.0, 0.0),
-        omega_B: Vector = (0.0, 0.0, 0.0),
-    ) -> None:
+    def place(self, p_WB: Vector, q_WB: Vector, v_WB: Vector = AT_REST, omega_B: Vector = AT_REST) -> None:
         """Set the state of the body; `q_WB` is normalised. Raises LabError for an invalid pose."""
         s = self._s
         length = math.sqrt(math.fsum(component * component for component in q_WB))
@@ -114,19 +108,15 @@ class InTunnel:
     def lost(self) -> str | None:
         """The first reason why the flight is over; None while it flies."""
         cause = int(self._s[at.LOST])
-        if cause == 0:
-            return None
-        return LOSS_TEXTS[cause].format(self._s[at.LOST_VALUE])
+        return self.loss_texts[cause].format(self._s[at.LOST_VALUE]) if cause else None
 
     def hold(self) -> None:
-        """Clamp the body where it is, at rest; actuators, air and sensors continue."""
         s = self._s
         s[at.HELD] = 1.0
         s[at.V : at.V + 3] = s[at.OMEGA : at.OMEGA + 3] = 0.0
         self._evaluate()
 
     def put_back(self, p_WB: Vector) -> None:
-        """Clamp the body upright at a place, and clear all causes of a loss; the actuators stay unchanged."""
         self._s[at.LOST] = 0.0
         self.place(p_WB, UPRIGHT)
         self.hold()
@@ -135,6 +125,5 @@ class InTunnel:
         self._s[at.HELD] = 0.0
         self._evaluate()
 
-    def push(self, force_W: Vector, torque_B: Vector = (0.0, 0.0, 0.0)) -> None:
-        """Apply a force [N, W] at the centre of mass and a torque [N m, B] until the next call."""
+    def push(self, force_W: Vector, torque_B: Vector = AT_REST) -> None:
         self._s[at.PUSH : at.PUSH + 3], self._s[at.PUSH_TORQUE : at.PUSH_TORQUE + 3] = force_W, torque_B

@@ -126,10 +126,8 @@ def press(s: State) -> None:
             c, d = s[at.HOVER_TURN], s[at.HOVER_TURN + 1]
             hover = added(hover, strike(s, 2 * flap, c, d, ux, uy, uz))
             hover = added(hover, strike(s, 2 * flap + 1, c, d, ux, uy, uz))
-    s[at.DRAG], s[at.DRAG + 1], s[at.DRAG + 2] = total[0], total[1], total[2]
-    s[at.DRAG + 3], s[at.DRAG + 4], s[at.DRAG + 5] = total[3], total[4], total[5]
-    s[at.HOVER_DRAG], s[at.HOVER_DRAG + 1], s[at.HOVER_DRAG + 2] = hover[0], hover[1], hover[2]
-    s[at.HOVER_DRAG + 3], s[at.HOVER_DRAG + 4], s[at.HOVER_DRAG + 5] = hover[3], hover[4], hover[5]
+    for i in range(6):
+        s[at.DRAG + i], s[at.HOVER_DRAG + i] = total[i], hover[i]
 
 
 @compiled
@@ -172,6 +170,5 @@ def drag(s: State) -> None:
     for arrow in range(at.PLATE_FORCES, at.PLATE_FORCES + 15, 3):
         x, y, z = s[arrow], s[arrow + 1], s[arrow + 2]
         for i in range(3):
-            s[arrow + i] = s[at.DRAG_FACTOR] * (
-                s[at.R + 3 * i] * x + s[at.R + 3 * i + 1] * y + s[at.R + 3 * i + 2] * z
-            )
+            r = at.R + 3 * i
+            s[arrow + i] = s[at.DRAG_FACTOR] * (s[r] * x + s[r + 1] * y + s[r + 2] * z)

@@ -132,7 +132,7 @@ class RigidBody(InTunnel):
 
     @property
     def lost(self) -> str | None:
-        """Return why the flight ended first, including errors in the user's code; None while it flies."""
+        """The first reason why the flight is over, or an error in the user's code; None while it flies."""
         return self._failed or super().lost
 
     def _stated(self, name: str, count: int) -> list[float]:

@@ -1,9 +1,8 @@
 """From timer counts to the commanded angle of a servo: pulse length, PWM period, zero offsets.
 
 The board's timer counts at 21 MHz; a PWM period is 52501 counts (2500.0476 us), a pulse 21000..42000 counts (1..2 ms).
-New counts take effect at the start of the next period, here the first whole microsecond at or after it; the first
-period starts at time 0. Source: the Crazyflie firmware's motors.c as the author
-changed it for servos.
+New counts take effect at the start of the next period, here the first whole microsecond at or after it; the first period
+starts at time 0. Source: the Crazyflie firmware's motors.c as the author changed it for servos.
 """
 
 from collections.abc import Sequence

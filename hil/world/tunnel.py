@@ -59,13 +59,10 @@ class Tunnel:
 
     def block(self, x: float, y: float, radius: float, depth: float) -> None:
         """Remove the share `depth` of the flow around (x, y) [m, W], half of it at `radius` [m]; depth 0 clears."""
-        self._s[at.OCCLUSION : at.OCCLUSION + 4] = (
-            _inside("occlusion x", x, -2.0, 2.0),
-            _inside("occlusion y", y, -2.0, 2.0),
-            _inside("occlusion radius", radius, 0.01, 5.0),
-            _inside("occlusion depth", depth, 0.0, 1.0),
-        )
-        self.shadow = depth
+        self.shadow = _inside("occlusion depth", depth, 0.0, 1.0)
+        place = [_inside(f"occlusion {name}", value, -2.0, 2.0) for name, value in (("x", x), ("y", y))]
+        size = _inside("occlusion radius", radius, 0.01, 5.0)
+        self._s[at.OCCLUSION : at.OCCLUSION + 4] = *place, size, depth
 
 
 def _inside(what: str, value: float, low: float, high: float) -> float:
