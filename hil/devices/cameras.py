@@ -1,26 +1,20 @@
 """The motion capture cameras: noisy, delayed poses of the body, sometimes missing or wrong.
 
-A pose is the truth with noise or, with `markers.enabled`, the fit to eight markers (`hil.devices.rigid_body`).
-Here frames and arrivals are computed; the harness exposes at `period_us` and delivers.
+A pose is the truth with noise or, with `markers.enabled`, the fit to eight markers (`hil.devices.markers`). Here
+frames and arrivals are computed; the harness exposes at `period_us` and delivers.
 """
-
-from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from firmware_py.geometry import IDENTITY, Quaternion, Vector, multiply, rotate
 from ground_station.mocap import MocapFrame
 from hil.devices.config import MocapConfig
-from hil.devices.markers import Sighting
+from hil.devices.markers import Sighting, VirtualMarkers
 from hil.world.body import Motion
 from hil.world.fixed_order import normal
-
-if TYPE_CHECKING:
-    from hil.devices.rigid_body import VirtualMarkers
 
 NOISE_ROWS = 512  # frames of noise drawn at once
 

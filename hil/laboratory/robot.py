@@ -25,8 +25,7 @@ from hil.devices.board import InjectFailure, KeptMemory, Requests, Thief, Virtua
 from hil.devices.board_firmware import Executor, PowerOn, PythonBoard
 from hil.devices.cameras import VirtualMocap
 from hil.devices.imu import GYRO_COUNTS, VirtualImu
-from hil.devices.markers import Sighting
-from hil.devices.rigid_body import make_markers
+from hil.devices.markers import Sighting, VirtualMarkers
 from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
 from hil.events import EventQueue
@@ -113,17 +112,13 @@ class Robot:
         at_rest = self.body.draw(0, open_circuit_voltage(config.battery.charge))
         self.battery: Battery = Battery(config.battery, at_rest)
         self.imu: VirtualImu = VirtualImu(config.imu, streams.imu)
-        self.mocap = VirtualMocap(
-            config.mocap,
-            streams.mocap,
-            make_markers(config.markers, self.body.markers, streams.markers),
-        )
+        seen = (config.markers, self.body.markers, streams.markers)
+        markers = VirtualMarkers(*seen) if config.markers.enabled else None
+        self.mocap = VirtualMocap(config.mocap, streams.mocap, markers)
         self.air, self.uart = ports.air, ports.uart
         self.executor = site.executor
         self._ports = ports
-        self._carrier = Carrier(
-            self.body, streams.board, self.body.room, config.robot.decks, self.body.escs
-        )
+        self._carrier = Carrier(self.body, streams.board, self.body.room, config.robot.decks, self.body.escs)
         self._thief: Thief | None = None
         self._seen_by: list[See] = []
         self._resets = 0

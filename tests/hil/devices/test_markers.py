@@ -14,8 +14,17 @@ from ground_station.mocap import MocapFrame
 from hil.config import load_config
 from hil.devices.cameras import VirtualMocap
 from hil.devices.config import MarkersConfig, MocapConfig
-from hil.devices.markers import COUNT, TRUNK_RADIUS, Cameras, Sighting
-from hil.devices.rigid_body import GHOST_REACH, NOISE_ROWS, WORST_PAIR, MarkerBody, VirtualMarkers
+from hil.devices.markers import (
+    COUNT,
+    GHOST_REACH,
+    NOISE_ROWS,
+    TRUNK_RADIUS,
+    WORST_PAIR,
+    Cameras,
+    MarkerBody,
+    Sighting,
+    VirtualMarkers,
+)
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
 from hil.floaty.drawing import marker_places, markers_of
