@@ -103,7 +103,7 @@ class Firmware:
         self.mavlink = self._mavlink_stack(config) if mavlink else None
         self._start_services(config)
         self.signals = Signals.of(core.estimator.memory, core.control.memory, self._supervisor)
-        self.statistics = Statistics(self.kernel, DEADLINES_US)
+        self.reports = Statistics(self.kernel, DEADLINES_US).reports
         self.kernel.start()
 
     def _start_services(self, config: FirmwareConfig) -> None:

@@ -122,13 +122,6 @@ class BoardScheduler(Protocol):
         """Start or stop reporting every task switch."""
 
 
-class BoardStatistics(Protocol):
-    """Timing of the tasks."""
-
-    def reports(self) -> Sequence[TaskReport]:
-        """Return the timing so far, task by task."""
-
-
 class FrameCounts(Protocol):
     """The board's counters of frames on its serial line."""
 
@@ -212,9 +205,8 @@ class BoardFirmware(Protocol):
     def log_numbers(self) -> Mapping[str, int]:
         """The numbers of its log variables in its table of contents, by name; empty without a log service."""
 
-    @property
-    def statistics(self) -> BoardStatistics:
-        """Timing of its tasks."""
+    def reports(self) -> Sequence[TaskReport]:
+        """Return the timing of its tasks so far, in the order of their first run."""
 
     @property
     def overrun(self) -> str:
@@ -278,10 +270,7 @@ class PythonBoard:
 
     runner: RunnerFactory = PythonRunner
     needs_polls: ClassVar[bool] = False
-
-    def wire_us(self, data: bytes) -> int:
-        """Return the time on the serial line between the two chips."""
-        return syslink_us(data)
+    wire_us = staticmethod(syslink_us)
 
     def boot(self, start: PowerOn) -> Firmware:
         return Firmware(start.config, start.board, start.serial, self.runner)

@@ -3,14 +3,17 @@
 Power comes on `WARM_UP_US` before the laboratory's time begins, because an image needs seconds to start; the robot rests
 in its holder meanwhile. A reset in flight takes its real time.
 
-The robot's state is read from the exported app by symbols, or from the log variables of an image without it.
+The robot's state is read from the exported app by symbols, or from the log variables of an image without it: the stock
+firmware's own estimate (in W), motors and supervisor; missing values are empty.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from math import nan, radians
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -21,18 +24,16 @@ from firmware_py.board import ImuCounts
 from firmware_py.config import FirmwareConfig, parameters_of
 from firmware_py.rtos import TaskReport
 from firmware_py.signals import CONTROL, ESTIMATOR, Signals
-from firmware_py.wire.supervisor import Cause, State
+from firmware_py.wire.supervisor import LOCKED, Cause, State
+from firmware_py.wire.telemetry import LEGACY_DEGREES
 from hil.crazyflie import syslink
 from hil.crazyflie.crazyflie import Crazyflie
 from hil.crazyflie.log_table import ImageVariable, log_numbers, log_table, parameter_table
 from hil.devices.board_firmware import ImageReport, Pins, PowerOn
-from hil.devices.crazyflie_signals import stock_signals
 from hil.errors import LabError
 from hil.stm32f405.chip import SOFTWARE, WATCHDOG, build_machine
-from hil.stm32f405.freertos import HEAP, HEAP_LEAST
 from hil.stm32f405.gdb import GdbServer
 from hil.stm32f405.image import Image
-from hil.stm32f405.processor import ChipProcessor
 from hil.world.body import Carrier
 from hil.world.servos import OUTPUTS
 
@@ -41,6 +42,16 @@ from hil.world.servos import OUTPUTS
 WARM_UP_US = 3_104_000
 IMU_PERIOD_US = 1_000
 OWN_LOGIC = "floaty_guard"  # exists in images with the user's own logic
+FLYING, TUMBLED, CRASHED = 1 << 4, 1 << 5, 1 << 7  # of `supervisor.info`, beside LOCKED
+DEGREE = radians(1.0)
+# Name and factor to SI of the estimate's twelve numbers.
+ESTIMATE = (
+    *((f"stateEstimate.{name}", 1.0) for name in ("x", "y", "z", "vx", "vy", "vz")),
+    *((f"stateEstimate.{name}", 1.0 / scale) for name, scale in zip(("roll", "pitch", "yaw"), LEGACY_DEGREES, strict=True)),
+    *((f"gyro.{name}", DEGREE) for name in "xyz"),
+)  # fmt: skip
+MOTORS = tuple(f"motor.m{number}" for number in (1, 2, 3, 4))
+NO_FLOATS, NO_COUNTS = np.empty(0, np.float32), np.empty(0, np.int32)
 
 
 class ChipSupervisor:
@@ -52,9 +63,8 @@ class ChipSupervisor:
     @property
     def state(self) -> State:
         number = int(self._state.read()) if self._state else State.CALIBRATING
-        return (
-            State(number) if number in tuple(State) else State.CALIBRATING
-        )  # a crash may have overwritten it
+        # A crash may have overwritten it.
+        return State(number) if number in tuple(State) else State.CALIBRATING
 
     @property
     def cause(self) -> Cause:
@@ -62,23 +72,34 @@ class ChipSupervisor:
         return Cause(number) if number in tuple(Cause) else Cause.NONE
 
 
-class ImageStatistics:
-    """The run times of the image's tasks."""
+@dataclass(frozen=True, slots=True)
+class StockSupervisor:
+    """`bits` are those of `supervisor.info`."""
 
-    def __init__(self, kernel: ChipProcessor) -> None:
-        self._kernel = kernel
+    bits: int
 
-    def reports(self) -> list[TaskReport]:
-        """Return the tasks in the order of their first run."""
-        kernel = self._kernel
-        counted = zip(kernel.tasks, kernel.run_times_us(), kernel.activations(), strict=True)
-        return [
-            TaskReport(
-                name=task.name, priority=task.priority, run_time_us=run_time_us, activations=activations,
-                worst_response_us=0, worst_latency_us=0, latency_histogram=(), deadline_us=None, deadline_misses=0,
-            )
-            for task, run_time_us, activations in counted
-        ]  # fmt: skip
+    @property
+    def state(self) -> State:
+        """Our name for its state: failsafe once it stops all motors."""
+        if self.bits & (LOCKED | TUMBLED | CRASHED):
+            return State.FAILSAFE
+        return State.FLYING if self.bits & FLYING else State.WAITING
+
+    @property
+    def cause(self) -> Cause:
+        return Cause.EMERGENCY_STOP if self.bits & LOCKED else Cause.NONE
+
+
+def stock_signals(table: Mapping[str, ImageVariable]) -> Signals:
+    """Return the current values; NaN for a variable that the image lacks."""
+
+    def read(name: str, missing: float) -> float:
+        return table[name].read() if name in table else missing
+
+    estimate = np.array([factor * read(name, nan) for name, factor in ESTIMATE], np.float32)
+    motors = np.array([read(name, 0.0) for name in MOTORS], np.int32)
+    supervisor = StockSupervisor(int(read("supervisor.info", 0.0)))
+    return Signals(estimate, NO_COUNTS, NO_FLOATS, NO_FLOATS, motors, supervisor)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,8 +117,7 @@ class ChipImage:
         return cls(Image(path, elf), build_machine(folder), debugger)
 
     def wire_us(self, data: bytes) -> int:
-        """Return 0: the chip simulates its serial line itself."""
-        return 0
+        return 0  # the chip simulates its serial line itself
 
     def boot(self, start: PowerOn) -> ImageFirmware:
         return ImageFirmware(self, start.board, start.rest, not start.polled, start.outputs, start.carrier)
@@ -129,13 +149,11 @@ class ImageFirmware:
         self.image, self.chip, self.parts = flashed.image, self._crazyflie.chip, self._crazyflie.parts
         self.kernel = self.scheduler = self._crazyflie.processor
         self._board = board
-        table = {variable.name: variable for variable in log_table(self.image, self.chip)}
-        self.variables = [v for v in table.values() if v.name.startswith("excite.")]
+        self._table = {variable.name: variable for variable in log_table(self.image, self.chip)}
+        self.variables = [one for name, one in self._table.items() if name.startswith("excite.")]
         self.log_numbers = log_numbers(self.image, self.chip)
         self.parameters = parameter_table(self.image, self.chip)
-        self._table = table
-        self._app = self._signals_of_app(table) if self.image.has("floaty_estimator") else None
-        self.statistics = ImageStatistics(self.kernel)
+        self._app = self._signals_of_app() if self.image.has("floaty_estimator") else None
         if rest is not None:
             self._warm_up(rest)
 
@@ -144,6 +162,17 @@ class ImageFirmware:
             self.kernel.run(now_us)
             self.parts.sample(rest())
         self.kernel.begin(WARM_UP_US)
+
+    def reports(self) -> list[TaskReport]:
+        kernel = self.kernel
+        counted = zip(kernel.tasks, kernel.run_times_us(), kernel.activations(), strict=True)
+        return [
+            TaskReport(
+                name=task.name, priority=task.priority, run_time_us=run_time_us, activations=activations,
+                worst_response_us=0, worst_latency_us=0, latency_histogram=(), deadline_us=None, deadline_misses=0,
+            )
+            for task, run_time_us, activations in counted
+        ]  # fmt: skip
 
     def differences(self, config: FirmwareConfig) -> str:
         if not self.image.has("floaty_parameters"):
@@ -171,8 +200,7 @@ class ImageFirmware:
     def radio_polled(self) -> None:
         self.radio_received(syslink.EMPTY)
 
-    def uart_ready(self) -> None:
-        """Do nothing: the image has no serial line."""
+    def uart_ready(self) -> None: ...  # the image has no serial line
 
     def check_watchdog(self) -> None:
         """Report the missing peripherals that the image has used; its watchdog acts by itself."""
@@ -180,7 +208,6 @@ class ImageFirmware:
 
     @property
     def clock_us(self) -> int | None:
-        """Return the firmware's own microseconds; None without a Crazyflie's clock."""
         return self._crazyflie.clock_us
 
     @property
@@ -193,15 +220,13 @@ class ImageFirmware:
         return sum(self._crazyflie.resets.values())
 
     def report(self) -> ImageReport:
-        kernel, code = self._crazyflie.tasks, hashlib.sha256(self.image.code).hexdigest()
-        try:
-            tasks = [] if kernel is None or not kernel.running else kernel.tasks()
-        except LabError:  # it has overwritten its own lists
-            tasks = []
-        stacks, free, least = {task.name: task.stack_free_bytes for task in tasks}, None, None
-        if kernel is not None and self.image.has(HEAP) and self.image.has(HEAP_LEAST):
-            free, least = kernel.heap_free_bytes, kernel.heap_least_free_bytes
-        resets = self._crazyflie.resets
+        kernel, resets = self._crazyflie.tasks, self._crazyflie.resets
+        stacks: dict[str, int] = {}
+        with suppress(LabError):  # it may have overwritten its own lists
+            if kernel is not None and kernel.running:
+                stacks = {task.name: task.stack_free_bytes for task in kernel.tasks()}
+        free, least = (None, None) if kernel is None else kernel.heap_bytes
+        code = hashlib.sha256(self.image.code).hexdigest()
         return ImageReport(code, stacks, free, least, resets[WATCHDOG], resets[SOFTWARE])
 
     # Values read from the app
@@ -211,13 +236,10 @@ class ImageFirmware:
         """Views on the app's core; without the app, the stock firmware's current values."""
         return self._app or stock_signals(self._table)
 
-    def _signals_of_app(self, table: dict[str, ImageVariable]) -> Signals:
-        estimator, control = (
-            self._struct("floaty_estimator", ESTIMATOR),
-            self._struct("floaty_control", CONTROL),
-        )
-        supervisor = ChipSupervisor(table if self.image.has("floaty_supervisor") else {})
-        return Signals.of(estimator, control, supervisor)
+    def _signals_of_app(self) -> Signals:
+        supervisor = ChipSupervisor(self._table if self.image.has("floaty_supervisor") else {})
+        memories = self._struct("floaty_estimator", ESTIMATOR), self._struct("floaty_control", CONTROL)
+        return Signals.of(*memories, supervisor)
 
     def _struct(self, name: str, layout: np.dtype[Any]) -> NDArray[Any]:
         """Return a view on a struct of the core, (1,); zeros for an image without the app."""

@@ -64,20 +64,12 @@ class _Clock:
     def __init__(self) -> None:
         self.now_us = 0
 
-    def advance(self, now_us: int) -> None:
-        """Let it be so late."""
-        self.now_us = now_us
-
     def run(self, now_us: int, until_us: int = 0) -> None:
-        """Set the time; nothing happens by itself."""
         self.now_us = now_us
 
-    def stop_before(self, us: int) -> None:
-        """Do nothing: it does not run ahead."""
+    advance = run
 
-    def reports(self) -> tuple[TaskReport, ...]:
-        """Return nothing: a board does not report its tasks."""
-        return ()
+    def stop_before(self, us: int) -> None: ...  # it does not run ahead
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +80,7 @@ class RealBoard:
     moving: bool
     wall: Paced  # maps simulated time to the wall clock
     needs_polls: ClassVar[bool] = False
-
-    def wire_us(self, data: bytes) -> int:
-        """Return the time on the serial line between a board's two chips."""
-        return syslink_us(data)
+    wire_us = staticmethod(syslink_us)
 
     def boot(self, start: PowerOn) -> RealFirmware:
         """Switch the board to the loop. Raises `LinkError` when it does not answer."""
@@ -123,7 +112,7 @@ class RealFirmware:
     overrun: ClassVar[str] = ""
 
     def __init__(self, real: RealBoard, board: Board) -> None:
-        self.kernel = self.statistics = _Clock()
+        self.kernel = _Clock()
         self._told: Loop | None = None  # last
         self._delay_us = 0  # recent mean, from a sample to the counts it caused
         self._added_us = 0  # the link's latency, which corrections add to their age
@@ -183,11 +172,12 @@ class RealFirmware:
         self._correction = encode_ext_pose(pose.p_GB, pose.q_GB, age_us)
         self._send()
 
-    def radio_polled(self) -> None:
-        """Do nothing: the board's own radio is polled."""
+    def radio_polled(self) -> None: ...  # the board's own radio is polled
 
-    def uart_ready(self) -> None:
-        """Do nothing: the board has no serial line."""
+    def uart_ready(self) -> None: ...  # the board has no serial line
+
+    def reports(self) -> tuple[TaskReport, ...]:
+        return ()  # a board does not report its tasks
 
     def check_watchdog(self) -> None:
         """Raise `LinkError` when the board has reported nothing for too long."""

@@ -69,7 +69,7 @@ def fly(
     queues = firmware.scheduler.queues if firmware.scheduler is not None else ()
     result = replace(
         judged(request, program, ended, metrics, log, digest, folder),
-        tasks=tuple(firmware.statistics.reports()),
+        tasks=tuple(firmware.reports()),
         queues=tuple(QueueReport(one.name, one.length, one.high_water, one.dropped) for one in queues),
         usage=firmware.usage,
         real_time_factor=round(factor, 2),

@@ -66,14 +66,13 @@ class FreeRtos:
         return self._word(self._image.symbol("xSchedulerRunning").address) != 0
 
     @property
-    def heap_free_bytes(self) -> int:
-        """Return the free bytes of heap_4."""
-        return self._word(self._image.symbol(HEAP).address)
-
-    @property
-    def heap_least_free_bytes(self) -> int:
-        """Return its smallest number of free bytes so far."""
-        return self._word(self._image.symbol(HEAP_LEAST).address)
+    def heap_bytes(self) -> tuple[int, int] | tuple[None, None]:
+        """Return the free bytes of heap_4 now and when it was fullest; None for another heap."""
+        if not (self._image.has(HEAP) and self._image.has(HEAP_LEAST)):
+            return None, None
+        return self._word(self._image.symbol(HEAP).address), self._word(
+            self._image.symbol(HEAP_LEAST).address
+        )
 
     def tasks(self) -> list[TaskView]:
         """Return all tasks, by priority and name."""

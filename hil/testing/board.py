@@ -138,7 +138,7 @@ class BareBoard:
     @property
     def tasks(self) -> Mapping[str, TaskReport]:
         """The tasks' timing, by name: run time, response, missed deadlines."""
-        return {report.name: report for report in self.firmware.statistics.reports()}
+        return {report.name: report for report in self.firmware.reports()}
 
     @property
     def battery_mv(self) -> int:

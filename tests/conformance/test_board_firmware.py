@@ -157,7 +157,7 @@ def test_variables_have_names_of_their_own_and_numbers_of_their_types(bench: Ben
 
 def test_tasks_are_told_alike_by_scheduler_and_statistics(bench: Bench) -> None:
     bench.run(100_000)
-    scheduler, reports = bench.firmware.scheduler, bench.firmware.statistics.reports()
+    scheduler, reports = bench.firmware.scheduler, bench.firmware.reports()
     if scheduler is None:
         assert not reports
         return

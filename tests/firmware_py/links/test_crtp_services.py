@@ -713,9 +713,9 @@ def test_console_tells_on_the_radio_what_it_tells_on_the_debug_pins(client: Crtp
 
 def test_idle_services_do_not_run(client: CrtpClient) -> None:
     client.run(1_000_000)
-    before = {report.name: report.activations for report in client.firmware.statistics.reports()}
+    before = {report.name: report.activations for report in client.firmware.reports()}
     client.run(2_000_000)
-    after = {report.name: report.activations for report in client.firmware.statistics.reports()}
+    after = {report.name: report.activations for report in client.firmware.reports()}
     for name in [
         "SYSLINK",
         "CRTP-RX",

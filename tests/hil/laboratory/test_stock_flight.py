@@ -11,7 +11,7 @@ from firmware_py.wire.supervisor import Cause, State
 from hil.api import Request, column, fly
 from hil.config import load_config
 from hil.crazyflie.log_table import log_table
-from hil.devices.crazyflie_signals import stock_signals
+from hil.devices.image_firmware import stock_signals
 from hil.errors import LabError
 from hil.experiments.hover import HOVER
 from hil.laboratory.fault_kinds import KINDS

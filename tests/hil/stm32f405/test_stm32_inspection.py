@@ -82,8 +82,8 @@ def test_the_high_water_mark_is_what_was_never_written(compiler: str) -> None:
 def test_an_image_without_freertos_is_refused() -> None:
     machine = FirmwareOnChip()
     kernel = FreeRtos(machine.image, machine.chip.read)
-    with pytest.raises(LabError, match="no variable or function is called xFreeBytesRemaining"):
-        assert kernel.heap_free_bytes
+    with pytest.raises(LabError, match="no variable or function is called xSchedulerRunning"):
+        assert kernel.running
 
 
 def crashed(machine: FirmwareOnChip) -> str:
@@ -331,7 +331,7 @@ def test_a_real_crazyflie_image_is_read() -> None:
     kernel = FreeRtos(image, read)
     memory[image.symbol("xTickCount").address - 0x2000_0000 :][:4] = pack("<I", 0)
     assert image.place(image.symbol("assertFail").address).startswith("assertFail (cfassert.c:")
-    assert kernel.heap_free_bytes == 0
+    assert kernel.heap_bytes[0] == 0
 
 
 @COMPILERS
