@@ -37,14 +37,6 @@ class KeptMemory:
     deck: bytearray = field(default_factory=lambda: bytearray(b"\xff" * DECK_MEMORY_SIZE))
 
 
-def stay_on(now_us: int) -> None:
-    """Ignore a reset."""
-
-
-def ignore_command(now_us: int, kind: int, data: bytes) -> None:
-    """Ignore a command to the radio chip."""
-
-
 def unsupported(now_us: int, unit: int, failing: int, instance: int) -> CommandResult:
     """Refuse every failure."""
     return CommandResult.UNSUPPORTED
@@ -54,8 +46,9 @@ def unsupported(now_us: int, unit: int, failing: int, instance: int) -> CommandR
 class Requests:
     """The world's answers when the processor resets itself, commands its radio chip, or a client makes a part fail."""
 
-    reset: Callable[[int], None] = stay_on
-    radio_command: Callable[[int, int, bytes], None] = ignore_command  # (now_us, kind, data), as in syslink
+    reset: Callable[[int], None] = lambda now_us: None
+    # (now_us, kind, data), as in syslink
+    radio_command: Callable[[int, int, bytes], None] = lambda now_us, kind, data: None
     fail: InjectFailure = unsupported
 
 
@@ -81,11 +74,8 @@ class VirtualBoard:
         self.battery_mv = 3900
         memory = memory or KeptMemory()
         self.eeprom, self.deck_memory = memory.eeprom, memory.deck
+        self._servo, self._radio, self._console, self._uart = servo, radio, console, uart
         self._requests = requests
-        self._servo = servo
-        self._radio = radio
-        self._console = console
-        self._uart = uart
         self._kernel: Processor | None = None
         self._events: EventQueue | None = None
         self._booted_us = 0
@@ -95,7 +85,6 @@ class VirtualBoard:
         self.imu = counts
 
     def supply(self, millivolts: int) -> None:
-        """Set the supply voltage."""
         self.battery_mv = millivolts
 
     def boot(self, now_us: int) -> None:

@@ -6,6 +6,7 @@ on that channel, and none answers.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -38,13 +39,12 @@ class VirtualDongle:
 
     def control(self, request: int, value: int, data: bytes) -> None:
         """Execute a vendor request; accept those without effect here (power, retry delay, carrier)."""
-        old = self._settings
         if request == SET_CHANNEL:
-            self._settings = AirSettings(value, old.bits_per_second, old.address)
+            self._settings = replace(self._settings, channel=value)
         elif request == SET_ADDRESS and len(data) == 5:
-            self._settings = AirSettings(old.channel, old.bits_per_second, data)
+            self._settings = replace(self._settings, address=data)
         elif request == SET_RATE and value < len(RATES):
-            self._settings = AirSettings(old.channel, RATES[value], old.address)
+            self._settings = replace(self._settings, bits_per_second=RATES[value])
         elif request == SET_RETRIES:
             self._retries = value & 0x0F
         elif request == SET_ACKS:
@@ -61,11 +61,9 @@ class VirtualDongle:
         retries = self._retries if acks else 0
         for any_board in self._boards:
             if packet and any_board.hears_all(settings):
-                hear_too = partial(any_board.overhear, data=packet)
-                to_all = RadioExchange(
-                    len(packet), settings.bits_per_second, any_board.air, retries, hear_too, _nobody_waits
-                )
-                self._transmitter.send(now_us, to_all)
+                hear_too, size = partial(any_board.overhear, data=packet), len(packet)
+                ether = (size, settings.bits_per_second, any_board.air, retries)
+                self._transmitter.send(now_us, RadioExchange(*ether, hear_too, lambda *_: None))
         payload: bytes | None = None  # of the last answer
         board = next((board for board in self._boards if packet and board.hears(settings)), None)
         air = NOWHERE if board is None else board.air
@@ -87,7 +85,3 @@ class VirtualDongle:
         jitter_us = int(self._rng.random() * air.uplink_jitter_us) if air.uplink_jitter_us else 0
         exchange = RadioExchange(len(packet), settings.bits_per_second, air, retries, hear, ended)
         self._transmitter.send(now_us + jitter_us, exchange)
-
-
-def _nobody_waits(repetitions: int | None, now_us: int) -> None:
-    """End an exchange that has no answer."""

@@ -23,13 +23,15 @@ from hil.world.motion import GRAVITY
 View = NDArray[np.float64]
 Counts = NDArray[np.int64]  # (7,) of a sample, then the number of noise rows left
 LEFT = 6
-
-
-# Layout of the sensor's array: for each of six channels (gyro x y z, accelerometer x y z) a row of
-NOW_1, NOW_2, B0, A1, A2, SCALE, BIAS, NOISE, FAULT_BIAS, STUCK, RANGE, COUNT, AXIS_COS, AXIS_SIN, FIELDS = (
-    range(15)
-)
+SAMPLE_RATE = 1000.0  # [Hz]
+GYRO_COUNTS = 32768 / math.radians(2000)  # per rad/s; data sheet, range +-2000 deg/s
+ACCEL_COUNTS = 32768 / (24 * GRAVITY)  # per m/s2; data sheet, range +-24 g
+COUNTS = 32768.0  # of int16, one more below zero than above
+NOISE_ROWS = 2048  # samples of noise drawn at once
 COS, SIN = cos(S_AZIMUTH), sin(S_AZIMUTH)  # of the default
+# Layout of the sensor's array: for each of six channels (gyro x y z, accelerometer x y z) a row of
+NOW_1, NOW_2, B0, A1, A2, SCALE, BIAS, NOISE, FAULT_BIAS, STUCK, RANGE, COUNT, AXIS_COS, AXIS_SIN = range(14)
+FIELDS = 14
 
 
 @compiled
@@ -64,13 +66,6 @@ def channels(
     counts[3] = channel(rows[3], c * fx + s * fy, pushed, noise[3])
     counts[4] = channel(rows[4], c * fy - s * fx, pushed, noise[4])
     counts[5] = channel(rows[5], specific_force_B[2], pushed, noise[5])
-
-
-SAMPLE_RATE = 1000.0  # [Hz]
-GYRO_COUNTS = 32768 / math.radians(2000)  # per rad/s; data sheet, range +-2000 deg/s
-ACCEL_COUNTS = 32768 / (24 * GRAVITY)  # per m/s2; data sheet, range +-24 g
-COUNTS = 32768.0  # of int16, one more below zero than above
-NOISE_ROWS = 2048  # samples of noise drawn at once
 
 
 def low_pass(bandwidth: float) -> tuple[float, float, float]:
@@ -111,15 +106,8 @@ class VirtualImu:
         """Return gyro x y z and accelerometer x y z counts, in S, of the body as it moves now."""
         if self._body is not body:
             self._body = body
-            self._measure = bound(
-                channels,
-                self._rows,
-                body.omega_B,
-                body.specific_force_B,
-                body.vibration,
-                self._draws,
-                self._counts,
-            )
+            felt = body.omega_B, body.specific_force_B, body.vibration
+            self._measure = bound(channels, self._rows, *felt, self._draws, self._counts)
         if self._left == 0:
             self._draws[:] = normal(self._rng, (NOISE_ROWS, 6))
             self._counts[LEFT] = NOISE_ROWS

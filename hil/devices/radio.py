@@ -56,12 +56,7 @@ class DirectionCounters:
         """Count a packet that has arrived."""
         self.delivered += 1
         self.latency_sum_us += latency_us
-        if latency_us > self.latency_max_us:
-            self.latency_max_us = latency_us
-
-
-def _nobody_asks(now_us: int) -> None:
-    """Ignore a poll: its host is not a dongle."""
+        self.latency_max_us = max(self.latency_max_us, latency_us)
 
 
 class VirtualRadio:
@@ -78,12 +73,8 @@ class VirtualRadio:
         """`wire_us`: a packet's time between the board's two chips."""
         self.medium = medium or Air.of(config)
         self._wire_us = wire_us
-        self.up = DirectionCounters()
-        self.down = DirectionCounters()
-
-        self._config = config
-        self._events = events
-        self._rng = rng
+        self.up, self.down = DirectionCounters(), DirectionCounters()
+        self._config, self._events, self._rng = config, events, rng
         self._uniforms: list[float] = []
         self._transmitter = Transmitter(config, events, self._uniform)
         self.air = self._transmitter.counters  # of the simulated exchanges
@@ -96,12 +87,10 @@ class VirtualRadio:
         self._answer_size: int | None = None  # of the exchange in progress, once the board has heard it
 
     def connect(
-        self, on_board: Receiver, on_ground: Receiver, on_poll: Callable[[int], object] = _nobody_asks
+        self, on_board: Receiver, on_ground: Receiver, on_poll: Callable[[int], object] = lambda now_us: None
     ) -> None:
         """Set the receivers of the uplink, the downlink, and empty polls that fetch a packet."""
-        self._on_board = on_board
-        self._on_ground = on_ground
-        self._on_poll = on_poll
+        self._on_board, self._on_ground, self._on_poll = on_board, on_ground, on_poll
 
     def uplink(self, now_us: int, data: bytes) -> None:
         """Take a packet for the board; drop the oldest when the host's queue is full."""
@@ -168,9 +157,8 @@ class VirtualRadio:
             heard = 1.0 - self.medium.lost_up(POLL_BYTES)
             lost = 1.0 - heard * (1.0 - self.medium.lost_down(EMPTY_ACK_BYTES))
             if lost:
-                lengths, weights, total = _polls_met(
-                    lost, length_us, host_us, again_us(POLL_BYTES, config.bits_per_second)
-                )
+                repeat_us = again_us(POLL_BYTES, config.bits_per_second)
+                lengths, weights, total = _polls_met(lost, length_us, host_us, repeat_us)
                 rest, kind = self._uniform() * total, 0
                 while kind <= RETRIES and rest >= weights[kind]:
                     rest -= weights[kind]
@@ -184,10 +172,11 @@ class VirtualRadio:
     def _exchange(self, start_us: int) -> None:
         """Hand a packet or poll to the dongle."""
         self._answer_size = None
-        exchange = RadioExchange(
-            POLL_BYTES if self._uploading is None else len(self._uploading.data),
-            self._config.bits_per_second, self.medium, RETRIES, self._hear, self._ended,
-        )  # fmt: skip
+        size, rate = (
+            len(self._uploading.data) if self._uploading else POLL_BYTES,
+            self._config.bits_per_second,
+        )
+        exchange = RadioExchange(size, rate, self.medium, RETRIES, self._hear, self._ended)
         self._transmitter.send(start_us, exchange)
 
     def _hear(self, now_us: int) -> int:
@@ -235,15 +224,11 @@ def _polls_met(
     lost: float, length_us: int, host_us: int, again_us: int
 ) -> tuple[tuple[int, ...], tuple[float, ...], float]:
     """Return poll lengths [us] by number of repetitions, and the chance to meet each: frequency times length."""
-    lengths = (
-        *(length_us + tries * again_us for tries in range(RETRIES + 1)),
-        host_us + (RETRIES + 1) * again_us,
-    )
-    weights = (
-        *((1.0 - lost) * power(lost, tries) * lengths[tries] for tries in range(RETRIES + 1)),
-        power(lost, RETRIES + 1) * lengths[-1],
-    )
-    return lengths, weights, sum(weights)
+    answered = [length_us + tries * again_us for tries in range(RETRIES + 1)]
+    failed = host_us + (RETRIES + 1) * again_us
+    weights = [(1.0 - lost) * power(lost, tries) * length for tries, length in enumerate(answered)]
+    weights.append(power(lost, RETRIES + 1) * failed)
+    return (*answered, failed), tuple(weights), sum(weights)
 
 
 def _check_size(data: bytes) -> None:

@@ -58,12 +58,8 @@ class _Line:
         arrived: Arrived,
     ) -> None:
         self.counters = LineCounters()
-        self._baud = config.baud
-        self._threshold = config.interrupt_threshold
-        self._capacity = capacity
-        self._events = events
-        self._arrived = arrived
-        self._rng = rng
+        self._baud, self._threshold = config.baud, config.interrupt_threshold
+        self._capacity, self._events, self._rng, self._arrived = capacity, events, rng, arrived
         self._free_ticks = 0  # end of the last byte
         self._gathered = b""  # bytes that the silence after the last byte hands over
         self._silence = 0  # its number: a later byte cancels it
@@ -135,18 +131,15 @@ class VirtualSerial:
         self.connected: bool = True
         self.uplink_bit_error_rate = config.uplink_bit_error_rate
         self.downlink_bit_error_rate = config.downlink_bit_error_rate
-        self._config = config
-        self._events = events
+        self._config, self._events = config, events
         self._up = _Line(config, HOST_BUFFER, events, rng, self._arrive_up)
         self._down = _Line(config, config.transmit_buffer, events, rng, self._arrive_down)
-        self.up = self._up.counters
-        self.down = self._down.counters
+        self.up, self.down = self._up.counters, self._down.counters
         self._received = bytearray()  # on board
 
     def connect(self, on_board: Callable[[int], object], on_ground: Callable[[int, bytes], object]) -> None:
         """Set the board's interrupt, after which it can `read`, and the ground's receiver (now_us, chunk)."""
-        self._on_board = on_board
-        self._on_ground = on_ground
+        self._on_board, self._on_ground = on_board, on_ground
 
     def uplink(self, now_us: int, data: bytes) -> None:
         """Take bytes for the board; drop those without room at the host."""
