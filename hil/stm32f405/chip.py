@@ -8,7 +8,7 @@ up with the core.
 import mmap
 from collections.abc import Callable
 from enum import IntEnum
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -111,9 +111,9 @@ class Chip:
         memories = [self._pointer(array) for array in arrays]
         if self._library.machine_attach(self.state, self._engine(uclib), *memories):
             raise LabError("unicorn refuses the machine's hooks")
+        get = partial(getattr, self._library)
         self._registers = [
-            (base, base + size, *(getattr(self._library, f"{name}_{access}") for access in ("read", "write")))
-            for base, size, name in WINDOWS
+            (base, base + size, get(f"{name}_read"), get(f"{name}_write")) for base, size, name in WINDOWS
         ]
         self._sent = self._ffi.new("uint8_t[]", self._library.LINE_BYTES)
         self._kept: list[NDArray[Any]] = []  # memory of devices, and the speeds of motors
@@ -124,12 +124,13 @@ class Chip:
         self.reset(POWER_ON)
 
     def _map(self, const: Any) -> None:
-        """Map flash, RAM, CCM and the system's memory. The alias of flash at 0 is mapped at its first use (`run`)."""
+        """Map flash, RAM, CCM and the system's memory. The alias of flash at 0 is mapped at its first use (`_after`)."""
         read, write, execute = const.UC_PROT_READ, const.UC_PROT_WRITE, const.UC_PROT_EXEC
+        self._readable = read | execute
         self._system = _memory(SYSTEM_SIZE)
         self._system[:] = 0xFF
         for place, array, rights in (
-            (FLASH, self.flash, read | execute),
+            (FLASH, self.flash, self._readable),
             (RAM, self.ram, read | write | execute),
             (CCM, self.ccm, read | write),
             (SYSTEM, self._system, read),
@@ -153,11 +154,6 @@ class Chip:
     # Time
 
     @property
-    def in_block(self) -> bool:
-        """Whether it stopped inside a block of instructions, where it would not stop by itself."""
-        return bool(self.state.resume == self.state.pc)
-
-    @property
     def now_us(self) -> int:
         """Microseconds since power-on."""
         return int(self.state.now) // CYCLES_PER_US
@@ -166,24 +162,18 @@ class Chip:
         """Run up to a time, or until the caller must act; return why it ended, a sum of `Why`."""
         if self.breakpoints | self.crash_points != self._planted:
             self._plant(self.breakpoints | self.crash_points)
-        why: int = self._library.machine_run(self.state, until_cycles)
+        return self._after(self._library.machine_run(self.state, until_cycles))
+
+    def _after(self, why: int) -> int:
+        """Map flash at 0 as well, as after a normal start, when it is first read there."""
         if why & Why.LOW_READ:
-            self._map_alias()
+            self._cpu.mem_map_ptr(0, self.flash.size, self._readable, self.flash.ctypes.data)
         return why
-
-    def _map_alias(self) -> None:
-        """Map flash at 0 as well, as after a normal start."""
-        from unicorn import unicorn_const as const
-
-        rights = const.UC_PROT_READ | const.UC_PROT_EXEC
-        self._cpu.mem_map_ptr(0, self.flash.size, rights, self.flash.ctypes.data)
 
     def step(self) -> int:
         """Execute one instruction."""
         self._cpu.ctl_flush_tb()  # hooks act on code translated after them, until it is flushed
-        why: int = self._library.machine_step(self.state)
-        if why & Why.LOW_READ:
-            self._map_alias()
+        why = self._after(self._library.machine_step(self.state))
         self._cpu.ctl_flush_tb()
         return why
 
@@ -264,51 +254,36 @@ class Chip:
         """Return memory, or registers as the core reads them. Raises `LabError` at any other address."""
         for base, end, read, _ in self._registers:
             if base <= address and address + size <= end:
-                words = range(address & ~3, address + size, 4)
-                found = b"".join(
-                    read(self._ffi.NULL, at - base, 4, self.state).to_bytes(8, "little")[:4] for at in words
-                )
-                return found[address & 3 :][:size]
+                places = range((address & ~3) - base, address + size - base, 4)
+                words = [read(self._ffi.NULL, place, 4, self.state) & 0xFFFF_FFFF for place in places]
+                return np.array(words, np.uint32).tobytes()[address & 3 :][:size]
         return self.view(address, size).tobytes()
 
     def view(self, address: int, size: int) -> NDArray[np.uint8]:
         """Return a live view of memory. Raises `LabError` at any other address."""
-        array, begin = self._place(address, size)
-        return array[begin : begin + size]
+        for base, array in (
+            (RAM, self.ram), (CCM, self.ccm), (FLASH, self.flash), (0, self.flash), (SYSTEM, self._system)
+        ):  # fmt: skip
+            begin = address - base
+            if 0 <= begin <= array.size - size:
+                return array[begin : begin + size]
+        raise LabError(f"0x{address:08x}, {size} bytes: no memory there")
 
     def write(self, address: int, data: bytes) -> None:
         for base, end, _, write in self._registers:
             if base <= address and address + len(data) <= end:
                 for at in range(0, len(data), 4):
                     word = data[at : at + 4]
-                    write(
-                        self._ffi.NULL,
-                        address + at - base,
-                        len(word),
-                        int.from_bytes(word, "little"),
-                        self.state,
-                    )
+                    number = int.from_bytes(word, "little")
+                    write(self._ffi.NULL, address + at - base, len(word), number, self.state)
                 return
         self.view(address, len(data))[:] = np.frombuffer(data, np.uint8)
         if FLASH <= address < FLASH + FLASH_SIZE:
             self._cpu.ctl_flush_tb()
 
-    def _place(self, address: int, size: int) -> tuple[NDArray[np.uint8], int]:
-        for base, array in (
-            (RAM, self.ram), (CCM, self.ccm), (FLASH, self.flash), (0, self.flash), (SYSTEM, self._system)
-        ):  # fmt: skip
-            if base <= address and address + size <= base + array.size:
-                return array, address - base
-        raise LabError(f"0x{address:08x}, {size} bytes: no memory there")
-
     def register(self, name: str) -> int:
         """Return a register: r0..r12, sp, lr, pc, xpsr, msp, psp, primask, basepri, control, s0..s31, d0..d15, fpscr."""
         return int(self.state.pc) if name == "pc" else int(self._cpu.reg_read(self._numbers[name]))
-
-    @property
-    def task_return(self) -> int:
-        """Return EXC_RETURN of the last exception that interrupted a task."""
-        return int(self.state.task_return)
 
     def set_register(self, name: str, value: int) -> None:
         if name == "pc":

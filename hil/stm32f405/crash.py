@@ -182,7 +182,7 @@ class CrashReports:
             return self._numbered(self._kernel.saved_registers(task))
         if not self._chip.register("xpsr") & 0x1FF:
             return self._registers()
-        psp, exc_return = self._chip.register("psp"), self._chip.task_return
+        psp, exc_return = self._chip.register("psp"), int(self._chip.state.task_return)
         return self._numbered(stacked_registers(self._chip.read, psp, exc_return))
 
     def _trace(self, registers: dict[int, int]) -> tuple[str, ...]:

@@ -64,10 +64,6 @@ class GdbServer:
         self._receive()
         return self._protocol.interrupted
 
-    def stops_at(self, address: int) -> bool:
-        """Return whether the debugger has a breakpoint at an address."""
-        return self._protocol.has_breakpoint(address)
-
     def close(self) -> None:
         self._part()
         self._listener.close()
@@ -120,23 +116,22 @@ class DebuggedChip:
         if self._wish is Wish.STAND or self._server.wants_to_stop():
             self._hold(SIGINT)
         seen: int = Why.TIME
+        state = self._chip.state
         while True:
             stands = self._wish is Wish.STEP
-            # The caller acts between two blocks, as without a debugger.
-            until = int(self._chip.state.now) if seen else until_cycles
+            # The caller acts between two blocks, as without a debugger: never inside one, where `resume` is the pc.
+            until = int(state.now) if seen else until_cycles
             seen |= self._chip.step() & ~Why.STEP if stands else self._chip.run(until)
             pc = self._chip.register("pc")
-            if seen & Why.BREAK and self._server.stops_at(pc):
+            if seen & Why.BREAK and pc in self._chip.breakpoints:
                 seen &= seen if pc in self._chip.crash_points else ~Why.BREAK
                 stands = True
             if seen & Why.WATCHPOINT:
                 seen &= ~Why.WATCHPOINT
-                self._hold(SIGTRAP, self._chip.state.watch_address)
+                self._hold(SIGTRAP, state.watch_address)
             elif stands:
                 self._hold(SIGTRAP)
-            if seen & Why.BREAK or (
-                not self._chip.in_block and (seen or self._chip.state.now >= until_cycles)
-            ):
+            if seen & Why.BREAK or (state.resume != state.pc and (seen or state.now >= until_cycles)):
                 return seen
 
     def _hold(self, signal: int, watched: int | None = None) -> None:

@@ -3,18 +3,21 @@
 The machine is stopped while packets are answered; `GdbServer` (gdb.py) carries the bytes.
 """
 
+import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Protocol
+from xml.etree.ElementTree import Element, SubElement, tostring
 
 from hil.errors import LabError
 from hil.stm32f405.freertos import FreeRtos
 
 PACKET_SIZE = 0x4000
 SIGINT, SIGTRAP = 2, 5
-INTERRUPT = 0x03
+INTERRUPT = b"\x03"
 ESCAPE, ESCAPED_WITH = 0x7D, 0x20
+# Of received bytes: a packet or its beginning, an acknowledgement, Ctrl-C; anything between them is dropped.
+ITEM = re.compile(rb"\$(?:([^#]*)#(..)|.*)|[-+\x03]", re.DOTALL)
 MALFORMED, FAULT = b"E01", b"E0e"  # the numbers of EPERM and EFAULT
 # Name and bytes, in the order of the target description: the index is the register's number on the wire.
 CORE = tuple((name, 4) for name in (*(f"r{n}" for n in range(13)), "sp", "lr", "pc", "xpsr"))
@@ -62,19 +65,14 @@ class MalformedError(Exception):
 def target_description() -> str:
     """Return the description of the registers for GDB."""
 
-    def feature(name: str, registers: tuple[tuple[str, int], ...]) -> str:
-        lines = "".join(
-            f'<reg name="{register}" bitsize="{8 * size}" '
-            f'type="{"ieee_double" if size == 8 else TYPES.get(register, "uint32")}"/>'
-            for register, size in registers
-        )
-        return f'<feature name="org.gnu.gdb.arm.{name}">{lines}</feature>'
-
-    features = feature("m-profile", CORE) + feature("vfp", FLOATING) + feature("m-system", SYSTEM)
-    return (
-        '<?xml version="1.0"?><!DOCTYPE target SYSTEM "gdb-target.dtd">'
-        f'<target version="1.0"><architecture>arm</architecture>{features}</target>'
-    )
+    target = Element("target", version="1.0")
+    SubElement(target, "architecture").text = "arm"
+    for name, registers in (("m-profile", CORE), ("vfp", FLOATING), ("m-system", SYSTEM)):
+        feature = SubElement(target, "feature", name=f"org.gnu.gdb.arm.{name}")
+        for register, size in registers:
+            kind = "ieee_double" if size == 8 else TYPES.get(register, "uint32")
+            SubElement(feature, "reg", name=register, bitsize=str(8 * size), type=kind)
+    return f'<?xml version="1.0"?><!DOCTYPE target SYSTEM "gdb-target.dtd">{tostring(target, "unicode")}'
 
 
 def framed(payload: bytes) -> bytes:
@@ -83,30 +81,24 @@ def framed(payload: bytes) -> bytes:
     return b"$%s#%02x" % (escaped, sum(escaped) & 0xFF)
 
 
-@dataclass(slots=True)
 class Framing:
     """Splits received bytes into packets; drops more than `2 * PACKET_SIZE` without an end."""
 
-    _waiting: bytearray
+    def __init__(self) -> None:
+        self._waiting = b""
 
     def take(self, data: bytes) -> list[bytes]:
         """Return complete items: `$payload` of good packets, `!` for each with a wrong checksum, `+`, `-` and Ctrl-C."""
-        self._waiting += data
-        found = []
-        while self._waiting:
-            if self._waiting[0] != ord("$"):
-                byte = self._waiting.pop(0)
-                if byte in (ord("+"), ord("-"), INTERRUPT):
-                    found.append(bytes((byte,)))
-                continue
-            end = self._waiting.find(b"#")
-            if end < 0 or len(self._waiting) < end + 3:
-                if len(self._waiting) > 2 * PACKET_SIZE:
-                    self._waiting.clear()
-                break
-            payload, checksum = bytes(self._waiting[1:end]), bytes(self._waiting[end + 1 : end + 3])
-            del self._waiting[: end + 3]
-            found.append(b"$" + payload if checksum.lower() == b"%02x" % (sum(payload) & 0xFF) else b"!")
+        received, self._waiting, found = self._waiting + data, b"", []
+        for item in ITEM.finditer(received):
+            payload, checksum = item.groups()
+            if not item[0].startswith(b"$"):
+                found.append(item[0])
+            elif payload is None:  # its end has not arrived yet
+                self._waiting = item[0] if len(item[0]) <= 2 * PACKET_SIZE else b""
+            else:
+                good = checksum.lower() == b"%02x" % (sum(payload) & 0xFF)
+                found.append(b"$" + payload if good else b"!")
         return found
 
 
@@ -117,7 +109,7 @@ class RemoteProtocol:
         """`kernel` has the tasks, GDB's threads, each by the address of its control block."""
         self._debuggee, self._kernel = debuggee, kernel
         self._thread = 0  # whose registers are requested; 0: those of the machine
-        self._framing = Framing(bytearray())
+        self._framing = Framing()
         self._items: list[bytes] = []
         self._watched: set[tuple[int, int, int]] = set()
         self._acknowledging = True
@@ -164,10 +156,6 @@ class RemoteProtocol:
         self._last = framed(self._stop_reply(watched))
         return self._last + self.receive(b"")
 
-    def has_breakpoint(self, address: int) -> bool:
-        """Return whether the debugger has set one at an address."""
-        return address in self._debuggee.breakpoints
-
     def leave(self, wish: Wish) -> None:
         """Remove all breakpoints from the machine."""
         self._debuggee.breakpoints.clear()
@@ -177,19 +165,13 @@ class RemoteProtocol:
         self.wish = wish
 
     def _answered(self, item: bytes) -> bytes:
-        if item == bytes((INTERRUPT,)):
+        if item == INTERRUPT:
             self.interrupted = self.wish in (Wish.RUN, Wish.STEP)
-            return b""
-        if item == b"!":
-            return b"-" if self._acknowledging else b""
-        if item == b"-":
-            return self._last
-        if item == b"+":
-            return b""
+        if not item.startswith(b"$"):
+            return {b"!": b"-" if self._acknowledging else b"", b"-": self._last}.get(item, b"")
         acknowledgement = b"+" if self._acknowledging else b""
-        reply = self._reply(item[1:])
-        self._last = reply
-        return acknowledgement + reply
+        self._last = self._reply(item[1:])
+        return acknowledgement + self._last
 
     def _reply(self, payload: bytes) -> bytes:
         """Return the answer to a packet; nothing while the machine runs or after it was killed."""
@@ -322,7 +304,7 @@ def _known(number: int) -> tuple[str, int]:
 
 
 def _hex(digits: bytes) -> int:
-    if not digits or not all(byte in b"0123456789abcdefABCDEF" for byte in digits):
+    if not re.fullmatch(rb"[0-9a-fA-F]+", digits):
         raise MalformedError
     return int(digits, 16)
 

@@ -79,11 +79,9 @@ def test_the_high_water_mark_is_what_was_never_written(compiler: str) -> None:
     assert {task.name: task.stack_free_bytes for task in kernel.tasks()}["REPORT"] == 64
 
 
-def test_an_image_without_freertos_is_refused() -> None:
+def test_an_image_without_heap_4_has_no_free_bytes_of_it() -> None:
     machine = FirmwareOnChip()
-    kernel = FreeRtos(machine.image, machine.chip.read)
-    with pytest.raises(LabError, match="no variable or function is called xSchedulerRunning"):
-        assert kernel.running
+    assert FreeRtos(machine.image, machine.chip.read).heap_bytes == (None, None)
 
 
 def crashed(machine: FirmwareOnChip) -> str:
