@@ -7,7 +7,7 @@ these breakpoints. The bits are those of the ARMv7-M Architecture Reference Manu
 """
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import PurePath
 from struct import unpack, unpack_from
@@ -71,9 +71,7 @@ class CrashReports:
 
     def here(self) -> Crash:
         """Return the crash at one of `addresses`."""
-        if self._chip.register("pc") == self._assertion:
-            return self._assertion_failed()
-        return self._fault()
+        return self._assertion_failed() if self._chip.register("pc") == self._assertion else self._fault()
 
     def watchdog(self) -> Crash:
         """Return the code that ran when the watchdog expired."""
@@ -106,7 +104,7 @@ class CrashReports:
     def division(self) -> Crash:
         """Return the code that divides by zero."""
         return self._here(
-            "division by zero: its result is 0; no fault follows, and the next ones are not reported"
+            "division by zero: its result is 0; no fault follows, and the next are not reported"
         )
 
     def _here(self, what: str) -> Crash:
@@ -117,9 +115,7 @@ class CrashReports:
         expression, file = (self._text(self._chip.register(name)) for name in ("r0", "r1"))
         line = self._chip.register("r2")
         crash = self._here(f"assertion {expression} failed at {file}:{line}")
-        return Crash(
-            crash.what, crash.who, self._with_place(f"{PurePath(file).name}:{line}", crash.trace[1:])
-        )
+        return replace(crash, trace=self._with_place(f"{PurePath(file).name}:{line}", crash.trace[1:]))
 
     def _with_place(self, line: str, trace: tuple[str, ...]) -> tuple[str, ...]:
         """Return a trace that begins at a line: a function's last call leaves no frame, or another line."""
@@ -133,11 +129,9 @@ class CrashReports:
         exc_return = self._chip.register("lr")
         frame = self._chip.register("psp" if exc_return & USES_PSP else "msp")
         number = self._chip.register("xpsr") & 0x1FF
-        what = (
-            f"{FAULTS[number]}: {self._reasons()}"
-            if number in FAULTS
-            else f"{self._who(number)} is not handled"
-        )
+        what = f"{self._who(number)} is not handled"
+        if number in FAULTS:
+            what = f"{FAULTS[number]}: {self._reasons()}"
         try:
             stacked = stacked_registers(self._chip.read, frame, exc_return)
         except LabError:
@@ -152,21 +146,16 @@ class CrashReports:
         reasons = [words for bit, words in CFSR_WORDS.items() if status >> bit & 1]
         if hard & VECTOR_UNREADABLE:
             reasons.append("the vector of an exception could not be read")
-        where = ""
+        what = " and ".join(reasons) or "for a reason that its registers do not say"
         if status & (BFAR_VALID | MMFAR_VALID):
-            where = f" at 0x{self._word(BFAR if status & BFAR_VALID else MMFAR):08x}"
-        return (" and ".join(reasons) or "for a reason that its registers do not say") + where
+            return f"{what} at 0x{self._word(BFAR if status & BFAR_VALID else MMFAR):08x}"
+        return what
 
     def _who(self, number: int) -> str:
         """Return the task, or the handler of the exception with that number."""
         if number:
-            name = self._image.function_at(self._vector(number) & ~1) or "no handler"
-            what = (
-                f"interrupt {number - FIRST_INTERRUPT}"
-                if number >= FIRST_INTERRUPT
-                else f"exception {number}"
-            )
-            return f"{what} ({name})"
+            name, own = self._image.function_at(self._vector(number) & ~1), number - FIRST_INTERRUPT
+            return f"{f'interrupt {own}' if own >= 0 else f'exception {number}'} ({name or 'no handler'})"
         if self._kernel is None or not self._kernel.running:
             return "main, before the scheduler ran"
         return self._task(self._kernel.current_block)
@@ -217,18 +206,13 @@ class CrashReports:
         return {n: registers.get(name, self._chip.register(name)) for n, name in enumerate(NAMES)}
 
     def _vector(self, exception: int) -> int:
-        offset = 4 * exception
-        return (
-            int(unpack_from("<I", self._image.code, offset)[0]) if offset + 4 <= len(self._image.code) else 0
-        )
+        return int.from_bytes(self._image.code[4 * exception :][:4], "little")
 
     def _text(self, address: int) -> str:
         """Return a string from the image's constants, or its address."""
-        try:
-            text = self._chip.read(address, LONGEST_TEXT).partition(b"\0")[0].decode("ascii")
-        except (LabError, UnicodeDecodeError):
-            return f"0x{address:08x}"
-        return text
+        with suppress(LabError, UnicodeDecodeError):
+            return self._chip.read(address, LONGEST_TEXT).partition(b"\0")[0].decode("ascii")
+        return f"0x{address:08x}"
 
     def _word(self, address: int) -> int:
         return int(unpack("<I", self._chip.read(address, 4))[0])

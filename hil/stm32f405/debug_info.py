@@ -17,9 +17,7 @@ from hil.errors import LabError, hint
 
 SP, LR, PC = 13, 14, 15
 DEEPEST = 32
-SHARED = MAXIMUM = (
-    0xFFFF_FFFF  # in .debug_frame (32-bit DWARF), the mark of an entry shared by several functions
-)
+SHARED = MAXIMUM = 0xFFFF_FFFF  # in .debug_frame (32-bit DWARF), the mark of an entry that functions share
 
 
 class CallFrames:
@@ -139,31 +137,24 @@ class DebugInfo:
     def address_of(self, line: str) -> int:
         """Return the first code address of `file.c:12`, 0 if that file has none."""
         file = line.partition(":")[0]
-        for _, _, unit in self._units:
-            if Path(_name(unit.get_top_DIE())).name == file:
-                found = [address for address, place in self._table(unit) if place == line]
-                if found:
-                    return found[0]
-        return 0
+        units = (unit for _, _, unit in self._units if Path(_name(unit.get_top_DIE())).name == file)
+        return next((address for unit in units for address, place in self._table(unit) if place == line), 0)
 
     def structure(self, name: str, address: int) -> Structure:
         """Return `struct name` of the file with a function's address; raises `LabError` if it has none."""
-        unit = self._unit_at(address)
-        for entry in unit.iter_DIEs() if unit is not None else ():
-            if entry.tag in AGGREGATES and "DW_AT_byte_size" in entry.attributes and _name(entry) == name:
-                return Structure(
-                    name, entry.attributes["DW_AT_byte_size"].value, dict(_members(entry, "", 0))
-                )
-        raise LabError(f"{self._path}: struct {name} is not described around 0x{address:08x}")
+        return self._described("struct", name, address, AGGREGATES, "DW_AT_byte_size")
 
     def variable(self, name: str, address: int) -> Structure:
         """Return a variable's structure in the file of a function; raises `LabError` without such a variable."""
+        return self._described("variable", name, address, ("DW_TAG_variable",), "DW_AT_type")
+
+    def _described(self, what: str, name: str, address: int, tags: tuple[str, ...], has: str) -> Structure:
         unit = self._unit_at(address)
         for entry in unit.iter_DIEs() if unit is not None else ():
-            if entry.tag == "DW_TAG_variable" and _name(entry) == name and "DW_AT_type" in entry.attributes:
-                kind = _stripped(entry.get_DIE_from_attribute("DW_AT_type"))
+            if entry.tag in tags and has in entry.attributes and _name(entry) == name:
+                kind = entry if entry.tag in AGGREGATES else _stripped(entry.get_DIE_from_attribute(has))
                 return Structure(name, _size(kind), dict(_members(kind, "", 0)))
-        raise LabError(f"{self._path}: variable {name} is not described around 0x{address:08x}")
+        raise LabError(f"{self._path}: {what} {name} is not described around 0x{address:08x}")
 
     @cached_property
     def _units(self) -> list[tuple[int, int, Any]]:
@@ -221,18 +212,15 @@ def _ranges(unit: Any, lists: Any) -> list[tuple[int, int]]:
     attributes = top.attributes
     low = attributes["DW_AT_low_pc"].value if "DW_AT_low_pc" in attributes else 0
     if "DW_AT_ranges" in attributes:
-        if unit["version"] >= 5:
-            ranges = lists.get_range_list_at_offset(attributes["DW_AT_ranges"].value, unit)
-        else:
-            ranges = lists.get_range_list_at_offset(attributes["DW_AT_ranges"].value)
+        of_unit = (unit,) if unit["version"] >= 5 else ()
+        ranges = lists.get_range_list_at_offset(attributes["DW_AT_ranges"].value, *of_unit)
         found, base = [], low
         for entry in ranges:
             if hasattr(entry, "base_address"):
                 base = entry.base_address
-            elif entry.is_absolute:
-                found.append((entry.begin_offset, entry.end_offset))
             else:
-                found.append((base + entry.begin_offset, base + entry.end_offset))
+                begin = 0 if entry.is_absolute else base
+                found.append((begin + entry.begin_offset, begin + entry.end_offset))
         return found
     if "DW_AT_high_pc" not in attributes:
         return []

@@ -16,7 +16,7 @@ Read = Callable[[int, int], bytes]  # (address, size)
 
 NO_FLOATS = 1 << 4  # in EXC_RETURN
 FRAME, FLOATS, PADDED = 0x20, 0x48, 1 << 9  # of an exception, ARMv7-M Architecture Reference Manual, B1.5.7
-UNUSED = 0xA5  # fills a new stack
+UNUSED = b"\xa5"  # fills a new stack
 WAITING_FOR_NOTIFICATION = 1
 STACK_CHUNK, MOST_TASKS = 64, 256
 RUNNING_TASK = "pxCurrentTCB"
@@ -81,13 +81,10 @@ class FreeRtos:
             ("xDelayedTaskList1", "blocked"), ("xDelayedTaskList2", "blocked"), ("xSuspendedTaskList", "suspended"),
             ("xTasksWaitingTermination", "deleted"), ("pxReadyTasksLists", "ready"), ("xPendingReadyList", "ready"),
         ):  # fmt: skip
-            if self._image.has(name):
-                states |= dict.fromkeys(self._members(name), state)
-        states = {
-            task: "blocked" if state == "suspended" and self._waits(task) else state
-            for task, state in states.items()
-        }
-        states |= {task: "running" for task in (self._word(self._current),) if task}
+            for task in self._members(name) if self._image.has(name) else ():
+                states[task] = "blocked" if state == "suspended" and self._waits(task) else state
+        if self.current_block:
+            states[self.current_block] = "running"
         views = [self.task(task, state) for task, state in states.items()]
         return sorted(views, key=lambda view: (-view.priority, view.name))
 
@@ -109,15 +106,11 @@ class FreeRtos:
 
     def task(self, task: int, state: str) -> TaskView:
         """Return the task with the control block at an address."""
-        text = self.name(task)
-        priority = self._word(task + self._task["uxPriority"].offset)
-        base = (
-            self._word(task + self._task["uxBasePriority"].offset)
-            if "uxBasePriority" in self._task.members
-            else priority
+        own, base = (
+            self._word(task + self._task[name if name in self._task.members else "uxPriority"].offset)
+            for name in ("uxPriority", "uxBasePriority")
         )
-        stack = self._word(task + self._task["pxStack"].offset)
-        return TaskView(text, state, priority, base, self._unused(stack), task)
+        return TaskView(self.name(task), state, own, base, self._unused(self.stack_begin(task)), task)
 
     def name(self, task: int) -> str:
         """Return the name of the task with the control block at an address."""
@@ -143,13 +136,10 @@ class FreeRtos:
 
     def _unused(self, stack: int) -> int:
         """Return how many bytes at the far end of a stack were never written."""
-        unused = 0
-        while True:
-            chunk = self._read(stack + unused, STACK_CHUNK)
-            used = len(chunk.lstrip(bytes((UNUSED,))))
-            unused += len(chunk) - used
-            if used:
-                return unused
+        end = stack
+        while not (used := self._read(end, STACK_CHUNK).lstrip(UNUSED)):
+            end += STACK_CHUNK
+        return end - stack + STACK_CHUNK - len(used)
 
     def _word(self, address: int) -> int:
         return int(unpack("<I", self._read(address, 4))[0])

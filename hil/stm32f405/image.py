@@ -78,19 +78,14 @@ class Image:
             if symbol.is_variable:
                 self._variables.setdefault(symbol.name, []).append(symbol)
 
-    @property
-    def initial_stack_pointer(self) -> int:
-        """Return the main stack pointer at reset."""
-        return int(unpack_from("<I", self.code, 0)[0]) & ~3
-
-    @property
-    def reset(self) -> int:
-        """Return the address of the first instruction, without the Thumb bit."""
-        return int(unpack_from("<I", self.code, 4)[0]) & ~1
+    def _called(self, name: str) -> list[Symbol]:
+        return self._variables.get(name) or [
+            function for function in self._functions if function.name == name
+        ]
 
     def symbol(self, name: str) -> Symbol:
         """Return a variable or function by its name; raises `LabError` for none or several."""
-        found = self._variables.get(name) or [f for f in self._functions if f.name == name]
+        found = self._called(name)
         if len(found) == 1:
             return found[0]
         if found:
@@ -100,7 +95,7 @@ class Image:
 
     def has(self, name: str) -> bool:
         """Return whether exactly one variable or function has that name."""
-        return len(self._variables.get(name) or [f for f in self._functions if f.name == name]) == 1
+        return len(self._called(name)) == 1
 
     def function_at(self, address: int) -> str:
         """Return the name of the function around an address, empty outside all of them."""
@@ -125,7 +120,8 @@ class Image:
             )
         if len(self.code) < 8:
             raise LabError(f"{self.path}: its flash holds {len(self.code)} bytes, no vector table")
-        stack, entry = self.initial_stack_pointer, unpack_from("<I", self.code, 4)[0]
+        stack, entry = unpack_from("<2I", self.code)
+        stack &= ~3  # as the register does, B1.4.7
         if not any(base < stack <= base + size for _, base, size in MEMORIES):
             raise LabError(
                 f"{self.path}: no vector table at 0x{self.base:08x}: the stack pointer there, 0x{stack:08x}, "
@@ -136,6 +132,7 @@ class Image:
                 f"{self.path}: no vector table at 0x{self.base:08x}: the reset vector there, 0x{entry:08x}, "
                 f"is not Thumb code between 0x{self.base:08x} and 0x{end:08x}"
             )
+        self.initial_stack_pointer, self.reset = stack, entry & ~1
 
 
 def _same(path: Path, content: bytes, elf: Elf) -> bytes:

@@ -97,15 +97,13 @@ class ChipProcessor:
         own, state = self._own, self.chip.state
         while True:
             until_us = min(now_us, self._limit_us) + self.ahead_us
-            own_is_due = own.next_us is not None and own.next_us <= until_us
-            if own_is_due and own.next_us is not None:
-                until_us = own.next_us
-            until = until_us * CYCLES_PER_US
-            if state.now < until:
-                why = self._run_chip(until)
-                if why:
+            due_us = own.next_us
+            if due_us is not None and due_us <= until_us:
+                until_us = due_us
+            if state.now < until_us * CYCLES_PER_US:
+                if why := self._run_chip(until_us * CYCLES_PER_US):
                     self._act(why)
-            elif own_is_due:
+            elif until_us == due_us:
                 own.run(until_us)
             else:
                 break
@@ -137,9 +135,7 @@ class ChipProcessor:
     @property
     def current(self) -> ChipTask:
         state = self.chip.state
-        if not state.task_count:
-            return ChipTask("-", 0, 0)
-        return self._task(state.task[state.running].block)
+        return self._task(state.task[state.running].block) if state.task_count else ChipTask("-", 0, 0)
 
     def run_times_us(self) -> list[int]:
         """Return each task's processor time, including interrupts and the idle task's sleep, across resets."""

@@ -8,7 +8,6 @@ from struct import pack
 import pytest
 
 from hil.crazyflie.log_table import log_table, parameter_table
-from hil.errors import LabError
 from hil.stm32f405.chip import Why
 from hil.stm32f405.crash import CrashReports
 from hil.stm32f405.freertos import FreeRtos
