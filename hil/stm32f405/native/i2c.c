@@ -173,12 +173,8 @@ void bus_due(struct machine *m, unsigned n)
 uint32_t bus_read(struct machine *m, unsigned n, uint32_t offset)
 {
     struct bus *b = &m->bus[n];
-    uint32_t value;
-    switch (offset) {
-    case 0x00: return b->cr1;
-    case 0x04: return b->cr2;
-    case 0x10:
-        value = b->dr;
+    uint32_t value = b->registers[offset / 4 % 10];
+    if (offset == 0x10) {
         if (b->sr1 & BTF && !(b->sr2 & TRA)) {
             b->dr = b->shift;
             b->sr1 &= ~(uint32_t)BTF;
@@ -188,22 +184,15 @@ uint32_t bus_read(struct machine *m, unsigned n, uint32_t offset)
             b->sr1 &= ~(uint32_t)RXNE;
         }
         update_lines(m, n);
-        return value;
-    case 0x14: return b->sr1;
-    case 0x18:
-        value = b->sr2;
-        if (b->sr1 & ADDR) {
-            b->sr1 &= ~(uint32_t)ADDR;
-            if (b->sr2 & TRA)
-                b->sr1 |= TXE;
-            else
-                receive(m, n);
-            update_lines(m, n);
-        }
-        return value;
-    case 0x1C: return b->ccr;
-    default: return b->others[offset / 4 % 10];
+    } else if (offset == 0x18 && b->sr1 & ADDR) {
+        b->sr1 &= ~(uint32_t)ADDR;
+        if (b->sr2 & TRA)
+            b->sr1 |= TXE;
+        else
+            receive(m, n);
+        update_lines(m, n);
     }
+    return value;
 }
 
 static void write_control(struct machine *m, unsigned n, uint32_t value)
@@ -255,11 +244,10 @@ void bus_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value)
     struct bus *b = &m->bus[n];
     switch (offset) {
     case 0x00: write_control(m, n, value & 0xFFFF); break;
-    case 0x04: b->cr2 = value & 0xFFFF; break;
     case 0x10: write_data(m, n, value); break;
     case 0x14: b->sr1 &= ~(uint32_t)ERRORS | value; break;
-    case 0x1C: b->ccr = value & 0xFFFF; break;
-    default: b->others[offset / 4 % 10] = value; break;
+    case 0x18: break; /* read only */
+    default: b->registers[offset / 4 % 10] = value & 0xFFFF;
     }
     update_lines(m, n);
 }

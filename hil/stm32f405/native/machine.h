@@ -100,17 +100,30 @@ struct esc { /* of a motor, at a timer's output */
     uint64_t reply_bit;                      /* [cycles] */
 };
 
+/* The registers of these three by name, and by their offset over 4. */
 struct bus {
-    uint32_t cr1, cr2, sr1, sr2, ccr, dr, shift, action, holding, others[10];
+    union {
+        struct { uint32_t cr1, cr2, oar1, oar2, dr, sr1, sr2, ccr, trise, fltr; };
+        uint32_t registers[10];
+    };
+    uint32_t shift, action, holding;
     struct device *device;
 };
 
 struct spi {
-    uint32_t cr1, cr2, sr, dr, held, shift, busy, others[6];
+    union {
+        struct { uint32_t cr1, cr2, sr, dr, others[6]; };
+        uint32_t registers[10];
+    };
+    uint32_t held, shift, busy;
 };
 
 struct usart {
-    uint32_t sr, dr, brr, cr1, cr2, cr3, held, shift, sending, overruns;
+    union {
+        struct { uint32_t sr, dr, brr, cr1, cr2, cr3, gtpr; };
+        uint32_t registers[7];
+    };
+    uint32_t held, shift, sending, overruns;
     uint8_t received[LINE_BYTES], sent[LINE_BYTES];
     uint32_t first, last, filled; /* of `received`, a ring; of `sent` */
 };

@@ -7,7 +7,7 @@ follows is written there. */
 enum { RXNE = 1, TXE = 2, OVR = 64, BSY = 128 };
 enum { SPE = 1 << 6, RXDMAEN = 1, TXDMAEN = 2, ERRIE = 1 << 5, RXNEIE = 1 << 6, TXEIE = 1 << 7 };
 enum { DESELECTED, SELECTED, ADDRESSED };
-enum { CR1 = 0x00, CR2 = 0x04, SR = 0x08, DR = 0x0C, WRITE = 0x80 };
+enum { CR1 = 0x00, SR = 0x08, DR = 0x0C, WRITE = 0x80 };
 
 static const uint32_t BASE[SPIS] = {0x40013000, 0x40003800, 0x40003C00};
 static const uint8_t SPI_IRQ[SPIS] = {35, 36, 51};
@@ -114,33 +114,23 @@ void spi_due(struct machine *m, unsigned n)
 uint32_t spi_read(struct machine *m, unsigned n, uint32_t offset)
 {
     struct spi *s = &m->spi[n];
-    switch (offset) {
-    case CR1: return s->cr1;
-    case CR2: return s->cr2;
-    case SR: return s->sr | (s->busy ? BSY : 0);
-    case DR:
+    if (offset == DR) {
         s->sr &= ~(uint32_t)(RXNE | OVR);
         update_line(m, n);
-        return s->dr;
-    default: return s->others[offset / 4 % 6];
     }
+    return s->registers[offset / 4 % 10] | (offset == SR && s->busy ? BSY : 0);
 }
 
 void spi_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value)
 {
     struct spi *s = &m->spi[n];
-    switch (offset) {
-    case CR1:
-        s->cr1 = value & 0xFFFF;
-        if (s->cr1 & SPE && !s->busy && !(s->sr & TXE)) { /* it was written before the start */
-            s->sr |= TXE;
-            shift_out(m, n, s->held);
-        }
-        break;
-    case CR2: s->cr2 = value & 0xFFFF; break;
-    case SR: break;
-    case DR: write_data(m, n, value & 0xFF); break;
-    default: s->others[offset / 4 % 6] = value;
+    if (offset == DR)
+        write_data(m, n, value & 0xFF);
+    else if (offset != SR)
+        s->registers[offset / 4 % 10] = value & 0xFFFF;
+    if (offset == CR1 && s->cr1 & SPE && !s->busy && !(s->sr & TXE)) { /* it was written before the start */
+        s->sr |= TXE;
+        shift_out(m, n, s->held);
     }
     spi_kick(m);
 }

@@ -108,23 +108,22 @@ uint32_t usart_feed(struct machine *m, unsigned n, const uint8_t *bytes, uint32_
 uint32_t usart_read(struct machine *m, unsigned n, uint32_t offset)
 {
     struct usart *u = &m->usart[n];
-    const uint32_t registers[] = {u->sr, u->dr, u->brr, u->cr1, u->cr2, u->cr3};
+    uint32_t value = offset < sizeof u->registers ? u->registers[offset / 4] : 0;
     if (offset == 0x04) {
         u->sr &= ~(uint32_t)(RXNE | ORE);
         update_line(m, n);
     }
-    return offset < sizeof registers ? registers[offset / 4] : 0;
+    return value;
 }
 
 void usart_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value)
 {
     struct usart *u = &m->usart[n];
-    uint32_t *const plain[] = {&u->brr, &u->cr1, &u->cr2, &u->cr3};
     if (offset == 0x00)
         u->sr &= value | ~(uint32_t)(TC | RXNE);
     else if (offset == 0x04)
         write_data(m, n, value & 0xFF);
-    else if (offset < 0x18)
-        *plain[offset / 4 - 2] = value & 0xFFFF;
+    else if (offset < sizeof u->registers)
+        u->registers[offset / 4] = value & 0xFFFF;
     usart_kick(m);
 }
