@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from firmware_py.export.boards import PYTHON
 from hil.deploy.drill import DRILL
-from hil.experiments.hover import HOVER
+from hil.experiments.position import HOVER
 from hil.laboratory.flight import Flight
 from hil.laboratory.metrics import column, free_flight
 from hil.laboratory.recorder import load_events

@@ -21,7 +21,7 @@ from hil.deploy.drill import DRILL, FAILURE
 from hil.devices.board_firmware import PythonBoard
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_experiment
-from hil.experiments.hover import HOVER
+from hil.experiments.position import HOVER
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Fault, parse

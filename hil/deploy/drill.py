@@ -5,12 +5,9 @@ robot is held. In free flight poses and samples fail for a moment; at the end th
 The cause `no control` belongs to a board whose controller has stopped: `hil.deploy.check` ends each flight with it.
 """
 
-from __future__ import annotations
-
 import struct
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import firmware_py.logic
 from firmware_py.wire import high_level
@@ -21,16 +18,11 @@ from firmware_py.wire.scalars import Scalar
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import parse
-
-if TYPE_CHECKING:
-    from hil.laboratory.flight import Flight
+from hil.laboratory.flight import Flight
 
 FEED = encode(Packet(PORT_LOCALISATION, CHANNEL_GENERIC, bytes((EMERGENCY_STOP_WATCHDOG,))))
-GO_TO = encode(
-    Packet(
-        high_level.PORT, 0, bytes((high_level.PathCommand.GO_TO, 0, 1)) + bytes(17) + struct.pack("<f", 1.0)
-    )
-)
+PATH = bytes((high_level.PathCommand.GO_TO, 0, 1)) + bytes(17) + struct.pack("<f", 1.0)
+GO_TO = encode(Packet(high_level.PORT, 0, PATH))
 STOP = encode(Packet(high_level.PORT, 0, bytes((high_level.PathCommand.STOP, 0))))
 THRUST = encode(Packet(PORT_COMMANDER, 0, bytes(12) + b"\1\0"))  # an attitude set-point, which is refused
 FAILING = Path(firmware_py.logic.__path__[0]) / "failing.py"
@@ -45,24 +37,20 @@ def drill(flight: Flight) -> None:
     flight.events.at(1_500_000, lambda now_us: cameras.turn(flight.robot, 0.0))
     plan(flight, 2.0, (0.0, "floaty.armed", Scalar.U8, 0), (0.2, "floaty.armed", Scalar.U8, 1))
     plan(flight, 2.4, *RECOVERY)
-    plan(
-        flight, 2.8,
-        (0.0, "FloatyKalm.maxVel", Scalar.F32, 1e-4), (0.4, "FloatyKalm.maxVel", Scalar.F32, estimator.bound_velocity),
-    )  # fmt: skip
+    bounds = (0.0, 1e-4), (0.4, estimator.bound_velocity)
+    plan(flight, 2.8, *((after_s, "FloatyKalm.maxVel", Scalar.F32, value) for after_s, value in bounds))
     plan(flight, 4.0, *((0.2 * mode, "extCtrl.manual", Scalar.U8, mode % 3) for mode in (1, 2, 3)))
-    plan(
-        flight, 4.8,
-        (0.0, "supervisor.lowBattery", Scalar.U16, 20_000),
-        (5.2, "supervisor.lowBattery", Scalar.U16, supervisor.low_battery_mv),
-    )  # fmt: skip
+    limits = (0.0, 20_000), (5.2, supervisor.low_battery_mv)
+    plan(flight, 4.8, *((after_s, "supervisor.lowBattery", Scalar.U16, value) for after_s, value in limits))
     plan(flight, 10.2, *RECOVERY)
     free_us = flight.release_us
-    for at_us, packet in (
+    packets = (
         (3_500_000, GO_TO),
         (3_600_000, STOP),
         (free_us + 3_000_000, FEED),
         (free_us + 4_200_000, THRUST),
-    ):
+    )
+    for at_us, packet in packets:
         flight.events.at(at_us, partial(flight.line.command, packet=packet))
 
 

@@ -2,39 +2,23 @@
 
 from hil.errors import LabError, hint
 from hil.experiments.airspeed import AIRSPEEDS
-from hil.experiments.hover import HOVER
+from hil.experiments.disturbances import OCCLUSION, PUSHED, SIDE_WINDS
 from hil.experiments.identification import IDENTIFICATION
 from hil.experiments.overload import OVERLOAD
 from hil.experiments.own import entries, in_file, in_package
-from hil.experiments.position import EIGHT, HEIGHT_SINE, Y_SQUARE
+from hil.experiments.position import EIGHT, HEIGHT_SINE, HOVER, Y_SQUARE
 from hil.experiments.power import ENDURANCE, POWER
-from hil.experiments.pushes import PUSHED
 from hil.experiments.take_off import TAKE_OFF_LANDING
-from hil.experiments.wind import OCCLUSION, SIDE_WINDS
 from hil.experiments.yaw import YAW_SINES, YAW_STEP, YAW_STEP_0
 from hil.laboratory.experiment import Experiment, Source
 
 EXPERIMENTS: dict[str, Experiment] = {
     experiment.name: experiment
     for experiment in (
-        HOVER,
-        YAW_STEP,
-        YAW_STEP_0,
-        *YAW_SINES,
-        HEIGHT_SINE,
-        Y_SQUARE,
-        EIGHT,
-        PUSHED,
-        *SIDE_WINDS,
-        OCCLUSION,
-        *AIRSPEEDS,
-        POWER,
-        ENDURANCE,
-        TAKE_OFF_LANDING,
-        OVERLOAD,
-        *IDENTIFICATION,
+        HOVER, YAW_STEP, YAW_STEP_0, *YAW_SINES, HEIGHT_SINE, Y_SQUARE, EIGHT, PUSHED, *SIDE_WINDS, OCCLUSION, *AIRSPEEDS,
+        POWER, ENDURANCE, TAKE_OFF_LANDING, OVERLOAD, *IDENTIFICATION,
     )
-}
+}  # fmt: skip
 
 __all__ = ["EXPERIMENTS", "Experiment", "find_again", "find_experiment"]
 

@@ -6,19 +6,14 @@ default robot inside its 20 cm box. The paper's method needs two flights with di
 gains on roll are those of its Methods, -0.2 and -0.15.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING
 
 from firmware_py.config import SIGNALS
 from firmware_py.wire.parameters import SetByName, encode_set_by_name
 from firmware_py.wire.scalars import Scalar
 from hil.laboratory.experiment import Experiment
-
-if TYPE_CHECKING:
-    from hil.laboratory.flight import Flight
+from hil.laboratory.flight import Flight
 
 BEGIN_US = 2_000_000  # the robot is at rest after its release
 REALISATIONS = 6  # of 22 s: 2 s to settle, and a period

@@ -56,13 +56,9 @@ def steps(times: Signal, value: Signal, goal: Signal) -> list[tuple[float, float
         outside = np.flatnonzero(np.abs(done - 1.0) > BAND)
         settled = outside[-1] + 1 if len(outside) else 0
         after = times[start:end] - times[start]
-        found.append(
-            (
-                float(after[risen[0]]) if len(risen) else np.nan,
-                float(after[settled]) if settled < len(after) else np.nan,
-                max(float(done.max()) - 1.0, 0.0),
-            )
-        )
+        rise = float(after[risen[0]]) if len(risen) else np.nan
+        settle = float(after[settled]) if settled < len(after) else np.nan
+        found.append((rise, settle, max(float(done.max()) - 1.0, 0.0)))
     return found
 
 

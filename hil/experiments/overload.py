@@ -6,24 +6,18 @@ in the position error. Losing the robot at full load does not fail the experimen
 flight must withstand.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from hil.laboratory.experiment import Experiment
+from hil.laboratory.flight import Flight
 from hil.laboratory.metrics import BOX, column, position_error
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from hil.devices.board import Thief
-    from hil.laboratory.flight import Flight
-    from hil.laboratory.robot import Robot
+from hil.laboratory.robot import Robot
 
 STEP_PERCENT = 5
 STEP_US = 1_500_000
@@ -37,22 +31,19 @@ def with_a_thief(robot: Robot) -> None:
 
 def steal_more_and_more(flight: Flight) -> None:
     """Plan the steps of the thief's share."""
-    thief = flight.robot.thief
     for index, percent in enumerate(range(0, 101, STEP_PERCENT)):
-        flight.events.at(flight.release_us + index * STEP_US, partial(_take, thief, flight, percent))
+        flight.events.at(flight.release_us + index * STEP_US, partial(_take, flight, percent))
 
 
-def _take(thief: Thief, flight: Flight, percent: int, now_us: int) -> None:
-    thief.share = percent / 100
+def _take(flight: Flight, percent: int, now_us: int) -> None:
+    flight.robot.thief.share = percent / 100
     flight.note("lab", f"the thief takes {percent} % of the processor")
 
 
 def thief_load(flight: pa.Table) -> NDArray[np.float64]:
     """Return the thief's share of the processor in every row, (N,), since the row before."""
     taken_us, times_us = column(flight, "cpu.THIEF"), column(flight, "t")
-    share: NDArray[np.float64] = np.zeros(len(times_us))
-    share[1:] = np.diff(taken_us) / np.diff(times_us)
-    return share
+    return np.append(0.0, np.diff(taken_us) / np.diff(times_us))
 
 
 def loads_that_hurt(flight: pa.Table) -> Mapping[str, float]:
@@ -79,14 +70,11 @@ OVERLOAD = Experiment(
     summary="hover while a task above all others takes 0 to 100 % of the processor",
     duration_s=21 * STEP_US * 1e-6,
     limits={
-        "estimator_late_from": 0.10,
-        "controller_late_from": 0.60,
-        "held_up_to": 0.60,
-        "lost": 1.0,
+        "estimator_late_from": 0.10, "controller_late_from": 0.60, "held_up_to": 0.60, "lost": 1.0,
         "uncontrolled": 21 * STEP_US * 1e-6,
     },
     prepare=with_a_thief,
     script=steal_more_and_more,
     measure=loads_that_hurt,
     pictures=("overload",),
-)
+)  # fmt: skip

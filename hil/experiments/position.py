@@ -1,4 +1,5 @@
-"""Position: the paper's sine in height, 20 cm at 0.05 Hz, and square in y, 10 cm to either side; a figure of eight.
+"""Position: the paper's hover (figure Hover_figure: 30 s at 1.15 m, 20 cm box, 6 cm, 20 deg), its sine in height, 20 cm at
+0.05 Hz, and square in y, 10 cm to either side; a figure of eight.
 
 The square's period is that of the author's ground station, 10 s; the flow limits the amplitude: beyond 20 cm from its
 axis hovering is not stable (paper, Horizontal tracking performance). The eight is larger, for robots without flow.
@@ -31,6 +32,15 @@ def eight(home: Goal, release_us: int) -> Trajectory:
     return Offsets(home, begin_us, x=Sine(EIGHT_M, EIGHT_HZ), y=Sine(EIGHT_M / 2, 2 * EIGHT_HZ))
 
 
+HOVER = Experiment(
+    name="hover",
+    summary="hold one point of the flow for 30 s (paper: 20 cm box, mostly < 6 cm, < 20 deg)",
+    duration_s=30.0,
+    limits={
+        "lost": 0.0, "within_6cm_x": 0.98, "within_6cm_y": 0.98, "within_6cm_z": 0.98, "in_box": 0.995,
+        "attitude_max": 0.349066,  # 20 deg
+    },
+)  # fmt: skip
 HEIGHT_SINE = Experiment(
     name="height-sine",
     summary="rise and sink by 20 cm at 0.05 Hz (paper: follows; height gives way to attitude)",

@@ -9,22 +9,16 @@ this plant's lift is 0.6 to 0.7 times its weight. Here the flow gains 5 % per me
 robot lifts off at 90 % and stays at the hover point at 95 %.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 
 from firmware_py.wire.crtp import PORT_PLATFORM, Packet, encode
 from hil.laboratory.experiment import Experiment
+from hil.laboratory.flight import Flight
 from hil.laboratory.metrics import BOX, body, column, position_error
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from hil.laboratory.flight import Flight
 
 TAKE_OFF, FLIGHT, LANDING = 0.93, 1.0, 0.88  # of the flight speed
 STANDING_Z = 0.049  # [m] of the centre of mass: the feet's height minus their depth in the net
@@ -50,12 +44,8 @@ def operate(flight: Flight) -> None:
     flight.events.at(release_us + _us(CONTROLLER_ON), partial(_switch, flight, True))
     flight.events.at(release_us + _us(FANS_OFF), partial(_switch, flight, False))
     speed = 0.0
-    for start, factor in (
-        (SPIN_UP, TAKE_OFF),
-        (FLIGHT_FROM, FLIGHT),
-        (LANDING_FROM, LANDING),
-        (FANS_OFF, 0.0),
-    ):
+    stages = (SPIN_UP, TAKE_OFF), (FLIGHT_FROM, FLIGHT), (LANDING_FROM, LANDING), (FANS_OFF, 0.0)
+    for start, factor in stages:
         _ramp(flight, release_us + _us(start), speed, factor)
         speed = factor
 
@@ -73,16 +63,14 @@ def _switch(flight: Flight, on: bool, now_us: int) -> None:
 def _ramp(flight: Flight, start_us: int, before: float, after: float) -> None:
     steps = _us(RAMP) // RAMP_STEP_US
     for step in range(1, steps + 1):
-        set_fans = _setter(flight, before + (after - before) * step / steps)
-        flight.events.at(start_us + step * RAMP_STEP_US, set_fans)
-    flight.events.at(
-        start_us,
-        lambda now_us: flight.note("lab", f"fans from {before:.0%} to {after:.0%} of the flight speed"),
-    )
+        factor = before + (after - before) * step / steps
+        flight.events.at(start_us + step * RAMP_STEP_US, partial(_set_fans, flight, factor))
+    text = f"fans from {before:.0%} to {after:.0%} of the flight speed"
+    flight.events.at(start_us, lambda now_us: flight.note("lab", text))
 
 
-def _setter(flight: Flight, factor: float) -> Callable[[int], None]:
-    return lambda now_us: flight.robot.body.tunnel.set_fan_factor(factor)
+def _set_fans(flight: Flight, factor: float, now_us: int) -> None:
+    flight.robot.body.tunnel.set_fan_factor(factor)
 
 
 def measure(flight: pa.Table) -> Mapping[str, float]:
@@ -91,9 +79,8 @@ def measure(flight: pa.Table) -> Mapping[str, float]:
     times = times - times[0]
     x, y, z, climb = body(flight, "x", "y", "z", "vz").T
     airborne = np.asarray(z > STANDING_Z + CLEAR)
-    values = dict.fromkeys(
-        ("lift_off", "reached_box", "touch_down_speed", "landed_off_axis", "hover_in_box"), float("nan")
-    )
+    names = ("lift_off", "reached_box", "touch_down_speed", "landed_off_axis", "hover_in_box")
+    values = dict.fromkeys(names, float("nan"))
     if not airborne.any():
         return values
     first = int(np.argmax(airborne))

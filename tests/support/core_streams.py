@@ -19,7 +19,7 @@ from firmware_py.core.subset import Block
 from firmware_py.core_runner import CoreBlocks, PythonRunner
 from firmware_py.export.native import NativeRunner
 from hil.config import load_config
-from hil.experiments.hover import HOVER
+from hil.experiments.position import HOVER
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
 from support.paths import ROOT

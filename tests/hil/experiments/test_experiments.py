@@ -17,8 +17,8 @@ from scipy.signal import TransferFunction, lsim, step
 from hil.config import load_config, profile_names
 from hil.experiments import EXPERIMENTS
 from hil.experiments.airspeed import LIFT_PER_RAD, attainable, hover_angle
+from hil.experiments.disturbances import FAULTS, PUSHES
 from hil.experiments.measures import recoveries, response, steps, y_steps
-from hil.experiments.pushes import FAULTS, PUSHES
 from hil.floaty.correction import TABLE
 from hil.floaty.plant import Plant
 from hil.floaty.shape import SIGNS

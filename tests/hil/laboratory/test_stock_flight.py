@@ -13,7 +13,7 @@ from hil.config import load_config
 from hil.crazyflie.log_table import log_table
 from hil.devices.image_firmware import stock_signals
 from hil.errors import LabError
-from hil.experiments.hover import HOVER
+from hil.experiments.position import HOVER
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.request import why_left
 from support.flights import served_image

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad, solve_ivp
 
 from hil.experiments import EXPERIMENTS
-from hil.experiments.specific_power import VEHICLES
+from hil.experiments.power import VEHICLES
 from hil.floaty.plant import Plant
 from hil.laboratory.faults import parse
 from hil.laboratory.metrics import column, free_flight
