@@ -37,43 +37,34 @@ FAULTS = ("push.y@0.5=1", "radio.cut@2:0.8")
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """How much a column may differ: `size` of the differences, in `unit`, at most `limit`."""
+    """How much a column may differ: a kind of `SIZES`, in `unit`, at most `limit`."""
 
     name: str
     columns: tuple[str, ...]
-    size: Callable[[NDArray[np.float64]], float]
+    size: str
     limit: float
     unit: str = ""
     factor: float = 1.0
 
 
-def _rms(difference: NDArray[np.float64]) -> float:
-    return float(np.sqrt((difference**2).mean()))
-
-
-def _mean(difference: NDArray[np.float64]) -> float:
-    return abs(float(difference.mean()))
-
-
-def _end(difference: NDArray[np.float64]) -> float:
-    return abs(float(difference[-1]))
-
-
-def _share(difference: NDArray[np.float64]) -> float:
-    return float((difference != 0).mean())
-
-
+# Of the differences between two columns:
+SIZES: dict[str, Callable[[NDArray[np.float64]], float]] = {
+    "rms": lambda difference: float(np.sqrt((difference**2).mean())),
+    "mean": lambda difference: abs(float(difference.mean())),
+    "final": lambda difference: abs(float(difference[-1])),
+    "share of time": lambda difference: float((difference != 0).mean()),
+}
 BOUNDS = (
-    Bound("position, rms", ("truth.x", "truth.y", "truth.z"), _rms, 2.0, "mm", 1e3),
-    Bound("body rates, rms", ("truth.p", "truth.q", "truth.r"), _rms, 0.15, "rad/s"),
-    Bound("estimated position, rms", ("estimate.x", "estimate.y", "estimate.z"), _rms, 4.0, "mm", 1e3),
-    Bound("estimated rates, mean", ("estimate.p", "estimate.q", "estimate.r"), _mean, 0.004, "rad/s"),
-    Bound("servo counts, rms", tuple(f"motor.m{servo}" for servo in range(1, 5)), _rms, 1300.0),
-    Bound("servo counts, mean", tuple(f"motor.m{servo}" for servo in range(1, 5)), _mean, 60.0),
-    Bound("age of poses, mean", ("estimator.pose_age_us",), _mean, 1.5, "ms", 1e-3),
-    Bound("poses fused", ("estimator.fused",), _end, 2.0),
-    Bound("poses not fused", tuple(f"estimator.{name}" for name in ("refused", "jumps", "too_old", "invalid")), _end, 1.0),
-    Bound("supervisor's state, share of time", ("supervisor.state",), _share, 3.0, "%", 100.0),
+    Bound("position", ("truth.x", "truth.y", "truth.z"), "rms", 2.0, "mm", 1e3),
+    Bound("body rates", ("truth.p", "truth.q", "truth.r"), "rms", 0.15, "rad/s"),
+    Bound("estimated position", ("estimate.x", "estimate.y", "estimate.z"), "rms", 4.0, "mm", 1e3),
+    Bound("estimated rates", ("estimate.p", "estimate.q", "estimate.r"), "mean", 0.004, "rad/s"),
+    Bound("servo counts", tuple(f"motor.m{servo}" for servo in range(1, 5)), "rms", 1300.0),
+    Bound("servo counts", tuple(f"motor.m{servo}" for servo in range(1, 5)), "mean", 60.0),
+    Bound("age of poses", ("estimator.pose_age_us",), "mean", 1.5, "ms", 1e-3),
+    Bound("poses fused", ("estimator.fused",), "final", 2.0),
+    Bound("poses not fused", tuple(f"estimator.{one}" for one in ("refused", "jumps", "too_old", "invalid")), "final", 1.0),
+    Bound("supervisor's state", ("supervisor.state",), "share of time", 3.0, "%", 100.0),
 )  # fmt: skip
 
 
@@ -92,7 +83,8 @@ class Compared:
 
     def __str__(self) -> str:
         unit = f" {self.bound.unit}" if self.bound.unit else ""
-        return f"{self.bound.name}: {self.found:.3g}{unit} apart ({self.column}), at most {self.bound.limit:g}{unit}"
+        what = f"{self.bound.name}, {self.bound.size}"
+        return f"{what}: {self.found:.3g}{unit} apart ({self.column}), at most {self.bound.limit:g}{unit}"
 
 
 def compare_flights(first: FlownRun, second: FlownRun) -> Iterator[Compared]:
@@ -103,7 +95,7 @@ def compare_flights(first: FlownRun, second: FlownRun) -> Iterator[Compared]:
         sizes = {}
         for name in bound.columns:
             a, b = (column(flight, name)[:rows] for flight in flights)
-            sizes[name] = bound.factor * bound.size(b - a) if rows else float("nan")
+            sizes[name] = bound.factor * SIZES[bound.size](b - a) if rows else float("nan")
         worst = max(sizes, key=lambda name: np.inf if np.isnan(sizes[name]) else sizes[name])
         yield Compared(bound, worst, sizes[worst])
 
@@ -116,10 +108,8 @@ def fly_beside_python(
     disturbed: Options = {**options, "duration_s": SECONDS, "faults": FAULTS}
     requests = Request.of(HOVER, **disturbed), Request.of(DRILL, **options)
     with TemporaryDirectory(prefix="floaty-") as folder:
-        pairs = [
-            _fly_both(request, image, Path(folder) / request.experiment.name, progress)
-            for request in requests
-        ]
+        place = Path(folder)
+        pairs = [_fly_both(one, image, place / one.experiment.name, progress) for one in requests]
         hovers, drills = ([result.folder for result in pair] for pair in pairs)
         ends = [text for pair in pairs for text in _ends(*pair)]
         return list(compare_flights(*map(load_flown, hovers))), ends, list(compare_states(*drills))
@@ -132,8 +122,8 @@ def _fly_both(
     results = []
     for name, board in (("python", PYTHON), ("image", str(image))):
         on_board = replace(request, bench=replace(request.bench, board=board))
-        shown = f"{request.experiment.name}, {name}"
-        results.append(fly(on_board, folder / name, progress=partial(progress, shown)))
+        show = partial(progress, f"{request.experiment.name}, {name}")
+        results.append(fly(on_board, folder / name, progress=show))
         if results[-1].outcome == "interrupted":
             raise KeyboardInterrupt
     return results[0], results[1]
