@@ -131,9 +131,7 @@ def _fly_both(
 
 def states_of(folder: Path) -> list[str]:
     """Return the states, with their causes, that the supervisor of a flight announced on its console."""
-    texts = (
-        event["text"].partition(ANNOUNCED) for event in load_events(folder) if event["source"] == "board"
-    )
+    texts = (one["text"].partition(ANNOUNCED) for one in load_events(folder) if one["source"] == "board")
     return [state for _, found, state in texts if found]
 
 

@@ -139,9 +139,7 @@ def plan(
     else:
         flights = [request(find_experiment(name), duration_s) for name in DEFAULT]
     length_s, body = duration_s or FAULTY_S, flights[0].config.robot.body
-    faulty = [
-        fault for fault in map(parse, FAULTS) if fault.start_s < length_s and KINDS[fault.kind].acts_on(body)
-    ]
+    faulty = [one for one in map(parse, FAULTS) if one.start_s < length_s and KINDS[one.kind].acts_on(body)]
     flights += request(HOVER, length_s, faulty), request(DRILL, None)
     if own_logic and flights[0].config.logic == LogicConfig():
         flights.append(request(FAILURE, None))

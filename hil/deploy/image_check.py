@@ -139,7 +139,6 @@ class ImageBench:
         self._of_parameters = flashed.image.symbol("floaty_toc_apply").address
 
     def scalar(self, name: str) -> Scalar | None:
-        """Return the type of a parameter."""
         return self._table[name].scalar if name in self._table else None
 
     def value(self, name: str) -> float:

@@ -35,9 +35,8 @@ def target_names(text: str | None) -> tuple[str, ...]:
     names = tuple(dict.fromkeys(name.strip() for name in text.split(",")))
     for name in names:
         if name not in TARGETS and not is_link(name):
-            raise LabError(
-                f"--targets {text}: {name!r} is none of {', '.join(TARGETS)}, and no link to a board"
-            )
+            allowed = ", ".join(TARGETS)
+            raise LabError(f"--targets {text}: {name!r} is none of {allowed}, and no link to a board")
     return names
 
 
@@ -143,6 +142,5 @@ class Toolbox:
 
 
 def add_loads(total: Loads, flight: Loads) -> None:
-    """Add a flight's loads to the total."""
     for name, load in flight.items():
         total.setdefault(name, EntryLoad()).merge(load)

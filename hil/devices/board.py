@@ -81,7 +81,6 @@ class VirtualBoard:
         self._booted_us = 0
 
     def measure(self, counts: ImuCounts) -> None:
-        """Load the IMU's registers with a sample."""
         self.imu = counts
 
     def supply(self, millivolts: int) -> None:
@@ -107,7 +106,6 @@ class VirtualBoard:
         return self.battery_mv
 
     def write_compare(self, counts: Sequence[int]) -> None:
-        """Hand the compare counts to the servo timers."""
         self._servo(self.now_us, counts)
 
     def radio_send(self, data: bytes) -> bool:
@@ -119,7 +117,6 @@ class VirtualBoard:
         return accepted
 
     def radio_command(self, kind: int, data: bytes) -> None:
-        """Hand a command to the radio chip."""
         self._requests.radio_command(self.now_us, kind, data)
         self._let_hardware_go_first()
 
@@ -152,7 +149,6 @@ class VirtualBoard:
         self._let_hardware_go_first()
 
     def inject_failure(self, unit: int, failing: int, instance: int) -> CommandResult:
-        """Pass a request for a failure to the world."""
         result = self._requests.fail(self.now_us, unit, failing, instance)
         self._let_hardware_go_first()
         return result

@@ -25,9 +25,8 @@ from hil.world.servos import OUTPUTS
 if TYPE_CHECKING:
     from hil.crazyflie.log_table import ImageParameter
 
-Trace = Callable[
-    [int, str, str, int, int], None
-]  # (us, event, who, a, b), in the words of tests/vectors/README.md
+# (us, event, who, a, b), in the words of tests/vectors/README.md
+Trace = Callable[[int, str, str, int, int], None]
 
 
 class Pins(Board, Protocol):

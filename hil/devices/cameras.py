@@ -85,7 +85,6 @@ class VirtualMocap:
         return p_WB, q_WB
 
     def _noisy_pose(self, body: Motion) -> tuple[Vector, Quaternion]:
-        """Return the truth with the configured noise."""
         if not self._draws:
             self._draws = normal(self._rng, (NOISE_ROWS, 6)).tolist()
         x, y, z, a, b, c = self._draws.pop()
@@ -95,7 +94,6 @@ class VirtualMocap:
         return (px + s * x, py + s * y, pz + s * z), q_WB
 
     def _solved_pose(self, markers: VirtualMarkers, body: Motion) -> tuple[Vector, Quaternion] | None:
-        """Return the pose fitted to the markers, None when too few are visible."""
         self.sighting = markers.look(body.p_WB, body.q_WB)
         return self.sighting.pose
 

@@ -53,7 +53,6 @@ class DirectionCounters:
     latency_max_us: int = 0
 
     def count_delivery(self, latency_us: int) -> None:
-        """Count a packet that has arrived."""
         self.delivered += 1
         self.latency_sum_us += latency_us
         self.latency_max_us = max(self.latency_max_us, latency_us)

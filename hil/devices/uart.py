@@ -40,7 +40,6 @@ class LineCounters:
     latency_sum_us: int = 0  # of the deliveries, for a chunk's last byte, from sender to receiver
 
     def count_delivery(self, size: int, latency_us: int) -> None:
-        """Count a chunk that has arrived."""
         self.delivered_bytes += size
         self.deliveries += 1
         self.latency_sum_us += latency_us

@@ -25,9 +25,7 @@ PUSHES = (
     ("push.roll", 0.2), ("push.pitch", 0.2), ("push.yaw", 0.2),  # [N m]
     ("push.x", 0.75), ("push.x", -0.75), ("push.y", 2.0), ("push.y", -2.0),  # [N]
 )  # fmt: skip
-FAULTS = tuple(
-    Fault(kind, BEGIN_S + index * EVERY_S, PUSH_S, size) for index, (kind, size) in enumerate(PUSHES)
-)
+FAULTS = tuple(Fault(kind, BEGIN_S + i * EVERY_S, PUSH_S, size) for i, (kind, size) in enumerate(PUSHES))
 PUSHED_S = BEGIN_S + len(PUSHES) * EVERY_S
 
 PUSHED = Experiment(

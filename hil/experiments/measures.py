@@ -34,10 +34,8 @@ def seconds(flight: pa.Table) -> Signal:
 
 def yaw_and_goal(flight: pa.Table) -> tuple[Signal, Signal]:
     """Return the true yaw without jumps at half turns, counted like the goal, and the goal [rad]."""
-    yaw, goal = (
-        np.unwrap(euler_zyx_of(body(flight, "qw", "qx", "qy", "qz"))[:, 2]),
-        column(flight, "goal.yaw"),
-    )
+    q_WB, goal = body(flight, "qw", "qx", "qy", "qz"), column(flight, "goal.yaw")
+    yaw = np.unwrap(euler_zyx_of(q_WB)[:, 2])
     return yaw + 2 * np.pi * np.round((goal[:1] - yaw[:1]) / (2 * np.pi)), goal
 
 
@@ -105,7 +103,6 @@ def response(times: Signal, value: Signal, goal: Signal, frequency_hz: float) ->
 
 
 def yaw_sine(frequency_hz: float, flight: pa.Table) -> Mapping[str, float]:
-    """Return gain and lag of yaw in a sine."""
     yaw, goal = yaw_and_goal(flight)
     gain, lag = response(seconds(flight), yaw, goal, frequency_hz)
     rms = float(np.sqrt(((yaw - goal) ** 2).mean()))
@@ -113,7 +110,6 @@ def yaw_sine(frequency_hz: float, flight: pa.Table) -> Mapping[str, float]:
 
 
 def height_sine(frequency_hz: float, flight: pa.Table) -> Mapping[str, float]:
-    """Return gain and lag of the height in a sine."""
     gain, lag = response(seconds(flight), *axis_and_goal("z", flight), frequency_hz)
     return {"gain": gain, "lag": lag}
 

@@ -25,9 +25,8 @@ def in_file(reference: str) -> Experiment:
     if name in found:
         return found[name]
     there = hint(name, found, f"there {_are(list(found))}")
-    raise LabError(
-        f"experiment {reference}: {f'no experiment {name!r} in it' if name else 'which one?'}; {there}"
-    )
+    what = f"no experiment {name!r} in it" if name else "which one?"
+    raise LabError(f"experiment {reference}: {what}; {there}")
 
 
 def in_whole_file(path: Path) -> dict[str, Experiment]:

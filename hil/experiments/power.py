@@ -63,9 +63,8 @@ def until_empty(flight: pa.Table) -> Mapping[str, float]:
     """Return power, and the minutes until the failsafe; NaN if the flight ended earlier."""
     times = column(flight, "t")
     stopped = column(flight, "supervisor.state")[-1] == State.FAILSAFE
-    return power(flight) | {
-        "endurance": float(times[-1] - times[0]) * 1e-6 / 60.0 if stopped else float("nan")
-    }
+    minutes = float(times[-1] - times[0]) * 1e-6 / 60.0
+    return power(flight) | {"endurance": minutes if stopped else float("nan")}
 
 
 def _configuration(flight: pa.Table) -> dict[str, Any]:

@@ -25,9 +25,8 @@ NUMBERS = (1, 2, 3, 4)  # of the servos and their flaps
 DEG = math.radians(1.0)
 LOADS = BatteryConfig()
 FLAPS = tuple(f"truth.flap_{number}" for number in NUMBERS)
-PLATES = tuple(
-    f"force.{part}_{axis}" for part in ("base", "flap1", "flap2", "flap3", "flap4") for axis in "xyz"
-)
+PARTS = ("base", "flap1", "flap2", "flap3", "flap4")
+PLATES = tuple(f"force.{part}_{axis}" for part in PARTS for axis in "xyz")
 SERVO_FAILURES: dict[str, Failure] = {
     **{
         f"servo.stuck.{number}": Failure(
@@ -144,7 +143,6 @@ class Plant(InTunnel):
 
     @property
     def look(self) -> Look:
-        """Base plate, flaps and stand."""
         return look_of(self._geometry, self._ground)
 
     @property

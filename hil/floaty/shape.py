@@ -46,10 +46,8 @@ class Plate:
 @lru_cache(256)
 def flap_plates(geometry: GeometryConfig) -> tuple[Plate, Plate]:
     """Return the flat part and the kinked strip of flap 2."""
-    outlined = (
-        [area_and_centre(surface.corners) for surface in surfaces(geometry)] if geometry.outline else []
-    )
-    flat, strip = outlined or _quadrant(geometry)
+    parts = surfaces(geometry) if geometry.outline else ()
+    flat, strip = [area_and_centre(part.corners) for part in parts] or _quadrant(geometry)
     order = (1, 0, 2) if geometry.kink_side == "x" else (0, 1, 2)
     bend = np.array([0.0, -sin(geometry.kink_angle), cos(geometry.kink_angle)])[[*order]]
     normals = (raised(np.array([0.0, 0.0, 1.0]), geometry), raised(bend, geometry))

@@ -171,7 +171,6 @@ class Chip:
         return why
 
     def step(self) -> int:
-        """Execute one instruction."""
         self._cpu.ctl_flush_tb()  # hooks act on code translated after them, until it is flushed
         why = self._after(self._library.machine_step(self.state))
         self._cpu.ctl_flush_tb()

@@ -62,7 +62,6 @@ class FreeRtos:
 
     @property
     def running(self) -> bool:
-        """Return whether the scheduler has started."""
         return self._word(self._image.symbol("xSchedulerRunning").address) != 0
 
     @property

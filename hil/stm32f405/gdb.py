@@ -38,7 +38,6 @@ class GdbServer:
 
     @property
     def port(self) -> int:
-        """Return the port for clients."""
         return int(self._listener.getsockname()[1])
 
     def hold(self, signal: int = SIGTRAP, watched: int | None = None) -> Wish:

@@ -25,7 +25,6 @@ class MemoryUse:
 
     @property
     def free(self) -> int:
-        """Return the free bytes."""
         return self.size - self.used
 
 
@@ -46,9 +45,8 @@ class Image:
                 raise LabError(f"--elf {elf_path}: goes with a .bin; {self.path} is an ELF file itself")
             elf = Elf(self.path, content)
         elif elf_path is None:
-            raise LabError(
-                f"{self.path}: not an ELF file; a .bin needs --elf FILE, the ELF that it was made of"
-            )
+            needed = "a .bin needs --elf FILE, the ELF that it was made of"
+            raise LabError(f"{self.path}: not an ELF file; {needed}")
         else:
             elf = Elf(elf_path)
         self.base = elf.base  # of the vector table

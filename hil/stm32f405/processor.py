@@ -146,7 +146,6 @@ class ChipProcessor:
         return [own // CYCLES_PER_US for own in self._with_outside(cycles, state.taken)]
 
     def activations(self) -> list[int]:
-        """Return each task's number of activations."""
         state = self.chip.state
         return self._with_outside([task.times for task in state.task[0 : state.task_count]], 0)
 

@@ -17,6 +17,5 @@ __all__ = ["Flights", "Waypoints", "faults", "trajectories"]
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(
-        import_module("hil.testing.flights" if name == "Flights" else "hil.testing.strategies"), name
-    )
+    file = "flights" if name == "Flights" else "strategies"
+    return getattr(import_module(f"hil.testing.{file}"), name)

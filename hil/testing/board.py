@@ -104,7 +104,6 @@ class BareBoard:
         self._repeats += 1
 
     def run(self, ms: float) -> None:
-        """Advance time."""
         self._run_until(self.now_us + round(ms * 1e3))
 
     def expect(self, text: str, within_ms: float) -> str:

@@ -186,15 +186,13 @@ def _marked(item: pytest.Item) -> Marked:
     mark = item.get_closest_marker("floaty")
     if mark is None:
         return Marked()
-    if mark.args:
-        pytest.fail(
-            f"@pytest.mark.floaty{mark.args}: expected seeds=, boards=, profiles=, needs=", pytrace=False
-        )
-    try:
-        return Marked.of(mark.kwargs)
-    except LabError as error:
-        wrong = str(error)
-    pytest.fail(f"{item.name}: @pytest.mark.floaty: {wrong}", pytrace=False)
+    wrong = f"{mark.args}: expected seeds=, boards=, profiles=, needs="
+    if not mark.args:
+        try:
+            return Marked.of(mark.kwargs)
+        except LabError as error:
+            wrong = f": {error}"
+    pytest.fail(f"{item.name}: @pytest.mark.floaty{wrong}", pytrace=False)
 
 
 def _wanted(config: pytest.Config) -> Wanted:
@@ -219,12 +217,8 @@ def _split(values: list[str]) -> tuple[str, ...]:
 
 def _options(config: pytest.Config) -> str:
     """Return the given options that choose seeds, boards and profiles."""
-    words = [
-        f"--floaty-{name}={value}"
-        for name in ("board", "profile")
-        for value in config.getoption(f"floaty_{name}")
-    ]
-    words += (
-        [f"--floaty-seeds={config.getoption('floaty_seeds')}"] if config.getoption("floaty_seeds") else []
-    )
+    given = {name: config.getoption(f"floaty_{name}") for name in ("board", "profile")}
+    words = [f"--floaty-{name}={value}" for name, values in given.items() for value in values]
+    if seeds := config.getoption("floaty_seeds"):
+        words.append(f"--floaty-seeds={seeds}")
     return "".join(f"{shlex.quote(word)} " for word in words)

@@ -59,9 +59,9 @@ class Waypoints:
 
     def __call__(self, t_s: float) -> tuple[float, float, float, float]:
         index = int(t_s / self.every_s) - 1  # home is first
-        return (
-            self.goals[min(index, len(self.goals) - 1)] if index >= 0 and self.goals else (0.0, 0.0, 0.0, 0.0)
-        )
+        if index < 0 or not self.goals:
+            return (0.0, 0.0, 0.0, 0.0)
+        return self.goals[min(index, len(self.goals) - 1)]
 
 
 @checked

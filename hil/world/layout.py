@@ -17,6 +17,11 @@ def _take(count: int = 1) -> int:
     return start
 
 
+def _each(count: int) -> range:
+    """Reserve `count` places and return them all."""
+    return range(_take(count), _size)
+
+
 # State, on the millisecond grid
 TIME_US = _take()
 P = _take(3)  # [m] p_WB
@@ -56,9 +61,7 @@ AFTER_US = _take()  # instant at which AFTER takes effect, inf: never
 AFTER = _take(4)
 SERVO_TRIM = _take(4)  # [rad] error added to the command
 SERVO_SPEED = _take(4)  # 1 healthy, 0 stuck
-SERVO_TAU = _take()
-SERVO_RATE = _take()
-DEAD_BAND = _take()
+SERVO_TAU, SERVO_RATE, DEAD_BAND = _each(3)
 
 # Inputs from outside
 HELD = _take()  # 1: the body is clamped where it is
@@ -98,26 +101,13 @@ CENTRE = _take(72)  # [m] centre of pressure r(phi), likewise, from the centre o
 # Identified correction (see correction.py); forces [N], torques [N m]
 CORRECTED = _take()  # 0: isolated plates only
 AIRSPEED = _take()  # [m/s] of the design
-X_INPUT = _take()
-X_TILT = _take()
-Y_INPUT = _take()
-Y_TILT = _take()
-Z_INPUT = _take()
 LIFT_FIT = _take(7)
-ROLL_INPUT = _take()
-ROLL_TILT = _take()
-ROLL_RATE = _take()
-PITCH_INPUT = _take()
-PITCH_TILT = _take()
-PITCH_RATE = _take()
-YAW_INPUT = _take()
-YAW_RATE = _take()
+X_INPUT, X_TILT, Y_INPUT, Y_TILT, Z_INPUT = _each(5)
+ROLL_INPUT, ROLL_TILT, ROLL_RATE, PITCH_INPUT, PITCH_TILT, PITCH_RATE, YAW_INPUT, YAW_RATE = _each(8)
 
 # Tether, net and limits
 TETHER_ANCHOR = _take(3)  # [m] in W
-TETHER_LENGTH = _take()
-TETHER_STIFFNESS = _take()
-TETHER_DAMPING = _take()
+TETHER_LENGTH, TETHER_STIFFNESS, TETHER_DAMPING = _each(3)
 NET_HEIGHT = _take()  # [m] z of the net in W
 NET_STIFFNESS = _take()  # [N/m] under one foot
 NET_DAMPING = _take()  # [N s/m]
@@ -125,10 +115,7 @@ FRICTION = _take()
 FOOT_SPREAD = _take()  # [m] |x| = |y| of a foot in B
 FOOT_BELOW = _take()  # [m] below the centre of mass
 FOOT_REACH = _take()  # [m] from the centre of mass
-LIMIT_RADIUS = _take()
-LIMIT_BELOW = _take()
-LIMIT_ABOVE = _take()
-LIMIT_COS_TILT = _take()
+LIMIT_RADIUS, LIMIT_BELOW, LIMIT_ABOVE, LIMIT_COS_TILT = _each(4)
 
 SIZE = _size
 

@@ -43,9 +43,8 @@ def upflow(s: State, x: float, y: float) -> float:
     """Return the vertical mean flow [m/s] over (x, y) [m, W] at the height of the body."""
     reach = (x * x + y * y) / (s[at.PROFILE_RADIUS] * s[at.PROFILE_RADIUS])
     height = s[at.P + 2] - s[at.HOVER_HEIGHT]
-    flow: float = (
-        s[at.FAN] * s[at.SPEED] / (1.0 + reach * reach * reach) * (1.0 - s[at.HEIGHT_SLOPE] * height)
-    )
+    slope = 1.0 - s[at.HEIGHT_SLOPE] * height
+    flow: float = s[at.FAN] * s[at.SPEED] / (1.0 + reach * reach * reach) * slope
     depth = s[at.OCCLUSION + 3]
     if depth > 0.0:
         dx, dy = x - s[at.OCCLUSION], y - s[at.OCCLUSION + 1]
@@ -100,7 +99,6 @@ def strike(s: State, plate: int, c: float, d: float, ux: float, uy: float, uz: f
 
 @compiled
 def added(a: Wrench, b: Wrench) -> Wrench:
-    """Return the sum of two forces and torques."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5]
 
 
