@@ -11,7 +11,7 @@ from statistics import median
 import numpy as np
 
 from firmware_py.config import parameters_of
-from firmware_py.core_runner import CoreBlocks
+from firmware_py.core_runner import CoreBlocks, PythonRunner
 from firmware_py.export.profile_c import profile_hash
 from firmware_py.logic.loading import load_logic, translation_of
 from firmware_py.wire import crtp
@@ -69,12 +69,8 @@ def examine(client: CoreClient, config: LabConfig) -> Iterator[Finding]:
     except SilenceError:
         if not firmware.good:
             raise
-        yield firmware
-        yield Finding(
-            "app",
-            "missing: the firmware answers, Floaty's app does not; see floaty deploy write",
-            good=False,
-        )
+        missing = "missing: the firmware answers, Floaty's app does not; see floaty deploy write"
+        yield from (firmware, Finding("app", missing, good=False))
         return
     yield firmware
     yield from _app(about, config)
@@ -99,15 +95,13 @@ def _firmware(client: CoreClient) -> Finding:
 
 
 def _app(about: About, config: LabConfig) -> Iterator[Finding]:
-    here, profile = translation_of(config.logic).version, profile_hash(config)
-    same = here.startswith(about.core)
-    yield Finding(
-        "core", f"{about.core}, {'as here' if same else f'{here[: len(about.core)]} here: export and flash it again'}", same
-    )  # fmt: skip
-    same = profile.startswith(about.profile)
-    yield Finding(
-        "profile", f"{about.profile}, {'as here' if same else f'{profile[: len(about.profile)]} here'}", same
-    )
+    for subject, there, here, advice in (
+        ("core", about.core, translation_of(config.logic).version, ": export and flash it again"),
+        ("profile", about.profile, profile_hash(config), ""),
+    ):
+        same = here.startswith(there)
+        compared = "as here" if same else f"{here[: len(there)]} here{advice}"
+        yield Finding(subject, f"{there}, {compared}", same)
     yield Finding("state", State(about.state).name.lower())
 
 
@@ -127,9 +121,7 @@ def _link(client: CoreClient, poses_hz: float) -> Finding:
     if rate < poses_hz:
         return Finding("link", f"{text}: too slow to fly with {poses_hz:.0f} poses/s", good=False)
     if again > LOSSY * BURST:
-        return Finding(
-            "link", f"{text}: poses are lost or late in a flight; move the antenna, or change the channel"
-        )
+        text += ": poses are lost or late in a flight; move the antenna, or change the channel"
     return Finding("link", text)
 
 
@@ -150,13 +142,13 @@ def _health(client: CoreClient) -> Iterator[Finding]:
     counts = np.array([(look.gyro_x, look.gyro_y, look.gyro_z) for look in looks], float)
     zero, noise = counts.mean(axis=0), counts.std(axis=0)
     known = "" if last.calibrated else ", zero not found yet"
-    told = f"zero at {zero[0]:.0f} {zero[1]:.0f} {zero[2]:.0f} counts, noise {noise.max():.1f}{known}"
+    measured = f"zero at {zero[0]:.0f} {zero[1]:.0f} {zero[2]:.0f} counts, noise {noise.max():.1f}{known}"
     if not noise.any():
         yield Finding("gyro", f"dead or frozen: {LOOKS} times the same counts", good=False)
     elif noise.max() > STILL_COUNTS:
-        yield Finding("gyro", f"alive; the board moves: {told}")
+        yield Finding("gyro", f"alive; the board moves: {measured}")
     else:
-        yield Finding("gyro", f"alive: {told}", bool(abs(zero).max() <= ZERO_MAX))
+        yield Finding("gyro", f"alive: {measured}", bool(abs(zero).max() <= ZERO_MAX))
     fit = all(PULSE_COUNTS[0] <= count <= PULSE_COUNTS[1] for count in last.counts)
     yield Finding("servos", f"pulses of {' '.join(f'{count / 21:.0f}' for count in last.counts)} us", fit)
 
@@ -164,51 +156,45 @@ def _health(client: CoreClient) -> Iterator[Finding]:
 def _core(client: CoreClient, about: About, config: LabConfig) -> Finding:
     """Compute some ticks on the board and here."""
     try:
-        blocks = CoreBlocks(
-            parameters_of(config), lambda blocks: RealCore(blocks, client), load_logic(config.logic)
-        )
+        blocks = CoreBlocks(parameters_of(config), PythonRunner, load_logic(config.logic))
+        core = RealCore(blocks, client)
     except LinkError as error:
         return Finding("computes", str(error).removeprefix(f"{client.name}: "), good=False)
-    core = blocks.run
-    assert isinstance(core, RealCore)
     core.call("reset")
     for _ in range(TICKS):
         for name in ("estimate", "supervise", "control"):
             core.call(name)
     cycles = core.load["estimate"].cycles // TICKS, core.load["control"].cycles // TICKS
     times = f"estimate {cycles[0]} cycles, control {cycles[1]}, at {about.clock_mhz} MHz"
-    verdict = (
-        "the same bits as here"
-        if core.unexpected == 0
-        else f"OTHER bits than here in {core.unexpected} calls"
-    )
-    return Finding("computes", f"{verdict}; {times}", core.unexpected == 0)
+    wrong = core.unexpected
+    verdict = f"OTHER bits than here in {wrong} calls" if wrong else "the same bits as here"
+    return Finding("computes", f"{verdict}; {times}", not wrong)
 
 
 def _loop(client: CoreClient) -> Finding:
     """Send samples as fast as a board in the loop takes them."""
     client.execute([loop(Hil.STILL)])
-    window, told, start_us = SampleWindow(), None, clock_us()
+    window, report, start_us = SampleWindow(), None, clock_us()
     while window.used < LOOP_SAMPLES and clock_us() - start_us < LOOP_TIMEOUT_US:
         if not window.full:
             window.put((0, 0, 0))
         # The board takes no samples before its first report.
-        while told and client.packets.ready and (data := window.packet(clock_us())) is not None:
+        while report and client.packets.ready and (data := window.packet(clock_us())) is not None:
             client.packets.send_any(crtp.encode(crtp.Packet(PORT_CORE, CHANNEL_LOOP, data)))
-        told = _told(client, window) or told
+        report = _last_report(client, window) or report
     rate = window.used / (clock_us() - start_us) * 1e6
     client.execute([loop(Hil.OFF)])
-    if told is None:
+    if report is None:
         return Finding("loop", "does not answer", good=False)
-    counts = f"{told.held} ms held, {told.lost} lost, {told.doubled} doubled"
+    counts = f"{report.held} ms held, {report.lost} lost, {report.doubled} doubled"
     return Finding("loop", f"carries {rate:.0f} samples/s of 1000: {counts}", window.used >= LOOP_SAMPLES)
 
 
-def _told(client: CoreClient, window: SampleWindow) -> Loop | None:
+def _last_report(client: CoreClient, window: SampleWindow) -> Loop | None:
     """Pass the board's reports to the window and return the last; wait for one if the window is full."""
-    told = None
+    report = None
     for packet in map(crtp.decode, client.packets.received(LOOK_S if window.full else 0.0)):
         if (packet.port, packet.channel) == (PORT_CORE, CHANNEL_LOOP):
-            told = decode_loop(packet.data)
-            window.hear(told, clock_us())
-    return told
+            report = decode_loop(packet.data)
+            window.on_report(report, clock_us())
+    return report

@@ -32,7 +32,7 @@ def to_set(table: Mapping[str, ImageParameter], config: FirmwareConfig) -> list[
 
 
 class ImageSettings:
-    """`begin` at a laboratory time, `hear` what the board sends; `say` reports what was set and what was not.
+    """`begin` at a laboratory time, then pass on what the board sends; `report` gets what was set and what was not.
 
     `table` has the image's parameters by name; `differences` describes in one line how it differs from a configuration.
     """
@@ -44,9 +44,9 @@ class ImageSettings:
         config: FirmwareConfig,
         events: EventQueue,
         uplink: Callable[[int, bytes], object],
-        say: Callable[[str], None],
+        report: Callable[[str], None],
     ) -> None:
-        self._differences, self._config, self._events, self._say = differences, config, events, say
+        self._differences, self._config, self._events, self._report = differences, config, events, report
         entries = {name: TocEntry(one.number, one.scalar, one.writable, False) for name, one in table.items()}
         self._controls = CrtpControls(lambda data: uplink(events.now_us, data), lambda: entries)
         self._left = to_set(table, config)
@@ -55,14 +55,14 @@ class ImageSettings:
     def begin(self, now_us: int) -> None:
         """Report the constants that differ from the profile, and write the first such parameter."""
         if differs := self._differences(self._config):
-            self._say(f"the image was built with other constants: {differs}")
+            self._report(f"the image was built with other constants: {differs}")
         if self._left:
             self._ask(now_us)
             self._turn(now_us)
         else:
             self._finish()
 
-    def hear(self, now_us: int, data: bytes) -> None:
+    def on_packet(self, now_us: int, data: bytes) -> None:
         """Take a packet from the board; ignore all but answers."""
         if self._left and (packet := decode(data)).port in PORTS and self._controls.receive(now_us, packet):
             self._go_on(now_us)
@@ -82,7 +82,7 @@ class ImageSettings:
             return
         name, value = self._left.pop(0)
         if answer.error:
-            self._say(answer.error)
+            self._report(answer.error)
         else:
             self._set.append(f"{name} {value:.6g}")
         if self._left:
@@ -92,6 +92,6 @@ class ImageSettings:
 
     def _finish(self) -> None:
         if self._set:
-            self._say(f"set over the radio: {', '.join(self._set)}")
+            self._report(f"set over the radio: {', '.join(self._set)}")
         if stays := self._differences(self._config):
-            self._say(f"the image keeps its own {stays}")
+            self._report(f"the image keeps its own {stays}")

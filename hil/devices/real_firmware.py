@@ -113,7 +113,7 @@ class RealFirmware:
 
     def __init__(self, real: RealBoard, board: Board) -> None:
         self.kernel = _Clock()
-        self._told: Loop | None = None  # last
+        self._report: Loop | None = None  # last
         self._delay_us = 0  # recent mean, from a sample to the counts it caused
         self._added_us = 0  # the link's latency, which corrections add to their age
         self._stood_us = 0  # total pause of simulated time because the board was late
@@ -189,12 +189,12 @@ class RealFirmware:
 
     def _counted(self, name: str) -> int:
         """Return a counter of the board, 0 before its first report."""
-        return 0 if self._told is None else int(getattr(self._told, name))
+        return 0 if self._report is None else int(getattr(self._report, name))
 
     def _exchange(self, timeout_s: float = 0.0) -> None:
         """Read the board's reports, within a timeout, and send what the link and the board have room for."""
         for raw in self._client.packets.received(timeout_s):
-            self._hear(raw)
+            self._on_packet(raw)
         self._send()
 
     def _send(self) -> None:
@@ -205,31 +205,31 @@ class RealFirmware:
         if packets.ready and (data := self._window.packet(self._wall.wall_us())) is not None:
             packets.send_any(crtp.encode(Packet(PORT_CORE, CHANNEL_LOOP, data)))
 
-    def _hear(self, raw: bytes) -> None:
+    def _on_packet(self, raw: bytes) -> None:
         packet = crtp.decode(raw)
         if packet.port != PORT_CORE or packet.channel != CHANNEL_LOOP:
             return
-        told = self._told = decode_loop(packet.data)
+        report = self._report = decode_loop(packet.data)
         self._heard_us = self.kernel.now_us
         supervisor = self._supervisor
-        supervisor.state, supervisor.cause = State(told.state), Cause(told.cause)
+        supervisor.state, supervisor.cause = State(report.state), Cause(report.cause)
         counters = self.signals.counters
-        counters[COUNTERS.index("fused")] = told.fused
-        counters[COUNTERS.index("refused")] = told.refused
-        counters[COUNTERS.index("pose_age_us")] = 100 * told.age
-        self.signals.count[:] = told.counts
-        self._board.write_compare(told.counts)
-        if self._window.hear(told, self._wall.wall_us()) and told.fresh:
-            self._measure(told)
+        counters[COUNTERS.index("fused")] = report.fused
+        counters[COUNTERS.index("refused")] = report.refused
+        counters[COUNTERS.index("pose_age_us")] = 100 * report.age
+        self.signals.count[:] = report.counts
+        self._board.write_compare(report.counts)
+        if self._window.on_report(report, self._wall.wall_us()) and report.fresh:
+            self._measure(report)
 
-    def _measure(self, told: Loop) -> None:
+    def _measure(self, report: Loop) -> None:
         """Measure the age of the sample behind these counts, and keep as many waiting as the board wants."""
         window = self._window
         batch_us = (window.batch - 1) * SAMPLE_US // 2  # a sample's mean wait for its packet
-        self._delays.append(((window.count - window.used) * SAMPLE_US, told.waiting * SAMPLE_US + batch_us))
+        self._delays.append(((window.count - window.used) * SAMPLE_US, report.waiting * SAMPLE_US + batch_us))
         total_us, waited_us = (sum(values) // len(self._delays) for values in zip(*self._delays, strict=True))
         self._delay_us, self._added_us = total_us, max(0, total_us - waited_us) // 2
-        surplus_us = SLEW_US * (told.waiting - HIL_WAITING)
+        surplus_us = SLEW_US * (report.waiting - HIL_WAITING)
         self._wall.shift(max(-SLEW_MAX_US, min(SLEW_MAX_US, surplus_us)))
 
 

@@ -41,11 +41,11 @@ class SampleWindow:
         self._samples.append(sample)
         self.count += 1
 
-    def hear(self, told: Loop, now_us: int) -> bool:
+    def on_report(self, report: Loop, now_us: int) -> bool:
         """Take a report of the board; return whether it has taken more samples."""
-        taken = told.used - self.used & 0xFFFF
+        taken = report.used - self.used & 0xFFFF
         acknowledged = self.count - len(self._samples)
-        more = told.received - acknowledged & 0xFFFF
+        more = report.received - acknowledged & 0xFFFF
         if taken > self.count - self.used or more > len(self._samples):
             return False  # an older packet, or one before the first sample
         self.used += taken
@@ -57,8 +57,8 @@ class SampleWindow:
         if more:
             self._news_us = now_us
         self._sent = max(self._sent, acknowledged)
-        if told.lost != self._lost:
-            self._lost = told.lost
+        if report.lost != self._lost:
+            self._lost = report.lost
             self._repeat()
         return taken > 0
 

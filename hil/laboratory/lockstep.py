@@ -94,7 +94,7 @@ class ModelledLine:
             flashed.parameters, flashed.differences, site.config, site.events, uplink, say
         )
         site.events.at(0, settings.begin)
-        self._receivers.append(settings.hear)
+        self._receivers.append(settings.on_packet)
 
     def begin(self, release: Callable[[int], None]) -> None:
         """Plan the release at the profile's time."""

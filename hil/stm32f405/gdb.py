@@ -7,6 +7,7 @@ continues as if it had not stopped. Ctrl-C is checked each time the laboratory r
 import select
 import socket
 from collections.abc import Callable
+from contextlib import suppress
 
 from hil.errors import LabError
 from hil.stm32f405.chip import Chip, Why
@@ -32,7 +33,7 @@ class GdbServer:
 
     def attach(self, debuggee: Debuggee, kernel: FreeRtos | None = None) -> None:
         """Switch to this machine and its tasks; a client of the previous one must reconnect."""
-        self._part()
+        self._disconnect()
         self._debuggee, self._kernel = debuggee, kernel
         self._protocol = RemoteProtocol(debuggee, kernel)
 
@@ -43,14 +44,17 @@ class GdbServer:
     def hold(self, signal: int = SIGTRAP, watched: int | None = None) -> Wish:
         """Stop the machine until the debugger runs, steps, leaves or ends it; wait for a debugger first."""
         if self._client is None:
-            self._welcome()
+            self._waiting(self.port)
+            self._client, _ = self._listener.accept()
+            self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._protocol = RemoteProtocol(self._debuggee, self._kernel)
         elif self._protocol.wish in (Wish.RUN, Wish.STEP):
             self._send(self._protocol.stopped(signal, watched))
-        while self._client is not None and self._protocol.wish is Wish.STAND:
+        while self._client is not None and self._protocol.wish is Wish.STOP:
             self._receive()
         wish = self._protocol.wish
         if wish in (Wish.DETACH, Wish.KILL):
-            self._part()
+            self._disconnect()
         return wish
 
     def wants_to_stop(self) -> bool:
@@ -64,36 +68,27 @@ class GdbServer:
         return self._protocol.interrupted
 
     def close(self) -> None:
-        self._part()
+        self._disconnect()
         self._listener.close()
-
-    def _welcome(self) -> None:
-        self._waiting(self.port)
-        self._client, _ = self._listener.accept()
-        self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._protocol = RemoteProtocol(self._debuggee, self._kernel)
 
     def _receive(self) -> None:
         """Answer the next packet; a disconnected debugger releases the machine."""
         assert self._client is not None
-        try:
+        data = b""
+        with suppress(OSError):
             data = self._client.recv(READ_SIZE)
-        except OSError:
-            data = b""
         if data:
             self._send(self._protocol.receive(data))
         else:
             self._protocol.leave(Wish.DETACH)
-            self._part()
+            self._disconnect()
 
     def _send(self, data: bytes) -> None:
         assert self._client is not None
-        try:
+        with suppress(OSError):  # the next `recv` reports the disconnection
             self._client.sendall(data)
-        except OSError:
-            return  # the next `recv` reports the disconnection
 
-    def _part(self) -> None:
+    def _disconnect(self) -> None:
         if self._client is not None:
             self._client.close()
             self._client = None
@@ -105,30 +100,30 @@ class DebuggedChip:
     def __init__(self, chip: Chip, server: GdbServer, kernel: FreeRtos | None = None) -> None:
         server.attach(chip, kernel)
         self._chip, self._server = chip, server
-        self._wish = Wish.STAND
+        self._wish = Wish.STOP
 
     def run(self, until_cycles: int) -> int:
         """Run up to a time, or until the caller must act, like `Chip.run`.
 
         Raises `KeyboardInterrupt` when the debugger ends it.
         """
-        if self._wish is Wish.STAND or self._server.wants_to_stop():
+        if self._wish is Wish.STOP or self._server.wants_to_stop():
             self._hold(SIGINT)
         seen: int = Why.TIME
         state = self._chip.state
         while True:
-            stands = self._wish is Wish.STEP
+            stopped = self._wish is Wish.STEP
             # The caller acts between two blocks, as without a debugger: never inside one, where `resume` is the pc.
             until = int(state.now) if seen else until_cycles
-            seen |= self._chip.step() & ~Why.STEP if stands else self._chip.run(until)
+            seen |= self._chip.step() & ~Why.STEP if stopped else self._chip.run(until)
             pc = self._chip.register("pc")
             if seen & Why.BREAK and pc in self._chip.breakpoints:
                 seen &= seen if pc in self._chip.crash_points else ~Why.BREAK
-                stands = True
+                stopped = True
             if seen & Why.WATCHPOINT:
                 seen &= ~Why.WATCHPOINT
                 self._hold(SIGTRAP, state.watch_address)
-            elif stands:
+            elif stopped:
                 self._hold(SIGTRAP)
             if seen & Why.BREAK or (state.resume != state.pc and (seen or state.now >= until_cycles)):
                 return seen

@@ -51,7 +51,7 @@ class Debuggee(Protocol):
 class Wish(Enum):
     """The debugger's request to the machine."""
 
-    STAND = auto()
+    STOP = auto()
     RUN = auto()
     STEP = auto()
     DETACH = auto()
@@ -115,7 +115,7 @@ class RemoteProtocol:
         self._acknowledging = True
         self._signal = SIGTRAP
         self._last = b""
-        self.wish = Wish.STAND
+        self.wish = Wish.STOP
         self.interrupted = False  # Ctrl-C arrived while the machine ran
         self._commands: dict[bytes, Callable[[bytes], bytes]] = {
             b"?": lambda _: self._stop_reply(),
@@ -143,7 +143,7 @@ class RemoteProtocol:
         self._items += self._framing.take(data)
         answers, waiting = b"", []
         for item in self._items:
-            if self.wish is Wish.STAND or not item.startswith(b"$"):
+            if self.wish is Wish.STOP or not item.startswith(b"$"):
                 answers += self._answered(item)
             else:
                 waiting.append(item)
@@ -152,7 +152,7 @@ class RemoteProtocol:
 
     def stopped(self, signal: int, watched: int | None = None) -> bytes:
         """Return the report to the debugger that its running machine has stopped, and the watched access."""
-        self.wish, self._signal, self.interrupted, self._thread = Wish.STAND, signal, False, 0
+        self.wish, self._signal, self.interrupted, self._thread = Wish.STOP, signal, False, 0
         self._last = framed(self._stop_reply(watched))
         return self._last + self.receive(b"")
 

@@ -58,7 +58,7 @@ class Told(CrtpClient):
             self.run(self.now_us + 1000)
             for _, data in self.sent:
                 if not self.lossy():
-                    self.settings.hear(self.now_us, data)
+                    self.settings.on_packet(self.now_us, data)
             self.sent.clear()
 
 
@@ -114,7 +114,7 @@ def test_what_no_parameter_sets_is_said_in_one_line() -> None:
 def test_packets_that_answer_nothing_change_nothing(packet: bytes) -> None:
     board = Told(load_config("floaty", ["controller.limit_u3=0.6"]))
     before = list(board.said)
-    board.settings.hear(board.now_us, packet)
+    board.settings.on_packet(board.now_us, packet)
     assert board.said == before
     board.listen(50_000)
     assert board.constants.fields.limit_u3 == pytest.approx(0.6)

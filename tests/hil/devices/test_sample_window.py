@@ -8,7 +8,7 @@ from firmware_py.wire.core_port import SAMPLES, SAMPLES_MAX, Loop
 from hil.devices.sample_window import PACKETS, REPEAT_US, SAMPLES_MIN, WINDOW, SampleWindow
 
 
-def told(used: int, waiting: int, lost: int = 0) -> Loop:
+def report(used: int, waiting: int, lost: int = 0) -> Loop:
     return Loop(used & 0xFFFF, waiting, 2, 0, True, 0, 0, lost, *(0,) * 8)
 
 
@@ -39,26 +39,26 @@ def test_a_window_is_full_until_the_board_has_taken_some() -> None:
     assert not window.full
     window.put((0, 0, 0))
     assert window.full
-    window.hear(told(0, 15), 0)
+    window.on_report(report(0, 15), 0)
     assert window.full
-    assert window.hear(told(1, 14), 0)
+    assert window.on_report(report(1, 14), 0)
     assert not window.full
 
 
 def test_what_was_acknowledged_makes_room_for_packets() -> None:
     window, _ = filled(WINDOW)
     assert window.packet(0) is None
-    window.hear(told(0, 9), 0)
+    window.on_report(report(0, 9), 0)
     assert number(window.packet(0)) == 21
     assert number(window.packet(0)) is None
 
 
 def test_behind_a_gap_all_is_sent_again() -> None:
     window, _ = filled(WINDOW)
-    window.hear(told(2, 2, lost=5), 0)
+    window.on_report(report(2, 2, lost=5), 0)
     assert window.repeated == PACKETS - 1
     assert [number(window.packet(0)) for _ in range(PACKETS)] == [4, 10, 16, 22]
-    window.hear(told(2, 2, lost=5), 0)
+    window.on_report(report(2, 2, lost=5), 0)
     assert window.repeated == PACKETS - 1
 
 
@@ -72,8 +72,8 @@ def test_without_news_all_is_sent_again_after_a_time() -> None:
 
 def test_news_of_a_packet_that_was_overtaken_is_no_news() -> None:
     window, _ = filled(18)
-    assert window.hear(told(10, 5), 0)
-    assert not window.hear(told(2, 3), 0)
+    assert window.on_report(report(10, 5), 0)
+    assert not window.on_report(report(2, 3), 0)
     assert (window.used, window.packet(0)) == (10, None)
 
 
@@ -84,7 +84,7 @@ def test_numbers_go_on_behind_65535() -> None:
         window.put((now % 7, 0, 0))
         if (data := window.packet(0)) is not None:
             assert number(data) == (now + 1 - SAMPLES_MIN) % 65536
-            assert window.hear(told(now + 1 - 2, 2), 0)
+            assert window.on_report(report(now + 1 - 2, 2), 0)
     assert window.used == samples - 2
 
 
@@ -97,6 +97,6 @@ def test_a_sample_is_packed_once_while_nothing_is_lost() -> None:
         if (data := window.packet(next(clock))) is not None:
             ends.append((number(data), number(data) + window.batch))
         if len(ends) > 2:
-            window.hear(told(ends[-3][1], 0), 0)
+            window.on_report(report(ends[-3][1], 0), 0)
     assert [begin for begin, _ in ends[1:]] == [end for _, end in ends[:-1]]
     assert window.repeated == 0

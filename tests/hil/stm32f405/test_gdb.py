@@ -112,7 +112,7 @@ def test_a_malformed_packet_changes_nothing(
     assert ask(protocol, packet) == b"E01"
     assert ask(protocol, b"g") == before
     assert machine.breakpoints == set()
-    assert protocol.wish is Wish.STAND
+    assert protocol.wish is Wish.STOP
 
 
 @settings(max_examples=25)
