@@ -11,7 +11,7 @@ the authors flew: their measurements. Floaty is not included: its power comes fr
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -71,24 +71,21 @@ def _configuration(flight: pa.Table) -> dict[str, Any]:
     return dict(stored_in(flight.schema.metadata, "config"))
 
 
-# The paper: about 33 min, 3.4 W, 10 W/kg
-LIMITS = {"lost": 0.0, "power": 3.6, "specific_power": 10.5, "endurance": 31.0}
 POWER = Experiment(
     name="power",
     summary="hover for 60 s: power, W/kg and the minutes a battery would last (paper: 3.4 W, 10 W/kg, 33 min)",
     duration_s=60.0,
-    limits=LIMITS,
+    limits={"lost": 0.0, "power": 3.6, "specific_power": 10.5, "endurance": 31.0},
     measure=estimate,
     pictures=("specific-power", "discharge"),
 )
-ENDURANCE = Experiment(
+ENDURANCE = replace(  # the final failsafe is shorter than the limit `uncontrolled`
+    POWER,
     name="endurance",
     summary="hover until the supervisor reports the battery empty (paper: 33 min)",
     duration_s=LONGEST_S,
-    limits=LIMITS,  # the final failsafe is shorter than the limit `uncontrolled`
     script=end_with_the_battery,
     measure=until_empty,
-    pictures=("specific-power", "discharge"),
 )
 
 WATTS_PER_SHP = 745.7  # the paper's

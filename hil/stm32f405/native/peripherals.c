@@ -6,33 +6,26 @@ host, and the random numbers are here (chapters 7, 5, 3, 8, 12, 21, 13, 34, 24).
 
 enum { LSI_HZ = 32000 };
 
-struct range {
-    uint32_t base;
-    uint8_t kind, index;
-};
 enum { NONE, PLAIN, TIMER, BUS, SPI, USART, DMA, PORT, EXTI, RCC, PWR, FLASH, WATCHDOG, ADC };
+#define STEP 0x400 /* each peripheral has so many addresses */
+#define AT(base) [(base) / STEP]
 
-/* By address in steps of 0x400. */
-static struct range find(uint32_t offset)
-{
-    static const struct range ranges[] = {
-        {0x00000, TIMER, 1}, {0x00400, TIMER, 2}, {0x00800, TIMER, 3}, {0x00C00, TIMER, 4}, {0x01000, TIMER, 5},
-        {0x01400, TIMER, 6}, {0x01800, TIMER, 11}, {0x01C00, TIMER, 12}, {0x02000, TIMER, 13}, {0x02800, PLAIN, 0},
-        {0x02C00, PLAIN, 0}, {0x03000, WATCHDOG, 0}, {0x03800, SPI, 1}, {0x03C00, SPI, 2}, {0x04400, USART, 1},
-        {0x04800, USART, 2}, {0x04C00, USART, 3}, {0x05000, USART, 4}, {0x05400, BUS, 0}, {0x05800, BUS, 1},
-        {0x05C00, BUS, 2}, {0x07000, PWR, 0}, {0x10000, TIMER, 0}, {0x10400, TIMER, 7}, {0x11000, USART, 0},
-        {0x11400, USART, 5}, {0x12000, ADC, 0}, {0x13000, SPI, 0}, {0x13800, PLAIN, 0}, {0x13C00, EXTI, 0},
-        {0x14000, TIMER, 8}, {0x14400, TIMER, 9}, {0x14800, TIMER, 10}, {0x20000, PORT, 0}, {0x20400, PORT, 1},
-        {0x20800, PORT, 2}, {0x20C00, PORT, 3}, {0x21000, PORT, 4}, {0x21400, PORT, 5}, {0x21800, PORT, 6},
-        {0x21C00, PORT, 7}, {0x22000, PORT, 8}, {0x23800, RCC, 0}, {0x23C00, FLASH, 0}, {0x26000, DMA, 0},
-        {0x26400, DMA, 1},
-    };
-    static const struct range nothing = {0, NONE, 0};
-    for (unsigned i = 0; i < sizeof ranges / sizeof *ranges; i++)
-        if (ranges[i].base == (offset & ~0x3FFu))
-            return ranges[i];
-    return nothing;
-}
+static const struct range {
+    uint8_t kind, index;
+} RANGES[PERIPHERALS_SIZE / STEP] = {
+    AT(0x00000) = {TIMER, 1}, AT(0x00400) = {TIMER, 2}, AT(0x00800) = {TIMER, 3}, AT(0x00C00) = {TIMER, 4},
+    AT(0x01000) = {TIMER, 5}, AT(0x01400) = {TIMER, 6}, AT(0x01800) = {TIMER, 11}, AT(0x01C00) = {TIMER, 12},
+    AT(0x02000) = {TIMER, 13}, AT(0x02800) = {PLAIN, 0}, AT(0x02C00) = {PLAIN, 0}, AT(0x03000) = {WATCHDOG, 0},
+    AT(0x03800) = {SPI, 1}, AT(0x03C00) = {SPI, 2}, AT(0x04400) = {USART, 1}, AT(0x04800) = {USART, 2},
+    AT(0x04C00) = {USART, 3}, AT(0x05000) = {USART, 4}, AT(0x05400) = {BUS, 0}, AT(0x05800) = {BUS, 1},
+    AT(0x05C00) = {BUS, 2}, AT(0x07000) = {PWR, 0}, AT(0x10000) = {TIMER, 0}, AT(0x10400) = {TIMER, 7},
+    AT(0x11000) = {USART, 0}, AT(0x11400) = {USART, 5}, AT(0x12000) = {ADC, 0}, AT(0x13000) = {SPI, 0},
+    AT(0x13800) = {PLAIN, 0}, AT(0x13C00) = {EXTI, 0}, AT(0x14000) = {TIMER, 8}, AT(0x14400) = {TIMER, 9},
+    AT(0x14800) = {TIMER, 10}, AT(0x20000) = {PORT, 0}, AT(0x20400) = {PORT, 1}, AT(0x20800) = {PORT, 2},
+    AT(0x20C00) = {PORT, 3}, AT(0x21000) = {PORT, 4}, AT(0x21400) = {PORT, 5}, AT(0x21800) = {PORT, 6},
+    AT(0x21C00) = {PORT, 7}, AT(0x22000) = {PORT, 8}, AT(0x23800) = {RCC, 0}, AT(0x23C00) = {FLASH, 0},
+    AT(0x26000) = {DMA, 0}, AT(0x26400) = {DMA, 1},
+};
 
 static void note_unknown(struct machine *m, uint32_t address)
 {
@@ -155,7 +148,7 @@ uint64_t peripheral_read(uc_engine *uc, uint64_t where, unsigned size, void *use
 {
     struct machine *m = user;
     uint32_t offset = (uint32_t)where & ~3u, at = offset & 0x3FF, shift = 8 * ((uint32_t)where & 3), value;
-    struct range range = find(offset);
+    struct range range = RANGES[offset / STEP];
     switch (range.kind) {
     case TIMER: value = timer_read(m, range.index, at); break;
     case BUS: value = bus_read(m, range.index, at); break;
@@ -181,7 +174,7 @@ void peripheral_write(uc_engine *uc, uint64_t where, unsigned size, uint64_t giv
 {
     struct machine *m = user;
     uint32_t offset = (uint32_t)where, at = offset & 0x3FF, value = (uint32_t)given;
-    struct range range = find(offset);
+    struct range range = RANGES[offset / STEP];
     switch (range.kind) {
     case TIMER: timer_write(m, range.index, at, value); break;
     case BUS: bus_write(m, range.index, at, value); break;
