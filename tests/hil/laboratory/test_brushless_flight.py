@@ -8,7 +8,7 @@ import pytest
 from hil.api import Request, column, fly
 from hil.crazyflie.log_table import log_table
 from hil.errors import LabError
-from hil.experiments.hover import HOVER
+from hil.experiments.position import HOVER
 from hil.laboratory.fault_kinds import KINDS
 from support.flights import served_image
 from support.stm32_firmware import build
