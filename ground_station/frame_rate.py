@@ -32,7 +32,7 @@ class FrameRate:
         if as_configured and not slow:
             return ""
         expected = (
-            "" if as_configured else f", not every {self._period_us * 1e-3:.1f} ms as mocap.period_us says"
+            "" if as_configured else f", not every {self._period_us * 1e-3:.1f} ms as set by mocap.period_us"
         )
         leaving = f"{rate_hz:.0f}, not {self._corrections_hz:g}" if slow else f"{self._corrections_hz:g}"
         return (

@@ -41,7 +41,7 @@ class TrackNotices:
         self._lost = True
         self._happened(t_us)
 
-    def begun_again(self, t_us: int, gap_us: int) -> None:
+    def restarted(self, t_us: int, gap_us: int) -> None:
         """Note a new track, `gap_us` after the last good pose."""
         self._gap_us = gap_us
         self._happened(t_us)
@@ -57,7 +57,7 @@ class TrackNotices:
                 f"{poses} refused, up to {self._distance:.2f} m and {degrees(self._angle):.0f} deg from the prediction"
             )
         if self._gap_us is not None:
-            notices.append(f"track begun again after {self._gap_us * 1e-6:.1f} s")
+            notices.append(f"track restarted after {self._gap_us * 1e-6:.1f} s")
         elif self._lost:
             notices.append("track lost")
         self._refused, self._distance, self._angle = 0, 0.0, 0.0
@@ -192,7 +192,7 @@ class Tracker:
         self._tracking, self._patience_us = True, self._config.reacquire_us
         if self._lost_us is not None:
             self.counters.restarts += 1
-            self._notices.begun_again(t_us, t_us - self._lost_us)
+            self._notices.restarted(t_us, t_us - self._lost_us)
 
     def _lose(self) -> None:
         if self._tracking:

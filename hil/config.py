@@ -5,6 +5,7 @@ Every mistake becomes a `LabError` that names the key, its value and what is all
 """
 
 import json
+import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -282,9 +283,7 @@ def _toml_value(text: str) -> Any:
 def _explain(tree: Mapping[str, Any], detail: ErrorDetails) -> str:
     """Return one line: the key, its value, what is allowed."""
     location = [str(part) for part in detail["loc"]]
-    name = (
-        ".".join(location).replace(".0", "[0]").replace(".1", "[1]").replace(".2", "[2]").replace(".3", "[3]")
-    )
+    name = re.sub(r"\.(\d)", r"[\1]", ".".join(location))
     if detail["type"] == "missing":
         return f"{name}: missing; a profile without `base` states every constant that is flashed"
     value = detail["input"]

@@ -49,6 +49,14 @@ def made_folder(option: str, path: Path) -> Path:
     return path
 
 
+def require_empty(option: str, folder: Path) -> None:
+    """Raise `LabError` for a folder with content, or a path that is not a folder."""
+    with refusing(f"{option} {folder}: ", OSError):
+        used = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    if used:
+        raise LabError(f"{option} {folder}: it exists and is not empty; choose a folder that is new or empty")
+
+
 LISTED = 12  # names in one line
 
 

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-from hil.errors import LabError, blame
+from hil.errors import LabError, blame, refusing
 
 _LOADED: dict[Path, tuple[str, ModuleType]] = {}  # with the hash of the executed text
 
@@ -13,10 +13,8 @@ _LOADED: dict[Path, tuple[str, ModuleType]] = {}  # with the hash of the execute
 def load_file(what: str, path: Path) -> tuple[ModuleType, str]:
     """Return the module of a file, and the file's SHA-256. Raises a `LabError` that begins with `what` and the path."""
     place = path.resolve()
-    try:
+    with refusing(f"{what} {path}: ", OSError):
         content = place.read_bytes()
-    except OSError as error:
-        raise LabError(f"{what} {path}: {error.strerror or error}") from None
     digest = hashlib.sha256(content).hexdigest()
     known, module = _LOADED.get(place, ("", None))
     if module is not None and known == digest:

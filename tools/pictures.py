@@ -163,7 +163,7 @@ def main(names: list[str]) -> int:
                 shutil.copy(new, DOCS / name)
                 print(f"{name}  made")
             except (MissingError, RuntimeError, OSError, subprocess.SubprocessError) as error:
-                print(f"{name}  stays as it is: {error}", file=sys.stderr)
+                print(f"{name}  unchanged: {error}", file=sys.stderr)
                 failed = True
             finally:
                 os.chdir(ROOT)

@@ -76,11 +76,11 @@ class CoreClient:
             except WireError as error:
                 raise LinkError(f"{self.name}: {error}") from None
             if about.version != core_port.VERSION:
-                what = f"its app speaks version {about.version}, expected {core_port.VERSION}"
+                what = f"its app has protocol version {about.version}, expected {core_port.VERSION}"
                 raise LinkError(f"{self.name}: {what}: export and flash it again")
             if about.done == 0:  # otherwise that number was an earlier program's
                 return about
-        raise LinkError(f"{self.name}: it begins no session")
+        raise LinkError(f"{self.name}: it starts no session")
 
     def execute(self, requests: Sequence[Request]) -> list[core_port.CoreAnswer]:
         """Execute requests in their order, at most one of them a call; return their answers."""

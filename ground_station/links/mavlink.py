@@ -66,7 +66,7 @@ class MavlinkLink:
         self.controls = MavlinkControls(self._send, lambda: self._addressee)
         self._time_request_ns = 0  # own clock in the last request
         self._read_us = 0  # when the bytes now being decoded were read
-        self._handlers: dict[str, Callable[[int, Message], Sequence[Sample]]] = {
+        self._handlers: dict[str, Callable[[int, Message], Sequence[Sample] | None]] = {
             "HEARTBEAT": self._on_heartbeat,
             "TIMESYNC": self._on_timesync,
             "DEBUG_FLOAT_ARRAY": self._on_flight_array,
@@ -141,7 +141,7 @@ class MavlinkLink:
             if handler is None or not self._is_of_board(message):
                 continue
             self.received_us = now_us
-            samples += handler(now_us, message)
+            samples += handler(now_us, message) or ()
         if self._read_us >= self._look_us:
             self._look_after(self._read_us)
         return samples
@@ -150,13 +150,12 @@ class MavlinkLink:
         system = message.get_srcSystem()
         return message.get_srcComponent() == BOARD_COMPONENT and self.board in (None, system)
 
-    def _on_heartbeat(self, now_us: int, message: Message) -> Sequence[Sample]:
+    def _on_heartbeat(self, now_us: int, message: Message) -> None:
         if message.autopilot != NO_AUTOPILOT:
             self.board = message.get_srcSystem()
             self.supervisor_state = services.read_heartbeat(message)
-        return ()
 
-    def _on_timesync(self, now_us: int, message: Message) -> Sequence[Sample]:
+    def _on_timesync(self, now_us: int, message: Message) -> None:
         if message.tc1 == 0:
             # The board takes our answer's time for the middle between its request and its receipt. So it gets the middle
             # between arrival and answer, as in NTP: a late answer is less precise, but not wrong.
@@ -165,24 +164,20 @@ class MavlinkLink:
         elif message.ts1 == self._time_request_ns:
             self.round_trip_us = now_us - message.ts1 // 1000
             self.latency = LinkLatency("serial", self.round_trip_us // 2, measured=True)
-        return ()
 
-    def _on_command_ack(self, now_us: int, message: Message) -> Sequence[Sample]:
+    def _on_command_ack(self, now_us: int, message: Message) -> None:
         self.answered = True
         if not self.controls.receive(self._read_us, message) and message.result != ACCEPTED:
             self.texts.append(services.refusal(message))
-        return ()
 
-    def _on_parameter(self, now_us: int, message: Message) -> Sequence[Sample]:
+    def _on_parameter(self, now_us: int, message: Message) -> None:
         self.controls.receive(self._read_us, message)
-        return ()
 
-    def _on_text(self, now_us: int, message: Message) -> Sequence[Sample]:
+    def _on_text(self, now_us: int, message: Message) -> None:
         self._text = self._text + message.text if message.chunk_seq else message.text
         continued = message.id and len(message.text) == TEXT_PIECE
         if not self.controls.receive(self._read_us, message) and not continued:
             self.texts.append(f"board: {self._text}")
-        return ()
 
     def _on_flight_array(self, now_us: int, message: Message) -> Sequence[Sample]:
         try:

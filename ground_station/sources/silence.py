@@ -15,7 +15,7 @@ class Silence:
         """Note the arrival of a frame."""
         if self._lasts and self._received_us is not None:
             gap_s = (now_us - self._received_us) * 1e-6
-            self._notices.append(f"motion capture: frames again after {gap_s:.1f} s")
+            self._notices.append(f"motion capture: frames arrive again after {gap_s:.1f} s")
         self._lasts = False
         self._received_us = now_us
 

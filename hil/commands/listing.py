@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from hil.commands.options import PATH, console, say, wide_console
-from hil.errors import LabError
+from hil.errors import LabError, refusing
 
 if TYPE_CHECKING:
     from hil.laboratory.result import Result
@@ -84,12 +84,9 @@ def runs(folder: Path) -> None:
     from hil.laboratory.recorder import EVENTS
     from hil.laboratory.result import RESULT, read_result
 
-    try:
-        written = {
-            path.parent: path.stat().st_mtime for name in (EVENTS, RESULT) for path in folder.rglob(name)
-        }
-    except OSError as error:
-        raise LabError(f"runs {folder}: {error.strerror or error}") from None
+    with refusing(f"runs {folder}: ", OSError):
+        found = [path for name in (EVENTS, RESULT) for path in folder.rglob(name)]
+        written = {path.parent: path.stat().st_mtime for path in found}
     if not written:
         raise LabError(f"runs {folder}: no run folder there; `floaty fly hover` makes one")
     table = Table(box=None, pad_edge=False)

@@ -16,7 +16,7 @@ import click
 
 from firmware_py.errors import FirmwareError
 from hil.commands.options import FILE, PATH, say
-from hil.errors import LabError, require
+from hil.errors import LabError, refusing, require, require_empty
 
 if TYPE_CHECKING:
     import numpy as np
@@ -96,14 +96,6 @@ def project_name(command: str, folder: Path) -> str:
     return name
 
 
-def require_empty(command: str, folder: Path) -> None:
-    """Raise `LabError` for a folder with content, or a path that is not a folder."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise LabError(
-            f"{command} {folder}: it exists and is not empty; choose a folder that is new or empty"
-        )
-
-
 def write_project(command: str, templates: Path, folder: Path, **values: object) -> None:
     """Write a folder's templates, filled with the values, into a new or empty folder."""
     from jinja2 import Environment, StrictUndefined
@@ -111,16 +103,14 @@ def write_project(command: str, templates: Path, folder: Path, **values: object)
     environment = Environment(
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
-    try:
-        require_empty(command, folder)
+    require_empty(command, folder)
+    with refusing(f"{command} {folder}: ", OSError):
         for template in sorted(templates.rglob("*.in")):
             place = template.relative_to(templates).with_suffix("")
             path = folder / NAMED.get(str(place), place)
             path.parent.mkdir(parents=True, exist_ok=True)
             text = environment.from_string(template.read_text(encoding="utf-8")).render(values)
             path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise LabError(f"{command} {folder}: {error.strerror or error}") from None
 
 
 def _constant(values: NDArray[np.float32]) -> str:

@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from ground_station.trajectory import Goal, Hold, Trajectory
 from hil.arguments import checked
-from hil.errors import LabError, blame
+from hil.errors import LabError, blame, refusing
 from hil.laboratory.faults import Fault
 from hil.laboratory.metrics import METRICS, Metric, check_limits, free_flight, measure
 from hil.laboratory.robot import Robot
@@ -89,10 +89,8 @@ class Experiment:
         for name in self.metrics:
             if name in METRICS:
                 raise LabError(f"experiment {self.name}: metric {name}: every flight has one of that name")
-        try:
+        with refusing(f"experiment {self.name}: ", LabError):
             check_limits(self.limits, self.metrics)
-        except LabError as error:
-            raise LabError(f"experiment {self.name}: {error}") from None
 
     @property
     def reference(self) -> str:

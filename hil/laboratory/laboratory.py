@@ -7,7 +7,7 @@ from outside arrive in between.
 from collections.abc import Callable
 
 from hil.clock import Clock, FreeRunning
-from hil.errors import LabError
+from hil.errors import refusing
 from hil.events import EndlessInstantError, EventQueue
 from hil.laboratory.robot import Robot
 
@@ -34,10 +34,8 @@ class Laboratory:
 
         Raises `LabError` when an experiment plans endless events at one instant.
         """
-        try:
+        with refusing("", EndlessInstantError):
             self._run(progress)
-        except EndlessInstantError as error:
-            raise LabError(str(error)) from None
 
     def _run(self, progress: Progress | None) -> None:
         clock, next_progress_us = self.clock, self.now_us

@@ -18,7 +18,7 @@ from ground_station.program import Cockpit
 from ground_station.telemetry_log import TELEMETRY
 from hil.bodies import make_body
 from hil.config import LabConfig
-from hil.errors import LabError, writing
+from hil.errors import LabError, made_folder, require_empty, writing
 from hil.laboratory.ages import STATION_START
 from hil.laboratory.channels import station_channels
 from hil.laboratory.flight import RECORD_PERIOD_US
@@ -65,7 +65,8 @@ class RealFlight:
         self._state: int | None = None  # the supervisor's
         self._broken = False  # writing has failed
         if folder is not None:
-            _make(folder)
+            require_empty("--out", folder)
+            made_folder("--out", folder)
 
     @property
     def telemetry(self) -> Path | None:
@@ -173,15 +174,6 @@ class RealFlight:
         outcome: Outcome = "lost" if self._lost else "completed" if self._whole else cut_short
         ended = outcome, self._lost or failure or None
         return judged(self._request, self._program, ended, metrics, log, digest, folder)
-
-
-def _make(folder: Path) -> None:
-    with writing("--out", folder):
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise LabError(
-                f"--out {folder}: there is something already, and a real flight is not flown again"
-            )
-        folder.mkdir(parents=True, exist_ok=True)
 
 
 def why_lost(frame: MocapFrame, config: LabConfig) -> str | None:

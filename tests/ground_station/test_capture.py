@@ -137,7 +137,7 @@ def test_a_stream_with_another_rate_than_the_profile_s_is_told_once() -> None:
     assert told(*[400] * 280, 1_400_000, *[5000] * 3000) == []  # a burst and a stall
     assert len(told(*[10_000] * 1000)) == len(told(*[4000] * 3000)) == 1
     (faster,) = told(*[10_000] * 1000)
-    assert "every 10.0 ms, not every 5.0 ms as mocap.period_us says: 50 corrections leave" in faster
+    assert "every 10.0 ms, not every 5.0 ms as set by mocap.period_us: 50 corrections leave" in faster
     (slower,) = told(*[40_000] * 1000)
     assert "25, not 50 corrections leave per second" in slower
     assert told(*[10_000] * 1000, expected_us=10_000) == []

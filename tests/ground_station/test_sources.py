@@ -224,7 +224,7 @@ def test_a_stream_that_stops_is_told_once_and_called_until_it_is_back() -> None:
     assert 4 <= calls <= 6
     assert bench.pose().valid
     assert bench.stream.notices == [
-        "motion capture: no frames; calling the server again", "motion capture: frames again after 3.0 s",
+        "motion capture: no frames; calling the server again", "motion capture: frames arrive again after 3.0 s",
     ]  # fmt: skip
 
 
@@ -248,8 +248,8 @@ def test_silence_begins_with_a_frame_and_each_one_is_told_twice() -> None:
         assert asked == [False, True, True]
     silence.on_frame(30_000_000 + 2_500_000)
     assert notices == [
-        "motion capture: no frames; calling the server again", "motion capture: frames again after 10.0 s",
-        "motion capture: no frames; calling the server again", "motion capture: frames again after 2.5 s",
+        "motion capture: no frames; calling the server again", "motion capture: frames arrive again after 10.0 s",
+        "motion capture: no frames; calling the server again", "motion capture: frames arrive again after 2.5 s",
     ]  # fmt: skip
 
 

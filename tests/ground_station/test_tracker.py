@@ -397,14 +397,14 @@ def test_one_line_reports_refused_poses() -> None:
     ]
 
 
-def test_a_track_that_is_lost_and_begun_again_is_reported() -> None:
+def test_a_track_that_is_lost_and_restarted_is_reported() -> None:
     rng = np.random.default_rng(2)
     blind = [replace(noisy(rng, n), valid=False) for n in range(100, 400)]
     back = [noisy(rng, n) for n in range(400, 600)]
     lines = told(tracking(), blind + back)
     assert [line for _, line in lines] == [
         "motion capture: track lost",
-        "motion capture: track begun again after 1.5 s",
+        "motion capture: track restarted after 1.5 s",
     ]
 
 

@@ -122,7 +122,7 @@ def test_a_stream_that_stops_is_failsafe_and_one_line_and_flies_again_when_it_is
     assert 4_000_000 < told_us[2] < 4_200_000
     stopped, back = lab.stream.notices
     assert stopped == "motion capture: no frames; calling the server again"
-    assert back == "motion capture: frames again after 2.0 s"
+    assert back == "motion capture: frames arrive again after 2.0 s"
 
 
 def test_a_body_that_is_taken_out_in_flight_is_failsafe_and_one_line(tmp_path: Path) -> None:

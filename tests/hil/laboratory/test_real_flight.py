@@ -385,7 +385,7 @@ def test_a_real_flight_overwrites_nothing(tmp_path: Path) -> None:
     StationBench(tmp_path / "run").record.close()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "events.jsonl").write_text("{}")
-    with pytest.raises(LabError, match="there is something already"):
+    with pytest.raises(LabError, match="it exists and is not empty"):
         StationBench(tmp_path / "other")
     with pytest.raises(LabError, match="cannot be written"):
         StationBench(Path("/proc/floaty/run"))
