@@ -177,9 +177,10 @@ def _side_wind(axis: int) -> Knob:
 
 
 def _push(part: int) -> Knob:
-    return _component(
-        part, lambda robot: robot.body.pushes.tolist(), lambda robot, all: robot.body.push(all[:3], all[3:])
-    )
+    def write(robot: Robot, pushes: list[float]) -> None:
+        robot.body.push(pushes[:3], pushes[3:])
+
+    return _component(part, lambda robot: robot.body.pushes.tolist(), write)
 
 
 UPLINK_LOSS, DOWNLINK_LOSS = (_radio(f"{way}_loss", either) for way in ("uplink", "downlink"))
