@@ -110,15 +110,14 @@ class CrtpControls(Dialogue[crtp.Packet]):
         """Send the stop of the localisation port, which every Crazyflie has; newer ones report that they are locked."""
         stop = crtp.Packet(crtp.PORT_LOCALISATION, crtp.CHANNEL_GENERIC, bytes((EMERGENCY_STOP,)))
         ask = crtp.Packet(crtp.PORT_SUPERVISOR, supervisor.SUPERVISOR_INFO, bytes((supervisor.GET_BITS,)))
+        head = bytes((supervisor.REPLY | supervisor.GET_BITS,))  # of the answer
 
         def send(now_us: int) -> None:
             self._transmit(crtp.encode(stop))
             self._transmit(crtp.encode(ask))
 
         def take(got: crtp.Packet) -> crtp.Packet | None:
-            is_state = got.port == crtp.PORT_SUPERVISOR and got.data[:1] == bytes(
-                (supervisor.REPLY | supervisor.GET_BITS,)
-            )
+            is_state = got.port == crtp.PORT_SUPERVISOR and got.data[:1] == head
             return got if is_state and int.from_bytes(got.data[1:3], "little") & supervisor.LOCKED else None
 
         yield Exchange(send, take)
