@@ -51,9 +51,8 @@ def compiler(*sources: Path) -> Callable[[Function], Function]:
         if not inspect.isfunction(function):  # `make fast` has compiled its module, too
             function = getattr(_module_from_source(function.__module__), function.__name__)
         stamp = shared.copy()
-        stamp.update(
-            function.__module__.encode()
-        )  # the kept code contains this name; own logic's has a hash of all its modules
+        # The kept code contains this name; own logic's has a hash of all its modules.
+        stamp.update(function.__module__.encode())
         stamp.update(Path(inspect.getfile(function)).read_bytes())
         return cast(Function, Compiled(function, stamp.hexdigest()))
 
@@ -220,13 +219,9 @@ def _machine_code(function: Compiled, arguments: tuple[NDArray[Any], ...]) -> by
     body = f"{call}\n    return 0" if nothing else f"return {call}"
     exec(f"def on_arrays({', '.join(names)}):\n    {body}", scope)
     signature = numba.types.int64(*[numba.types.voidptr] * len(arguments))
-    options = {
-        "error_model": "numpy",
-        "fastmath": False,
-        "no_cpython_wrapper": True,
-        "no_cfunc_wrapper": True,
-    }
-    dispatcher = numba.njit(**options)(scope["on_arrays"])
+    dispatcher = numba.njit(
+        error_model="numpy", fastmath=False, no_cpython_wrapper=True, no_cfunc_wrapper=True
+    )(scope["on_arrays"])
     dispatcher.compile(signature)
     done = dispatcher.overloads[signature.args]
     module = done.library._final_module.clone()

@@ -5,7 +5,7 @@ under `firmware_py.export` the same core as C on this machine and as machine cod
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from firmware_py.compiling import bound
 from firmware_py.config import CpuConfig
@@ -13,10 +13,8 @@ from firmware_py.core import entry
 from firmware_py.core.structs import Control, Estimator, Input, Parameters, Report, Sampling, Supervisor
 from firmware_py.core.subset import Block, Struct
 from firmware_py.export.usage import Usage
+from firmware_py.logic.loading import Logic
 from firmware_py.logic.plugs import CALLS
-
-if TYPE_CHECKING:
-    from firmware_py.logic.loading import Logic
 
 
 class CoreRunner(Protocol):
@@ -51,7 +49,7 @@ class CoreBlocks:
     """
 
     def __init__(
-        self, parameters: Block[Parameters], runner: RunnerFactory, logic: "Logic | None" = None
+        self, parameters: Block[Parameters], runner: RunnerFactory, logic: Logic | None = None
     ) -> None:
         self.parameters = parameters
         self.data = Input.allocate()  # by the estimator task; gyro: the sensors task, mode: the stabilizer

@@ -131,7 +131,7 @@ class Firmware:
             pilot=pilot,
             commander=high_level.defaults,
             stock=StockState(),
-            say=self._console.write,
+            print_line=self._console.write,
             mavlink=self.mavlink,
         )
         self.variables = (*log_variables(running), *stock_variables(running))
@@ -168,7 +168,7 @@ class Firmware:
         MavlinkParameters(stack, own)
         CommandService(stack, self._board, supervisor, streams, setpoints, own, running.storage)
         answer_for_what_is_not_there(stack)
-        self._console.listeners.append(stack.say)
+        self._console.listeners.append(stack.console_line)
 
     @property
     def log_numbers(self) -> dict[str, int]:

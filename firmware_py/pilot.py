@@ -46,7 +46,7 @@ class Pilot:
         """Whether poses over CRTP are absolute."""
         return bool(self._core.data.fields.absolute)
 
-    def flies(self, now_us: int) -> bool:
+    def has_target(self, now_us: int) -> bool:
         """Return whether there is a target; poses from links other than CRTP do not pass the pilot."""
         idle = self.planner.phase(now_us) is Phase.IDLE
         return not (idle and self.here is not None and self.absolute)
@@ -56,11 +56,11 @@ class Pilot:
         """Whether set-points lead."""
         return self._setpoint_us is not None
 
-    def forsaken(self, now_us: int) -> bool:
+    def setpoints_stopped(self, now_us: int) -> bool:
         """Return whether set-points lead and have stopped arriving."""
         return self._setpoint_us is not None and now_us - self._setpoint_us >= SETPOINT_SILENCE_US
 
-    def judged(self, setpoint: tuple[Vector, float] | None, now_us: int) -> int:
+    def evaluate(self, setpoint: tuple[Vector, float] | None, now_us: int) -> int:
         """Return the outcome for a set-point, `SETPOINT_...`; None: it gives no position."""
         data = self._core.data.fields
         data.poses_absolute = i32(self.absolute)

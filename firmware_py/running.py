@@ -44,5 +44,5 @@ class Running:
     pilot: Pilot
     commander: Defaults
     stock: StockState
-    say: Callable[[str], None]  # on the console
+    print_line: Callable[[str], None]  # on the console
     mavlink: "MavlinkStack | None"

@@ -178,7 +178,7 @@ def _button(running: Running, name: str, lines: Callable[[Running], Iterable[str
     def press(value: float) -> None:
         if value:
             for line in lines(running):
-                running.say(line)
+                running.print_line(line)
 
     return Parameter(name, U8, "", lambda: 0, press, 0, 0xFF)
 

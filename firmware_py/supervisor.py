@@ -82,13 +82,13 @@ class CoreSupervisor:
     def battery_mv(self) -> int:
         return int(self._data.battery_mv)
 
-    def look(self, now_us: int) -> None:
+    def update(self, now_us: int) -> None:
         """Update the controller's mode and announce a change of state; called every 10 ms."""
         data, goals = self._data, self._goals
         data.now_us, data.connected = wrapped(now_us), i32(self._connected())
-        if goals.forsaken(now_us):
+        if goals.setpoints_stopped(now_us):
             self.emergency_stop()
-        data.idle = i32(not goals.flies(now_us))
+        data.idle = i32(not goals.has_target(now_us))
         if self._core.run.call("supervise"):
             self.state, self.cause = State(int(self._fields.state)), Cause(int(self._fields.cause))
             cause = self.cause

@@ -93,11 +93,8 @@ class _Field:
         """Yield the numbers that a mark names, each with its index among the names."""
         scalar = Scalar[mark.type] if mark.type else SCALARS[self.base]
         unit = getattr(mark, "shown", "") or mark.unit
-        names = (
-            mark.names
-            if isinstance(mark, Logged)
-            else mark.names or (mark.section and f"{mark.section}.{self.name}")
-        )
+        section = "" if isinstance(mark, Logged) else mark.section
+        names = mark.names or (section and f"{section}.{self.name}")
         for listed, stock in ((names, False), (mark.stock, True)):
             for number, name in enumerate(whole_names(listed)):
                 element = np.unravel_index(mark.first + mark.step * number, self.shape) if self.shape else ()

@@ -68,7 +68,7 @@ def stabilizer_task(  # noqa: PLR0913 - what a task uses is wired once
         yield from estimator_run.give_nowait()
         if control_runs:
             yield from kernel.work(costs.control_us())
-            supervisor.look(kernel.now_us)
+            supervisor.update(kernel.now_us)
             yield from kernel.yield_if_pending()
             core.run.call("control")
             board.write_compare(core.control.fields.count.tolist())

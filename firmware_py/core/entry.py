@@ -25,7 +25,7 @@ watch_control = supervisor.watch_control
 _see_from_goal = goal.see_from_goal
 _age_at_tick = poses.age_at_tick
 _file_pose = predictor.pose_into_history
-_see_pose = supervisor.see_pose
+_note_pose = supervisor.note_pose
 _estimate = predictor.estimate
 _clear_samples = sampling.clear_samples
 _report_state = goal.report_state
@@ -46,7 +46,7 @@ def file_pose(
     _age_at_tick(data, sampling)
     answer = _file_pose(parameters, data, estimator)
     if answer == POSE_ON_TIME:
-        _see_pose(data, supervisor)
+        _note_pose(data, supervisor)
     return answer
 
 

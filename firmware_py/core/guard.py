@@ -74,7 +74,7 @@ def guard_estimate(estimator: Estimator, guard: Guard) -> None:
 
 
 @kernel
-def see_logic(supervisor: Supervisor, guard: Guard) -> None:
+def note_faults(supervisor: Supervisor, guard: Guard) -> None:
     """Note which of the user's modules has returned NaN or infinity since the last call."""
     if guard.estimator_faults > supervisor.estimator_faults:
         supervisor.not_finite = i32(CAUSE_ESTIMATOR_NOT_FINITE)

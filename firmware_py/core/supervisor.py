@@ -139,7 +139,7 @@ def lasting_cause(supervisor: Supervisor) -> i32:
 
 
 @kernel
-def look_whether_ready(sampling: Sampling, supervisor: Supervisor) -> None:
+def update_ready(sampling: Sampling, supervisor: Supervisor) -> None:
     """Note the lasting cause, and whether the robot would fly with poses and an IMU."""
     supervisor.lasting = lasting_cause(supervisor)
     supervisor.ready = i32(0)
@@ -226,7 +226,7 @@ def supervise(
     if supervisor.watchdog_on != 0 and supervisor.watchdog_us >= WATCHDOG_US:
         supervisor.stopped = i32(1)
         supervisor.locked = i32(1)
-    look_whether_ready(sampling, supervisor)
+    update_ready(sampling, supervisor)
     cause = cause_of_failsafe(parameters, data, sampling, supervisor)
     state = state_of(data, sampling, supervisor, cause)
     changed = i32(0)
@@ -240,7 +240,7 @@ def supervise(
 
 
 @kernel
-def see_pose(data: Input, supervisor: Supervisor) -> None:
+def note_pose(data: Input, supervisor: Supervisor) -> None:
     """Note an accepted pose."""
     supervisor.pose_seen = i32(1)
     supervisor.silent_us = i32(waited_us(data) - since_last_look(data, supervisor))
@@ -260,7 +260,7 @@ def recover(parameters: Parameters, data: Input, supervisor: Supervisor) -> i32:
 
 
 @kernel
-def obey(parameters: Parameters, data: Input, supervisor: Supervisor) -> i32:
+def execute(parameters: Parameters, data: Input, supervisor: Supervisor) -> i32:
     """Execute a request; return whether that was possible."""
     if data.request == REQUEST_RECOVER:
         return recover(parameters, data, supervisor)
@@ -284,9 +284,9 @@ def obey(parameters: Parameters, data: Input, supervisor: Supervisor) -> i32:
 @kernel
 def serve(parameters: Parameters, data: Input, sampling: Sampling, supervisor: Supervisor) -> i32:
     """Serve a request; return whether it was executed."""
-    obeyed = obey(parameters, data, supervisor)
-    look_whether_ready(sampling, supervisor)
-    return obeyed
+    executed = execute(parameters, data, supervisor)
+    update_ready(sampling, supervisor)
+    return executed
 
 
 @kernel

@@ -158,9 +158,8 @@ class Expressions:
                 left, right = self._reach(node.left), self._reach(node.right)
                 if left is None or right is None:
                     return None
-                operate = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul}[
-                    type(node.op)
-                ]
+                operators = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul}
+                operate = operators[type(node.op)]
                 ends = [operate(one, other) for one in left for other in right]
                 return min(ends), max(ends)
         literal = constant_literal(node)
@@ -218,13 +217,10 @@ class Expressions:
                 hint = instead(CONSTRUCTS, "keywords")
             raise self.refuse(node, f"call {ast.unparse(node.func)}(..) is no plain call of a kernel{hint}")
         name = node.func.id
-        if name in CASTS and len(node.args) == 1 and (name == "bool" or name in self.module.builtins):
+        known = name in ("abs", "bool") or name in self.module.builtins
+        if name in CASTS and len(node.args) == 1 and known:
             return self._cast(node, CASTS[name], alone)
-        if (
-            name in FLOAT_FUNCTIONS
-            and len(node.args) == 1
-            and (name == "abs" or name in self.module.builtins)
-        ):
+        if name in FLOAT_FUNCTIONS and len(node.args) == 1 and known:
             return Value(f"{FLOAT_FUNCTIONS[name]}({self.scalar(node.args[0], F32, f'{name} of').text})", F32)
         if name == "elapsed" and len(node.args) == 2 and name in self.module.builtins:
             later, earlier = (self.scalar(argument, I32, "an instant") for argument in node.args)

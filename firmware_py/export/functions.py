@@ -20,7 +20,7 @@ class FunctionPrinter:
         self._print = Expressions(kernel)
         self._locals, self._loops = find_locals(kernel)
         self._lines: list[str] = []
-        self._said = kernel.node.body[0].end_lineno or 0  # comments up to this line are printed
+        self._commented = kernel.node.body[0].end_lineno or 0  # comments up to this line are printed
         self._body = kernel.node.body[1:] if ast.get_docstring(kernel.node) else kernel.node.body
         if not (kernel.scope.own or ast.get_docstring(kernel.node)):
             raise self._print.refuse(kernel.node, "no docstring")
@@ -61,22 +61,18 @@ class FunctionPrinter:
 
     def _comments(self, line: int, depth: int) -> None:
         standing = self.kernel.scope.standing
-        for number in range(self._said + 1, line):
+        for number in range(self._commented + 1, line):
             if number in standing:
                 self._lines.append(f"{'    ' * depth}// {standing[number]}")
-        self._said = max(self._said, line - 1)
+        self._commented = max(self._commented, line - 1)
 
-    def _say(self, node: ast.stmt, depth: int, text: str) -> None:
+    def _write(self, node: ast.stmt, depth: int, text: str) -> None:
         """Print a line with the comment behind its statement, folded if it is long."""
         simple = not isinstance(node, ast.If | ast.For)
-        comment = (
-            self.kernel.scope.comment(node) if simple else self.kernel.scope.trailing.get(node.lineno, "")
-        )
-        indent = "    " * depth
-        for line in textwrap.wrap(
-            text, WIDTH - len(indent), subsequent_indent="    ", break_long_words=False
-        ):
-            self._lines.append(indent + line)
+        scope, indent = self.kernel.scope, "    " * depth
+        comment = scope.comment(node) if simple else scope.trailing.get(node.lineno, "")
+        folded = textwrap.wrap(text, WIDTH - len(indent), subsequent_indent="    ", break_long_words=False)
+        self._lines += [indent + line for line in folded]
         if comment:
             self._lines[-1] += f"  // {comment}"
 
@@ -88,9 +84,9 @@ class FunctionPrinter:
                 place, value = self._print.value(target), self._print.value(node.value, alone=True)
                 if place.kind != value.kind or place.kind.rank:
                     raise self._print.refuse(node, f"{describe(place.kind)} = {describe(value.kind)}")
-                self._say(node, depth, f"{place.text} = {value.text};")
+                self._write(node, depth, f"{place.text} = {value.text};")
             case ast.Expr(value=ast.Call()):
-                self._say(node, depth, f"{self._print.value(node.value, alone=True).text};")
+                self._write(node, depth, f"{self._print.value(node.value, alone=True).text};")
             case ast.Return():
                 self._return(node, depth)
             case ast.If():
@@ -113,9 +109,9 @@ class FunctionPrinter:
                 raise self._print.refuse(node, f"{name} stands for more than one array")
             if local.assignments == 1 and not value.kind.rank:
                 text = f"const {text}"
-            self._say(node, depth, f"{text} = {value.text};")
+            self._write(node, depth, f"{text} = {value.text};")
         elif self._print.names[name] == value.kind:
-            self._say(node, depth, f"{name} = {value.text};")
+            self._write(node, depth, f"{name} = {value.text};")
         else:
             raise self._print.refuse(node, f"{name} changes its type to {describe(value.kind)}")
 
@@ -124,16 +120,16 @@ class FunctionPrinter:
         if node.value is None:
             if wanted != VOID:
                 raise self._print.refuse(node, f"return without {describe(wanted)}")
-            self._say(node, depth, "return;")
+            self._write(node, depth, "return;")
             return
         value = self._print.value(node.value, alone=True)
         if value.kind != wanted or wanted == VOID:
             raise self._print.refuse(node, f"returns {describe(value.kind)}, not {describe(wanted)}")
-        self._say(node, depth, f"return {value.text};")
+        self._write(node, depth, f"return {value.text};")
 
     def _if(self, node: ast.If, depth: int, before: str) -> None:
         test = self._print.scalar(node.test, BOOL, "the condition")
-        self._say(node, depth, f"{before}if ({test.text}) {{")
+        self._write(node, depth, f"{before}if ({test.text}) {{")
         self._block(node.body, depth + 1)
         indent = "    " * depth
         if len(node.orelse) == 1 and isinstance(node.orelse[0], ast.If):
@@ -167,13 +163,12 @@ class FunctionPrinter:
         if name in self._print.names:
             raise self._print.refuse(node, f"loop variable {name} is in use")
         start = self._print.scalar(limits[0], I32, "the start of a range").text if len(limits) == 2 else "0"
-        end = self._print.scalar(
-            limits[-1], I32, "the end of a range", alone=True
-        ).text  # evaluated once, and last
+        # Evaluated once, and last.
+        end = self._print.scalar(limits[-1], I32, "the end of a range", alone=True).text
         limit = ""
         if not self._fixed(limits[-1]):  # Python evaluates the end of a range once
             limit, end = f", {name}_end = {end}", f"{name}_end"
-        self._say(node, depth, f"for (int32_t {name} = {start}{limit}; {name} < {end}; {name}++) {{")
+        self._write(node, depth, f"for (int32_t {name} = {start}{limit}; {name} < {end}; {name}++) {{")
         reach = self._print.loop(limits[0] if len(limits) == 2 else None, limits[-1])
         if reach:
             self._print.loops[name] = reach

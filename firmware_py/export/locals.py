@@ -59,12 +59,9 @@ def find_writes(kernel: Signature) -> None:
     """Find the kernels that a kernel calls, and the names through which it writes; those called come first."""
     aliases: dict[str, str] = {}
     for node in ast.walk(kernel.node):
-        if (
-            isinstance(node, ast.Assign)
-            and isinstance(node.value, ast.Attribute | ast.Name)
-            and _alias_of(node)
-        ):
-            aliases[_alias_of(node)] = _root(node.value)
+        match node:
+            case ast.Assign(targets=[ast.Name(id=name), *_], value=ast.Attribute() | ast.Name() as source):
+                aliases[name] = _root(source)
     roots: dict[str, ast.AST] = {}
     for node in ast.walk(kernel.node):
         if isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store):
@@ -88,10 +85,6 @@ def _check_above(kernel: Signature, callee: Signature, node: ast.Call) -> None:
         raise refusal(kernel.path, node, f"{kernel.node.name} calls itself: recursion")
     if callee.path == kernel.path and callee.node.lineno > kernel.node.lineno:
         raise refusal(kernel.path, node, f"{callee.node.name} is defined below its caller (no recursion)")
-
-
-def _alias_of(node: ast.Assign) -> str:
-    return node.targets[0].id if isinstance(node.targets[0], ast.Name) else ""
 
 
 def _root(node: ast.expr) -> str:

@@ -61,18 +61,18 @@ PERIOD_US: Final = 10_000_000
 class Notices:
     """Limits the lines per kind. The caller keeps the number of kinds small: clients' input is not part of a kind."""
 
-    def __init__(self, kernel: Kernel, say: Callable[[str], None]) -> None:
+    def __init__(self, kernel: Kernel, write: Callable[[str], None]) -> None:
         self._kernel = kernel
-        self._say = say
-        self._said_us: dict[str, int] = {}
+        self._write = write
+        self._reported_us: dict[str, int] = {}
         self._withheld: dict[str, int] = {}
 
     def refuse(self, kind: str, line: str) -> None:
         """Report a refused request, or count it when its kind was reported less than a period ago."""
         now_us = self._kernel.now_us
-        if now_us - self._said_us.get(kind, -PERIOD_US) < PERIOD_US:
+        if now_us - self._reported_us.get(kind, -PERIOD_US) < PERIOD_US:
             self._withheld[kind] = self._withheld.get(kind, 0) + 1
             return
         withheld = self._withheld.pop(kind, 0)
-        self._said_us[kind] = now_us
-        self._say(f"{line} ({withheld} more before)" if withheld else line)
+        self._reported_us[kind] = now_us
+        self._write(f"{line} ({withheld} more before)" if withheld else line)

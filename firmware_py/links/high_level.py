@@ -156,7 +156,7 @@ class HighLevelService:
         """Refuse roll, pitch, yaw rate and thrust (port 3). Without thrust clients send them to disconnect."""
         check_size("an attitude set-point", packet.data, setpoints.ATTITUDE_SIZE)
         if any(packet.data[12:14]):
-            self._refuse_setpoint("attitude", self._pilot.judged(None, self._stack.kernel.now_us))
+            self._refuse_setpoint("attitude", self._pilot.evaluate(None, self._stack.kernel.now_us))
         yield from self._stack.kernel.yield_if_pending()
 
     def _see_setpoint(self, packet: Packet) -> Task:
@@ -176,7 +176,7 @@ class HighLevelService:
         """Fly to a set-point if it gives a position and poses are absolute."""
         now_us = self._stack.kernel.now_us
         place = setpoints.decode_place(data) if kind in (setpoints.POSITION, setpoints.FULL_STATE) else None
-        answer = self._pilot.judged(place, now_us)
+        answer = self._pilot.evaluate(place, now_us)
         if answer == SETPOINT_OUTSIDE:
             self._refuse_place("set-point")
         elif place is None or answer != SETPOINT_POSITION:

@@ -50,10 +50,9 @@ class LogBlock:
         except (
             struct.error,
             OverflowError,
-        ):  # one does not fit its type, or is no integer where its type is one
-            return self.layout.pack(
-                *(item[0].cast(value) for item, value in zip(self.items, values, strict=True))
-            )
+        ):  # one does not fit its type, or is a fraction where its type is whole
+            cast = (item[0].cast(value) for item, value in zip(self.items, values, strict=True))
+            return self.layout.pack(*cast)
 
 
 class LogService:

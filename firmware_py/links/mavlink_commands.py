@@ -65,14 +65,14 @@ class CommandService:
             Command.REQUEST_PROTOCOL_VERSION: lambda command: self._once(NUMBERS["PROTOCOL_VERSION"]),
             Command.REQUEST_AUTOPILOT_CAPABILITIES: lambda command: self._once(NUMBERS["AUTOPILOT_VERSION"]),
         }
-        stack.handle("COMMAND_LONG", self._obey)
-        stack.handle("COMMAND_INT", self._obey)
+        stack.handle("COMMAND_LONG", self._execute)
+        stack.handle("COMMAND_INT", self._execute)
         stack.handle("PING", self._answer_ping)
         stack.handle("FILE_TRANSFER_PROTOCOL", lambda request: stack.reply(services.ftp_nak(request)))
 
-    def _obey(self, command: Message) -> None:
-        obey = self._commands.get(command.command)
-        result, answers = (CommandResult.UNSUPPORTED, ()) if obey is None else obey(command)
+    def _execute(self, command: Message) -> None:
+        execute = self._commands.get(command.command)
+        result, answers = (CommandResult.UNSUPPORTED, ()) if execute is None else execute(command)
         self._stack.refused += result is not CommandResult.ACCEPTED
         source = command.get_srcSystem(), command.get_srcComponent()
         self._stack.reply(services.command_ack(command.command, result, *source))
@@ -118,9 +118,7 @@ class CommandService:
 
     def _fail(self, command: Message) -> Outcome:
         """Make the simulated hardware fail; real hardware cannot."""
-        unit, failing, instance = (
-            _whole(value) for value in (command.param1, command.param2, command.param3)
-        )
+        unit, failing, instance = map(_whole, (command.param1, command.param2, command.param3))
         return self._board.inject_failure(unit, failing, instance), ()
 
     def _terminate(self, command: Message) -> Outcome:

@@ -121,9 +121,9 @@ class PoseService:
 
     def _take_pose(self, message: Message) -> None:
         pose = mavlink.read_pose(message)
-        self._meet(message)
+        self._make_partner(message)
         now_us = self._stack.kernel.now_us
-        goal = self._setpoints.see_pose()
+        goal = self._setpoints.note_pose()
         self.age_us = self._age_us(now_us, pose.t_us)
         self._localisation.last = Correction(pose.p_WB, pose.q_WB, self.age_us)
         self._measurements.send_nowait((now_us, self._localisation.last, True, goal))
@@ -138,9 +138,9 @@ class PoseService:
 
     def _see_heartbeat(self, message: Message) -> None:
         if self._partner is None:
-            self._meet(message)
+            self._make_partner(message)
 
-    def _meet(self, message: Message) -> None:
+    def _make_partner(self, message: Message) -> None:
         """Make the sender of the message the partner."""
         source = (message.get_srcSystem(), message.get_srcComponent())
         if source != self._partner:

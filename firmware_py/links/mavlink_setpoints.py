@@ -55,7 +55,7 @@ class SetpointService:
                 return CommandResult.ACCEPTED, self._enter(mode, _source(command))
         return CommandResult.DENIED, ()
 
-    def see_pose(self) -> PathPoint:
+    def note_pose(self) -> PathPoint:
         """Return the goal for a pose from MAVLink that has just arrived."""
         self._seen_from, self._seen_us = self._goal, self._stack.kernel.now_us
         return PathPoint(*self._goal)

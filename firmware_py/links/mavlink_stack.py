@@ -122,7 +122,7 @@ class MavlinkStack:
         yield from self._transmit.send(message)
         yield from self._paced_sent.take()
 
-    def say(self, line: str) -> None:
+    def console_line(self, line: str) -> None:
         """Send a line of the console as STATUSTEXT."""
         self.report(WARNING if "failsafe" in line else INFO, line)
 

@@ -24,7 +24,7 @@ from {package} import {modules}
 _closed = guard.closed
 _guard_control = guard.guard_control
 _guard_estimate = guard.guard_estimate
-_see_logic = guard.see_logic
+_note_faults = guard.note_faults
 """
 BUDGET = f"""
 from firmware_py.core import budget
@@ -50,7 +50,7 @@ class EntryText:
 def compose(plugs: Sequence[Plug], package: str) -> EntryText:
     """Return the entry module that finds the user's modules in a package: the core's, with some calls replaced."""
     by_name = {plug.point.name: plug for plug in plugs}
-    bodies = {"supervise": f"    _see_logic(supervisor, {GUARD})\n{_body('supervise')}"}
+    bodies = {"supervise": f"    _note_faults(supervisor, {GUARD})\n{_body('supervise')}"}
     if ESTIMATOR.name in by_name:
         bodies |= {hook: _estimator_body(by_name[ESTIMATOR.name], hook) for hook in ESTIMATOR.hooks}
     if CONTROLLER.name in by_name:

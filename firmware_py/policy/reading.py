@@ -104,9 +104,7 @@ def answer_of(steps: Iterable[NetworkStep], observations: NDArray[np.float32]) -
     """Return the outputs (n, 4) to observations (n, 20), computed in float64."""
     x = observations.astype(float)
     for step in steps:
-        first, second = (*(array.astype(float) for array in step.arrays.values()), np.zeros(1), np.zeros(1))[
-            :2
-        ]
+        first, second, *_ = *(array.astype(float) for array in step.arrays.values()), np.zeros(1), np.zeros(1)
         if step.kind == DENSE:
             x = (first * x[:, None, :]).sum(axis=2) + second
         elif step.kind == SCALE:
@@ -185,10 +183,8 @@ def _step(node: Any, given: list[NDArray[Any] | None], attributes: Mapping[str, 
         ends = [*known, *(np.asarray(attributes[key]) for key in ("min", "max") if key in attributes)]
         if len(ends) == 2 and ends[0] == -ends[1] < 0:
             return NetworkStep(LIMIT, name, {"LIMIT": ends[1]})
-    plain = attributes.get("alpha", 1.0) == attributes.get("beta", 1.0) == 1.0 and not attributes.get(
-        "transA"
-    )
-    if kind in ("Gemm", "MatMul") and forward and plain:
+    scaled = attributes.get("alpha", 1.0) != 1.0 or attributes.get("beta", 1.0) != 1.0
+    if kind in ("Gemm", "MatMul") and forward and not scaled and not attributes.get("transA"):
         weights = known[0] if attributes.get("transB") else known[0].T
         biases = np.ravel(known[1]) if len(known) > 1 else np.zeros(weights.shape[:1])
         return NetworkStep(DENSE, name, {"WEIGHTS": weights, "BIASES": biases})
@@ -214,9 +210,7 @@ def _steps_of(tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]) 
         if kind not in (TANH, RELU, "none"):
             raise PolicyError(f"activation = {kind}: expected tanh, relu or none")
     if tensors.keys() & set(OBSERVED):
-        mean, std = (
-            tensors.get(name, np.array(default)) for name, default in zip(OBSERVED, (0, 1), strict=True)
-        )
+        mean, std = tensors.get(OBSERVED[0], np.array(0)), tensors.get(OBSERVED[1], np.array(1))
         yield NetworkStep(SCALE, "observation.mean", {"FACTORS": np.ones(1), "SUMMANDS": -mean})
         yield NetworkStep(SCALE, "observation.std", {"FACTORS": 1 / std, "SUMMANDS": np.zeros(1)})
     if "limit" in metadata:

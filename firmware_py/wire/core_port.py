@@ -221,9 +221,8 @@ _HEAD, _ABOUT, _PLACE, _PLACE_SIZE, _CALL, _CALLED, _WHY, _HEALTH, _MODE, _SAMPL
 _NARROW, _WIDE = struct.Struct("<I"), struct.Struct("<hhh")
 WRITE_MAX = MAX_DATA - _HEAD.size - _PLACE.size  # bytes in a packet
 READ_MAX = MAX_DATA - _HEAD.size
-_BEHIND_FIRST = {
-    width: (MAX_DATA - _SAMPLES.size) // width for width in (NARROW, WIDE)
-}  # samples in a packet
+# Samples in a packet.
+_BEHIND_FIRST = {width: (MAX_DATA - _SAMPLES.size) // width for width in (NARROW, WIDE)}
 SAMPLES_MAX = 1 + _BEHIND_FIRST[NARROW]  # in a packet, when the rate changes little
 
 

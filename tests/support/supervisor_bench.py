@@ -35,7 +35,7 @@ class SupervisorBench:
     def look(self, after_us: int = 0) -> int:
         """Return the mode that is decided some time later."""
         self.now_us += after_us
-        self.view.look(self.now_us)
+        self.view.update(self.now_us)
         return int(self.data.mode)
 
     def watch_control(self, after_us: int) -> int:

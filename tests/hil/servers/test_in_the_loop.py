@@ -153,7 +153,7 @@ def test_a_mode_that_begins_while_a_sample_is_filed_begins_without_it(tmp_path: 
     app.boot()
     host = Host(app)
     host.run(100)
-    app.c.floaty_hil_ask(int(Hil.MOVING))
+    app.c.floaty_hil_request(int(Hil.MOVING))
     app.locked.value = 1
     host.send()
     host.looped.clear()

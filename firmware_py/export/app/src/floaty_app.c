@@ -103,7 +103,7 @@ int32_t floaty_loop_us(void) {
 
 /* The estimator, in the stabilizer task */
 
-static bool asked(int32_t wanted) {
+static bool take_request(int32_t wanted) {
   const bool was = floaty_requests[wanted];
   floaty_requests[wanted] = false;
   return was;
@@ -140,7 +140,7 @@ static void take_measurements(stabilizerStep_t step) {
 }
 
 /* For the firmware's commander and its log variables: in degrees, pitch positive with the nose up. */
-static void tell_state(state_t *state, stabilizerStep_t step) {
+static void publish_state(state_t *state, stabilizerStep_t step) {
   const FloatyReport *r = &floaty_report;
   state->position = (point_t){step, r->position[0], r->position[1], r->position[2]};
   state->velocity = (point_t){step, r->velocity[0], r->velocity[1], r->velocity[2]};
@@ -201,7 +201,7 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
   if (floaty_hil_holds()) {
     return;
   }
-  if (asked(FLOATY_RESET)) {
+  if (take_request(FLOATY_RESET)) {
     call_reset();
   }
   floaty_input.poses_absolute = floaty_input.absolute && floaty_hil_mode == FLOATY_HIL_OFF; /* a host sends corrections */
@@ -211,7 +211,7 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
   take_measurements(stabilizerStep - floaty_hil_held);
   if (floaty_sampling.estimate_due) {
     call_estimate();
-    tell_state(state, stabilizerStep);
+    publish_state(state, stabilizerStep);
   }
 }
 
@@ -220,7 +220,7 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
 static void serve_requests(void) {
   static const int32_t ORDER[] = {FLOATY_REQUEST_RECOVER, FLOATY_REQUEST_ARM, FLOATY_REQUEST_DISARM, FLOATY_REQUEST_STOP};
   for (unsigned i = 0; i < sizeof ORDER / sizeof ORDER[0]; i++) {
-    if (asked(ORDER[i])) {
+    if (take_request(ORDER[i])) {
       request(ORDER[i]);
     }
   }
@@ -269,7 +269,7 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
     if (floaty_hil_mode != FLOATY_HIL_STILL) {
       floaty_servos_write(floaty_control.count);
     }
-    floaty_hil_tell(true);
+    floaty_hil_report(true);
   }
   if (stabilizerStep % BATTERY_STEPS == 0) {
     floaty_input.battery_mv = (int32_t)(1000.0f * pmGetBatteryVoltage());

@@ -75,7 +75,7 @@ extern volatile uint8_t floaty_hil_mode;  /* in force, a FLOATY_HIL_... */
 extern volatile uint32_t floaty_hil_held; /* steps since the start in which the flight was held: neither steps nor time */
 
 /* Any task: request a mode; it is in force from the next step on. */
-void floaty_hil_ask(uint8_t mode);
+void floaty_hil_request(uint8_t mode);
 
 /* The receiving task: take a packet with samples. */
 void floaty_hil_receive(const CRTPPacket *packet);
@@ -91,4 +91,4 @@ bool floaty_hil_holds(void);
 bool floaty_hil_sample(int32_t counts[3]);
 
 /* The stabilizer task: report to the host; `fresh`: the controller has just run. */
-void floaty_hil_tell(bool fresh);
+void floaty_hil_report(bool fresh);

@@ -12,7 +12,7 @@
 #define AXES 3
 #define BUFFER 64         /* samples; a power of two, so that it divides 65536, and more than a host has in flight */
 #define SILENT_STEPS 1000 /* without a sample the mode ends */
-#define TELL_STEPS 10     /* while the flight is held */
+#define REPORT_STEPS 10     /* while the flight is held */
 
 typedef struct {
   int16_t counts[AXES];
@@ -39,7 +39,7 @@ static uint32_t held_before;       /* this mode */
 static uint16_t silent_steps;
 static bool running;               /* samples are taken */
 
-void floaty_hil_ask(uint8_t asked) {
+void floaty_hil_request(uint8_t asked) {
   silent_steps = 0;
   wanted = asked;
 }
@@ -64,7 +64,7 @@ static bool put(uint16_t number, const Sample *sample) {
 }
 
 /* Advance a sample to the next one. */
-static void go_on(Sample *sample, const uint8_t *step, uint8_t width) {
+static void advance(Sample *sample, const uint8_t *step, uint8_t width) {
   Sample difference;
   if (width == FLOATY_WIDE) {
     memcpy(&difference, step, sizeof difference);
@@ -102,7 +102,7 @@ void floaty_hil_receive(const CRTPPacket *packet) {
   const uint8_t *step = packet->data + sizeof head;
   const uint8_t *end = packet->data + packet->size;
   for (uint16_t number = head.number; put(number, &sample) && step + head.width <= end; number++) {
-    go_on(&sample, step, head.width);
+    advance(&sample, step, head.width);
     step += head.width;
   }
 }
@@ -138,8 +138,8 @@ bool floaty_hil_holds(void) {
     return false;
   }
   floaty_hil_held += 1;
-  if (silent_steps % TELL_STEPS == 0) {
-    floaty_hil_tell(false);
+  if (silent_steps % REPORT_STEPS == 0) {
+    floaty_hil_report(false);
   }
   return true;
 }
@@ -161,20 +161,20 @@ bool floaty_hil_sample(int32_t counts[3]) {
   return fresh;
 }
 
-void floaty_hil_tell(bool fresh) {
+void floaty_hil_report(bool fresh) {
   CRTPPacket packet;
   if (floaty_hil_mode == FLOATY_HIL_OFF) {
     return;
   }
-  const bool come = stream == modes; /* a sample of this mode */
+  const bool current = stream == modes; /* a sample of this mode */
   const FloatyWireLoop loop = {
-      .used = come ? (uint16_t)(first + used) : 0,
-      .waiting = come ? (uint8_t)(received - used) : 0,
+      .used = current ? (uint16_t)(first + used) : 0,
+      .waiting = current ? (uint8_t)(received - used) : 0,
       .fresh = fresh,
       .held = (uint16_t)(floaty_hil_held - held_before),
       .late = late,
-      .lost = come ? lost : 0,
-      .doubled = come ? doubled : 0,
+      .lost = current ? lost : 0,
+      .doubled = current ? doubled : 0,
       FLOATY_LOOP_OF_CORE,
   };
   memset(&packet, 0, sizeof packet);

@@ -109,7 +109,7 @@ static int loop(const uint8_t *data, uint32_t length, bool is_new) {
     return REFUSED(OUTSIDE);
   }
   if (is_new) {
-    floaty_hil_ask(data[0]);
+    floaty_hil_request(data[0]);
   }
   return 0;
 }
