@@ -70,11 +70,6 @@ class Statistics:
         """Return the tasks in the order of their creation, between two runs."""
         return [self._report(task) for task in self._tasks]
 
-    def load(self) -> float:
-        """Return the share of processor time that the tasks consumed since the start, 0 to 1."""
-        busy_us = sum(self._kernel.run_time_us(task) for task in self._tasks)
-        return busy_us / self._kernel.now_us if self._kernel.now_us else 0.0
-
     def _report(self, task: Task) -> TaskReport:
         lasting_us = self._kernel.now_us - task.released_us if task.place == READY else 0
         delayed = [0] * (len(LATENCY_BOUNDS_US) + 1)
