@@ -81,24 +81,19 @@ class PythonRunner:
     """Runs the Python sources: compiled by numba, or plain with NUMBA_DISABLE_JIT=1."""
 
     def __init__(self, blocks: CoreBlocks) -> None:
-        self._calls = _Calls(blocks)
+        self._blocks = blocks
+        self._calls: dict[str, Callable[[], Any]] = {}
 
     def call(self, name: str) -> int:
         """Execute an entry point; its first call compiles it."""
-        return self._calls[name]() or 0
+        call = self._calls.get(name) or self._bind(name)
+        return call() or 0
 
-
-class _Calls(dict[str, Callable[[], Any]]):
-    """The entry points by name, each bound to its blocks when it is first looked up."""
-
-    def __init__(self, blocks: CoreBlocks) -> None:
-        self._blocks = blocks
-
-    def __missing__(self, name: str) -> Callable[[], Any]:
+    def _bind(self, name: str) -> Callable[[], Any]:
         blocks = self._blocks
         module = entry if blocks.logic is None else blocks.logic.loaded.entry
         arguments = (blocks.named[block].arg for block in blocks.calls[name])
-        return self.setdefault(name, bound(getattr(module, name), *arguments))
+        return self._calls.setdefault(name, bound(getattr(module, name), *arguments))
 
 
 class ConfiguredCosts:

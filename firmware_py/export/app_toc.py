@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 
 from firmware_py.config import FirmwareConfig
-from firmware_py.core.subset import f32
 from firmware_py.export.app_wire import C_TYPES
 from firmware_py.export.literals import float_literal
 from firmware_py.logic.loading import load_logic
@@ -234,7 +233,7 @@ def _row(parameter: AppParameter) -> str:
     """Return a parameter as a row of the table in C."""
     cells = (
         f'"{parameter.name}"', f"&{_seen(parameter)}", f"&{parameter.target}",
-        *map(number, (parameter.scale, parameter.low, parameter.high, parameter.initial)),
+        *map(float_literal, (parameter.scale, parameter.low, parameter.high, parameter.initial)),
         f"KIND_{parameter.scalar.name}", f"KIND_{parameter.place.scalar.name}",
     )  # fmt: skip
     return f"  {{{', '.join(cells)}}},"
@@ -242,7 +241,7 @@ def _row(parameter: AppParameter) -> str:
 
 def _variable(parameter: AppParameter) -> str:
     """Return the definition of the variable that clients read and write."""
-    initial = number(parameter.initial) if parameter.scalar.is_float else str(int(parameter.initial))
+    initial = float_literal(parameter.initial) if parameter.scalar.is_float else str(int(parameter.initial))
     return f"static {TYPES[parameter.scalar.format]} {_seen(parameter)} = {initial};"
 
 
@@ -269,8 +268,3 @@ def _groups(kind: str, lines: Iterable[tuple[str, str]]) -> Iterator[str]:
 def _macro(scalar: Scalar) -> str:
     """Return what the firmware's macros call a type."""
     return TYPES[scalar.format].removesuffix("_t").upper()
-
-
-def number(value: float) -> str:
-    """Return a float32 constant of C."""
-    return float_literal(f32(value))

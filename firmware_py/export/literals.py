@@ -51,9 +51,9 @@ def _float_element(path: str, name: str, node: ast.expr) -> str:
     return float_literal(value)
 
 
-def float_literal(value: np.float32) -> str:
-    """Return the shortest decimal that every correct compiler reads as exactly this float."""
-    text = str(value)
+def float_literal(value: float | np.float32) -> str:
+    """Return the shortest decimal that every correct compiler reads as exactly this float32."""
+    text = str(np.float32(value))
     return f"{text if '.' in text or 'e' in text else text + '.0'}f"
 
 
