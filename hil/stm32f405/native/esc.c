@@ -34,7 +34,8 @@ static void take_frame(struct machine *m, struct esc *e, int inverted)
         throttle = 0;
     e->ready |= !throttle;
     set_throttle(m, e, e->ready ? throttle : 0);
-    e->left = inverted ? REPLY_BITS + 1 : 0;
+    e->left = inverted ? REPLY_BITS : 0;
+    e->high = 1;
     plan(m, DUE_ESC + (unsigned)(e - m->esc), m->now + (inverted ? REPLY_AFTER : SILENCE));
 }
 
@@ -65,27 +66,29 @@ static uint32_t reply_of(const struct esc *e)
     return reply;
 }
 
-/* The next bit of the reply is due, the wire's return to rest, or the end of patience. */
+/* The next edge of the reply is due, the wire's return to rest, or the end of patience. */
 void esc_due(struct machine *m, unsigned i)
 {
     struct esc *e = &m->esc[i];
     uint64_t now = m->due[DUE_ESC + i];
-    if (!e->left) {
+    uint32_t bits = 0; /* to the edge after this one */
+    if (!e->left && e->high) {
         e->ready = 0;
         set_throttle(m, e, 0);
         plan(m, DUE_ESC + i, NEVER);
         return;
     }
-    if (e->left == REPLY_BITS + 1) {
+    if (e->left == REPLY_BITS)
         e->reply = reply_of(e);
-        e->high = 1;
+    e->high = !e->high;
+    timer_edge(m, e->timer, e->channel, (int)e->high, now);
+    while (e->left) {
+        e->left--;
+        bits++;
+        if (e->left && e->reply >> (e->left - 1) & 1)
+            break;
     }
-    e->left--;
-    if (e->left ? e->reply >> (e->left - 1) & 1 : !e->high) {
-        e->high = !e->high;
-        timer_edge(m, e->timer, e->channel, (int)e->high, now);
-    }
-    plan(m, DUE_ESC + i, now + (e->left ? e->reply_bit : SILENCE));
+    plan(m, DUE_ESC + i, now + (bits && (e->left || !e->high) ? bits * e->reply_bit : SILENCE));
 }
 
 /* Connect an ESC to a timer's output, of a motor with so many poles that turns at `rpm`; return 0 without room. */
