@@ -27,7 +27,7 @@ from hil.world.body import Channel, Quantity, Setting, Vector, View
 from hil.world.config import BatteryConfig, PlantConfig, TunnelConfig
 from hil.world.fixed_order import atan2, compiled, exp, normal
 from hil.world.in_tunnel import UPRIGHT, InTunnel
-from hil.world.motion import GRAVITY, accelerate, gust, rotate, surround
+from hil.world.motion import GRAVITY, accelerate, gust, move, surround
 from hil.world.plates import State
 from hil.world.room import Room
 from hil.world.tunnel import Tunnel
@@ -271,18 +271,12 @@ def step(s: State, draws: View, step_us: float) -> None:
         spin(s, duration)
         evaluate(s)
         return
-    px, py, pz = s[at.P], s[at.P + 1], s[at.P + 2]
-    vx, vy, vz = s[at.V], s[at.V + 1], s[at.V + 2]
-    qw, qx, qy, qz = s[at.Q], s[at.Q + 1], s[at.Q + 2], s[at.Q + 3]
-    ox, oy, oz = s[at.OMEGA], s[at.OMEGA + 1], s[at.OMEGA + 2]
-    s[SINKING] = -vz
+    for i in range(13):
+        s[at.BEFORE + i] = s[at.P + i]
+    s[SINKING] = -s[at.V + 2]
     for part in range(2):
-        h = 0.5 * duration if part == 0 else duration
-        s[at.P], s[at.P + 1], s[at.P + 2] = px + h * s[at.V], py + h * s[at.V + 1], pz + h * s[at.V + 2]
-        s[at.V], s[at.V + 1], s[at.V + 2] = vx + h * s[at.ACC], vy + h * s[at.ACC + 1], vz + h * s[at.ACC + 2]
-        rotate(s, qw, qx, qy, qz, h)
-        s[at.OMEGA], s[at.OMEGA + 1] = ox + h * s[at.ALPHA], oy + h * s[at.ALPHA + 1]
-        s[at.OMEGA + 2] = oz + h * s[at.ALPHA + 2]
+        s[at.DURATION] = 0.5 * duration if part == 0 else duration
+        move(s)
         spin(s, 0.5 * duration)
         evaluate(s)
     if s[at.LOST] == 0.0:
