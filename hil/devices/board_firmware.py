@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 from firmware_py.board import Board, ImuCounts
 from firmware_py.config import FirmwareConfig
@@ -18,12 +18,10 @@ from firmware_py.firmware import Firmware
 from firmware_py.rtos import TaskReport
 from firmware_py.signals import Signals
 from firmware_py.wire.scalars import Scalar
+from hil.crazyflie.log_table import ImageParameter
 from hil.crazyflie.shockburst import syslink_us
 from hil.world.body import Carrier
 from hil.world.servos import OUTPUTS
-
-if TYPE_CHECKING:
-    from hil.crazyflie.log_table import ImageParameter
 
 # (us, event, who, a, b), in the words of tests/vectors/README.md
 Trace = Callable[[int, str, str, int, int], None]

@@ -55,14 +55,15 @@ class BareBoard:
         self.counts: tuple[int, ...] = ()
         self.console: list[str] = []
         self.sent: list[tuple[int, bytes]] = []
-        self.now_us = 0
-        self._noise = 1
+        self.now_us, self._noise = 0, 1
         self.imu_running = True  # False: no more interrupts of the IMU
         self._heard = 0  # console lines that an `expect` has matched or passed
         self._repeats = 0  # the current generation of repeated packets
         self._events = EventQueue()
         self._serial = SerialPins(self.sent) if serial else None
-        self._board = VirtualBoard(self._set_counts, self._send, self._say, self._serial)
+        self._board = VirtualBoard(
+            self._set_counts, self._send, lambda now_us, text: self.console.append(text), self._serial
+        )
         self._board.boot(0)
         self.feed_imu()
         self.firmware = Firmware(config, self._board, mavlink=serial, runner=runner)
@@ -76,13 +77,7 @@ class BareBoard:
         counts: ImuCounts | None = None,
     ) -> None:
         """Set the IMU's measurement from now on: rates [rad/s] and specific force [m/s2], both in B, or counts."""
-        (p, q, r), (fx, fy, fz) = omega_B, f_B
-        rates = (COS * p + SIN * q, COS * q - SIN * p, r)
-        forces = (COS * fx + SIN * fy, COS * fy - SIN * fx, fz)
-        self._fed = counts or (
-            _count(rates[0], GYRO_COUNTS), _count(rates[1], GYRO_COUNTS), _count(rates[2], GYRO_COUNTS),
-            _count(forces[0], ACCEL_COUNTS), _count(forces[1], ACCEL_COUNTS), _count(forces[2], ACCEL_COUNTS),
-        )  # fmt: skip
+        self._fed = counts or (*_counts(omega_B, GYRO_COUNTS), *_counts(f_B, ACCEL_COUNTS))
         self._board.measure(self._fed)
 
     def receive(self, packet: bytes, every_ms: float = 0.0) -> None:
@@ -182,9 +177,10 @@ class BareBoard:
             self.sent.append((now_us, data))
         return True
 
-    def _say(self, now_us: int, text: str) -> None:
-        self.console.append(text)
 
-
-def _count(value: float, per_unit: float) -> int:
-    return int(min(max(round(value * per_unit), -COUNTS), COUNTS - 1.0))
+def _counts(v_B: Vector, per_unit: float) -> tuple[int, int, int]:
+    """Return a vector as the sensor measures it: turned into S, in counts, saturated."""
+    x, y, z = v_B
+    v_S = COS * x + SIN * y, COS * y - SIN * x, z
+    a, b, c = (int(min(max(round(one * per_unit), -COUNTS), COUNTS - 1.0)) for one in v_S)
+    return a, b, c
