@@ -66,7 +66,11 @@ class VirtualMocap:
 
     def _pose(self, body: Motion) -> tuple[Vector, Quaternion] | None:
         """Return the pose with its errors, None when the body is not tracked."""
-        pose = self._noisy_pose(body) if self.markers is None else self._solved_pose(self.markers, body)
+        if self.markers is None:
+            pose: tuple[Vector, Quaternion] | None = self._noisy_pose(body)
+        else:
+            self.sighting = self.markers.look(body.p_WB, body.q_WB)
+            pose = self.sighting.pose
         outlier = self.outlier > 0.0 and self._rng_outlier.random() < self.outlier
         offset = _direction(self._rng_outlier) if outlier else NOWHERE
         dropped = self.dropout > 0.0 and self._rng_dropout.random() < self.dropout
@@ -92,10 +96,6 @@ class VirtualMocap:
         s, half = self._config.position_noise, 0.5 * self._config.rotation_noise
         q_WB = turned(body.q_WB.tolist(), half * a, half * b, half * c)
         return (px + s * x, py + s * y, pz + s * z), q_WB
-
-    def _solved_pose(self, markers: VirtualMarkers, body: Motion) -> tuple[Vector, Quaternion] | None:
-        self.sighting = markers.look(body.p_WB, body.q_WB)
-        return self.sighting.pose
 
 
 def _direction(rng: np.random.Generator) -> Vector:

@@ -155,13 +155,10 @@ class ImageFirmware:
         self.parameters = parameter_table(self.image, self.chip)
         self._app = self._signals_of_app() if self.image.has("floaty_estimator") else None
         if rest is not None:
-            self._warm_up(rest)
-
-    def _warm_up(self, rest: Callable[[], ImuCounts]) -> None:
-        for now_us in range(IMU_PERIOD_US, WARM_UP_US + 1, IMU_PERIOD_US):
-            self.kernel.run(now_us)
-            self.parts.sample(rest())
-        self.kernel.begin(WARM_UP_US)
+            for now_us in range(IMU_PERIOD_US, WARM_UP_US + 1, IMU_PERIOD_US):
+                self.kernel.run(now_us)
+                self.parts.sample(rest())
+            self.kernel.begin(WARM_UP_US)
 
     def reports(self) -> list[TaskReport]:
         kernel = self.kernel

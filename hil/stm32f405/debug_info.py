@@ -8,6 +8,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from operator import itemgetter
 from pathlib import Path
 from struct import unpack_from
 from typing import Any
@@ -17,7 +18,7 @@ from hil.errors import LabError, hint
 
 SP, LR, PC = 13, 14, 15
 DEEPEST = 32
-SHARED = MAXIMUM = 0xFFFF_FFFF  # in .debug_frame (32-bit DWARF), the mark of an entry that functions share
+SHARED = 0xFFFF_FFFF  # in .debug_frame (32-bit DWARF), the mark of an entry that functions share
 
 
 class CallFrames:
@@ -70,7 +71,7 @@ class CallFrames:
 
     def _rules_at(self, address: int) -> dict[Any, Any] | None:
         """Return the rule that unwinds a function's frame at an address."""
-        index = bisect_right(self._entries, (address, MAXIMUM)) - 1
+        index = bisect_right(self._entries, address, key=itemgetter(0)) - 1
         begin, end, at, shared = self._entries[index] if index >= 0 else (0, 0, 0, 0)
         if not begin <= address < end:
             return None
@@ -131,7 +132,7 @@ class DebugInfo:
         if unit is None:
             return ""
         table = self._table(unit)
-        index = bisect_right(table, (address, "\U0010ffff")) - 1
+        index = bisect_right(table, address, key=itemgetter(0)) - 1
         return table[index][1] if index >= 0 else ""
 
     def address_of(self, line: str) -> int:
@@ -165,11 +166,7 @@ class DebugInfo:
             for low, high in _ranges(unit, lists):
                 if low:  # code dropped by the linker is at 0
                     pieces.append((low, high, unit))
-        return sorted(pieces, key=lambda piece: piece[0])
-
-    @cached_property
-    def _unit_starts(self) -> list[int]:
-        return [start for start, _, _ in self._units]
+        return sorted(pieces, key=itemgetter(0))
 
     @cached_property
     def _index(self) -> Any:
@@ -180,7 +177,7 @@ class DebugInfo:
         offset = self._index.cu_offset_at_addr(address) if self._index is not None else None
         if offset is not None:
             return self._dwarf.get_CU_at(offset)
-        index = bisect_right(self._unit_starts, address) - 1
+        index = bisect_right(self._units, address, key=itemgetter(0)) - 1
         return self._units[index][2] if index >= 0 and address < self._units[index][1] else None
 
     def _table(self, unit: Any) -> list[tuple[int, str]]:

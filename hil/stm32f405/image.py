@@ -6,6 +6,7 @@ An image that cannot run here, or be inspected while it runs, is refused in one 
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from struct import unpack_from
 
@@ -69,8 +70,7 @@ class Image:
             )
         self.debug = DebugInfo(elf.dwarf, elf.path)
         functions = [one for one in elf.symbols if one.is_function and one.address >= FLASH]
-        self._functions = sorted(functions, key=lambda function: function.address)
-        self._starts = [function.address for function in self._functions]
+        self._functions = sorted(functions, key=attrgetter("address"))
         self._variables: dict[str, list[Symbol]] = {}
         for symbol in elf.symbols:
             if symbol.is_variable:
@@ -97,7 +97,7 @@ class Image:
 
     def function_at(self, address: int) -> str:
         """Return the name of the function around an address, empty outside all of them."""
-        index = bisect_right(self._starts, address) - 1
+        index = bisect_right(self._functions, address, key=attrgetter("address")) - 1
         function = self._functions[index] if index >= 0 else None
         return function.name if function and address < function.address + function.size else ""
 
