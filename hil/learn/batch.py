@@ -172,13 +172,13 @@ def advance_all(
     for n in range(plants.shape[0]):
         s = plants[n]
         change = 0.0
-        act(parameters[0], actions[n], control[0])
-        allocate(parameters[0], control[0])
-        drive_servos(parameters[0], control[0])
+        act(parameters, actions[n], control)
+        allocate(parameters, control)
+        drive_servos(parameters, control)
         for i in range(ACTIONS):
             change += (actions[n, i] - previous[n, i]) * (actions[n, i] - previous[n, i])
             previous[n, i] = actions[n, i]
-        command(s, control[0].count, zero_offsets[n])
+        command(s, control.count, zero_offsets[n])
         push(s, s[at.TIME_US] * 1e-6, pushes[n])
         for i in range(3):
             rates[i] = 0.5 * s[at.OMEGA + i]
@@ -191,8 +191,8 @@ def advance_all(
         for i in range(SEEN, ERRORS):
             errors[n, i] = constants[2 + i] * draws[n, GUSTS + i]
         find_goal(s, home, paths[n], goal)
-        estimate(s, rings[n, seen_at], rates, errors[n], goal, estimator[0].now)
-        observe(parameters[0], estimator[0], previous[n], observations[n])
+        estimate(s, rings[n, seen_at], rates, errors[n], goal, estimator.now)
+        observe(parameters, estimator, previous[n], observations[n])
         dx, dy, dz = s[at.P] - goal[0], s[at.P + 1] - goal[1], s[at.P + 2] - goal[2]
         turned = wrapped(rings[n, newest, 8] - goal[3])
         distance, tilt = (
@@ -212,14 +212,14 @@ def observe_start(
     for row in range(DELAY_MAX + 1):
         look(s, ring[row])
     find_goal(s, home, path, goal)
-    estimate(s, ring[0], s[at.OMEGA : at.OMEGA + 3], errors, goal, estimator[0].now)
-    observe(parameters[0], estimator[0], previous, out)
+    estimate(s, ring[0], s[at.OMEGA : at.OMEGA + 3], errors, goal, estimator.now)
+    observe(parameters, estimator, previous, out)
 
 
 @compiled
 def observe_board(parameters: Any, estimator: Any, previous: Actions, out: Actions) -> None:
     """Write the observation from the memory of a board's core."""
-    observe(parameters[0], estimator[0], previous, out)
+    observe(parameters, estimator, previous, out)
 
 
 class Fleet:
