@@ -121,9 +121,7 @@ def test_time_counts_from_the_boot_and_goes_where_it_is_led(bench: Bench) -> Non
     assert kernel.now_us == 20_950
 
 
-def test_views_have_the_shapes_of_the_core_and_follow_it(
-    bench: Bench, request: pytest.FixtureRequest
-) -> None:
+def test_views_have_the_core_s_shapes_and_follow_it(bench: Bench, request: pytest.FixtureRequest) -> None:
     assert has_core(bench.firmware) == (request.node.callspec.params["make"] != "image")
     signals = bench.firmware.signals
     views = (signals.estimate, signals.counters, signals.u, signals.flap, signals.count)

@@ -67,9 +67,7 @@ WRITES = {  # of the input
 }  # fmt: skip
 
 
-def test_no_call_writes_parameters_or_the_tasks_part_of_the_input(
-    recording: Recording, runner: RunnerFactory
-) -> None:
+def test_no_call_writes_parameters_or_the_tasks_inputs(recording: Recording, runner: RunnerFactory) -> None:
     core = core_at_start(recording, runner)
     for step in recording.steps:
         run_step(core, step)

@@ -65,7 +65,7 @@ def test_a_client_that_does_not_read_holds_nobody_up(pair: Pair) -> None:
     client.close()
 
 
-def test_a_closed_end_gives_its_address_back_and_everything_it_reads_from(
+def test_closing_an_end_releases_its_address_and_its_readers(
     again: Callable[[], Pair],
 ) -> None:
     for _ in range(3):

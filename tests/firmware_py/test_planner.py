@@ -32,7 +32,7 @@ def coefficients(
 
 @given(MOTIONS, MOTIONS, DURATIONS)
 @settings(max_examples=15, deadline=None)
-def test_between_two_motions_lies_the_polynomial_without_jerk_at_its_ends(
+def test_two_motions_are_joined_without_jerk_at_ends(
     begin: PathPoint, end: PathPoint, duration: float
 ) -> None:
     path = between(begin, end, duration)

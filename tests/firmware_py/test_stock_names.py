@@ -71,9 +71,7 @@ def test_what_has_no_effect_is_kept_and_what_is_persistent_survives(client: Crtp
 
 
 @pytest.mark.parametrize("name", BUTTONS)
-def test_a_button_lets_the_console_speak_once_and_reads_zero_again(
-    client: CrtpClient, tables, name: str
-) -> None:
+def test_a_button_prints_once_and_reads_zero_again(client: CrtpClient, tables, name: str) -> None:
     _, params = tables
     assert client.write(params, name, 1) == 0
     client.run(client.now_us + 200_000)

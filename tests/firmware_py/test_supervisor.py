@@ -223,9 +223,7 @@ def test_angles_from_outside_move_the_flaps_unless_somebody_the_battery_or_own_l
 
 
 @pytest.mark.parametrize(("gap_us", "outside"), [(EPISODE_GAP_US, True), (EPISODE_GAP_US + 10_000, False)])
-def test_bounded_steps_up_to_50_ms_apart_are_one_episode_which_counts_after_200_ms(
-    gap_us: int, outside: bool
-) -> None:
+def test_bounded_steps_50_ms_apart_are_one_episode_that_counts_at_200_ms(gap_us: int, outside: bool) -> None:
     bench = in_flight(lambda bench: bench.fly(1_000_000))
     for now_us in range(0, EPISODE_LIMIT_US + gap_us, gap_us):
         bench.fly(10_000, bounded=True)
@@ -480,7 +478,7 @@ def test_recovery_is_refused_while_the_battery_is_low(flying: CrtpClient) -> Non
     assert flying.one(SUPERVISOR, 1, b"\2") == b"\x82\0\0"
 
 
-def test_an_estimator_at_its_bounds_is_a_failsafe_that_ends_half_a_second_after_it_is_back(
+def test_a_bounded_estimator_is_a_failsafe_until_half_a_second_after_it_returns(
     flying: CrtpClient,
 ) -> None:
     flying.send(PARAM, 3, b"\0kalman\0maxPos\0\x06" + struct.pack("<f", 0.03))  # the robot is at y = 0.04

@@ -155,7 +155,5 @@ def test_a_stream_with_another_rate_than_the_profile_s_is_told_once() -> None:
     (("--set", "capture.system=optitrak"), "capture.system = 'optitrak': input should be 'optitrack', 'vicon'"),
     (("--set", "capture.system=qualisys", "--set", "capture.port=1"), "capture.system = qualisys: qualisys: its client"),
 ])  # fmt: skip
-def test_what_cannot_be_is_one_line_and_exit_code_two(
-    cli: Cli, arguments: tuple[str, ...], message: str
-) -> None:
+def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: tuple[str, ...], message: str) -> None:
     assert message in cli.refusal("station", "--link", "udp://127.0.0.1:1", *arguments)

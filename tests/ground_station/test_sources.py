@@ -152,9 +152,7 @@ def test_frames_that_come_twice_or_late_are_dropped_and_counted() -> None:
     ("", {"floaty": 7, "wand": 8}, "body=NAME is missing; there are: floaty, wand"),
     ("floaty", {}, "no body 'floaty'; there are: none"),
 ])  # fmt: skip
-def test_a_wrong_body_is_one_line_with_those_there_are(
-    name: str, bodies: dict[str, int], message: str
-) -> None:
+def test_a_wrong_body_is_one_line_listing_the_bodies(name: str, bodies: dict[str, int], message: str) -> None:
     stream = NatnetStream(name, AS_STREAMED)
     stream.on_packet(packets.server_info(V), 0)
     with pytest.raises(MocapError) as caught:

@@ -80,9 +80,7 @@ def test_free_running_time_never_stands_still() -> None:
     assert (free.stood_still_us, free.notices()) == (0, [])
 
 
-def test_the_age_of_the_process_counts_from_its_start_and_is_nan_where_no_system_says_it(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_process_age_is_nan_where_unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     first = clock.process_age_s()
     assert 0.0 < first <= clock.process_age_s()
     monkeypatch.setattr(clock, "PROCESS", tmp_path / "none")

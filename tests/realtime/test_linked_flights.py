@@ -59,9 +59,7 @@ def address(link: str) -> str:
 
 
 @pytest.mark.parametrize("link", [DONGLE, pytest.param("mavlink:pty", marks=pytest.mark.long)])
-def test_the_goal_moves_when_the_board_flies_and_the_flight_is_judged_by_what_the_station_sent(
-    tmp_path: Path, link: str
-) -> None:
+def test_the_goal_moves_once_the_board_flies_and_judges_the_flight(tmp_path: Path, link: str) -> None:
     result = fly(tmp_path / "run", "yaw-step", "--link", link)
     assert result["passed"], result["verdicts"]
     log = load_log(tmp_path / "run")

@@ -257,7 +257,7 @@ class connect:
 GOOD_BODIES = CAMERAS[CAMERAS.index("        return {") :]
 
 
-def test_a_missing_package_is_one_line_that_says_how_to_get_it(
+def test_a_missing_package_is_one_line_with_the_remedy(
     stand_in: Callable[..., MotioncaptureSource],
 ) -> None:
     with pytest.raises(

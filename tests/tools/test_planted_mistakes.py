@@ -127,9 +127,7 @@ def test_c_that_does_not_compile_is_a_mistake_of_the_table(project, capsys) -> N
         ("'abs(n)' = { new = 'n', tests = 'test_x.py' }", "steps.py: no such tests: test_x.py"),
     ],
 )
-def test_a_bad_row_is_one_line_and_exit_code_two_before_anything_is_planted(
-    project, capsys, row: str, complaint: str
-) -> None:
+def test_a_bad_row_is_one_line_and_nothing_is_planted(project, capsys, row: str, complaint: str) -> None:
     assert plant(project, CAUGHT, row) == 2
     said = capsys.readouterr()
     assert said.err.startswith(complaint)
@@ -146,9 +144,7 @@ def test_every_room_has_its_own_count() -> None:
 
 
 @pytest.mark.long
-def test_one_room_with_too_many_survivors_is_not_made_up_for_by_the_others(
-    project, capsys, monkeypatch
-) -> None:
+def test_other_rooms_do_not_compensate_for_one_with_survivors(project, capsys, monkeypatch) -> None:
     monkeypatch.setattr(planted_mistakes, "SHARE_CAUGHT", 0.5)
     (project / "room").mkdir()
     (project / "room" / "__init__.py").touch()

@@ -486,9 +486,7 @@ def rest(record: Record) -> tuple[list[int], int, Vector, Vector]:
 
 @settings(deadline=None, max_examples=60)
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(-math.pi, math.pi), st.floats(0.92, 1.08))
-def test_first_pose_is_taken_over_wherever_it_looks(
-    roll: float, pitch: float, yaw: float, length: float
-) -> None:
+def test_first_pose_is_adopted_at_any_attitude(roll: float, pitch: float, yaw: float, length: float) -> None:
     core = Core()
     for _ in range(10):
         core.tick()
@@ -646,9 +644,7 @@ FLOATS = [name for name, kind in Parameters.dtype.fields.items() if kind[0].kind
 @settings(deadline=None, max_examples=150)
 @given(st.sampled_from(FLOATS), any_number)
 @pytest.mark.long
-def test_senseless_parameter_moves_no_servo_out_of_range_and_does_no_lasting_harm(
-    name: str, value: float
-) -> None:
+def test_a_senseless_parameter_keeps_servos_in_range_and_is_recoverable(name: str, value: float) -> None:
     core = settled((0.1, 0, 0))
     sane = float(core.parameters.memory[name][0])
     core.parameters.memory[name] = value

@@ -20,9 +20,7 @@ number = st.floats(-1.5, 1.5, width=32)
 
 @settings(deadline=None, max_examples=100)
 @given(st.tuples(*16 * (number,)), st.tuples(*4 * (number,)), st.tuples(*4 * (number,)))
-def test_an_observation_is_the_error_and_the_motion_in_the_heading_frame(
-    state: Any, target: Any, previous: Any
-) -> None:
+def test_an_observation_is_error_and_motion_in_heading_frame(state: Any, target: Any, previous: Any) -> None:
     parameters, estimator = parameters_of(CONFIG), Estimator.allocate()
     estimator.fields.now[:], parameters.fields.target[:] = state, target
     out = np.full(OBSERVATIONS, np.nan, np.float32)

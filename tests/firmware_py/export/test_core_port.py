@@ -274,9 +274,7 @@ def client_of(app: App, mess: float = 0.0) -> tuple[CoreClient, AppPackets]:
 
 
 @pytest.mark.parametrize("mess", [0.0, 0.1])
-def test_a_flight_on_the_app_has_the_bits_of_python_after_every_call_in_any_loss(
-    app: App, mess: float
-) -> None:
+def test_a_flight_on_the_app_equals_python_bitwise_at_any_loss(app: App, mess: float) -> None:
     client, _ = client_of(app, mess)
     request = Request.of(find_experiment("hover"), duration_s=2.0, faults=(parse("mocap.outlier@1"),))
     checked = check_flight(request, lambda stack: {"app": partial(RealCore, client=client)}, lambda *_: None)
@@ -336,9 +334,7 @@ def test_an_estimate_is_charged_with_the_poses_filed_before_it(app: App) -> None
     assert blocks.run.estimate_us() == 50
 
 
-def test_a_board_that_reboots_is_told_from_one_that_is_silent(
-    app: App, library: Path, tmp_path: Path
-) -> None:
+def test_a_reboot_is_distinguished_from_silence(app: App, library: Path, tmp_path: Path) -> None:
     client, packets = client_of(app)
     client.begin()
     packets.app = App(library, tmp_path / "rebooted.so")

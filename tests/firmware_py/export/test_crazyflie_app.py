@@ -198,9 +198,7 @@ ENDLESS = LAW.replace(
 
 @pytest.mark.long
 @pytest.mark.parametrize("law", [LAW, ENDLESS], ids=["not a number", "an endless loop"])
-def test_own_logic_flies_in_the_app_as_in_the_laboratory_until_it_fails_in_both(
-    tmp_path: Path, law: str
-) -> None:
+def test_own_logic_flies_and_fails_in_the_app_as_in_the_laboratory(tmp_path: Path, law: str) -> None:
     config = own_config(tmp_path, law, ESTIMATOR, "gain_iy = 0.5")
     app, laboratory = App(build_app(tmp_path / "app", config), tmp_path / "copy.so"), Laboratory(config)
     rng, states, integrals = np.random.default_rng(3), set(), set()
@@ -372,9 +370,7 @@ def test_a_client_that_writes_the_estimators_parameter_does_not_disturb_the_flig
 
 
 @pytest.mark.parametrize("reset_us", [1_190_000, 1_195_000])
-def test_a_microsecond_clock_set_to_zero_neither_ends_a_flight_nor_its_failsafe(
-    app: App, reset_us: int
-) -> None:
+def test_resetting_the_microsecond_clock_ends_neither_flight_nor_failsafe(app: App, reset_us: int) -> None:
     flying(app)
     app.usec_reset.value = reset_us
     for step in range(1200, 1680):
@@ -562,7 +558,7 @@ P_WB, Q_WB = (1.0, 2.0, 3.0), from_euler_zyx(0.1, -0.2, 1.3)
 
 
 @pytest.mark.parametrize("how", ["attitude", "quaternion"])
-def test_absolute_poses_and_a_set_point_fly_as_corrections_to_there(
+def test_absolute_poses_fly_as_corrections_to_a_goal(
     app: App, library: Path, tmp_path: Path, how: str
 ) -> None:
     rng = np.random.default_rng(5)
@@ -657,9 +653,7 @@ ONLY_POSITIONS, OUTSIDE = "only positions are\n", "it leaves the box, see box.ra
         (position(0.0, 0.0, 1.9), OUTSIDE),
     ],
 )
-def test_a_set_point_that_is_not_followed_leaves_the_goal_and_is_refused_in_one_line(
-    app: App, other: dict[str, float], reason: str
-) -> None:
+def test_a_bad_set_point_keeps_the_goal_in_one_line(app: App, other: dict[str, float], reason: str) -> None:
     app.boot(absolute=True)
     for size, value in (("radius", 0.15), ("below", 0.65), ("above", 0.65)):
         app.set(f"box.{size}", value)
@@ -682,7 +676,7 @@ def test_an_app_that_has_booted_takes_absolute_poses(app: App) -> None:
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0, 1.1), (0.7, 0.7, 0.0), (0.0, 0.0, -2.1)])
-def test_a_pose_that_cannot_be_a_correction_is_counted_and_reported(
+def test_an_impossible_correction_is_counted_and_reported(
     app: App, place: tuple[float, float, float]
 ) -> None:
     flying(app)
@@ -750,7 +744,7 @@ def test_parameters_have_the_names_types_and_defaults_of_the_laboratory(app: App
 
 
 @given(data=st.data())
-def test_the_board_takes_just_the_parameter_values_that_the_laboratory_takes(
+def test_the_board_accepts_the_laboratory_s_parameter_values_only(
     functions: App, data: st.DataObject
 ) -> None:
     laboratory = LABORATORY

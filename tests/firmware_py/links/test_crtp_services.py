@@ -195,9 +195,7 @@ def test_telemetry_tells_the_excitation_sample_by_sample(client: CrtpClient, par
 
 
 @pytest.mark.parametrize("kind", ["a block", "telemetry"])
-def test_rows_end_a_second_after_the_partner_fell_silent_and_the_next_one_gets_none_of_them(
-    client: CrtpClient, logs, kind: str
-) -> None:
+def test_rows_end_a_second_after_silence_and_the_next_gets_none(client: CrtpClient, logs, kind: str) -> None:
     if kind == "telemetry":
         client.stream(client.now_us)
     else:
@@ -221,9 +219,7 @@ def test_rows_end_a_second_after_the_partner_fell_silent_and_the_next_one_gets_n
     assert client.packets(LOG, 2)
 
 
-def test_without_polls_it_is_a_packet_within_a_second_that_keeps_rows_coming(
-    client: CrtpClient, logs
-) -> None:
+def test_without_polls_a_packet_per_second_keeps_rows_coming(client: CrtpClient, logs) -> None:
     assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
     assert client.one(LOG, 1, bytes((3, 1, 1))) == bytes((3, 1, 0))
     client.polling = False
@@ -391,9 +387,7 @@ def test_each_parameter_of_the_set_point_sets_its_own_element(client: CrtpClient
     assert client.read(params, "setpoint.Yaw") == 0.0
 
 
-def test_the_sensors_and_decks_that_are_told_as_present_are_those_of_the_board(
-    client: CrtpClient, params
-) -> None:
+def test_sensors_and_decks_reported_present_are_the_board_s(client: CrtpClient, params) -> None:
     present = {
         name for name in params if name.startswith(("imu_sensors.", "deck.")) and client.read(params, name)
     }
@@ -425,9 +419,7 @@ def test_the_authors_gains_by_their_own_names_are_the_profile_as_flown(client: C
             assert ours[name] == flown[name], name
 
 
-def test_every_parameter_refuses_what_is_no_number_or_outside_and_says_what_is_in_force(
-    client: CrtpClient, params
-) -> None:
+def test_every_parameter_refuses_bad_values_and_returns_the_one_in_force(client: CrtpClient, params) -> None:
     refused = 0
     for name, (number, kind) in params.items():
         before = client.read(params, name)
@@ -610,9 +602,7 @@ def test_memory_tester_gives_the_address_and_counts_wrong_bytes(client: CrtpClie
 @pytest.mark.parametrize(
     ("number", "address", "length"), [(0, 8192, 1), (0, 8190, 3), (1, 100, 13), (9, 0, 1), (0, 2**32 - 1, 2)]
 )
-def test_memory_access_outside_is_an_error(
-    client: CrtpClient, number: int, address: int, length: int
-) -> None:
+def test_memory_access_outside_fails(client: CrtpClient, number: int, address: int, length: int) -> None:
     head = struct.pack("<BI", number, address)
     assert client.one(MEM, 1, head + bytes((length,))) == head + bytes((errno.EIO,))
     before = bytes(client.eeprom)

@@ -124,7 +124,7 @@ def test_take_off_go_to_and_land_move_the_goal_and_the_estimator_gets_the_error(
     assert absolute.state == "WAITING"
 
 
-def test_corrections_are_flown_as_they_come_until_the_commander_moves_the_goal_among_them(
+def test_corrections_are_flown_unchanged_until_the_commander_moves_the_goal(
     relative: Flyer,
 ) -> None:
     assert relative.state == "FLYING"
@@ -317,9 +317,7 @@ def boxed(absolute: Flyer) -> Flyer:
         ((0.0, 0.0, 1.649), 0), ((0.0, 0.0, 1.651), ENOEXEC),
     ],
 )  # fmt: skip
-def test_goal_outside_the_box_is_refused(
-    boxed: Flyer, place: tuple[float, float, float], status: int
-) -> None:
+def test_goals_outside_the_box_fail(boxed: Flyer, place: tuple[float, float, float], status: int) -> None:
     assert boxed.order(boxed.commander.go_to, *place, 0.0, 1.0) == status
     boxed.wait(1.5)
     goal = place if status == 0 else (0.0, 0.0, 1.15)  # where it is
@@ -357,9 +355,7 @@ def test_robot_that_was_pushed_out_of_the_box_may_return(boxed: Flyer) -> None:
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0, 1.1), (0.95, 0.0, 0.0), (0.7, 0.7, 0.0), (0.0, 0.0, -2.1)])
-def test_pose_that_cannot_be_a_correction_changes_nothing_and_is_reported_once(
-    relative: Flyer, place: tuple[float, float, float]
-) -> None:
+def test_an_impossible_correction_only_reports(relative: Flyer, place: tuple[float, float, float]) -> None:
     before = relative.estimate()
     relative.place = place
     relative.wait(0.3)

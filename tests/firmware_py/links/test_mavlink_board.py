@@ -126,7 +126,7 @@ def test_the_age_of_a_pose_is_true_whatever_the_stations_clock_shows(ahead_us: i
     ("lag_us", "age_us"),
     [(-5_200, None), (-4_800, 0), (-200, 0), (499_800, 499_800), (500_200, None)],
 )
-def test_a_pose_from_the_future_is_as_old_as_the_clocks_are_known_and_one_of_half_a_second_unknown(
+def test_ages_within_the_clock_error_are_zero_and_longer_ones_unknown(
     lag_us: int, age_us: int | None
 ) -> None:
     client = MavlinkClient()
@@ -336,7 +336,7 @@ def test_the_older_request_sets_groups_of_streams(client: MavlinkClient) -> None
     assert "LOCAL_POSITION_NED" not in counts
 
 
-def test_when_the_line_is_full_replies_wait_and_what_nobody_asked_for_is_dropped(
+def test_on_a_full_line_replies_wait_and_streams_are_dropped(
     client: MavlinkClient,
 ) -> None:
     client.uart_room = 0
@@ -444,9 +444,7 @@ def test_a_parameter_is_read_by_index_and_by_name(client: MavlinkClient) -> None
         (b"DLY_ACTIVATE", math.inf, 9),
     ],
 )
-def test_a_value_that_is_not_allowed_is_refused_and_the_one_in_force_is_echoed(
-    client: MavlinkClient, name: bytes, value: float, kind: int
-) -> None:
+def test_a_bad_value_echoes_the_old_one(client: MavlinkClient, name: bytes, value: float, kind: int) -> None:
     before = client.one("param_request_read", 1, 1, name, -1).param_value
     answers = client.ask("param_set", 1, 1, name, value, kind)
     again = client.ask("param_set", 1, 1, name, value, kind)
@@ -455,7 +453,7 @@ def test_a_value_that_is_not_allowed_is_refused_and_the_one_in_force_is_echoed(
     assert client.stack.refused == 2
 
 
-def test_what_cannot_be_done_with_a_parameter_is_answered_with_the_reason_each_time(
+def test_each_impossible_parameter_request_is_answered_with_the_reason(
     client: MavlinkClient,
 ) -> None:
     def error(name: str, *fields: Any) -> tuple[Any, ...]:

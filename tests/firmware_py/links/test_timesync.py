@@ -24,7 +24,7 @@ def test_nobody_knows_before_the_first_answer() -> None:
 
 
 @given(st.lists(st.tuples(delays, delays), min_size=1, max_size=2 * WINDOW))
-def test_the_offset_is_off_by_no_more_than_half_of_the_shortest_round_trip(
+def test_the_offset_error_is_at_most_half_the_shortest_round_trip(
     rounds: list[tuple[int, int]],
 ) -> None:
     clock = RemoteClock()

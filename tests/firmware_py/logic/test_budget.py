@@ -88,9 +88,7 @@ SUM = "for i in range({}):\n    memory.hidden = memory.hidden + DT"
         (SUM.format("100000"), "", ""),
     ],
 )
-def test_a_loop_of_known_length_is_refused_where_it_exceeds_the_budget(
-    tmp_path: Path, body: str, before: str, at: str
-) -> None:
+def test_a_known_loop_beyond_the_budget_is_refused(tmp_path: Path, body: str, before: str, at: str) -> None:
     text = law(body, before)
     if not at:
         load_logic(own_config(tmp_path, text).logic)

@@ -76,7 +76,7 @@ def stack() -> Iterator[ExitStack]:
 
 
 @pytest.mark.parametrize("board", [*BOARDS[1:], "plain"])
-def test_a_matrix_times_a_vector_has_the_same_bits_on_every_target(
+def test_matrix_times_vector_is_equal_on_every_target(
     config: LabConfig, stack: ExitStack, board: str
 ) -> None:
     logic = load_logic(config.logic)
@@ -144,9 +144,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("old", "new", "at", "reason"), REFUSED, ids=[case[3] for case in REFUSED])
-def test_what_is_no_constant_array_is_one_line_with_file_and_line(
-    tmp_path: Path, old: str, new: str, at: str, reason: str
-) -> None:
+def test_a_bad_constant_array_is_one_line(tmp_path: Path, old: str, new: str, at: str, reason: str) -> None:
     text = LAW.replace(old, new, 1)
     with pytest.raises(LabError) as error:
         own_config(tmp_path, text)

@@ -51,7 +51,7 @@ CONSTRUCTS = [
 
 
 @pytest.mark.parametrize(("body", "told"), CONSTRUCTS, ids=[body.split("\n")[0] for body, _ in CONSTRUCTS])
-def test_a_construct_outside_the_subset_is_one_line_that_says_what_to_write(
+def test_an_unsupported_construct_is_one_line_with_a_replacement(
     tmp_path: Path, body: str, told: str
 ) -> None:
     lines = "".join(f"    {line}\n" for line in body.splitlines())

@@ -55,9 +55,7 @@ IN_THE_LAW = [
 
 
 @pytest.mark.parametrize(("statement", "line", "told"), IN_THE_LAW, ids=[row[0] for row in IN_THE_LAW])
-def test_a_statement_outside_the_subset_is_told_with_file_line_and_what_to_write(
-    tmp_path: Path, statement: str, line: int, told: str
-) -> None:
+def test_an_unsupported_statement_is_one_line(tmp_path: Path, statement: str, line: int, told: str) -> None:
     text = changed(LAW, IN_LAW, IN_LAW + indent(f"{statement}\n", "    "))
     with pytest.raises(LabError) as error:
         own_config(tmp_path, text)
@@ -191,9 +189,7 @@ def test_a_statement_outside_the_subset_is_told_with_file_line_and_what_to_write
         ("DT = f32(0.01)", "DT = f32(0.01", "DT", "'(' was never closed"),
     ],
 )
-def test_a_mistake_is_told_with_file_line_and_what_is_expected(
-    tmp_path: Path, old: str, new: str, at: str, told: str
-) -> None:
+def test_a_mistake_is_reported_with_its_place(tmp_path: Path, old: str, new: str, at: str, told: str) -> None:
     text = changed(LAW, old, new)
     with pytest.raises(LabError) as error:
         own_config(tmp_path, text)
@@ -220,9 +216,7 @@ def test_a_mistake_is_told_with_file_line_and_what_is_expected(
         ("np.i0(own.gain_iy)", "np.i0 is outside the subset"),
     ],
 )
-def test_a_call_of_numpy_is_told_where_it_stands_and_what_to_write(
-    tmp_path: Path, call: str, told: str
-) -> None:
+def test_a_numpy_call_is_reported_with_place_and_replacement(tmp_path: Path, call: str, told: str) -> None:
     text = changed(changed(LAW, *CALLS_NUMPY), IN_LAW, f"{IN_LAW}    control.u[1] = {call}\n")
     with pytest.raises(LabError) as error:
         own_config(tmp_path, text)
@@ -241,9 +235,7 @@ def test_a_call_of_numpy_is_told_where_it_stands_and_what_to_write(
         ("gain_iy = nan", "logic.gain_iy = nan"),
     ],
 )
-def test_a_value_of_the_profile_is_refused_with_what_is_allowed(
-    tmp_path: Path, values: str, told: str
-) -> None:
+def test_a_wrong_profile_value_is_refused_with_the_range(tmp_path: Path, values: str, told: str) -> None:
     with pytest.raises(LabError) as error:
         own_config(tmp_path, values=values)
     assert str(error.value).startswith(told)
@@ -269,9 +261,7 @@ def test_a_file_that_is_not_there_is_one_line_and_exit_code_two(cli: Cli, tmp_pa
     assert said == f"floaty: logic.controller = {tmp_path / 'controller.py'}: No such file or directory\n"
 
 
-def test_a_mistake_in_a_module_is_one_line_and_exit_code_two_wherever_it_would_fly(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_wrong_module_is_one_line_always(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     make_project(tmp_path, changed(LAW, "f32(0.01)", "0.01"))
     for command in (("fly", "hover"), ("deploy", "check"), ("deploy", "write", "app")):

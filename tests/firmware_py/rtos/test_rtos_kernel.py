@@ -34,9 +34,7 @@ INSTANTS_US = st.lists(st.integers(0, 20_000), max_size=30)
     timeout=st.integers(0, 3),
     work_us=st.integers(0, 9_000),
 )
-def test_a_queue_never_holds_more_than_its_length_and_loses_only_what_it_counts(
-    length, from_isr, period, timeout, work_us
-):
+def test_a_queue_never_exceeds_its_length_and_counts_its_losses(length, from_isr, period, timeout, work_us):
     kernel = Kernel()
     queue = kernel.create_queue(length, "queue")
     sent, received, waiting = [], [], []

@@ -167,9 +167,7 @@ def test_no_room_for_a_flight_s_own_files_ends_the_campaign_and_is_no_row() -> N
 
 
 @pytest.mark.parametrize(("changed", "what"), [("robot.py", "profiles"), ("cf2.elf", "image")])
-def test_a_campaign_continues_with_the_files_with_which_it_began(
-    changed: str, what: str, tmp_path: Path
-) -> None:
+def test_a_campaign_resumes_only_with_its_original_files(changed: str, what: str, tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text('base = "floaty"\n[robot]\nbody = "robot.py"\n')
     for name in ("robot.py", "cf2.elf"):
         (tmp_path / name).write_text("x = 1\n")
@@ -292,9 +290,7 @@ def test_a_cell_of_the_failure_map_leads_to_its_flights(reported: tuple[Path, Fi
 
 @pytest.mark.long
 @pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine")
-def test_the_report_fits_a_phone_and_its_cells_lead_down(
-    reported: tuple[Path, Findings], tmp_path: Path
-) -> None:
+def test_the_report_fits_a_phone_and_its_cells_link(reported: tuple[Path, Findings], tmp_path: Path) -> None:
     with browser(tmp_path) as tab:
         for width in (390, 1180):
             tab.open(reported[0].as_uri(), width)
@@ -317,9 +313,7 @@ def test_a_report_of_nothing_and_of_nothing_that_failed_can_be_written(tmp_path:
 @pytest.mark.parametrize(
     ("sampling", "flights", "method"), [("saltelli", 640, "total Sobol index"), ("morris", 80, "Morris' mu*")]
 )
-def test_a_design_has_the_indices_that_it_is_for(
-    tmp_path: Path, sampling: str, flights: int, method: str
-) -> None:
+def test_a_design_has_its_own_indices(tmp_path: Path, sampling: str, flights: int, method: str) -> None:
     spec = spec_of(sampling=sampling, flights=flights)
     flown_into(tmp_path, spec, workers(2))
     found = find(spec, Dataset(tmp_path, plan_of(spec), resume=True).table())

@@ -58,9 +58,7 @@ def test_only_the_fault_that_matters_is_left_with_the_smallest_size_and_time_tha
         ("mocap.dropout", lambda size: size >= 0.3, 0.3, 0.3 + 1.0 / 64),
     ],
 )
-def test_sizes_shrink_towards_what_is_harmless_for_their_kind(
-    kind: str, fails: Callable[[float], bool], low: float, high: float
-) -> None:
+def test_sizes_shrink_to_harmless(kind: str, fails: Callable[[float], bool], low: float, high: float) -> None:
     least = shrink(trial(*FAULTS), DURATION_S, lambda one: fails(size_of(one, kind, harmless(kind) or 0.0)))
     (fault,) = least.faults
     assert fault.kind == kind
@@ -99,7 +97,7 @@ def test_a_fault_that_the_flights_end_cuts_off_lasts_no_longer_than_to_there() -
     assert max(span for span in tried if span != 9.0) <= DURATION_S - 8.0
 
 
-def test_a_flight_that_fails_in_another_manner_is_not_the_one_to_be_shrunk(
+def test_a_flight_that_fails_differently_is_not_the_shrunk_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     results = [

@@ -223,9 +223,7 @@ def test_an_older_run_is_kept_where_no_board_answers(cli: Cli, option: str) -> N
 
 
 @pytest.mark.long
-def test_without_rerun_the_flight_is_flown_and_says_what_is_missing(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_rerun_the_flight_flies_and_names_it(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     for module in ("hil.pictures.viewer", "hil.pictures.viewer.recording"):
         monkeypatch.delitem(sys.modules, module, raising=False)
@@ -237,9 +235,7 @@ def test_without_rerun_the_flight_is_flown_and_says_what_is_missing(
 
 @pytest.mark.long
 @pytest.mark.parametrize("view", [["--view", "--realtime"], ["--view", "wbe"]])
-def test_a_viewer_that_cannot_open_is_one_line_and_leaves_no_folder(
-    cli: Cli, view: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_viewer_that_fails_is_one_line(cli: Cli, view: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     for name in DISPLAYS:
         monkeypatch.delenv(name, raising=False)
     assert cli("fly", "hover", *view, "--out", "run") == 2

@@ -90,9 +90,7 @@ def test_what_cflib_flashes_is_there_byte_for_byte_and_nothing_else(
         (1, 16, 10, OUT_OF_RANGE),
     ],
 )
-def test_writing_stays_inside_flash_and_buffer(
-    buffer_page: int, page: int, pages: int, answer: bytes
-) -> None:
+def test_writes_stay_inside_flash_and_buffer(buffer_page: int, page: int, pages: int, answer: bytes) -> None:
     request = struct.pack("<BBBHHH", 0xFF, 0xFF, 0x18, buffer_page, page, pages)
     assert Bootloader().answer(request) == request[:3] + answer
 

@@ -80,9 +80,7 @@ def test_hovers_at_the_voltage_at_which_four_thrusts_are_its_weight() -> None:
         ((2, 4), 2, 1.0),
     ],
 )
-def test_stronger_motors_turn_it_as_the_firmwares_mixer_expects(
-    stronger: tuple[int, int], axis: int, sign: float
-) -> None:
+def test_stronger_motors_turn_it_as_the_mixer_does(stronger: tuple[int, int], axis: int, sign: float) -> None:
     duties = tuple(0.65 if motor in stronger else 0.6 for motor in (1, 2, 3, 4))
     alpha = spun_up(duties).alpha_B * np.sign(sign)  # type: ignore[arg-type]
     others = [abs(alpha[other]) for other in range(3) if other != axis]

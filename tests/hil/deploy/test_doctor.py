@@ -135,9 +135,7 @@ def test_what_is_not_well_is_marked_and_is_exit_code_one(
     assert [text for text in found.values() if text.startswith("!")] == [found[subject]]
 
 
-def test_a_board_that_gets_no_samples_is_told_after_a_time(
-    cli: Cli, board: Board, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_board_without_samples_is_reported(cli: Cli, board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
     board.deaf = True
     monkeypatch.setattr("hil.deploy.doctor.LOOP_TIMEOUT_US", 50_000)
     assert cli("board", "doctor", URI) == 1

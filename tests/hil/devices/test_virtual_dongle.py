@@ -231,9 +231,7 @@ def test_a_broadcast_is_lost_for_each_board_on_its_own() -> None:
     [(1, 90, 90, 2), (1, 126, 80, 2), (2, 0, 80, 0), (2, 1, 80, 1), (2, 3, 80, 2), (3, 2, 80, 2)],
     ids=["channel", "no channel", "250K", "1M", "no rate", "power"],
 )
-def test_the_radio_chip_is_tuned_by_a_command_until_the_next_start(
-    command: int, value: int, channel: int, rate: int
-) -> None:
+def test_a_command_tunes_the_radio_until_the_reset(command: int, value: int, channel: int, rate: int) -> None:
     bench = DongleWithBoards()
     assert bench.exchange(bytes((0xFF, 0x03, command, value)))[0] & 1  # answered where it was asked
     bench.wait(5000)
@@ -370,9 +368,7 @@ def test_the_bootloader_does_not_know_safelink() -> None:
 
 
 @pytest.mark.parametrize(("safelink", "passed_on"), [(0, 4), (1, 1)])
-def test_every_try_that_the_board_hears_is_passed_on_unless_safelink_knows_it(
-    safelink: int, passed_on: int
-) -> None:
+def test_every_received_try_is_passed_on_unless_safelink_knows_it(safelink: int, passed_on: int) -> None:
     bench = DongleWithBoards(downlink_loss=1.0)
     bench.exchange(bytes((0xFF, 0x05, safelink)))
     assert bench.exchange(b"\x14hello") == b"\x00"

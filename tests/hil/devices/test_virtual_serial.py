@@ -217,9 +217,7 @@ messages = st.lists(st.tuples(st.integers(0, 3000), st.binary(min_size=1, max_si
     cuts=st.lists(st.integers(0, 60_000), max_size=4),
     readings=st.lists(st.booleans(), min_size=1, max_size=50),
 )
-def test_bytes_keep_their_order_nothing_is_invented_and_counters_add_up(
-    up, down, baud, threshold, cuts, readings
-):
+def test_bytes_keep_their_order_and_counters_add_up(up, down, baud, threshold, cuts, readings):
     bench = LineWithEnds(baud=baud, interrupt_threshold=threshold, receive_buffer=128, transmit_buffer=512)
     line, received, reads = bench.line, bytearray(), 0
 

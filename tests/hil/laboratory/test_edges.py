@@ -37,9 +37,7 @@ def turned(yaw: np.ndarray, goal: np.ndarray) -> pa.Table:
 
 @pytest.mark.parametrize("facing", [0.0, 180.0, -180.0, 179.0, -179.0, 540.0])
 @pytest.mark.parametrize("first", [0.01, -0.01])
-def test_metrics_of_a_yaw_that_crosses_180_degrees_are_those_of_one_that_does_not(
-    facing: float, first: float
-) -> None:
+def test_metrics_are_the_same_when_yaw_crosses_180_degrees(facing: float, first: float) -> None:
     goal = np.full(ROWS, radians(facing))
     error = first + 0.05 * np.sin(2 * pi * 0.5 * 1e-6 * TIMES)
     flight = turned(goal + error, goal)

@@ -381,9 +381,7 @@ def test_faults_on_one_knob_add_up_and_leave_it_as_it_was() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(("kind", "axis"), [("wind.side_x", 0), ("wind.side_y", 1)])
 @given(wind=st.floats(-20.0, 20.0), more=st.floats(-30.0, 30.0))
-def test_side_wind_blows_either_way_up_to_20_metres_per_second(
-    kind: str, axis: int, wind: float, more: float
-) -> None:
+def test_side_wind_blows_both_ways_up_to_20_m_per_s(kind: str, axis: int, wind: float, more: float) -> None:
     plant = Plant(
         GeometryConfig(), PlantConfig(), TunnelConfig(), PlantServoConfig(), np.random.default_rng(1)
     )
@@ -522,9 +520,7 @@ def test_the_hover_has_the_stated_outcome(tmp_path: Path, text: str, seed: int) 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 2])
-def test_swapped_markers_lose_the_robot_where_neither_the_fit_nor_the_tracker_refuses_them(
-    tmp_path: Path, seed: int
-) -> None:
+def test_swapped_markers_lose_the_robot_where_fit_and_tracker_accept_them(tmp_path: Path, seed: int) -> None:
     wide = (MARKERS_ON, "markers.max_error=0.2")
     assert go(tmp_path / "run", "marker.swap@1", seed=seed, duration_s=4.0, settings=wide).passed
     alone = (*wide, "tracker.enabled=false")

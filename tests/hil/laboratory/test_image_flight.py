@@ -162,9 +162,7 @@ def test_an_elf_beside_another_board_is_refused() -> None:
         Request.of(HOVER, elf=Path("x.elf"))
 
 
-def test_without_a_compiler_an_image_is_refused_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_compiler_images_fail_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from firmware_py.export import compilers
     from support.stm32_firmware import build
 

@@ -222,9 +222,7 @@ def test_a_radio_that_a_client_has_moved_is_reported_where_it_stays_and_returns_
         ("kinds", "mocap.dropout"),
     ],
 )
-def test_a_typed_line_that_says_nothing_possible_is_answered_and_changes_nothing(
-    line: str, answer: str
-) -> None:
+def test_an_impossible_typed_line_is_answered_and_changes_nothing(line: str, answer: str) -> None:
     bench = Bench()
     type_line, answers = live(bench)
     type_line(line)

@@ -95,7 +95,7 @@ def test_what_own_logic_logs_is_recorded_and_drawn(failed: Result) -> None:
 
 
 @pytest.mark.parametrize("board", ["c", pytest.param("cortex-m4", marks=pytest.mark.long)])
-def test_the_same_flight_on_another_board_is_alike_to_the_last_bit(
+def test_the_same_flight_on_another_board_is_bit_identical(
     failed: Result, tmp_path: Path, board: str
 ) -> None:
     again = hover(
@@ -122,9 +122,7 @@ def test_without_numba_the_same_text_makes_the_same_flight(failed: Result) -> No
 
 @pytest.mark.long
 @pytest.mark.parametrize("profile", ["original", "lqr"])
-def test_the_laws_that_ship_hover_within_the_limits_and_alike_on_every_board(
-    tmp_path: Path, profile: str
-) -> None:
+def test_shipped_laws_hover_within_limits_and_alike_on_every_board(tmp_path: Path, profile: str) -> None:
     results = [
         hover(tmp_path / board, profile=profile, board=board) for board in ("python", "c", "cortex-m4")
     ]

@@ -152,9 +152,7 @@ def test_a_real_flight_lies_over_the_simulated_one(both: tuple[Path, Path], simu
 
 
 @pytest.mark.long
-def test_the_command_shows_both_and_says_what_only_one_has(
-    cli: Cli, both: tuple[Path, Path], simulated: Path, tmp_path: Path
-) -> None:
+def test_the_command_shows_both(cli: Cli, both: tuple[Path, Path], simulated: Path, tmp_path: Path) -> None:
     assert cli("compare", both[0], simulated, "--out", tmp_path / "out") == 1
     shown = cli.out
     assert "not in " in shown
@@ -331,7 +329,7 @@ def test_a_robot_that_leaves_the_flow_is_lost_and_what_follows_is_not_judged(tmp
         ({}, "completed", None),
     ],
 )
-def test_whatever_ends_a_flight_its_result_is_written(
+def test_every_end_writes_a_result(
     tmp_path: Path, how: dict[str, Any], outcome: str, cause: str | None
 ) -> None:
     bench = StationBench(tmp_path / "run")
@@ -347,9 +345,7 @@ def test_whatever_ends_a_flight_its_result_is_written(
     assert texts[:3] == [("station", "connected"), ("board", "supervisor: flying"), ("lab", "hover begins")]
 
 
-def test_a_killed_station_leaves_all_but_the_last_second_and_can_be_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_station_loses_only_the_last_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hil.pictures.figures, "PICTURES", PICTURES[:1])
     bench = StationBench(tmp_path / "run")
     bench.plan.start(bench.now_us)
@@ -402,9 +398,7 @@ def test_a_full_disk_ends_the_record_and_not_the_flight(tmp_path: Path) -> None:
     assert read_result(tmp_path / "run").metrics["lost"] == 0.0
 
 
-def test_what_the_station_recorded_stands_in_the_time_of_the_log(
-    both: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_the_station_s_records_have_the_time_of_the_log(both: tuple[Path, Path], tmp_path: Path) -> None:
     """A computer's clock has run for days when a flight begins, here for 7 s."""
     bench = StationBench(tmp_path / "run")
     shutil.copy(both[0] / "telemetry.csv", tmp_path / "run")

@@ -95,9 +95,7 @@ def test_the_file_holds_the_keys_that_programs_read_and_null_where_there_is_no_n
     [("completed", True, True), ("lost", True, True), ("completed", False, False), ("lost", False, False),
      ("interrupted", True, False), ("error", True, False)],
 )  # fmt: skip
-def test_a_run_passes_that_ends_by_itself_and_holds_every_limit(
-    result: Result, outcome: Any, holds: bool, passed: bool
-) -> None:
+def test_a_complete_run_within_limits_passes(result: Result, outcome: Any, holds: bool, passed: bool) -> None:
     verdicts = (Verdict("rms_x", 0.0, 1.0, True, "m", "max"), Verdict("rms_y", 0.0, 1.0, holds, "m", "max"))
     write_result(replace(result, outcome=outcome, verdicts=verdicts))
     assert json.loads((result.folder / RESULT).read_text(encoding="utf-8"))["passed"] is passed
@@ -117,7 +115,7 @@ def test_a_run_passes_that_ends_by_itself_and_holds_every_limit(
         (lambda folder: change(folder, verdicts=[{"metric": "rms_x"}]), "verdicts.0.value is missing"),
     ],
 )  # fmt: skip
-def test_what_is_no_result_is_one_line_that_names_file_and_value(
+def test_a_bad_result_is_one_line(
     cli: Cli, result: Result, damage: Callable[[Path], None], told: str
 ) -> None:
     write_result(result)

@@ -70,9 +70,7 @@ def unseen(tmp_path_factory: pytest.TempPathFactory) -> str:
         (TAKES_ALL, range(150, 151)),
     ],
 )
-def test_a_flight_is_the_same_whatever_its_picture_does(
-    program: str, taken: range, unseen: str, tmp_path: Path
-) -> None:
+def test_the_picture_does_not_affect_flights(program: str, taken: range, unseen: str, tmp_path: Path) -> None:
     is_silent = program == NEVER_COMES_UP
     view = LiveView(picture(program), [].append, start_timeout_s=0.01 if is_silent else 30)
     assert flight_hash(tmp_path / "run", view) == unseen

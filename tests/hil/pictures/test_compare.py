@@ -126,7 +126,7 @@ def test_metrics_stand_side_by_side_in_the_unit_of_the_table(runs: dict[str, Pat
     assert told["rms_x"].difference == pytest.approx(100 * (b["rms_x"] - a["rms_x"]))
 
 
-def test_metrics_of_flights_of_different_length_are_taken_over_the_time_that_both_flew(
+def test_metrics_of_unequal_flights_cover_the_common_time(
     runs: dict[str, Path],
 ) -> None:
     long = load_flown(runs["one"])
@@ -145,7 +145,7 @@ def test_metrics_of_flights_of_different_length_are_taken_over_the_time_that_bot
 
 
 @pytest.mark.long
-def test_flights_that_are_released_at_other_instants_are_compared_by_the_time_since_then(
+def test_flights_are_compared_by_the_time_since_their_release(
     runs: dict[str, Path],
 ) -> None:
     a, b = load_flown(runs["one"]), load_flown(runs["two"])
@@ -173,9 +173,7 @@ def test_the_difference_is_the_second_less_the_first_at_the_same_time(runs: dict
 
 
 @pytest.mark.long
-def test_of_two_different_robots_position_and_attitude_are_compared(
-    runs: dict[str, Path], tmp_path: Path
-) -> None:
+def test_two_robots_are_compared_by_position_and_attitude(runs: dict[str, Path], tmp_path: Path) -> None:
     flaps = load_flown(runs["one"])
     log = flaps.log.rename_columns(
         [
@@ -202,9 +200,7 @@ def test_the_caption_names_the_colours_of_the_lines(runs: dict[str, Path], tmp_p
 
 
 @pytest.mark.long
-def test_the_command_tells_the_difference_by_its_exit_code(
-    cli: Cli, runs: dict[str, Path], tmp_path: Path
-) -> None:
+def test_the_exit_code_of_the_command_is_the_verdict(cli: Cli, runs: dict[str, Path], tmp_path: Path) -> None:
     assert cli("compare", runs["one"], runs["again"], "--out", tmp_path) == 0
     assert "identical" in cli.out
     assert cli("compare", runs["one"], runs["two"], "--out", tmp_path / "new") == 1
@@ -224,9 +220,7 @@ def test_the_command_tells_the_difference_by_its_exit_code(
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "no parquet", "no flight", "no json"])
-def test_a_bad_folder_is_one_line_and_exit_code_two(
-    cli: Cli, runs: dict[str, Path], tmp_path: Path, damage: str
-) -> None:
+def test_a_bad_folder_is_one_line(cli: Cli, runs: dict[str, Path], tmp_path: Path, damage: str) -> None:
     bad = tmp_path / "bad"
     if damage == "empty":
         bad.mkdir()

@@ -247,7 +247,7 @@ def test_the_report_begins_with_what_was_asked_for_what_failed_and_what_happened
     )
 
 
-def test_faults_failsafe_flap_limits_and_loss_are_marked_for_every_figure_and_shown_close_up(
+def test_faults_failsafe_flap_limits_and_loss_are_marked_and_shown_close_up(
     folder: Path,
 ) -> None:
     """Row 150 is 0.5 s after the release."""

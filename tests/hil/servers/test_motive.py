@@ -70,9 +70,7 @@ def test_a_frame_arrives_as_it_was_sent(frame: Frame, version: tuple[int, int]) 
 
 
 @given(st.lists(described, max_size=3), st.sampled_from(VERSIONS[2:]))
-def test_model_definitions_arrive_as_they_were_sent(
-    models: list[BodyDescription], version: tuple[int, int]
-) -> None:
+def test_model_definitions_arrive_unchanged(models: list[BodyDescription], version: tuple[int, int]) -> None:
     sent = ModelDefinition(tuple(models))
     assert decode(encode_models(sent, version), version) == sent
 
@@ -149,7 +147,7 @@ def client(lab: MotiveBench) -> Iterator[NatNetSocket]:
 
 
 @pytest.mark.parametrize("payload", [b"", b"Ping\0", bytes(271)], ids=["empty", "Ping", "with the sender"])
-def test_every_form_of_connect_is_answered_and_frames_follow(
+def test_every_connect_is_answered_with_frames(
     lab: MotiveBench, client: NatNetSocket, payload: bytes
 ) -> None:
     client.say(MessageId.CONNECT, payload)

@@ -105,9 +105,7 @@ def test_what_is_not_known_is_answered_with_nothing(protocol: RemoteProtocol) ->
     "packet", [b"m", b"m,", b"m20000000", b"mxyz,4", b"p", b"pff", b"P0", b"P0=12", b"M20000000,4:00",
                b"M20000000,0:", b"Z0", b"Z1,", b"c-1", b"M20000000,1:zz"],
 )  # fmt: skip
-def test_a_malformed_packet_changes_nothing(
-    protocol: RemoteProtocol, machine: BareCortex, packet: bytes
-) -> None:
+def test_malformed_packets_do_nothing(protocol: RemoteProtocol, machine: BareCortex, packet: bytes) -> None:
     before = ask(protocol, b"g")
     assert ask(protocol, packet) == b"E01"
     assert ask(protocol, b"g") == before
@@ -149,7 +147,7 @@ def test_the_target_description_numbers_the_registers_as_they_are_sent(protocol:
     assert [name for name, _ in registers[:17]] == [*(f"r{n}" for n in range(13)), "sp", "lr", "pc", "xpsr"]
 
 
-def test_registers_are_read_all_at_once_and_written_one_by_one(
+def test_registers_are_read_together_and_written_singly(
     protocol: RemoteProtocol, machine: BareCortex
 ) -> None:
     number = {name: index for index, (name, _) in enumerate(REGISTERS)}
@@ -272,9 +270,7 @@ def test_a_machine_without_watchpoints_refuses_them(protocol: RemoteProtocol) ->
     assert ask(protocol, b"Z2,20000000,4") == b"E0e"
 
 
-def test_time_stands_still_while_the_debugger_asks(
-    client: tuple[GdbServer, socket.socket], machine: BareCortex
-) -> None:
+def test_time_stops_while_gdb_asks(client: tuple[GdbServer, socket.socket], machine: BareCortex) -> None:
     server, line = client
     before = [machine.register(name) for name, _ in REGISTERS]
     line.sendall(b"".join(framed(b"m20000000,4") for _ in range(50)) + framed(b"c"))

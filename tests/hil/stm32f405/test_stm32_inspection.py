@@ -159,9 +159,7 @@ def stopped(machine: FirmwareOnChip, why: Why) -> tuple[ChipProcessor, CrashRepo
         (NULL_WRITE, Why.LOW_WRITE, "null pointer: write to 0x0000000c, ", "nowhere[3] = 1"),
     ],
 )
-def test_an_access_near_address_0_is_reported_once_and_goes_on(
-    compiler: str, planted: int, why: Why, expected: str, text: str
-) -> None:
+def test_a_null_access_reports_once(compiler: str, planted: int, why: Why, expected: str, text: str) -> None:
     machine = FirmwareOnChip(compiler, planted=planted)
     _, reports = stopped(machine, why)
     crash = str(reports.low_access(machine.chip.state.fault_address, why is Why.LOW_WRITE))

@@ -115,9 +115,7 @@ def test_dma_does_not_reach_the_core_coupled_memory(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(("rising", "falling", "edges"), [(1, 0, (True, False)), (0, 1, (False, True))])
-def test_a_pin_interrupts_on_the_edge_that_is_chosen(
-    bench: Bench, rising: int, falling: int, edges: tuple[bool, bool]
-) -> None:
+def test_pins_interrupt_on_edges(bench: Bench, rising: int, falling: int, edges: tuple[bool, bool]) -> None:
     bench[SYSCFG + 0x14] = 2 << 8  # EXTI14 on port C
     bench[EXTI], bench[EXTI + 8], bench[EXTI + 12] = 1 << 14, rising << 14, falling << 14
     seen = []

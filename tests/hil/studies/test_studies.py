@@ -125,9 +125,7 @@ def judged(expected: Expected, *cells: str) -> list[str]:
         (Expected(holds_to=1, lost_from=3), ("hh", "dl"), []),
     ],
 )
-def test_what_is_not_expected_is_told(
-    expected: Expected, cells: tuple[str, ...], surprises: list[str]
-) -> None:
+def test_surprises_are_reported(expected: Expected, cells: tuple[str, ...], surprises: list[str]) -> None:
     assert judged(expected, *cells) == surprises
 
 

@@ -128,9 +128,7 @@ def test_boards_with_the_same_counts_need_no_cause(flown: Path, tmp_path: Path) 
     assert (found.first, found.causes) == (None, ())
 
 
-def test_only_flights_of_two_boards_that_were_asked_for_alike_are_comparable(
-    flown: Path, tmp_path: Path
-) -> None:
+def test_only_equal_requests_on_two_boards_are_comparable(flown: Path, tmp_path: Path) -> None:
     a = load_flown(flown)
     b = other(flown, tmp_path / "b", lambda columns: None)
     assert comparable(a, b)

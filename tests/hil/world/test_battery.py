@@ -40,9 +40,7 @@ def test_voltage_falls_with_the_charge(charge: float, less: float) -> None:
 
 
 @given(st.floats(0.05, 1.0), st.floats(0.1, 12.0), st.integers(1, 4), st.floats(0.0, 0.5))
-def test_power_leaves_the_terminals_and_the_resistance_heats(
-    charge: float, power: float, cells: int, sag_V: float
-) -> None:
+def test_power_leaves_and_the_resistance_heats(charge: float, power: float, cells: int, sag_V: float) -> None:
     config = BatteryConfig(charge=charge, cells=cells)
     battery = Battery(config)
     battery.sag_V = sag_V

@@ -49,9 +49,7 @@ def test_counts_of_the_original_board_give_its_angles() -> None:
 @pytest.mark.parametrize(
     ("width_ms", "moves"), [(0.4999, False), (0.5, True), (1.5, True), (2.5, True), (2.5001, False)]
 )
-def test_a_pulse_of_half_a_millisecond_to_two_and_a_half_moves_the_servo(
-    width_ms: float, moves: bool
-) -> None:
+def test_pulses_of_0_5_to_2_5_ms_move_the_servo(width_ms: float, moves: bool) -> None:
     (angle,) = commanded_angles((math.floor(width_ms * 21_000 + 0.5),), (0.0,), (9.0,))
     assert (angle != 9.0) == moves
 
