@@ -65,9 +65,7 @@ def test_a_client_that_does_not_read_holds_nobody_up(pair: Pair) -> None:
     client.close()
 
 
-def test_closing_an_end_releases_its_address_and_its_readers(
-    again: Callable[[], Pair],
-) -> None:
+def test_closing_an_end_releases_its_address_and_its_readers(again: Callable[[], Pair]) -> None:
     for _ in range(3):
         open_end, connect = again()
         client = connect(open_end)

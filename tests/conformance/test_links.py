@@ -116,9 +116,7 @@ def send(board: BoardEnd, now_us: int, p: Place, q: Place = UPRIGHT, goal: Place
     board.link.send(now_us, MocapFrame(now_us - 40_000, p, q, True), Goal(goal, 0.0))
 
 
-def test_poses_arrive_once_in_order_relative_to_the_goal_of_their_instant(
-    board: BoardEnd,
-) -> None:
+def test_poses_arrive_once_in_order_relative_to_the_goal_of_their_instant(board: BoardEnd) -> None:
     expected = []
     for number in range(100):
         p, goal = (0.01 * number, -0.02 * number, 0.5), (0.3 * (number // 10), 0.1, -0.2 * (number // 10))

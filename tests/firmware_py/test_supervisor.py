@@ -9,12 +9,7 @@ import pytest
 from firmware_py.core import structs
 from firmware_py.core.sampling import RECOVERY_STEPS, STALE_STEPS
 from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL
-from firmware_py.core.supervisor import (
-    BATTERY_LOW_US,
-    DOWN_US,
-    EPISODE_GAP_US,
-    EPISODE_LIMIT_US,
-)
+from firmware_py.core.supervisor import BATTERY_LOW_US, DOWN_US, EPISODE_GAP_US, EPISODE_LIMIT_US
 from firmware_py.links.platform import supervisor_bits
 from firmware_py.wire.crtp import Correction
 from firmware_py.wire.supervisor import Cause, State
@@ -478,9 +473,7 @@ def test_recovery_is_refused_while_the_battery_is_low(flying: CrtpClient) -> Non
     assert flying.one(SUPERVISOR, 1, b"\2") == b"\x82\0\0"
 
 
-def test_a_bounded_estimator_is_a_failsafe_until_half_a_second_after_it_returns(
-    flying: CrtpClient,
-) -> None:
+def test_a_bounded_estimator_is_a_failsafe_until_half_a_second_after_it_returns(flying: CrtpClient) -> None:
     flying.send(PARAM, 3, b"\0kalman\0maxPos\0\x06" + struct.pack("<f", 0.03))  # the robot is at y = 0.04
     begin_us = flying.now_us
     while state(flying)[0] is State.FLYING:

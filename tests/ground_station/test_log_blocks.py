@@ -134,11 +134,7 @@ def test_attitudes_of_a_crazyflie_come_in_degrees_and_are_samples_in_radians(lin
     assert sample.values == pytest.approx((*np.radians((10, 20, 30)), 41, 5, 6))
 
 
-@given(
-    phase=st.integers(0, 19),
-    after=st.tuples(*[st.integers(1, 19)] * 3),
-    begin=st.integers(0, 1000),
-)
+@given(phase=st.integers(0, 19), after=st.tuples(*[st.integers(1, 19)] * 3), begin=st.integers(0, 1000))
 def test_blocks_of_one_period_share_the_instant_of_the_controllers_block(phase, after, begin):
     line = Line()
     line.logs.request(0)

@@ -282,10 +282,7 @@ def test_what_is_read_late_counts_from_its_arrival():
     bench = LinkWithCodec()
     bench.pose(1_000_000)
     request = bench.of(dialect.MAVLINK_MSG_ID_TIMESYNC)[0][1]
-    messages = (
-        dialect.MAVLink_timesync_message(5, request.ts1),
-        dialect.MAVLink_timesync_message(0, 777),
-    )
+    messages = (dialect.MAVLink_timesync_message(5, request.ts1), dialect.MAVLink_timesync_message(0, 777))
     bench.link.receive(1_004_200, b"".join(message.pack(bench.codec) for message in messages), 1_010_200)
     assert bench.link.latency.us == 2100
     answered_us, answer = bench.of(dialect.MAVLINK_MSG_ID_TIMESYNC)[1]

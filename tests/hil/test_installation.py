@@ -84,9 +84,7 @@ def test_a_package_reports_the_commit_that_it_was_built_from(
     assert commit() == "0123456789ab"
 
 
-def test_a_surrounding_repository_s_commit_is_not_the_package_s(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_surrounding_repository_s_commit_is_not_the_package_s(monkeypatch: pytest.MonkeyPatch) -> None:
     assert re.fullmatch(r"[0-9a-f]{12}\+?", commit())
     monkeypatch.setattr(installation, "ROOT", installation.ROOT / "hil")
     assert commit() == ""

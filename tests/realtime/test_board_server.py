@@ -51,9 +51,7 @@ def test_scanning_finds_the_board(served: Served) -> None:
     assert ["radio://0/80/2M", ""] in found
 
 
-def test_both_tables_are_complete_with_ranges_defaults_and_storage(
-    client: CflibClient,
-) -> None:
+def test_both_tables_are_complete_with_ranges_defaults_and_storage(client: CflibClient) -> None:
     assert client.cf.platform.get_protocol_version() == 12
     param = client.cf.param
     names = {f"{group}.{name}" for group, values in param.values.items() for name in values}

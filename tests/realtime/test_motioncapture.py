@@ -257,9 +257,7 @@ class connect:
 GOOD_BODIES = CAMERAS[CAMERAS.index("        return {") :]
 
 
-def test_a_missing_package_is_one_line_with_the_remedy(
-    stand_in: Callable[..., MotioncaptureSource],
-) -> None:
+def test_a_missing_package_is_one_line_with_the_remedy(stand_in: Callable[..., MotioncaptureSource]) -> None:
     with pytest.raises(
         MocapError, match=r"No module named 'motioncapture': .*-m pip install 'motioncapture>="
     ):

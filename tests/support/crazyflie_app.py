@@ -49,10 +49,7 @@ class Timer(ctypes.Structure):
 class Pins(ctypes.Structure):
     """GPIO_TypeDef."""
 
-    _fields_ = (
-        *((name, ctypes.c_uint32) for name in PIN_REGISTERS.split()),
-        ("AFR", ctypes.c_uint32 * 2),
-    )
+    _fields_ = (*((name, ctypes.c_uint32) for name in PIN_REGISTERS.split()), ("AFR", ctypes.c_uint32 * 2))
 
 
 def build_app(

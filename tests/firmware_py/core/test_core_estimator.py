@@ -17,12 +17,7 @@ from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation
 
 from firmware_py.core import entry
-from firmware_py.core.structs import (
-    HISTORY,
-    POSE_INVALID,
-    POSE_ON_TIME,
-    Parameters,
-)
+from firmware_py.core.structs import HISTORY, POSE_INVALID, POSE_ON_TIME, Parameters
 from ground_station.trajectory import Goal, Offsets, Sine, Square, Trajectory
 from hil.experiments import Experiment
 from hil.laboratory.lockstep import lockstep_flight

@@ -22,13 +22,7 @@ from firmware_py.export.crazyflie import write_app
 from firmware_py.export.errors import ExportError
 from firmware_py.export.profile_c import profile_hash
 from firmware_py.firmware import Firmware
-from firmware_py.geometry import (
-    Quaternion,
-    Vector,
-    from_euler_zyx,
-    in_goal_frame,
-    yaw_quaternion,
-)
+from firmware_py.geometry import Quaternion, Vector, from_euler_zyx, in_goal_frame, yaw_quaternion
 from firmware_py.wire import crtp, telemetry
 from hil.config import LabConfig, load_config
 from hil.devices.board import VirtualBoard

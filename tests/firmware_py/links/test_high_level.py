@@ -124,9 +124,7 @@ def test_take_off_go_to_and_land_move_the_goal_and_the_estimator_gets_the_error(
     assert absolute.state == "WAITING"
 
 
-def test_corrections_are_flown_unchanged_until_the_commander_moves_the_goal(
-    relative: Flyer,
-) -> None:
+def test_corrections_are_flown_unchanged_until_the_commander_moves_the_goal(relative: Flyer) -> None:
     assert relative.state == "FLYING"
     relative.place = (0.02, 0.0, 0.01)
     relative.wait(0.5)

@@ -123,8 +123,7 @@ def test_the_age_of_a_pose_is_true_whatever_the_stations_clock_shows(ahead_us: i
 
 
 @pytest.mark.parametrize(
-    ("lag_us", "age_us"),
-    [(-5_200, None), (-4_800, 0), (-200, 0), (499_800, 499_800), (500_200, None)],
+    ("lag_us", "age_us"), [(-5_200, None), (-4_800, 0), (-200, 0), (499_800, 499_800), (500_200, None)]
 )
 def test_ages_within_the_clock_error_are_zero_and_longer_ones_unknown(
     lag_us: int, age_us: int | None
@@ -336,9 +335,7 @@ def test_the_older_request_sets_groups_of_streams(client: MavlinkClient) -> None
     assert "LOCAL_POSITION_NED" not in counts
 
 
-def test_on_a_full_line_replies_wait_and_streams_are_dropped(
-    client: MavlinkClient,
-) -> None:
+def test_on_a_full_line_replies_wait_and_streams_are_dropped(client: MavlinkClient) -> None:
     client.uart_room = 0
     client.command(511, 30, 1000)
     client.run(client.now_us + 1_000_000)
@@ -453,9 +450,7 @@ def test_a_bad_value_echoes_the_old_one(client: MavlinkClient, name: bytes, valu
     assert client.stack.refused == 2
 
 
-def test_each_impossible_parameter_request_is_answered_with_the_reason(
-    client: MavlinkClient,
-) -> None:
+def test_each_impossible_parameter_request_is_answered_with_the_reason(client: MavlinkClient) -> None:
     def error(name: str, *fields: Any) -> tuple[Any, ...]:
         (found,) = [a for a in client.ask(name, 1, 1, *fields) if a.get_type() == "PARAM_ERROR"]
         assert (found.target_system, found.target_component) == (255, 190)

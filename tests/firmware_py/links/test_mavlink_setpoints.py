@@ -207,9 +207,7 @@ def test_the_older_message_chooses_modes_as_well(client: MavlinkClient) -> None:
     assert client.command(DO_SET_MODE, 1, 3, 0)[0].result == DENIED
 
 
-def test_offboard_ends_half_a_second_after_the_last_setpoint_keeping_the_goal(
-    client: MavlinkClient,
-) -> None:
+def test_offboard_ends_half_a_second_after_the_last_setpoint_keeping_the_goal(client: MavlinkClient) -> None:
     offboard(client)
     for x in (0.0, 0.05, 0.1):
         client.run(client.now_us + 400_000)
@@ -256,9 +254,7 @@ def test_a_target_outside_the_box_names_the_parameters(client: MavlinkClient, x:
     assert aim(client) == round(inside[0], 6)
 
 
-def test_the_box_follows_its_parameters_and_a_goal_outside_may_return(
-    client: MavlinkClient,
-) -> None:
+def test_the_box_follows_its_parameters_and_a_goal_outside_may_return(client: MavlinkClient) -> None:
     client.ask("param_set", 1, 1, b"BOX_RADIUS", 1.0, 9)
     assert texts(client, "set_position_target_local_ned", *target(0.9)) == []
     client.ask("param_set", 1, 1, b"BOX_RADIUS", 0.1, 9)

@@ -24,9 +24,7 @@ def test_nobody_knows_before_the_first_answer() -> None:
 
 
 @given(st.lists(st.tuples(delays, delays), min_size=1, max_size=2 * WINDOW))
-def test_the_offset_error_is_at_most_half_the_shortest_round_trip(
-    rounds: list[tuple[int, int]],
-) -> None:
+def test_the_offset_error_is_at_most_half_the_shortest_round_trip(rounds: list[tuple[int, int]]) -> None:
     clock = RemoteClock()
     for number, (there_us, back_us) in enumerate(rounds):
         exchange(clock, number * 500_000, there_us, back_us)

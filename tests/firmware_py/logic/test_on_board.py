@@ -85,9 +85,7 @@ def test_mavlink_has_room_for_the_longest_name(config: LabConfig) -> None:
     assert (found.param_id, found.param_value) == ("OWN_TWELVE_CHARS", pytest.approx(0.1))
 
 
-def test_a_failing_law_holds_the_hover_angles_until_recovery(
-    config: LabConfig,
-) -> None:
+def test_a_failing_law_holds_the_hover_angles_until_recovery(config: LabConfig) -> None:
     bench = Bench(config)
     bench.run(GYRO_ZERO_US + 300_000)
     assert bench.supervisor.state is State.FLYING

@@ -143,12 +143,7 @@ def test_block_fits_a_packet_and_comes_back(block):
 
 @pytest.mark.parametrize("block", telemetry.ALL_BLOCKS, ids=lambda block: f"block{block.id}")
 def test_cflib_reads_the_block(block):
-    names = {
-        Scalar.U8: "uint8_t",
-        Scalar.U16: "uint16_t",
-        Scalar.F32: "float",
-        Scalar.F16: "FP16",
-    }
+    names = {Scalar.U8: "uint8_t", Scalar.U16: "uint16_t", Scalar.F32: "float", Scalar.F16: "FP16"}
     config = LogConfig("theirs", block.period_ms)
     for variable in block.variables:
         config.add_variable(variable.name, names[variable.type])

@@ -97,9 +97,7 @@ def test_a_fault_that_the_flights_end_cuts_off_lasts_no_longer_than_to_there() -
     assert max(span for span in tried if span != 9.0) <= DURATION_S - 8.0
 
 
-def test_a_flight_that_fails_differently_is_not_the_shrunk_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_flight_that_fails_differently_is_not_the_shrunk_one(monkeypatch: pytest.MonkeyPatch) -> None:
     results = [
         SimpleNamespace(passed=False, outcome=name, verdicts=(), failed=(), cause="")
         for name in ("lost", "completed")
@@ -128,9 +126,7 @@ def test_what_is_harmless_can_be_written() -> None:
 
 @pytest.mark.long
 def test_the_command_shrinks_a_flight_that_is_lost_and_says_how_to_fly_it(
-    cli: Cli,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: pytest.TempPathFactory,
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: pytest.TempPathFactory
 ) -> None:
     monkeypatch.chdir(str(tmp_path))
     text = """

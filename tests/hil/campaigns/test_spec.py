@@ -94,10 +94,7 @@ def test_a_bad_spec_is_one_line_and_exit_code_two(
         (["nowhere.toml"], "campaign nowhere.toml: No such file"),
         (["tabel"], "campaign 'tabel': neither the name of a campaign (did you mean table?) nor a path"),
         (["table", "--shrink", "1000"], "--shrink 1000: the campaign has flights 0..999"),
-        (
-            ["table", "--workers", "2", "--cluster", "tcp://a:1"],
-            "--workers 2: not together with --cluster",
-        ),
+        (["table", "--workers", "2", "--cluster", "tcp://a:1"], "--workers 2: not together with --cluster"),
     ],
 )
 def test_a_bad_option_is_one_line_and_exit_code_two(

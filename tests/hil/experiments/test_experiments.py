@@ -176,10 +176,7 @@ def test_the_default_profile_holds_the_limits(tmp_path: Path, name: str, link: s
 def test_the_authors_gains_hold_their_own_limits(tmp_path: Path, name: str) -> None:
     result = flown(tmp_path / "run", name, profile="as-flown", seed=7)
     assert result.passed, explain(result)
-    assert {verdict.metric for verdict in result.verdicts} == {
-        *load_config("as-flown").limits[name],
-        *ALWAYS,
-    }
+    assert {verdict.metric for verdict in result.verdicts} == {*load_config("as-flown").limits[name], *ALWAYS}
 
 
 @pytest.mark.long

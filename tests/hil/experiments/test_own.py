@@ -102,8 +102,7 @@ def test_an_experiment_of_a_file_is_flown_and_its_run_names_the_file_and_its_has
 def test_experiments_of_a_file_fly_in_other_processes_with_the_same_hash(cli: Cli) -> None:
     Path("neighbour.py").write_text("REACH = 0.05\n")
     write(
-        "from neighbour import REACH\nwide = " + PLAIN % ", Along(lambda t: (0.0, REACH * t, 0.0))",
-        "mine.py",
+        "from neighbour import REACH\nwide = " + PLAIN % ", Along(lambda t: (0.0, REACH * t, 0.0))", "mine.py"
     )
     write("other = " + PLAIN % "", "other.py")
     assert cli("list", "other.py") == 0

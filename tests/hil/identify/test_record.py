@@ -207,9 +207,7 @@ def test_the_worst_record_counts_and_of_several_the_clearest_response() -> None:
     assert Evidence.of(Estimate({}, {}, 1.0), [calm], []).coherence == 1.0
 
 
-def test_rates_sampled_before_the_inputs_belong_to_the_next_tick(
-    tmp_path: Path,
-) -> None:
+def test_rates_sampled_before_the_inputs_belong_to_the_next_tick(tmp_path: Path) -> None:
     early = loaded(tmp_path, columns(120, begin_ms=1009))
     late = loaded(tmp_path, columns(120, begin_ms=1008))
     assert early.u_t[0] == late.u_t[0] == pytest.approx(1.0)

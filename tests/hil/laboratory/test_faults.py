@@ -491,11 +491,7 @@ LONGEST = {
     "marker.hidden@1:0.7=6": "failsafe",  # two are too few
     "marker.noise@1:0.7=6": "failsafe",  # it fits too badly
 }
-STATED = {
-    **{f"{name}@1": kind.outcome for name, kind in OF_FLOATY.items()},
-    **LONGER,
-    **LONGEST,
-}
+STATED = {**{f"{name}@1": kind.outcome for name, kind in OF_FLOATY.items()}, **LONGER, **LONGEST}
 
 
 # The others are in the long tier.

@@ -427,10 +427,7 @@ def test_battery_and_load_are_logged_and_shown_where_the_board_tells_them(tmp_pa
     voltages = log.column("battery.voltage").to_numpy()
     assert np.isnan(voltages[:95]).all()
     assert voltages[105:] == pytest.approx(3.9)
-    assert [panel.label for panel in figures.station(log).panels] == [
-        "not used [so far]",
-        "battery [V]",
-    ]
+    assert [panel.label for panel in figures.station(log).panels] == ["not used [so far]", "battery [V]"]
 
 
 def test_a_counter_of_sixteen_bits_goes_on_where_it_wraps() -> None:

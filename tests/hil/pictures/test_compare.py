@@ -126,14 +126,11 @@ def test_metrics_stand_side_by_side_in_the_unit_of_the_table(runs: dict[str, Pat
     assert told["rms_x"].difference == pytest.approx(100 * (b["rms_x"] - a["rms_x"]))
 
 
-def test_metrics_of_unequal_flights_cover_the_common_time(
-    runs: dict[str, Path],
-) -> None:
+def test_metrics_of_unequal_flights_cover_the_common_time(runs: dict[str, Path]) -> None:
     long = load_flown(runs["one"])
     rows = long.log.num_rows - 30  # 0.3 s less
     short = FlownRun(
-        long.log.slice(0, rows),
-        replace(long.result, metrics=measure(long.log.slice(0, rows), lost=False)),
+        long.log.slice(0, rows), replace(long.result, metrics=measure(long.log.slice(0, rows), lost=False))
     )
     for a, b in ((long, short), (short, long)):
         comparison = compare(a, b)
@@ -145,9 +142,7 @@ def test_metrics_of_unequal_flights_cover_the_common_time(
 
 
 @pytest.mark.long
-def test_flights_are_compared_by_the_time_since_their_release(
-    runs: dict[str, Path],
-) -> None:
+def test_flights_are_compared_by_the_time_since_their_release(runs: dict[str, Path]) -> None:
     a, b = load_flown(runs["one"]), load_flown(runs["two"])
     assert compare(a, b).apart == (), "row by row"
     t = b.log.column_names.index("t")

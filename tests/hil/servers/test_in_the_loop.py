@@ -246,9 +246,7 @@ def test_a_flight_stands_still_for_a_time_and_goes_on_with_the_last_sample(host:
     assert host.looped[-1].late in range(told.late, 101)
 
 
-def test_samples_wait_behind_a_gap_and_repeated_ones_are_dropped(
-    host: Host,
-) -> None:
+def test_samples_wait_behind_a_gap_and_repeated_ones_are_dropped(host: Host) -> None:
     host.run(100)
     host.count += 4
     host.run(60)
@@ -305,9 +303,7 @@ def test_a_packet_holds_as_many_samples_as_fit(host: Host) -> None:
     assert encode_samples(0, [*steady[:2], (9000, 0, 0), *wild])[1] == 4
 
 
-def test_without_the_host_the_board_flies_on_for_a_time_then_enters_failsafe(
-    host: Host,
-) -> None:
+def test_without_the_host_the_board_flies_on_for_a_time_then_enters_failsafe(host: Host) -> None:
     host.run(1000, poses=True)
     host.run(600, sending=False)
     assert host.looped[-1].state == State.FLYING

@@ -36,15 +36,7 @@ from hil.errors import LabError
 from hil.servers.dongle_server import HOST
 from hil.servers.motive import MAX_CLIENTS, Streaming, Up, VirtualMotive, in_axes
 from hil.servers.natnet_bytes import encode_frame, encode_models, encode_server_info
-from support.motive_bench import (
-    FROM_MOTIVE,
-    LATENCY_US,
-    PLACES,
-    MotiveBench,
-    needs,
-    seen,
-    sighted,
-)
+from support.motive_bench import FROM_MOTIVE, LATENCY_US, PLACES, MotiveBench, needs, seen, sighted
 from support.paths import SUPPORT
 
 VERSIONS = [(3, 0), (3, 1), (4, 0), (4, 1)]
@@ -330,8 +322,7 @@ def test_no_bytes_stop_the_server(lab: MotiveBench, client: NatNetSocket) -> Non
 
 def test_a_taken_port_is_said_in_one_line(lab: MotiveBench) -> None:
     with pytest.raises(
-        LabError,
-        match=rf"^natnet port {lab.motive.port}: Address already in use; --set capture.port=0 takes",
+        LabError, match=rf"^natnet port {lab.motive.port}: Address already in use; --set capture.port=0 takes"
     ):
         VirtualMotive(Streaming(lab.motive.port, (4, 1), False), {1: "floaty"}, {})
 

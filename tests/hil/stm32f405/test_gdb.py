@@ -16,15 +16,7 @@ from hil.errors import LabError
 from hil.stm32f405.chip import CYCLES_PER_US, Why
 from hil.stm32f405.freertos import FreeRtos
 from hil.stm32f405.gdb import DebuggedChip, GdbServer
-from hil.stm32f405.gdb_protocol import (
-    PACKET_SIZE,
-    REGISTERS,
-    SIGINT,
-    SIGTRAP,
-    RemoteProtocol,
-    Wish,
-    framed,
-)
+from hil.stm32f405.gdb_protocol import PACKET_SIZE, REGISTERS, SIGINT, SIGTRAP, RemoteProtocol, Wish, framed
 from hil.stm32f405.image import Image
 from support import stm32_firmware
 from support.bare_cortex import BareCortex

@@ -89,9 +89,7 @@ def test_who_is_not_selected_neither_answers_nor_listens(bench: Selected) -> Non
     assert bench.told == []
 
 
-def test_a_second_byte_waits_in_the_register_and_a_third_overruns(
-    bench: Selected,
-) -> None:
+def test_a_second_byte_waits_in_the_register_and_a_third_overruns(bench: Selected) -> None:
     bench.select(True)
     bench[SPI1 + DR] = 0x10
     bench[SPI1 + DR] = 0

@@ -77,9 +77,7 @@ def test_expected(floaty):
 """
 
 
-def test_a_broken_controller_is_one_message_without_traceback(
-    pytester: pytest.Pytester,
-) -> None:
+def test_a_broken_controller_is_one_message_without_traceback(pytester: pytest.Pytester) -> None:
     make_project(pytester.path, LAW.replace("DT * memory", "sum([v for v in control.u]) * memory"))
     tests = pytester.makepyfile(BROKEN).name
     result = pytester.runpytest_inprocess()
@@ -173,9 +171,7 @@ def test_run_folders_are_kept_as_asked(pytester: pytest.Pytester, keep: str, num
     assert (pytester.path / "runs" / "pytest").is_dir() == bool(numbers)
 
 
-def test_every_test_can_examine_the_flight_of_a_module_fixture(
-    pytester: pytest.Pytester,
-) -> None:
+def test_every_test_can_examine_the_flight_of_a_module_fixture(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
         import pytest
 
@@ -251,9 +247,7 @@ def test_command_line_overrides_mark(marked: dict[str, object], wanted: Wanted, 
 
 
 @pytest.mark.long
-def test_paths_start_at_the_root_folder_and_ini_names_the_profile(
-    pytester: pytest.Pytester,
-) -> None:
+def test_paths_start_at_the_root_folder_and_ini_names_the_profile(pytester: pytest.Pytester) -> None:
     pytester.makeini("[pytest]\nfloaty_profile = strict.toml\n")
     (pytester.path / "strict.toml").write_text(STRICT)
     (pytester.path / "flights.py").write_text(
@@ -379,9 +373,7 @@ def test_the_junit_file_has_hash_command_and_metrics(pytester: pytest.Pytester) 
 
 
 @pytest.mark.long
-def test_under_xdist_every_test_has_its_own_folders_and_the_same_hashes(
-    pytester: pytest.Pytester,
-) -> None:
+def test_under_xdist_every_test_has_its_own_folders_and_the_same_hashes(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
         import pytest
 
