@@ -53,7 +53,7 @@ def test_arbitrary_calls_give_the_bits_of_python(recording: Recording, runner: R
         assert run_step(core, step) == after, f"call {number}, {step.call}"
 
 
-def test_what_one_runner_begins_another_one_continues(recording: Recording, runner: RunnerFactory) -> None:
+def test_one_runner_continues_what_another_began(recording: Recording, runner: RunnerFactory) -> None:
     """All state lies in the blocks: runners that take turns with Python's compute what one alone does."""
     core = core_at_start(recording, runner)
     runners = (core.run, PythonRunner(core))

@@ -206,7 +206,7 @@ def in_flight(happen: Callable[[SupervisorBench], object], now_us: int = 0) -> S
 
 @EVENTS
 @pytest.mark.parametrize("manual", MANUALS)
-def test_angles_from_outside_move_the_flaps_unless_somebody_the_battery_or_own_logic_stopped_the_robot(
+def test_manual_angles_act_unless_the_robot_was_stopped(
     happen: Callable[[SupervisorBench], object], cause: Cause, flown_by: tuple[int, int, int], manual: int
 ) -> None:
     bench = in_flight(happen)
@@ -227,7 +227,7 @@ def test_bounded_steps_50_ms_apart_are_one_episode_that_counts_at_200_ms(gap_us:
         bench.fly(gap_us - 10_000)
 
 
-def test_an_episode_after_a_silent_one_begins_anew() -> None:
+def test_an_episode_after_a_silent_one_restarts() -> None:
     bench = in_flight(lambda bench: None)
     for _ in range(3):
         bench.fly(3_800_000)
@@ -238,7 +238,7 @@ CAN_BE_ARMED, CAN_FLY = 1 << 0, 1 << 3
 
 
 @EVENTS
-def test_a_board_that_says_that_it_can_fly_flies_at_the_next_pose(
+def test_a_board_that_can_fly_flies_at_the_next_pose(
     happen: Callable[[SupervisorBench], object], cause: Cause, flown_by: tuple[int, int, int]
 ) -> None:
     bench = in_flight(happen)
@@ -249,7 +249,7 @@ def test_a_board_that_says_that_it_can_fly_flies_at_the_next_pose(
 
 
 @EVENTS
-def test_a_disarmed_board_that_says_that_it_can_be_armed_obeys(
+def test_a_board_that_reports_can_be_armed_arms(
     happen: Callable[[SupervisorBench], object], cause: Cause, flown_by: tuple[int, int, int]
 ) -> None:
     bench = in_flight(happen)
@@ -282,7 +282,7 @@ def test_silence_begins_when_the_last_pose_is_as_old_as_its_limit(start_us: int,
         (fell_silent, Cause.SILENCE),
     ],
 )
-def test_what_is_decided_by_time_is_decided_over_the_wrap_of_its_clock(
+def test_timed_decisions_survive_the_clock_wrap(
     happen: Callable[[SupervisorBench], object], cause: Cause, start_us: int
 ) -> None:
     bench = in_flight(lambda bench: bench.fly(500_000), start_us)
@@ -318,7 +318,7 @@ def test_a_board_that_is_disarmed_while_it_calibrates_is_in_failsafe() -> None:
     assert bench.found == (State.FAILSAFE, Cause.DISARMED)
 
 
-def test_a_board_says_that_it_can_fly_when_its_gyro_is_calibrated_and_not_before() -> None:
+def test_a_board_can_fly_only_after_gyro_calibration() -> None:
     bench = SupervisorBench()
     told = [supervisor_bits(bench.view) & CAN_FLY]
     bench.calibrate()
@@ -380,7 +380,7 @@ def test_a_gyro_is_stale_after_20_steps_and_alive_after_100_with_new_counts() ->
     assert found == [False, True, True, False]
 
 
-def test_a_sample_that_is_late_on_a_link_is_no_fault_of_the_gyro() -> None:
+def test_a_late_sample_on_a_link_is_not_a_stale_gyro() -> None:
     bench = in_flight(lambda bench: None)
     bench.data.gyro_again = 1
     bench.steps(10 * STALE_STEPS)
@@ -397,13 +397,13 @@ def test_control_is_lost_once_after_50_ms_without_a_look_and_until_the_next_one(
         assert bench.fly(10_000) == MODE_FLY
 
 
-def test_nobody_misses_a_controller_that_has_not_begun() -> None:
+def test_a_controller_that_has_not_begun_is_not_lost() -> None:
     bench = SupervisorBench(look=False)
     assert bench.watch_control(1_000_000) == 0
     assert bench.view.state is State.CALIBRATING
 
 
-def test_a_flight_that_begins_afresh_waits_for_gyro_and_pose_and_is_not_armed_by_it() -> None:
+def test_a_restarted_flight_waits_for_gyro_and_pose_and_stays_disarmed() -> None:
     bench = in_flight(lambda bench: bench.fly(100_000))
     bench.view.arm(False)
     bench.core.run.call("begin_afresh")
@@ -416,7 +416,7 @@ def test_a_flight_that_begins_afresh_waits_for_gyro_and_pose_and_is_not_armed_by
     assert bench.view.state is State.WAITING
 
 
-def test_a_robot_without_anything_to_fly_to_waits() -> None:
+def test_a_robot_without_a_goal_waits() -> None:
     bench = in_flight(lambda bench: bench.fly(100_000))
     bench.data.absolute = 1
     bench.pilot.measured(Correction((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), None), bench.now_us)
@@ -504,7 +504,7 @@ def test_state_and_cause_are_log_variables(flying: CrtpClient) -> None:
     assert flying.log(table, *names) == [3, 3, 0, 0, 0b10_0100_0110]
 
 
-def test_flaps_never_rest_whatever_the_supervisor_says(flying: CrtpClient) -> None:
+def test_flaps_are_written_in_every_supervisor_state(flying: CrtpClient) -> None:
     stop(flying)
     flying.run(flying.now_us + 500_000)
     times = [t for t, _ in flying.writes]

@@ -75,7 +75,7 @@ def test_same_seed_same_hash(flown: Result, tmp_path: Path) -> None:
     assert again.hash == flown.hash
 
 
-def test_a_body_in_free_fall_falls_as_galileo_says(tmp_path: Path) -> None:
+def test_a_body_in_free_fall_falls_as_galileo_found(tmp_path: Path) -> None:
     robot = FLOATING.replace("0.981)", "0.0)")
     body = make_body(load_config(project(tmp_path, robot)), np.random.default_rng(1), (0.0, 0.0, 1.15))
     body.hold()
@@ -175,7 +175,7 @@ def test_a_body_that_fails_in_flight_is_lost_with_the_cause(value: str, cause: s
     assert result.cause == f"{cause} at 1.20 s"
 
 
-def test_power_that_is_no_number_in_flight_ends_it(tmp_path: Path) -> None:
+def test_a_nan_power_ends_the_flight(tmp_path: Path) -> None:
     power = "\n    def power(self):\n        return 1.0 if self.time_s < 1.2 else float('nan')\n"
     result = hover(tmp_path / "run", profile=project(tmp_path, FLOATING + power), duration_s=1.0)
     assert result.outcome == "lost"

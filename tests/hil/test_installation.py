@@ -38,7 +38,7 @@ def test_the_first_line_is_for_programs_and_the_others_are_aligned(program: Prog
     assert len({len(row[0]) for line in others if (row := re.match(r"\w+( [\w-]+)? {2,}", line))}) == 1
 
 
-def test_without_git_and_tools_it_says_so(program: Program) -> None:
+def test_missing_git_and_tools_are_reported(program: Program) -> None:
     found = rows()
     assert found["commit"] == "unknown"
     assert {name: text for name, text in found.items() if name.startswith("program")} == {

@@ -67,7 +67,7 @@ def plant(project: Path, *rows: str, options: tuple[str, ...] = ()) -> int:
 
 
 @pytest.mark.long
-def test_what_the_tests_see_is_caught_and_what_they_do_not_see_survives(project, capsys) -> None:
+def test_detected_mistakes_are_caught_and_others_survive(project, capsys) -> None:
     assert plant(project, CAUGHT, SURVIVES, options=("--jobs", "2")) == 1
     said = capsys.readouterr().out
     assert "1 of 2 caught, 50.0 %; survived:\n  steps.py: abs(n) -> n\n" in said
@@ -81,7 +81,7 @@ def test_with_95_percent_of_the_chosen_rows_caught_all_is_well(project, capsys) 
 
 
 @pytest.mark.long
-def test_an_endless_loop_is_caught_where_the_row_says_so(project, capsys, monkeypatch) -> None:
+def test_an_endless_loop_is_caught_where_the_row_allows_it(project, capsys, monkeypatch) -> None:
     monkeypatch.setattr(planted_mistakes, "LIMIT_S", 1)
     assert plant(project, HANGS, TOO_SLOW) == 1
     said = capsys.readouterr().out

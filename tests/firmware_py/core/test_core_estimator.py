@@ -564,7 +564,7 @@ def test_variances_do_not_grow_beyond_their_bound() -> None:
 @pytest.mark.parametrize(
     "place", [*(("x", state) for state in range(16)), ("P", (4, 4)), ("P", (8, 8)), ("P", (4, 9))]
 )
-def test_broken_state_starts_afresh_from_the_next_pose(place: tuple[str, object], bad: float) -> None:
+def test_a_broken_state_restarts_from_the_next_pose(place: tuple[str, object], bad: float) -> None:
     p, q = (0.3, -0.2, 0.1), quaternion(yaw=2.0)
     core = settled(p, q)
     name, index = place
@@ -597,7 +597,7 @@ def test_broken_state_does_not_reach_the_controller_while_the_filter_waits() -> 
     assert_sane(core)
 
 
-def test_the_report_has_the_attitude_twice_every_pose_once_and_the_flaps_as_they_stand() -> None:
+def test_the_report_has_attitude_poses_and_flaps() -> None:
     core = settled((0.1, 0.2, 0.3), quaternion(0.3, -0.2, 1.0))
     for p, age_us in (((0.6, 0.2, 0.3), 40_000), ((math.nan, 0, 0), 40_000), ((0, 0, 0), 200_000)):
         core.pose(p, LEVEL, age_us)

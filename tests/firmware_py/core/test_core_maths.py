@@ -140,5 +140,5 @@ def test_hyperbolic_tangent_is_exact_to_4e_7_of_its_value_everywhere() -> None:
     assert np.abs(np.array([maths.tanh(a) for a in x]) / exact - 1).max() < 4e-7
 
 
-def test_hyperbolic_tangent_of_no_number_is_none() -> None:
+def test_hyperbolic_tangent_of_nan_is_nan() -> None:
     assert np.isnan(maths.tanh(f32(math.nan)))

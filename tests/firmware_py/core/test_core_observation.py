@@ -44,7 +44,7 @@ def test_an_action_is_limited_and_means_a_share_of_each_input_s_limit() -> None:
     assert control.fields.u.tolist() == [0.5, -0.25, 0.125, -0.5]
 
 
-def test_an_action_that_is_no_number_stays_so_for_the_guard() -> None:
+def test_a_nan_action_stays_nan_for_the_guard() -> None:
     parameters, control = parameters_of(CONFIG), Control.allocate()
     act(parameters.arg[0], np.full(ACTIONS, np.nan, np.float32), control.arg[0])
     assert np.isnan(control.fields.u).all()

@@ -140,7 +140,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("body", "reason"), REFUSED, ids=[body for body, _ in REFUSED])
-def test_what_is_outside_the_subset_is_refused_with_file_line_and_reason(body: str, reason: str) -> None:
+def test_code_outside_the_subset_is_refused_with_file_line_and_reason(body: str, reason: str) -> None:
     with pytest.raises(ExportError) as refusal:
         translated(body)
     match = re.fullmatch(r"firmware_py/core/entry\.py:(\d+): (.*)", str(refusal.value))
@@ -181,7 +181,7 @@ REFUSED_KERNELS = [
 @pytest.mark.parametrize(
     ("text", "line", "reason"), REFUSED_KERNELS, ids=[case[2] for case in REFUSED_KERNELS]
 )
-def test_what_is_no_kernel_struct_or_constant_is_refused(text: str, line: int, reason: str) -> None:
+def test_unknown_objects_are_refused(text: str, line: int, reason: str) -> None:
     with pytest.raises(ExportError) as refusal:
         translated("y = x", text)
     first = PROBE.count("\n") + 1
@@ -229,7 +229,7 @@ def test_the_c_has_no_double_no_library_and_no_memory_of_its_own() -> None:
 
 
 @pytest.mark.skipif(not COMPILERS, reason="no C compiler")
-def test_a_struct_that_is_laid_out_otherwise_does_not_compile() -> None:
+def test_a_struct_of_another_layout_does_not_compile() -> None:
     swapped = C.header.replace("int32_t quiet_ticks;", "int32_t spare;\n    int32_t quiet_ticks;")
     with pytest.raises(ExportError, match="layout_FloatyEstimator"):
         build(Translation(swapped, C.source, ()), BUILD)
@@ -262,7 +262,7 @@ def test_arguments_that_are_only_read_are_const_and_private_functions_static() -
     ]
 
 
-def test_what_is_not_reached_is_left_out_and_the_version_follows_the_sources() -> None:
+def test_unreachable_code_is_left_out_and_the_version_follows_the_sources() -> None:
     texts = core_texts()
     texts["servo"] += (
         '\nSPARE = f32(7.0)\n\n\n@kernel\ndef spare(x: f32) -> f32:\n    """Spare."""\n    return x * SPARE\n'

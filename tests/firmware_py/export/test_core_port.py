@@ -169,7 +169,7 @@ def test_a_new_session_ends_the_old_one(app: App) -> None:
         (Message.WRITE, b"\0"), (Message.READ, b"\0\0"), (9, b""),
     ],
 )  # fmt: skip
-def test_what_lies_outside_is_refused_and_takes_no_number(app: App, request_: tuple[Message, bytes]) -> None:
+def test_requests_outside_are_refused_and_take_no_number(app: App, request_: tuple[Message, bytes]) -> None:
     begun(app)
     assert ask(app, BEGUN, request_).refusal() == Refusal.OUTSIDE
     assert ticks(app, BEGUN) == 0
@@ -201,7 +201,7 @@ def test_a_call_touches_nothing_that_flies(app: App) -> None:
     assert app.estimator() == flies
 
 
-def test_what_fell_into_its_failsafe_in_the_air_executes_nothing(flown: App) -> None:
+def test_a_board_in_failsafe_in_the_air_executes_nothing(flown: App) -> None:
     for request in (call(Call.ESTIMATE), loop(Hil.STILL), read(0, 4), write(0, b"\0")):
         assert ask(flown, BEGUN, request).refusal() == Refusal.FLYING
     assert ask(flown, BEGUN, health()).kind == Message.HEALTH
@@ -286,7 +286,7 @@ def test_a_flight_on_the_app_equals_python_bitwise_at_any_loss(app: App, mess: f
 
 
 @pytest.mark.long
-def test_what_the_board_computes_flies_even_where_it_is_wrong(tmp_path: Path) -> None:
+def test_the_board_s_results_fly_even_where_they_are_wrong(tmp_path: Path) -> None:
     folder = tmp_path / "app"
     library = build_app(
         folder, plant=("floaty_core.c", "control->count[flap] =", "control->count[flap] = 1 +")

@@ -204,7 +204,7 @@ def test_looking_ahead_tells_the_cost_and_leaves_the_memory_alone(image: CoreIma
     assert runner.usage == other.usage
 
 
-def test_what_was_seen_ahead_is_forgotten_when_the_inputs_change(image: CoreImage) -> None:
+def test_look_ahead_results_are_dropped_when_the_inputs_change(image: CoreImage) -> None:
     (blocks, runner), (direct, other) = started(image), started(image)
     for each in (blocks, direct):
         feed(each, 1)

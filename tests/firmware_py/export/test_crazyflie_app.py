@@ -293,7 +293,7 @@ def hover_of(app: App) -> list[int]:
     return hover
 
 
-def test_a_loop_that_stands_still_puts_the_servos_to_hover(app: App) -> None:
+def test_a_stopped_loop_moves_the_servos_to_hover(app: App) -> None:
     flying(app)
     hover = hover_of(app)
     assert app.counts() != hover
@@ -329,7 +329,7 @@ def test_poses_come_through_the_app_channel_too(app: App) -> None:
 
 
 @pytest.mark.parametrize("lacking", ["gyro_known", "sensors"])
-def test_a_board_without_a_bmi088_says_so_and_leaves_the_flaps_at_hover(app: App, lacking: str) -> None:
+def test_a_board_without_bmi088_reports_it_and_holds_hover(app: App, lacking: str) -> None:
     getattr(app, lacking).value = 1 - getattr(app, lacking).value
     app.boot()
     assert "no raw counts of a BMI088: flaps stay at hover" in app.console()
@@ -398,14 +398,14 @@ def test_an_age_beyond_what_is_logged_is_the_greatest_value(app: App) -> None:
 
 
 @pytest.mark.parametrize("reason", ["watchdog", "assert"])
-def test_after_a_watchdog_or_assert_reset_floaty_says_so_and_flies_on(app: App, reason: str) -> None:
+def test_after_a_watchdog_or_assert_reset_floaty_reports_it_and_flies_on(app: App, reason: str) -> None:
     getattr(app, f"after_{reason}").value = 1
     flying(app)
     assert f"SYS: after {reason}\n" in app.console()
     assert "restarted by watchdog or assert" in app.console()
 
 
-def test_a_self_test_that_does_not_pass_is_told_once(app: App) -> None:
+def test_a_failed_self_test_is_reported_once(app: App) -> None:
     app.c.appInit()
     app.c.stub_run_app(48)
     assert app.console() == ""
@@ -462,7 +462,7 @@ def test_a_switch_that_is_written_2_is_put_back_and_does_nothing(app: App, name:
     assert app.supervisor.state == reference.State.FLYING
 
 
-def test_while_another_controller_runs_the_state_is_no_flight(app: App) -> None:
+def test_under_another_controller_the_state_is_failsafe(app: App) -> None:
     flying(app)
     fly_on(app, 1200, 60, controlled=False)
     app.c.stub_run_app(1)
@@ -583,7 +583,7 @@ def test_absolute_poses_fly_as_corrections_to_a_goal(
     assert max(map(abs, estimate(app))) > 0.1
 
 
-def test_the_firmwares_commander_is_told_the_state_in_the_world(app: App) -> None:
+def test_the_firmwares_commander_gets_the_state_in_the_world(app: App) -> None:
     app.boot(absolute=True)
     commanded(app, **position(0.0, 0.0, 1.0, 170.0))
     q_WB = from_euler_zyx(0.02, -0.01, 3.2)
@@ -607,7 +607,7 @@ def test_until_something_is_commanded_floaty_holds_where_it_is(app: App) -> None
     assert app.supervisor.state == reference.State.FLYING
 
 
-def test_a_yaw_that_is_no_number_leaves_the_goals_yaw(app: App) -> None:
+def test_a_nan_yaw_leaves_the_goals_yaw(app: App) -> None:
     app.boot(absolute=True)
     commanded(app, **position(1.0, 2.0, 2.9, 40.0))
     absolute(app, 1, 300, P_WB, yaw_quaternion(1.0))

@@ -149,7 +149,7 @@ def test_arbitrary_bits_meet_no_undefined_behaviour_and_an_unclamped_conversion_
     assert done.stdout == ""
 
 
-def test_a_missing_compiler_is_one_line_that_says_what_to_install() -> None:
+def test_a_missing_compiler_is_one_line_with_the_package() -> None:
     with pytest.raises(ExportError, match=r"no C compiler tcc on this machine: .*pip install .*ziglang"):
         find_compiler("tcc")
 

@@ -78,7 +78,7 @@ def test_a_client_finds_the_crazyflie_protocol_version_12(client: CrtpClient) ->
         (3, b"\0", 0, 1),
     ],
 )
-def test_what_cannot_be_read_is_malformed_and_what_nobody_serves_unserved(
+def test_malformed_and_unserved_packets_are_counted(
     client: CrtpClient, channel: int, data: bytes, malformed: int, unserved: int
 ) -> None:
     client.send(LOC, channel, data)
@@ -116,7 +116,7 @@ def test_cflib_reads_every_entry_of_the_table(client: CrtpClient, port: int, ele
     assert client.one(port, 0, struct.pack("<BH", 2, count)) == b"\2"
 
 
-def test_a_parameter_that_cannot_be_written_says_so_in_the_table(client: CrtpClient) -> None:
+def test_read_only_parameters_are_marked_in_the_table(client: CrtpClient) -> None:
     count = struct.unpack_from("<H", client.one(PARAM, 0, b"\3"), 1)[0]
     table = [client.one(PARAM, 0, struct.pack("<BH", 2, number))[3:] for number in range(count)]
     entries = {f"{entry.group}.{entry.name}": entry for entry in map(ParamTocElement, range(count), table)}
@@ -507,7 +507,7 @@ def test_a_spoilt_store_is_an_empty_one(noise: bytes, place: int) -> None:
     assert storage.load() == (values if eeprom[1024:end] == before[1024:end] else {})
 
 
-def test_a_store_that_somebody_else_filled_with_strange_names_can_be_written() -> None:
+def test_a_store_with_foreign_names_can_be_written() -> None:
     eeprom = bytearray(b"\xff" * 8192)
     records = b"\4\xff\x80\0\xe9\2ab"
     eeprom[1024 : 1034 + len(records)] = struct.pack("<4sHI", b"FPS1", len(records), crc32(records)) + records

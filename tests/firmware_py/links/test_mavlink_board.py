@@ -66,7 +66,7 @@ def test_without_a_goal_the_board_flies_to_its_home(client: MavlinkClient) -> No
     assert last_pose(client)[0] == pytest.approx((0.1, 0.2, 0.3), abs=1e-6)
 
 
-def test_what_a_goal_masks_out_stays_as_it_was(client: MavlinkClient) -> None:
+def test_masked_parts_of_a_goal_stay_unchanged(client: MavlinkClient) -> None:
     target(client, (1.0, -2.0, -3.0), -math.pi / 2)
     target(client, (0.0, 0.0, 0.0), math.pi / 2, IGNORE_REST | IGNORE_POSITION)
     client.pose(((2.0, 2.0, 3.0), LEVEL))
@@ -155,7 +155,7 @@ def test_the_clock_is_asked_ten_times_a_second_until_five_answers_came_then_twic
 
 
 @pytest.mark.parametrize("lag_us", [600_000, -20_000])
-def test_an_age_that_cannot_be_is_no_age(lag_us: int) -> None:
+def test_an_impossible_age_is_unknown(lag_us: int) -> None:
     client = MavlinkClient()
     client.clock_ahead_us = 5_000_000
     client.poses(GYRO_ZERO_US, 2_000_000, lag_us=lag_us)
@@ -164,7 +164,7 @@ def test_an_age_that_cannot_be_is_no_age(lag_us: int) -> None:
     assert client.firmware.signals.supervisor.state is State.FLYING
 
 
-def test_only_the_clock_of_who_sends_poses_counts() -> None:
+def test_only_the_clock_of_the_sender_of_poses_counts() -> None:
     client = MavlinkClient()
     client.clock_ahead_us = 5_000_000
     client.poses(100_000, 1_500_000, lag_us=30_000)
@@ -200,7 +200,7 @@ def test_after_boot_every_stream_keeps_its_rate() -> None:
     assert client.of("HEARTBEAT")[0].get_srcComponent() == 1
 
 
-def test_an_interval_is_set_told_switched_off_and_returned_to_its_default(client: MavlinkClient) -> None:
+def test_an_interval_is_set_read_switched_off_and_reset(client: MavlinkClient) -> None:
     def interval() -> int:
         ack, answer = [a for a in client.command(510, 30) if a.get_type() != "ATTITUDE"]
         assert (ack.command, ack.result) == (510, 0)
@@ -227,7 +227,7 @@ def test_an_interval_is_set_told_switched_off_and_returned_to_its_default(client
 @pytest.mark.parametrize(
     "params", [(30, math.nan), (30, -2), (30, 0.5), (math.nan, 1000), (1e30, 1000), (3, 1000)]
 )
-def test_an_interval_that_cannot_be_is_denied(client: MavlinkClient, params: tuple[float, float]) -> None:
+def test_an_impossible_interval_is_denied(client: MavlinkClient, params: tuple[float, float]) -> None:
     assert client.command(511, *params)[0].result == DENIED
 
 
@@ -389,7 +389,7 @@ def test_more_streams_than_the_queue_takes_have_their_turns_too(client: MavlinkC
     assert 2 * min(counts.values()) >= max(counts.values()) - 2
 
 
-def test_what_waits_for_room_on_the_line_leaves_within_a_tick_of_it(client: MavlinkClient) -> None:
+def test_waiting_messages_leave_within_a_tick_of_room(client: MavlinkClient) -> None:
     for wait_us in range(1_000_000, 1_020_000, 2_000):
         client.uart_room = 0
         client.run(client.now_us + wait_us)
@@ -465,7 +465,7 @@ def test_each_impossible_parameter_request_is_answered_with_the_reason(client: M
     assert client.stack.refused == 8
 
 
-def test_an_unknown_parameter_is_told_to_people_once(client: MavlinkClient) -> None:
+def test_an_unknown_parameter_is_reported_in_text_once(client: MavlinkClient) -> None:
     assert [a.get_type() for a in client.ask("param_set", 1, 1, b"NONE", 1.0, 9)] == [
         "PARAM_ERROR",
         "STATUSTEXT",
@@ -538,7 +538,7 @@ def test_every_command_is_acknowledged_to_its_sender(client: MavlinkClient, kind
 
 
 @pytest.mark.parametrize("target", [(2, 1), (1, 2), (7, 0)])
-def test_a_command_for_somebody_else_is_ignored(client: MavlinkClient, target: tuple[int, int]) -> None:
+def test_a_command_for_another_system_is_ignored(client: MavlinkClient, target: tuple[int, int]) -> None:
     assert client.command(400, 0, target=target) == []
     assert client.stack.unserved == 1
     assert client.firmware.signals.supervisor.armed
@@ -560,7 +560,7 @@ def test_a_forced_stop_is_latched(client: MavlinkClient, params: tuple[float, ..
     assert why.severity == dialect.MAV_SEVERITY_WARNING
 
 
-def test_a_stop_that_can_be_left_says_how(client: MavlinkClient) -> None:
+def test_a_recoverable_stop_names_its_parameter(client: MavlinkClient) -> None:
     client.ask("param_set", 1, 1, b"FLOATY_STOP", 1, 9)
     ack, why = client.command(400, 1)
     assert (ack.result, why.text) == (TEMPORARILY_REJECTED, "not armed: stopped; set FLOATY_STOP 0")
@@ -576,7 +576,7 @@ def test_with_an_empty_battery_arming_is_refused_with_that_reason(client: Mavlin
 
 
 @pytest.mark.parametrize("kind", ["command_long", "command_int"])
-def test_a_board_on_the_ground_is_reset_once_what_it_said_has_left(client: MavlinkClient, kind: str) -> None:
+def test_a_grounded_board_resets_after_its_last_bytes(client: MavlinkClient, kind: str) -> None:
     fields = (246, 0, 1, 0, 0, 0, 0, 0, 0) if kind == "command_long" else (0, 246, 0, 0, 1, 0, 0, 0, 0, 0, 0)
     for _ in range(2):  # the second because the first acknowledgement was lost
         assert [answer.result for answer in client.ask(kind, 1, 1, *fields)] == [0]
@@ -611,7 +611,7 @@ def test_hardware_that_flies_lets_no_part_of_it_fail(client: MavlinkClient) -> N
     assert [answer.result for answer in client.command(420, 0, 2)] == [UNSUPPORTED]
 
 
-def test_the_heartbeat_says_armed_only_while_the_flaps_are_under_control() -> None:
+def test_the_heartbeat_is_armed_only_while_the_flaps_are_controlled() -> None:
     client = MavlinkClient()
     client.command(511, 0, 50_000)
 
@@ -639,13 +639,13 @@ def test_the_heartbeat_says_armed_only_while_the_flaps_are_under_control() -> No
     "params",
     [(400, 2), (400, math.nan), (185, 0), (185, 2), (245, 0), (245, 2), (246, 0), (246, 2), (246, math.nan)],
 )
-def test_a_parameter_that_cannot_be_is_denied(client: MavlinkClient, params: tuple[float, ...]) -> None:
+def test_impossible_command_parameters_are_denied(client: MavlinkClient, params: tuple[float, ...]) -> None:
     assert client.command(*params)[0].result == DENIED  # type: ignore[arg-type]
     assert client.firmware.signals.supervisor.armed
 
 
 @pytest.mark.parametrize("params", [(410,), (512, 242)])
-def test_home_is_where_the_configuration_says(client: MavlinkClient, params: tuple[float, ...]) -> None:
+def test_home_is_that_of_the_configuration(client: MavlinkClient, params: tuple[float, ...]) -> None:
     answers = {answer.get_type(): answer for answer in client.command(*params)}  # type: ignore[arg-type]
     home = answers["HOME_POSITION"]
     assert (home.x, home.y, home.z) == pytest.approx((0.0, 0.0, -1.15))
@@ -653,7 +653,7 @@ def test_home_is_where_the_configuration_says(client: MavlinkClient, params: tup
 
 
 @pytest.mark.parametrize("params", [(520, 1), (512, 148)])
-def test_the_version_is_told(client: MavlinkClient, params: tuple[float, ...]) -> None:
+def test_the_version_is_reported(client: MavlinkClient, params: tuple[float, ...]) -> None:
     answers = {answer.get_type(): answer for answer in client.command(*params)}  # type: ignore[arg-type]
     version = answers["AUTOPILOT_VERSION"]
     assert version.flight_sw_version.to_bytes(4, "big")[:2] == bytes((26, 11))
@@ -661,7 +661,7 @@ def test_the_version_is_told(client: MavlinkClient, params: tuple[float, ...]) -
 
 
 @pytest.mark.parametrize("params", [(519, 1), (512, 300)])
-def test_the_versions_of_the_protocol_are_told(client: MavlinkClient, params: tuple[float, ...]) -> None:
+def test_the_versions_of_the_protocol_are_reported(client: MavlinkClient, params: tuple[float, ...]) -> None:
     """In bytes, because pymavlink does not have the message."""
     ack, answer = (message for message in client.command(*params) if message.get_type() not in STREAMS)  # type: ignore[arg-type]
     assert (ack.command, ack.result) == (params[0], 0)

@@ -74,7 +74,7 @@ def test_a_connection_as_qgroundcontrol_makes_it_meets_no_silence(client: Mavlin
 
 
 @pytest.mark.parametrize("kind", [MISSION, FENCE, RALLY])
-def test_whatever_else_is_asked_or_told_of_missions_is_unsupported(client: MavlinkClient, kind: int) -> None:
+def test_other_mission_messages_are_unsupported(client: MavlinkClient, kind: int) -> None:
     item = (1, 1, 0, 3, 16, 0, 1, 0, 0, 0, 0, 0, 0, 0, kind)
     requests: dict[str, tuple[Any, ...]] = {
         "mission_count": (1, 1, 3, kind),
@@ -94,7 +94,7 @@ def test_whatever_else_is_asked_or_told_of_missions_is_unsupported(client: Mavli
     assert ack.type == dialect.MAV_MISSION_UNSUPPORTED
 
 
-def test_missions_and_logs_of_somebody_else_are_left_to_him(client: MavlinkClient) -> None:
+def test_mission_and_log_requests_to_another_system_are_ignored(client: MavlinkClient) -> None:
     assert client.ask("mission_request_list", 2, 1, 0) == []
     assert client.ask("log_request_list", 2, 1, 0, 0xFFFF) == []
     assert client.ask("set_mode", 2, 1, 4) == []

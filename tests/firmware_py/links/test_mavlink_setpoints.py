@@ -108,7 +108,7 @@ def test_other_messages_are_not_answered(client: MavlinkClient, name: str, field
     assert texts(client, name, *fields) == []
 
 
-def test_control_is_for_nobody_alone(client: MavlinkClient) -> None:
+def test_exclusive_control_is_refused(client: MavlinkClient) -> None:
     answers = client.ask("change_operator_control", 1, 0, 0, b"")
     (ack,) = [a for a in answers if a.get_type() == "CHANGE_OPERATOR_CONTROL_ACK"]
     assert (ack.gcs_system_id, ack.control_request, ack.ack) == (STATION[0], 0, 2)

@@ -133,7 +133,7 @@ DATA = [
 
 @pytest.mark.parametrize("board", EVERY)
 @pytest.mark.parametrize(("body", "before", "harmless"), DATA, ids=[body.split("\n")[0] for body, *_ in DATA])
-def test_a_loop_whose_length_depends_on_data_is_stopped_alike_on_every_target(
+def test_a_data_dependent_loop_stops_equally_on_every_target(
     blocks_of: Make, board: str, body: str, before: str, harmless: int | None
 ) -> None:
     text = law(body, before).replace("high=1000000)", "high=2000000000)")

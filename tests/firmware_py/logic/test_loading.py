@@ -300,7 +300,7 @@ def test_an_edited_module_is_never_mistaken_for_what_it_was(tmp_path: Path) -> N
     assert [after_one_tick(factor) for factor in ("0.25", "0.5", "0.25")] == [0.25, 0.5, 0.25]
 
 
-def test_what_is_loaded_needs_no_writable_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_loading_needs_no_writable_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     project = tmp_path / "project"
     project.mkdir()
     (project / "__pycache__").touch()  # no folder can be made there, not even by root

@@ -64,7 +64,7 @@ def test_parameters_are_taken_inside_their_bounds_and_can_be_stored(bench: Bench
     assert after.set(1_000_000) == OK
 
 
-def test_what_the_memory_marks_is_logged_and_nothing_else(bench: Bench) -> None:
+def test_only_marked_memory_is_logged(bench: Bench) -> None:
     names = [variable.name for variable in bench.firmware.variables if variable.name.startswith("logic.")]
     assert names == ["logic.integral", "logic.errors1", "logic.errors2", "logic.errors3", "logic.ticks"]
     y = bench.read("stateEstimate.y")

@@ -365,7 +365,7 @@ NO_WAIT = "must not wait while the scheduler is suspended"
         (doing(lambda kernel: kernel.current.priority_set(7)), "priority 7 is outside 0..6"),
     ],
 )
-def test_what_freertos_asserts_against_is_an_error_of_the_task(body, complaint):
+def test_an_assertion_of_freertos_is_an_error_of_the_task(body, complaint):
     kernel = Kernel()
     start(kernel, task=(1, body, kernel))
     with pytest.raises(TaskError, match=r"^task task at 0\.000 ms: ") as caught:
@@ -373,7 +373,7 @@ def test_what_freertos_asserts_against_is_an_error_of_the_task(body, complaint):
     assert complaint in str(caught.value)
 
 
-def test_what_need_not_wait_is_allowed_while_the_scheduler_is_suspended():
+def test_calls_that_need_not_wait_work_while_the_scheduler_is_suspended():
     kernel = Kernel()
     queue = kernel.create_queue(1, "queue")
     semaphore = kernel.create_binary_semaphore("semaphore")
@@ -518,7 +518,7 @@ def test_a_give_lets_a_taker_of_higher_priority_run_at_once(give):
     assert [who for _, event, who, *_ in lines if event == "Q_SEND"] == ["low"]
 
 
-def test_a_give_without_waiting_that_finds_the_semaphore_full_is_counted_and_wakes_nobody():
+def test_giving_a_full_semaphore_is_counted_and_wakes_no_task():
     lines = []
     kernel = Kernel(trace=lambda *line: lines.append(line))
     semaphore = kernel.create_binary_semaphore("semaphore")
@@ -536,7 +536,7 @@ def test_a_give_without_waiting_that_finds_the_semaphore_full_is_counted_and_wak
     ]
 
 
-def test_nothing_pends_for_a_task_that_woke_nobody_above_itself():
+def test_waking_a_lower_task_leaves_no_pending_yield():
     kernel = Kernel()
     semaphore = kernel.create_binary_semaphore("semaphore")
     pending = []
@@ -551,7 +551,7 @@ def test_nothing_pends_for_a_task_that_woke_nobody_above_itself():
     assert pending == [()]
 
 
-def test_a_task_that_waits_for_a_mutex_it_holds_is_an_error_when_a_lent_priority_would_be_taken_back():
+def test_waiting_for_a_held_mutex_fails_when_its_lent_priority_returns():
     kernel = Kernel()
     mutex = kernel.create_mutex("lock")
 

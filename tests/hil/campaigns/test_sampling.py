@@ -152,7 +152,7 @@ def test_a_campaign_over_seeds_alone_has_no_axes() -> None:
     assert [draw(spec, index).options["seed"] for index in range(3)] == [1, 2, 3]
 
 
-def test_nothing_warns_that_a_sample_is_no_power_of_two() -> None:
+def test_sample_sizes_cause_no_warning() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         points_of(spec_of(sampling="sobol", flights=37), 5, 11)

@@ -109,12 +109,12 @@ def test_a_flight_that_fails_differently_is_not_the_shrunk_one(monkeypatch: pyte
     assert not reflight.fails(reflight.whole)
 
 
-def test_a_flight_that_holds_cannot_be_shrunk() -> None:
+def test_a_passing_flight_cannot_be_shrunk() -> None:
     with pytest.raises(LabError, match="does not fail"):
         shrink(trial(*FAULTS), DURATION_S, lambda one: False)
 
 
-def test_what_is_harmless_can_be_written() -> None:
+def test_harmless_sizes_can_be_written() -> None:
     for name, kind in KINDS.items():
         size = harmless(name)
         if kind.sized:
@@ -125,7 +125,7 @@ def test_what_is_harmless_can_be_written() -> None:
 
 
 @pytest.mark.long
-def test_the_command_shrinks_a_flight_that_is_lost_and_says_how_to_fly_it(
+def test_the_command_shrinks_a_lost_flight_and_prints_its_command(
     cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: pytest.TempPathFactory
 ) -> None:
     monkeypatch.chdir(str(tmp_path))
@@ -158,7 +158,7 @@ size = 2.0
     assert cli(*command[1:]) == 1, "it fails"
 
 
-def test_what_is_shrunk_is_the_flight_that_was_drawn() -> None:
+def test_the_shrunk_flight_is_the_drawn_one() -> None:
     spec = spec_of(flights=8, sampling="sobol")
     drawn = next(one for one in (draw(spec, index) for index in range(8)) if one.options["faults"])
     reflight = Reflight(spec, drawn, print)

@@ -18,7 +18,7 @@ from support.serving import FLOATY
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
-def test_fly_writes_everything_and_says_where(cli: Cli, tmp_path: Path) -> None:
+def test_fly_writes_everything_and_prints_where(cli: Cli, tmp_path: Path) -> None:
     assert cli("fly", "hover", "--duration", "3", "--seed", "5") == 0
     folder = tmp_path / "runs" / "hover-5"
     expected = {

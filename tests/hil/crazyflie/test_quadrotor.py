@@ -271,7 +271,7 @@ def test_a_motor_without_current_runs_out_and_comes_back() -> None:
     assert body.rpm[2] == pytest.approx(before, rel=1e-6)
 
 
-def test_a_stuck_motor_stays_at_its_command_until_it_obeys_again() -> None:
+def test_a_stuck_motor_keeps_its_command_until_released() -> None:
     body = spun_up((0.6,) * 4)
     body.hold()
     before = body.rpm[3]

@@ -86,7 +86,7 @@ def test_the_first_difference_is_reported_with_its_tick_call_and_word(
         assert found.differences[0].bits == bits
 
 
-def test_a_target_that_answers_otherwise_is_found() -> None:
+def test_a_differing_target_is_found() -> None:
     class Late(PythonRunner):
         def call(self, name: str) -> int:
             return super().call(name) + (name == "file_pose")

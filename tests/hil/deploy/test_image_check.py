@@ -130,7 +130,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., FlownRun]:
     return fly_hover
 
 
-def test_flights_are_compared_by_what_their_bounds_say(flown: Callable[..., FlownRun]) -> None:
+def test_flights_are_compared_by_their_bounds(flown: Callable[..., FlownRun]) -> None:
     right = flown()
     assert [one.found for one in compare_flights(right, right)] == [0.0] * 10
     late = {one.bound.name: one for one in compare_flights(right, flown("mocap.latency@0.1:0.4=43"))}

@@ -161,7 +161,7 @@ def test_a_body_that_fits_badly_is_not_tracked() -> None:
     assert here.look(HOME, LEVEL).pose is not None
 
 
-def test_markers_that_are_not_seen_stand_where_the_body_has_them() -> None:
+def test_unseen_markers_are_placed_on_the_body() -> None:
     here = markers()
     here.hidden = 4
     sighting = here.look(HOME, LEVEL)

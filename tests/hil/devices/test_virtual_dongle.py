@@ -146,7 +146,7 @@ def test_the_hosts_jitter_delays_answers_and_stays_within_its_bound() -> None:
 
 
 @pytest.mark.parametrize("setting", [(81, 2, ADDRESS), (80, 1, ADDRESS), (80, 2, b"\xe7\xe7\xe7\xe7\x00")])
-def test_nobody_answers_on_another_channel_rate_or_address(setting: tuple[int, int, bytes]) -> None:
+def test_no_board_answers_on_another_channel_rate_or_address(setting: tuple[int, int, bytes]) -> None:
     bench = DongleWithBoards()
     bench.tune(*setting)
     assert bench.exchange(b"\x10hello") == b"\x00"
@@ -173,7 +173,7 @@ def test_giving_up_takes_as_long_as_the_tries(
     assert bench.events.now_us == pytest.approx(500 + (retries + 1) * try_us, abs=retries + 1)
 
 
-def test_ten_boards_hear_only_what_is_for_them() -> None:
+def test_ten_boards_receive_only_their_packets() -> None:
     bench = DongleWithBoards(boards=10)
     for n, board in enumerate(bench.boards):
         bench.tune(80, 2, board.settings.address)
@@ -182,7 +182,7 @@ def test_ten_boards_hear_only_what_is_for_them() -> None:
     assert [stm.packets for stm in bench.stms] == [[bytes((0x10, n))] for n in range(10)]
 
 
-def test_a_broadcast_reaches_every_board_on_its_channel_once_and_nobody_answers() -> None:
+def test_a_broadcast_reaches_every_board_on_its_channel_once_unanswered() -> None:
     bench = DongleWithBoards(boards=3)
     bench.boards[2].settings = AirSettings(81, 2_000_000, ADDRESS)
     bench.tune(80, 2, bytes.fromhex("FFE7E7E7E7"))
@@ -285,7 +285,7 @@ def test_safelink_brings_everything_once_and_in_order(up: float, down: float, be
     assert [bytes((packet[0] & 0xF3,)) + packet[1:] for packet in bench.stms[0].packets] == sent_up
 
 
-def test_without_acknowledgements_a_packet_is_sent_once_and_nobody_answers() -> None:
+def test_without_acknowledgements_a_packet_is_sent_once_unanswered() -> None:
     bench, answers = DongleWithBoards(uplink_loss=0.5), []
     bench.dongle.control(0x10, 0, b"")
     for _ in range(2000):
@@ -376,7 +376,7 @@ def test_every_received_try_is_passed_on_unless_safelink_knows_it(safelink: int,
     assert bench.stms[0].packets == [b"\x14hello"] * passed_on
 
 
-def test_a_command_that_names_none_does_nothing() -> None:
+def test_an_unknown_command_does_nothing() -> None:
     bench = DongleWithBoards()
     assert bench.exchange(b"\xff\xfe")[0] == 1
     bench.wait(RESET_DELAY_US + 1000)

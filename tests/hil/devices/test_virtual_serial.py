@@ -87,7 +87,7 @@ def test_messages_without_a_gap_share_chunks():
     assert bench.on_ground == [(640, b"a" * 40 + b"b" * 24), (810, b"b" * 16)]
 
 
-def test_a_gap_shorter_than_a_byte_is_no_silence():
+def test_a_gap_shorter_than_a_byte_does_not_end_a_chunk():
     bench = LineWithEnds(baud=1_000_000, host_latency_us=0)
     bench.write(0, b"a" * 10)
     bench.write(109, b"b" * 10)
@@ -192,7 +192,7 @@ def test_wrong_bits_begin_and_end_in_flight():
     assert [data for _, data in bench.on_ground] == [bytes(30), b"\xff" * 30, bytes(30)]
 
 
-def test_what_passes_a_pulled_cable_is_lost_and_counted():
+def test_bytes_on_a_pulled_cable_are_lost_and_counted():
     bench = LineWithEnds(baud=1_000_000)
     bench.line.connected = False
     bench.uplink(0, b"lost")

@@ -193,7 +193,7 @@ def test_saturated_flaps_make_no_constant_believable(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_what_is_not_excited_is_not_identifiable(tmp_path: Path) -> None:
+def test_an_unexcited_input_is_not_identifiable(tmp_path: Path) -> None:
     found = identified(tmp_path, flight(7))
     assert {found.constant(name).why for name in ("roll_u1", "yaw_rate", "z_u4")} == {
         "its axis is not excited"

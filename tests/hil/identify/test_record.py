@@ -140,7 +140,7 @@ def swinging(robot: Mapping[str, float], hertz: float = 2.0, seconds: float = 60
     return Record("r", t, t, inputs, 0 * inputs, rates, t, pose, 0.0, 0.0, CONFIG, False)
 
 
-def test_a_robot_that_moves_as_its_model_says_is_disturbed_by_nothing() -> None:
+def test_a_robot_that_follows_its_model_has_no_disturbance() -> None:
     robot = robot_of(CONFIG)
     record = swinging(robot)
     at = int(np.argmin(np.abs(FREQUENCIES - 2.0)))

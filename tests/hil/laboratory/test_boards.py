@@ -98,7 +98,7 @@ def test_over_a_link_only_python_flies(link: str) -> None:
 
 
 @pytest.mark.parametrize("missing", ["unicorn", "elftools.elf.elffile"])
-def test_a_missing_package_is_said_in_one_line(
+def test_a_missing_package_is_one_line(
     missing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, missing, None)

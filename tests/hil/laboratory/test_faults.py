@@ -58,7 +58,7 @@ def go(
 # What a text means
 
 
-def test_a_text_says_kind_start_duration_and_size() -> None:
+def test_a_text_gives_kind_start_duration_and_size() -> None:
     assert parse("mocap.dropout@10:0.5") == Fault("mocap.dropout", 10.0, 0.5, 1.0)
     assert parse("mocap.outlier@10:0.5=0.3") == Fault("mocap.outlier", 10.0, 0.5, 0.3)
     assert parse(" servo.stuck.2@5 ") == Fault("servo.stuck.2", 5.0, math.inf, 0.0)
@@ -418,7 +418,7 @@ def test_a_fault_turns_its_own_knobs_and_no_other(link: str) -> None:
         assert turned <= set(kind.knobs), kind.meaning
 
 
-def test_what_changed_between_two_faults_stays_changed() -> None:
+def test_a_change_between_two_faults_persists() -> None:
     flight = lockstep_flight(
         Request.of(HOVER, duration_s=1.0, faults=[parse("wind.fan@0.1:0.1=0.9"), parse("wind.fan@0.5:0.1=0.9")])
     )  # fmt: skip

@@ -59,7 +59,7 @@ def said(result: Result) -> list[str]:
         (HUNGRY_WATCHDOG, r"watchdog reset: nobody fed it in time; this ran then, in task SPIN-[01]: "),
     ],
 )
-def test_what_an_image_dies_of_is_an_event(
+def test_a_crash_s_cause_is_an_event(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, planted: int, expected: str
 ) -> None:
     result = flown(tmp_path, planted, 0.3, monkeypatch)

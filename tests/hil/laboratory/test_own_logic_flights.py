@@ -83,7 +83,7 @@ def test_a_law_with_an_endless_loop_is_a_failed_flight_that_names_file_and_line(
     assert any(event["source"] == "lab" and where in event["text"] for event in load_events(result.folder))
 
 
-def test_what_own_logic_logs_is_recorded_and_drawn(failed: Result) -> None:
+def test_own_logic_s_log_is_recorded_and_drawn(failed: Result) -> None:
     log = load_log(failed.folder)
     own = {field.name: field.metadata[b"unit"] for field in log.schema if field.name.startswith("logic.")}
     errors = {f"logic.errors{axis}": b"m" for axis in (1, 2, 3)}

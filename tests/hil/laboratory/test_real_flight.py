@@ -119,7 +119,7 @@ def test_the_cameras_judge_a_flight_as_the_truth_does(both: tuple[Path, Path]) -
     assert measured[0]["unseen"] == 0.0
 
 
-def test_the_estimate_of_a_real_board_stands_in_the_log_as_the_board_has_it(both: tuple[Path, Path]) -> None:
+def test_the_log_has_the_estimate_of_the_real_board(both: tuple[Path, Path]) -> None:
     real, truth = (load_log(folder) for folder in both)
     names = [f"estimate.{name}" for name in ("x", "vy", "z", "roll", "pitch", "yaw", "r")]
     names += ["control.u3", "motor.m2", "supervisor.state"]
@@ -162,7 +162,7 @@ def test_the_command_shows_both(cli: Cli, both: tuple[Path, Path], simulated: Pa
     assert len(page.tables["apart"]) == 11
 
 
-def test_the_report_of_a_real_flight_says_whose_eyes_it_has(both: tuple[Path, Path], tmp_path: Path) -> None:
+def test_the_report_of_a_real_flight_names_the_cameras(both: tuple[Path, Path], tmp_path: Path) -> None:
     folder = Path(shutil.copytree(both[0], tmp_path / "run"))
     page = Page(write_report(folder).read_text(encoding="utf-8"))
     text = (folder / "report.html").read_text(encoding="utf-8")
@@ -177,7 +177,7 @@ def test_the_report_of_a_real_flight_says_whose_eyes_it_has(both: tuple[Path, Pa
     )  # its own, path, path against goal, latency budget
 
 
-def test_what_an_operator_did_is_marked_in_the_figures_at_its_time(both: tuple[Path, Path]) -> None:
+def test_the_operator_s_actions_are_marked_in_the_figures(both: tuple[Path, Path]) -> None:
     events = [
         {
             "t_us": 3_000_000,
@@ -246,7 +246,7 @@ class StationBench:
         return result
 
 
-def test_what_is_judged_begins_with_the_trajectory_and_ends_with_its_experiment(tmp_path: Path) -> None:
+def test_the_judged_part_lasts_from_trajectory_to_experiment_end(tmp_path: Path) -> None:
     bench = StationBench(tmp_path / "run", "yaw-step")
     bench.fly(1.0, (0.2, 0.0, 1.15))
     bench.plan.start(bench.now_us)
@@ -435,7 +435,7 @@ def test_a_counter_of_sixteen_bits_goes_on_where_it_wraps() -> None:
     assert [count(value) for value in (65_530.0, 65_535.0, 4.0, 4.0, 10.0)] == [0, 5, 10, 10, 16]
 
 
-def test_an_experiment_that_needs_what_only_a_laboratory_has_is_told_so(tmp_path: Path) -> None:
+def test_an_experiment_that_needs_the_laboratory_is_refused(tmp_path: Path) -> None:
     bench = StationBench(tmp_path / "run", "power")
     bench.plan.start(bench.now_us)
     bench.fly(1.0)

@@ -78,7 +78,7 @@ def test_a_stored_request_is_read_back_equal() -> None:
         assert Request.read(json.loads(json.dumps(request.stored())), find_again) == request
 
 
-def test_the_file_holds_the_keys_that_programs_read_and_null_where_there_is_no_number(result: Result) -> None:
+def test_the_file_has_documented_keys_and_null_for_missing_numbers(result: Result) -> None:
     write_result(result)
     content = json.loads((result.folder / RESULT).read_text(encoding="utf-8"))
     assert set(content) == set(KEYS)

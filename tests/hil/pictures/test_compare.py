@@ -102,7 +102,7 @@ def test_a_log_that_ends_earlier_differs_where_it_ends(runs: dict[str, Path]) ->
         assert "the log has ended" in str(first)
 
 
-def test_a_missing_column_is_told(runs: dict[str, Path]) -> None:
+def test_a_missing_column_is_reported(runs: dict[str, Path]) -> None:
     run = load_flown(runs["one"])
     less = FlownRun(run.log.drop_columns(["truth.x"]), run.result)
     comparison = compare(run, less)
@@ -111,14 +111,14 @@ def test_a_missing_column_is_told(runs: dict[str, Path]) -> None:
     assert not comparison.identical
 
 
-def test_what_was_set_otherwise_is_told_and_nothing_else(runs: dict[str, Path]) -> None:
+def test_only_differing_settings_are_reported(runs: dict[str, Path]) -> None:
     comparison = compare(load_flown(runs["one"]), load_flown(runs["strong"]))
     gain = load_config().controller.gain_z
     assert ("controller.gain_z", str(gain), "3.5") in comparison.settings
     assert {name for name, _, _ in comparison.settings} <= {"controller.gain_z", "overrides", "commit"}
 
 
-def test_metrics_stand_side_by_side_in_the_unit_of_the_table(runs: dict[str, Path]) -> None:
+def test_metrics_are_side_by_side_in_the_unit_of_the_table(runs: dict[str, Path]) -> None:
     a, b = (json.loads((runs[name] / "result.json").read_text())["metrics"] for name in ("one", "two"))
     told = {pair.name: pair for pair in compare(load_flown(runs["one"]), load_flown(runs["two"])).metrics}
     assert told["rms_x"].values == pytest.approx((100 * a["rms_x"], 100 * b["rms_x"]))

@@ -155,7 +155,7 @@ def test_the_report_tells_where_the_flight_comes_from(folder: Path) -> None:
 
 
 @pytest.mark.usefixtures("few_pictures")
-def test_a_failed_limit_is_told_first(folder: Path) -> None:
+def test_a_failed_limit_comes_first(folder: Path) -> None:
     change_result(
         folder,
         passed=False,

@@ -339,7 +339,7 @@ def real_log(rows: int = 30) -> pa.Table:
     return pa.table(columns).replace_schema_metadata({"request": request, "look": look})
 
 
-def test_a_real_flight_has_the_same_scene_and_what_nobody_knows_is_not_drawn(tmp_path: Path) -> None:
+def test_a_real_flight_has_the_same_scene_without_unknown_parts(tmp_path: Path) -> None:
     path = staged(tmp_path / "real.rrd", real_log())
     assert timeline_of(real_log().schema.metadata) == (FROM_START, 0)
     counted = rows_by_entity(path)
@@ -411,7 +411,7 @@ def test_faults_share_a_lane_and_a_push_is_an_arrow_that_can_be_seen(folder: Pat
     assert gone - begun == 1000 * PUSH_SHOWN_US
 
 
-def test_a_view_stands_in_the_blueprint_when_the_log_has_its_curves(folder: Path) -> None:
+def test_a_view_is_in_the_blueprint_when_the_log_has_its_curves(folder: Path) -> None:
     simulated = load_log(folder).schema
     known = {path for _, path in views_of(simulated)}
     assert {"position", "processor", "battery", "link/rate", "queue"} <= known

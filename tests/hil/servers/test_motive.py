@@ -225,7 +225,7 @@ def test_markers_of_a_body_that_is_not_tracked_have_no_label() -> None:
     lab.motive.close()
 
 
-def test_markers_of_all_bodies_share_a_frame_and_are_told_apart() -> None:
+def test_markers_of_all_bodies_share_a_frame_and_are_distinguishable() -> None:
     lab = MotiveBench()
     lab.motive.close()
     names = {1: "floaty", 2: "floaty2"}
@@ -284,7 +284,7 @@ def test_frames_end_with_the_disconnect(lab: MotiveBench, client: NatNetSocket) 
     assert client.hears_nothing()
 
 
-def test_sixteen_clients_are_served_and_one_more_displaces_who_was_silent_longest(lab: MotiveBench) -> None:
+def test_a_seventeenth_client_displaces_the_longest_silent_one(lab: MotiveBench) -> None:
     clients = [NatNetSocket(lab) for _ in range(MAX_CLIENTS + 1)]
     for client in clients[:-1]:
         client.connect()
@@ -298,7 +298,7 @@ def test_sixteen_clients_are_served_and_one_more_displaces_who_was_silent_longes
         client.close()
 
 
-def test_what_cannot_be_read_is_counted_and_not_answered(lab: MotiveBench, client: NatNetSocket) -> None:
+def test_unreadable_packets_are_counted_and_not_answered(lab: MotiveBench, client: NatNetSocket) -> None:
     broken = [b"", b"\0", packet(MessageId.FRAME), packet(MessageId.ECHO_REQUEST, b"short")]
     for data in (*broken, packet(MessageId.REQUEST, b"Bitstream")[:-1], b"\xff" * 2048):
         client.send(data)
@@ -320,7 +320,7 @@ def test_no_bytes_stop_the_server(lab: MotiveBench, client: NatNetSocket) -> Non
     assert decode(client.hear(), (4, 1)).name == "Motive"
 
 
-def test_a_taken_port_is_said_in_one_line(lab: MotiveBench) -> None:
+def test_a_taken_port_is_one_line(lab: MotiveBench) -> None:
     with pytest.raises(
         LabError, match=rf"^natnet port {lab.motive.port}: Address already in use; --set capture.port=0 takes"
     ):
@@ -328,7 +328,7 @@ def test_a_taken_port_is_said_in_one_line(lab: MotiveBench) -> None:
 
 
 @pytest.mark.parametrize("interface", [HOST, "0.0.0.0"], ids=["loopback", "any"])
-def test_a_program_that_joins_the_group_on_either_interface_hears_each_frame_once(interface: str) -> None:
+def test_a_group_member_on_either_interface_gets_each_frame_once(interface: str) -> None:
     """On any: the kernel takes the interface of the route, as for Bitcraze's scripts with libmotioncapture."""
     lab = MotiveBench(multicast=True)
     member = socket.inet_aton(MULTICAST_GROUP) + socket.inet_aton(interface)

@@ -7,7 +7,7 @@ from hil.servers.server import Server, Service
 from support.watching import Watcher
 
 
-def test_rows_of_a_served_robot_say_what_it_looks_like() -> None:
+def test_rows_of_a_served_robot_describe_its_look() -> None:
     watcher = Watcher()
     server = Server(Service(load_config()), lambda text: None, watcher)
     server.lab.end_at(1_000_000)

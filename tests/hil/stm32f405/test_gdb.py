@@ -86,7 +86,7 @@ def test_without_acknowledgements_only_answers_are_sent(protocol: RemoteProtocol
     assert protocol.receive(b"$?#00") == b""
 
 
-def test_what_is_not_known_is_answered_with_nothing(protocol: RemoteProtocol) -> None:
+def test_unknown_packets_get_an_empty_answer(protocol: RemoteProtocol) -> None:
     for (
         packet
     ) in b"vMustReplyEmpty vCont? X20000000,0: G00 qTStatus R00 b Z5,20000000,4 QPassSignals: _".split():
@@ -166,7 +166,7 @@ def test_memory_that_is_not_there_is_an_error(protocol: RemoteProtocol) -> None:
     assert ask(protocol, b"M30000000,1:00") == b"E0e"
 
 
-def test_code_is_where_the_image_says(protocol: RemoteProtocol, image: Image) -> None:
+def test_code_is_at_the_image_s_address(protocol: RemoteProtocol, image: Image) -> None:
     assert bytes.fromhex(ask(protocol, b"m8004000,800").decode()) == image.code[:0x800]
 
 
@@ -228,7 +228,7 @@ def test_ctrl_c_stops_a_run(client: tuple[GdbServer, socket.socket], machine: Ba
     assert line.recv(4096) == b"+" + framed(b"OK") + framed(b"T02thread:1;") + framed(b"OK")
 
 
-def test_who_hangs_up_lets_the_machine_go_and_another_may_come(
+def test_after_a_hang_up_the_machine_runs_and_accepts_another(
     client: tuple[GdbServer, socket.socket], machine: BareCortex, image: Image
 ) -> None:
     server, line = client
@@ -243,7 +243,7 @@ def test_who_hangs_up_lets_the_machine_go_and_another_may_come(
         assert server.hold() is Wish.KILL
 
 
-def test_who_leaves_takes_the_breakpoints_along(protocol: RemoteProtocol, machine: BareCortex) -> None:
+def test_leaving_removes_the_breakpoints(protocol: RemoteProtocol, machine: BareCortex) -> None:
     for packet in (b"Z0,8005000,2", b"Z0,8007000,2", b"z0,8005000,2", b"z0,8006000,2"):
         assert ask(protocol, packet) == b"OK"
     assert machine.breakpoints == {0x0800_7000}
@@ -346,7 +346,7 @@ def test_a_watchpoint_stops_after_the_access(kind: bytes, name: str) -> None:
         assert said[4] == b"01000000"
 
 
-def test_the_chip_waits_for_its_debugger_and_stands_at_its_first_instruction() -> None:
+def test_the_chip_waits_for_its_debugger_at_its_first_instruction() -> None:
     machine, answers = on_chip(lambda _: [b"QStartNoAckMode", b"pf", b"me000ed28,4", b"D"], 2_000)
     reset = framed(pack("<I", machine.image.reset).hex().encode())
     assert answers == b"+" + framed(b"OK") + reset + framed(b"00000000") + framed(b"OK")

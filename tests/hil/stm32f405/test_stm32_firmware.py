@@ -121,7 +121,7 @@ def test_a_busy_chip_wants_its_turn_ten_times_a_millisecond() -> None:
 
 
 @pytest.mark.parametrize("taken_us", [0, 400, 900])
-def test_what_occupies_the_processor_takes_its_time_from_the_tasks_alone(taken_us: int) -> None:
+def test_processor_load_takes_time_only_from_tasks(taken_us: int) -> None:
     machine = FirmwareOnChip()
     processor, state = machine.processor(), machine.chip.state
     processor.run(20_000)

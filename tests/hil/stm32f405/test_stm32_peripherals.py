@@ -47,7 +47,7 @@ def test_a_compare_register_is_seen_from_outside(bench: Bench) -> None:
     assert bench.chip.state.compare[2][0] == 25522
 
 
-def test_who_is_not_on_the_bus_does_not_acknowledge(bench: Bench) -> None:
+def test_an_absent_device_does_not_acknowledge(bench: Bench) -> None:
     bench[I2C1 + 0x1C], bench[I2C1] = 35, ENABLED
     bench[I2C1] = START | ENABLED
     bench.until(I2C1 + 0x14, SB)
@@ -69,7 +69,7 @@ def test_a_byte_takes_nine_bits_on_the_bus(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("pairs", [False, True])
-def test_what_is_written_to_a_device_is_read_back(bench: Bench, pairs: bool) -> None:
+def test_a_device_reads_back_its_writes(bench: Bench, pairs: bool) -> None:
     memory = np.zeros(256, np.uint8)
     bench.chip.add_device(1, 0x50, memory, pairs=pairs)
     bench[I2C1 + 0x1C] = 35

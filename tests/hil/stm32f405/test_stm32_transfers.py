@@ -174,7 +174,7 @@ def address(bench: Bench, device: int) -> None:
 @pytest.mark.parametrize(
     ("clock", "bit_us"), [(210, 10.0), (0x8000 | 35, 2.5), (0xC000 | 4, 100 / 42)], ids=["standard", "fast", "16/9"]
 )  # fmt: skip
-def test_a_bit_on_the_bus_takes_what_the_clock_register_says(bench: Bench, clock: int, bit_us: float) -> None:
+def test_a_bit_lasts_as_the_clock_register_sets(bench: Bench, clock: int, bit_us: float) -> None:
     bench.chip.add_device(1, 0x50, np.zeros(256, np.uint8))
     bench[I2C1 + 0x1C], bench[I2C1] = clock, 1
     address(bench, 0x50 << 1)

@@ -116,7 +116,7 @@ def test_a_clock_with_long_microseconds_is_measured_through_its_carries(flown: P
     assert found.causes == ("long microsecond: a microsecond of the boards' clocks lasts 1.0000 | 1.0119 us",)
 
 
-def test_what_no_known_cause_explains_is_said_so(flown: Path, tmp_path: Path) -> None:
+def test_an_unexplained_difference_is_reported(flown: Path, tmp_path: Path) -> None:
     found = two_boards(load_flown(flown), other(flown, tmp_path / "b", bumped))
     assert found.first is not None
     assert found.first.why == "none of the known causes"

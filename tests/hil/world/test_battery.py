@@ -149,7 +149,7 @@ def test_the_estimate_of_a_short_hover_is_the_endurance(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_hover_draws_what_the_paper_says(tmp_path: Path) -> None:
+def test_a_hover_draws_the_paper_s_power(tmp_path: Path) -> None:
     result = flown(tmp_path / "run", "power", duration_s=15.0)
     assert result.passed
     assert result.metrics["power"] == pytest.approx(3.4, rel=0.10)

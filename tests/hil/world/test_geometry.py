@@ -131,7 +131,7 @@ IMPOSSIBLE: Mapping[str, str] = {
 
 
 @pytest.mark.parametrize("override", IMPOSSIBLE)
-def test_a_robot_that_cannot_be_is_refused_in_one_line(override: str) -> None:
+def test_an_impossible_robot_is_refused_in_one_line(override: str) -> None:
     with pytest.raises(LabError, match=IMPOSSIBLE[override]) as caught:
         load_config(overrides=[override])
     assert "\n" not in str(caught.value)
