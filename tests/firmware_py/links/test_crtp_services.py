@@ -3,7 +3,6 @@
 import ctypes
 import errno
 import json
-import math
 import struct
 from collections import Counter
 from math import inf, nan
@@ -148,16 +147,6 @@ def test_telemetry_has_the_types_and_units_of_the_table_of_contents(client: Crtp
             assert logs[variable.name][1] == stored.log_number
             unit = "deg" if variable.scale else variable.unit
             assert client.firmware.variables[logs[variable.name][0]].unit == unit
-
-
-def test_values_that_do_not_fit_their_type_travel_as_c_casts_them(client: CrtpClient, logs) -> None:
-    client.firmware.signals.counters[0] = 70_000  # poses that were fused
-    fused = logs["kalman.fused"][0]
-    assert client.create(1, (2, logs["locSrv.poses"][0]), (1, fused), (8, fused), (7, fused)) == 0
-    client.one(LOG, 1, bytes((3, 1, 1)))
-    client.run(client.now_us + 30_000)
-    values = struct.unpack("<HBef", client.packets(LOG, 2)[0][4:])
-    assert values == (70_000 % (1 << 16), 70_000 % (1 << 8), math.inf, 70_000.0)
 
 
 def test_attitudes_are_shown_in_degrees_with_the_nose_up_positive_as_the_stock_firmware_shows_them(

@@ -103,9 +103,3 @@ def test_mission_and_log_requests_to_another_system_are_ignored(client: MavlinkC
 def test_a_log_that_is_not_there_ends_at_once(client: MavlinkClient) -> None:
     (data,) = answers(client, "LOG_DATA", "log_request_data", 1, 1, 7, 1000, 90)
     assert (data.id, data.ofs, data.count) == (7, 1000, 0)
-
-
-def test_a_mode_cannot_be_chosen_and_the_answer_says_so(client: MavlinkClient) -> None:
-    (ack,) = answers(client, "COMMAND_ACK", "set_mode", 1, 1, 4)
-    assert (ack.command, ack.result) == (176, DENIED)
-    assert (ack.target_system, ack.target_component) == STATION

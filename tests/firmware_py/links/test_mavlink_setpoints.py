@@ -117,11 +117,6 @@ def test_exclusive_control_is_refused(client: MavlinkClient) -> None:
     ]
 
 
-@pytest.mark.parametrize("number", [179, 16, 22])  # DO_SET_HOME, a waypoint, take-off
-def test_a_command_that_is_not_served_is_unsupported(client: MavlinkClient, number: int) -> None:
-    assert [a.result for a in client.command(number)] == [UNSUPPORTED]
-
-
 @pytest.mark.parametrize(
     ("fields", "line"),
     [

@@ -347,12 +347,6 @@ def test_a_long_text_travels_in_pieces_of_which_the_last_is_shorter(size: int, p
     assert [(message.id, message.chunk_seq) for message in messages] == [(7, n) for n in range(len(pieces))]
 
 
-def test_parameters_are_real32() -> None:
-    message = over_the_wire(services.parameter("EXT_X_P", -2.5, 3, 60))
-    assert message.param_type == dialect.MAV_PARAM_TYPE_REAL32
-    assert (message.param_value, message.param_index, message.param_count) == (-2.5, 3, 60)
-
-
 def test_version_is_packed_in_bytes() -> None:
     message = over_the_wire(services.autopilot_version((1, 2, 3), b"abcdefghij", 0x1234))
     assert message.flight_sw_version.to_bytes(4, "big")[:3] == bytes((1, 2, 3))
