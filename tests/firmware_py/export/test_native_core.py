@@ -27,7 +27,6 @@ from support.core_streams import (
 )
 from support.paths import ROOT, TESTS
 
-LONG = bool(os.environ.get("FLOATY_LONG"))
 C = translate()
 COMPILERS = [compiler for compiler in compilers() if compiler.name != "cc"]
 IDS = [compiler.name for compiler in COMPILERS]
