@@ -173,11 +173,6 @@ def test_battery_gives_what_electronics_and_thrust_take() -> None:
     )  # nothing new: the last one
 
 
-def test_less_battery_voltage_lifts_less() -> None:
-    full, empty = spun_up((0.6,) * 4, 4.2), spun_up((0.6,) * 4, 3.2)
-    assert empty.thrust[0] < 0.7 * full.thrust[0]
-
-
 @pytest.mark.parametrize(
     ("place", "motion", "text"),
     [

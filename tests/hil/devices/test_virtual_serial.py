@@ -72,13 +72,6 @@ def test_a_long_message_arrives_in_chunks_of_the_threshold():
     ]
 
 
-def test_a_message_that_fills_its_chunk_waits_for_no_silence():
-    bench = LineWithEnds(baud=1_000_000, host_latency_us=0)
-    bench.write(0, bytes(64))
-    bench.run()
-    assert bench.on_ground == [(640, bytes(64))]
-
-
 def test_messages_without_a_gap_share_chunks():
     bench = LineWithEnds(baud=1_000_000, host_latency_us=0)
     bench.write(0, b"a" * 40)

@@ -62,15 +62,6 @@ def test_settling_rise_and_overshoot_are_those_of_the_textbook(damping: float) -
     assert np.abs(after[times >= settle - 0.003] - 1).max() > 0.05
 
 
-def test_a_step_that_does_not_stay_settled_is_not_settled() -> None:
-    times = np.arange(0.0, 3.0, 0.01)
-    goal = (times >= 1.0).astype(float)
-    value = goal.copy()
-    value[-1] = 0.9
-    ((_, settle, _),) = steps(times, value, goal)
-    assert math.isnan(settle)
-
-
 @pytest.mark.parametrize(("early_s", "rise_s"), [(0.04, 0.5), (0.49, 0.5), (1.2, np.nan)])
 def test_a_jump_just_before_the_end_is_not_judged(early_s: float, rise_s: float) -> None:
     """Over a real link the goal may begin to move some ten milliseconds before the flight's time runs."""

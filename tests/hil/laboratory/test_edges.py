@@ -60,14 +60,6 @@ def test_a_step_across_180_degrees_settles_where_one_elsewhere_does(facing: floa
     assert found["overshoot"] == 0.0
 
 
-@pytest.mark.parametrize("degrees", [30.0, -40.0])
-def test_a_sine_that_is_late_has_a_positive_lag(degrees: float) -> None:
-    turn = 2 * pi * 0.5 * 1e-6 * TIMES
-    goal, flown = np.sin(turn), 0.8 * np.sin(turn - radians(degrees))
-    gain, lag = measures.response(1e-6 * TIMES, flown, goal, 0.5)
-    assert (gain, lag) == pytest.approx((0.8, radians(degrees)), abs=0.02)
-
-
 def test_a_step_settles_at_the_first_row_from_which_it_stays_within_5_percent() -> None:
     times, goal = np.arange(6.0), np.array([0.0, 1, 1, 1, 1, 1])
     ((rise_s, settle_s, overshoot),) = measures.steps(times, np.array([0, 0.5, 1.2, 0.94, 0.96, 1.0]), goal)

@@ -44,14 +44,6 @@ def test_every_sample_of_a_kilohertz_passes_the_queue(compiler: str) -> None:
     assert machine.peek("samples_lost") == 0
 
 
-def test_the_tick_is_a_millisecond() -> None:
-    machine = FirmwareOnChip()
-    run(machine, 0, 20)
-    before = machine.peek("xTickCount")
-    run(machine, 20, 220)
-    assert machine.peek("xTickCount") - before in (199, 200, 201)
-
-
 @COMPILERS
 def test_the_eeprom_is_written_and_read_back_by_dma(compiler: str) -> None:
     machine = FirmwareOnChip(compiler)

@@ -319,11 +319,6 @@ def test_plant_is_not_placed_at_nonsense() -> None:
             make().place(*pose)
 
 
-def test_truth_cannot_be_written_through_its_views() -> None:
-    with pytest.raises(ValueError, match="read-only"):
-        make().p_WB[0] = 1.0
-
-
 vector = st.tuples(*3 * (st.floats(-1, 1),))
 
 
