@@ -39,6 +39,9 @@ def test_a_failed_limit_is_exit_code_one(cli: Cli) -> None:
     assert "lost" in cli.out
 
 
+UDP = ("--link", "udp://127.0.0.1:1")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -58,19 +61,8 @@ def test_a_failed_limit_is_exit_code_one(cli: Cli) -> None:
             "takes robots of flat plates; this one's body is crazyflie",
         ),
         (["deploy", "write", "app", "--profile", "crazyflie"], "own firmware, not with the app"),
-        (
-            ["station", "--link", "udp://127.0.0.1:1", "--tlog", "t.tlog"],
-            "--tlog t.tlog: --link udp://127.0.0.1:1: only mavlink:",
-        ),
-        (
-            ["station", "--link", "udp://127.0.0.1:1", "--out", "a", "--log", "b"],
-            "--log b: --out a has a telemetry.csv",
-        ),
-        (
-            ["param", "set", "controller.gain_z", "--link", "udp://127.0.0.1:1"],
-            "controller.gain_z: expected NAME=VALUE",
-        ),
-        (["param", "set", "a=b", "--link", "udp://127.0.0.1:1"], "a=b: expected NAME=VALUE"),
+        (["station", *UDP, "--tlog", "t.tlog"], "--tlog t.tlog: --link udp://127.0.0.1:1: only mavlink:"),
+        (["station", *UDP, "--out", "a", "--log", "b"], "--log b: --out a has a telemetry.csv"),
         (["param", "list", "--link", "usb://1"], "usb://1: expected radio://"),
         (["fly", "hover", "--seeds", "2", "--perfetto"], "--seeds 2"),
         (["fly", "hover", "--gdb", "3333"], "--gdb 3333: needs one flight with an image as --board"),

@@ -47,6 +47,5 @@ def test_a_group_is_found_however_it_is_written(cli: Cli, asked: list[ControlReq
 def test_a_wrong_setting_is_one_line_and_not_sent(
     cli: Cli, asked: list[ControlRequest], setting: str
 ) -> None:
-    assert cli("param", "set", setting, *LINK) == 2
-    assert f"{setting}: expected NAME=VALUE with a number" in cli.err
+    assert f"{setting}: expected NAME=VALUE with a number" in cli.refusal("param", "set", setting, *LINK)
     assert asked == []
