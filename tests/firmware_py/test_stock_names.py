@@ -53,9 +53,7 @@ def test_every_parameter_that_clients_use_has_its_stock_type_access_and_persiste
     assert {name: texts.get(name) for name in STOCK["parameters"]} == STOCK["parameters"]
 
 
-def test_parameters_without_effect_keep_their_values_and_persistent_ones_survive(
-    client: CrtpClient, tables
-) -> None:
+def test_parameters_without_effect_keep_values_and_persistence(client: CrtpClient, tables) -> None:
     _, params = tables
     for name, value in (
         ("pid_attitude.pitch_kd", 0.25),

@@ -45,9 +45,7 @@ def served(request: pytest.FixtureRequest, library: Path) -> Iterator[Served]:
 
 
 @pytest.mark.parametrize("medium", ["radio", "udp"])
-def test_linked_board_equals_python(
-    cli: Cli, served: Served, medium: str, python: str, tmp_path: Path
-) -> None:
+def test_a_linked_board_is_equal(cli: Cli, served: Served, medium: str, python: str, tmp_path: Path) -> None:
     (uri,) = served.line(f"{medium} ")
     out = tmp_path / "run"
     assert cli("fly", "hover", "--duration", "1", "--board", uri, "--out", out) == 0
@@ -56,9 +54,7 @@ def test_linked_board_equals_python(
     assert result.usage.entries["control"].calls == 200
 
 
-def test_killing_the_board_ends_the_flight_in_one_line_and_keeps_its_log(
-    library: Path, tmp_path: Path
-) -> None:
+def test_killing_the_board_ends_the_flight_in_one_line_with_its_log(library: Path, tmp_path: Path) -> None:
     with board(library) as served:
         (uri,) = served.line("udp ")
         out = tmp_path / "run"

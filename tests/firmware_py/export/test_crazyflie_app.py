@@ -552,9 +552,7 @@ P_WB, Q_WB = (1.0, 2.0, 3.0), from_euler_zyx(0.1, -0.2, 1.3)
 
 
 @pytest.mark.parametrize("how", ["attitude", "quaternion"])
-def test_absolute_poses_fly_as_corrections_to_a_goal(
-    app: App, library: Path, tmp_path: Path, how: str
-) -> None:
+def test_absolute_poses_become_corrections(app: App, library: Path, tmp_path: Path, how: str) -> None:
     rng = np.random.default_rng(5)
     twin = App(library, tmp_path / "twin.so")
     app.boot(absolute=True)
@@ -670,9 +668,7 @@ def test_an_app_that_has_booted_takes_absolute_poses(app: App) -> None:
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0, 1.1), (0.7, 0.7, 0.0), (0.0, 0.0, -2.1)])
-def test_an_impossible_correction_is_counted_and_reported(
-    app: App, place: tuple[float, float, float]
-) -> None:
+def test_impossible_corrections_are_counted_and_reported(app: App, place: tuple[float, float, float]) -> None:
     flying(app)
     before, invalid = estimate(app), app.log("kalman.invalid")
     for step in range(1200, 1260):
@@ -738,9 +734,7 @@ def test_parameters_have_the_names_types_and_defaults_of_the_laboratory(app: App
 
 
 @given(data=st.data())
-def test_the_board_accepts_the_laboratory_s_parameter_values_only(
-    functions: App, data: st.DataObject
-) -> None:
+def test_the_board_accepts_the_laboratory_s_parameters_only(functions: App, data: st.DataObject) -> None:
     laboratory = LABORATORY
     names = sorted(name for name in functions.params if name in laboratory.parameters)
     name = data.draw(st.sampled_from(names))

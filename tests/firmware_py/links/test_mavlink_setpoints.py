@@ -64,9 +64,7 @@ def aim(client: MavlinkClient) -> float:
 
 
 @pytest.mark.parametrize("name", UNSERVED)
-def test_an_unserved_request_is_reported_once_then_seldom_with_count(
-    client: MavlinkClient, name: str
-) -> None:
+def test_unserved_requests_are_reported_once_then_seldom(client: MavlinkClient, name: str) -> None:
     line = f"{name.upper()} is not served"
     assert texts(client, name, *UNSERVED[name]) == [line]
     client.messages.clear()

@@ -76,9 +76,7 @@ def stack() -> Iterator[ExitStack]:
 
 
 @pytest.mark.parametrize("board", [*BOARDS[1:], "plain"])
-def test_matrix_times_vector_is_equal_on_every_target(
-    config: LabConfig, stack: ExitStack, board: str
-) -> None:
+def test_matrix_times_vector_is_equal_everywhere(config: LabConfig, stack: ExitStack, board: str) -> None:
     logic = load_logic(config.logic)
     other = PlainRunner if board == "plain" else runner_of(board, ROOT / "runs" / "build", config.logic)
     flown, beside = (CoreBlocks(parameters_of(config), runner, logic) for runner in (PythonRunner, other))

@@ -47,9 +47,7 @@ def test_an_empty_folder_becomes_a_project(cli: Cli) -> None:
     assert files_in(Path("law")) == sorted(FILES)
 
 
-def test_the_current_folder_becomes_a_project(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_this_folder_becomes_a_project(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     assert cli("new", ".") == 0

@@ -44,8 +44,6 @@ def test_a_group_is_found_however_it_is_written(cli: Cli, asked: list[ControlReq
 
 
 @pytest.mark.parametrize("setting", ["extCtrl.y_P", "=1", "extCtrl.y_P=", "extCtrl.y_P=two"])
-def test_a_wrong_setting_is_one_line_and_not_sent(
-    cli: Cli, asked: list[ControlRequest], setting: str
-) -> None:
+def test_wrong_settings_are_refused_unsent(cli: Cli, asked: list[ControlRequest], setting: str) -> None:
     assert f"{setting}: expected NAME=VALUE with a number" in cli.refusal("param", "set", setting, *LINK)
     assert asked == []

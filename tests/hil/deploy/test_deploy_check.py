@@ -190,7 +190,7 @@ class Watch(PythonRunner):
 
 
 @pytest.mark.parametrize("target", ["c-O2", pytest.param("cortex-m4", marks=pytest.mark.long)])
-def test_changed_c_operator_is_found(
+def test_changed_operator_is_found(
     cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path, target: str
 ) -> None:
     monkeypatch.chdir(built)
@@ -216,9 +216,7 @@ def test_changed_c_operator_is_found(
 
 
 @pytest.mark.long
-def test_code_that_leaves_its_memory_is_exit_1(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path
-) -> None:
+def test_code_outside_its_memory_is_exit_1(cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path) -> None:
     monkeypatch.chdir(built)
     text, right = translate().source, "const int32_t row = estimator->tick % FLOATY_HISTORY;"
     assert text.count(right) == 1

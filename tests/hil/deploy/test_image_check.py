@@ -98,9 +98,7 @@ def changed(name: str, **fields: object) -> tuple[AppParameter, ...]:
         ("supervisor.poseTimeout", {"scale": 100.0}, "floaty_parameters.pose_timeout_us = 500000, in the profile 50000"),
     ],
 )  # fmt: skip
-def test_a_wrong_parameter_is_found(
-    board: AppBoard, name: str, fields: dict[str, object], found: str
-) -> None:
+def test_wrong_parameter_is_found(board: AppBoard, name: str, fields: dict[str, object], found: str) -> None:
     assert any(found in line for line in check_parameters(changed(name, **fields), board))
 
 

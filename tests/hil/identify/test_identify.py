@@ -173,9 +173,7 @@ def test_an_unsuitable_validation_flight_is_refused_at_once(tmp_path: Path, wron
     ("name", "reason"), [("runs", "name ends in .toml"), ("no/x.toml", "no is not a folder")]
 )
 @pytest.mark.parametrize("command", ["identify", "tune"])
-def test_an_unwritable_file_is_refused(
-    cli: Cli, tmp_path: Path, command: str, name: str, reason: str
-) -> None:
+def test_unwritable_file_is_refused(cli: Cli, tmp_path: Path, command: str, name: str, reason: str) -> None:
     out = tmp_path / name
     call = ("identify", "missing", "--profile-out", out) if command == "identify" else ("tune", "--out", out)
     assert reason in cli.refusal(*call)

@@ -95,9 +95,7 @@ def test_own_logic_s_log_is_recorded_and_drawn(failed: Result) -> None:
 
 
 @pytest.mark.parametrize("board", ["c", pytest.param("cortex-m4", marks=pytest.mark.long)])
-def test_the_same_flight_on_another_board_is_bit_identical(
-    failed: Result, tmp_path: Path, board: str
-) -> None:
+def test_a_flight_on_another_board_is_bit_identical(failed: Result, tmp_path: Path, board: str) -> None:
     again = hover(
         tmp_path, *failed.request.overrides, profile=failed.request.profile, duration_s=0.5, board=board
     )

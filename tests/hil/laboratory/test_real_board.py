@@ -52,9 +52,7 @@ def test_a_flight_on_a_board_has_the_hash_of_python(
 
 @pytest.mark.long
 @pytest.mark.parametrize("experiment", ["hover", "yaw-step"])
-def test_experiments_equal_python_at_loss(
-    plugged: Plug, library: Path, tmp_path: Path, experiment: str
-) -> None:
+def test_experiments_are_equal_at_loss(plugged: Plug, library: Path, tmp_path: Path, experiment: str) -> None:
     plugged(library).mess = 0.1
     hashes = []
     for board in ("python", URI):

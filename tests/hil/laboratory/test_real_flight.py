@@ -329,9 +329,7 @@ def test_a_robot_that_leaves_the_flow_is_lost_and_what_follows_is_not_judged(tmp
         ({}, "completed", None),
     ],
 )
-def test_every_end_writes_a_result(
-    tmp_path: Path, how: dict[str, Any], outcome: str, cause: str | None
-) -> None:
+def test_each_end_has_a_result(tmp_path: Path, how: dict[str, Any], outcome: str, cause: str | None) -> None:
     bench = StationBench(tmp_path / "run")
     bench.record.note("station", "connected")
     bench.plan.start(bench.now_us)

@@ -76,9 +76,7 @@ def test_rows_that_an_onlooker_keeps_stay_as_they_were_recorded(tmp_path: Path) 
     assert watcher.notes == []
 
 
-def test_a_long_log_is_readable_with_its_memory_freed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_long_log_is_readable_with_freed_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = 20 * ROWS_PER_BATCH * BATCHES_PER_PIECE
     recorder = make(tmp_path, np.ones(2))
     for row in range(rows):

@@ -115,9 +115,7 @@ def test_a_complete_run_within_limits_passes(result: Result, outcome: Any, holds
         (lambda folder: change(folder, verdicts=[{"metric": "rms_x"}]), "verdicts.0.value is missing"),
     ],
 )  # fmt: skip
-def test_a_bad_result_is_one_line(
-    cli: Cli, result: Result, damage: Callable[[Path], None], told: str
-) -> None:
+def test_bad_result_is_one_line(cli: Cli, result: Result, damage: Callable[[Path], None], told: str) -> None:
     write_result(result)
     killed(result.folder, metadata_of(result.request, result.program, Look()))
     damage(result.folder)

@@ -39,9 +39,7 @@ def values(message: dict) -> dict[str, float]:
     return {parameter["name"]: parameter["value"] for parameter in message["parameters"]}
 
 
-def test_a_changed_parameter_is_shown(
-    screen: FoxgloveScreen, client: FoxgloveClient, typed: list[str]
-) -> None:
+def test_changed_parameter_is_shown(screen: FoxgloveScreen, client: FoxgloveClient, typed: list[str]) -> None:
     screen.know({"extCtrl.y_P": 1.6, "extCtrl.z_P": 2.0})
     client.send(op="getParameters", parameterNames=[], id="all")
     assert values(client.receive("parameterValues")) == {"extCtrl.y_P": 1.6, "extCtrl.z_P": 2.0}

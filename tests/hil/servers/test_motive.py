@@ -139,9 +139,7 @@ def client(lab: MotiveBench) -> Iterator[NatNetSocket]:
 
 
 @pytest.mark.parametrize("payload", [b"", b"Ping\0", bytes(271)], ids=["empty", "Ping", "with the sender"])
-def test_every_connect_is_answered_with_frames(
-    lab: MotiveBench, client: NatNetSocket, payload: bytes
-) -> None:
+def test_each_connect_is_answered_with_frames(lab: MotiveBench, client: NatNetSocket, payload: bytes) -> None:
     client.say(MessageId.CONNECT, payload)
     info = decode(client.hear(), (4, 1))
     assert (info.name, info.natnet_version, info.data_port) == ("Motive", (4, 1, 0, 0), lab.motive.data_port)

@@ -139,9 +139,7 @@ def test_the_target_description_numbers_the_registers_as_they_are_sent(protocol:
     assert [name for name, _ in registers[:17]] == [*(f"r{n}" for n in range(13)), "sp", "lr", "pc", "xpsr"]
 
 
-def test_registers_are_read_together_and_written_singly(
-    protocol: RemoteProtocol, machine: BareCortex
-) -> None:
+def test_registers_are_read_together_written_singly(protocol: RemoteProtocol, machine: BareCortex) -> None:
     number = {name: index for index, (name, _) in enumerate(REGISTERS)}
     assert ask(protocol, b"P%x=78563412" % number["r7"]) == b"OK"
     assert ask(protocol, b"P%x=%s" % (number["d3"], pack("<d", -1.5).hex().encode())) == b"OK"

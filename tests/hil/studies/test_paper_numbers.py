@@ -82,9 +82,7 @@ def test_new_gains_are_better_when_they_hover_no_worse() -> None:
 @pytest.mark.parametrize(
     ("delay_ms", "late_ms", "refused"), [(5, 9, False), (4.9, 9, True), (9, 4.9, True), (9, 5, False)]
 )
-def test_gains_with_less_delay_margin_than_the_link_fail(
-    delay_ms: float, late_ms: float, refused: bool
-) -> None:
+def test_gains_with_less_margin_than_the_link_fail(delay_ms: float, late_ms: float, refused: bool) -> None:
     axis: Any = SimpleNamespace(
         least=SimpleNamespace(delay=1e-3 * delay_ms),
         least_late=1e-3 * late_ms,
