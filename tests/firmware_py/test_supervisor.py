@@ -110,11 +110,15 @@ def test_floatys_own_stop_can_be_left(flying: CrtpClient, leave) -> None:
     assert after(flying, 20_000) == (State.FLYING, Cause.NONE)
 
 
-def test_floatys_own_parameter_arms_and_disarms(flying: CrtpClient) -> None:
-    write(flying, "floaty.armed", 0)
-    assert after(flying, 20_000) == (State.FAILSAFE, Cause.DISARMED)
-    write(flying, "floaty.armed", 1)
-    assert after(flying, 20_000) == (State.FLYING, Cause.NONE)
+@pytest.mark.parametrize(
+    "arm", [lambda c, on: write(c, "floaty.armed", on), lambda c, on: c.one(SUPERVISOR, 1, bytes((1, on)))]
+)
+def test_a_disarmed_board_hovers_until_it_is_armed(flying: CrtpClient, arm) -> None:
+    arm(flying, False)
+    assert after(flying, 11_000) == (State.FAILSAFE, Cause.DISARMED)
+    assert flying.writes[-1][1] == HOVER_COUNTS
+    arm(flying, True)
+    assert after(flying, 11_000) == (State.FLYING, Cause.NONE)
 
 
 @pytest.mark.parametrize(
@@ -440,14 +444,6 @@ def test_watchdog_bites_one_second_after_its_last_meal_and_not_before_the_first(
     assert after(flying, 16_000) == (State.FAILSAFE, Cause.EMERGENCY_STOP)
     flying.send(port, 1, data)
     assert after(flying, 100_000)[1] is Cause.EMERGENCY_STOP
-
-
-def test_disarmed_board_does_not_fly_until_it_is_armed(flying: CrtpClient) -> None:
-    flying.one(SUPERVISOR, 1, b"\1\0")
-    assert after(flying, 11_000) == (State.FAILSAFE, Cause.DISARMED)
-    assert flying.writes[-1][1] == HOVER_COUNTS
-    flying.one(SUPERVISOR, 1, b"\1\1")
-    assert after(flying, 11_000)[0] is State.FLYING
 
 
 def test_low_battery_needs_five_seconds_and_ends_by_recovery_with_a_good_voltage(flying: CrtpClient) -> None:

@@ -116,20 +116,13 @@ def test_a_wrong_fault_is_one_line_and_exit_code_two(
     assert os.listdir() == []
 
 
-@pytest.mark.parametrize("link", ["radio", "udp://127.0.0.1:19850", "radio://0/80/2M/E7E7E7E7E7"])
-def test_a_fault_of_the_radio_acts_on_every_radio_and_on_no_serial_line(link: str) -> None:
-    check([parse("radio.cut@1")], 3.0, link, load_config())
-    with pytest.raises(LabError, match="acts with --link mavlink only"):
-        check([parse("serial.cut@1")], 3.0, link, load_config())
-
-
-def test_a_radio_fault_is_refused_on_the_serial_line() -> None:
-    with pytest.raises(LabError, match="--link radio only"):
-        check([parse("radio.loss@1")], 30.0, MAVLINK, load_config())
-
-
-def test_markers_have_faults_on_either_link() -> None:
-    check([parse("marker.swap@1")], 30.0, MAVLINK, load_config(overrides=[MARKERS_ON]))
+@pytest.mark.parametrize("link", ["radio", "udp://127.0.0.1:19850", "radio://0/80/2M/E7E7E7E7E7", MAVLINK])
+def test_faults_of_a_link_act_on_that_link_alone_and_those_of_markers_on_all(link: str) -> None:
+    own, other = ("serial", "radio") if link == MAVLINK else ("radio", "serial")
+    check([parse(f"{own}.cut@1")], 3.0, link, load_config())
+    with pytest.raises(LabError, match=f"acts with --link {'radio' if link == MAVLINK else 'mavlink'} only"):
+        check([parse(f"{other}.cut@1")], 3.0, link, load_config())
+    check([parse("marker.swap@1")], 3.0, link, load_config(overrides=[MARKERS_ON]))
 
 
 # Every kind acts from its begin to its end and no longer
@@ -140,7 +133,6 @@ Seen = Callable[[pa.Table, pa.Table], float]  # (rows with the fault, the same r
 
 
 def _grown(*names: str) -> Seen:
-    """How much counters have grown."""
     return lambda rows, _: float(sum(column(rows, name)[-1] - column(rows, name)[0] for name in names))
 
 
@@ -242,7 +234,6 @@ class Sign:
 
     @property
     def duration_s(self) -> float:
-        """How long the fault acts."""
         return round(self.window[1] + 0.05, 2)
 
 
