@@ -105,7 +105,6 @@ def bench(request: pytest.FixtureRequest) -> Bench:
 
 
 def answer(bench: Bench) -> Answer:
-    """What comes within a while."""
     for _ in range(30 * PATIENCE_US // TURN_US):
         bench.turn()
         if (answer := bench.controls.answer(bench.now_us)) is not None:

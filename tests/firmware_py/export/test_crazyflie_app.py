@@ -89,7 +89,6 @@ def pose(data: bytes) -> Event:
 
 
 def write(name: str, value: float) -> Event:
-    """Set a parameter on both boards."""
 
     def act(app: App, laboratory: Laboratory) -> None:
         app.set(name, value)
@@ -284,7 +283,6 @@ def flying(app: App, until: int = 1200) -> None:
 
 
 def hover_of(app: App) -> list[int]:
-    """The servo counts of the hover angles."""
     before = app.counts()
     app.c.floaty_hover()
     hover = app.counts()
@@ -530,7 +528,6 @@ def commanded(app: App, **fields: float) -> None:
 
 
 def position(x: float, y: float, z: float, yaw_deg: float = 0.0) -> dict[str, float]:
-    """A set-point of the high-level commander."""
     return {"x": x, "y": y, "z": z, "yaw": yaw_deg, "x_mode": 1, "y_mode": 1, "z_mode": 1, "yaw_mode": 1}
 
 
@@ -543,7 +540,6 @@ def absolute(app: App, first: int, steps: int, p_WB: Vector, q_WB: Quaternion) -
 
 
 def estimate(app: App) -> list[float]:
-    """Position, velocity, attitude in G."""
     return np.frombuffer(app.estimator(), Estimator.dtype)[0]["now"][:9].tolist()  # type: ignore[no-any-return]
 
 

@@ -48,7 +48,6 @@ def texts(client: MavlinkClient, name: str, *fields: Any) -> list[str]:
 
 
 def by(client: MavlinkClient, sender: tuple[int, int], name: str, *fields: Any) -> None:
-    """Send as somebody else."""
     other = codec(*sender)
     client.receive(getattr(other, f"{name}_encode")(*fields).pack(other))
     client.run(client.now_us + 3000)

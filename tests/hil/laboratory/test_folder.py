@@ -29,7 +29,6 @@ with reserved(request_of("hover", duration_s=0.05), Path(sys.argv[1])):
 
 
 def stored(folder: str) -> list[tuple[str, bytes]]:
-    """Return the files of a folder with their content."""
     return [(path.name, path.read_bytes()) for path in sorted(Path(folder).iterdir())]
 
 

@@ -43,7 +43,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def changed(run: FlownRun, row: int, column: str, value: float) -> FlownRun:
-    """The run with one cell changed."""
     place = run.log.column_names.index(column)
     field = run.log.schema.field(place)
     values = run.log.column(place).to_numpy().copy()

@@ -42,7 +42,6 @@ def protocol(machine: BareCortex) -> RemoteProtocol:
 
 
 def ask(protocol: RemoteProtocol, payload: bytes) -> bytes:
-    """Return the content of the answer to a packet."""
     answer = protocol.receive(framed(payload))
     assert answer[:2] == b"+$", answer
     assert answer[-3:] == b"#%02x" % (sum(answer[2:-3]) % 256)

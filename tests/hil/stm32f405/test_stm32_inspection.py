@@ -145,7 +145,6 @@ def test_a_call_through_a_null_pointer_is_a_change_to_arm_code(compiler: str) ->
 
 
 def stopped(machine: FirmwareOnChip, why: Why) -> tuple[ChipProcessor, CrashReports]:
-    """Run until something is noticed."""
     processor = machine.processor()
     assert run_to_end(machine, 100) == why
     return processor, reports_of(machine)
