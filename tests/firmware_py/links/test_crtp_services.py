@@ -342,18 +342,14 @@ def test_floats_are_rounded_as_numpy_does(value: float) -> None:
     assert Scalar.U8.pack(inf) == Scalar.U8.pack(nan) == b"\0"
 
 
-def test_a_variable_can_be_fetched_as_every_type_as_c_casts_it(client: CrtpClient, logs) -> None:
-    client.firmware.signals.counters[0] = (
-        70_000  # poses that were fused: fit neither 16 bits nor a half float
-    )
-    number = logs["kalman.fused"][0]
+@pytest.mark.parametrize("name", ["kalman.fused", "gyro.xVariance"])
+def test_a_variable_can_be_fetched_as_every_type_as_c_casts_it(client: CrtpClient, logs, name: str) -> None:
+    client.firmware.signals.counters[0] = 70_000  # fits neither 16 bits nor a half float
+    client.firmware._core.sampling.fields.variance[0] = 70_000
     for kind, scalar in LOG_SCALARS.items():
-        assert client.create(kind, (kind, number)) == 0
-        client.one(LOG, 1, bytes((3, kind, 0)))
-        client.run(client.now_us + 3000)
-        data = client.packets(LOG, 2)[-1]
-        real = inf if scalar is Scalar.F16 else 70_000.0
-        assert scalar.unpack(data[4:]) == (C_TYPES[scalar](70_000).value if scalar in C_TYPES else real)
+        real = inf if scalar is Scalar.F16 else 70_000
+        expected = C_TYPES[scalar](70_000).value if scalar in C_TYPES else real
+        assert client.log({name: (logs[name][0], kind)}, name) == [expected]
 
 
 # Parameters
