@@ -134,16 +134,12 @@ def test_every_reason_why_a_command_is_not_run_is_needed() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("page", RUN, ids=name_of)
-def test_the_commands_of_a_page_print_what_it_shows(
-    page: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_commands_print_what_pages_show(page: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     run_examples(page, monkeypatch, why_not_run)
 
 
-def test_an_output_is_compared_with_its_numbers_but_not_with_its_widths_nor_with_the_machine_s_speed() -> (
-    None
-):
+def test_outputs_are_compared_by_words_and_numbers_except_widths_and_speeds() -> None:
     printed = (
         "first run on this machine: compiling\n┏━━━┓\n┃ metric ┃ value ┃\n│ rms_x  │  1.717 cm │\n"
         "completed; 12 times real time; 7.2 s from start to end; hash 548635c0b434aedb\n"

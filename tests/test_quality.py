@@ -14,10 +14,6 @@ ROOT = Path(__file__).parent.parent
 )
 def test_the_sources_are_clean(command: str) -> None:
     ran = subprocess.run(
-        [sys.executable, "-m", *command.split()],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=300,
+        [sys.executable, "-m", *command.split()], cwd=ROOT, capture_output=True, text=True, timeout=300
     )
     assert ran.returncode == 0, ran.stdout[-4000:] + ran.stderr[-1000:]

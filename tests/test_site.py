@@ -71,9 +71,7 @@ def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:
 
 @pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine")
 @pytest.mark.parametrize("place", ["index.html", "howto/boards.html"])
-def test_a_page_opened_from_the_disk_finds_words_and_loads_files_alone(
-    site: Path, tmp_path: Path, place: str
-) -> None:
+def test_a_page_on_disk_finds_words_and_loads_only_files(site: Path, tmp_path: Path, place: str) -> None:
     page = site / place
     text = page.read_text(encoding="utf-8")
     page.write_text(text.replace("</body>", SEARCH.replace("WORDS", "watchdog reset")), encoding="utf-8")

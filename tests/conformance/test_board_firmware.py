@@ -121,9 +121,7 @@ def test_time_counts_from_the_boot_and_goes_where_it_is_led(bench: Bench) -> Non
     assert kernel.now_us == 20_950
 
 
-def test_views_have_the_shapes_of_the_core_and_follow_it(
-    bench: Bench, request: pytest.FixtureRequest
-) -> None:
+def test_views_have_the_core_s_shapes_and_follow_it(bench: Bench, request: pytest.FixtureRequest) -> None:
     assert has_core(bench.firmware) == (request.node.callspec.params["make"] != "image")
     signals = bench.firmware.signals
     views = (signals.estimate, signals.counters, signals.u, signals.flap, signals.count)
@@ -155,7 +153,7 @@ def test_variables_have_names_of_their_own_and_numbers_of_their_types(bench: Ben
         assert variable.scalar.is_float or value == variable.scalar.cast(value), variable.name
 
 
-def test_tasks_are_told_alike_by_scheduler_and_statistics(bench: Bench) -> None:
+def test_scheduler_and_statistics_report_the_same_tasks(bench: Bench) -> None:
     bench.run(100_000)
     scheduler, reports = bench.firmware.scheduler, bench.firmware.reports()
     if scheduler is None:
@@ -172,7 +170,7 @@ def test_tasks_are_told_alike_by_scheduler_and_statistics(bench: Bench) -> None:
     assert all(queue.dropped == 0 <= queue.high_water <= queue.length for queue in scheduler.queues)
 
 
-def test_what_occupies_the_processor_is_counted_beside_the_tasks(bench: Bench) -> None:
+def test_interrupt_load_is_counted_beside_the_tasks(bench: Bench) -> None:
     scheduler = bench.firmware.scheduler
     if scheduler is None:
         return
@@ -220,7 +218,7 @@ def test_servos_get_four_counts_of_a_pulse(bench: Bench) -> None:
     assert all(0 <= count <= 52_501 for counts in bench.counts for count in counts)  # 0: not set yet
 
 
-def test_what_a_board_cannot_report_is_absent(bench: Bench) -> None:
+def test_missing_reports_are_none(bench: Bench) -> None:
     firmware = bench.firmware
     assert firmware.mavlink is None
     assert firmware.overrun == ""
@@ -239,7 +237,7 @@ def test_what_a_board_cannot_report_is_absent(bench: Bench) -> None:
         assert (report.watchdog_resets, report.software_resets) == (0, 0)
 
 
-def test_a_boot_begins_anew_with_the_same_face(bench: Bench) -> None:
+def test_a_reboot_restores_the_initial_views(bench: Bench) -> None:
     bench.run(30_000)
     first = bench.firmware
     again = bench.boot()

@@ -106,7 +106,6 @@ def bench(request: pytest.FixtureRequest) -> Bench:
 
 
 def answer(bench: Bench) -> Answer:
-    """What comes within a while."""
     for _ in range(30 * PATIENCE_US // TURN_US):
         bench.turn()
         if (answer := bench.controls.answer(bench.now_us)) is not None:
@@ -123,7 +122,7 @@ def on_board(bench: Bench, name: str) -> float:
     return next(item for item in bench.firmware.parameters if item.name == name).read()
 
 
-def test_what_is_written_is_in_force_and_is_read_back(bench: Bench) -> None:
+def test_a_written_value_is_in_force_and_is_read_back(bench: Bench) -> None:
     before = on_board(bench, "extCtrl.y_P")
     name = bench.name("extCtrl.y_P")
     assert ask(bench, ControlAction.READ, "extCtrl.y_P") == Answer(((name, before),))
@@ -145,7 +144,7 @@ def test_a_value_that_is_not_allowed_changes_nothing_and_is_one_line(bench: Benc
     assert on_board(bench, "supervisor.poseTimeout") == 500
 
 
-def test_an_unknown_name_is_told_with_the_nearest_one(bench: Bench) -> None:
+def test_an_unknown_name_is_refused_with_the_nearest_one(bench: Bench) -> None:
     near = bench.name("extCtrl.y_P")
     for action in (ControlAction.READ, ControlAction.WRITE):
         told = ask(bench, action, near[:-1] + "Q", 1.0)
@@ -172,7 +171,7 @@ def test_a_group_is_listed_whole(bench: Bench) -> None:
     assert told == [name for name in everything if name.upper().startswith(group)]
 
 
-def test_what_is_saved_is_there_after_the_next_boot(bench: Bench) -> None:
+def test_saved_values_survive_a_boot(bench: Bench) -> None:
     ask(bench, ControlAction.WRITE, "extCtrl.y_P", -1.75)
     assert ask(bench, ControlAction.SAVE) == Answer(())
     booted = Firmware(load_config(), bench)  # type: ignore[arg-type]
@@ -209,7 +208,7 @@ def test_a_stop_of_which_only_the_question_arrives_is_sent_again(bench: Bench) -
     assert bench.firmware.signals.supervisor.stopped
 
 
-def test_what_the_board_cannot_do_is_refused_in_one_line(bench: Bench) -> None:
+def test_an_impossible_request_is_refused_in_one_line(bench: Bench) -> None:
     bench.battery_mv = 2_000  # type: ignore[attr-defined]
     bench.run(8_000_000)  # type: ignore[attr-defined]
     told = ask(bench, ControlAction.ARM)

@@ -42,7 +42,7 @@ def test_arbitrary_calls_give_the_bits_of_python(recording: Recording, runner: R
         assert run_step(core, step) == after, f"call {number}, {step.call}"
 
 
-def test_what_one_runner_begins_another_one_continues(recording: Recording, runner: RunnerFactory) -> None:
+def test_one_runner_continues_what_another_began(recording: Recording, runner: RunnerFactory) -> None:
     """All state lies in the blocks: runners that take turns with Python's compute what one alone does."""
     core = core_at_start(recording, runner)
     runners = (core.run, PythonRunner(core))
@@ -56,9 +56,7 @@ WRITES = {  # of the input
 }  # fmt: skip
 
 
-def test_no_call_writes_parameters_or_the_tasks_part_of_the_input(
-    recording: Recording, runner: RunnerFactory
-) -> None:
+def test_no_call_writes_parameters_or_the_tasks_inputs(recording: Recording, runner: RunnerFactory) -> None:
     core = core_at_start(recording, runner)
     for step in recording.steps:
         run_step(core, step)

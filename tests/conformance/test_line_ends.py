@@ -55,7 +55,7 @@ def test_clients_come_and_go(pair: Pair) -> None:
     assert open_end.received == b"012"
 
 
-def test_a_client_that_does_not_read_holds_nobody_up(pair: Pair) -> None:
+def test_a_client_that_does_not_read_delays_no_other(pair: Pair) -> None:
     open_end, connect = pair
     client = connect(open_end)
     for _ in range(20_000):
@@ -65,9 +65,7 @@ def test_a_client_that_does_not_read_holds_nobody_up(pair: Pair) -> None:
     client.close()
 
 
-def test_a_closed_end_gives_its_address_back_and_everything_it_reads_from(
-    again: Callable[[], Pair],
-) -> None:
+def test_closing_an_end_releases_its_address_and_its_readers(again: Callable[[], Pair]) -> None:
     for _ in range(3):
         open_end, connect = again()
         client = connect(open_end)
@@ -78,7 +76,7 @@ def test_a_closed_end_gives_its_address_back_and_everything_it_reads_from(
         client.close()
 
 
-def test_an_end_that_is_closed_twice_harms_nobody(again: Callable[[], Pair]) -> None:
+def test_closing_an_end_twice_is_harmless(again: Callable[[], Pair]) -> None:
     closed, _ = again()
     closed.close()
     open_end, connect = again()  # with the same address, and the descriptors that have become free

@@ -98,7 +98,7 @@ def test_frames_come_once_in_order_and_after_their_exposure(source: MocapSource)
     assert all(frame.t_us < now_us for frame in frames)
 
 
-def test_what_was_opened_is_said_once_and_lines_are_single(source: MocapSource) -> None:
+def test_opening_is_reported_once_in_single_lines(source: MocapSource) -> None:
     source.open()
     notices = source.notices()
     assert len(notices) == 1
@@ -123,7 +123,7 @@ def test_a_source_that_is_opened_again_delivers_again(source: MocapSource) -> No
 
 
 @pytest.mark.realtime
-def test_who_has_no_time_does_not_wait(source: MocapSource) -> None:
+def test_without_a_timeout_nothing_waits(source: MocapSource) -> None:
     """Who has no time gets at once what lies there, which is nothing or a frame."""
     source.open()
     begin_us = clock_us()

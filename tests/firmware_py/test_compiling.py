@@ -51,7 +51,7 @@ def half(x):
 @pytest.mark.parametrize(
     "kept", [pytest.param("beside the sources", marks=pytest.mark.long), "NUMBA_CACHE_DIR"]
 )
-def test_what_is_compiled_is_kept_until_any_source_changes(kept: str, tmp_path: Path) -> None:
+def test_compiled_code_is_kept_until_a_source_changes(kept: str, tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     environment.pop("NUMBA_CACHE_DIR", None)
     if kept == "NUMBA_CACHE_DIR":

@@ -37,7 +37,7 @@ def test_exponential(x: float) -> None:
     assert ulps(elementary.exp(x), math.exp(x)) <= ULPS
 
 
-def test_exponential_beyond_what_can_be_told() -> None:
+def test_exponential_beyond_the_range() -> None:
     assert elementary.exp(-1e300) == elementary.exp(-math.inf) == 0.0
     assert elementary.exp(1e300) == elementary.exp(math.inf) == math.inf
 

@@ -32,9 +32,7 @@ def coefficients(
 
 @given(MOTIONS, MOTIONS, DURATIONS)
 @settings(max_examples=15, deadline=None)
-def test_between_two_motions_lies_the_polynomial_without_jerk_at_its_ends(
-    begin: PathPoint, end: PathPoint, duration: float
-) -> None:
+def test_motions_are_joined_without_jerk_at_ends(begin: PathPoint, end: PathPoint, duration: float) -> None:
     path = between(begin, end, duration)
     for axis in range(3):
         states = [(m.position[axis], m.velocity[axis], m.acceleration[axis]) for m in (begin, end)]

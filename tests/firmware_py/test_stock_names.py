@@ -53,7 +53,7 @@ def test_every_parameter_that_clients_use_has_its_stock_type_access_and_persiste
     assert {name: texts.get(name) for name in STOCK["parameters"]} == STOCK["parameters"]
 
 
-def test_what_has_no_effect_is_kept_and_what_is_persistent_survives(client: CrtpClient, tables) -> None:
+def test_parameters_without_effect_keep_values_and_persistence(client: CrtpClient, tables) -> None:
     _, params = tables
     for name, value in (
         ("pid_attitude.pitch_kd", 0.25),
@@ -71,9 +71,7 @@ def test_what_has_no_effect_is_kept_and_what_is_persistent_survives(client: Crtp
 
 
 @pytest.mark.parametrize("name", BUTTONS)
-def test_a_button_lets_the_console_speak_once_and_reads_zero_again(
-    client: CrtpClient, tables, name: str
-) -> None:
+def test_a_button_prints_once_and_reads_zero_again(client: CrtpClient, tables, name: str) -> None:
     _, params = tables
     assert client.write(params, name, 1) == 0
     client.run(client.now_us + 200_000)

@@ -9,12 +9,7 @@ import pytest
 from firmware_py.core import structs
 from firmware_py.core.sampling import RECOVERY_STEPS, STALE_STEPS
 from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL
-from firmware_py.core.supervisor import (
-    BATTERY_LOW_US,
-    DOWN_US,
-    EPISODE_GAP_US,
-    EPISODE_LIMIT_US,
-)
+from firmware_py.core.supervisor import BATTERY_LOW_US, DOWN_US, EPISODE_GAP_US, EPISODE_LIMIT_US
 from firmware_py.links.platform import supervisor_bits
 from firmware_py.wire.crtp import Correction
 from firmware_py.wire.supervisor import Cause, State
@@ -115,11 +110,15 @@ def test_floatys_own_stop_can_be_left(flying: CrtpClient, leave) -> None:
     assert after(flying, 20_000) == (State.FLYING, Cause.NONE)
 
 
-def test_floatys_own_parameter_arms_and_disarms(flying: CrtpClient) -> None:
-    write(flying, "floaty.armed", 0)
-    assert after(flying, 20_000) == (State.FAILSAFE, Cause.DISARMED)
-    write(flying, "floaty.armed", 1)
-    assert after(flying, 20_000) == (State.FLYING, Cause.NONE)
+@pytest.mark.parametrize(
+    "arm", [lambda c, on: write(c, "floaty.armed", on), lambda c, on: c.one(SUPERVISOR, 1, bytes((1, on)))]
+)
+def test_a_disarmed_board_hovers_until_it_is_armed(flying: CrtpClient, arm) -> None:
+    arm(flying, False)
+    assert after(flying, 11_000) == (State.FAILSAFE, Cause.DISARMED)
+    assert flying.writes[-1][1] == HOVER_COUNTS
+    arm(flying, True)
+    assert after(flying, 11_000) == (State.FLYING, Cause.NONE)
 
 
 @pytest.mark.parametrize(
@@ -211,7 +210,7 @@ def in_flight(happen: Callable[[SupervisorBench], object], now_us: int = 0) -> S
 
 @EVENTS
 @pytest.mark.parametrize("manual", MANUALS)
-def test_angles_from_outside_move_the_flaps_unless_somebody_the_battery_or_own_logic_stopped_the_robot(
+def test_manual_angles_act_unless_the_robot_was_stopped(
     happen: Callable[[SupervisorBench], object], cause: Cause, flown_by: tuple[int, int, int], manual: int
 ) -> None:
     bench = in_flight(happen)
@@ -223,9 +222,7 @@ def test_angles_from_outside_move_the_flaps_unless_somebody_the_battery_or_own_l
 
 
 @pytest.mark.parametrize(("gap_us", "outside"), [(EPISODE_GAP_US, True), (EPISODE_GAP_US + 10_000, False)])
-def test_bounded_steps_up_to_50_ms_apart_are_one_episode_which_counts_after_200_ms(
-    gap_us: int, outside: bool
-) -> None:
+def test_bounded_steps_50_ms_apart_are_one_episode_that_counts_at_200_ms(gap_us: int, outside: bool) -> None:
     bench = in_flight(lambda bench: bench.fly(1_000_000))
     for now_us in range(0, EPISODE_LIMIT_US + gap_us, gap_us):
         bench.fly(10_000, bounded=True)
@@ -234,7 +231,7 @@ def test_bounded_steps_up_to_50_ms_apart_are_one_episode_which_counts_after_200_
         bench.fly(gap_us - 10_000)
 
 
-def test_an_episode_after_a_silent_one_begins_anew() -> None:
+def test_an_episode_after_a_silent_one_restarts() -> None:
     bench = in_flight(lambda bench: None)
     for _ in range(3):
         bench.fly(3_800_000)
@@ -245,7 +242,7 @@ CAN_BE_ARMED, CAN_FLY = 1 << 0, 1 << 3
 
 
 @EVENTS
-def test_a_board_that_says_that_it_can_fly_flies_at_the_next_pose(
+def test_a_board_that_can_fly_flies_at_the_next_pose(
     happen: Callable[[SupervisorBench], object], cause: Cause, flown_by: tuple[int, int, int]
 ) -> None:
     bench = in_flight(happen)
@@ -256,7 +253,7 @@ def test_a_board_that_says_that_it_can_fly_flies_at_the_next_pose(
 
 
 @EVENTS
-def test_a_disarmed_board_that_says_that_it_can_be_armed_obeys(
+def test_a_board_that_reports_can_be_armed_arms(
     happen: Callable[[SupervisorBench], object], cause: Cause, flown_by: tuple[int, int, int]
 ) -> None:
     bench = in_flight(happen)
@@ -289,7 +286,7 @@ def test_silence_begins_when_the_last_pose_is_as_old_as_its_limit(start_us: int,
         (fell_silent, Cause.SILENCE),
     ],
 )
-def test_what_is_decided_by_time_is_decided_over_the_wrap_of_its_clock(
+def test_timed_decisions_survive_the_clock_wrap(
     happen: Callable[[SupervisorBench], object], cause: Cause, start_us: int
 ) -> None:
     bench = in_flight(lambda bench: bench.fly(500_000), start_us)
@@ -325,7 +322,7 @@ def test_a_board_that_is_disarmed_while_it_calibrates_is_in_failsafe() -> None:
     assert bench.found == (State.FAILSAFE, Cause.DISARMED)
 
 
-def test_a_board_says_that_it_can_fly_when_its_gyro_is_calibrated_and_not_before() -> None:
+def test_a_board_can_fly_only_after_gyro_calibration() -> None:
     bench = SupervisorBench()
     told = [supervisor_bits(bench.view) & CAN_FLY]
     bench.calibrate()
@@ -387,7 +384,7 @@ def test_a_gyro_is_stale_after_20_steps_and_alive_after_100_with_new_counts() ->
     assert found == [False, True, True, False]
 
 
-def test_a_sample_that_is_late_on_a_link_is_no_fault_of_the_gyro() -> None:
+def test_a_late_sample_on_a_link_is_not_a_stale_gyro() -> None:
     bench = in_flight(lambda bench: None)
     bench.data.gyro_again = 1
     bench.steps(10 * STALE_STEPS)
@@ -404,13 +401,13 @@ def test_control_is_lost_once_after_50_ms_without_a_look_and_until_the_next_one(
         assert bench.fly(10_000) == MODE_FLY
 
 
-def test_nobody_misses_a_controller_that_has_not_begun() -> None:
+def test_a_controller_that_has_not_begun_is_not_lost() -> None:
     bench = SupervisorBench(look=False)
     assert bench.watch_control(1_000_000) == 0
     assert bench.view.state is State.CALIBRATING
 
 
-def test_a_flight_that_begins_afresh_waits_for_gyro_and_pose_and_is_not_armed_by_it() -> None:
+def test_a_restarted_flight_waits_for_gyro_and_pose_and_stays_disarmed() -> None:
     bench = in_flight(lambda bench: bench.fly(100_000))
     bench.view.arm(False)
     bench.core.run.call("restart")
@@ -423,7 +420,7 @@ def test_a_flight_that_begins_afresh_waits_for_gyro_and_pose_and_is_not_armed_by
     assert bench.view.state is State.WAITING
 
 
-def test_a_robot_without_anything_to_fly_to_waits() -> None:
+def test_a_robot_without_a_goal_waits() -> None:
     bench = in_flight(lambda bench: bench.fly(100_000))
     bench.data.absolute = 1
     bench.pilot.measured(Correction((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), None), bench.now_us)
@@ -449,14 +446,6 @@ def test_watchdog_bites_one_second_after_its_last_meal_and_not_before_the_first(
     assert after(flying, 100_000)[1] is Cause.EMERGENCY_STOP
 
 
-def test_disarmed_board_does_not_fly_until_it_is_armed(flying: CrtpClient) -> None:
-    flying.one(SUPERVISOR, 1, b"\1\0")
-    assert after(flying, 11_000) == (State.FAILSAFE, Cause.DISARMED)
-    assert flying.writes[-1][1] == HOVER_COUNTS
-    flying.one(SUPERVISOR, 1, b"\1\1")
-    assert after(flying, 11_000)[0] is State.FLYING
-
-
 def test_low_battery_needs_five_seconds_and_ends_by_recovery_with_a_good_voltage(flying: CrtpClient) -> None:
     flying.battery_mv = 3100
     flying.run(flying.now_us + 4_000_000)
@@ -480,9 +469,7 @@ def test_recovery_is_refused_while_the_battery_is_low(flying: CrtpClient) -> Non
     assert flying.one(SUPERVISOR, 1, b"\2") == b"\x82\0\0"
 
 
-def test_an_estimator_at_its_bounds_is_a_failsafe_that_ends_half_a_second_after_it_is_back(
-    flying: CrtpClient,
-) -> None:
+def test_a_bounded_estimator_is_a_failsafe_until_half_a_second_after_it_returns(flying: CrtpClient) -> None:
     flying.send(PARAM, 3, b"\0kalman\0maxPos\0\x06" + struct.pack("<f", 0.03))  # the robot is at y = 0.04
     begin_us = flying.now_us
     while state(flying)[0] is State.FLYING:
@@ -513,7 +500,7 @@ def test_state_and_cause_are_log_variables(flying: CrtpClient) -> None:
     assert flying.log(table, *names) == [3, 3, 0, 0, 0b10_0100_0110]
 
 
-def test_flaps_never_rest_whatever_the_supervisor_says(flying: CrtpClient) -> None:
+def test_flaps_are_written_in_every_supervisor_state(flying: CrtpClient) -> None:
     stop(flying)
     flying.run(flying.now_us + 500_000)
     times = [t for t, _ in flying.writes]

@@ -12,18 +12,18 @@ VARIABLES = {variable.name: variable for variable in CORE_VARIABLES}
 
 
 @pytest.mark.parametrize("table", [CORE_PARAMETERS, CORE_VARIABLES], ids=["parameters", "variables"])
-def test_no_name_stands_twice_and_each_fits_a_table_of_contents(table: tuple[object, ...]) -> None:
+def test_names_are_unique_and_fit_a_table_of_contents(table: tuple[object, ...]) -> None:
     names = [one.name for one in table]
     assert len(set(names)) == len(names)
     assert max(map(len, names)) <= MAX_NAME + 1  # with the dot
 
 
-def test_what_a_client_cannot_set_of_the_cores_parameters_belongs_to_the_hardware() -> None:
+def test_only_hardware_parameters_of_the_core_are_not_settable() -> None:
     settable = {parameter.place.field for parameter in CORE_PARAMETERS}
     assert set(Parameters.dtype.names or ()) - settable == {"age_measured", "direction", "gyro_scale", "home"}
 
 
-def test_a_name_stands_for_its_own_element() -> None:
+def test_a_name_maps_to_its_own_element() -> None:
     assert [VARIABLES[f"kalman.var{axis}"].place.index for axis in ("X", "PZ")] == [(0, 0), (5, 5)]
     assert VARIABLES["Uncertainty.P_x_vx"].place.index == (0, 3)
     assert VARIABLES["stateEstimate.yaw_rate"].place.index == (11,)

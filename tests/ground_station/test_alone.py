@@ -38,7 +38,7 @@ def test_it_loads_nothing_of_the_laboratory() -> None:
         ("home = ", ["--link", "udp://127.0.0.1:1"], "Invalid value"),
     ],
 )
-def test_what_cannot_be_flown_is_one_line(
+def test_bad_input_is_one_line(
     settings: str, arguments: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "ground.toml"

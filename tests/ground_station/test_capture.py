@@ -46,7 +46,7 @@ def test_the_tunnel_is_moved_and_turned_in_the_system_s_frame() -> None:
     assert to_euler_zyx(q) == pytest.approx((0.0, 0.0, QUARTER))
 
 
-def test_y_is_up_by_default_where_motive_says_so() -> None:
+def test_motive_s_default_up_axis_is_y() -> None:
     assert Alignment(CaptureConfig(system="optitrack")).axes == "y-up"
     assert Alignment(CaptureConfig(system="vicon")).axes == "z-up"
     assert Alignment(CaptureConfig(system="optitrack", axes="z-up")).axes == "z-up"
@@ -109,7 +109,7 @@ def test_the_command_line_overrides_what_it_names(text: str, changes: dict[str, 
     "optitrack:", "optitrack:h:0", "optitrack:h,body=", "optitrack:h,x", "virtual:1",
     "vicon", "vicon:h,multicast", "qualisys:", "vrpn:h:x", "phasespace:h", "",
 ])  # fmt: skip
-def test_what_names_no_source_is_refused(text: str) -> None:
+def test_an_invalid_source_is_refused(text: str) -> None:
     with pytest.raises(MocapError, match="expected optitrack"):
         find_source(text, CaptureConfig())
 
@@ -124,7 +124,7 @@ def test_a_port_may_be_named_where_the_client_takes_one(text: str) -> None:
     find_source(text, CaptureConfig()).close()
 
 
-def test_a_stream_with_another_rate_than_the_profile_s_is_told_once() -> None:
+def test_a_stream_of_another_rate_is_reported_once() -> None:
     def told(*periods_us: int, expected_us: int = 5000) -> list[str]:
         rate, t_us, lines = FrameRate(expected_us, 50.0), 7, []
         for period_us in periods_us:
@@ -155,7 +155,5 @@ def test_a_stream_with_another_rate_than_the_profile_s_is_told_once() -> None:
     (("--set", "capture.system=optitrak"), "capture.system = 'optitrak': input should be 'optitrack', 'vicon'"),
     (("--set", "capture.system=qualisys", "--set", "capture.port=1"), "capture.system = qualisys: qualisys: its client"),
 ])  # fmt: skip
-def test_what_cannot_be_is_one_line_and_exit_code_two(
-    cli: Cli, arguments: tuple[str, ...], message: str
-) -> None:
+def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: tuple[str, ...], message: str) -> None:
     assert message in cli.refusal("station", "--link", "udp://127.0.0.1:1", *arguments)

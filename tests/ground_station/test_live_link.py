@@ -127,7 +127,7 @@ def test_a_muted_link_sends_nothing_until_it_is_opened_again():
 @pytest.mark.parametrize(
     ("stops", "failure", "why"), [(True, "", "stopped while connecting"), (False, "no", "no")]
 )
-def test_who_cannot_or_may_not_connect_leaves_the_device_closed(stops, failure, why):
+def test_a_failed_connection_closes_the_device(stops, failure, why):
     board = Board(steps=5)
     board.failure = failure
     with pytest.raises(LinkError, match=f"^board:1: {why}$"):
@@ -148,7 +148,7 @@ def test_a_board_that_is_silent_for_two_seconds_is_lost():
     board.close()
 
 
-def test_what_nobody_fetches_is_bounded():
+def test_unread_data_is_bounded():
     board = opened()
     for _ in range(PIECES + 10):
         board._on_bytes(b"x")
@@ -157,7 +157,7 @@ def test_what_nobody_fetches_is_bounded():
     board.close()
 
 
-def test_what_a_board_prints_is_a_notice_for_each_line():
+def test_console_lines_become_notices():
     link = CrazyradioLink("udp://127.0.0.1:19850", LinkSettings(50.0, 0, 0))
     for piece in (b"imu: gyro ", b"zero found\nsuper", b"visor: flying\n\n"):
         assert link.receive(0, encode(Packet(PORT_CONSOLE, 0, piece))) == ()

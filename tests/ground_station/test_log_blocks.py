@@ -96,7 +96,7 @@ def test_a_lost_request_is_repeated_after_a_tenth_of_a_second(arrives):
     assert line.board.blocks[CONTROL.id] == [(v.type.log_number, v.name) for v in CONTROL.variables]
 
 
-def test_a_board_without_a_variable_sends_the_other_blocks_and_the_user_is_told():
+def test_a_missing_variable_costs_only_its_block_and_is_reported():
     line = Line({name: number for name, number in TABLE.items() if name != "system.load"})
     line.logs.request(0)
     line.talk()
@@ -104,7 +104,7 @@ def test_a_board_without_a_variable_sends_the_other_blocks_and_the_user_is_told(
     assert line.logs.notices == ["the board has no system.load: without these blocks of telemetry"]
 
 
-def test_a_refusal_is_told_and_ends_the_script():
+def test_a_refusal_is_reported_and_ends_the_script():
     line = Line()
     line.logs.request(0)
     line.talk()
@@ -136,11 +136,7 @@ def test_attitudes_of_a_crazyflie_come_in_degrees_and_are_samples_in_radians(lin
     assert sample.values == pytest.approx((*np.radians((10, 20, 30)), 41, 5, 6))
 
 
-@given(
-    phase=st.integers(0, 19),
-    after=st.tuples(*[st.integers(1, 19)] * 3),
-    begin=st.integers(0, 1000),
-)
+@given(phase=st.integers(0, 19), after=st.tuples(*[st.integers(1, 19)] * 3), begin=st.integers(0, 1000))
 def test_blocks_of_one_period_share_the_instant_of_the_controllers_block(phase, after, begin):
     line = Line()
     line.logs.request(0)

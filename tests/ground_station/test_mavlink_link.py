@@ -193,7 +193,7 @@ def status(millivolts, per_mille):
     return dialect.MAVLink_sys_status_message(0, 0, 0, per_mille, millivolts, -1, -1, 0, 0, 0, 0, 0, 0)
 
 
-def test_battery_and_load_stand_in_the_row_of_the_telemetry_before_them(tmp_path):
+def test_battery_and_load_belong_to_the_preceding_row(tmp_path):
     bench = LinkWithCodec()
     assert bench.hear(0, status(3_900, 250)) == []  # there is no row yet
     log = TelemetryLog(tmp_path / "telemetry.csv")
@@ -217,7 +217,7 @@ def test_a_status_does_not_put_off_that_missing_telemetry_is_asked_for():
     assert [message.param1 for _, message in bench.of(COMMAND)] == [ARRAY]
 
 
-def test_others_are_not_listened_to():
+def test_other_systems_are_ignored():
     bench = LinkWithCodec()
     bench.pose(0)
     bench.hear(0, heartbeat())
@@ -253,7 +253,7 @@ def test_a_text_in_pieces_is_one_line_unless_its_beginning_was_lost():
 
 
 @pytest.mark.parametrize(("result", "word"), [(2, "denied"), (5, "in progress"), (77, "77")])
-def test_a_refusal_without_a_reason_is_told_in_the_standard_s_words(result, word):
+def test_a_refusal_without_reason_has_the_standard_s_word(result, word):
     bench = LinkWithCodec()
     controls, told = bench.link.controls, dialect.MAVLink_statustext_message(6, b"written by somebody")
     controls.ask(0, ControlRequest(ControlAction.SAVE))
@@ -277,15 +277,12 @@ def test_the_round_trip_is_that_of_the_own_request_only():
     assert bench.link.round_trip_us == 4200
 
 
-def test_what_is_read_late_counts_from_its_arrival():
+def test_late_reads_count_from_their_arrival():
     """The board's request is answered with the middle between arrival and answer, as NTP has it."""
     bench = LinkWithCodec()
     bench.pose(1_000_000)
     request = bench.of(dialect.MAVLINK_MSG_ID_TIMESYNC)[0][1]
-    messages = (
-        dialect.MAVLink_timesync_message(5, request.ts1),
-        dialect.MAVLink_timesync_message(0, 777),
-    )
+    messages = (dialect.MAVLink_timesync_message(5, request.ts1), dialect.MAVLink_timesync_message(0, 777))
     bench.link.receive(1_004_200, b"".join(message.pack(bench.codec) for message in messages), 1_010_200)
     assert bench.link.latency.us == 2100
     answered_us, answer = bench.of(dialect.MAVLINK_MSG_ID_TIMESYNC)[1]
@@ -358,7 +355,7 @@ def test_at_57600_baud_the_loads_are_those_of_frames_counted_by_hand():
 
 
 @given(st.integers(9600, 3_000_000), st.floats(1.0, 200.0), st.booleans())
-def test_what_the_budget_allows_fits_and_it_allows_no_less_than_fits(baud, pose_hz, signed):
+def test_the_budget_allows_exactly_what_fits(baud, pose_hz, signed):
     try:
         budget = link_budget(baud, pose_hz, signed)
     except LinkError:

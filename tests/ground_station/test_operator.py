@@ -124,7 +124,7 @@ def test_bad_input_is_one_line_and_changes_nothing(bench, line):
         ("set controller.gain_q2 1", "controller.gain_q"),
     ],
 )
-def test_what_was_nearly_right_is_told(bench, line, near):
+def test_near_misses_are_suggested(bench, line, near):
     (told,) = bench.type(line)
     assert f"did you mean {near}" in told
 
@@ -225,7 +225,7 @@ def test_stop_waits_for_nothing_and_lasts_until_a_reboot(bench):
     assert not bench.firmware.signals.supervisor.stopped
 
 
-def test_a_stop_that_nobody_acknowledges_is_noted_and_said(bench):
+def test_an_unacknowledged_stop_is_noted_and_reported(bench):
     bench.heard = 0
     assert bench.type("stop", wait_us=4_000_000) == ["stop: no answer within 2 s"]
     assert bench.noted == ["stop"]
@@ -239,7 +239,7 @@ def test_lines_are_done_in_their_order(bench):
     assert bench.noted[1] == "mark now it's on"
 
 
-def test_too_many_lines_are_refused_and_said(bench):
+def test_too_many_lines_are_refused_and_reported(bench):
     for number in range(LINES + 5):
         bench.operator.take(f"mark {number}")
     assert len(bench.said) == 5
@@ -254,7 +254,7 @@ def test_help_has_every_command(bench):
     }  # fmt: skip
 
 
-def test_who_wants_to_know_parameters_is_told_all_of_them_and_every_change_unasked(bench):
+def test_a_parameter_listener_gets_all_values_and_every_change(bench):
     known = {}
     bench.operator = Operator(find, bench.said.append, bench.noted.append, known.update)
     assert bench.type(wait_us=8_000_000) == []

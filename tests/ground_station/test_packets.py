@@ -21,7 +21,7 @@ def test_a_link_is_ready_when_the_radio_has_taken_what_was_sent_and_udp_always_i
     packets.close()
 
 
-def test_a_lost_link_is_said_once_and_for_all_in_one_line() -> None:
+def test_a_lost_link_is_reported_once_in_one_line() -> None:
     packets = CflibPackets("udp://127.0.0.1:9")
     packets._lose("pulled out\nTraceback ...")
     packets._lose("again")

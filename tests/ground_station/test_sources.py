@@ -152,9 +152,7 @@ def test_frames_that_come_twice_or_late_are_dropped_and_counted() -> None:
     ("", {"floaty": 7, "wand": 8}, "body=NAME is missing; there are: floaty, wand"),
     ("floaty", {}, "no body 'floaty'; there are: none"),
 ])  # fmt: skip
-def test_a_wrong_body_is_one_line_with_those_there_are(
-    name: str, bodies: dict[str, int], message: str
-) -> None:
+def test_a_wrong_body_is_one_line_listing_the_bodies(name: str, bodies: dict[str, int], message: str) -> None:
     stream = NatnetStream(name, AS_STREAMED)
     stream.on_packet(packets.server_info(V), 0)
     with pytest.raises(MocapError) as caught:
@@ -212,7 +210,7 @@ def test_changed_models_are_asked_for() -> None:
     assert [data[0] for data in bench.stream.outgoing] == [4]
 
 
-def test_a_stream_that_stops_is_told_once_and_called_until_it_is_back() -> None:
+def test_a_stopped_stream_is_reported_once_and_requested_until_it_returns() -> None:
     bench = ServedStream()
     bench.frame()
     calls = 0
@@ -228,7 +226,7 @@ def test_a_stream_that_stops_is_told_once_and_called_until_it_is_back() -> None:
     ]  # fmt: skip
 
 
-def test_who_did_not_listen_does_not_call_the_server_silent() -> None:
+def test_a_busy_station_does_not_report_silence() -> None:
     bench = ServedStream()
     bench.frame()
     bench.now_us += 3_000_000
@@ -238,7 +236,7 @@ def test_who_did_not_listen_does_not_call_the_server_silent() -> None:
     assert bench.stream.notices == []
 
 
-def test_silence_begins_with_a_frame_and_each_one_is_told_twice() -> None:
+def test_silence_is_reported_at_its_begin_and_end() -> None:
     notices: list[str] = []
     silence = Silence(notices)
     assert not silence.lasts(10 * SILENCE_US)  # nothing has come yet: that is for who connects to say

@@ -264,7 +264,7 @@ def test_the_exact_opposite_attitude_is_refused(w: float) -> None:
         ((0.1, -0.2, 1.15), (1.02, 0.0, 0.0, 0.0)),
     ],
 )
-def test_what_is_no_pose_counts_as_not_seen(p, q) -> None:
+def test_an_invalid_pose_counts_as_not_seen(p, q) -> None:
     tracker = tracking()
     track = tracker.take(frame(100, p, q))
     assert (track.quality, track.frame.valid) == (NOT_YET, False)
@@ -273,7 +273,7 @@ def test_what_is_no_pose_counts_as_not_seen(p, q) -> None:
     assert qualities(*[frame(n, p, q) for n in range(5)]) == [NOT_YET] * 5
 
 
-def test_a_push_of_20_newton_is_no_outlier() -> None:
+def test_a_push_of_20_newton_is_accepted() -> None:
     """59 m/s^2 for 0.1 s on each axis and its opposite, and 0.2 N m (154 rad/s^2) at the same time."""
     for axis in np.vstack((np.eye(3), -np.eye(3))):
         tracker, rng = tracking(), np.random.default_rng(6)
@@ -334,7 +334,7 @@ def test_a_robot_that_falls_is_tracked_from_the_third_pose_on() -> None:
     assert qualities(*falls) == [NOT_YET, NOT_YET, YES]
 
 
-def test_after_the_time_to_reacquire_the_track_begins_anew_at_the_newest_pose() -> None:
+def test_after_the_time_to_reacquire_the_track_restarts_at_the_newest_pose() -> None:
     tracker, rng = tracking(), np.random.default_rng(2)
     tracked = [
         tracker.take(noisy(rng, n, (0.6, -0.2, 1.15))).quality is Quality.TRACKED for n in range(100, 200)
@@ -408,7 +408,7 @@ def test_a_track_that_is_lost_and_restarted_is_reported() -> None:
     ]
 
 
-def test_rubbish_now_and_then_is_told_twice_a_second_at_most() -> None:
+def test_occasional_outliers_are_reported_at_most_twice_a_second() -> None:
     rng = np.random.default_rng(2)
     frames = [noisy(rng, n) if n % 10 else frame(n, rng.uniform(-1, 1, 3)) for n in range(100, 2100)]
     assert 10 <= len(told(tracking(), frames)) <= 20

@@ -127,7 +127,7 @@ def test_the_command_of_a_request_flies_it_again_bit_for_bit(cli: Cli, options: 
     assert load_run("two").hash == flown.hash
 
 
-def test_the_command_of_a_request_says_all_that_is_not_the_usual() -> None:
+def test_the_command_of_a_request_has_all_that_differs_from_defaults() -> None:
     usual = command_of(request_of("yaw-step"))
     assert usual == "floaty fly yaw-step --seed 1"
     command = command_of(
@@ -151,7 +151,7 @@ def shell_words(command: str) -> list[str]:
     return shown.stdout.splitlines()
 
 
-def test_an_experiment_that_stands_nowhere_has_no_command() -> None:
+def test_an_experiment_without_a_file_has_no_command() -> None:
     hover = EXPERIMENTS["hover"]
     assert command_of(Request.of(replace(hover, duration_s=5.0))) is None
     assert command_of(Request.of(Experiment("mine", "", 1.0, {}))) is None

@@ -48,7 +48,7 @@ def test_a_little_lateness_is_made_up_for(wall: Wall) -> None:
     assert (paced.stood_still_us, paced.notices()) == (0, [])
 
 
-def test_after_a_stall_time_goes_on_from_where_it_stood(wall: Wall) -> None:
+def test_after_a_stall_time_continues_from_its_value(wall: Wall) -> None:
     paced = Paced()
     paced.start(0)
     wall.us += 300_000
@@ -62,7 +62,7 @@ def test_after_a_stall_time_goes_on_from_where_it_stood(wall: Wall) -> None:
     assert paced.notices() == []
 
 
-def test_a_machine_that_is_always_too_slow_is_told_once_per_second_and_every_stall_counts(wall: Wall) -> None:
+def test_a_slow_machine_is_reported_once_per_second_and_every_stall_counts(wall: Wall) -> None:
     paced, lines = Paced(), []
     for now_us in range(0, 5_000_000, 50_000):
         paced.wait_until(now_us)
@@ -74,15 +74,13 @@ def test_a_machine_that_is_always_too_slow_is_told_once_per_second_and_every_sta
     assert paced.stood_still_us == pytest.approx(2_500_000, abs=30_000)
 
 
-def test_free_running_time_never_stands_still() -> None:
+def test_free_running_time_never_waits() -> None:
     free = FreeRunning()
     free.wait_until(10**15)
     assert (free.stood_still_us, free.notices()) == (0, [])
 
 
-def test_the_age_of_the_process_counts_from_its_start_and_is_nan_where_no_system_says_it(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_process_age_is_nan_where_unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     first = clock.process_age_s()
     assert 0.0 < first <= clock.process_age_s()
     monkeypatch.setattr(clock, "PROCESS", tmp_path / "none")

@@ -107,7 +107,7 @@ def test_a_profile_builds_on_another(tmp_path: Path) -> None:
         ("[tunnel]\nspeed = 10\n", r"model: missing"),
     ],
 )
-def test_a_broken_profile_says_what_is_wrong(tmp_path: Path, text: str, message: str) -> None:
+def test_a_broken_profile_is_one_line(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "self.toml"
     path.write_text(text)
     with pytest.raises(LabError, match=message):

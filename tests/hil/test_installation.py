@@ -38,7 +38,7 @@ def test_the_first_line_is_for_programs_and_the_others_are_aligned(program: Prog
     assert len({len(row[0]) for line in others if (row := re.match(r"\w+( [\w-]+)? {2,}", line))}) == 1
 
 
-def test_without_git_and_tools_it_says_so(program: Program) -> None:
+def test_missing_git_and_tools_are_reported(program: Program) -> None:
     found = rows()
     assert found["commit"] == "unknown"
     assert {name: text for name, text in found.items() if name.startswith("program")} == {
@@ -84,9 +84,7 @@ def test_a_package_reports_the_commit_that_it_was_built_from(
     assert commit() == "0123456789ab"
 
 
-def test_the_commit_of_a_repository_around_the_package_is_not_its_own(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_surrounding_repository_s_commit_is_not_the_package_s(monkeypatch: pytest.MonkeyPatch) -> None:
     assert re.fullmatch(r"[0-9a-f]{12}\+?", commit())
     monkeypatch.setattr(installation, "ROOT", installation.ROOT / "hil")
     assert commit() == ""

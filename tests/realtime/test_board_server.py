@@ -51,9 +51,7 @@ def test_scanning_finds_the_board(served: Served) -> None:
     assert ["radio://0/80/2M", ""] in found
 
 
-def test_both_tables_are_complete_and_parameters_have_ranges_defaults_and_storage(
-    client: CflibClient,
-) -> None:
+def test_both_tables_are_complete_with_ranges_defaults_and_storage(client: CflibClient) -> None:
     assert client.cf.platform.get_protocol_version() == 12
     param = client.cf.param
     names = {f"{group}.{name}" for group, values in param.values.items() for name in values}
@@ -105,9 +103,7 @@ def test_a_power_cycle_is_noticed_and_stored_parameters_come_back(served: Served
         assert again.answer(again.cf.param.persistent_clear, "extCtrl.vz_P") == ("extCtrl.vz_P", True)
 
 
-def test_a_board_that_is_off_or_left_in_its_bootloader_gets_its_button_pressed(
-    served: Served, cache: Path
-) -> None:
+def test_a_board_off_or_in_its_bootloader_gets_its_button_pressed(served: Served, cache: Path) -> None:
     tool = Bootloader(served.radio_uris[0])
     switch = PowerSwitch(served.radio_uris[0])
     for leave in (lambda: tool.start_bootloader(warm_boot=True), switch.platform_power_down):

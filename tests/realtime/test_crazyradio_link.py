@@ -15,7 +15,7 @@ from support.telemetry_rows import is_whole
 @pytest.mark.parametrize(
     "answer", [None, b"\xf1" + b"Something else    ".ljust(30, b"\0")], ids=["silent", "alien"]
 )
-def test_a_peer_that_is_no_board_is_one_line_after_some_seconds(answer: bytes | None) -> None:
+def test_a_foreign_peer_is_one_line_after_some_seconds(answer: bytes | None) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
         peer.bind(("127.0.0.1", 0))
         peer.settimeout(PATIENCE_S)

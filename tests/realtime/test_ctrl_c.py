@@ -27,9 +27,7 @@ BUSY = LAW.replace(
 @pytest.mark.parametrize(
     ("board", "plain"), [("python", "0"), ("python", "1"), ("c", "0"), ("cortex-m4", "0")]
 )
-def test_ctrl_c_ends_a_flight_on_every_board_and_keeps_its_log(
-    tmp_path: Path, board: str, plain: str
-) -> None:
+def test_ctrl_c_ends_a_flight_on_any_board_and_keeps_the_log(tmp_path: Path, board: str, plain: str) -> None:
     profile = make_project(tmp_path, BUSY, "", "after = 130000")
     process = subprocess.Popen(
         (sys.executable, "-m", "hil.commands", "fly", "hover", "--duration", "600", "--profile", profile, "--board", board,

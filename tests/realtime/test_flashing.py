@@ -58,7 +58,7 @@ def test_an_image_is_there_byte_for_byte_and_the_board_starts(served: Served) ->
     tool.close()
 
 
-def test_the_command_says_what_it_has_written_and_read_back(served: Served, tmp_path: Path) -> None:
+def test_the_command_reports_what_it_wrote_and_read_back(served: Served, tmp_path: Path) -> None:
     (tmp_path / "cf2.bin").write_bytes(image_of(2 * 1024 + 77))
     served.forget()
     command = [*FLOATY, "deploy", "flash", "--uri", served.radio_uris[0], str(tmp_path / "cf2.bin")]
@@ -99,7 +99,7 @@ def test_only_radio_flashes(uri: str) -> None:
         struct.pack("<II", 0x3000_0000, START + 101) + bytes(200),
     ],
 )  # fmt: skip
-def test_what_is_no_firmware_is_not_sent(image: bytes) -> None:
+def test_an_invalid_firmware_is_not_sent(image: bytes) -> None:
     with pytest.raises(LinkError, match="not an image for the board"):
         check_image(image)
 

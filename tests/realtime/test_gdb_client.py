@@ -53,7 +53,7 @@ def debugged(run: Callable[[GdbServer], object], image: Image, *commands: str) -
 
 
 @pytest.mark.parametrize("compiler", ["clang", "gcc"])
-def test_gdb_stops_at_a_breakpoint_and_names_who_called(compiler: str) -> None:
+def test_gdb_stops_at_a_breakpoint_and_names_the_callers(compiler: str) -> None:
     image = Image(stm32_firmware.build(compiler))
     printed = debugged(
         BareCortex(image).run_for, image, f"set var $r0 = {ASSERTION}", "set var $lr = 0xffffffff", "set var $pc = go_wrong",
@@ -148,7 +148,7 @@ def test_gdb_shows_tasks_and_stops_at_a_write() -> None:
     assert re.search(r"#0  .*tick \(\)", printed), printed
 
 
-def test_a_flight_that_stood_at_breakpoints_has_the_hash_of_one_that_did_not(tmp_path: Path) -> None:
+def test_breakpoints_do_not_change_the_hash_of_a_flight(tmp_path: Path) -> None:
     elf = str(stm32_firmware.build())
     command = [*FLOATY, "fly", "hover", "--duration", "0.2", "--board", elf, "--out"]
     alone = subprocess.run(

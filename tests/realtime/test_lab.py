@@ -39,7 +39,7 @@ def is_taken(port: int) -> bool:
 
 
 @mavproxy_here
-def test_mavproxy_flies_the_robot_from_what_motive_says(tmp_path: Path) -> None:
+def test_mavproxy_flies_the_robot_from_motive_s_poses(tmp_path: Path) -> None:
     """Its optitrack module knows no ports but 1510 and 1511."""
     if any(map(is_taken, (1510, 1511))):
         pytest.skip("MAVProxy's optitrack IS NOT TESTED: another program has UDP port 1510 or 1511")

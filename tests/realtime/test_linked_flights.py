@@ -1,7 +1,9 @@
 """Whole flights over real links: a goal that moves, faults of every layer, and what the record says of them."""
 
 import json
+import signal
 import subprocess
+import time
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,7 @@ import pytest
 
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_events, load_log
-from support.serving import FLOATY, free_port, serve
+from support.serving import FLOATY, PATIENCE_S, free_port, serve, station
 
 DONGLE = "radio://0/80/2M/E7E7E7E7E7"
 # It stays well within the limits whenever it is released; that depends on the machine.
@@ -59,9 +61,7 @@ def address(link: str) -> str:
 
 
 @pytest.mark.parametrize("link", [DONGLE, pytest.param("mavlink:pty", marks=pytest.mark.long)])
-def test_the_goal_moves_when_the_board_flies_and_the_flight_is_judged_by_what_the_station_sent(
-    tmp_path: Path, link: str
-) -> None:
+def test_the_goal_moves_once_the_board_flies_and_judges_the_flight(tmp_path: Path, link: str) -> None:
     result = fly(tmp_path / "run", "yaw-step", "--link", link)
     assert result["passed"], result["verdicts"]
     log = load_log(tmp_path / "run")
@@ -147,3 +147,19 @@ def test_the_tests_of_a_project_fly_over_a_real_link(pytester: pytest.Pytester) 
     result = pytester.runpytest_inprocess(f"--floaty-link={DONGLE}")
     result.assert_outcomes(passed=1, skipped=2)
     result.stdout.fnmatch_lines(["floaty: 1 not flown: needs lockstep: this flies over radio://*"])
+
+
+# A machine that stalls
+
+
+def test_a_robot_flown_from_outside_survives_a_stall_of_its_world() -> None:
+    with serve("--udp", "0", motive=True) as lab:
+        with station(lab, lab.udp_uris[0], "--duration", "12") as typed:
+            lab.wait_for("released", PATIENCE_S)
+            lab.process.send_signal(signal.SIGSTOP)
+            time.sleep(1.0)
+            lab.process.send_signal(signal.SIGCONT)
+            lab.wait_for(r"time stood still for (9|1\d)\d\d ms", PATIENCE_S)
+            assert typed.process.wait(PATIENCE_S) == 0, typed.lines
+        assert lab.interrupt() == 0
+        assert not any("lost" in line for line in lab.lines)

@@ -71,7 +71,7 @@ def fresh(x_m: float, age_us: int = 20_000) -> MocapFrame:
     return MocapFrame(clock_us() - age_us, (x_m, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), True)
 
 
-def test_an_open_link_hears_the_board_and_knows_its_state(link: LiveLink) -> None:
+def test_an_open_link_receives_the_board_s_state(link: LiveLink) -> None:
     link.open(lambda: False)
     link.start_telemetry(clock_us())
     heard: list[Sample] = []
@@ -132,6 +132,6 @@ def test_a_board_that_has_gone_is_a_lost_link_in_one_line(end: str) -> None:
     assert "\n" not in message
 
 
-def test_connecting_ends_when_it_is_told_to(link: LiveLink) -> None:
+def test_connecting_can_be_interrupted(link: LiveLink) -> None:
     with pytest.raises(LinkError, match="stopped while connecting"):
         link.open(lambda: True)

@@ -67,7 +67,7 @@ def test_mavproxy_watches_tunes_and_commands(proxied: tuple[Served, MavProxy], t
 
 
 @mavproxy_here
-def test_a_signed_board_obeys_mavproxy_once_it_has_the_key(tmp_path: Path) -> None:
+def test_mavproxy_controls_a_signed_board_with_the_key(tmp_path: Path) -> None:
     key = hashlib.sha256(b"floaty").hexdigest()
     with serve("--mavlink", address("pty"), "--set", f"mavlink.signing_key={key}") as served:
         proxy = MavProxy(served.line("mavlink ")[0], tmp_path)
@@ -142,7 +142,7 @@ def test_mavsdk_lets_units_fail_stops_and_reboots() -> None:
 
 
 @mavsdk_here
-def test_mavsdk_flies_offboard_and_hears_that_there_are_no_missions() -> None:
+def test_mavsdk_flies_offboard_and_gets_no_missions() -> None:
     with serve("--mavlink", address("udp"), "--station") as served:
         served.wait_for("released", PATIENCE_S)
         _, host, port = served.line("mavlink ")[0].split(":")

@@ -157,7 +157,7 @@ def test_a_line_on_which_nothing_comes_is_given_up_after_four_seconds(peers: Cal
         (mute_station, "", "", r"no heartbeat of an autopilot within 1 s: \d+ frames of others"),
     ],
 )
-def test_why_there_is_no_connection_is_said(
+def test_a_failed_connection_gives_its_reason(
     peers: Callable[..., Peer],
     talk: Talk,
     station_key: str,
@@ -195,7 +195,7 @@ def wait_until(reached: Callable[[], bool]) -> None:
         time.sleep(0.005)
 
 
-def test_a_stuck_line_makes_nobody_wait_and_is_a_lost_one(peers: Callable[..., Peer]) -> None:
+def test_a_stuck_line_blocks_no_caller_and_is_lost(peers: Callable[..., Peer]) -> None:
     peer = peers(board)
     link = link_to(peer)
     link.open(lambda: False)
@@ -254,7 +254,7 @@ def rfc2217_server(device: str) -> Iterator[str]:
 
 
 @pytest.mark.filterwarnings("ignore:set:DeprecationWarning")  # pyserial's own
-def test_a_port_of_another_computer_works_alike(peers: Callable[..., Peer]) -> None:
+def test_a_remote_port_works_like_a_local_one(peers: Callable[..., Peer]) -> None:
     peer = peers(board)
     with rfc2217_server(peer.uri.removeprefix("mavlink:")) as url:
         link = MavlinkSerialLink(f"mavlink:{url}", LinkSettings(50.0, 0, 115_200))

@@ -35,7 +35,7 @@ body = st.tuples(*[st.floats()] * 7)
 
 @given(st.integers(0, 2**63 - 1), st.dictionaries(names, body, max_size=3))
 @settings(max_examples=50)
-def test_a_line_says_what_was_seen(t_us: int, bodies: dict[str, tuple[float, ...]]) -> None:
+def test_a_line_reports_a_pose(t_us: int, bodies: dict[str, tuple[float, ...]]) -> None:
     line = encode_arrival(Arrival(t_us, bodies))
     assert line.count("\n") == 1
     decoded = decode_line(line.encode())
@@ -43,7 +43,7 @@ def test_a_line_says_what_was_seen(t_us: int, bodies: dict[str, tuple[float, ...
     assert repr(decoded) == repr(Arrival(t_us, bodies))  # NaN is as NaN here
 
 
-def test_a_line_says_why_no_more_will_come() -> None:
+def test_a_line_reports_the_end() -> None:
     assert decode_line(encode_error("no\nway").encode()) == "no\nway"
 
 
@@ -257,9 +257,7 @@ class connect:
 GOOD_BODIES = CAMERAS[CAMERAS.index("        return {") :]
 
 
-def test_a_missing_package_is_one_line_that_says_how_to_get_it(
-    stand_in: Callable[..., MotioncaptureSource],
-) -> None:
+def test_a_missing_package_is_one_line_with_the_remedy(stand_in: Callable[..., MotioncaptureSource]) -> None:
     with pytest.raises(
         MocapError, match=r"No module named 'motioncapture': .*-m pip install 'motioncapture>="
     ):
@@ -272,7 +270,7 @@ def test_of_several_bodies_one_must_be_named(stand_in: Callable[..., Motioncaptu
         stand_in(CAMERAS.replace(GOOD_BODIES, two)).open()
 
 
-def test_what_is_no_pose_is_never_one(stand_in: Callable[..., MotioncaptureSource]) -> None:
+def test_invalid_poses_are_never_valid(stand_in: Callable[..., MotioncaptureSource]) -> None:
     """Twenty frames each: good, lost, the same over and over, not a number, not a rotation, good."""
     cases = """
         return [{"one": self.body(float(number))}, {"two": self.body(1.0)}, {"one": self.body(5.0)},
@@ -300,7 +298,7 @@ def test_garbage_on_the_pipe_is_counted(stand_in: Callable[..., MotioncaptureSou
 
 
 @needs("motioncapture")
-def test_a_process_that_nobody_looks_after_ends_by_itself() -> None:
+def test_an_orphaned_process_ends() -> None:
     """Vicon's connect() goes on for ever, and lets no signal handler of Python's run."""
     command = [
         sys.executable,

@@ -9,10 +9,7 @@ from hil.laboratory.recorder import load_events
 from support.browser import BROWSER, Tab, browser
 from support.serving import PATIENCE_S, Served, serve, started, station
 
-pytestmark = [
-    pytest.mark.realtime,
-    pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine"),
-]
+pytestmark = [pytest.mark.realtime, pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine")]
 SHOWS = "document.getElementById('scene').naturalWidth > 0 && document.getElementById('status').dataset.time > 0.5"
 TEXTS = "document.getElementById('texts').textContent"
 SECONDS = "Number(document.getElementById('status').dataset.time)"

@@ -45,9 +45,7 @@ def served(request: pytest.FixtureRequest, library: Path) -> Iterator[Served]:
 
 
 @pytest.mark.parametrize("medium", ["radio", "udp"])
-def test_a_flight_on_a_board_behind_a_link_is_the_flight_of_python(
-    cli: Cli, served: Served, medium: str, python: str, tmp_path: Path
-) -> None:
+def test_a_linked_board_is_equal(cli: Cli, served: Served, medium: str, python: str, tmp_path: Path) -> None:
     (uri,) = served.line(f"{medium} ")
     out = tmp_path / "run"
     assert cli("fly", "hover", "--duration", "1", "--board", uri, "--out", out) == 0
@@ -56,9 +54,7 @@ def test_a_flight_on_a_board_behind_a_link_is_the_flight_of_python(
     assert result.usage.entries["control"].calls == 200
 
 
-def test_a_board_that_is_killed_in_flight_ends_it_in_one_line_with_what_was_flown(
-    library: Path, tmp_path: Path
-) -> None:
+def test_killing_the_board_ends_the_flight_in_one_line_with_its_log(library: Path, tmp_path: Path) -> None:
     with board(library) as served:
         (uri,) = served.line("udp ")
         out = tmp_path / "run"
@@ -103,9 +99,7 @@ def in_the_loop(library: Path, out: Path, duration_s: int) -> Iterator[tuple[Ser
             yield served, host, uri
 
 
-def test_a_host_that_stops_for_longer_finds_the_board_in_the_failsafe_and_flies_on(
-    library: Path, tmp_path: Path
-) -> None:
+def test_a_host_that_pauses_finds_the_board_in_failsafe_and_flies_on(library: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     with in_the_loop(library, out, 4) as (served, host, _):
         served.forget()

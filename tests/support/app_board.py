@@ -31,7 +31,6 @@ from support.paths import TESTS
 from support.serving import PATIENCE_S, Served
 
 STEP_US = 1000
-TRANSMIT_PERIOD_US = 1000  # in which the firmware tries again when its radio chip takes nothing
 
 
 class AppBoard:

@@ -46,14 +46,12 @@ class Tab:
                 self.errors.append(f"{content['entry']['text']} {content['entry'].get('url', '')}")
 
     def open(self, address: str, width: int = 1280, height: int = 800) -> None:
-        """Load a page."""
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
         self.call("Emulation.setDeviceMetricsOverride", **size)
         self.call("Page.navigate", url=address)
         self.until("document.readyState === 'complete'")
 
     def value(self, expression: str) -> Any:
-        """Return what an expression is in the page."""
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
@@ -67,12 +65,10 @@ class Tab:
         return value
 
     def press(self, key: str) -> None:
-        """Press a key."""
         for kind in ("keyDown", "keyUp"):
             self.call("Input.dispatchKeyEvent", type=kind, key=key)
 
     def picture(self, path: Path) -> None:
-        """Keep what is shown."""
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot")["data"]))
 
 

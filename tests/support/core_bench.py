@@ -57,7 +57,6 @@ class Core:
         entry.estimate(*(block.arg for block in blocks))
 
     def fly(self) -> None:
-        """Run the controller on the estimate."""
         self.data.fields.mode = MODE_FLY
         entry.control(self.parameters.arg, self.data.arg, self.estimator.arg, self.control.arg)
 

@@ -49,10 +49,7 @@ class Timer(ctypes.Structure):
 class Pins(ctypes.Structure):
     """GPIO_TypeDef."""
 
-    _fields_ = (
-        *((name, ctypes.c_uint32) for name in PIN_REGISTERS.split()),
-        ("AFR", ctypes.c_uint32 * 2),
-    )
+    _fields_ = (*((name, ctypes.c_uint32) for name in PIN_REGISTERS.split()), ("AFR", ctypes.c_uint32 * 2))
 
 
 def build_app(
@@ -178,7 +175,6 @@ class App:
         self.gyro[2] ^= self.gyro_noise
 
     def radio(self, data: bytes, port: int = LOCALISATION, channel: int = GENERIC) -> None:
-        """Receive a packet."""
         self.c.stub_radio(port, channel, data, len(data))
 
     def sent(self) -> bytes:
@@ -188,7 +184,6 @@ class App:
         return packet.raw[:length]
 
     def app_channel(self, data: bytes) -> None:
-        """Receive a packet of the app channel."""
         self.c.stub_app_packet(data, len(data))
         self.c.stub_run_app(1)
 
@@ -198,7 +193,6 @@ class App:
         return [tim5.CCR3, tim3.CCR1, tim3.CCR2, tim5.CCR4]
 
     def estimator(self) -> bytes:
-        """Return the estimator's memory."""
         return self._estimator.raw
 
     def state(self) -> dict[str, float]:
@@ -208,19 +202,15 @@ class App:
         return dict(zip((f"stateEstimate.{name}" for part in parts for name in part), values, strict=True))
 
     def console(self) -> str:
-        """Return what the app has printed."""
         return self._console.value.decode()
 
     def log(self, name: str) -> float:
-        """Return the value of a log variable."""
         return float(self.c.stub_log_value(self.logs[name]))
 
     def get(self, name: str) -> float:
-        """Return a parameter as a client reads it."""
         return float(self.c.stub_param_get(self.params[name]))
 
     def set(self, name: str, value: float) -> None:
-        """Write a parameter as a client does."""
         self.c.stub_param_set(self.params[name], value)
 
 

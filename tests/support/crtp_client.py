@@ -35,12 +35,10 @@ class CrtpClient(FirmwareBench):
         self.firmware.radio_received(raw)
 
     def packets(self, port: int, channel: int) -> list[bytes]:
-        """The data of what the board has sent on a channel."""
         packets = (crtp.decode(raw) for _, raw in self.sent)
         return [packet.data for packet in packets if (packet.port, packet.channel) == (port, channel)]
 
     def ask(self, port: int, channel: int, data: bytes, wait_us: int = 3000) -> list[bytes]:
-        """The replies on the same channel."""
         self.sent.clear()
         self.send(port, channel, data)
         self.run(self.now_us + wait_us)

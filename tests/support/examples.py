@@ -52,7 +52,6 @@ def shape_of(text: str) -> list[str]:
 
 
 def matches(shown: str, printed: str) -> bool:
-    """Whether an output is what is shown."""
     lines = [
         r"(?:[^\n]*\n)*?" if line == "…" else ".*".join(map(re.escape, line.split("…"))) + r"\n"
         for line in shape_of(shown)

@@ -21,12 +21,10 @@ def flown(folder: Path, experiment: str | Experiment, *overrides: str, **options
 
 
 def hover(folder: Path, *overrides: str, **options: Unpack[Options]) -> Result:
-    """Fly the hover."""
     return flown(folder, "hover", *overrides, **options)
 
 
 def explain(result: Result) -> str:
-    """Say why a flight that should have passed has not."""
     return f"{result.outcome} {result.cause}: {[str(v) for v in result.verdicts if not v.holds]}, {result.folder}"
 
 

@@ -54,6 +54,5 @@ class FoxgloveClient:
                 return message
 
     def close(self) -> None:
-        """Hang up."""
         self._stream.close()
         self._socket.close()

@@ -61,12 +61,10 @@ class MavlinkClient(FirmwareBench):
         self.events.at(now_us + 2000, lambda _: self.receive(data))
 
     def receive(self, data: bytes) -> None:
-        """Bytes on the line, now."""
         self.uplink += data
         self.firmware.uart_ready()
 
     def send(self, name: str, *fields: Any) -> None:
-        """Send a message of pymavlink's own making."""
         self.receive(getattr(self.codec, f"{name}_encode")(*fields).pack(self.codec))
 
     def ask(self, name: str, *fields: Any, wait_us: int = 3000) -> list[Any]:
@@ -99,7 +97,6 @@ class MavlinkClient(FirmwareBench):
             self.events.at(at_us, lambda _, t_us=stamp_us: self.pose((p, LEVEL), t_us))
 
     def of(self, kind: str) -> list[Any]:
-        """The messages of one kind."""
         return [message for _, message in self.messages if message.get_type() == kind]
 
     def texts(self) -> list[str]:
@@ -124,7 +121,6 @@ def codec(system: int, component: int) -> Any:
 
 
 def count(messages: Iterable[Any]) -> dict[str, int]:
-    """How many of each kind."""
     counts: dict[str, int] = {}
     for message in messages:
         counts[message.get_type()] = counts.get(message.get_type(), 0) + 1

@@ -60,7 +60,6 @@ class MavlinkLab:
         lab.run()
 
     def tell(self, name: str, *fields: Any) -> None:
-        """Send a message of pymavlink's own making."""
         message = getattr(self._codec, f"{name}_encode")(*fields)
         self._uplink(self.server.lab.events.now_us, message.pack(self._codec))
 

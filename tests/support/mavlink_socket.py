@@ -63,7 +63,6 @@ class MavlinkSocket:
     def wait(
         self, kind: str, wanted: Callable[[Any], bool] = lambda _: True, timeout_s: float = PATIENCE_S
     ) -> Any:
-        """The next message of this kind that is wanted."""
         deadline = time.monotonic() + timeout_s
         while True:
             while self._seen < len(self.received):
@@ -76,7 +75,6 @@ class MavlinkSocket:
             self.poll(left_s)
 
     def collect(self, duration_s: float) -> list[Any]:
-        """All messages of a time."""
         first, deadline = len(self.received), time.monotonic() + duration_s
         while (left_s := deadline - time.monotonic()) > 0:
             self.poll(left_s)

@@ -46,11 +46,7 @@ class MotiveBench:
     """A Motive that sees one body move, without a plant."""
 
     def __init__(
-        self,
-        version: tuple[int, int] = (4, 1),
-        multicast: bool = False,
-        markers: bool = False,
-        up: Up = "y",
+        self, version: tuple[int, int] = (4, 1), multicast: bool = False, markers: bool = False, up: Up = "y"
     ) -> None:
         self.readers: Readers = {}
         places = PLACES if markers else NO_POINTS

@@ -67,7 +67,6 @@ class Served:
         return self.line("motive ")[0]
 
     def type(self, line: str) -> None:
-        """Type a line into its terminal."""
         self.process.stdin.write(line.encode() + b"\n")
         self.process.stdin.flush()
 

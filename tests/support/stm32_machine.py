@@ -37,13 +37,10 @@ class FirmwareOnChip:
         return self.chip.run(us * CYCLES_PER_US)
 
     def peek(self, name: str, index: int = 0) -> int:
-        """Return a word of a variable."""
         return self.peek_all(name, index + 1)[index]
 
     def peek_all(self, name: str, count: int) -> list[int]:
-        """Return the first words of a variable."""
         return list(unpack(f"<{count}I", self.chip.read(self.image.symbol(name).address, 4 * count)))
 
     def poke(self, name: str, value: int) -> None:
-        """Change a word."""
         self.chip.write(self.image.symbol(name).address, pack("<I", value))

@@ -17,12 +17,7 @@ from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation
 
 from firmware_py.core import entry
-from firmware_py.core.structs import (
-    HISTORY,
-    POSE_INVALID,
-    POSE_ON_TIME,
-    Parameters,
-)
+from firmware_py.core.structs import HISTORY, POSE_INVALID, POSE_ON_TIME, Parameters
 from ground_station.trajectory import Goal, Offsets, Sine, Square, Trajectory
 from hil.experiments import Experiment
 from hil.laboratory.lockstep import lockstep_flight
@@ -486,9 +481,7 @@ def rest(record: Record) -> tuple[list[int], int, Vector, Vector]:
 
 @settings(deadline=None, max_examples=60)
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(-math.pi, math.pi), st.floats(0.92, 1.08))
-def test_first_pose_is_taken_over_wherever_it_looks(
-    roll: float, pitch: float, yaw: float, length: float
-) -> None:
+def test_first_pose_is_adopted_at_any_attitude(roll: float, pitch: float, yaw: float, length: float) -> None:
     core = Core()
     for _ in range(10):
         core.tick()
@@ -571,7 +564,7 @@ def test_variances_do_not_grow_beyond_their_bound() -> None:
 @pytest.mark.parametrize(
     "place", [*(("x", state) for state in range(16)), ("P", (4, 4)), ("P", (8, 8)), ("P", (4, 9))]
 )
-def test_broken_state_starts_afresh_from_the_next_pose(place: tuple[str, object], bad: float) -> None:
+def test_a_broken_state_restarts_from_the_next_pose(place: tuple[str, object], bad: float) -> None:
     p, q = (0.3, -0.2, 0.1), quaternion(yaw=2.0)
     core = settled(p, q)
     name, index = place
@@ -604,7 +597,7 @@ def test_broken_state_does_not_reach_the_controller_while_the_filter_waits() -> 
     assert_sane(core)
 
 
-def test_the_report_has_the_attitude_twice_every_pose_once_and_the_flaps_as_they_stand() -> None:
+def test_the_report_has_attitude_poses_and_flaps() -> None:
     core = settled((0.1, 0.2, 0.3), quaternion(0.3, -0.2, 1.0))
     for p, age_us in (((0.6, 0.2, 0.3), 40_000), ((math.nan, 0, 0), 40_000), ((0, 0, 0), 200_000)):
         core.pose(p, LEVEL, age_us)
@@ -646,9 +639,7 @@ FLOATS = [name for name, kind in Parameters.dtype.fields.items() if kind[0].kind
 @settings(deadline=None, max_examples=150)
 @given(st.sampled_from(FLOATS), any_number)
 @pytest.mark.long
-def test_senseless_parameter_moves_no_servo_out_of_range_and_does_no_lasting_harm(
-    name: str, value: float
-) -> None:
+def test_a_senseless_parameter_keeps_servos_in_range_and_is_recoverable(name: str, value: float) -> None:
     core = settled((0.1, 0, 0))
     sane = float(core.parameters.memory[name][0])
     core.parameters.memory[name] = value

@@ -98,7 +98,7 @@ def test_what_is_excited_comes_on_top_of_the_inputs_and_out_at_the_flaps() -> No
         assert board.control.fields.command == pytest.approx(part[0] * np.array([1, 1, -1, -1]), abs=1e-6)
 
 
-def test_nothing_is_excited_while_it_is_off_or_the_loop_is_open_and_then_the_period_begins_anew() -> None:
+def test_excitation_stops_when_off_or_open_loop_and_restarts_its_period() -> None:
     board = Board(EXCITE_OFF, **RMS)
     assert not board.fly(20).any()
     board.parameters.fields.excite_kind = EXCITE_MULTISINE

@@ -56,9 +56,7 @@ def test_a_set_point_is_admitted_inside_the_cylinder_around_home_and_nowhere_els
     ],
     ids=["sideways", "below", "above"],
 )
-def test_from_outside_the_box_a_set_point_no_further_outside_is_admitted(
-    goal: object, nearer: object, further: object
-) -> None:
+def test_from_outside_the_box_none_leads_further(goal: object, nearer: object, further: object) -> None:
     core = boxed()
     core.data.fields.goal_kind, core.data.fields.goal[:3] = GOAL_ABSOLUTE, HOME + goal
     assert admits(core, HOME + nearer)

@@ -20,9 +20,7 @@ number = st.floats(-1.5, 1.5, width=32)
 
 @settings(deadline=None, max_examples=100)
 @given(st.tuples(*16 * (number,)), st.tuples(*4 * (number,)), st.tuples(*4 * (number,)))
-def test_an_observation_is_the_error_and_the_motion_in_the_heading_frame(
-    state: Any, target: Any, previous: Any
-) -> None:
+def test_an_observation_is_error_and_motion_in_heading_frame(state: Any, target: Any, previous: Any) -> None:
     parameters, estimator = parameters_of(CONFIG), Estimator.allocate()
     estimator.fields.now[:], parameters.fields.target[:] = state, target
     out = np.full(OBSERVATIONS, np.nan, np.float32)
@@ -46,7 +44,7 @@ def test_an_action_is_limited_and_means_a_share_of_each_input_s_limit() -> None:
     assert control.fields.u.tolist() == [0.5, -0.25, 0.125, -0.5]
 
 
-def test_an_action_that_is_no_number_stays_so_for_the_guard() -> None:
+def test_a_nan_action_stays_nan_for_the_guard() -> None:
     parameters, control = parameters_of(CONFIG), Control.allocate()
     act(parameters.arg, np.full(ACTIONS, np.nan, np.float32), control.arg)
     assert np.isnan(control.fields.u).all()

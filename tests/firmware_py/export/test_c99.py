@@ -58,30 +58,22 @@ def test_the_probe_itself_is_inside_the_subset() -> None:
     )
 
 
+# Statements beside those of tests/firmware_py/logic/test_loading.py.
 REFUSED = [
-    ("while n > COUNT:\n    y = x", "While statement"),
     ("a = [x, y]", "List expression"),
     ("a = (x, y)", "Tuple expression"),
     ("a = {}", "Dict expression"),
     ('a = "text"', "literal 'text'"),
-    ("y = x * 0.5", "float literal 0.5 without f32"),
     ("y = x + n", "Add of f32 and i32"),
-    ("y = x * 2", "Mult of f32 and i32"),
     ("y = x // y", "FloorDiv of f32"),
     ("y = x % y", "Mod of f32"),
-    ("y = x ** y", "Pow of f32"),
     ("a = n / 2", "Div of i32"),
     ("a = n << 2", "LShift of i32"),
     ("a = n & 1", "BitAnd of i32"),
     ("a = ~n", "Invert of i32"),
     ("a = not n", "Not of i32"),
-    ("y += x", "AugAssign statement"),
     ("z: f32 = x", "AnnAssign statement"),
     ("a = b = x", "Assign statement"),
-    ("y = x if n > 0 else y", "IfExp expression"),
-    ("a = 0 < n < 3", "comparison 0 < n < 3"),
-    ("a = x is y", "comparison x is y"),
-    ("a = x < n", "comparison of f32 and i32"),
     ("if n:\n    y = x", "the condition is i32, not bool"),
     ("if x > y and n:\n    y = x", "an operand of and/or is i32, not bool"),
     ("y = n", "y changes its type to i32"),
@@ -93,21 +85,10 @@ REFUSED = [
     ("for i in range(4):\n    for i in range(2):\n        y = x", "loop variable i is in use"),
     ("for i in range(0, 4, 2):\n    y = x", "a loop runs over range"),
     ("for i in control.u:\n    y = x", "a loop runs over range"),
-    ("for i in range(4):\n    y = x\nelse:\n    y = -x", "else of a loop"),
-    ("for i in range(4):\n    break", "Break statement"),
-    ("try:\n    y = x\nexcept ValueError:\n    y = -x", "Try statement"),
-    ("with x:\n    y = x", "With statement"),
-    ("raise ValueError", "Raise statement"),
-    ("assert x > y", "Assert statement"),
-    ("pass", "Pass statement"),
-    ("global y", "Global statement"),
-    ("del y", "Delete statement"),
     ("import math", "import math is outside the subset"),
-    ("y = lambda: x", "lambda: write a @kernel"),
     ("y = math.sin(x)", "call math.sin(..) is no plain call of a kernel"),
     ("y = sin(x)", "call of sin, which is no kernel"),
     ("y = float(x)", "call of float, which is no kernel"),
-    ("y = max(x, y)", "call of max, which is no kernel"),
     ("y = abs(n)", "abs of is i32, not f32"),
     ("y = sqrt(n)", "sqrt of is i32, not f32"),
     ("y = f32(x > y)", "f32(..) of bool"),
@@ -115,13 +96,11 @@ REFUSED = [
     ("y = f32(1e39)", "f32(1e+39) is no finite 32-bit number"),
     ("a = i32(3000000000)", "i32(3000000000) is no finite 32-bit number"),
     ("a = n + 3000000000", "literal 3000000000"),
-    ("y = control.u[0:2]", "slice"),
     ("y = control.u[-1]", "index -1: f32 array of 4 has 0..3"),
     ("y = control.u[4]", "index 4: f32 array of 4 has 0..3"),
     ("y = control.u[x]", "an index is f32, not i32"),
     ("y = control.u[0, 1]", "2 indices on f32 array"),
     ("y = control.integral_z[0]", "1 indices on f32"),
-    ("y = control.nothing", "control.nothing is no field of a struct"),
     ("y = control.u", "y changes its type to f32 array"),
     ("control.u[0] = n", "f32 = i32"),
     ("control.u = control.flap", "f32 array = f32 array"),
@@ -140,7 +119,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("body", "reason"), REFUSED, ids=[body for body, _ in REFUSED])
-def test_what_is_outside_the_subset_is_refused_with_file_line_and_reason(body: str, reason: str) -> None:
+def test_code_outside_the_subset_is_refused_with_file_line_and_reason(body: str, reason: str) -> None:
     with pytest.raises(ExportError) as refusal:
         translated(body)
     match = re.fullmatch(r"firmware_py/core/entry\.py:(\d+): (.*)", str(refusal.value))
@@ -180,7 +159,7 @@ REFUSED_KERNELS = [
 @pytest.mark.parametrize(
     ("text", "line", "reason"), REFUSED_KERNELS, ids=[case[2] for case in REFUSED_KERNELS]
 )
-def test_what_is_no_kernel_struct_or_constant_is_refused(text: str, line: int, reason: str) -> None:
+def test_unknown_objects_are_refused(text: str, line: int, reason: str) -> None:
     with pytest.raises(ExportError) as refusal:
         translated("y = x", text)
     first = PROBE.count("\n") + 1
@@ -228,7 +207,7 @@ def test_the_c_has_no_double_no_library_and_no_memory_of_its_own() -> None:
 
 
 @pytest.mark.skipif(not COMPILERS, reason="no C compiler")
-def test_a_struct_that_is_laid_out_otherwise_does_not_compile() -> None:
+def test_a_struct_of_another_layout_does_not_compile() -> None:
     swapped = C.header.replace("int32_t quiet_ticks;", "int32_t spare;\n    int32_t quiet_ticks;")
     with pytest.raises(ExportError, match="layout_FloatyEstimator"):
         build(Translation(swapped, C.source, ()), BUILD)
@@ -261,7 +240,7 @@ def test_arguments_that_are_only_read_are_const_and_private_functions_static() -
     }
 
 
-def test_what_is_not_reached_is_left_out_and_the_version_follows_the_sources() -> None:
+def test_unreachable_code_is_left_out_and_the_version_follows_the_sources() -> None:
     texts = core_texts()
     texts["servo"] += (
         '\nSPARE = f32(7.0)\n\n\n@kernel\ndef spare(x: f32) -> f32:\n    """Spare."""\n    return x * SPARE\n'

@@ -169,7 +169,7 @@ def test_a_new_session_ends_the_old_one(app: App) -> None:
         (Message.WRITE, b"\0"), (Message.READ, b"\0\0"), (9, b""),
     ],
 )  # fmt: skip
-def test_what_lies_outside_is_refused_and_takes_no_number(app: App, request_: tuple[Message, bytes]) -> None:
+def test_requests_outside_are_refused_and_take_no_number(app: App, request_: tuple[Message, bytes]) -> None:
     begun(app)
     assert ask(app, BEGUN, request_).refusal() == Refusal.OUTSIDE
     assert ticks(app, BEGUN) == 0
@@ -201,7 +201,7 @@ def test_a_call_touches_nothing_that_flies(app: App) -> None:
     assert app.estimator() == flies
 
 
-def test_what_fell_into_its_failsafe_in_the_air_executes_nothing(flown: App) -> None:
+def test_a_board_in_failsafe_in_the_air_executes_nothing(flown: App) -> None:
     for request in (call(Call.ESTIMATE), loop(Hil.STILL), read(0, 4), write(0, b"\0")):
         assert ask(flown, BEGUN, request).refusal() == Refusal.FLYING
     assert ask(flown, BEGUN, health()).kind == Message.HEALTH
@@ -274,9 +274,7 @@ def client_of(app: App, mess: float = 0.0) -> tuple[CoreClient, AppPackets]:
 
 
 @pytest.mark.parametrize("mess", [0.0, 0.1])
-def test_a_flight_on_the_app_has_the_bits_of_python_after_every_call_in_any_loss(
-    app: App, mess: float
-) -> None:
+def test_a_flight_on_the_app_equals_python_bitwise_at_any_loss(app: App, mess: float) -> None:
     client, _ = client_of(app, mess)
     request = Request.of(find_experiment("hover"), duration_s=2.0, faults=(parse("mocap.outlier@1"),))
     checked = check_flight(request, lambda stack: {"app": partial(RealCore, client=client)}, lambda *_: None)
@@ -288,7 +286,7 @@ def test_a_flight_on_the_app_has_the_bits_of_python_after_every_call_in_any_loss
 
 
 @pytest.mark.long
-def test_what_the_board_computes_flies_even_where_it_is_wrong(tmp_path: Path) -> None:
+def test_the_board_s_results_fly_even_where_they_are_wrong(tmp_path: Path) -> None:
     folder = tmp_path / "app"
     library = build_app(
         folder, plant=("floaty_core.c", "control->count[flap] =", "control->count[flap] = 1 +")
@@ -336,9 +334,7 @@ def test_an_estimate_is_charged_with_the_poses_filed_before_it(app: App) -> None
     assert blocks.run.estimate_us() == 50
 
 
-def test_a_board_that_reboots_is_told_from_one_that_is_silent(
-    app: App, library: Path, tmp_path: Path
-) -> None:
+def test_a_reboot_is_distinguished_from_silence(app: App, library: Path, tmp_path: Path) -> None:
     client, packets = client_of(app)
     client.begin()
     packets.app = App(library, tmp_path / "rebooted.so")

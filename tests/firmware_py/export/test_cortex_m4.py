@@ -130,9 +130,7 @@ def memory(blocks: CoreBlocks) -> list[bytes]:
 
 
 @pytest.mark.parametrize("kind", ["image", "optimised"])
-def test_instructions_and_their_cycles_are_those_that_capstone_reads(
-    kind: str, request: pytest.FixtureRequest
-) -> None:
+def test_instructions_and_cycles_are_those_of_capstone(kind: str, request: pytest.FixtureRequest) -> None:
     image = request.getfixturevalue(kind)
     sums = count(image.code, image.constants)
     instructions = listed(image)
@@ -149,9 +147,7 @@ def test_instructions_and_their_cycles_are_those_that_capstone_reads(
 
 
 @pytest.mark.parametrize("kind", ["image", "optimised"])
-def test_a_call_takes_the_instructions_and_cycles_of_its_way(
-    kind: str, request: pytest.FixtureRequest
-) -> None:
+def test_a_call_costs_the_instructions_of_its_path(kind: str, request: pytest.FixtureRequest) -> None:
     image = request.getfixturevalue(kind)
     blocks, runner = started(image)
     for tick in range(20):
@@ -208,7 +204,7 @@ def test_looking_ahead_tells_the_cost_and_leaves_the_memory_alone(image: CoreIma
     assert runner.usage == other.usage
 
 
-def test_what_was_seen_ahead_is_forgotten_when_the_inputs_change(image: CoreImage) -> None:
+def test_look_ahead_results_are_dropped_when_the_inputs_change(image: CoreImage) -> None:
     (blocks, runner), (direct, other) = started(image), started(image)
     for each in (blocks, direct):
         feed(each, 1)
@@ -261,16 +257,12 @@ def test_the_core_leaves_room_on_the_board(image: CoreImage) -> None:
         (lambda text: text + "\nint floaty_wrong(void) { return; }\n", "error:"),
     ],
 )
-def test_code_that_cannot_be_a_core_is_refused_in_one_line(
-    core: Translation, change: Callable[[str], str], refused: str
-) -> None:
+def test_code_that_is_no_core_fails(core: Translation, change: Callable[[str], str], refused: str) -> None:
     with pytest.raises(ExportError, match=refused) as error:
         build_image(change(core.source), core.header, BUILD)
     assert "\n" not in str(error.value)
 
 
-def test_what_is_built_is_not_compiled_again(
-    core: Translation, image: CoreImage, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_build_is_reused(core: Translation, image: CoreImage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("firmware_py.export.compilers.subprocess", None)
     assert build_image(core.source, core.header, BUILD) == image

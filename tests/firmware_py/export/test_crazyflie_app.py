@@ -22,13 +22,7 @@ from firmware_py.export.crazyflie import write_app
 from firmware_py.export.errors import ExportError
 from firmware_py.export.profile_c import profile_hash
 from firmware_py.firmware import Firmware
-from firmware_py.geometry import (
-    Quaternion,
-    Vector,
-    from_euler_zyx,
-    in_goal_frame,
-    yaw_quaternion,
-)
+from firmware_py.geometry import Quaternion, Vector, from_euler_zyx, in_goal_frame, yaw_quaternion
 from firmware_py.wire import crtp, telemetry
 from hil.config import LabConfig, load_config
 from hil.devices.board import VirtualBoard
@@ -95,7 +89,6 @@ def pose(data: bytes) -> Event:
 
 
 def write(name: str, value: float) -> Event:
-    """Set a parameter on both boards."""
 
     def act(app: App, laboratory: Laboratory) -> None:
         app.set(name, value)
@@ -198,9 +191,7 @@ ENDLESS = LAW.replace(
 
 @pytest.mark.long
 @pytest.mark.parametrize("law", [LAW, ENDLESS], ids=["not a number", "an endless loop"])
-def test_own_logic_flies_in_the_app_as_in_the_laboratory_until_it_fails_in_both(
-    tmp_path: Path, law: str
-) -> None:
+def test_own_logic_flies_and_fails_in_the_app_as_in_the_laboratory(tmp_path: Path, law: str) -> None:
     config = own_config(tmp_path, law, ESTIMATOR, "gain_iy = 0.5")
     app, laboratory = App(build_app(tmp_path / "app", config), tmp_path / "copy.so"), Laboratory(config)
     rng, states, integrals = np.random.default_rng(3), set(), set()
@@ -292,7 +283,6 @@ def flying(app: App, until: int = 1200) -> None:
 
 
 def hover_of(app: App) -> list[int]:
-    """The servo counts of the hover angles."""
     before = app.counts()
     app.c.floaty_hover()
     hover = app.counts()
@@ -301,7 +291,7 @@ def hover_of(app: App) -> list[int]:
     return hover
 
 
-def test_a_loop_that_stands_still_puts_the_servos_to_hover(app: App) -> None:
+def test_a_stopped_loop_moves_the_servos_to_hover(app: App) -> None:
     flying(app)
     hover = hover_of(app)
     assert app.counts() != hover
@@ -337,7 +327,7 @@ def test_poses_come_through_the_app_channel_too(app: App) -> None:
 
 
 @pytest.mark.parametrize("lacking", ["gyro_known", "sensors"])
-def test_a_board_without_a_bmi088_says_so_and_leaves_the_flaps_at_hover(app: App, lacking: str) -> None:
+def test_a_board_without_bmi088_reports_it_and_holds_hover(app: App, lacking: str) -> None:
     getattr(app, lacking).value = 1 - getattr(app, lacking).value
     app.boot()
     assert "no raw counts of a BMI088: flaps stay at hover" in app.console()
@@ -372,9 +362,7 @@ def test_a_client_that_writes_the_estimators_parameter_does_not_disturb_the_flig
 
 
 @pytest.mark.parametrize("reset_us", [1_190_000, 1_195_000])
-def test_a_microsecond_clock_set_to_zero_neither_ends_a_flight_nor_its_failsafe(
-    app: App, reset_us: int
-) -> None:
+def test_resetting_the_microsecond_clock_ends_neither_flight_nor_failsafe(app: App, reset_us: int) -> None:
     flying(app)
     app.usec_reset.value = reset_us
     for step in range(1200, 1680):
@@ -408,14 +396,14 @@ def test_an_age_beyond_what_is_logged_is_the_greatest_value(app: App) -> None:
 
 
 @pytest.mark.parametrize("reason", ["watchdog", "assert"])
-def test_after_a_watchdog_or_assert_reset_floaty_says_so_and_flies_on(app: App, reason: str) -> None:
+def test_after_a_watchdog_or_assert_reset_floaty_reports_it_and_flies_on(app: App, reason: str) -> None:
     getattr(app, f"after_{reason}").value = 1
     flying(app)
     assert f"SYS: after {reason}\n" in app.console()
     assert "restarted by watchdog or assert" in app.console()
 
 
-def test_a_self_test_that_does_not_pass_is_told_once(app: App) -> None:
+def test_a_failed_self_test_is_reported_once(app: App) -> None:
     app.c.appInit()
     app.c.stub_run_app(48)
     assert app.console() == ""
@@ -472,7 +460,7 @@ def test_a_switch_that_is_written_2_is_put_back_and_does_nothing(app: App, name:
     assert app.supervisor.state == reference.State.FLYING
 
 
-def test_while_another_controller_runs_the_state_is_no_flight(app: App) -> None:
+def test_under_another_controller_the_state_is_failsafe(app: App) -> None:
     flying(app)
     fly_on(app, 1200, 60, controlled=False)
     app.c.stub_run_app(1)
@@ -540,7 +528,6 @@ def commanded(app: App, **fields: float) -> None:
 
 
 def position(x: float, y: float, z: float, yaw_deg: float = 0.0) -> dict[str, float]:
-    """A set-point of the high-level commander."""
     return {"x": x, "y": y, "z": z, "yaw": yaw_deg, "x_mode": 1, "y_mode": 1, "z_mode": 1, "yaw_mode": 1}
 
 
@@ -553,7 +540,6 @@ def absolute(app: App, first: int, steps: int, p_WB: Vector, q_WB: Quaternion) -
 
 
 def estimate(app: App) -> list[float]:
-    """Position, velocity, attitude in G."""
     return np.frombuffer(app.estimator(), Estimator.dtype)[0]["now"][:9].tolist()  # type: ignore[no-any-return]
 
 
@@ -562,9 +548,7 @@ P_WB, Q_WB = (1.0, 2.0, 3.0), from_euler_zyx(0.1, -0.2, 1.3)
 
 
 @pytest.mark.parametrize("how", ["attitude", "quaternion"])
-def test_absolute_poses_and_a_set_point_fly_as_corrections_to_there(
-    app: App, library: Path, tmp_path: Path, how: str
-) -> None:
+def test_absolute_poses_become_corrections(app: App, library: Path, tmp_path: Path, how: str) -> None:
     rng = np.random.default_rng(5)
     twin = App(library, tmp_path / "twin.so")
     app.boot(absolute=True)
@@ -593,7 +577,7 @@ def test_absolute_poses_and_a_set_point_fly_as_corrections_to_there(
     assert max(map(abs, estimate(app))) > 0.1
 
 
-def test_the_firmwares_commander_is_told_the_state_in_the_world(app: App) -> None:
+def test_the_firmwares_commander_gets_the_state_in_the_world(app: App) -> None:
     app.boot(absolute=True)
     commanded(app, **position(0.0, 0.0, 1.0, 170.0))
     q_WB = from_euler_zyx(0.02, -0.01, 3.2)
@@ -617,7 +601,7 @@ def test_until_something_is_commanded_floaty_holds_where_it_is(app: App) -> None
     assert app.supervisor.state == reference.State.FLYING
 
 
-def test_a_yaw_that_is_no_number_leaves_the_goals_yaw(app: App) -> None:
+def test_a_nan_yaw_leaves_the_goals_yaw(app: App) -> None:
     app.boot(absolute=True)
     commanded(app, **position(1.0, 2.0, 2.9, 40.0))
     absolute(app, 1, 300, P_WB, yaw_quaternion(1.0))
@@ -657,9 +641,7 @@ ONLY_POSITIONS, OUTSIDE = "only positions are\n", "it leaves the box, see box.ra
         (position(0.0, 0.0, 1.9), OUTSIDE),
     ],
 )
-def test_a_set_point_that_is_not_followed_leaves_the_goal_and_is_refused_in_one_line(
-    app: App, other: dict[str, float], reason: str
-) -> None:
+def test_a_bad_set_point_keeps_the_goal_in_one_line(app: App, other: dict[str, float], reason: str) -> None:
     app.boot(absolute=True)
     for size, value in (("radius", 0.15), ("below", 0.65), ("above", 0.65)):
         app.set(f"box.{size}", value)
@@ -682,9 +664,7 @@ def test_an_app_that_has_booted_takes_absolute_poses(app: App) -> None:
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0, 1.1), (0.7, 0.7, 0.0), (0.0, 0.0, -2.1)])
-def test_a_pose_that_cannot_be_a_correction_is_counted_and_reported(
-    app: App, place: tuple[float, float, float]
-) -> None:
+def test_impossible_corrections_are_counted_and_reported(app: App, place: tuple[float, float, float]) -> None:
     flying(app)
     before, invalid = estimate(app), app.log("kalman.invalid")
     for step in range(1200, 1260):
@@ -750,9 +730,7 @@ def test_parameters_have_the_names_types_and_defaults_of_the_laboratory(app: App
 
 
 @given(data=st.data())
-def test_the_board_takes_just_the_parameter_values_that_the_laboratory_takes(
-    functions: App, data: st.DataObject
-) -> None:
+def test_the_board_accepts_the_laboratory_s_parameters_only(functions: App, data: st.DataObject) -> None:
     laboratory = LABORATORY
     names = sorted(name for name in functions.params if name in laboratory.parameters)
     name = data.draw(st.sampled_from(names))

@@ -27,7 +27,6 @@ from support.core_streams import (
 )
 from support.paths import ROOT, TESTS
 
-LONG = bool(os.environ.get("FLOATY_LONG"))
 C = translate()
 COMPILERS = [compiler for compiler in compilers() if compiler.name != "cc"]
 IDS = [compiler.name for compiler in COMPILERS]
@@ -149,7 +148,7 @@ def test_arbitrary_bits_meet_no_undefined_behaviour_and_an_unclamped_conversion_
     assert done.stdout == ""
 
 
-def test_a_missing_compiler_is_one_line_that_says_what_to_install() -> None:
+def test_a_missing_compiler_is_one_line_with_the_package() -> None:
     with pytest.raises(ExportError, match=r"no C compiler tcc on this machine: .*pip install .*ziglang"):
         find_compiler("tcc")
 

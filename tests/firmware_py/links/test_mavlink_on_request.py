@@ -51,7 +51,7 @@ def velocity(client: MavlinkClient) -> tuple[float, float, float]:
 
 
 @pytest.mark.parametrize("number", ON_REQUEST)
-def test_nobody_gets_it_unasked_and_who_asks_gets_it_at_his_rate(number: int) -> None:
+def test_rare_messages_are_sent_only_on_request_at_the_requested_rate(number: int) -> None:
     client = MavlinkClient()
     client.run(1_500_000)
     assert client.of(ON_REQUEST[number]) == []
@@ -109,7 +109,7 @@ def test_the_imu_measures_in_si_in_the_bodys_axes() -> None:
     assert 0 <= client.now_us - found.time_usec <= 3000
 
 
-def test_the_board_says_whether_it_is_in_the_air_as_far_as_it_knows() -> None:
+def test_the_board_reports_whether_it_is_in_the_air() -> None:
     client = MavlinkClient()
 
     def landed(end_us: int) -> int:
@@ -123,7 +123,7 @@ def test_the_board_says_whether_it_is_in_the_air_as_far_as_it_knows() -> None:
     assert landed(2_100_000) == dialect.MAV_LANDED_STATE_UNDEFINED  # silence
 
 
-def test_what_seldom_comes_comes_unasked_within_five_seconds_and_is_right(moving: MavlinkClient) -> None:
+def test_slow_streams_come_within_five_seconds_with_right_values(moving: MavlinkClient) -> None:
     moving.messages.clear()
     moving.run(moving.now_us + 5_100_000)
     heard = {name: moving.of(name)[-1] for name in SELDOM}

@@ -17,16 +17,14 @@ def exchange(clock: RemoteClock, sent_us: int, there_us: int, back_us: int, ahea
     return clock.answer(sent_us + there_us + back_us, sent_us, sent_us + there_us + ahead_us)
 
 
-def test_nobody_knows_before_the_first_answer() -> None:
+def test_the_offset_is_unknown_before_the_first_answer() -> None:
     clock = RemoteClock()
     clock.request(1000)
     assert clock.offset_us(2000) is None
 
 
 @given(st.lists(st.tuples(delays, delays), min_size=1, max_size=2 * WINDOW))
-def test_the_offset_is_off_by_no_more_than_half_of_the_shortest_round_trip(
-    rounds: list[tuple[int, int]],
-) -> None:
+def test_the_offset_error_is_at_most_half_the_shortest_round_trip(rounds: list[tuple[int, int]]) -> None:
     clock = RemoteClock()
     for number, (there_us, back_us) in enumerate(rounds):
         exchange(clock, number * 500_000, there_us, back_us)
@@ -56,7 +54,7 @@ def test_drifting_clocks_never_contradict_themselves(ppm: int, rounds: list[tupl
             assert abs(offset_us - AHEAD_US - drift_us) <= 1000 + 2 * number * 50 + 60
 
 
-def test_a_clock_that_was_set_anew_is_believed_at_once() -> None:
+def test_a_reset_clock_is_accepted_at_once() -> None:
     clock = RemoteClock()
     for number in range(5):
         exchange(clock, number * 100_000, 1000, 1000)

@@ -82,9 +82,7 @@ SUM = "for i in range({}):\n    memory.hidden = memory.hidden + DT"
         (SUM.format("100000"), "", ""),
     ],
 )
-def test_a_loop_of_known_length_is_refused_where_it_exceeds_the_budget(
-    tmp_path: Path, body: str, before: str, at: str
-) -> None:
+def test_a_known_loop_beyond_the_budget_is_refused(tmp_path: Path, body: str, before: str, at: str) -> None:
     text = law(body, before)
     if not at:
         load_logic(own_config(tmp_path, text).logic)
@@ -129,7 +127,7 @@ DATA = [
 
 @pytest.mark.parametrize("board", EVERY)
 @pytest.mark.parametrize(("body", "before", "harmless"), DATA, ids=[body.split("\n")[0] for body, *_ in DATA])
-def test_a_loop_whose_length_depends_on_data_is_stopped_alike_on_every_target(
+def test_a_data_dependent_loop_stops_equally_on_every_target(
     blocks_of: Make, board: str, body: str, before: str, harmless: int | None
 ) -> None:
     text = law(body, before).replace("high=1000000)", "high=2000000000)")

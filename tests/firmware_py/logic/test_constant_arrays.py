@@ -68,7 +68,7 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> LabConfig:
 
 
 @pytest.mark.parametrize("board", [*BOARDS[1:], "plain"])
-def test_a_matrix_times_a_vector_has_the_same_bits_on_every_target(config: LabConfig, board: str) -> None:
+def test_matrix_times_vector_is_equal_everywhere(config: LabConfig, board: str) -> None:
     logic = load_logic(config.logic)
     other = PlainRunner if board == "plain" else runner_of(board, ROOT / "runs" / "build", config.logic)
     flown, beside = (CoreBlocks(parameters_of(config), runner, logic) for runner in (PythonRunner, other))
@@ -99,42 +99,23 @@ REFUSED = [
     (BIASES, "BIASES = constant(\n    1.0,\n    -1e39)", "    -1e39", "BIASES: -1e+39 is no finite float32"),
     (BIASES, "BIASES = constant(1.0, True)", "BIASES", "BIASES: True is no number"),
     (BIASES, "BIASES = constant(1.0, (2.0, 3.0))", "BIASES", "BIASES: (2.0, 3.0) is no number"),
-    (
-        BIASES,
-        "BIASES = constant(\n    (1.0, 2.0),\n    (3.0,),\n)",
-        "    (3.0",
-        "BIASES: a row of 1 numbers; the first has 2",
-    ),
+    (BIASES, "BIASES = constant(\n    (1.0, 2.0),\n    (3.0,),\n)", "    (3.0",
+     "BIASES: a row of 1 numbers; the first has 2"),
     (BIASES, "BIASES = constant(((1.0,),))", "BIASES", "BIASES: (1.0,) is no number"),
-    (
-        BIASES,
-        f"BIASES = constant({'0,' * 65600})",
-        "BIASES",
-        "BIASES: 65680 numbers in the constant arrays of this file: at most 65536",
-    ),
+    (BIASES, f"BIASES = constant({'0,' * 65600})", "BIASES",
+     "BIASES: 65680 numbers in the constant arrays of this file: at most 65536"),
     (BIASES, "BIASES = [0.5, -1.0]", "BIASES", "constant BIASES is none of f32(number), a 32-bit integer and"),
     (BODY, BODY + "    WEIGHTS[0, 1] = f32(1.0)\n", "    WEIGHTS[", "WEIGHTS is a constant and is written"),
     (BODY, BODY + "    biases[1] = f32(1.0)\n", "    biases[1]", "BIASES is a constant and is written"),
-    (
-        "total = biases[row]",
-        "total = biases[row] + WEIGHTS[0, 16]",
-        "        total =",
-        "index 16: f32 matrix of 16 has 0..15 (in control_law)",
-    ),
-    (
-        "range(5)",
-        "range(6)",
-        "        total =",
-        "index row, which is 0..5: f32 array of 5 has 0..4 (in control_law)",
-    ),
+    ("total = biases[row]", "total = biases[row] + WEIGHTS[0, 16]", "        total =",
+     "index 16: f32 matrix of 16 has 0..15 (in control_law)"),
+    ("range(5)", "range(6)", "        total =", "index row, which is 0..5: f32 array of 5 has 0..4 (in control_law)"),
     ("biases[row]", "BIASES", "        total =", "total stands for more than one array (in control_law)"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("old", "new", "at", "reason"), REFUSED, ids=[case[3] for case in REFUSED])
-def test_what_is_no_constant_array_is_one_line_with_file_and_line(
-    tmp_path: Path, old: str, new: str, at: str, reason: str
-) -> None:
+def test_a_bad_constant_array_is_one_line(tmp_path: Path, old: str, new: str, at: str, reason: str) -> None:
     text = LAW.replace(old, new, 1)
     with pytest.raises(LabError) as error:
         own_config(tmp_path, text)

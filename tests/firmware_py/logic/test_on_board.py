@@ -64,7 +64,7 @@ def test_parameters_are_taken_inside_their_bounds_and_can_be_stored(bench: Bench
     assert after.set(1_000_000) == OK
 
 
-def test_what_the_memory_marks_is_logged_and_nothing_else(bench: Bench) -> None:
+def test_only_marked_memory_is_logged(bench: Bench) -> None:
     names = [variable.name for variable in bench.firmware.variables if variable.name.startswith("logic.")]
     assert names == ["logic.integral", "logic.errors1", "logic.errors2", "logic.errors3", "logic.ticks"]
     y = bench.read("stateEstimate.y")
@@ -85,9 +85,7 @@ def test_mavlink_has_room_for_the_longest_name(config: LabConfig) -> None:
     assert (found.param_id, found.param_value) == ("OWN_TWELVE_CHARS", pytest.approx(0.1))
 
 
-def test_a_law_that_fails_puts_the_flaps_to_hover_at_once_until_it_is_asked_to_recover(
-    config: LabConfig,
-) -> None:
+def test_a_failing_law_holds_the_hover_angles_until_recovery(config: LabConfig) -> None:
     bench = Bench(config)
     bench.run(GYRO_ZERO_US + 300_000)
     assert bench.supervisor.state is State.FLYING
@@ -145,9 +143,7 @@ def loop(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("place", ["u", "flap"])
 @pytest.mark.parametrize("index", range(4))
-def test_no_number_is_let_through_at_any_place(
-    loop: CoreBlocks, wrong: float, place: str, index: int
-) -> None:
+def test_not_a_number_is_stopped_everywhere(loop: CoreBlocks, wrong: float, place: str, index: int) -> None:
     data: Any = loop.data.fields
     data.manual[:], data.pose_quaternion[:] = (0.1, 0.2, 0.3, 0.4), (0.5, -0.4, 3.0, -3.0)
     loop.run.call("control")

@@ -214,7 +214,7 @@ def test_what_is_no_policy_is_refused(
         ("none/net.safetensors", "No such file or directory"),
     ],
 )
-def test_a_file_that_is_none_is_refused(tmp_path: Path, name: str, reason: str) -> None:
+def test_a_file_of_another_kind_is_refused(tmp_path: Path, name: str, reason: str) -> None:
     if "/" not in name:
         (tmp_path / name).write_bytes(b"years of work")
     with pytest.raises(PolicyError, match=f"^{re.escape(reason)}") as error:

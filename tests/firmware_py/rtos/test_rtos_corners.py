@@ -100,7 +100,7 @@ def test_a_priority_set_while_one_is_lent_counts_when_the_mutex_is_given(kernel)
 
 
 @pytest.mark.parametrize("how", ["set", "lent and returned"])
-def test_waiters_stand_in_the_order_of_the_priority_they_have_now(kernel, how):
+def test_waiters_are_ordered_by_their_present_priority(kernel, how):
     queue = kernel.create_queue(2, "queue")
     mutex = kernel.create_mutex("mutex")
     served = []
@@ -290,7 +290,7 @@ def test_the_start_latency_ends_at_the_first_switch_to_the_task(kernel):
     assert [report.worst_latency_us for report in statistics.reports()] == [0, 0]
 
 
-def test_a_notification_of_a_task_that_is_ready_already_does_not_begin_its_activation_anew(kernel):
+def test_notifying_a_ready_task_does_not_restart_its_activation(kernel):
     """Its wait ends at 1 ms, the notification comes at 2 ms, it runs at 3 ms."""
 
     def low():

@@ -78,12 +78,12 @@ def test_stock_pose_has_no_age():
         ((0, 0, 0), (0, 1.11, 0, 0)),
     ],
 )
-def test_the_board_refuses_a_pose_that_is_none(p, q):
+def test_the_board_refuses_an_invalid_pose(p, q):
     with pytest.raises(WireError):
         crtp.decode_ext_pose(struct.pack("<B7fB", 8, *p, *q[1:], q[0], 0))
 
 
-def test_a_position_outside_of_any_tunnel_is_none():
+def test_a_position_outside_of_any_tunnel_is_invalid():
     assert crtp.decode_ext_pose(crtp.encode_ext_pose((0, -1000.0, 0), Q, 0)[1:]).p_GB == (0, -1000.0, 0)
     for x in (1000.5, -1001.0, 3e38):
         with pytest.raises(WireError, match="within 1000 m"):
@@ -91,7 +91,7 @@ def test_a_position_outside_of_any_tunnel_is_none():
 
 
 @pytest.mark.parametrize("z", [nan, inf, 1000.5, -3e38])
-def test_a_position_without_attitude_is_judged_alike(z):
+def test_a_position_without_attitude_follows_the_same_rule(z):
     assert localisation.decode_position(struct.pack("<3f", 1, 2, 1000)) == (1, 2, 1000)
     with pytest.raises(WireError, match="within 1000 m"):
         localisation.decode_position(struct.pack("<3f", 1, 2, z))
@@ -143,12 +143,7 @@ def test_block_fits_a_packet_and_comes_back(block):
 
 @pytest.mark.parametrize("block", telemetry.ALL_BLOCKS, ids=lambda block: f"block{block.id}")
 def test_cflib_reads_the_block(block):
-    names = {
-        Scalar.U8: "uint8_t",
-        Scalar.U16: "uint16_t",
-        Scalar.F32: "float",
-        Scalar.F16: "FP16",
-    }
+    names = {Scalar.U8: "uint8_t", Scalar.U16: "uint16_t", Scalar.F32: "float", Scalar.F16: "FP16"}
     config = LogConfig("theirs", block.period_ms)
     for variable in block.variables:
         config.add_variable(variable.name, names[variable.type])

@@ -157,7 +157,7 @@ def test_a_field_that_does_not_fit_is_refused_and_takes_no_sequence_number() -> 
 # Damage
 
 
-def test_garbage_before_frames_loses_none_of_them() -> None:
+def test_garbage_before_frames_loses_no_frame() -> None:
     rng = np.random.default_rng(3)
     frames = golden(peer(), conversation(rng, 3000))
     stream = b""

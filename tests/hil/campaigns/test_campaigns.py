@@ -69,7 +69,7 @@ def test_the_dataset_is_the_same_for_any_number_of_workers(tmp_path: Path, stop:
     assert (standings[0].flown < 200) == bool(stop)
 
 
-def test_a_row_says_all_of_its_flight_and_columns_have_units(tmp_path: Path) -> None:
+def test_a_row_describes_its_flight_and_columns_have_units(tmp_path: Path) -> None:
     spec = spec_of()
     flown_into(tmp_path / "out", spec, workers(1))
     table = pq.read_table(tmp_path / "out" / FLIGHTS)
@@ -160,16 +160,14 @@ def test_a_full_disk_is_one_line_and_what_is_there_is_kept(tmp_path: Path, limit
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_no_room_for_a_flight_s_own_files_ends_the_campaign_and_is_no_row() -> None:
+def test_a_full_disk_for_a_flight_s_files_ends_the_campaign_without_a_row() -> None:
     with small_files(10_000), pytest.raises(LabError, match=r"flight 0: .*File too large"):
         fly_job(draw(spec_of(flights=1), 0))
     gc.collect()  # the telemetry log that found no room
 
 
 @pytest.mark.parametrize(("changed", "what"), [("robot.py", "profiles"), ("cf2.elf", "image")])
-def test_a_campaign_continues_with_the_files_with_which_it_began(
-    changed: str, what: str, tmp_path: Path
-) -> None:
+def test_a_campaign_resumes_only_with_its_original_files(changed: str, what: str, tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text('base = "floaty"\n[robot]\nbody = "robot.py"\n')
     for name in ("robot.py", "cf2.elf"):
         (tmp_path / name).write_text("x = 1\n")
@@ -217,7 +215,7 @@ def test_the_interval_is_wilson_s() -> None:
     assert (low, high) == pytest.approx((0.01787621, 0.40415005), abs=1e-6)  # statsmodels, proportion_confint
 
 
-def test_what_was_planted_is_found(tmp_path: Path) -> None:
+def test_the_planted_effect_is_found(tmp_path: Path) -> None:
     spec = spec_of(flights=256, sampling="sobol", table={"constants": ["roll_u1"]})
     flown_into(tmp_path, spec, workers(2))
     found = find(spec, Dataset(tmp_path, plan_of(spec), resume=True).table())
@@ -292,9 +290,7 @@ def test_a_cell_of_the_failure_map_leads_to_its_flights(reported: tuple[Path, Fi
 
 @pytest.mark.long
 @pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine")
-def test_the_report_fits_a_phone_and_its_cells_lead_down(
-    reported: tuple[Path, Findings], tmp_path: Path
-) -> None:
+def test_the_report_fits_a_phone_and_its_cells_link(reported: tuple[Path, Findings], tmp_path: Path) -> None:
     with browser(tmp_path) as tab:
         for width in (390, 1180):
             tab.open(reported[0].as_uri(), width)
@@ -317,9 +313,7 @@ def test_a_report_of_nothing_and_of_nothing_that_failed_can_be_written(tmp_path:
 @pytest.mark.parametrize(
     ("sampling", "flights", "method"), [("saltelli", 640, "total Sobol index"), ("morris", 80, "Morris' mu*")]
 )
-def test_a_design_has_the_indices_that_it_is_for(
-    tmp_path: Path, sampling: str, flights: int, method: str
-) -> None:
+def test_a_design_has_its_own_indices(tmp_path: Path, sampling: str, flights: int, method: str) -> None:
     spec = spec_of(sampling=sampling, flights=flights)
     flown_into(tmp_path, spec, workers(2))
     found = find(spec, Dataset(tmp_path, plan_of(spec), resume=True).table())
@@ -328,7 +322,7 @@ def test_a_design_has_the_indices_that_it_is_for(
     assert failing.by_axis["fault 1 push.y size"] > 0.1
 
 
-def test_flights_without_an_end_are_failures_and_told_apart(tmp_path: Path) -> None:
+def test_flights_without_an_end_are_distinct_failures(tmp_path: Path) -> None:
     spec = spec_of(flights=3, settings=["limits.hover.unsee=1"])
     rows = Dataset(tmp_path, plan_of(spec), False)
     for index in range(3):
@@ -340,7 +334,7 @@ def test_flights_without_an_end_are_failures_and_told_apart(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(("limit", "value"), [("simulated_s", 1.2), ("wall_s", 1e-6)])
-def test_a_flight_beyond_a_limit_of_time_is_a_row_that_says_which(limit: str, value: float) -> None:
+def test_a_flight_beyond_its_time_limit_is_a_row_that_names_it(limit: str, value: float) -> None:
     row = fly_job(draw(spec_of(limits={limit: value}), 0))
     assert (row.outcome, row.passed, row.hash) == ("error", False, "")
     assert row.error == f"TooLongError: limits.{limit} = {value:g}: the flight had not ended"

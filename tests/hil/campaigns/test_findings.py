@@ -190,7 +190,7 @@ def test_nineteen_of_twenty_intervals_contain_the_rate_of_pairs_that_agree_in_94
     assert 0.92 <= np.mean(inside) <= 0.99
 
 
-def test_clusters_of_which_none_fails_count_once() -> None:
+def test_clusters_without_failure_count_once() -> None:
     assert tallied(np.zeros((50, 2), bool)).interval == interval(0.0, 50)
 
 

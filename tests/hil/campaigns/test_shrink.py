@@ -58,9 +58,7 @@ def test_only_the_fault_that_matters_is_left_with_the_smallest_size_and_time_tha
         ("mocap.dropout", lambda size: size >= 0.3, 0.3, 0.3 + 1.0 / 64),
     ],
 )
-def test_sizes_shrink_towards_what_is_harmless_for_their_kind(
-    kind: str, fails: Callable[[float], bool], low: float, high: float
-) -> None:
+def test_sizes_shrink_to_harmless(kind: str, fails: Callable[[float], bool], low: float, high: float) -> None:
     least = shrink(trial(*FAULTS), DURATION_S, lambda one: fails(size_of(one, kind, harmless(kind) or 0.0)))
     (fault,) = least.faults
     assert fault.kind == kind
@@ -99,9 +97,7 @@ def test_a_fault_that_the_flights_end_cuts_off_lasts_no_longer_than_to_there() -
     assert max(span for span in tried if span != 9.0) <= DURATION_S - 8.0
 
 
-def test_a_flight_that_fails_in_another_manner_is_not_the_one_to_be_shrunk(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_flight_that_fails_differently_is_not_the_shrunk_one(monkeypatch: pytest.MonkeyPatch) -> None:
     results = [
         SimpleNamespace(passed=False, outcome=name, verdicts=(), failed=(), cause="")
         for name in ("lost", "completed")
@@ -113,12 +109,12 @@ def test_a_flight_that_fails_in_another_manner_is_not_the_one_to_be_shrunk(
     assert not reflight.fails(reflight.whole)
 
 
-def test_a_flight_that_holds_cannot_be_shrunk() -> None:
+def test_a_passing_flight_cannot_be_shrunk() -> None:
     with pytest.raises(LabError, match="does not fail"):
         shrink(trial(*FAULTS), DURATION_S, lambda one: False)
 
 
-def test_what_is_harmless_can_be_written() -> None:
+def test_harmless_sizes_can_be_written() -> None:
     for name, kind in KINDS.items():
         size = harmless(name)
         if kind.sized:
@@ -129,10 +125,8 @@ def test_what_is_harmless_can_be_written() -> None:
 
 
 @pytest.mark.long
-def test_the_command_shrinks_a_flight_that_is_lost_and_says_how_to_fly_it(
-    cli: Cli,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: pytest.TempPathFactory,
+def test_the_command_shrinks_a_lost_flight_and_prints_its_command(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: pytest.TempPathFactory
 ) -> None:
     monkeypatch.chdir(str(tmp_path))
     text = """
@@ -164,7 +158,7 @@ size = 2.0
     assert cli(*command[1:]) == 1, "it fails"
 
 
-def test_what_is_shrunk_is_the_flight_that_was_drawn() -> None:
+def test_the_shrunk_flight_is_the_drawn_one() -> None:
     spec = spec_of(flights=8, sampling="sobol")
     drawn = next(one for one in (draw(spec, index) for index in range(8)) if one.options["faults"])
     reflight = Reflight(spec, drawn, print)

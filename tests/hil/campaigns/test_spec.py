@@ -21,6 +21,11 @@ def test_the_example_flies_the_hover_on_every_robot_that_the_table_allows() -> N
     assert spec.table.constants == "all"
 
 
+PARAMETERS = HOVER + "[parameters]\n"
+TAU = PARAMETERS + '"actuators.tau" = '
+PUSH = HOVER + '[[faults]]\nkind = "push.y"\n'
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -32,40 +37,27 @@ def test_the_example_flies_the_hover_on_every_robot_that_the_table_allows() -> N
         (HOVER + 'stop = "soon"', "stop = 'soon': expected \"failure rate known to ±1 %\""),
         (HOVER + 'stop = "failure rate known to ±0 %"', "above 0 and below 50"),
         (HOVER + "seed = -1", "seed = -1"),
-        (HOVER + '[parameters]\n"actuators.tau" = { unifrom = [1, 2] }', "did you mean uniform?"),
-        (HOVER + '[parameters]\n"actuators.tau" = { uniform = [2, 1] }', "expected low < high"),
-        (
-            HOVER + '[parameters]\n"actuators.tau" = {}',
-            "expected one of uniform, log_uniform, normal, choice",
-        ),
-        (HOVER + '[parameters]\n"actuators.tau" = { log_uniform = [0, 1] }', "expected bounds above 0"),
-        (HOVER + '[parameters]\n"actuators.tau" = { normal = [0.05, 0] }', "expected a deviation above 0"),
-        (HOVER + '[parameters]\n"actuators.tau" = { choice = [] }', "parameters.actuators.tau.choice"),
-        (HOVER + '[parameters]\n"actuators.tau" = { uniform = [0.04, 0.9] }', "actuators.tau = 0.8"),
-        (
-            HOVER + '[parameters]\n"serial.baud" = { uniform = [100000, 200000] }',
-            "input should be a valid integer",
-        ),
-        (HOVER + '[parameters]\n"actuators.tua" = { uniform = [0.04, 0.06] }', "did you mean tau?"),
-        (
-            HOVER + '[parameters]\n"plant.variant" = { choice = ["methods", "bent"] }',
-            "plant.variant = 'bent'",
-        ),
+        (TAU + "{ unifrom = [1, 2] }", "did you mean uniform?"),
+        (TAU + "{ uniform = [2, 1] }", "expected low < high"),
+        (TAU + "{}", "expected one of uniform, log_uniform, normal, choice"),
+        (TAU + "{ log_uniform = [0, 1] }", "expected bounds above 0"),
+        (TAU + "{ normal = [0.05, 0] }", "expected a deviation above 0"),
+        (TAU + "{ choice = [] }", "parameters.actuators.tau.choice"),
+        (TAU + "{ uniform = [0.04, 0.9] }", "actuators.tau = 0.8"),
+        (PARAMETERS + '"serial.baud" = { uniform = [100000, 200000] }', "input should be a valid integer"),
+        (PARAMETERS + '"actuators.tua" = { uniform = [0.04, 0.06] }', "did you mean tau?"),
+        (PARAMETERS + '"plant.variant" = { choice = ["methods", "bent"] }', "plant.variant = 'bent'"),
         (HOVER + '[table]\nconstants = ["roll_u9"]', "table.constants.0 = 'roll_u9': input should be"),
-        ('experiments = ["hover"]\nfligths = 3', "fligths = 3: unknown key; did you mean flights?"),
         ('experiments = "hover"\nflights = 3', "experiments = 'hover': input should be a valid list"),
-        (
-            HOVER + '[[faults]]\nkind = "push.y"\nstart_s = { uniform = [1.0] }',
-            "faults.0.start_s.uniform.1: missing",
-        ),
+        (PUSH + "start_s = { uniform = [1.0] }", "faults.0.start_s.uniform.1: missing"),
         (
             HOVER + '[table]\n[parameters]\n"plant.constant_factors.roll_u1" = { uniform = [1, 2] }',
             "in both [parameters] and [table]",
         ),
         (HOVER + '[[faults]]\nkind = "push.w"\nstart_s = 1', "fault 'push.w@1.0': unknown kind 'push.w'"),
-        (HOVER + '[[faults]]\nkind = "push.y"\nstart_s = 1\nsize = 99', "size 99: expected -20..20 N"),
-        (HOVER + '[[faults]]\nkind = "push.y"\nstart_s = 99', "the flight ends 30 s after the release"),
-        (HOVER + '[[faults]]\nkind = "push.y"\nstart_s = 1\nprobability = 2', "faults.0.probability = 2"),
+        (PUSH + "start_s = 1\nsize = 99", "size 99: expected -20..20 N"),
+        (PUSH + "start_s = 99", "the flight ends 30 s after the release"),
+        (PUSH + "start_s = 1\nprobability = 2", "faults.0.probability = 2"),
         (HOVER + "[limits]\nwall_s = 0", "limits.wall_s = 0: input should be greater than 0"),
         (HOVER + 'sampling = "saltelli"', "needs at least two numbers that vary; there are 0"),
         (HOVER + 'sampling = "saltelli"\n[table]', "with 13 numbers that vary needs 60 or 120"),
@@ -94,10 +86,7 @@ def test_a_bad_spec_is_one_line_and_exit_code_two(
         (["nowhere.toml"], "campaign nowhere.toml: No such file"),
         (["tabel"], "campaign 'tabel': neither the name of a campaign (did you mean table?) nor a path"),
         (["table", "--shrink", "1000"], "--shrink 1000: the campaign has flights 0..999"),
-        (
-            ["table", "--workers", "2", "--cluster", "tcp://a:1"],
-            "--workers 2: not together with --cluster",
-        ),
+        (["table", "--workers", "2", "--cluster", "tcp://a:1"], "--workers 2: not together with --cluster"),
     ],
 )
 def test_a_bad_option_is_one_line_and_exit_code_two(
@@ -119,7 +108,7 @@ def test_files_that_a_spec_names_begin_at_its_folder(tmp_path: Path) -> None:
     assert spec.board == f"{tmp_path}/cf2.elf"
 
 
-def test_a_missing_extra_says_how_to_install_it(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_extra_names_its_installation(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hil.errors.find_spec", lambda name: None)
     assert cli("campaign", "table") == 2
     assert "floaty campaign: SALib is missing: " in cli.err

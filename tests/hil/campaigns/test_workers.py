@@ -56,9 +56,7 @@ def test_a_flight_that_raises_is_a_row_with_its_error(crew: Workers) -> None:
     assert all(rows[n].hash == planted(draw(spec, n)).hash for n in range(8) if n != 3)
 
 
-def test_the_flight_that_kills_its_worker_each_time_is_a_row_and_all_others_are_flown(
-    crew: Workers, tmp_path: Path
-) -> None:
+def test_a_flight_that_always_kills_its_worker_is_a_row_beside_others(crew: Workers, tmp_path: Path) -> None:
     spec = spec_of(flights=10, settings=[str(tmp_path / "once")])
     rows = rows_of(crew, spec, killing)
     assert sorted(rows) == list(range(10))
@@ -148,9 +146,7 @@ def test_a_cluster_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch
         Workers(0, "tcp://127.0.0.1:9")
 
 
-def test_the_command_flies_reports_and_resumes(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_command_flies_and_resumes(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     Path("tiny.toml").write_text(
         'experiments = ["hover"]\nprofiles = ["floaty", "as-flown"]\nduration_s = 0.3\nflights = 4\n'

@@ -83,7 +83,7 @@ def test_a_station_refuses_a_port_on_which_no_board_listens(cli: Cli) -> None:
         (["deploy", "flash", "cf2.bin"], "Missing option '--uri'"),
     ],
 )  # fmt: skip
-def test_what_cannot_work_is_refused(cli: Cli, arguments: list[str], message: str) -> None:
+def test_impossible_links_are_refused(cli: Cli, arguments: list[str], message: str) -> None:
     Path("cf2.bin").write_bytes(struct.pack("<II", 0x2002_0000, 0x0800_41C1) + bytes(2000))
     Path("cf2.elf").write_bytes(b"\x7fELF" + bytes(500))
     assert message in cli.refusal(*arguments)

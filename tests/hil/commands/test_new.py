@@ -47,9 +47,7 @@ def test_an_empty_folder_becomes_a_project(cli: Cli) -> None:
     assert files_in(Path("law")) == sorted(FILES)
 
 
-def test_the_present_folder_becomes_a_project_of_its_name(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_this_folder_becomes_a_project(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     assert cli("new", ".") == 0
@@ -65,9 +63,7 @@ def test_the_present_folder_becomes_a_project_of_its_name(
         ("file/law", "floaty: new file/law: Not a directory\n"),
     ],
 )
-def test_a_folder_that_cannot_be_is_one_line_and_nothing_is_written(
-    cli: Cli, tmp_path: Path, folder: str, told: str
-) -> None:
+def test_an_impossible_folder_is_one_line(cli: Cli, tmp_path: Path, folder: str, told: str) -> None:
     Path("taken").mkdir()
     Path("taken/controller.py").write_text("years of work")
     Path("file").touch()
@@ -92,9 +88,7 @@ def test_a_project_of_a_robot_flies_and_its_tests_pass(
 
 
 @pytest.mark.long
-def test_a_project_flies_and_its_tests_pass(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, pytester: pytest.Pytester
-) -> None:
+def test_a_project_passes_tests(cli: Cli, monkeypatch: pytest.MonkeyPatch, pytester: pytest.Pytester) -> None:
     monkeypatch.chdir(pytester.path)
     assert cli("new", "law") == 0
     monkeypatch.chdir("law")

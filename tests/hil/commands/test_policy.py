@@ -75,7 +75,7 @@ def test_more_numbers_than_the_flash_has_room_for_are_one_line(cli: Cli) -> None
     assert cli.err.startswith("floaty: policy huge.onnx: controller.py:")
 
 
-def test_a_file_or_folder_that_cannot_be_used_is_one_line(cli: Cli) -> None:
+def test_an_unusable_file_or_folder_is_one_line(cli: Cli) -> None:
     file = write_onnx(Path("bad.onnx"), network(), "Sigmoid")
     assert "bad.onnx: Sigmoid /Sigmoid_1: a policy consists of " in cli.refusal(
         "policy", file, "--out", "law"

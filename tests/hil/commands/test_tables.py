@@ -52,9 +52,7 @@ def test_means_are_those_of_the_completed_flights(capsys: pytest.CaptureFixture[
     assert "fails: rms_x" in shown
 
 
-def test_a_limit_that_holds_is_ok_and_one_that_does_not_fails(
-    flown: Result, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_held_limit_is_ok_and_a_missed_one_fails(flown: Result, capsys: pytest.CaptureFixture[str]) -> None:
     for holds, mark in ((True, "ok"), (False, "FAILS")):
         verdict = Verdict("rms_x", 0.01, 0.02, holds, "m", "max")
         print_result(replace(flown, metrics=flown.metrics | {"rms_x": 0.01}, verdicts=(verdict,)))
@@ -86,7 +84,7 @@ def test_seeds_count_up_and_one_that_fails_is_exit_code_one(
 
 
 @pytest.mark.parametrize(("differ", "code"), [((False, False), 0), ((True, False), 1), ((True, True), 1)])
-def test_boards_of_which_one_seed_differs_are_not_the_same(
+def test_differing_boards_fail(
     differ: tuple[bool, ...], code: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first = FirstCount(7, 0.07, "motor.m1", (1, 2), "radio")

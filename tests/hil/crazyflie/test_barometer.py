@@ -43,7 +43,7 @@ def test_noise_is_that_of_the_data_sheet_with_the_filter_for_drones() -> None:
     assert np.std(pressures[20:]) == pytest.approx(0.11 * 11.69, rel=0.05)
 
 
-def test_filter_answers_a_step_as_its_coefficient_says() -> None:
+def test_the_filter_has_the_step_response_of_its_coefficient() -> None:
     registers = np.zeros(256, np.uint8)
     registers[CONFIG] = DRONE
     barometer = Barometer(registers)

@@ -62,7 +62,7 @@ def test_cflib_reads_the_sectors_of_the_stm32() -> None:
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # cflib leaves the file open
 @pytest.mark.parametrize(("name", "start"), [("stm32", 16), ("nrf51", 88)])
 @pytest.mark.parametrize("size", [1, 25, 1024, 1025, 10 * 1024, 30_321])
-def test_what_cflib_flashes_is_there_byte_for_byte_and_nothing_else(
+def test_cflib_flashes_exactly_its_bytes(
     tmp_path: Path, name: str, start: int, size: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bootloader = Bootloader()
@@ -90,9 +90,7 @@ def test_what_cflib_flashes_is_there_byte_for_byte_and_nothing_else(
         (1, 16, 10, OUT_OF_RANGE),
     ],
 )
-def test_writing_stays_inside_flash_and_buffer(
-    buffer_page: int, page: int, pages: int, answer: bytes
-) -> None:
+def test_writes_stay_inside_flash_and_buffer(buffer_page: int, page: int, pages: int, answer: bytes) -> None:
     request = struct.pack("<BBBHHH", 0xFF, 0xFF, 0x18, buffer_page, page, pages)
     assert Bootloader().answer(request) == request[:3] + answer
 

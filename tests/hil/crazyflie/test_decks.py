@@ -48,7 +48,7 @@ def test_unknown_deck_and_one_twice_are_one_clear_line(value: str, line: str) ->
 # One-wire memories
 
 
-def test_memories_are_found_and_read_in_pieces_as_their_format_says() -> None:
+def test_memories_are_found_and_read_in_pieces() -> None:
     decks = DeckBench("flow2", "multiranger").decks
     assert decks.answer(syslink.SCAN_MEMORIES, b"") == b"\2"
     for number, product, name in ((0, FLOW, b"bcFlow2"), (1, MULTIRANGER, b"bcMultiranger")):
@@ -63,7 +63,7 @@ def test_memories_are_found_and_read_in_pieces_as_their_format_says() -> None:
         assert memory[10:12] + memory[12 : 12 + len(name)] == bytes((1, len(name))) + name
 
 
-def test_a_memory_keeps_what_is_written_and_nobody_answers_for_one_that_is_not_there() -> None:
+def test_a_memory_keeps_writes_and_an_absent_one_is_silent() -> None:
     decks = DeckBench("flow2").decks
     decks.answer(syslink.WRITE_MEMORY, struct.pack("<BHH", 0, 100, 3) + b"abc")
     assert decks.answer(syslink.READ_MEMORY, struct.pack("<BH", 0, 99) + bytes(5))[3:] == b"\xffabc\xff"
@@ -80,7 +80,7 @@ def test_serial_number_has_the_sum_of_maxims_note_27() -> None:
     assert crc == 0
 
 
-def test_a_board_without_decks_has_no_memories_and_nobody_on_its_bus() -> None:
+def test_a_board_without_decks_has_no_memories_and_an_empty_bus() -> None:
     bench = DeckBench()
     assert bench.decks.answer(syslink.SCAN_MEMORIES, b"") == b"\0"
     assert not bench.answers(ADDRESS)
@@ -106,7 +106,7 @@ def ranged(bench: DeckBench, address: int) -> tuple[int, float]:
     return status, ((high << 8 | low) * 2011 + 1024) // 2048 * 1e-3
 
 
-def test_ranger_measures_in_the_time_that_its_registers_say() -> None:
+def test_the_ranger_measures_in_the_time_of_its_registers() -> None:
     bench = DeckBench("flow2")
     bench.place((0.0, 0.0, 1.0))
     start(bench, ADDRESS)
@@ -130,7 +130,7 @@ def test_ranger_returns_the_distance_of_the_floor_with_little_noise() -> None:
     assert np.mean(seen) == pytest.approx(0.0, abs=0.002)
 
 
-def test_ranger_out_of_reach_says_so_and_one_that_is_stopped_says_nothing() -> None:
+def test_a_ranger_reports_out_of_reach_and_a_stopped_one_nothing() -> None:
     bench = DeckBench("flow2")
     bench.place((0.0, 0.0, 3.2))  # "medium" reaches 2.9 m
     start(bench, ADDRESS)

@@ -85,7 +85,7 @@ def test_the_first_difference_is_reported_with_its_tick_call_and_word(
         assert found.differences[0].bits == bits
 
 
-def test_a_target_that_answers_otherwise_is_found() -> None:
+def test_a_differing_target_is_found() -> None:
     class Late(PythonRunner):
         def call(self, name: str) -> int:
             return super().call(name) + (name == "file_pose")
@@ -163,9 +163,7 @@ SOMETHING_OF_EACH = ("--duration", "0.8", "--fault", "mocap.latency@0.2:0.4=150"
 
 
 @pytest.mark.long
-def test_ten_thousand_ticks_of_hover_yaw_step_and_faults_do_not_differ_in_a_bit(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path
-) -> None:
+def test_ten_thousand_ticks_are_bit_identical(cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path) -> None:
     monkeypatch.chdir(built)
     assert cli("deploy", "check") == 0
     sums = re.search(r"^(\d+) ticks, .*: no bit differs$", cli.out, re.MULTILINE)
@@ -191,7 +189,7 @@ class Watch(PythonRunner):
 
 
 @pytest.mark.parametrize("target", ["c-O2", pytest.param("cortex-m4", marks=pytest.mark.long)])
-def test_one_changed_operator_in_the_c_is_exit_one_and_found_in_its_tick(
+def test_changed_operator_is_found(
     cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path, target: str
 ) -> None:
     monkeypatch.chdir(built)
@@ -217,9 +215,7 @@ def test_one_changed_operator_in_the_c_is_exit_one_and_found_in_its_tick(
 
 
 @pytest.mark.long
-def test_machine_code_that_leaves_its_memory_is_exit_one(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path
-) -> None:
+def test_code_outside_its_memory_is_exit_1(cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path) -> None:
     monkeypatch.chdir(built)
     text, right = translate().source, "const int32_t row = estimator->tick % FLOATY_HISTORY;"
     assert text.count(right) == 1
@@ -333,9 +329,7 @@ def test_c_that_does_not_compile_is_one_line_and_exit_code_two(cli: Cli) -> None
         (["hover", "--targets", "plain", "--elf", "cf2.elf"], "--elf cf2.elf: nothing to check it with"),
     ],
 )
-def test_bad_input_of_check_is_one_line_and_exit_code_two(
-    cli: Cli, arguments: list[str], message: str
-) -> None:
+def test_bad_input_of_check_is_one_line_and_exit_two(cli: Cli, arguments: list[str], message: str) -> None:
     assert message in cli.refusal("deploy", "check", *arguments)
 
 
@@ -356,9 +350,7 @@ def test_the_exported_app_holds_the_c_that_is_checked(cli: Cli) -> None:
         ([], "Missing argument"),
     ],
 )
-def test_bad_input_of_export_is_one_line_and_exit_code_two(
-    cli: Cli, arguments: list[str], message: str
-) -> None:
+def test_bad_input_of_export_is_one_line_and_exit_two(cli: Cli, arguments: list[str], message: str) -> None:
     Path("other").mkdir()
     Path("other/thesis.tex").write_text("mine", encoding="utf-8")
     assert message in cli.refusal("deploy", "write", *arguments)

@@ -119,7 +119,7 @@ def forget(board: Board) -> None:
         (forget, "firmware", "!does not tell its version"),
     ],
 )  # fmt: skip
-def test_what_is_not_well_is_marked_and_is_exit_code_one(
+def test_a_defect_is_marked_and_is_exit_code_one(
     cli: Cli,
     board: Board,
     monkeypatch: pytest.MonkeyPatch,
@@ -135,9 +135,7 @@ def test_what_is_not_well_is_marked_and_is_exit_code_one(
     assert [text for text in found.values() if text.startswith("!")] == [found[subject]]
 
 
-def test_a_board_that_gets_no_samples_is_told_after_a_time(
-    cli: Cli, board: Board, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_board_without_samples_is_reported(cli: Cli, board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
     board.deaf = True
     monkeypatch.setattr("hil.deploy.doctor.LOOP_TIMEOUT_US", 50_000)
     assert cli("board", "doctor", URI) == 1
@@ -150,13 +148,13 @@ def test_a_board_in_someones_hand_moves_and_is_well(cli: Cli, board: Board) -> N
     assert findings(cli)["gyro"].startswith("alive; the board moves")
 
 
-def test_another_profile_than_here_is_told(cli: Cli, board: Board) -> None:
+def test_another_profile_on_board_is_reported(cli: Cli, board: Board) -> None:
     assert cli("board", "doctor", URI, "--profile", "as-flown") == 1
     assert findings(cli)["profile"].startswith(f"!{profile_hash(load_config())[:8]}, ")
 
 
 @pytest.mark.long
-def test_a_core_that_computes_otherwise_is_found(cli: Cli, tmp_path: Path, board: Board) -> None:
+def test_a_core_that_computes_differently_is_found(cli: Cli, tmp_path: Path, board: Board) -> None:
     plant = ("floaty_core.c", "control->count[flap] =", "control->count[flap] = 1 ^")
     board.app = App(build_app(tmp_path / "app", plant=plant), tmp_path / "other.so")
     board.app.boot()
@@ -167,7 +165,7 @@ def test_a_core_that_computes_otherwise_is_found(cli: Cli, tmp_path: Path, board
 @pytest.mark.parametrize(
     ("flown", "silent", "said"), [(True, False, "it may be in the air"), (False, True, "silent for 3 s")]
 )
-def test_a_board_that_flies_or_says_nothing_is_left_alone_in_one_line(
+def test_a_flying_or_silent_board_is_refused_in_one_line(
     cli: Cli, board: Board, monkeypatch: pytest.MonkeyPatch, flown: bool, silent: bool, said: str
 ) -> None:
     board.app.supervisor.flown, board.silent = flown, silent
@@ -180,12 +178,12 @@ def test_a_board_that_flies_or_says_nothing_is_left_alone_in_one_line(
     assert f"floaty: {URI}: {said}" in cli.err
 
 
-def test_a_cable_without_a_board_is_told_in_one_line(cli: Cli) -> None:
+def test_a_cable_without_a_board_is_refused_in_one_line(cli: Cli) -> None:
     assert cli("board", "doctor", "usb://0") == 2
     assert cli.err == "floaty: LINK usb://0: Could not open usb://0\n"
 
 
-def test_a_firmware_without_the_app_is_told_from_a_board_that_is_silent(cli: Cli, board: Board) -> None:
+def test_a_firmware_without_the_app_is_distinguished_from_silence(cli: Cli, board: Board) -> None:
     board.silent = True
     assert cli("board", "doctor", URI) == 1
     found = findings(cli)

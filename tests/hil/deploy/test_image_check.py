@@ -97,9 +97,7 @@ def changed(name: str, **fields: object) -> tuple[AppParameter, ...]:
         ("supervisor.poseTimeout", {"scale": 100.0}, "floaty_parameters.pose_timeout_us = 500000, in the profile 50000"),
     ],
 )  # fmt: skip
-def test_a_parameter_that_is_otherwise_is_found(
-    board: AppBoard, name: str, fields: dict[str, object], found: str
-) -> None:
+def test_wrong_parameter_is_found(board: AppBoard, name: str, fields: dict[str, object], found: str) -> None:
     assert any(found in line for line in check_parameters(changed(name, **fields), board))
 
 
@@ -129,7 +127,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., FlownRun]:
     return fly_hover
 
 
-def test_flights_are_compared_by_what_their_bounds_say(flown: Callable[..., FlownRun]) -> None:
+def test_flights_are_compared_by_their_bounds(flown: Callable[..., FlownRun]) -> None:
     right = flown()
     assert [one.found for one in compare_flights(right, right)] == [0.0] * 10
     late = {one.bound.name: one for one in compare_flights(right, flown("mocap.latency@0.1:0.4=43"))}

@@ -53,9 +53,7 @@ def test_all_targets_are_equal_with_own_logic(cli: Cli, project: Path) -> None:
         ),
     ],
 )
-def test_one_changed_operator_in_the_c_of_own_logic_is_exit_one_and_named(
-    cli: Cli, project: Path, right: str, wrong: str, where: str
-) -> None:
+def test_changed_c_of_own_logic_is_named(cli: Cli, project: Path, right: str, wrong: str, where: str) -> None:
     text = translation_of(LogicConfig(controller=str(project / "controller.py"))).source
     assert text.count(right) == 1
     (project / "changed.c").write_text(text.replace(right, wrong), encoding="utf-8")
@@ -81,9 +79,7 @@ def test_a_parameter_that_is_set_in_flight_reaches_every_target(project: Path) -
     assert made[0].targets[0].divergence is None
 
 
-def test_export_from_a_folder_of_the_users_writes_an_app_with_the_c_that_is_checked(
-    cli: Cli, project: Path
-) -> None:
+def test_exporting_from_a_user_s_folder_writes_the_c_that_is_checked(cli: Cli, project: Path) -> None:
     assert cli("deploy", "write", "app", "--profile", "profile.toml", "--set", "logic.gain_iy=0.5") == 0
     core = (project / "app" / "src" / "floaty_core.c").read_text(encoding="utf-8")
     assert core == translation_of(LogicConfig(controller=str(project / "controller.py"))).source

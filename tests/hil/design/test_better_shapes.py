@@ -87,7 +87,7 @@ def test_a_written_profile_is_the_robot_that_was_written(name: str, tmp_path: Pa
     assert again.controller.model_dump() == pytest.approx(shipped.controller.model_dump(), rel=0.02, abs=1e-3)
 
 
-def test_the_flat_robot_falls_over_in_the_time_that_its_pole_says() -> None:
+def test_the_flat_robot_falls_over_in_the_time_of_its_pole() -> None:
     point = point_of("design-flat")
     tunnel = TunnelConfig(turbulence="none", profile_radius=5.0, height_slope=0.0, speed=point.speed)
     plant = Plant(

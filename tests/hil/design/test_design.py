@@ -124,7 +124,7 @@ def test_hover_angle_and_speed_are_each_others_inverse() -> None:
         assert speed_at(G0, COEFFICIENT, opening_at(G0, COEFFICIENT, speed)) == pytest.approx(speed, rel=1e-9)
 
 
-def test_an_updraft_that_carries_nobody_is_refused_in_one_line() -> None:
+def test_an_updraft_that_carries_no_robot_is_refused_in_one_line() -> None:
     with pytest.raises(LabError, match=r"no hover at 8 m/s: .* carry 0\.34 kg at 9\.19 to") as caught:
         opening_at(G0, COEFFICIENT, 8.0)
     assert "\n" not in str(caught.value)
@@ -173,7 +173,7 @@ def test_the_attainable_set_contains_what_single_inputs_do_and_is_mirror_symmetr
 
 
 @pytest.mark.long
-def test_roll_becomes_stable_where_the_specification_says_and_best_hover_angles_too() -> None:
+def test_roll_stability_and_best_hover_angles_are_those_of_the_specification() -> None:
     stable = sweeps.stability(PAPER)
     assert math.degrees(stable.crossing) == pytest.approx(33.7, abs=0.05)
     assert stable.along[0] == pytest.approx(56.5, abs=0.05)
@@ -217,6 +217,6 @@ def test_command_writes_pictures_a_page_and_all_claims(cli: Cli, tmp_path: Path)
         (["--speed", "10", "--angle", "25"], "one follows from the other"),
     ],
 )
-def test_what_cannot_be_is_one_line(cli: Cli, arguments: list[str], text: str) -> None:
+def test_bad_input_is_one_line(cli: Cli, arguments: list[str], text: str) -> None:
     assert cli("design", *arguments) == 2
     assert text in cli.err

@@ -89,9 +89,7 @@ def test_roll_becomes_stable_where_its_stiffness_falls_through_zero(monkeypatch:
 @pytest.mark.parametrize(
     ("degrees", "phase", "until"), [(-170.0, 10.0, 10.0), (170.0, 10.0, 350.0), (-90.0, 90.0, 90.0)]
 )
-def test_the_phase_margin_is_to_the_nearer_side_and_the_delay_margin_goes_backwards(
-    degrees: float, phase: float, until: float
-) -> None:
+def test_margins_take_the_nearer_phase_and_positive_delay(degrees: float, phase: float, until: float) -> None:
     w = np.geomspace(0.1, 10.0, 2001)
     found = margins_of(w, np.exp(1j * math.radians(degrees)) / w)
     assert found.phase == pytest.approx(math.radians(phase), abs=1e-6)

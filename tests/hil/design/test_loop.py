@@ -173,7 +173,7 @@ def test_robots_that_no_gains_hold_are_refused() -> None:
         design(task(axis), loops, [gains_in(CONFIG, axis)])
 
 
-def test_what_a_robot_needs_at_rest_is_an_offset_that_the_integral_takes_away() -> None:
+def test_the_integral_removes_the_offset_at_rest() -> None:
     at_rest = GainTask(ROLL, Flow(flat(ROLL), 0.02, 0.01), CONFIG, NOW, 0.001)
     gains = np.array([-2.0, -1.0, 1.0, 0.05])
     assert at_rest.offset(gains) == pytest.approx(0.03 / 2.0)  # u = 2 y - roll = 0.02, roll = 0.01

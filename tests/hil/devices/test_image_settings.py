@@ -62,7 +62,7 @@ class Told(CrtpClient):
             self.sent.clear()
 
 
-def test_a_board_that_is_told_a_profile_has_its_constants_bit_for_bit() -> None:
+def test_a_board_given_a_profile_has_its_constants_bit_for_bit() -> None:
     config = load_config("floaty", list(OTHER))
     board = Told(config)
     assert board.constants.bytes() != parameters_of(config).bytes()
@@ -77,7 +77,7 @@ def test_a_board_that_is_told_a_profile_has_its_constants_bit_for_bit() -> None:
     assert "RandConsts.openMin -0.192" in said
 
 
-def test_every_profile_can_be_told_but_for_laws_of_its_own() -> None:
+def test_every_profile_without_own_laws_can_be_set() -> None:
     for profile in ("as-flown", "cad", "design-best", "design-half"):
         config = load_config(profile)
         board = Told(config)
@@ -93,14 +93,14 @@ def test_settings_arrive_over_a_link_that_loses_a_third() -> None:
     assert board.constants.bytes() == parameters_of(config).bytes()
 
 
-def test_a_board_that_is_as_the_profile_says_is_told_nothing() -> None:
+def test_a_board_that_matches_its_profile_gets_no_writes() -> None:
     board = Told(load_config())
     board.listen(50_000)
     assert board.writes_up == 0
     assert board.said == []
 
 
-def test_what_no_parameter_sets_is_said_in_one_line() -> None:
+def test_values_without_a_parameter_are_reported_in_one_line() -> None:
     board = Told(load_config("floaty", ["predictor.age=fixed", "controller.limit_u3=0.6"]))
     board.listen(50_000)
     assert board.said == [

@@ -103,9 +103,7 @@ def test_any_three_markers_are_far_from_one_line() -> None:
 
 
 @given(places, turns, st.integers(0, 2**32), st.sets(st.integers(0, COUNT - 1), min_size=3))
-def test_noisy_points_give_the_pose_of_scipys_kabsch(
-    p_WB: Array, turn: Rotation, seed: int, rows: set[int]
-) -> None:
+def test_noisy_points_give_scipys_kabsch_pose(p_WB: Array, turn: Rotation, seed: int, rows: set[int]) -> None:
     seen = np.isin(np.arange(COUNT), list(rows))
     points = turn.apply(PLACES) + p_WB + 0.002 * np.random.default_rng(seed).standard_normal((COUNT, 3))
     fit = MarkerBody(PLACES).fit(points, seen)
@@ -172,7 +170,7 @@ def test_a_body_that_fits_badly_is_not_tracked() -> None:
     assert here.look(HOME, LEVEL).pose is not None
 
 
-def test_markers_that_are_not_seen_stand_where_the_body_has_them() -> None:
+def test_unseen_markers_are_placed_on_the_body() -> None:
     here = markers()
     here.hidden = 4
     sighting = here.look(HOME, LEVEL)
@@ -192,9 +190,7 @@ def test_markers_that_are_not_seen_stand_where_the_body_has_them() -> None:
 
 
 @given(turns, st.sampled_from(list(itertools.combinations(range(COUNT), 2))))
-def test_two_exchanged_labels_leave_the_pose_or_turn_it_over_and_show(
-    turn: Rotation, pair: tuple[int, int]
-) -> None:
+def test_two_exchanged_labels_keep_the_pose_or_visibly_flip_it(turn: Rotation, pair: tuple[int, int]) -> None:
     points = turn.apply(PLACES)
     points[list(pair)] = points[list(pair[::-1])]
     fit = MarkerBody(PLACES).fit(points, ALL)

@@ -26,7 +26,7 @@ def filled(samples: int, now_us: int = 0) -> tuple[SampleWindow, list[int]]:
     return window, numbers
 
 
-def test_packets_grow_with_those_under_way_and_are_no_more_than_so_many() -> None:
+def test_packets_grow_with_those_in_flight_up_to_a_limit() -> None:
     window, numbers = filled(WINDOW)
     assert numbers == [0, 4, 9, 15]
     assert len(numbers) == PACKETS
@@ -45,7 +45,7 @@ def test_a_window_is_full_until_the_board_has_taken_some() -> None:
     assert not window.full
 
 
-def test_what_was_acknowledged_makes_room_for_packets() -> None:
+def test_acknowledgements_make_room_for_packets() -> None:
     window, _ = filled(WINDOW)
     assert window.packet(0) is None
     window.on_report(report(0, 9), 0)
@@ -70,7 +70,7 @@ def test_without_news_all_is_sent_again_after_a_time() -> None:
     assert window.repeated == PACKETS
 
 
-def test_news_of_a_packet_that_was_overtaken_is_no_news() -> None:
+def test_an_overtaken_acknowledgement_changes_nothing() -> None:
     window, _ = filled(18)
     assert window.on_report(report(10, 5), 0)
     assert not window.on_report(report(2, 3), 0)

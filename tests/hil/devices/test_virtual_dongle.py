@@ -146,7 +146,7 @@ def test_the_hosts_jitter_delays_answers_and_stays_within_its_bound() -> None:
 
 
 @pytest.mark.parametrize("setting", [(81, 2, ADDRESS), (80, 1, ADDRESS), (80, 2, b"\xe7\xe7\xe7\xe7\x00")])
-def test_nobody_answers_on_another_channel_rate_or_address(setting: tuple[int, int, bytes]) -> None:
+def test_no_board_answers_on_another_channel_rate_or_address(setting: tuple[int, int, bytes]) -> None:
     bench = DongleWithBoards()
     bench.tune(*setting)
     assert bench.exchange(b"\x10hello") == b"\x00"
@@ -173,7 +173,7 @@ def test_giving_up_takes_as_long_as_the_tries(
     assert bench.events.now_us == pytest.approx(500 + (retries + 1) * try_us, abs=retries + 1)
 
 
-def test_ten_boards_hear_only_what_is_for_them() -> None:
+def test_ten_boards_receive_only_their_packets() -> None:
     bench = DongleWithBoards(boards=10)
     for n, board in enumerate(bench.boards):
         bench.tune(80, 2, board.settings.address)
@@ -182,7 +182,7 @@ def test_ten_boards_hear_only_what_is_for_them() -> None:
     assert [stm.packets for stm in bench.stms] == [[bytes((0x10, n))] for n in range(10)]
 
 
-def test_a_broadcast_reaches_every_board_on_its_channel_once_and_nobody_answers() -> None:
+def test_a_broadcast_reaches_every_board_on_its_channel_once_unanswered() -> None:
     bench = DongleWithBoards(boards=3)
     bench.boards[2].settings = AirSettings(81, 2_000_000, ADDRESS)
     bench.tune(80, 2, bytes.fromhex("FFE7E7E7E7"))
@@ -231,9 +231,7 @@ def test_a_broadcast_is_lost_for_each_board_on_its_own() -> None:
     [(1, 90, 90, 2), (1, 126, 80, 2), (2, 0, 80, 0), (2, 1, 80, 1), (2, 3, 80, 2), (3, 2, 80, 2)],
     ids=["channel", "no channel", "250K", "1M", "no rate", "power"],
 )
-def test_the_radio_chip_is_tuned_by_a_command_until_the_next_start(
-    command: int, value: int, channel: int, rate: int
-) -> None:
+def test_a_command_tunes_the_radio_until_the_reset(command: int, value: int, channel: int, rate: int) -> None:
     bench = DongleWithBoards()
     assert bench.exchange(bytes((0xFF, 0x03, command, value)))[0] & 1  # answered where it was asked
     bench.wait(5000)
@@ -287,7 +285,7 @@ def test_safelink_brings_everything_once_and_in_order(up: float, down: float, be
     assert [bytes((packet[0] & 0xF3,)) + packet[1:] for packet in bench.stms[0].packets] == sent_up
 
 
-def test_without_acknowledgements_a_packet_is_sent_once_and_nobody_answers() -> None:
+def test_without_acknowledgements_a_packet_is_sent_once_unanswered() -> None:
     bench, answers = DongleWithBoards(uplink_loss=0.5), []
     bench.dongle.control(0x10, 0, b"")
     for _ in range(2000):
@@ -370,9 +368,7 @@ def test_the_bootloader_does_not_know_safelink() -> None:
 
 
 @pytest.mark.parametrize(("safelink", "passed_on"), [(0, 4), (1, 1)])
-def test_every_try_that_the_board_hears_is_passed_on_unless_safelink_knows_it(
-    safelink: int, passed_on: int
-) -> None:
+def test_every_received_try_is_passed_on_unless_safelink_knows_it(safelink: int, passed_on: int) -> None:
     bench = DongleWithBoards(downlink_loss=1.0)
     bench.exchange(bytes((0xFF, 0x05, safelink)))
     assert bench.exchange(b"\x14hello") == b"\x00"
@@ -380,7 +376,7 @@ def test_every_try_that_the_board_hears_is_passed_on_unless_safelink_knows_it(
     assert bench.stms[0].packets == [b"\x14hello"] * passed_on
 
 
-def test_a_command_that_names_none_does_nothing() -> None:
+def test_an_unknown_command_does_nothing() -> None:
     bench = DongleWithBoards()
     assert bench.exchange(b"\xff\xfe")[0] == 1
     bench.wait(RESET_DELAY_US + 1000)

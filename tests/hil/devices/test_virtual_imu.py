@@ -90,15 +90,6 @@ def test_every_specimen_has_its_own_constant_bias() -> None:
     assert np.array(rests)[:, 3:].std(axis=0) * ACCEL_LSB == pytest.approx(3 * [0.2], rel=0.15)
 
 
-def test_counts_saturate() -> None:
-    plant = still_plant()
-    plant.place(HOME, LEVEL, omega_B=(0, 0, 60))
-    imu = VirtualImu(SILENT, np.random.default_rng(1))
-    assert settled(imu, plant)[2] == 32767
-    plant.place(HOME, LEVEL, omega_B=(0, 0, -60))
-    assert settled(imu, plant)[2] == -32768
-
-
 def test_a_moved_zero_is_a_rate_in_the_body_frame_and_heals() -> None:
     plant, imu = still_plant(), VirtualImu(SILENT, np.random.default_rng(1))
     before = np.array(settled(imu, plant))
@@ -109,7 +100,7 @@ def test_a_moved_zero_is_a_rate_in_the_body_frame_and_heals() -> None:
     assert settled(imu, plant) == tuple(before)
 
 
-def test_a_smaller_range_bounds_the_gyro_alone() -> None:
+def test_a_smaller_range_bounds_the_gyro_alone_and_full_scale_always() -> None:
     plant, imu = still_plant(), VirtualImu(SILENT, np.random.default_rng(1))
     plant.place(HOME, LEVEL, omega_B=(0, 0, -2))
     free = settled(imu, plant)
@@ -119,8 +110,9 @@ def test_a_smaller_range_bounds_the_gyro_alone() -> None:
     assert bounded[3:] == free[3:]
     imu.set_rate_range(1e6)  # beyond full scale: full scale
     assert settled(imu, plant) == free
-    plant.place(HOME, LEVEL, omega_B=(0, 0, 60))
-    assert settled(imu, plant)[2] == 32767
+    for rate, full_scale in ((60, 32767), (-60, -32768)):
+        plant.place(HOME, LEVEL, omega_B=(0, 0, rate))
+        assert settled(imu, plant)[2] == full_scale
 
 
 def test_a_frozen_sensor_repeats_itself_until_it_thaws() -> None:

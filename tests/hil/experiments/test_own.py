@@ -65,9 +65,7 @@ def test_a_function_of_time_moves_the_goal_from_home_after_the_release() -> None
         (lambda t: (0.0, 1e-4 / (round(t, 6) - 0.2), 0.0), "at 0.2 s: test_own.py:"),
     ],
 )
-def test_a_trajectory_without_a_goal_at_some_instant_is_refused_before_the_flight(
-    way: Callable[[float], tuple[float, ...]], told: str
-) -> None:
+def test_an_incomplete_trajectory_is_refused(way: Callable[[float], tuple[float, ...]], told: str) -> None:
     with pytest.raises(LabError) as error:
         Request.of(Experiment("mine", "", 0.3, {}, Along(way)))
     assert told in str(error.value)
@@ -104,8 +102,7 @@ def test_an_experiment_of_a_file_is_flown_and_its_run_names_the_file_and_its_has
 def test_experiments_of_a_file_fly_in_other_processes_with_the_same_hash(cli: Cli) -> None:
     Path("neighbour.py").write_text("REACH = 0.05\n")
     write(
-        "from neighbour import REACH\nwide = " + PLAIN % ", Along(lambda t: (0.0, REACH * t, 0.0))",
-        "mine.py",
+        "from neighbour import REACH\nwide = " + PLAIN % ", Along(lambda t: (0.0, REACH * t, 0.0))", "mine.py"
     )
     write("other = " + PLAIN % "", "other.py")
     assert cli("list", "other.py") == 0
@@ -173,9 +170,7 @@ def test_the_only_experiment_of_a_file_needs_no_name() -> None:
         ("declare('a.b', Kind('', '', 3.0, 0.0, 2.0, ()))", ":wide", "mine.py:2: fault kind a.b: size 3 in 0..2"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_in_a_file_is_one_line_and_exit_code_two(
-    cli: Cli, text: str, name: str, told: str
-) -> None:
+def test_a_wrong_file_is_one_line_and_exit_code_two(cli: Cli, text: str, name: str, told: str) -> None:
     write(text)
     assert told in cli.refusal("fly", f"mine.py{name}")
 
@@ -272,9 +267,7 @@ def test_an_installed_experiment_is_listed_with_its_package_and_flown_by_name(cl
         ("", "wide-eight = eights.nowhere:wide", "No module named 'eights.nowhere'"),
     ],
 )
-def test_a_broken_package_is_one_line_and_leaves_the_list_as_it_is(
-    cli: Cli, text: str, entry: str, told: str
-) -> None:
+def test_a_broken_package_is_one_line_and_hides_no_other(cli: Cli, text: str, entry: str, told: str) -> None:
     install(text, entry)
     error = cli.refusal("fly", "wide-eight")
     assert error.startswith("floaty: experiment wide-eight of eights 1.2: ")
@@ -302,9 +295,7 @@ def test_an_experiment_that_ships_goes_before_an_installed_one() -> None:
         Experiment("wide", "", 1.0, {}, Along(lambda t: (0.0, 0.0, 0.0)), source=Source("mine.py:wide", "")),
     ],
 )
-def test_a_station_in_its_own_process_is_not_asked_for_a_trajectory_that_it_cannot_find(
-    experiment: Experiment, tmp_path: Path
-) -> None:
+def test_a_separate_station_is_not_sent_unknown_trajectories(experiment: Experiment, tmp_path: Path) -> None:
     write("wide = " + PLAIN % "")
     request = Request.of(experiment, link="udp://127.0.0.1:19850")
     with pytest.raises(LabError, match="its trajectory must stand in a file or a package"):

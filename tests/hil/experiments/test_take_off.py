@@ -41,7 +41,7 @@ def test_a_robot_at_rest_sinks_in_by_its_weight() -> None:
     assert plant.specific_force_B == pytest.approx([0.0, 0.0, GRAVITY], abs=1e-4)
 
 
-def test_a_drop_bounces_as_the_spring_and_the_damper_say() -> None:
+def test_a_drop_bounces_by_spring_and_damper() -> None:
     def motion(t: float, state: np.ndarray) -> list[float]:
         z, v = state
         depth = GROUND.foot_below - z

@@ -164,9 +164,7 @@ def test_pymavlink_reads_the_flight_in_the_world_s_frame(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("write", [write_csv, write_mcap, write_tlog])
-def test_a_run_that_was_killed_is_exported_up_to_there(
-    folder: Path, tmp_path: Path, write: Callable[[Path], Path]
-) -> None:
+def test_a_killed_run_is_exported(folder: Path, tmp_path: Path, write: Callable[[Path], Path]) -> None:
     import pyarrow as pa
 
     log = load_log(folder)

@@ -143,9 +143,7 @@ def test_another_sample_rate_does_no_harm(tmp_path: Path) -> None:
     ],
     ids=["too short", "no excitation", "half the rows lost", "clock twice too slow", "clock 2 % fast", "6 rows a second"],
 )  # fmt: skip
-def test_a_log_that_cannot_tell_is_refused_with_the_reason(
-    tmp_path: Path, seconds: float, change: Change, reason: str
-) -> None:
+def test_a_poor_log_is_refused(tmp_path: Path, seconds: float, change: Change, reason: str) -> None:
     with pytest.raises(LabError, match=reason):
         identified(tmp_path, flight(5, seconds), change)
 
@@ -158,9 +156,7 @@ def test_a_log_that_cannot_tell_is_refused_with_the_reason(
         ("other", "it excites no input of the fit"),
     ],
 )
-def test_a_flight_that_cannot_validate_is_refused_before_the_fit(
-    tmp_path: Path, wrong: str, reason: str
-) -> None:
+def test_an_unsuitable_validation_flight_is_refused_at_once(tmp_path: Path, wrong: str, reason: str) -> None:
     for name, columns in (("fit", flight(1)), ("held", flight(1 if wrong == "same" else 2))):
         (tmp_path / name).mkdir()
         if name == "held" and wrong != "same":
@@ -177,9 +173,7 @@ def test_a_flight_that_cannot_validate_is_refused_before_the_fit(
     ("name", "reason"), [("runs", "name ends in .toml"), ("no/x.toml", "no is not a folder")]
 )
 @pytest.mark.parametrize("command", ["identify", "tune"])
-def test_a_profile_that_cannot_be_written_is_refused_at_once(
-    cli: Cli, tmp_path: Path, command: str, name: str, reason: str
-) -> None:
+def test_unwritable_file_is_refused(cli: Cli, tmp_path: Path, command: str, name: str, reason: str) -> None:
     out = tmp_path / name
     call = ("identify", "missing", "--profile-out", out) if command == "identify" else ("tune", "--out", out)
     assert reason in cli.refusal(*call)
@@ -197,7 +191,7 @@ def test_saturated_flaps_make_no_constant_believable(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_what_is_not_excited_is_not_identifiable(tmp_path: Path) -> None:
+def test_an_unexcited_input_is_not_identifiable(tmp_path: Path) -> None:
     found = identified(tmp_path, flight(7))
     assert {found.constant(name).why for name in ("roll_u1", "yaw_rate", "z_u4")} == {
         "its axis is not excited"

@@ -70,9 +70,7 @@ def test_poses_have_the_board_s_clock_and_a_yaw_without_jumps(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("facing", [np.pi, -np.pi, 2.0])
-def test_a_robot_that_looks_elsewhere_is_refused_because_its_poses_are_in_the_world(
-    tmp_path: Path, facing: float
-) -> None:
+def test_a_robot_that_looks_elsewhere_is_refused(tmp_path: Path, facing: float) -> None:
     yaw = np.angle(np.exp(1j * (facing + 0.1 * np.sin(np.arange(150.0)))))
     with pytest.raises(LabError, match=r"it looks along -?\d+ deg; expected within 30 deg of 0"):
         loaded(tmp_path, columns(150, **{POSE_COLUMNS[6]: yaw}))
@@ -142,7 +140,7 @@ def swinging(robot: Mapping[str, float], hertz: float = 2.0, seconds: float = 60
     return Record("r", t, t, inputs, 0 * inputs, rates, t, pose, 0.0, 0.0, CONFIG, False)
 
 
-def test_a_robot_that_moves_as_its_model_says_is_disturbed_by_nothing() -> None:
+def test_a_robot_that_follows_its_model_has_no_disturbance() -> None:
     robot = robot_of(CONFIG)
     record = swinging(robot)
     at = int(np.argmin(np.abs(FREQUENCIES - 2.0)))
@@ -166,9 +164,7 @@ def test_fifteen_seconds_of_flight_after_the_first_two_show_the_flow_and_less_do
 @pytest.mark.parametrize(
     ("share", "verdict"), [(0.25, IDENTIFIED), (0.26, WEAK), (0.7, WEAK), (0.71, UNKNOWN), (np.inf, UNKNOWN)]
 )
-def test_a_constant_is_as_well_known_as_its_interval_is_narrow_whatever_its_sign(
-    sign: float, share: float, verdict: str
-) -> None:
+def test_a_constant_is_as_certain_as_its_interval_is_narrow(sign: float, share: float, verdict: str) -> None:
     value = 0.0 if share == np.inf else 64.0 * sign
     found = constant((value, 64.0 * min(share, 1.0)))
     assert _verdict(found, Evidence(1.0, 0.0, 1.0), 64.0)[0] == verdict
@@ -211,9 +207,7 @@ def test_the_worst_record_counts_and_of_several_the_clearest_response() -> None:
     assert Evidence.of(Estimate({}, {}, 1.0), [calm], []).coherence == 1.0
 
 
-def test_rates_that_were_sampled_before_the_inputs_of_their_tick_belong_to_the_next_tick(
-    tmp_path: Path,
-) -> None:
+def test_rates_sampled_before_the_inputs_belong_to_the_next_tick(tmp_path: Path) -> None:
     early = loaded(tmp_path, columns(120, begin_ms=1009))
     late = loaded(tmp_path, columns(120, begin_ms=1008))
     assert early.u_t[0] == late.u_t[0] == pytest.approx(1.0)

@@ -62,9 +62,7 @@ def test_without_a_file_every_constant_is_known_to_a_fifth() -> None:
         ({"more": 1}, "more: Extra inputs"),
     ],
 )  # fmt: skip
-def test_a_file_that_does_not_fit_is_refused(
-    tmp_path: Path, changes: dict[str, object], message: str
-) -> None:
+def test_a_file_that_differs_is_refused(tmp_path: Path, changes: dict[str, object], message: str) -> None:
     with pytest.raises(LabError, match=message):
         robots_of(written(tmp_path, **changes), CONFIG, 8)
 

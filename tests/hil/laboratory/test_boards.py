@@ -30,9 +30,7 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Result:
 
 
 @pytest.mark.parametrize("board", ["c", "cortex-m4"])
-def test_a_flight_on_another_board_is_recorded_alike_to_the_last_bit(
-    tmp_path: Path, python: Result, board: str
-) -> None:
+def test_a_flight_on_another_board_has_the_same_records(tmp_path: Path, python: Result, board: str) -> None:
     result = hover(tmp_path, board=board, duration_s=DURATION_S)
     assert result.passed
     assert load_log(tmp_path).equals(load_log(python.folder))  # truth, estimate, counts and all the rest
@@ -100,7 +98,7 @@ def test_over_a_link_only_python_flies(link: str) -> None:
 
 
 @pytest.mark.parametrize("missing", ["unicorn", "elftools.elf.elffile"])
-def test_a_missing_package_is_said_in_one_line(
+def test_a_missing_package_is_one_line(
     missing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, missing, None)
@@ -116,9 +114,7 @@ def test_a_missing_package_is_said_in_one_line(
 
 
 @pytest.mark.long
-def test_the_emulated_chip_is_compiled_once_for_all_folders(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_emulated_chip_is_compiled_only_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for package in ("unicorn", "cffi", "ziglang"):
         pytest.importorskip(package)
     image = str(build())

@@ -32,7 +32,7 @@ def rows(count):
     return times, (times - AGE_US) // FRAME_US * FRAME_US + 2_000  # between two rows
 
 
-def test_a_pose_stands_where_it_was_true():
+def test_a_pose_is_placed_at_its_exposure():
     times, exposed = rows(300)
     log = at_exposure(log_of(exposed, times))
     known = slice(0, 296)  # what the cameras saw in the last 38 ms nobody has been told
@@ -52,7 +52,7 @@ def test_a_rotation_goes_the_short_way_whatever_the_signs():
     assert (Rotation.from_quat(found).inv() * rotation(times[:296])).magnitude().max() < 1e-3
 
 
-def test_where_nothing_was_seen_nothing_is_claimed():
+def test_unseen_instants_have_no_pose():
     times, exposed = rows(300)
     gone = (times > 1_800_000) & (times < 2_500_000)
     exposed[gone] = exposed[~gone & (times < 2_000_000)][-1]

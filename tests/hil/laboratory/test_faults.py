@@ -58,7 +58,7 @@ def go(
 # What a text means
 
 
-def test_a_text_says_kind_start_duration_and_size() -> None:
+def test_a_text_gives_kind_start_duration_and_size() -> None:
     assert parse("mocap.dropout@10:0.5") == Fault("mocap.dropout", 10.0, 0.5, 1.0)
     assert parse("mocap.outlier@10:0.5=0.3") == Fault("mocap.outlier", 10.0, 0.5, 0.3)
     assert parse(" servo.stuck.2@5 ") == Fault("servo.stuck.2", 5.0, math.inf, 0.0)
@@ -116,20 +116,13 @@ def test_a_wrong_fault_is_one_line_and_exit_code_two(
     assert os.listdir() == []
 
 
-@pytest.mark.parametrize("link", ["radio", "udp://127.0.0.1:19850", "radio://0/80/2M/E7E7E7E7E7"])
-def test_a_fault_of_the_radio_acts_on_every_radio_and_on_no_serial_line(link: str) -> None:
-    check([parse("radio.cut@1")], 3.0, link, load_config())
-    with pytest.raises(LabError, match="acts with --link mavlink only"):
-        check([parse("serial.cut@1")], 3.0, link, load_config())
-
-
-def test_a_radio_fault_is_refused_on_the_serial_line() -> None:
-    with pytest.raises(LabError, match="--link radio only"):
-        check([parse("radio.loss@1")], 30.0, MAVLINK, load_config())
-
-
-def test_markers_have_faults_on_either_link() -> None:
-    check([parse("marker.swap@1")], 30.0, MAVLINK, load_config(overrides=[MARKERS_ON]))
+@pytest.mark.parametrize("link", ["radio", "udp://127.0.0.1:19850", "radio://0/80/2M/E7E7E7E7E7", MAVLINK])
+def test_faults_of_a_link_act_on_that_link_alone_and_those_of_markers_on_all(link: str) -> None:
+    own, other = ("serial", "radio") if link == MAVLINK else ("radio", "serial")
+    check([parse(f"{own}.cut@1")], 3.0, link, load_config())
+    with pytest.raises(LabError, match=f"acts with --link {'radio' if link == MAVLINK else 'mavlink'} only"):
+        check([parse(f"{other}.cut@1")], 3.0, link, load_config())
+    check([parse("marker.swap@1")], 3.0, link, load_config(overrides=[MARKERS_ON]))
 
 
 # Every kind acts from its begin to its end and no longer
@@ -140,7 +133,6 @@ Seen = Callable[[pa.Table, pa.Table], float]  # (rows with the fault, the same r
 
 
 def _grown(*names: str) -> Seen:
-    """How much counters have grown."""
     return lambda rows, _: float(sum(column(rows, name)[-1] - column(rows, name)[0] for name in names))
 
 
@@ -242,7 +234,6 @@ class Sign:
 
     @property
     def duration_s(self) -> float:
-        """How long the fault acts."""
         return round(self.window[1] + 0.05, 2)
 
 
@@ -381,9 +372,7 @@ def test_faults_on_one_knob_add_up_and_leave_it_as_it_was() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(("kind", "axis"), [("wind.side_x", 0), ("wind.side_y", 1)])
 @given(wind=st.floats(-20.0, 20.0), more=st.floats(-30.0, 30.0))
-def test_side_wind_blows_either_way_up_to_20_metres_per_second(
-    kind: str, axis: int, wind: float, more: float
-) -> None:
+def test_side_wind_blows_both_ways_up_to_20_m_per_s(kind: str, axis: int, wind: float, more: float) -> None:
     plant = Plant(
         GeometryConfig(), PlantConfig(), TunnelConfig(), PlantServoConfig(), np.random.default_rng(1)
     )
@@ -420,7 +409,7 @@ def test_a_fault_turns_its_own_knobs_and_no_other(link: str) -> None:
         assert turned <= set(kind.knobs), kind.meaning
 
 
-def test_what_changed_between_two_faults_stays_changed() -> None:
+def test_a_change_between_two_faults_persists() -> None:
     flight = lockstep_flight(
         Request.of(HOVER, duration_s=1.0, faults=[parse("wind.fan@0.1:0.1=0.9"), parse("wind.fan@0.5:0.1=0.9")])
     )  # fmt: skip
@@ -493,11 +482,7 @@ LONGEST = {
     "marker.hidden@1:0.7=6": "failsafe",  # two are too few
     "marker.noise@1:0.7=6": "failsafe",  # it fits too badly
 }
-STATED = {
-    **{f"{name}@1": kind.outcome for name, kind in OF_FLOATY.items()},
-    **LONGER,
-    **LONGEST,
-}
+STATED = {**{f"{name}@1": kind.outcome for name, kind in OF_FLOATY.items()}, **LONGER, **LONGEST}
 
 
 # The others are in the long tier.
@@ -522,9 +507,7 @@ def test_the_hover_has_the_stated_outcome(tmp_path: Path, text: str, seed: int) 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 2])
-def test_swapped_markers_lose_the_robot_where_neither_the_fit_nor_the_tracker_refuses_them(
-    tmp_path: Path, seed: int
-) -> None:
+def test_swapped_markers_lose_the_robot_where_fit_and_tracker_accept_them(tmp_path: Path, seed: int) -> None:
     wide = (MARKERS_ON, "markers.max_error=0.2")
     assert go(tmp_path / "run", "marker.swap@1", seed=seed, duration_s=4.0, settings=wide).passed
     alone = (*wide, "tracker.enabled=false")

@@ -80,7 +80,7 @@ def test_log_events_and_report_know_what_the_tracker_refused(tmp_path: Path) -> 
     ).read_text(encoding="utf-8")
 
 
-def test_without_a_tracker_the_log_says_nothing_of_it(tmp_path: Path) -> None:
+def test_without_a_tracker_the_log_has_no_column_of_it(tmp_path: Path) -> None:
     result = hover(tmp_path / "run", profile="as-flown", duration_s=0.2)
     assert [name for name in load_log(result.folder).column_names if name.startswith("tracker")] == []
     assert np.isnan(result.metrics["frames_refused"])
@@ -221,7 +221,7 @@ def test_a_lost_flight_holds_no_limit_unless_its_limit_on_the_loss_admits_it() -
     assert all(verdict.holds for verdict in judge(values, {"lost": 1.0, "flown": 1.0}, {}))
 
 
-def test_a_lost_flight_says_so_in_every_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_lost_flight_is_marked_in_every_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result = hover(tmp_path / "run", duration_s=3.0, faults=["wind.fan@0.5=0.3"])
     assert {verdict.metric for verdict in result.verdicts if verdict.holds} == set()
     assert [verdict.metric for verdict in result.failed] == ["lost"]

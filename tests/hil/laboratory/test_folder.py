@@ -29,7 +29,6 @@ with reserved(request_of("hover", duration_s=0.05), Path(sys.argv[1])):
 
 
 def stored(folder: str) -> list[tuple[str, bytes]]:
-    """Return the files of a folder with their content."""
     return [(path.name, path.read_bytes()) for path in sorted(Path(folder).iterdir())]
 
 
@@ -70,7 +69,7 @@ def test_a_folder_that_was_asked_for_keeps_another_flight_unless_it_may_be_repla
     assert fly("hover", "mine", replace=True, duration_s=0.1, profile="lqr").request.profile == "lqr"
 
 
-def test_what_cannot_be_read_is_not_replaced() -> None:
+def test_an_unreadable_folder_is_not_replaced() -> None:
     run = fly("hover", duration_s=SHORT)
     result = json.loads((run.folder / "result.json").read_text())
     (run.folder / "result.json").write_text(json.dumps({**result, "seed": "one"}))

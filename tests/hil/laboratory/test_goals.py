@@ -43,7 +43,7 @@ def test_a_goal_that_can_be_followed_is_not(path: Callable[[float], Place]) -> N
 
 
 @pytest.mark.parametrize("goal", [Goal((0.0, math.nan, 1.15), 0.0), Goal((0.0, 0.0, 1.15), math.inf)])
-def test_a_goal_that_is_no_place_is_refused(goal: Goal) -> None:
+def test_an_invalid_goal_is_refused(goal: Goal) -> None:
     class Own:
         def at(self, t_us: int) -> Goal:
             return goal

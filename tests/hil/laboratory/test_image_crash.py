@@ -59,7 +59,7 @@ def said(result: Result) -> list[str]:
         (HUNGRY_WATCHDOG, r"watchdog reset: nobody fed it in time; this ran then, in task SPIN-[01]: "),
     ],
 )
-def test_what_an_image_dies_of_is_an_event(
+def test_a_crash_s_cause_is_an_event(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, planted: int, expected: str
 ) -> None:
     result = flown(tmp_path, planted, 0.3, monkeypatch)
@@ -78,9 +78,7 @@ def test_what_an_image_dies_of_is_an_event(
 
 
 @pytest.mark.long
-def test_the_report_has_what_was_never_used_of_the_stacks_and_how_often_the_image_began_anew(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_report_has_free_stacks_and_restarts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = flown(tmp_path, ASSERTION, 0.3, monkeypatch)
     assert read_result(result.folder).image == result.image
     image = result.image

@@ -79,7 +79,7 @@ def test_the_image_answers_a_push_as_the_python_board_does(tmp_path: Path) -> No
 
 @pytest.mark.long
 @flies
-def test_what_sets_the_image_apart_from_the_python_board_is_measured(tmp_path: Path) -> None:
+def test_the_image_s_difference_from_the_python_board_is_measured(tmp_path: Path) -> None:
     for name, board in (("python", "python"), ("binary", ELF)):
         flown(tmp_path / name, 1.0, board=board)
     found = two_boards(*(load_flown(tmp_path / name) for name in ("python", "binary")))
@@ -139,7 +139,7 @@ def test_an_image_without_the_app_is_flown_and_recorded_with_its_tasks_and_repor
         (str(Path(__file__)), "not an ELF file; a .bin needs --elf FILE, the ELF that it was made of"),
     ],
 )
-def test_what_is_no_image_is_refused_in_one_line(tmp_path: Path, board: str, text: str) -> None:
+def test_an_invalid_image_is_refused_in_one_line(tmp_path: Path, board: str, text: str) -> None:
     with pytest.raises(LabError) as refused:
         flown(tmp_path / "run", 1.0, board=board)
     assert text in str(refused.value)
@@ -162,9 +162,7 @@ def test_an_elf_beside_another_board_is_refused() -> None:
         Request.of(HOVER, elf=Path("x.elf"))
 
 
-def test_without_a_compiler_an_image_is_refused_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_compiler_images_fail_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from firmware_py.export import compilers
     from support.stm32_firmware import build
 

@@ -99,7 +99,7 @@ def test_firmware_that_waits_for_every_instant_flies_as_one_that_runs_ahead() ->
     )
 
 
-def test_a_board_without_power_rests_and_boots_with_its_memories_and_a_clock_that_begins_anew() -> None:
+def test_power_off_stops_a_board_which_boots_with_its_memories_and_a_new_clock() -> None:
     bench = Bench()
     bench.fly(3.0)
     served, robot = bench.server.ends.robots[0], bench.robot()
@@ -158,7 +158,7 @@ def test_a_typed_fault_acts_at_once_and_ends_by_itself() -> None:
     assert any(text.endswith("fault push.y:0.2=0.5 ends") for text in bench.said)
 
 
-def test_a_typed_status_lists_the_faults_in_force_and_a_held_robot_says_that_it_does_not_move() -> None:
+def test_a_typed_status_lists_the_faults_and_whether_the_robot_is_held() -> None:
     bench = Bench()
     type_line, answers = live(bench)
     bench.fly(0.5)
@@ -222,9 +222,7 @@ def test_a_radio_that_a_client_has_moved_is_reported_where_it_stays_and_returns_
         ("kinds", "mocap.dropout"),
     ],
 )
-def test_a_typed_line_that_says_nothing_possible_is_answered_and_changes_nothing(
-    line: str, answer: str
-) -> None:
+def test_an_impossible_typed_line_is_answered_and_changes_nothing(line: str, answer: str) -> None:
     bench = Bench()
     type_line, answers = live(bench)
     type_line(line)
@@ -256,7 +254,7 @@ def site_in(lab: Laboratory) -> Site:
     return Site(load_config(), lab.events, Streams.of_seed(1), lambda source, text: None)
 
 
-def test_a_holder_lets_nobody_go_who_does_not_fly() -> None:
+def test_a_holder_releases_only_a_flying_robot() -> None:
     lab = Laboratory(FreeRunning())
     robot = ServedRobot(1, site_in(lab), print).robot
     robot.body.hold()

@@ -53,7 +53,7 @@ def test_the_budget_is_numpys_mean_and_percentile_of_each_stage(times: list[tupl
         assert one.p99_us == np.percentile(values, 99, method="inverted_cdf")
 
 
-def test_the_line_says_what_is_assumed_and_nothing_that_was_not_told() -> None:
+def test_the_line_marks_assumptions_and_omits_unknown_stages() -> None:
     budget = LatencyBudget()
     assert str(budget) == "no pose sent"
     assert all(map(math.isnan, budget.last()))
@@ -69,7 +69,7 @@ def test_the_line_says_what_is_assumed_and_nothing_that_was_not_told() -> None:
 
 
 @pytest.mark.parametrize("untold", [(), *STAGES[:3], STAGES[:2], STAGES[:3]])
-def test_where_a_stage_of_the_cameras_was_not_told_they_are_one_stage(untold: tuple[str, ...] | str) -> None:
+def test_unknown_camera_stages_are_one_stage(untold: tuple[str, ...] | str) -> None:
     columns = {stage: [1.0, math.nan if stage in untold else 2.0] for stage in STAGES}
     assert reported_stages(columns) == ((*STAGES[:3], *STAGES[4:]) if untold == () else STAGES[3:])
 

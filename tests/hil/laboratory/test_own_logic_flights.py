@@ -83,7 +83,7 @@ def test_a_law_with_an_endless_loop_is_a_failed_flight_that_names_file_and_line(
     assert any(event["source"] == "lab" and where in event["text"] for event in load_events(result.folder))
 
 
-def test_what_own_logic_logs_is_recorded_and_drawn(failed: Result) -> None:
+def test_own_logic_s_log_is_recorded_and_drawn(failed: Result) -> None:
     log = load_log(failed.folder)
     own = {field.name: field.metadata[b"unit"] for field in log.schema if field.name.startswith("logic.")}
     errors = {f"logic.errors{axis}": b"m" for axis in (1, 2, 3)}
@@ -95,9 +95,7 @@ def test_what_own_logic_logs_is_recorded_and_drawn(failed: Result) -> None:
 
 
 @pytest.mark.parametrize("board", ["c", pytest.param("cortex-m4", marks=pytest.mark.long)])
-def test_the_same_flight_on_another_board_is_alike_to_the_last_bit(
-    failed: Result, tmp_path: Path, board: str
-) -> None:
+def test_a_flight_on_another_board_is_bit_identical(failed: Result, tmp_path: Path, board: str) -> None:
     again = hover(
         tmp_path, *failed.request.overrides, profile=failed.request.profile, duration_s=0.5, board=board
     )
@@ -122,9 +120,7 @@ def test_without_numba_the_same_text_makes_the_same_flight(failed: Result) -> No
 
 @pytest.mark.long
 @pytest.mark.parametrize("profile", ["original", "lqr"])
-def test_the_laws_that_ship_hover_within_the_limits_and_alike_on_every_board(
-    tmp_path: Path, profile: str
-) -> None:
+def test_shipped_laws_hover_within_limits_and_alike_on_every_board(tmp_path: Path, profile: str) -> None:
     results = [
         hover(tmp_path / board, profile=profile, board=board) for board in ("python", "c", "cortex-m4")
     ]

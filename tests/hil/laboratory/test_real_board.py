@@ -52,9 +52,7 @@ def test_a_flight_on_a_board_has_the_hash_of_python(
 
 @pytest.mark.long
 @pytest.mark.parametrize("experiment", ["hover", "yaw-step"])
-def test_whole_experiments_have_the_hash_of_python_at_ten_per_cent_loss(
-    plugged: Plug, library: Path, tmp_path: Path, experiment: str
-) -> None:
+def test_experiments_are_equal_at_loss(plugged: Plug, library: Path, tmp_path: Path, experiment: str) -> None:
     plugged(library).mess = 0.1
     hashes = []
     for board in ("python", URI):
@@ -62,9 +60,7 @@ def test_whole_experiments_have_the_hash_of_python_at_ten_per_cent_loss(
     assert hashes[0] == hashes[1]
 
 
-def test_measured_cycles_are_the_processor_time_of_the_tasks(
-    plugged: Plug, library: Path, tmp_path: Path
-) -> None:
+def test_measured_cycles_are_the_tasks_processor_time(plugged: Plug, library: Path, tmp_path: Path) -> None:
     link = plugged(library)
     link.app.cycles.value = 168 * 700
     result = fly(
@@ -100,9 +96,7 @@ def test_a_board_that_fails_in_flight_ends_it_in_one_line_with_what_was_flown(
     assert link.closed == 1
 
 
-def test_the_check_compares_a_board_and_prints_what_it_measured(
-    cli: Cli, plugged: Plug, library: Path
-) -> None:
+def test_the_check_compares_a_board_and_prints_measurements(cli: Cli, plugged: Plug, library: Path) -> None:
     plugged(library).app.cycles.value = 1234
     arguments = ("deploy", "check", "hover", "--duration", "0.3", "--targets", URI)
     assert cli(*arguments) == 0
@@ -113,9 +107,7 @@ def test_the_check_compares_a_board_and_prints_what_it_measured(
 
 
 @pytest.mark.long
-def test_a_bit_error_planted_in_the_app_is_found_with_call_field_and_values(
-    cli: Cli, plugged: Plug, tmp_path: Path
-) -> None:
+def test_a_bit_error_in_the_app_is_found_with_call_and_field(cli: Cli, plugged: Plug, tmp_path: Path) -> None:
     plant = ("floaty_core.c", "control->count[flap] =", "control->count[flap] = 1 ^")
     plugged(build_app(tmp_path / "app", plant=plant))
     assert cli("deploy", "check", "hover", "--duration", "0.1", "--targets", URI) == 1

@@ -119,7 +119,7 @@ def test_the_cameras_judge_a_flight_as_the_truth_does(both: tuple[Path, Path]) -
     assert measured[0]["unseen"] == 0.0
 
 
-def test_the_estimate_of_a_real_board_stands_in_the_log_as_the_board_has_it(both: tuple[Path, Path]) -> None:
+def test_the_log_has_the_estimate_of_the_real_board(both: tuple[Path, Path]) -> None:
     real, truth = (load_log(folder) for folder in both)
     names = [f"estimate.{name}" for name in ("x", "vy", "z", "roll", "pitch", "yaw", "r")]
     names += ["control.u3", "motor.m2", "supervisor.state"]
@@ -152,9 +152,7 @@ def test_a_real_flight_lies_over_the_simulated_one(both: tuple[Path, Path], simu
 
 
 @pytest.mark.long
-def test_the_command_shows_both_and_says_what_only_one_has(
-    cli: Cli, both: tuple[Path, Path], simulated: Path, tmp_path: Path
-) -> None:
+def test_the_command_shows_both(cli: Cli, both: tuple[Path, Path], simulated: Path, tmp_path: Path) -> None:
     assert cli("compare", both[0], simulated, "--out", tmp_path / "out") == 1
     shown = cli.out
     assert "not in " in shown
@@ -164,7 +162,7 @@ def test_the_command_shows_both_and_says_what_only_one_has(
     assert len(page.tables["apart"]) == 11
 
 
-def test_the_report_of_a_real_flight_says_whose_eyes_it_has(both: tuple[Path, Path], tmp_path: Path) -> None:
+def test_the_report_of_a_real_flight_names_the_cameras(both: tuple[Path, Path], tmp_path: Path) -> None:
     folder = Path(shutil.copytree(both[0], tmp_path / "run"))
     page = Page(write_report(folder).read_text(encoding="utf-8"))
     text = (folder / "report.html").read_text(encoding="utf-8")
@@ -179,7 +177,7 @@ def test_the_report_of_a_real_flight_says_whose_eyes_it_has(both: tuple[Path, Pa
     )  # its own, path, path against goal, latency budget
 
 
-def test_what_an_operator_did_is_marked_in_the_figures_at_its_time(both: tuple[Path, Path]) -> None:
+def test_the_operator_s_actions_are_marked_in_the_figures(both: tuple[Path, Path]) -> None:
     events = [
         {
             "t_us": 3_000_000,
@@ -248,7 +246,7 @@ class StationBench:
         return result
 
 
-def test_what_is_judged_begins_with_the_trajectory_and_ends_with_its_experiment(tmp_path: Path) -> None:
+def test_the_judged_part_lasts_from_trajectory_to_experiment_end(tmp_path: Path) -> None:
     bench = StationBench(tmp_path / "run", "yaw-step")
     bench.fly(1.0, (0.2, 0.0, 1.15))
     bench.plan.start(bench.now_us)
@@ -331,9 +329,7 @@ def test_a_robot_that_leaves_the_flow_is_lost_and_what_follows_is_not_judged(tmp
         ({}, "completed", None),
     ],
 )
-def test_whatever_ends_a_flight_its_result_is_written(
-    tmp_path: Path, how: dict[str, Any], outcome: str, cause: str | None
-) -> None:
+def test_each_end_has_a_result(tmp_path: Path, how: dict[str, Any], outcome: str, cause: str | None) -> None:
     bench = StationBench(tmp_path / "run")
     bench.record.note("station", "connected")
     bench.plan.start(bench.now_us)
@@ -347,9 +343,7 @@ def test_whatever_ends_a_flight_its_result_is_written(
     assert texts[:3] == [("station", "connected"), ("board", "supervisor: flying"), ("lab", "hover begins")]
 
 
-def test_a_killed_station_leaves_all_but_the_last_second_and_can_be_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_station_loses_only_the_last_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hil.pictures.figures, "PICTURES", PICTURES[:1])
     bench = StationBench(tmp_path / "run")
     bench.plan.start(bench.now_us)
@@ -402,9 +396,7 @@ def test_a_full_disk_ends_the_record_and_not_the_flight(tmp_path: Path) -> None:
     assert read_result(tmp_path / "run").metrics["lost"] == 0.0
 
 
-def test_what_the_station_recorded_stands_in_the_time_of_the_log(
-    both: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_the_station_s_records_have_the_time_of_the_log(both: tuple[Path, Path], tmp_path: Path) -> None:
     """A computer's clock has run for days when a flight begins, here for 7 s."""
     bench = StationBench(tmp_path / "run")
     shutil.copy(both[0] / "telemetry.csv", tmp_path / "run")
@@ -433,10 +425,7 @@ def test_battery_and_load_are_logged_and_shown_where_the_board_tells_them(tmp_pa
     voltages = log.column("battery.voltage").to_numpy()
     assert np.isnan(voltages[:95]).all()
     assert voltages[105:] == pytest.approx(3.9)
-    assert [panel.label for panel in figures.station(log).panels] == [
-        "not used [so far]",
-        "battery [V]",
-    ]
+    assert [panel.label for panel in figures.station(log).panels] == ["not used [so far]", "battery [V]"]
 
 
 def test_a_counter_of_sixteen_bits_goes_on_where_it_wraps() -> None:
@@ -444,7 +433,7 @@ def test_a_counter_of_sixteen_bits_goes_on_where_it_wraps() -> None:
     assert [count(value) for value in (65_530.0, 65_535.0, 4.0, 4.0, 10.0)] == [0, 5, 10, 10, 16]
 
 
-def test_an_experiment_that_needs_what_only_a_laboratory_has_is_told_so(tmp_path: Path) -> None:
+def test_an_experiment_that_needs_the_laboratory_is_refused(tmp_path: Path) -> None:
     bench = StationBench(tmp_path / "run", "power")
     bench.plan.start(bench.now_us)
     bench.fly(1.0)

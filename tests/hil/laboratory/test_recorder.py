@@ -49,9 +49,7 @@ def test_rows_survive_the_way_to_parquet(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("writable", [True, False])
-def test_a_long_log_is_read_without_memory_for_all_of_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writable: bool
-) -> None:
+def test_a_long_log_is_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writable: bool) -> None:
     rows = 2 * ROWS_PER_BATCH * BATCHES_PER_PIECE + 7
     recorder = make(tmp_path, np.ones(2))
     for row in range(rows):
@@ -78,9 +76,7 @@ def test_rows_that_an_onlooker_keeps_stay_as_they_were_recorded(tmp_path: Path) 
     assert watcher.notes == []
 
 
-def test_memory_of_a_long_log_is_given_back_and_the_log_still_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_long_log_is_readable_with_freed_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = 20 * ROWS_PER_BATCH * BATCHES_PER_PIECE
     recorder = make(tmp_path, np.ones(2))
     for row in range(rows):

@@ -78,7 +78,7 @@ def test_a_stored_request_is_read_back_equal() -> None:
         assert Request.read(json.loads(json.dumps(request.stored())), find_again) == request
 
 
-def test_the_file_holds_the_keys_that_programs_read_and_null_where_there_is_no_number(result: Result) -> None:
+def test_the_file_has_documented_keys_and_null_for_missing_numbers(result: Result) -> None:
     write_result(result)
     content = json.loads((result.folder / RESULT).read_text(encoding="utf-8"))
     assert set(content) == set(KEYS)
@@ -95,9 +95,7 @@ def test_the_file_holds_the_keys_that_programs_read_and_null_where_there_is_no_n
     [("completed", True, True), ("lost", True, True), ("completed", False, False), ("lost", False, False),
      ("interrupted", True, False), ("error", True, False)],
 )  # fmt: skip
-def test_a_run_passes_that_ends_by_itself_and_holds_every_limit(
-    result: Result, outcome: Any, holds: bool, passed: bool
-) -> None:
+def test_a_complete_run_within_limits_passes(result: Result, outcome: Any, holds: bool, passed: bool) -> None:
     verdicts = (Verdict("rms_x", 0.0, 1.0, True, "m", "max"), Verdict("rms_y", 0.0, 1.0, holds, "m", "max"))
     write_result(replace(result, outcome=outcome, verdicts=verdicts))
     assert json.loads((result.folder / RESULT).read_text(encoding="utf-8"))["passed"] is passed
@@ -117,9 +115,7 @@ def test_a_run_passes_that_ends_by_itself_and_holds_every_limit(
         (lambda folder: change(folder, verdicts=[{"metric": "rms_x"}]), "verdicts.0.value is missing"),
     ],
 )  # fmt: skip
-def test_what_is_no_result_is_one_line_that_names_file_and_value(
-    cli: Cli, result: Result, damage: Callable[[Path], None], told: str
-) -> None:
+def test_bad_result_is_one_line(cli: Cli, result: Result, damage: Callable[[Path], None], told: str) -> None:
     write_result(result)
     killed(result.folder, metadata_of(result.request, result.program, Look()))
     damage(result.folder)

@@ -111,9 +111,7 @@ def test_the_report_shows_the_line(result: Result) -> None:
     assert "Radio" not in shown
 
 
-def test_the_telemetry_log_has_every_byte_that_passed_the_line_in_frames_with_their_times(
-    result: Result,
-) -> None:
+def test_the_telemetry_log_has_every_frame_on_the_line_with_its_time(result: Result) -> None:
     """pymavlink reads the file, the plant's UART has counted the bytes."""
     log = load_log(result.folder)
     file = mavutil.mavlink_connection(str(result.folder / "link.tlog"))

@@ -44,9 +44,7 @@ def test_flight_too_short_for_take_off_and_landing_is_refused(tmp_path: Path) ->
     ("profile", "override"),
     [(PROFILE, "controller.gain_z=3"), (PROFILE, "actuators.tau=0.1"), ("floaty", "quadrotor.mass=0.03")],
 )
-def test_setting_that_nothing_on_the_robot_reads_is_refused(
-    profile: str, override: str, tmp_path: Path
-) -> None:
+def test_a_setting_that_the_robot_ignores_is_refused(profile: str, override: str, tmp_path: Path) -> None:
     image = tmp_path / "cf2.elf"
     image.write_bytes(b"")
     with pytest.raises(

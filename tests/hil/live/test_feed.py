@@ -70,9 +70,7 @@ def unseen(tmp_path_factory: pytest.TempPathFactory) -> str:
         (TAKES_ALL, range(150, 151)),
     ],
 )
-def test_a_flight_is_the_same_whatever_its_picture_does(
-    program: str, taken: range, unseen: str, tmp_path: Path
-) -> None:
+def test_the_picture_does_not_affect_flights(program: str, taken: range, unseen: str, tmp_path: Path) -> None:
     is_silent = program == NEVER_COMES_UP
     view = LiveView(picture(program), [].append, start_timeout_s=0.01 if is_silent else 30)
     assert flight_hash(tmp_path / "run", view) == unseen
@@ -81,7 +79,7 @@ def test_a_flight_is_the_same_whatever_its_picture_does(
     assert view.offered - missed in taken
 
 
-def test_what_does_not_fit_into_the_queue_is_dropped_and_counted() -> None:
+def test_rows_beyond_the_queue_are_dropped_and_counted() -> None:
     view = LiveView(picture(STALLS), [].append)
     for piece in range(2000):
         view.rows(rows(1000 * piece, 1000))  # 8 kB: more than a pipe holds
@@ -90,7 +88,7 @@ def test_what_does_not_fit_into_the_queue_is_dropped_and_counted() -> None:
     assert not view._feed._thread.is_alive()  # it was in the middle of a piece
 
 
-def test_a_picture_that_says_nothing_is_not_waited_for() -> None:
+def test_a_silent_picture_does_not_delay_the_flight() -> None:
     said: list[str] = []
     view = LiveView(picture(NEVER_COMES_UP), said.append, start_timeout_s=0.01)
     assert said == ["the viewer has not opened within 0.01 s; the flight goes on without waiting"]
@@ -104,7 +102,7 @@ def test_a_picture_that_cannot_come_up_is_an_error_before_the_flight(program: st
         LiveView(picture(program), [].append)
 
 
-def test_a_picture_says_where_it_is_and_what_was_typed_there() -> None:
+def test_a_picture_reports_its_address_and_typed_lines() -> None:
     said: list[str] = []
     view = LiveView(picture(TAKES_ALL), said.append)
     view.note(5, "lab", "the first text")
@@ -181,7 +179,7 @@ class Seen:
 
 
 @pytest.mark.parametrize("kept", [True, False])
-def test_who_looks_on_sees_every_row_once_five_times_a_second(kept: bool, tmp_path: Path) -> None:
+def test_a_viewer_gets_every_row_once_five_times_a_second(kept: bool, tmp_path: Path) -> None:
     seen, value = Seen(), [0.0]
     channel = Channel("float64", lambda: value, (Quantity(("x",), "m"),))
     recorder = Recorder(tmp_path if kept else None, (channel,), {}, seen)

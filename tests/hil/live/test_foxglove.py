@@ -39,9 +39,7 @@ def values(message: dict) -> dict[str, float]:
     return {parameter["name"]: parameter["value"] for parameter in message["parameters"]}
 
 
-def test_a_parameter_is_changed_by_the_operator_and_shown_when_the_board_has_it(
-    screen: FoxgloveScreen, client: FoxgloveClient, typed: list[str]
-) -> None:
+def test_changed_parameter_is_shown(screen: FoxgloveScreen, client: FoxgloveClient, typed: list[str]) -> None:
     screen.know({"extCtrl.y_P": 1.6, "extCtrl.z_P": 2.0})
     client.send(op="getParameters", parameterNames=[], id="all")
     assert values(client.receive("parameterValues")) == {"extCtrl.y_P": 1.6, "extCtrl.z_P": 2.0}
@@ -55,9 +53,7 @@ def test_a_parameter_is_changed_by_the_operator_and_shown_when_the_board_has_it(
         pass
 
 
-def test_the_rows_of_a_flight_are_what_the_mcap_file_has(
-    screen: FoxgloveScreen, client: FoxgloveClient, tmp_path: Path
-) -> None:
+def test_the_rows_are_those_of_mcap(screen: FoxgloveScreen, client: FoxgloveClient, tmp_path: Path) -> None:
     fly(Request.of(EXPERIMENTS["hover"], duration_s=0.1), tmp_path / "run")
     log = load_log(tmp_path / "run")
     screen.show(log.slice(0, 20), [{"t_us": 5, "source": "lab", "text": "released"}])

@@ -77,9 +77,7 @@ def test_a_page_without_the_token_or_by_another_name_is_refused(panel: PanelScre
 
 
 @pytest.mark.parametrize("wrong", ["token", "origin"])
-def test_a_socket_of_another_origin_or_without_the_token_is_refused(
-    panel: PanelScreen, loop: IOLoop, typed: list[str], wrong: str
-) -> None:
+def test_a_foreign_socket_is_refused(panel: PanelScreen, loop: IOLoop, typed: list[str], wrong: str) -> None:
     token, origin = ("guessed", panel.origin) if wrong == "token" else (panel.token, "http://evil.example")
     with pytest.raises(HTTPClientError) as refused:
         connect(loop, panel, token, origin)
@@ -87,9 +85,7 @@ def test_a_socket_of_another_origin_or_without_the_token_is_refused(
     assert typed == []
 
 
-def test_lines_reach_the_flight_and_what_is_no_line_is_answered(
-    panel: PanelScreen, loop: IOLoop, typed: list[str]
-) -> None:
+def test_lines_reach_the_flight_and_bad_ones_fail(panel: PanelScreen, loop: IOLoop, typed: list[str]) -> None:
     socket = connect(loop, panel, panel.token, panel.origin)
     assert receive(loop, socket)["texts"] == []
     for line in ("mark one", "x" * (LINE_MOST + 1), "mark two"):
@@ -102,9 +98,7 @@ def test_lines_reach_the_flight_and_what_is_no_line_is_answered(
     socket.close()
 
 
-def test_a_page_shows_the_newest_row_with_scene_and_curves_and_a_late_one_skips_the_rest(
-    panel: PanelScreen, loop: IOLoop, tmp_path: Path
-) -> None:
+def test_a_page_shows_only_the_newest_row(panel: PanelScreen, loop: IOLoop, tmp_path: Path) -> None:
     fly(Request.of(EXPERIMENTS["hover"], duration_s=0.5), tmp_path / "run")
     log = load_log(tmp_path / "run")
     socket = connect(loop, panel, panel.token, panel.origin)

@@ -124,7 +124,7 @@ def test_a_parameter_is_set_over_the_radio_and_noted_when_the_board_has_it(tmp_p
     ]
 
 
-def test_a_paused_flight_goes_on_step_by_step_and_ends_as_if_it_had_never_stood(tmp_path: Path) -> None:
+def test_a_paused_flight_steps_and_ends_as_an_unpaused_one(tmp_path: Path) -> None:
     view = Script({100: ["pause"]}, ("step 100", "step", "mark still", "go"))
     assert flown(tmp_path / "paused", view) == flown(tmp_path / "alone", None)
     events = [event for event in load_events(tmp_path / "paused") if event["source"] == "operator"]

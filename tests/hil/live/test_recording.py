@@ -52,7 +52,7 @@ def test_a_link_leads_to_its_instant(links: Links, run: Path, at_s: float) -> No
 
 
 @pytest.mark.parametrize("path", ["/", "/0123456789abcdef/1.00", "/../result.json", "/log.parquet"])
-def test_what_is_no_link_of_this_flight_leads_nowhere(links: Links, run: Path, path: str) -> None:
+def test_a_foreign_link_leads_nowhere(links: Links, run: Path, path: str) -> None:
     status, where, text = answer(links, path)
     assert (status, where) == (404, None)
     assert text.startswith(f"Here is {run}; for another flight: floaty view RUN --view web")

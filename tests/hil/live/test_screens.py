@@ -13,7 +13,7 @@ from hil.live.window import DISPLAYS, LOOPBACK, free_port, open_window, show
 
 
 @pytest.mark.parametrize("target", ["wbe", "connect:here", "connect:127.0.0.1:0", "connect:127.0.0.1:99999"])
-def test_an_unknown_target_says_what_is_allowed(target: str) -> None:
+def test_an_unknown_target_lists_the_allowed_ones(target: str) -> None:
     with pytest.raises(
         LabError, match=f"--view {target}: expected nothing, web, connect:HOST:PORT or foxglove"
     ):
@@ -21,14 +21,14 @@ def test_an_unknown_target_says_what_is_allowed(target: str) -> None:
 
 
 @pytest.mark.long
-def test_a_viewer_that_is_not_there_is_said_before_the_flight() -> None:
+def test_a_missing_viewer_is_reported_before_the_flight() -> None:
     port = free_port(0)
     with pytest.raises(LabError, match=f"connect:127.0.0.1:{port}: no viewer listens there"):
         open_view(f"connect:127.0.0.1:{port}", "fly", [].append)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
-def test_without_a_display_one_line_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_missing_display_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(window, "PORT", free_port(0))
     for name in DISPLAYS:
         monkeypatch.delenv(name, raising=False)

@@ -17,10 +17,7 @@ from hil.pictures.report import write_report
 from support.browser import BROWSER, browser
 from support.html_page import Page
 
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine"),
-]
+pytestmark = [pytest.mark.long, pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine")]
 SELDOM = ("close-up-1", "radio")  # a window of its own; a value in a second
 ACT = """
 <script>

@@ -43,7 +43,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def changed(run: FlownRun, row: int, column: str, value: float) -> FlownRun:
-    """The run with one cell changed."""
     place = run.log.column_names.index(column)
     field = run.log.schema.field(place)
     values = run.log.column(place).to_numpy().copy()
@@ -102,7 +101,7 @@ def test_a_log_that_ends_earlier_differs_where_it_ends(runs: dict[str, Path]) ->
         assert "the log has ended" in str(first)
 
 
-def test_a_missing_column_is_told(runs: dict[str, Path]) -> None:
+def test_a_missing_column_is_reported(runs: dict[str, Path]) -> None:
     run = load_flown(runs["one"])
     less = FlownRun(run.log.drop_columns(["truth.x"]), run.result)
     comparison = compare(run, less)
@@ -111,14 +110,14 @@ def test_a_missing_column_is_told(runs: dict[str, Path]) -> None:
     assert not comparison.identical
 
 
-def test_what_was_set_otherwise_is_told_and_nothing_else(runs: dict[str, Path]) -> None:
+def test_only_differing_settings_are_reported(runs: dict[str, Path]) -> None:
     comparison = compare(load_flown(runs["one"]), load_flown(runs["strong"]))
     gain = load_config().controller.gain_z
     assert ("controller.gain_z", str(gain), "3.5") in comparison.settings
     assert {name for name, _, _ in comparison.settings} <= {"controller.gain_z", "overrides", "commit"}
 
 
-def test_metrics_stand_side_by_side_in_the_unit_of_the_table(runs: dict[str, Path]) -> None:
+def test_metrics_are_side_by_side_in_the_unit_of_the_table(runs: dict[str, Path]) -> None:
     a, b = (json.loads((runs[name] / "result.json").read_text())["metrics"] for name in ("one", "two"))
     told = {pair.name: pair for pair in compare(load_flown(runs["one"]), load_flown(runs["two"])).metrics}
     assert told["rms_x"].values == pytest.approx((100 * a["rms_x"], 100 * b["rms_x"]))
@@ -126,14 +125,11 @@ def test_metrics_stand_side_by_side_in_the_unit_of_the_table(runs: dict[str, Pat
     assert told["rms_x"].difference == pytest.approx(100 * (b["rms_x"] - a["rms_x"]))
 
 
-def test_metrics_of_flights_of_different_length_are_taken_over_the_time_that_both_flew(
-    runs: dict[str, Path],
-) -> None:
+def test_metrics_of_unequal_flights_cover_the_common_time(runs: dict[str, Path]) -> None:
     long = load_flown(runs["one"])
     rows = long.log.num_rows - 30  # 0.3 s less
     short = FlownRun(
-        long.log.slice(0, rows),
-        replace(long.result, metrics=measure(long.log.slice(0, rows), lost=False)),
+        long.log.slice(0, rows), replace(long.result, metrics=measure(long.log.slice(0, rows), lost=False))
     )
     for a, b in ((long, short), (short, long)):
         comparison = compare(a, b)
@@ -145,9 +141,7 @@ def test_metrics_of_flights_of_different_length_are_taken_over_the_time_that_bot
 
 
 @pytest.mark.long
-def test_flights_that_are_released_at_other_instants_are_compared_by_the_time_since_then(
-    runs: dict[str, Path],
-) -> None:
+def test_flights_are_compared_by_the_time_since_their_release(runs: dict[str, Path]) -> None:
     a, b = load_flown(runs["one"]), load_flown(runs["two"])
     assert compare(a, b).apart == (), "row by row"
     t = b.log.column_names.index("t")
@@ -173,9 +167,7 @@ def test_the_difference_is_the_second_less_the_first_at_the_same_time(runs: dict
 
 
 @pytest.mark.long
-def test_of_two_different_robots_position_and_attitude_are_compared(
-    runs: dict[str, Path], tmp_path: Path
-) -> None:
+def test_two_robots_are_compared_by_position_and_attitude(runs: dict[str, Path], tmp_path: Path) -> None:
     flaps = load_flown(runs["one"])
     log = flaps.log.rename_columns(
         [
@@ -202,9 +194,7 @@ def test_the_caption_names_the_colours_of_the_lines(runs: dict[str, Path], tmp_p
 
 
 @pytest.mark.long
-def test_the_command_tells_the_difference_by_its_exit_code(
-    cli: Cli, runs: dict[str, Path], tmp_path: Path
-) -> None:
+def test_the_exit_code_of_the_command_is_the_verdict(cli: Cli, runs: dict[str, Path], tmp_path: Path) -> None:
     assert cli("compare", runs["one"], runs["again"], "--out", tmp_path) == 0
     assert "identical" in cli.out
     assert cli("compare", runs["one"], runs["two"], "--out", tmp_path / "new") == 1
@@ -224,9 +214,7 @@ def test_the_command_tells_the_difference_by_its_exit_code(
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "no parquet", "no flight", "no json"])
-def test_a_bad_folder_is_one_line_and_exit_code_two(
-    cli: Cli, runs: dict[str, Path], tmp_path: Path, damage: str
-) -> None:
+def test_a_bad_folder_is_one_line(cli: Cli, runs: dict[str, Path], tmp_path: Path, damage: str) -> None:
     bad = tmp_path / "bad"
     if damage == "empty":
         bad.mkdir()

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Sequence
 from math import nan
-from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -11,7 +10,7 @@ import pytest
 
 from firmware_py.geometry import yaw_quaternion
 from hil.pictures import compare, curves
-from hil.pictures.compare import FlownRun, MetricPair
+from hil.pictures.compare import MetricPair
 from hil.pictures.panels import TOGETHER_S, marks_of_flight, saturated
 from hil.pictures.trials import openings
 
@@ -110,12 +109,6 @@ def test_the_mean_opening_counts_every_flap_in_its_own_sense() -> None:
     value, command = openings(flight([0.0] * 30, **angles))
     assert value == pytest.approx(np.full(30, np.degrees(0.25)))
     assert command == pytest.approx(value)
-
-
-def run(table: pa.Table) -> FlownRun:
-    origin = dict.fromkeys((*compare.SETTINGS, "source", "folder"), "")
-    result = SimpleNamespace(**origin, metrics={}, own_metrics={}, overrides=(), faults=())
-    return FlownRun(table, result)  # type: ignore[arg-type]
 
 
 def test_logs_differ_first_where_they_do_a_gap_equals_a_gap_and_a_longer_one_goes_on() -> None:

@@ -73,7 +73,7 @@ def known_flap(rows: pa.Table) -> pa.Array:
     return pa.array(column(rows, "truth.flap_2") + hover)
 
 
-def test_where_it_was_farthest_and_from_when_on_it_stayed_near_is_told(folder: Path) -> None:
+def test_the_largest_error_and_the_settling_are_reported(folder: Path) -> None:
     log, result = load_log(folder), read_result(folder)
     told = {moment.text.partition(":")[0]: moment for moment in story_of(log, result)}
     free = free_flight(log)
@@ -91,7 +91,7 @@ def test_where_it_was_farthest_and_from_when_on_it_stayed_near_is_told(folder: P
     assert back.t_s == pytest.approx(2.0, abs=0.011)
 
 
-def test_commands_at_their_limits_are_named_with_how_long_they_stood_there(folder: Path) -> None:
+def test_commands_at_their_limits_are_named_with_their_duration(folder: Path) -> None:
     log = load_log(folder)
     rows = log.filter(since_release(log) >= 1.5)
     (limits,) = [sentence for sentence in evidence(rows) if sentence.startswith("Commands at their limits: ")]

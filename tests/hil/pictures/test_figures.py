@@ -88,7 +88,7 @@ def test_the_time_since_the_last_fused_pose_goes_on_over_batches(cut: int) -> No
     np.testing.assert_array_equal(curves.since_fusion(later)[first.num_rows :], expected)
 
 
-def test_curves_and_states_stand_at_seconds_from_the_release() -> None:
+def test_curves_and_states_are_in_seconds_from_the_release() -> None:
     counts = {
         name: [0.0, 0.0, 0.0, 0.0]
         for name in ("cpu.KALMAN", "rtos.measurements_high_water", "rtos.measurements_dropped")

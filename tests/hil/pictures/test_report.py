@@ -155,7 +155,7 @@ def test_the_report_tells_where_the_flight_comes_from(folder: Path) -> None:
 
 
 @pytest.mark.usefixtures("few_pictures")
-def test_a_failed_limit_is_told_first(folder: Path) -> None:
+def test_a_failed_limit_comes_first(folder: Path) -> None:
     change_result(
         folder,
         passed=False,
@@ -247,9 +247,7 @@ def test_the_report_begins_with_what_was_asked_for_what_failed_and_what_happened
     )
 
 
-def test_faults_failsafe_flap_limits_and_loss_are_marked_for_every_figure_and_shown_close_up(
-    folder: Path,
-) -> None:
+def test_faults_failsafe_flap_limits_and_loss_are_marked_and_shown_close_up(folder: Path) -> None:
     """Row 150 is 0.5 s after the release."""
     log, result = load_log(folder), read_result(folder)
     columns = {name: log.column(name).to_numpy().copy() for name in log.column_names}

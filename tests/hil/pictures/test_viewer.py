@@ -318,28 +318,17 @@ def real_log(rows: int = 30) -> pa.Table:
     columns = {name: np.where(silent, np.nan, 0.1) for name in names}
     columns |= {"cameras.qw": np.where(silent, np.nan, 1.0)}
     columns |= {f"goal.{name}": np.zeros(rows) for name in ("x", "y", "z", "yaw")}
-    columns |= {
-        "t": 10_000 * np.arange(rows),
-        "flight.free": np.zeros(rows),
-        "supervisor.state": np.full(rows, 2),
-    }
-    columns |= {
-        "link.sent": np.arange(rows) // 2,
-        "station.frames": np.arange(rows),
-        "station.samples": np.arange(rows),
-    }
-    columns |= {
-        "link.late": np.arange(rows) // 25,
-        "station.unusable": np.zeros(rows),
-        "station.malformed": np.zeros(rows),
-    }
+    columns |= dict.fromkeys(("flight.free", "station.unusable", "station.malformed"), np.zeros(rows))
+    columns |= dict.fromkeys(("station.frames", "station.samples"), np.arange(rows))
+    columns |= {"t": 10_000 * np.arange(rows), "supervisor.state": np.full(rows, 2)}
+    columns |= {"link.sent": np.arange(rows) // 2, "link.late": np.arange(rows) // 25}
     columns |= {"estimator.rejected": np.where(silent, np.nan, np.arange(rows) // 20)}
     request = json.dumps({"link": "udp://127.0.0.1:19850", "experiment": "hover"})
     look = json.dumps(look_of(GeometryConfig(), NetConfig()).stored())
     return pa.table(columns).replace_schema_metadata({"request": request, "look": look})
 
 
-def test_a_real_flight_has_the_same_scene_and_what_nobody_knows_is_not_drawn(tmp_path: Path) -> None:
+def test_a_real_flight_has_the_same_scene_without_unknown_parts(tmp_path: Path) -> None:
     path = staged(tmp_path / "real.rrd", real_log())
     assert timeline_of(real_log().schema.metadata) == (FROM_START, 0)
     counted = rows_by_entity(path)
@@ -371,17 +360,8 @@ def test_rates_are_those_of_the_second_before() -> None:
 
 
 def test_the_stages_of_the_age_lie_on_one_another(folder: Path) -> None:
-    ages = pa.table(
-        {
-            "camera": [20e3],
-            "processing": [18e3],
-            "network": [1e3],
-            "mocap": [39e3],
-            "station": [100.0],
-            "link": [2e3],
-        }
-    )
-    table = ages.rename_columns([f"age.{name}" for name in ages.column_names])
+    ages = {"camera": 20e3, "processing": 18e3, "network": 1e3, "mocap": 39e3, "station": 100.0, "link": 2e3}
+    table = pa.table({f"age.{name}": [age_us] for name, age_us in ages.items()})
     np.testing.assert_allclose(curves.AGE_STAGES.read(table), [[20.0, 38.0, 39.0, 39.1, 41.1]])
     counted = rows_by_entity(write_run_rrd(folder))
     assert counted["/plot/age/stages"] > 60  # by the station's own record, and their names
@@ -411,7 +391,7 @@ def test_faults_share_a_lane_and_a_push_is_an_arrow_that_can_be_seen(folder: Pat
     assert gone - begun == 1000 * PUSH_SHOWN_US
 
 
-def test_a_view_stands_in_the_blueprint_when_the_log_has_its_curves(folder: Path) -> None:
+def test_a_view_is_in_the_blueprint_when_the_log_has_its_curves(folder: Path) -> None:
     simulated = load_log(folder).schema
     known = {path for _, path in views_of(simulated)}
     assert {"position", "processor", "battery", "link/rate", "queue"} <= known

@@ -34,7 +34,7 @@ def test_eeprom_and_deck_memory_of_each_board_are_kept_over_a_restart(tmp_path: 
     again.ends.close()
 
 
-def test_what_changes_while_the_server_runs_is_written_at_once(tmp_path: Path) -> None:
+def test_changes_are_written_at_once(tmp_path: Path) -> None:
     server = serve(tmp_path)
     server.ends.robots[0].robot.board.eeprom[8000:8003] = b"new"
     server.lab.end_at(30_000)
@@ -50,13 +50,13 @@ def test_without_a_folder_every_server_begins_with_new_boards() -> None:
     assert serve(None).ends.robots[0].robot.board.eeprom[8000:8003] == b"\xff" * 3
 
 
-def test_a_file_that_is_no_such_memory_is_refused(tmp_path: Path) -> None:
+def test_an_invalid_memory_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "board-1.eeprom").write_bytes(b"short")
     with pytest.raises(LabError, match=r"board-1.eeprom: 5 bytes; this memory has 8192"):
         serve(tmp_path)
 
 
-def test_a_folder_that_cannot_be_one_is_refused(tmp_path: Path) -> None:
+def test_an_invalid_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(LabError, match=r"--state .*file: File exists"):
         serve(tmp_path / "file")

@@ -107,7 +107,6 @@ class Script:
         lab.run()
 
     def off(self, x: float, y: float, z: float) -> float:
-        """How far the robot is from there [m]."""
         return float(np.abs(self.robot.body.p_WB - (x, y, z)).max())
 
 

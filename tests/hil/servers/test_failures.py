@@ -50,7 +50,7 @@ def lab(held: MavlinkLab) -> MavlinkLab:
 
 
 @pytest.mark.parametrize(("unit", "failing"), EXPECTED)
-def test_a_unit_fails_as_it_is_told_until_it_is_ok(lab: MavlinkLab, unit: int, failing: int) -> None:
+def test_a_unit_fails_as_commanded_until_ok(lab: MavlinkLab, unit: int, failing: int) -> None:
     assert lab.command(INJECT, unit, failing) == ACCEPTED
     lab.run(3.5)
     size = {(VIO, INTERMITTENT): 0.5}.get((unit, failing))
@@ -60,7 +60,7 @@ def test_a_unit_fails_as_it_is_told_until_it_is_ok(lab: MavlinkLab, unit: int, f
 
 
 @pytest.mark.parametrize("unit", [*range(10), 99, *range(100, 107), -1, 0.5, math.nan])
-def test_what_nothing_here_does_is_unsupported(lab: MavlinkLab, unit: float) -> None:
+def test_unknown_failures_are_unsupported(lab: MavlinkLab, unit: float) -> None:
     for failing in (OFF, STUCK, GARBAGE, WRONG, SLOW, DELAYED, INTERMITTENT, 8, -1, math.nan):
         if (unit, failing) not in EXPECTED and (unit, failing) != (SIGNAL, OFF):
             assert lab.command(INJECT, unit, failing) == UNSUPPORTED

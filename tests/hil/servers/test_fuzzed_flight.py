@@ -62,9 +62,7 @@ def go_to(place: tuple[float, float, float]) -> bytes:
 @pytest.mark.parametrize(
     ("seed", "duration_s"), [(1, 2.5), *(pytest.param(s, 30.0, marks=pytest.mark.long) for s in (2, 3, 4))]
 )
-def test_random_packets_of_a_connected_client_lose_nothing(
-    seed: int, duration_s: float, absolute: bool
-) -> None:
+def test_a_client_s_random_packets_lose_nothing(seed: int, duration_s: float, absolute: bool) -> None:
     fuzzed = Fuzzed(seed, absolute)
     robot = fuzzed.served.robot
     assert robot.free

@@ -88,7 +88,7 @@ def host(app: App) -> Host:
     return Host(app)
 
 
-def test_a_board_tells_its_state_and_counts_a_hundred_times_a_second(host: Host) -> None:
+def test_a_board_reports_state_and_counts_at_100_hz(host: Host) -> None:
     host.run(1000, poses=True)
     assert len(host.looped) == 99
     told = host.looped[-1]
@@ -110,7 +110,7 @@ def test_samples_are_taken_one_a_step_when_enough_wait(host: Host) -> None:
     assert told.held == HIL_WAITING
 
 
-def test_the_gyro_is_the_hosts_and_its_zero_is_found_anew(host: Host) -> None:
+def test_the_gyro_is_the_hosts_with_a_new_zero(host: Host) -> None:
     host.app.gyro[:] = (1000, 1000, 1000)
     assert not host.app.sampling.calibrated
     host.run(560, poses=True)
@@ -189,7 +189,7 @@ def gyro_sums(app: App) -> tuple[int, int, int]:
     return x, y, z
 
 
-def test_without_a_sample_the_flight_stands_still_and_is_counted(host: Host) -> None:
+def test_without_a_sample_the_flight_pauses_and_is_counted(host: Host) -> None:
     host.run(1000, poses=True)
     before = host.looped[-1]
     state = host.app.estimator()
@@ -207,7 +207,7 @@ def test_without_a_sample_the_flight_stands_still_and_is_counted(host: Host) -> 
     assert (host.looped[-1].state, host.looped[-1].late, host.looped[-1].fresh) == (State.FLYING, 0, 1)
 
 
-def test_what_is_counted_counts_from_the_beginning_of_the_loop(host: Host) -> None:
+def test_counters_restart_with_the_loop(host: Host) -> None:
     host.run(100)
     host.run(200, sending=False)
     assert host.looped[-1].held > 100
@@ -218,7 +218,7 @@ def test_what_is_counted_counts_from_the_beginning_of_the_loop(host: Host) -> No
     assert host.looped[-1].held == HIL_WAITING
 
 
-def test_while_the_flight_stands_still_poses_grow_no_older(host: Host) -> None:
+def test_poses_do_not_age_in_a_pause(host: Host) -> None:
     host.run(1000, poses=True)
     host.run(HIL_WAITING + 2, sending=False)
     host.app.radio(POSE)
@@ -227,7 +227,7 @@ def test_while_the_flight_stands_still_poses_grow_no_older(host: Host) -> None:
     assert host.looped[-1].age in range(400, 600)
 
 
-def test_a_second_step_in_the_same_tick_while_the_flight_stands_still_is_no_silence(host: Host) -> None:
+def test_a_second_step_in_a_paused_tick_is_not_silence(host: Host) -> None:
     host.run(1000, poses=True)
     host.run(HIL_WAITING + 5, sending=False)
     host.app.step(host.step)
@@ -235,7 +235,7 @@ def test_a_second_step_in_the_same_tick_while_the_flight_stands_still_is_no_sile
     assert {told.state for told in host.looped[-5:]} == {State.FLYING}
 
 
-def test_a_flight_stands_still_for_a_time_and_goes_on_with_the_last_sample(host: Host) -> None:
+def test_a_pause_ends_after_a_time_with_the_last_sample(host: Host) -> None:
     host.run(100)
     host.run(HIL_HOLD + 100, sending=False)
     told = host.looped[-1]
@@ -246,9 +246,7 @@ def test_a_flight_stands_still_for_a_time_and_goes_on_with_the_last_sample(host:
     assert host.looped[-1].late in range(told.late, 101)
 
 
-def test_behind_a_gap_nothing_is_taken_until_it_is_closed_and_what_comes_again_is_left_out(
-    host: Host,
-) -> None:
+def test_samples_wait_behind_a_gap_and_repeated_ones_are_dropped(host: Host) -> None:
     host.run(100)
     host.count += 4
     host.run(60)
@@ -282,9 +280,7 @@ def test_samples_beyond_the_buffer_are_not_taken(host: Host) -> None:
     ],
     ids=["narrow", "wide", "one too wide", "one"],
 )
-def test_the_board_takes_the_samples_that_were_packed(
-    host: Host, samples: list[tuple[int, int, int]]
-) -> None:
+def test_the_board_unpacks_the_samples_sent(host: Host, samples: list[tuple[int, int, int]]) -> None:
     data, count = encode_samples(0, samples)
     assert (count, len(data) <= 30) == (len(samples), True)
     host.run(3, sending=False)
@@ -307,9 +303,7 @@ def test_a_packet_holds_as_many_samples_as_fit(host: Host) -> None:
     assert encode_samples(0, [*steady[:2], (9000, 0, 0), *wild])[1] == 4
 
 
-def test_a_host_that_stops_is_flown_on_without_for_a_time_and_then_leads_to_the_failsafe(
-    host: Host,
-) -> None:
+def test_without_the_host_the_board_flies_on_for_a_time_then_enters_failsafe(host: Host) -> None:
     host.run(1000, poses=True)
     host.run(600, sending=False)
     assert host.looped[-1].state == State.FLYING
@@ -397,9 +391,7 @@ def test_a_flight_in_the_loop_holds_all_limits_and_tells_the_loops_delay(app: Ap
     ],
     ids=["radio", "slow", "narrow", "10 %", "20 %", "very slow"],
 )
-def test_hover_holds_all_limits_in_the_loop_for_twenty_seconds_over_any_link(
-    app: App, tmp_path: Path, link: dict[str, float], stood_s: float
-) -> None:
+def test_hover_holds_over_any_link(app: App, tmp_path: Path, link: dict[str, float], stood_s: float) -> None:
     result, _ = flown(tmp_path / "run", app, 20.0, **link)
     assert result.passed, result.verdicts
     metrics = result.metrics
@@ -429,7 +421,7 @@ def test_a_link_that_queues_delays_the_flight_and_not_the_loop(app: App, tmp_pat
 
 
 @pytest.mark.long
-def test_what_was_lost_is_sent_again_and_nothing_else(app: App, tmp_path: Path) -> None:
+def test_only_lost_samples_are_sent_again(app: App, tmp_path: Path) -> None:
     result, _ = flown(tmp_path / "run", app, 1.0, loss=0.1)
     metrics = result.metrics
     assert metrics["samples_late"] == metrics["failsafe"] == 0
@@ -495,7 +487,7 @@ def test_processor_time_of_a_real_board_cannot_be_taken(app: App) -> None:
         (("--hil", "--board", URI), f"--board {URI}: silent for 3 s"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_in_the_loop_is_refused_in_one_line(
+def test_impossible_loops_are_refused_in_one_line(
     cli: Cli, app: App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], said: str
 ) -> None:
     monkeypatch.chdir(tmp_path)

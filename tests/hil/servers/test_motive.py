@@ -6,7 +6,7 @@ import socket
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -36,15 +36,7 @@ from hil.errors import LabError
 from hil.servers.dongle_server import HOST
 from hil.servers.motive import MAX_CLIENTS, Streaming, Up, VirtualMotive, in_axes
 from hil.servers.natnet_bytes import encode_frame, encode_models, encode_server_info
-from support.motive_bench import (
-    FROM_MOTIVE,
-    LATENCY_US,
-    PLACES,
-    MotiveBench,
-    needs,
-    seen,
-    sighted,
-)
+from support.motive_bench import FROM_MOTIVE, LATENCY_US, PLACES, MotiveBench, needs, seen, sighted
 from support.paths import SUPPORT
 
 VERSIONS = [(3, 0), (3, 1), (4, 0), (4, 1)]
@@ -70,9 +62,7 @@ def test_a_frame_arrives_as_it_was_sent(frame: Frame, version: tuple[int, int]) 
 
 
 @given(st.lists(described, max_size=3), st.sampled_from(VERSIONS[2:]))
-def test_model_definitions_arrive_as_they_were_sent(
-    models: list[BodyDescription], version: tuple[int, int]
-) -> None:
+def test_model_definitions_arrive_unchanged(models: list[BodyDescription], version: tuple[int, int]) -> None:
     sent = ModelDefinition(tuple(models))
     assert decode(encode_models(sent, version), version) == sent
 
@@ -148,10 +138,27 @@ def client(lab: MotiveBench) -> Iterator[NatNetSocket]:
     client.close()
 
 
+@pytest.fixture
+def start() -> Iterator[Callable[..., tuple[MotiveBench, NatNetSocket]]]:
+    """Start a Motive with options, or with `motive` in its place, and a client of it."""
+    started: list[tuple[MotiveBench, NatNetSocket]] = []
+
+    def start(motive: Callable[[MotiveBench], VirtualMotive] | None = None, **options: Any) -> Any:
+        lab = MotiveBench(**options)
+        if motive is not None:
+            lab.motive.close()
+            lab.motive = motive(lab)
+        started.append((lab, NatNetSocket(lab)))
+        return started[-1]
+
+    yield start
+    for lab, client in started:
+        client.close()
+        lab.motive.close()
+
+
 @pytest.mark.parametrize("payload", [b"", b"Ping\0", bytes(271)], ids=["empty", "Ping", "with the sender"])
-def test_every_form_of_connect_is_answered_and_frames_follow(
-    lab: MotiveBench, client: NatNetSocket, payload: bytes
-) -> None:
+def test_each_connect_is_answered_with_frames(lab: MotiveBench, client: NatNetSocket, payload: bytes) -> None:
     client.say(MessageId.CONNECT, payload)
     info = decode(client.hear(), (4, 1))
     assert (info.name, info.natnet_version, info.data_port) == ("Motive", (4, 1, 0, 0), lab.motive.data_port)
@@ -165,9 +172,8 @@ def test_every_form_of_connect_is_answered_and_frames_follow(
 
 
 @pytest.mark.parametrize(("up", "axes"), [("y", None), ("y", "y-up"), ("z", "z-up")])
-def test_the_station_sees_the_world_whichever_axis_of_motive_points_up(up: Up, axes: Axes | None) -> None:
-    lab = MotiveBench(up=up)
-    client = NatNetSocket(lab)
+def test_the_station_sees_the_world_whichever_axis_points_up(start, up: Up, axes: Axes | None) -> None:
+    lab, client = start(up=up)
     stream = NatnetStream("floaty", Alignment(CaptureConfig(axes=axes)))
     for request in (MessageId.CONNECT, MessageId.REQUEST_MODELDEF, MessageId.KEEPALIVE):
         client.say(request)
@@ -180,13 +186,10 @@ def test_the_station_sees_the_world_whichever_axis_of_motive_points_up(up: Up, a
         assert found.p_WB == pytest.approx(seen(number).p_WB, abs=1e-6)
         turned = Rotation.from_quat(found.q_WB, scalar_first=True).inv()
         assert (turned * Rotation.from_quat(seen(number).q_WB, scalar_first=True)).magnitude() < 1e-6
-    client.close()
-    lab.motive.close()
 
 
-def test_with_z_up_markers_and_model_are_in_the_world_s_axes() -> None:
-    lab = MotiveBench(markers=True, up="z")
-    client = NatNetSocket(lab)
+def test_with_z_up_markers_and_model_are_in_the_world_s_axes(start) -> None:
+    lab, client = start(markers=True, up="z")
     client.connect()
     client.say(MessageId.REQUEST_MODELDEF)
     (body,) = decode(client.hear(), (4, 1)).bodies
@@ -198,8 +201,6 @@ def test_with_z_up_markers_and_model_are_in_the_world_s_axes() -> None:
     frame = decode(client.hear(), (4, 1))
     assert np.array(frame.unlabelled) == pytest.approx(sighted(2).ghosts, abs=1e-6)
     assert len(frame.unlabelled) == 2
-    client.close()
-    lab.motive.close()
 
 
 def test_a_frame_is_stamped_with_its_exposure(lab: MotiveBench, client: NatNetSocket) -> None:
@@ -221,9 +222,8 @@ def test_a_body_that_is_not_tracked_is_marked(lab: MotiveBench, client: NatNetSo
     assert not decode(client.hear(), (4, 1)).bodies[0].valid
 
 
-def test_markers_of_a_body_that_is_not_tracked_have_no_label() -> None:
-    lab = MotiveBench(markers=True)
-    client = NatNetSocket(lab)
+def test_markers_of_a_body_that_is_not_tracked_have_no_label(start) -> None:
+    lab, client = start(markers=True)
     client.connect()
     lab.expose(valid=False)
     frame = decode(client.hear(), (4, 1))
@@ -231,16 +231,12 @@ def test_markers_of_a_body_that_is_not_tracked_have_no_label() -> None:
     assert frame.labelled == ()
     places = np.vstack((expected.points[expected.seen], expected.ghosts)) @ FROM_MOTIVE
     assert np.array(frame.unlabelled) == pytest.approx(places, abs=1e-6)
-    client.close()
-    lab.motive.close()
 
 
-def test_markers_of_all_bodies_share_a_frame_and_are_told_apart() -> None:
-    lab = MotiveBench()
-    lab.motive.close()
+def test_markers_of_all_bodies_share_a_frame_and_are_distinguishable(start) -> None:
     names = {1: "floaty", 2: "floaty2"}
-    lab.motive = VirtualMotive(Streaming(0, (3, 1), False), names, lab.readers, PLACES)
-    client = NatNetSocket(lab)
+    one = Streaming(0, (3, 1), False)
+    lab, client = start(lambda lab: VirtualMotive(one, names, lab.readers, PLACES))
     client.connect()
     for _ in range(2):  # nothing is left of the frame before
         lab.motive.take(1, seen(1), 0, sighted(1))
@@ -252,15 +248,11 @@ def test_markers_of_all_bodies_share_a_frame_and_are_told_apart() -> None:
         ghosts = np.vstack((sighted(1).ghosts, sighted(2).ghosts))
         assert np.array(frame.unlabelled) == pytest.approx(ghosts @ FROM_MOTIVE, abs=1e-6)
         assert [body.error for body in frame.bodies] == pytest.approx([0.001, 0.002])
-    client.close()
-    lab.motive.close()
 
 
-def test_bodies_of_one_exposure_share_a_frame() -> None:
-    lab = MotiveBench()
-    lab.motive.close()
-    lab.motive = VirtualMotive(Streaming(0, (3, 1), False), {1: "floaty", 2: "floaty2"}, lab.readers)
-    client = NatNetSocket(lab)
+def test_bodies_of_one_exposure_share_a_frame(start) -> None:
+    names, one = {1: "floaty", 2: "floaty2"}, Streaming(0, (3, 1), False)
+    lab, client = start(lambda lab: VirtualMotive(one, names, lab.readers))
     client.connect()
     lab.motive.take(1, seen(1), 0)
     assert client.hears_nothing()
@@ -269,8 +261,6 @@ def test_bodies_of_one_exposure_share_a_frame() -> None:
     assert [body.id for body in found] == [1, 2]
     client.say(MessageId.REQUEST_MODELDEF)
     assert [body.name for body in decode(client.hear(), (3, 1)).bodies] == ["floaty", "floaty2"]
-    client.close()
-    lab.motive.close()
 
 
 def test_the_bitstream_is_changed_for_the_client_that_asks(lab: MotiveBench, client: NatNetSocket) -> None:
@@ -294,7 +284,7 @@ def test_frames_end_with_the_disconnect(lab: MotiveBench, client: NatNetSocket) 
     assert client.hears_nothing()
 
 
-def test_sixteen_clients_are_served_and_one_more_displaces_who_was_silent_longest(lab: MotiveBench) -> None:
+def test_a_seventeenth_client_displaces_the_longest_silent_one(lab: MotiveBench) -> None:
     clients = [NatNetSocket(lab) for _ in range(MAX_CLIENTS + 1)]
     for client in clients[:-1]:
         client.connect()
@@ -308,7 +298,7 @@ def test_sixteen_clients_are_served_and_one_more_displaces_who_was_silent_longes
         client.close()
 
 
-def test_what_cannot_be_read_is_counted_and_not_answered(lab: MotiveBench, client: NatNetSocket) -> None:
+def test_unreadable_packets_are_counted_and_not_answered(lab: MotiveBench, client: NatNetSocket) -> None:
     broken = [b"", b"\0", packet(MessageId.FRAME), packet(MessageId.ECHO_REQUEST, b"short")]
     for data in (*broken, packet(MessageId.REQUEST, b"Bitstream")[:-1], b"\xff" * 2048):
         client.send(data)
@@ -330,16 +320,15 @@ def test_no_bytes_stop_the_server(lab: MotiveBench, client: NatNetSocket) -> Non
     assert decode(client.hear(), (4, 1)).name == "Motive"
 
 
-def test_a_taken_port_is_said_in_one_line(lab: MotiveBench) -> None:
+def test_a_taken_port_is_one_line(lab: MotiveBench) -> None:
     with pytest.raises(
-        LabError,
-        match=rf"^natnet port {lab.motive.port}: Address already in use; --set capture.port=0 takes",
+        LabError, match=rf"^natnet port {lab.motive.port}: Address already in use; --set capture.port=0 takes"
     ):
         VirtualMotive(Streaming(lab.motive.port, (4, 1), False), {1: "floaty"}, {})
 
 
 @pytest.mark.parametrize("interface", [HOST, "0.0.0.0"], ids=["loopback", "any"])
-def test_a_program_that_joins_the_group_on_either_interface_hears_each_frame_once(interface: str) -> None:
+def test_a_group_member_on_either_interface_gets_each_frame_once(interface: str) -> None:
     """On any: the kernel takes the interface of the route, as for Bitcraze's scripts with libmotioncapture."""
     lab = MotiveBench(multicast=True)
     member = socket.inet_aton(MULTICAST_GROUP) + socket.inet_aton(interface)

@@ -11,7 +11,7 @@ from hil.servers.serial_server import Address, parse_addresses
 from support.line_clients import OpenEnd, TcpClient
 
 
-def test_several_tcp_clients_all_hear_the_board_and_are_heard() -> None:
+def test_several_tcp_clients_all_exchange_bytes_with_the_board() -> None:
     bench = OpenEnd(Address("tcp").open)
     first, second, third = (TcpClient(bench) for _ in range(3))
     for number, client in enumerate((first, second, third)):
@@ -45,7 +45,7 @@ def test_a_tcp_client_that_does_not_read_takes_nothing_from_another() -> None:
     bench.close()
 
 
-def test_what_one_tcp_client_sent_at_once_is_not_torn_by_another() -> None:
+def test_one_client_s_message_is_not_split_by_another() -> None:
     bench = OpenEnd(Address("tcp").open)
     first, second = TcpClient(bench), TcpClient(bench)
     long, short = bytes(range(256)) * 64, b"between"

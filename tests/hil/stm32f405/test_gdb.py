@@ -16,15 +16,7 @@ from hil.errors import LabError
 from hil.stm32f405.chip import CYCLES_PER_US, Why
 from hil.stm32f405.freertos import FreeRtos
 from hil.stm32f405.gdb import DebuggedChip, GdbServer
-from hil.stm32f405.gdb_protocol import (
-    PACKET_SIZE,
-    REGISTERS,
-    SIGINT,
-    SIGTRAP,
-    RemoteProtocol,
-    Wish,
-    framed,
-)
+from hil.stm32f405.gdb_protocol import PACKET_SIZE, REGISTERS, SIGINT, SIGTRAP, RemoteProtocol, Wish, framed
 from hil.stm32f405.image import Image
 from support import stm32_firmware
 from support.bare_cortex import BareCortex
@@ -50,7 +42,6 @@ def protocol(machine: BareCortex) -> RemoteProtocol:
 
 
 def ask(protocol: RemoteProtocol, payload: bytes) -> bytes:
-    """Return the content of the answer to a packet."""
     answer = protocol.receive(framed(payload))
     assert answer[:2] == b"+$", answer
     assert answer[-3:] == b"#%02x" % (sum(answer[2:-3]) % 256)
@@ -94,7 +85,7 @@ def test_without_acknowledgements_only_answers_are_sent(protocol: RemoteProtocol
     assert protocol.receive(b"$?#00") == b""
 
 
-def test_what_is_not_known_is_answered_with_nothing(protocol: RemoteProtocol) -> None:
+def test_unknown_packets_get_an_empty_answer(protocol: RemoteProtocol) -> None:
     for (
         packet
     ) in b"vMustReplyEmpty vCont? X20000000,0: G00 qTStatus R00 b Z5,20000000,4 QPassSignals: _".split():
@@ -105,9 +96,7 @@ def test_what_is_not_known_is_answered_with_nothing(protocol: RemoteProtocol) ->
     "packet", [b"m", b"m,", b"m20000000", b"mxyz,4", b"p", b"pff", b"P0", b"P0=12", b"M20000000,4:00",
                b"M20000000,0:", b"Z0", b"Z1,", b"c-1", b"M20000000,1:zz"],
 )  # fmt: skip
-def test_a_malformed_packet_changes_nothing(
-    protocol: RemoteProtocol, machine: BareCortex, packet: bytes
-) -> None:
+def test_malformed_packets_do_nothing(protocol: RemoteProtocol, machine: BareCortex, packet: bytes) -> None:
     before = ask(protocol, b"g")
     assert ask(protocol, packet) == b"E01"
     assert ask(protocol, b"g") == before
@@ -149,9 +138,7 @@ def test_the_target_description_numbers_the_registers_as_they_are_sent(protocol:
     assert [name for name, _ in registers[:17]] == [*(f"r{n}" for n in range(13)), "sp", "lr", "pc", "xpsr"]
 
 
-def test_registers_are_read_all_at_once_and_written_one_by_one(
-    protocol: RemoteProtocol, machine: BareCortex
-) -> None:
+def test_registers_are_read_together_written_singly(protocol: RemoteProtocol, machine: BareCortex) -> None:
     number = {name: index for index, (name, _) in enumerate(REGISTERS)}
     assert ask(protocol, b"P%x=78563412" % number["r7"]) == b"OK"
     assert ask(protocol, b"P%x=%s" % (number["d3"], pack("<d", -1.5).hex().encode())) == b"OK"
@@ -176,7 +163,7 @@ def test_memory_that_is_not_there_is_an_error(protocol: RemoteProtocol) -> None:
     assert ask(protocol, b"M30000000,1:00") == b"E0e"
 
 
-def test_code_is_where_the_image_says(protocol: RemoteProtocol, image: Image) -> None:
+def test_code_is_at_the_image_s_address(protocol: RemoteProtocol, image: Image) -> None:
     assert bytes.fromhex(ask(protocol, b"m8004000,800").decode()) == image.code[:0x800]
 
 
@@ -238,7 +225,7 @@ def test_ctrl_c_stops_a_run(client: tuple[GdbServer, socket.socket], machine: Ba
     assert line.recv(4096) == b"+" + framed(b"OK") + framed(b"T02thread:1;") + framed(b"OK")
 
 
-def test_who_hangs_up_lets_the_machine_go_and_another_may_come(
+def test_after_a_hang_up_the_machine_runs_and_accepts_another(
     client: tuple[GdbServer, socket.socket], machine: BareCortex, image: Image
 ) -> None:
     server, line = client
@@ -253,7 +240,7 @@ def test_who_hangs_up_lets_the_machine_go_and_another_may_come(
         assert server.hold() is Wish.KILL
 
 
-def test_who_leaves_takes_the_breakpoints_along(protocol: RemoteProtocol, machine: BareCortex) -> None:
+def test_leaving_removes_the_breakpoints(protocol: RemoteProtocol, machine: BareCortex) -> None:
     for packet in (b"Z0,8005000,2", b"Z0,8007000,2", b"z0,8005000,2", b"z0,8006000,2"):
         assert ask(protocol, packet) == b"OK"
     assert machine.breakpoints == {0x0800_7000}
@@ -272,9 +259,7 @@ def test_a_machine_without_watchpoints_refuses_them(protocol: RemoteProtocol) ->
     assert ask(protocol, b"Z2,20000000,4") == b"E0e"
 
 
-def test_time_stands_still_while_the_debugger_asks(
-    client: tuple[GdbServer, socket.socket], machine: BareCortex
-) -> None:
+def test_time_stops_while_gdb_asks(client: tuple[GdbServer, socket.socket], machine: BareCortex) -> None:
     server, line = client
     before = [machine.register(name) for name, _ in REGISTERS]
     line.sendall(b"".join(framed(b"m20000000,4") for _ in range(50)) + framed(b"c"))
@@ -358,7 +343,7 @@ def test_a_watchpoint_stops_after_the_access(kind: bytes, name: str) -> None:
         assert said[4] == b"01000000"
 
 
-def test_the_chip_waits_for_its_debugger_and_stands_at_its_first_instruction() -> None:
+def test_the_chip_waits_for_its_debugger_at_its_first_instruction() -> None:
     machine, answers = on_chip(lambda _: [b"QStartNoAckMode", b"pf", b"me000ed28,4", b"D"], 2_000)
     reset = framed(pack("<I", machine.image.reset).hex().encode())
     assert answers == b"+" + framed(b"OK") + reset + framed(b"00000000") + framed(b"OK")

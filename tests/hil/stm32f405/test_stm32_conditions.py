@@ -49,9 +49,7 @@ def executed(load: int, store: int, watched: tuple[int, int] | None = None) -> B
         "write-watched",
     ],
 )
-def test_an_access_in_an_it_block_leaves_no_condition_for_what_follows(
-    load: int, store: int, watched: tuple[int, int] | None
-) -> None:
+def test_an_it_block_leaves_no_condition(load: int, store: int, watched: tuple[int, int] | None) -> None:
     assert executed(load, store, watched).chip.register("r7") == 5
 
 

@@ -93,7 +93,7 @@ def test_an_exception_with_floats_stacks_twenty_six_words_and_restores_all_float
 
 
 @COMPILERS
-def test_what_is_masked_is_taken_exactly_where_the_mask_falls(compiler: str) -> None:
+def test_a_masked_interrupt_is_taken_exactly_at_unmasking(compiler: str) -> None:
     (count, place, count_again, place_again, here, there), _ = recorded(MASKING, compiler)
     # BASEPRI 0x50, BASEPRI_MAX 0x70 and BASEPRI 0x60 hold an interrupt of priority 0x60 back, BASEPRI 0x70 does not;
     # PRIMASK does. Three instructions counted before each.

@@ -74,7 +74,7 @@ def test_an_image_is_what_a_programmer_writes_into_flash(compiler: str) -> None:
 
 @COMPILERS
 @pytest.mark.parametrize("function", ["Reset_Handler", "assertFail", "vTaskSwitchContext"])
-def test_an_address_is_told_as_function_and_line(compiler: str, function: str) -> None:
+def test_an_address_is_reported_as_function_and_line(compiler: str, function: str) -> None:
     image = Image(stm32_firmware.build(compiler))
     first = next(
         n for n, text in enumerate(FIRMWARE.splitlines(), 1) if f"void {function}(" in text and "{" in text
@@ -101,7 +101,7 @@ def test_lines_are_those_of_binutils() -> None:
     assert {a for a, _ in differ} <= {""}
 
 
-def test_between_functions_there_is_no_place() -> None:
+def test_an_address_between_functions_has_no_place() -> None:
     image = Image(stm32_firmware.build())
     assert image.place(0x0800_0100) == "0x08000100, outside every function"
     assert image.place(0x2000_0000) == "0x20000000, outside every function"
@@ -170,7 +170,7 @@ def test_a_bin_of_another_build_is_refused_at_the_first_byte_that_differs(elf: P
     assert "differs at 0x08004200" in refused(binary, elf)
 
 
-def test_what_is_no_elf_file_is_refused(elf: Path, tmp_path: Path) -> None:
+def test_a_file_of_another_kind_is_refused(elf: Path, tmp_path: Path) -> None:
     text = tmp_path / "cf2.bin"
     text.write_bytes(b"no firmware at all" * 40)
     assert "not an ELF file; a .bin needs --elf FILE" in refused(text)

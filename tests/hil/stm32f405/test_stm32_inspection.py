@@ -92,7 +92,7 @@ def crashed(machine: FirmwareOnChip) -> str:
 
 
 @COMPILERS
-def test_a_bus_fault_is_told_with_address_task_function_line_and_callers(compiler: str) -> None:
+def test_a_bus_fault_is_reported_with_address_task_function_line_and_callers(compiler: str) -> None:
     text = crashed(FirmwareOnChip(compiler, planted=BUS_FAULT))
     place = f"go_wrong (firmware.c:{line_of('return REGISTER(0x30000000)')})"
     caller = f"report (firmware.c:{line_of('go_wrong(planted)')})"
@@ -101,14 +101,14 @@ def test_a_bus_fault_is_told_with_address_task_function_line_and_callers(compile
 
 
 @COMPILERS
-def test_an_undefined_instruction_is_told_where_it_stands(compiler: str) -> None:
+def test_an_undefined_instruction_is_reported_with_its_place(compiler: str) -> None:
     text = crashed(FirmwareOnChip(compiler, planted=UNDEFINED))
     place = f"go_wrong (firmware.c:{line_of('udf #7')})"
     assert text.startswith(f"HardFault: undefined instruction, in task REPORT: {place} < report (firmware.c:")
 
 
 @COMPILERS
-def test_an_assertion_is_told_with_its_text_and_who_made_it(compiler: str) -> None:
+def test_an_assertion_is_reported_with_text_and_caller(compiler: str) -> None:
     machine = FirmwareOnChip(compiler, planted=ASSERTION)
     text = crashed(machine)
     line = line_of("assert_that(how != ASSERTION)")
@@ -142,7 +142,6 @@ def test_a_call_through_a_null_pointer_is_a_change_to_arm_code(compiler: str) ->
 
 
 def stopped(machine: FirmwareOnChip, why: Why) -> tuple[ChipProcessor, CrashReports]:
-    """Run until something is noticed."""
     processor = machine.processor()
     assert run_to_end(machine, 100) == why
     return processor, reports_of(machine)
@@ -156,9 +155,7 @@ def stopped(machine: FirmwareOnChip, why: Why) -> tuple[ChipProcessor, CrashRepo
         (NULL_WRITE, Why.LOW_WRITE, "null pointer: write to 0x0000000c, ", "nowhere[3] = 1"),
     ],
 )
-def test_an_access_near_address_0_is_reported_once_and_goes_on(
-    compiler: str, planted: int, why: Why, expected: str, text: str
-) -> None:
+def test_a_null_access_reports_once(compiler: str, planted: int, why: Why, expected: str, text: str) -> None:
     machine = FirmwareOnChip(compiler, planted=planted)
     _, reports = stopped(machine, why)
     crash = str(reports.low_access(machine.chip.state.fault_address, why is Why.LOW_WRITE))
@@ -248,7 +245,7 @@ def test_a_stack_that_overflows_within_one_block_names_its_task_at_the_next_inte
     assert text.startswith("stack overflow, some calls before this place, in task REPORT: ")
 
 
-def test_an_assertion_without_a_text_is_told_by_its_addresses() -> None:
+def test_an_assertion_without_text_is_reported_by_its_addresses() -> None:
     machine = FirmwareOnChip(planted=ASSERTION)
     crashed(machine)
     machine.chip.set_register("r0", 0x3000_0000)
@@ -257,7 +254,7 @@ def test_an_assertion_without_a_text_is_told_by_its_addresses() -> None:
     assert text.startswith("assertion 0x30000000 failed at 0x08080000:")
 
 
-def test_a_watchdog_reset_is_told_with_who_ran_then() -> None:
+def test_a_watchdog_reset_names_the_running_task() -> None:
     machine = FirmwareOnChip(planted=HUNGRY_WATCHDOG)
     reports = reports_of(machine)
     assert run_to_end(machine, 400) & Why.WATCHDOG
@@ -281,7 +278,7 @@ def test_a_fault_in_an_interrupt_names_its_handler() -> None:
     )
 
 
-def test_a_frame_that_cannot_be_read_is_told() -> None:
+def test_an_unreadable_frame_is_reported() -> None:
     machine = FirmwareOnChip(planted=BUS_FAULT)
     crashed(machine)
     machine.chip.set_register("psp", 0x3000_0000)
@@ -289,7 +286,7 @@ def test_a_frame_that_cannot_be_read_is_told() -> None:
     assert text.endswith("0x30000000; there is no memory at its stack pointer, 0x30000000, in task REPORT")
 
 
-def test_a_fault_that_cannot_be_handled_is_told_as_a_lock_up() -> None:
+def test_an_unhandled_fault_is_reported_as_lock_up() -> None:
     machine = FirmwareOnChip()
     run_to_end(machine, 30)
     while machine.chip.register("xpsr") & 0x1FF:

@@ -82,16 +82,14 @@ def test_a_read_counts_on_from_its_address_and_a_write_too(bench: Selected) -> N
     assert bench.told == [0x16, 0x20 | WRITE]
 
 
-def test_who_is_not_selected_neither_answers_nor_listens(bench: Selected) -> None:
+def test_an_unselected_device_is_inactive(bench: Selected) -> None:
     assert bench.exchange(bytes((0x20 | WRITE, 7))) == b"\xff\xff"
     assert bench.registers[0x20] == 0x20
     bench.chip.tell_devices()
     assert bench.told == []
 
 
-def test_a_second_byte_waits_in_the_register_and_a_third_is_received_over_one_not_read(
-    bench: Selected,
-) -> None:
+def test_a_second_byte_waits_in_the_register_and_a_third_overruns(bench: Selected) -> None:
     bench.select(True)
     bench[SPI1 + DR] = 0x10
     bench[SPI1 + DR] = 0
@@ -121,7 +119,7 @@ def test_dma_carries_both_directions_and_both_streams_complete(bench: Selected) 
     assert bench.is_pending(68)
 
 
-def test_what_is_written_before_the_start_leaves_at_the_start(bench: Selected) -> None:
+def test_bytes_written_before_the_start_leave_at_the_start(bench: Selected) -> None:
     bench[SPI1 + CR1] = MASTER | BY_64
     bench.select(True)
     bench[SPI1 + DR] = 0x11
@@ -135,7 +133,7 @@ def test_what_is_written_before_the_start_leaves_at_the_start(bench: Selected) -
     assert bench.exchange(b"\0") == b"\x11"
 
 
-def test_a_device_on_i2c_is_told_of_writes_alone_and_can_move() -> None:
+def test_a_device_on_i2c_gets_writes_only_and_can_move() -> None:
     bench, i2c = Bench(), 0x4000_5400
     told: list[int] = []
     device = bench.chip.add_device(1, 0x29, np.zeros(16, np.uint8))

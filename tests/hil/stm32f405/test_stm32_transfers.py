@@ -174,7 +174,7 @@ def address(bench: Bench, device: int) -> None:
 @pytest.mark.parametrize(
     ("clock", "bit_us"), [(210, 10.0), (0x8000 | 35, 2.5), (0xC000 | 4, 100 / 42)], ids=["standard", "fast", "16/9"]
 )  # fmt: skip
-def test_a_bit_on_the_bus_takes_what_the_clock_register_says(bench: Bench, clock: int, bit_us: float) -> None:
+def test_a_bit_lasts_as_the_clock_register_sets(bench: Bench, clock: int, bit_us: float) -> None:
     bench.chip.add_device(1, 0x50, np.zeros(256, np.uint8))
     bench[I2C1 + 0x1C], bench[I2C1] = clock, 1
     address(bench, 0x50 << 1)
@@ -199,9 +199,7 @@ def test_the_last_byte_by_dma_is_not_acknowledged_and_no_other_follows(bench: Be
 
 
 @pytest.mark.parametrize(("control", "pending"), [(1 << 9, False), (1 << 10 | 1 << 9, True)])
-def test_an_empty_register_interrupts_only_with_buffer_interrupts(
-    bench: Bench, control: int, pending: bool
-) -> None:
+def test_empty_registers_interrupt_only_if_buffered(bench: Bench, control: int, pending: bool) -> None:
     bench.chip.add_device(1, 0x50, np.zeros(256, np.uint8))
     bench[I2C1 + 0x1C], bench[I2C1] = 35, 1
     address(bench, 0x50 << 1)

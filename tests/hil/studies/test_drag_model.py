@@ -98,9 +98,7 @@ def test_the_sweeps_are_the_papers() -> None:
 
 
 @pytest.mark.long
-def test_command_writes_a_table_the_figures_and_a_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_writes_table_figures_and_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["floaty", "drag-model", "--out", str(tmp_path / "out")])
     with pytest.raises(SystemExit) as end:
         app.main()

@@ -52,7 +52,7 @@ def test_every_experiment_is_a_row_or_known_not_to_be_the_papers() -> None:
 
 
 @pytest.mark.parametrize("name", ROWS)
-def test_a_row_shows_metrics_that_exist_and_says_where_the_paper_claims_them(name: str) -> None:
+def test_a_row_shows_existing_metrics_with_the_paper_s_source(name: str) -> None:
     assert set(ROWS[name].claims) <= set(METRICS)
     assert ROWS[name].claim
     assert ROWS[name].place
@@ -97,7 +97,7 @@ def test_a_flight_of_the_paper_is_the_flight_that_fly_flies(cli: Cli, flown: Pat
 
 
 @pytest.mark.long
-def test_the_report_tells_the_papers_value_and_ours(flown: Path) -> None:
+def test_the_report_has_the_papers_value_and_ours(flown: Path) -> None:
     page = Page((flown / "report.html").read_text(encoding="utf-8"))
     rows = {row[0]: row[1:] for row in page.tables["paper"]}
     told = content(flown)["rows"][0]["profiles"]
@@ -135,7 +135,7 @@ def test_every_seed_of_the_default_profile_must_hold(result: Row) -> None:
     assert bad.failed == ["max_x 1×"]
 
 
-def test_what_misses_the_paper_is_told_whatever_the_limits_say(result: Row) -> None:
+def test_a_miss_of_the_paper_is_reported_beside_the_limits(result: Row) -> None:
     row = PaperRow(
         "t",
         "c",
@@ -158,7 +158,7 @@ def test_what_misses_the_paper_is_told_whatever_the_limits_say(result: Row) -> N
 
 
 @pytest.mark.long
-def test_the_badges_say_which_kind_of_verdict_they_are(result: Row, tmp_path: Path) -> None:
+def test_the_badges_name_their_kind_of_verdict(result: Row, tmp_path: Path) -> None:
     good = trials(result, True, True)
     marks = (Instant("paper", 0.5, "paper: settled"),)
     row = PaperRow("t", "c", "p", {"rms_x": MetricClaim("0", 0.0)}, "why", marks=marks)

@@ -41,9 +41,7 @@ def test_a_spread_is_the_sample_s_deviation_in_the_displayed_unit() -> None:
         ("peak_rate", 1.5, 2.0, ""),
     ],
 )
-def test_a_value_misses_the_paper_s_on_the_side_where_it_is_worse(
-    metric: str, bound: float, value: float, missed: str
-) -> None:
+def test_a_value_misses_the_paper_s_when_worse(metric: str, bound: float, value: float, missed: str) -> None:
     row: Any = SimpleNamespace(claims={metric: SimpleNamespace(bound=bound)})
     assert Trials("floaty", (result(**{metric: value}),)).missed(row, metric) == missed
 
@@ -84,9 +82,7 @@ def test_new_gains_are_better_when_they_hover_no_worse() -> None:
 @pytest.mark.parametrize(
     ("delay_ms", "late_ms", "refused"), [(5, 9, False), (4.9, 9, True), (9, 4.9, True), (9, 5, False)]
 )
-def test_gains_that_bear_less_delay_than_the_link_has_are_refused(
-    delay_ms: float, late_ms: float, refused: bool
-) -> None:
+def test_gains_with_less_margin_than_the_link_fail(delay_ms: float, late_ms: float, refused: bool) -> None:
     axis: Any = SimpleNamespace(
         least=SimpleNamespace(delay=1e-3 * delay_ms),
         least_late=1e-3 * late_ms,

@@ -81,12 +81,12 @@ def test_a_model_error_scales_the_constants_of_its_part_and_no_other() -> None:
         (("tunnel.speed=7",), "", "lost"),
     ],
 )
-def test_outcomes_are_told_apart(settings: tuple[str, ...], fault: str, outcome: str) -> None:
+def test_outcomes_are_distinguished(settings: tuple[str, ...], fault: str, outcome: str) -> None:
     result = flight(settings, fault, 2.0)
     assert outcome_of(result) == outcome, result.metrics
 
 
-def test_a_flight_that_stopped_on_an_error_is_no_outcome_of_the_robot() -> None:
+def test_an_error_is_not_an_outcome_of_the_robot() -> None:
     result = flight((), "", 0.1)
     assert outcome_of(dataclasses.replace(result, outcome="error")) == "error"
 
@@ -125,9 +125,7 @@ def judged(expected: Expected, *cells: str) -> list[str]:
         (Expected(holds_to=1, lost_from=3), ("hh", "dl"), []),
     ],
 )
-def test_what_is_not_expected_is_told(
-    expected: Expected, cells: tuple[str, ...], surprises: list[str]
-) -> None:
+def test_surprises_are_reported(expected: Expected, cells: tuple[str, ...], surprises: list[str]) -> None:
     assert judged(expected, *cells) == surprises
 
 

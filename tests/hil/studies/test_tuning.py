@@ -77,9 +77,7 @@ def hovered(rms_m: float, outcome: str = "completed") -> Row:
         (hovered(0.02), hovered(0.01, "lost"), False, False),
     ],
 )
-def test_new_gains_are_judged_beside_the_old_ones_on_the_same_model(
-    old: Row, new: Row, better: bool, another: bool
-) -> None:
+def test_new_gains_are_judged_against_the_old_ones(old: Row, new: Row, better: bool, another: bool) -> None:
     tuned = SimpleNamespace(before=old)
     one = Round(tuned, (new,), "given.toml", Path("tuned.toml"))  # type: ignore[arg-type]
     assert (one.better, one.worth_another) == (better, another)
@@ -91,9 +89,7 @@ def test_new_gains_are_judged_beside_the_old_ones_on_the_same_model(
     ("arguments", "message"),
     [([], "its own gains lose the robot"), (["--repeat", "2"], "round 1 ends: identify-u1 lost the robot: ")],
 )
-def test_a_robot_that_is_lost_ends_it_with_a_clear_line(
-    cli: Cli, tmp_path: Path, arguments: list[str], message: str
-) -> None:
+def test_a_lost_robot_ends_in_one_line(cli: Cli, tmp_path: Path, arguments: list[str], message: str) -> None:
     profile = tmp_path / "bad.toml"
     profile.write_text('base = "cad"\n[controller]\ngain_y = 3.5\n')
     assert cli("tune", "--profile", profile, "--runs", tmp_path / "runs", *arguments) == 2
@@ -101,9 +97,7 @@ def test_a_robot_that_is_lost_ends_it_with_a_clear_line(
 
 
 @pytest.mark.long
-def test_a_round_from_the_authors_gains_and_the_plate_model_hovers_as_the_default_profile_does(
-    cli: Cli, tmp_path: Path
-) -> None:
+def test_tuning_from_the_authors_gains_hovers_like_the_default_profile(cli: Cli, tmp_path: Path) -> None:
     out = tmp_path / "mine.toml"
     arguments = (
         "--profile",

@@ -116,7 +116,7 @@ def test_a_clock_with_long_microseconds_is_measured_through_its_carries(flown: P
     assert found.causes == ("long microsecond: a microsecond of the boards' clocks lasts 1.0000 | 1.0119 us",)
 
 
-def test_what_no_known_cause_explains_is_said_so(flown: Path, tmp_path: Path) -> None:
+def test_an_unexplained_difference_is_reported(flown: Path, tmp_path: Path) -> None:
     found = two_boards(load_flown(flown), other(flown, tmp_path / "b", bumped))
     assert found.first is not None
     assert found.first.why == "none of the known causes"
@@ -128,9 +128,7 @@ def test_boards_with_the_same_counts_need_no_cause(flown: Path, tmp_path: Path) 
     assert (found.first, found.causes) == (None, ())
 
 
-def test_only_flights_of_two_boards_that_were_asked_for_alike_are_comparable(
-    flown: Path, tmp_path: Path
-) -> None:
+def test_only_equal_requests_on_two_boards_are_comparable(flown: Path, tmp_path: Path) -> None:
     a = load_flown(flown)
     b = other(flown, tmp_path / "b", lambda columns: None)
     assert comparable(a, b)

@@ -25,7 +25,7 @@ def test_time_passes_only_when_it_is_let(board: BareBoard) -> None:
     assert board.now_us == 12_500
 
 
-def test_expect_returns_the_line_at_the_millisecond_in_which_it_is_said(board: BareBoard) -> None:
+def test_expect_returns_a_line_in_its_millisecond(board: BareBoard) -> None:
     assert board.expect("gyro zero", within_ms=2000) == "imu: gyro zero found, 0.0 0.0 0.0 counts"
     said_us = board.now_us
     again = BareBoard(load_config())
@@ -43,7 +43,7 @@ def test_a_line_counts_once_and_those_before_it_not_at_all(board: BareBoard) -> 
     assert str(error.value).endswith("the board printed: nothing")
 
 
-def test_what_was_said_instead_is_shown(board: BareBoard) -> None:
+def test_other_lines_are_shown_on_failure(board: BareBoard) -> None:
     with pytest.raises(
         UnmetExpectation, match=r"from 0 ms on; the board printed:\n  imu: gyro zero found.*\n  super"
     ):

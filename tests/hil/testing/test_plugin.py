@@ -77,9 +77,7 @@ def test_expected(floaty):
 """
 
 
-def test_a_broken_controller_is_one_message_and_no_traceback_of_the_library(
-    pytester: pytest.Pytester,
-) -> None:
+def test_a_broken_controller_is_one_message_without_traceback(pytester: pytest.Pytester) -> None:
     make_project(pytester.path, LAW.replace("DT * memory", "sum([v for v in control.u]) * memory"))
     tests = pytester.makepyfile(BROKEN).name
     result = pytester.runpytest_inprocess()
@@ -173,9 +171,7 @@ def test_run_folders_are_kept_as_asked(pytester: pytest.Pytester, keep: str, num
     assert (pytester.path / "runs" / "pytest").is_dir() == bool(numbers)
 
 
-def test_what_a_fixture_of_the_module_has_flown_can_be_looked_at_by_every_test(
-    pytester: pytest.Pytester,
-) -> None:
+def test_every_test_can_examine_the_flight_of_a_module_fixture(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
         import pytest
 
@@ -246,16 +242,12 @@ def test_flights_take_what_the_mark_says_and_options_go_before_it(pytester: pyte
         ({"profiles": ["floaty"]}, Wanted(profiles=("as-flown",)), [choice(profile="as-flown")]),
     ],
 )
-def test_the_command_line_goes_before_the_mark_and_the_mark_before_the_usual(
-    marked: dict[str, object], wanted: Wanted, found: list[Options]
-) -> None:
+def test_command_line_overrides_mark(marked: dict[str, object], wanted: Wanted, found: list[Options]) -> None:
     assert choices_of(Marked.of(marked), wanted) == found
 
 
 @pytest.mark.long
-def test_paths_begin_at_the_root_folder_and_the_ini_file_names_the_usual_profile(
-    pytester: pytest.Pytester,
-) -> None:
+def test_paths_start_at_the_root_folder_and_ini_names_the_profile(pytester: pytest.Pytester) -> None:
     pytester.makeini("[pytest]\nfloaty_profile = strict.toml\n")
     (pytester.path / "strict.toml").write_text(STRICT)
     (pytester.path / "flights.py").write_text(
@@ -274,9 +266,7 @@ def test_paths_begin_at_the_root_folder_and_the_ini_file_names_the_usual_profile
 # What cannot be had
 
 
-def test_a_board_that_cannot_be_had_is_skipped_and_the_summary_says_so(
-    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_absent_board_is_skipped(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
     def runner_of(board: str, folder: Path, logic: object) -> None:
         if board != "python":
             raise ExportError("no C compiler on this machine")
@@ -312,9 +302,7 @@ def test_a_board_that_cannot_be_had_is_skipped_and_the_summary_says_so(
         (choice(board="c", link="udp://127.0.0.1:1"), (), "board c: --floaty-link udp://127.0.0.1:1: only python flies"),
     ],
 )  # fmt: skip
-def test_what_a_test_needs_decides_whether_it_is_flown(
-    chosen: Options, needs: tuple[str, ...], told: str
-) -> None:
+def test_a_test_s_needs_decide_whether_it_flies(chosen: Options, needs: tuple[str, ...], told: str) -> None:
     reason = why_not(chosen, needs)
     assert reason.startswith(told)
     assert bool(reason) == bool(told)
@@ -358,9 +346,7 @@ def test_a_wrong_mark_fails_the_collection_in_one_line(pytester: pytest.Pytester
         (["--floaty-link=udp://127.0.0.1:1", "-n2"], "flights in real time fly one at a time; omit -n"),
     ],
 )
-def test_an_option_that_cannot_be_is_refused_before_any_test(
-    pytester: pytest.Pytester, options: list[str], told: str
-) -> None:
+def test_a_bad_option_is_refused_first(pytester: pytest.Pytester, options: list[str], told: str) -> None:
     pytester.makepyfile(FLY)
     result = pytester.runpytest_inprocess(*options)
     assert result.ret in (pytest.ExitCode.USAGE_ERROR, pytest.ExitCode.INTERRUPTED)
@@ -387,9 +373,7 @@ def test_the_junit_file_has_hash_command_and_metrics(pytester: pytest.Pytester) 
 
 
 @pytest.mark.long
-def test_under_xdist_every_test_flies_into_folders_of_its_own_and_the_hashes_are_the_same(
-    pytester: pytest.Pytester,
-) -> None:
+def test_under_xdist_every_test_has_its_own_folders_and_the_same_hashes(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
         import pytest
 

@@ -60,7 +60,7 @@ def test_every_goal_is_within_reach_of_home_where_the_way_begins(way: Along, t_s
     assert goal == pickle.loads(pickle.dumps(way))(HOME, 0).at(round(t_s * 1e6))
 
 
-def test_a_way_holds_every_goal_as_long_as_it_says_and_the_last_to_the_end() -> None:
+def test_a_path_holds_every_goal_for_its_time_and_the_last_to_the_end() -> None:
     way = Waypoints(0.5, ((0.01, 0.0, 0.0, 0.0), (0.02, 0.0, 0.0, 0.0)))
     assert [way(t)[0] for t in (0.0, 0.49, 0.5, 0.99, 1.0, 9.5)] == [0.0, 0.0, 0.01, 0.01, 0.02, 0.02]
 
@@ -81,6 +81,6 @@ def test_a_failing_way_shrinks_to_one_goal_on_one_axis() -> None:
         (lambda: faults("push.y", size=(30.0, 40.0)), "size 30..40: expected some of -20..20"),
     ],
 )
-def test_what_no_flight_can_have_is_one_line(make: object, told: str) -> None:
+def test_impossible_arguments_are_one_line(make: object, told: str) -> None:
     with pytest.raises(LabError, match=told.replace(".", r"\.")):
         make()  # type: ignore[operator]

@@ -40,9 +40,7 @@ def test_voltage_falls_with_the_charge(charge: float, less: float) -> None:
 
 
 @given(st.floats(0.05, 1.0), st.floats(0.1, 12.0), st.integers(1, 4), st.floats(0.0, 0.5))
-def test_power_leaves_the_terminals_and_the_resistance_heats(
-    charge: float, power: float, cells: int, sag_V: float
-) -> None:
+def test_power_leaves_and_the_resistance_heats(charge: float, power: float, cells: int, sag_V: float) -> None:
     config = BatteryConfig(charge=charge, cells=cells)
     battery = Battery(config)
     battery.sag_V = sag_V
@@ -151,7 +149,7 @@ def test_the_estimate_of_a_short_hover_is_the_endurance(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_hover_draws_what_the_paper_says(tmp_path: Path) -> None:
+def test_a_hover_draws_the_paper_s_power(tmp_path: Path) -> None:
     result = flown(tmp_path / "run", "power", duration_s=15.0)
     assert result.passed
     assert result.metrics["power"] == pytest.approx(3.4, rel=0.10)

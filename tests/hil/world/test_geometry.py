@@ -111,7 +111,6 @@ def test_at_its_trim_every_geometry_carries_its_weight_and_nothing_else(geometry
     assert torque == pytest.approx([0, 0, 0], abs=1e-12)
 
 
-CORNERS = "[[0.05, 0.0], [0.115, 0.0], [0.115, 0.115], [0.0, 0.115]]"
 IMPOSSIBLE: Mapping[str, str] = {
     "geometry.base_side=0.3": r"base_side = 0\.3: leaves no flaps inside footprint = 0\.23",
     "geometry.strip_width=0.08": r"strip_width = 0\.08: leaves no flat part of the flap, which is 0\.075 wide",
@@ -131,7 +130,7 @@ IMPOSSIBLE: Mapping[str, str] = {
 
 
 @pytest.mark.parametrize("override", IMPOSSIBLE)
-def test_a_robot_that_cannot_be_is_refused_in_one_line(override: str) -> None:
+def test_an_impossible_robot_is_refused_in_one_line(override: str) -> None:
     with pytest.raises(LabError, match=IMPOSSIBLE[override]) as caught:
         load_config(overrides=[override])
     assert "\n" not in str(caught.value)

@@ -113,7 +113,7 @@ def test_gusts_grow_towards_the_edge_and_then_no_more() -> None:
     assert flow(plant, 0, 0, 1.0)[0] == pytest.approx(0.5 * u)
 
 
-def test_knobs_refuse_what_is_no_wind() -> None:
+def test_knobs_refuse_invalid_wind() -> None:
     tunnel = make().tunnel
     for turn in (
         lambda: tunnel.set_fan_factor(math.nan),
