@@ -37,8 +37,8 @@ class Demonstrations:
 def observe_rows(parameters: Any, estimator: Any, states: Rows, previous: Rows, out: Rows) -> None:
     """Write the observation of every row."""
     for n in range(len(states)):
-        estimator[0].now[:] = states[n]
-        observe(parameters[0], estimator[0], previous[n], out[n])
+        estimator.now[:] = states[n]
+        observe(parameters, estimator, previous[n], out[n])
 
 
 def demonstrations_of(log: pa.Table, config: FirmwareConfig) -> Demonstrations:
