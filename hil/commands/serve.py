@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -32,9 +31,8 @@ from hil.errors import LabError, require
 if TYPE_CHECKING:
     from hil.config import LabConfig
     from hil.live.feed import LiveView
-    from hil.servers.motive import Streaming
-    from hil.servers.serial_server import Address
-    from hil.servers.server import Ends, Server
+    from hil.servers.motive import VirtualMotive
+    from hil.servers.server import Opened, Server
 
 UDP_PORT = 19850  # where cflib looks for boards
 RADIO_PORT = 19840
@@ -125,9 +123,9 @@ def serve(asked: ServeOptions) -> int:
     from hil.laboratory.lockstep import debugger, image_at
     from hil.laboratory.robot import PYTHON_BOARD
     from hil.servers.live_faults import LiveFaults
-    from hil.servers.motive import streaming_of
     from hil.servers.serial_server import parse_addresses
-    from hil.servers.server import Server, Service
+    from hil.servers.server import Doors, Server, Service
+    from hil.servers.swarm import Swarm
 
     markers = (MARKERS_ON,) if asked.motive else ()
     poses = (
@@ -143,31 +141,31 @@ def serve(asked: ServeOptions) -> int:
     stack = click.get_current_context().with_resource(ExitStack())
     port = debugger(asked.gdb, Path(asked.board or ""), stack)
     executor = PYTHON_BOARD if asked.board is None else image_at(asked.board, None, port)
+    plan = Service(config, 1, asked.seed, bool(ends), planned, asked.state, executor)
+    doors = Doors(asked.udp, asked.radio_port if asked.radio else None, ends, station, asked.motive)
+    swarm = stack.enter_context(closing(Swarm(plan, asked.boards, doors, say)))
     view = open_live(asked.target)
-    plan = Service(config, asked.boards, asked.seed, bool(ends), planned, asked.state, executor)
-    server = Server(plan, say, view)
-    try:
-        streaming = streaming_of(config.capture) if asked.motive else None
-        _open_ends(server.ends, asked.udp, asked.radio_port if asked.radio else None, ends, streaming)
-        if station is not None:
-            for robot in server.ends.robots:
-                robot.fly(station == "poses")
-        faults = LiveFaults(server, say if view is None else partial(_answer, view, server))
-        faults.listen(sys.stdin)
-        stops = stop_signals()
-        say("serving; Ctrl-C ends")
+    server = stack.enter_context(closing(Server(plan, say, view)))
+    answer = say if view is None else partial(_answer, view, server)
+    others = swarm.wait()
+    _tell([server.open(doors, [other.dongles for other in others]), *others])
+    motive = stack.enter_context(closing(_motive(server, config, asked.boards))) if asked.motive else None
+    swarm.listen(server.clock.readers, answer, motive)
+    faults = LiveFaults(server, answer, swarm.terminals)
+    faults.listen(sys.stdin)
+    stops = stop_signals()
+    say("serving; Ctrl-C ends")
 
-        def stopping() -> bool:
-            for line in view.lines() if view is not None else ():
-                faults.take(line, server.lab.now_us)
-            return bool(stops)
+    def stopping() -> bool:
+        for line in view.lines() if view is not None else ():
+            faults.take(line, server.lab.now_us)
+        return bool(stops)
 
-        server.run(stopping)
-    finally:
-        server.ends.close()
+    server.run(stopping)
+    swarm.close()
     close_live(view)
-    if server.ends.motive is not None and server.ends.motive.malformed:
-        say(f"motive could not read {server.ends.motive.malformed} packets")
+    if motive is not None and motive.malformed:
+        say(f"motive could not read {motive.malformed} packets")
     say(f"stopped; time stood still for {server.clock.stood_still_us / 1000:.0f} ms")
     return 0
 
@@ -205,27 +203,30 @@ def _check_options(asked: ServeOptions) -> None:
         raise LabError(f"--gdb {gdb}: needs one board and an image as --board")
 
 
-def _open_ends(
-    ends: Ends,
-    udp: int | None,
-    radio_port: int | None,
-    serial: Sequence[Address],
-    streaming: Streaming | None,
-) -> None:
-    """Open what programs connect to, and say where it is."""
-    if radio_port is not None:
-        say(radio_hint(ends.serve_radio(radio_port), [robot.uri for robot in ends.robots]))
-    if udp is not None:
-        say(f"udp    {' '.join(ends.serve_udp(udp))}")
-    if serial:
-        say(f"mavlink {' '.join(ends.serve_mavlink(serial))}")
-    if streaming is not None:
-        port = ends.serve_motive(streaming).port
-        options = (",multicast" if streaming.multicast else "") + (",z-up" if streaming.up == "z" else "")
-        say(f"motive optitrack:127.0.0.1:{port}{options}")
+def _motive(server: Server, config: LabConfig, count: int) -> VirtualMotive:
+    """Open a Motive that tracks `count` robots, and say where it is."""
+    from hil.servers.motive import streaming_of
+    from hil.servers.server import open_motive
+
+    streaming = streaming_of(config.capture)
+    motive = open_motive(streaming, server.robot, server.clock.readers, count)
+    options = (",multicast" if streaming.multicast else "") + (",z-up" if streaming.up == "z" else "")
+    say(f"motive optitrack:127.0.0.1:{motive.port}{options}")
+    return motive
 
 
-def radio_hint(address: str, uris: list[str]) -> str:
+def _tell(robots: list[Opened]) -> None:
+    """Say where clients find the robots."""
+    if robots[0].dongles:
+        say(radio_hint(robots[0].dongles, [robot.radio for robot in robots]))
+    if robots[0].udp:
+        say(f"udp    {' '.join(robot.udp for robot in robots)}")
+    if robots[0].mavlink:
+        say(f"mavlink {' '.join(robot.mavlink for robot in robots)}")
+
+
+def radio_hint(port: int, uris: list[str]) -> str:
     """Return the text to type before a program's name so that it finds the dongle, and the addresses of the boards."""
     folder = Path(__file__).parents[1] / "servers" / "dongle_site"
-    return f"radio  {' '.join(uris)}\nuse    env PYTHONPATH={shlex.quote(str(folder))} FLOATY_DONGLE={address} PROGRAM"
+    variables = f"PYTHONPATH={shlex.quote(str(folder))} FLOATY_DONGLE=127.0.0.1:{port}"
+    return f"radio  {' '.join(uris)}\nuse    env {variables} PROGRAM"

@@ -42,7 +42,7 @@ class Script:
         self.robot = self.server.lab.robots[0]
         self._next_us = 0
         if station:
-            self.server.ends.robots[0].fly(absolute=True)
+            self.server.served.fly(absolute=True)
         else:
             self.robot.seen_by(lambda frame, now_us, _: self._feed(frame, now_us))
         self.cf = SimpleNamespace(

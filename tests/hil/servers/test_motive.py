@@ -238,8 +238,7 @@ def test_markers_of_a_body_that_is_not_tracked_have_no_label() -> None:
 def test_markers_of_all_bodies_share_a_frame_and_are_told_apart() -> None:
     lab = MotiveBench()
     lab.motive.close()
-    names = {1: "floaty", 2: "floaty2"}
-    lab.motive = VirtualMotive(Streaming(0, (3, 1), False), names, lab.readers, PLACES)
+    lab.motive = VirtualMotive(Streaming(0, (3, 1), False), 2, lab.readers, PLACES)
     client = NatNetSocket(lab)
     client.connect()
     for _ in range(2):  # nothing is left of the frame before
@@ -259,7 +258,7 @@ def test_markers_of_all_bodies_share_a_frame_and_are_told_apart() -> None:
 def test_bodies_of_one_exposure_share_a_frame() -> None:
     lab = MotiveBench()
     lab.motive.close()
-    lab.motive = VirtualMotive(Streaming(0, (3, 1), False), {1: "floaty", 2: "floaty2"}, lab.readers)
+    lab.motive = VirtualMotive(Streaming(0, (3, 1), False), 2, lab.readers)
     client = NatNetSocket(lab)
     client.connect()
     lab.motive.take(1, seen(1), 0)
@@ -269,6 +268,26 @@ def test_bodies_of_one_exposure_share_a_frame() -> None:
     assert [body.id for body in found] == [1, 2]
     client.say(MessageId.REQUEST_MODELDEF)
     assert [body.name for body in decode(client.hear(), (3, 1)).bodies] == ["floaty", "floaty2"]
+    client.close()
+    lab.motive.close()
+
+
+def test_a_body_whose_process_is_late_is_not_tracked_and_delays_the_others_by_a_frame_at_most() -> None:
+    lab = MotiveBench()
+    lab.motive.close()
+    lab.motive = VirtualMotive(Streaming(0, (4, 1), False), 3, lab.readers)
+    client = NatNetSocket(lab)
+    client.connect()
+    for body in (3, 1):
+        lab.motive.take(body, seen(body), 0)
+    assert client.hears_nothing()
+    lab.motive.take(3, seen(4), 0)
+    late = decode(client.hear(), (4, 1))
+    assert [(body.id, body.valid) for body in late.bodies] == [(1, True), (2, False), (3, True)]
+    assert late.bodies[2].p == pytest.approx(FROM_MOTIVE.T @ seen(3).p_WB, abs=1e-6)
+    for body in (2, 1):
+        lab.motive.take(body, seen(body), 0)
+    assert all(body.valid for body in decode(client.hear(), (4, 1)).bodies)
     client.close()
     lab.motive.close()
 
@@ -335,7 +354,7 @@ def test_a_taken_port_is_said_in_one_line(lab: MotiveBench) -> None:
         LabError,
         match=rf"^natnet port {lab.motive.port}: Address already in use; --set capture.port=0 takes",
     ):
-        VirtualMotive(Streaming(lab.motive.port, (4, 1), False), {1: "floaty"}, {})
+        VirtualMotive(Streaming(lab.motive.port, (4, 1), False), 1, {})
 
 
 @pytest.mark.parametrize("interface", [HOST, "0.0.0.0"], ids=["loopback", "any"])

@@ -1,4 +1,4 @@
-"""Where several robots of one server start."""
+"""Where the robots of a swarm start."""
 
 import pytest
 
@@ -8,9 +8,7 @@ from hil.servers.server import Server, Service
 
 @pytest.mark.parametrize(("spacing", "sides"), [(0.0, (0.0, 0.0, 0.0, 0.0)), (0.5, (0.0, 0.5, -0.5, 1.0))])
 def test_robots_of_one_room_start_side_by_side(spacing: float, sides: tuple[float, ...]) -> None:
-    server = Server(Service(load_config("floaty", [f"flight.spacing={spacing}"]), 4), lambda line: None)
-    try:
-        places = [served.robot.body.p_WB.tolist() for served in server.ends.robots]
-        assert places == [[0.0, side, 1.15] for side in sides]
-    finally:
-        server.ends.close()
+    config = load_config("floaty", [f"flight.spacing={spacing}"])
+    for number, side in enumerate(sides, 1):
+        server = Server(Service(config, number), lambda line: None)
+        assert server.robot.body.p_WB.tolist() == [0.0, side, 1.15]

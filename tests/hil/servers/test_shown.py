@@ -12,8 +12,8 @@ def test_rows_of_a_served_robot_say_what_it_looks_like() -> None:
     server = Server(Service(load_config()), lambda text: None, watcher)
     server.lab.end_at(1_000_000)
     server.lab.run()
-    server.ends.close()
+    server.close()
     look = Look.read(stored_in(watcher.batches[0].schema.metadata, "look"))
-    own = server.ends.robots[0].robot.body.look
+    own = server.robot.body.look
     assert [part.name for part in look.parts] == [part.name for part in own.parts]
     assert len(look.outline) == len(own.outline) > 0
