@@ -140,7 +140,7 @@ class Server:
         self.served = ServedRobot(number, site, say, plan.mavlink, plan.state, self._fail)
         robot = self.robot = self.served.robot
         robot.body.hold()
-        self.lab.robots.append(robot)
+        self.lab.add(robot)
         self.switchboard = Switchboard(robot)
         self._holder = Holder(robot, self._let_go)
         robot.watch(0)

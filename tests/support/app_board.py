@@ -50,7 +50,7 @@ class AppBoard:
 class AppFirmware:
     """The app that has booted, stepped with every sample of the IMU, which has its own gyro."""
 
-    flashed = scheduler = usage = clock_us = mavlink = next_wake_us = None
+    flashed = scheduler = usage = clock_us = mavlink = None
     overrun = ""
     variables = ()
 
@@ -103,7 +103,7 @@ def main(library: str, *overrides: str) -> None:
         served = ServedRobot(1, site, print)
         served.robot.body.hold()
         served.robot.watch(0)
-        lab.robots.append(served.robot)
+        lab.add(served.robot)
         print("use", f"{VARIABLE}=127.0.0.1:{served.serve_radio(0, clock.readers)}")
         print("udp", served.serve_udp(0, clock.readers))
         print("radio", served.uri)

@@ -102,7 +102,6 @@ def test_a_board_without_power_rests_and_boots_with_its_memories_and_a_clock_tha
     before, counts = robot.firmware, robot.firmware.signals.count.tolist()
     served.nrf51.hear(bench.server.lab.now_us, b"\xff\xfe\x02")  # the power switch: system off
     assert served.nrf51.power is Power.RADIO_ONLY
-    assert robot.next_wake_us is None
     bench.fly(0.5)
     assert before.signals.count.tolist() == counts
     served.nrf51.hear(bench.server.lab.now_us, b"\xff\xfe\x03")  # system on
@@ -254,7 +253,7 @@ def test_a_holder_lets_nobody_go_who_does_not_fly() -> None:
     lab = Laboratory(FreeRunning())
     robot = ServedRobot(1, site_in(lab), print).robot
     robot.body.hold()
-    lab.robots.append(robot)
+    lab.add(robot)
     gone: list[int] = []
     Holder(robot, gone.append)
     robot.watch(0)
@@ -270,7 +269,7 @@ def test_a_rebooted_board_talks_on_its_serial_line_by_the_laboratorys_clock() ->
     robot = Robot(site, Ports(nobody_listens, uart=uart))
     heard: list[int] = []
     uart.connect(robot.uart_ready, lambda now_us, data: heard.append(now_us))
-    lab.robots.append(robot)
+    lab.add(robot)
     robot.watch(0)
     lab.events.at(2 * SECOND_US, lambda _: robot.cut_power())
     lab.events.at(3 * SECOND_US, robot.boot)

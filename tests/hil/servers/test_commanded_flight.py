@@ -39,7 +39,7 @@ class Script:
         self.said: list[str] = []
         self.server = Server(Service(load_config()), self.said.append)
         self.server.lab.clock = FreeRunning()
-        self.robot = self.server.lab.robots[0]
+        self.robot = self.server.robot
         self._next_us = 0
         if station:
             self.server.served.fly(absolute=True)
