@@ -99,8 +99,12 @@ class Paced:
 
     def now_us(self) -> int:
         """Return the simulated time by the wall clock; only after `start`."""
-        assert self._start_ns is not None
-        return (time.monotonic_ns() - self._start_ns) // 1000
+        return self.wall_us() - self.began_us
+
+    @property
+    def began_us(self) -> int:
+        """The wall clock at simulated time 0; 0 before `start`."""
+        return 0 if self._start_ns is None else self._start_ns // 1000
 
     @staticmethod
     def wall_us() -> int:

@@ -209,7 +209,7 @@ def _motive(server: Server, config: LabConfig, count: int) -> VirtualMotive:
     from hil.servers.server import open_motive
 
     streaming = streaming_of(config.capture)
-    motive = open_motive(streaming, server.robot, server.clock.readers, count)
+    motive = open_motive(streaming, server.robot, server.clock, count)
     options = (",multicast" if streaming.multicast else "") + (",z-up" if streaming.up == "z" else "")
     say(f"motive optitrack:127.0.0.1:{motive.port}{options}")
     return motive

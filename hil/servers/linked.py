@@ -72,7 +72,7 @@ class StationProcess:
         self._heard = 0  # bytes of the station's output
         self._said = ""  # its last line
         station_uri, self._environment = self._serve(uri, config.serial.baud)
-        motive = self._motive = open_motive(Streaming(0, (4, 1), multicast=False), self.robot, self._readers)
+        motive = self._motive = open_motive(Streaming(0, (4, 1), multicast=False), self.robot, lab.clock)
         self._command = [
             sys.executable, "-m", "hil.commands", "station", request.experiment.reference, "--link", station_uri,
             "--mocap", f"optitrack:127.0.0.1:{motive.port},body={name_of(1)},y-up",

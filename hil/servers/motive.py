@@ -131,10 +131,15 @@ def name_of(number: int) -> str:
 
 
 class VirtualMotive:
-    """Tracks `count` bodies, each with the same `markers`, (N, 3) [m] in B."""
+    """Tracks `count` bodies, each with the same `markers`, (N, 3) [m] in B; `period_us` is that of the cameras."""
 
     def __init__(
-        self, settings: Streaming, count: int, readers: Readers, markers: Points = NO_POINTS
+        self,
+        settings: Streaming,
+        count: int,
+        readers: Readers,
+        markers: Points = NO_POINTS,
+        period_us: int = 10_000,
     ) -> None:
         self.malformed = 0
         self._version = settings.version
@@ -158,6 +163,8 @@ class VirtualMotive:
         }
         self._number = 0
         # Of the frame being assembled.
+        self._tolerance_us = period_us // 2
+        self._exposure_us = 0
         self._seen: dict[int, BodyPose] = {}
         self._exposed = self._received = 0  # ticks
         self._labelled: list[LabelledMarker] = []
@@ -183,14 +190,25 @@ class VirtualMotive:
         for each in (self._socket, *self._groups):
             each.close()
 
-    def take(self, body: int, frame: MocapFrame, now_us: int, sighting: Sighting | None = None) -> None:
-        """Take a body's frame of another clock, whose time is `now_us`; the last body completes a frame.
+    def take(
+        self,
+        body: int,
+        frame: MocapFrame,
+        now_us: int,
+        sighting: Sighting | None = None,
+        began_us: int = 0,
+    ) -> None:
+        """Take a body's frame of another clock, whose time is `now_us`, and which began at `began_us` of all bodies' clock.
 
-        So does one that comes again: in that frame the missing ones, whose processes are late, are not tracked.
+        The last body completes a frame; so does one of a later exposure. A body that comes after that is not tracked.
         """
-        sent = self._ticks()
-        if body in self._seen:
-            self._stream(sent)
+        sent, later_us = self._ticks(), began_us + frame.t_us - self._exposure_us
+        if later_us < -self._tolerance_us:
+            return
+        if later_us > self._tolerance_us:
+            if self._seen:
+                self._stream(sent)
+            self._exposure_us += later_us
         arrival_us = now_us if frame.received_us is None else frame.received_us
         self._exposed, self._received = (
             max(0, sent - (now_us - t_us) * _TICKS_PER_US)  # not before the start

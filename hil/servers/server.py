@@ -9,7 +9,7 @@ from pathlib import Path
 from firmware_py.rtos import WatchdogError
 from firmware_py.wire.mavlink_numbers import CommandResult
 from ground_station.trajectory import Goal, Hold
-from hil.clock import Paced, Readers
+from hil.clock import Paced
 from hil.config import LabConfig
 from hil.crazyflie.nrf51 import Power
 from hil.devices.board_firmware import Executor
@@ -37,12 +37,17 @@ from hil.world.body import Channel
 BUTTON_US = 5_000_000  # off, or in the bootloader without a client: then the button is pressed
 
 
-def open_motive(settings: Streaming, robot: Robot, readers: Readers, count: int = 1) -> VirtualMotive:
+def open_motive(settings: Streaming, robot: Robot, clock: Paced, count: int = 1) -> VirtualMotive:
     """Open a Motive that tracks `count` bodies, and a robot as the first."""
     markers = robot.body.markers.places if robot.config.markers.enabled else NO_POINTS
-    motive = VirtualMotive(settings, count, readers, markers)
-    robot.seen_by(partial(motive.take, 1))
+    motive = VirtualMotive(settings, count, clock.readers, markers, robot.config.mocap.period_us)
+    show(robot, clock, partial(motive.take, 1))
     return motive
+
+
+def show(robot: Robot, clock: Paced, take: Callable[..., None]) -> None:
+    """Pass a robot's frames of the cameras to `VirtualMotive.take`."""
+    robot.seen_by(lambda frame, now_us, sighting: take(frame, now_us, sighting, clock.began_us))
 
 
 class Shown:

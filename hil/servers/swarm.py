@@ -17,7 +17,7 @@ from hil.clock import Readers
 from hil.errors import LabError
 from hil.servers.live_faults import LiveFaults
 from hil.servers.motive import VirtualMotive
-from hil.servers.server import Doors, Opened, Server, Service
+from hil.servers.server import Doors, Opened, Server, Service, show
 
 FORK = multiprocessing.get_context("fork")  # a robot starts in 0.1 s with what is loaded already
 END_TIMEOUT_S = 10.0  # for a process to end in order
@@ -123,7 +123,7 @@ def _serve_apart(plan: Service, doors: Doors, pipe: Connection) -> None:
     try:
         opened = server.open(doors)
         if doors.motive:
-            server.robot.seen_by(partial(calling("take"), plan.number))
+            show(server.robot, server.clock, partial(calling("take"), plan.number))
         calling("opened")(plan.number, opened)
         server.clock.readers[pipe.fileno()] = read
         read(0)  # an empty line when robot 1 starts

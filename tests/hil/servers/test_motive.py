@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -272,22 +273,33 @@ def test_bodies_of_one_exposure_share_a_frame() -> None:
     lab.motive.close()
 
 
-def test_a_body_whose_process_is_late_is_not_tracked_and_delays_the_others_by_a_frame_at_most() -> None:
+def test_a_body_whose_process_is_late_is_not_tracked_in_one_frame_and_is_in_time_in_the_next() -> None:
     lab = MotiveBench()
     lab.motive.close()
     lab.motive = VirtualMotive(Streaming(0, (4, 1), False), 3, lab.readers)
     client = NatNetSocket(lab)
     client.connect()
+
+    def expose(body: int, count: int) -> None:
+        """Clocks of their own, which began at different times."""
+        frame = replace(seen(10 * count + body), t_us=1_000_000 * body + 10_000 * count)
+        lab.motive.take(body, frame, frame.t_us, None, 50_000_000 - 1_000_000 * body)
+
     for body in (3, 1):
-        lab.motive.take(body, seen(body), 0)
+        expose(body, 1)
     assert client.hears_nothing()
-    lab.motive.take(3, seen(4), 0)
+    expose(1, 2)
     late = decode(client.hear(), (4, 1))
     assert [(body.id, body.valid) for body in late.bodies] == [(1, True), (2, False), (3, True)]
-    assert late.bodies[2].p == pytest.approx(FROM_MOTIVE.T @ seen(3).p_WB, abs=1e-6)
-    for body in (2, 1):
-        lab.motive.take(body, seen(body), 0)
-    assert all(body.valid for body in decode(client.hear(), (4, 1)).bodies)
+    assert late.bodies[2].p == pytest.approx(FROM_MOTIVE.T @ seen(13).p_WB, abs=1e-6)
+    for body, count in ((2, 1), (3, 2)):
+        expose(body, count)
+    assert client.hears_nothing()
+    expose(2, 2)
+    bodies = decode(client.hear(), (4, 1)).bodies
+    assert [body.valid for body in bodies] == [True] * 3
+    assert bodies[1].p == pytest.approx(FROM_MOTIVE.T @ seen(22).p_WB, abs=1e-6)
+    assert client.hears_nothing()
     client.close()
     lab.motive.close()
 
