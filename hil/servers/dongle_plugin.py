@@ -22,6 +22,7 @@ VARIABLE = "FLOATY_DONGLE"
 DEFAULT_SERVER = "127.0.0.1:19840"
 SERIAL = "F10A7Y0001"
 CONNECT_TIMEOUT_S = 2.0
+READY_TIMEOUT_S = 60.0  # a server may compile first
 
 CONTROL, WRITE, READ, PORTS = b"C", b"W", b"R", b"P"
 HEAD_SIZE = 3
@@ -107,7 +108,7 @@ class Connection:
         self._requests: dict[int, bytes] = {}
         self._found: dict[tuple[bytes, ...], list[Line]] = {}  # by the settings of the dongle
         try:
-            ports = self._lines[0].read(CONNECT_TIMEOUT_S)
+            ports = self._lines[0].read(READY_TIMEOUT_S)
             for other in range(0, len(ports), 2):
                 self._lines.append(Line((host, int.from_bytes(ports[other : other + 2]))))
         except OSError:

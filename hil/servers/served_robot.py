@@ -18,7 +18,7 @@ from ground_station.tracker import tracker_of
 from ground_station.trajectory import Goal, Hold
 from hil.clock import Readers
 from hil.config import LabConfig
-from hil.crazyflie.nrf51 import RATES, AirSettings, Band, Nrf51
+from hil.crazyflie.nrf51 import RATES, AirSettings, Band, Nrf51, ToPeers
 from hil.crazyflie.radio_line import POLL_PERIOD_US
 from hil.crazyflie.shockburst import Air
 from hil.devices.board import InjectFailure, KeptMemory, unsupported
@@ -125,6 +125,7 @@ class ServedRobot:
         mavlink: bool = False,
         state: Path | None = None,
         fail: InjectFailure = unsupported,
+        to_peers: ToPeers = lambda *_: None,
     ) -> None:
         config, events, rng = site.config, site.events, site.streams.radio
         self._rng = rng
@@ -141,8 +142,8 @@ class ServedRobot:
         self.udp_radio = VirtualRadio(patient, events, rng, air, wire_us)
         settings = AirSettings(CHANNEL, config.radio.bits_per_second, address_of(number))
         chip = bytes((number, 0x10, 0xA7, 0xF1, 0x0A, 0xC0))
-        band = Band(events, rng.random)
-        self.nrf51 = Nrf51(settings, chip, config.radio.downlink_queue, band, self, air, wire_us)
+        self.band = Band(events, rng.random, to_peers)
+        self.nrf51 = Nrf51(settings, chip, config.radio.downlink_queue, self.band, self, air, wire_us)
         memory.eeprom[:CONFIG_SIZE] = _factory_config(number, config)
         self._files = BoardFiles(state, number, memory) if state is not None else None
         if self._files is not None:

@@ -11,7 +11,7 @@ from firmware_py.wire.mavlink_numbers import CommandResult
 from ground_station.trajectory import Goal, Hold
 from hil.clock import Paced
 from hil.config import LabConfig
-from hil.crazyflie.nrf51 import Power
+from hil.crazyflie.nrf51 import AirSettings, Power, ToPeers
 from hil.devices.board_firmware import Executor
 from hil.devices.markers import NO_POINTS
 from hil.laboratory.channels import (
@@ -127,10 +127,16 @@ class Service:
 class Server:
     """Releases a robot when it flies and puts it back when it is lost; serve it to clients, then `run`.
 
-    `say` gets lines for the user, `onlooker` sees the robot.
+    `say` gets lines for the user, `onlooker` sees the robot, `to_peers` gets the board's packets to those of other robots.
     """
 
-    def __init__(self, plan: Service, say: Callable[[str], None], onlooker: Onlooker | None = None) -> None:
+    def __init__(
+        self,
+        plan: Service,
+        say: Callable[[str], None],
+        onlooker: Onlooker | None = None,
+        to_peers: ToPeers = lambda *_: None,
+    ) -> None:
         number, config = plan.number, plan.config
         config = config.model_copy(update={"flight": config.flight.beside(number)})
         if plan.mavlink:
@@ -142,7 +148,7 @@ class Server:
         self._planned = False  # its faults
         streams = Streams.of_seed(plan.seed + number - 1)
         site = Site(config, self.lab.events, streams, self._note, plan.executor)
-        self.served = ServedRobot(number, site, say, plan.mavlink, plan.state, self._fail)
+        self.served = ServedRobot(number, site, say, plan.mavlink, plan.state, self._fail, to_peers)
         robot = self.robot = self.served.robot
         robot.body.hold()
         self.lab.add(robot)
@@ -165,6 +171,10 @@ class Server:
         if doors.station is not None:
             served.fly(doors.station == "poses")
         return Opened(served.uri, dongles, udp, mavlink)
+
+    def hear_peer(self, settings: AirSettings, packet: bytes) -> None:
+        """Let the board hear a packet of another robot's board."""
+        self.served.band.carry(self.lab.now_us, settings, packet)
 
     def close(self) -> None:
         """Close what is open to clients."""

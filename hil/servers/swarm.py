@@ -1,8 +1,8 @@
 """The robots 2, 3, ... of `floaty serve --boards N`: each has a process of its own, forked from that of robot 1.
 
 Each process opens its robot's connections. A pipe to robot 1's process carries what all share: where clients find the
-robot, lines for the user, poses for Motive, and typed lines. A message to robot 1's process is the name of a call and its
-arguments. One to another robot is a typed line, or None: the end.
+robot, lines for the user, poses for Motive, packets between boards, and typed lines. A message is the name of a call and
+its arguments.
 """
 
 import multiprocessing
@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 from multiprocessing.connection import Connection
 
-from hil.clock import Readers
+from hil.crazyflie.nrf51 import AirSettings
 from hil.errors import LabError
 from hil.servers.live_faults import LiveFaults
 from hil.servers.motive import VirtualMotive
@@ -48,25 +48,39 @@ class Swarm:
                 self._read(number, 0)
         return list(self._opened.values())
 
-    def listen(self, readers: Readers, answer: Call, motive: VirtualMotive | None) -> None:
-        """Start the robots; their answers to typed lines go to `answer`, their frames of the cameras to a Motive."""
-        self._calls["answer"] = answer
+    def listen(self, server: Server, answer: Call, motive: VirtualMotive | None) -> None:
+        """Start the robots beside the first, which `server` has; their answers to typed lines go to `answer`."""
+
+        def hear(number: int, settings: AirSettings, packet: bytes) -> None:
+            server.hear_peer(settings, packet)
+            self.to_peers(settings, packet, number)
+
+        self._calls |= {"answer": answer, "hear": hear}
         if motive is not None:
             self._calls["take"] = motive.take
         for number, pipe in self._pipes.items():
-            readers[pipe.fileno()] = partial(self._read, number)
-            pipe.send("")
+            server.clock.readers[pipe.fileno()] = partial(self._read, number)
+            pipe.send(("type", ("",)))
 
     @property
     def terminals(self) -> dict[int, Callable[[str], None]]:
         """Return what takes the lines that are typed for a robot, by its number."""
-        return {number: pipe.send for number, pipe in self._pipes.items()}
+        return {number: partial(self._type, number) for number in self._pipes}
+
+    def _type(self, number: int, line: str) -> None:
+        self._pipes[number].send(("type", (line,)))
+
+    def to_peers(self, settings: AirSettings, packet: bytes, sender: int = 1) -> None:
+        """Pass a board's packet to those of the other processes."""
+        for number, pipe in self._pipes.items():
+            if number != sender:
+                pipe.send(("hear", (settings, packet)))
 
     def close(self) -> None:
         """Let the processes end in order."""
         for pipe in self._pipes.values():
             with suppress(OSError):
-                pipe.send(None)
+                pipe.send(("end", ()))
         for pipe, process in zip(self._pipes.values(), self._processes, strict=True):
             with suppress(EOFError, OSError):
                 while pipe.poll(END_TIMEOUT_S):
@@ -108,18 +122,23 @@ def _serve_apart(plan: Service, doors: Doors, pipe: Connection) -> None:
 
     def read(now_us: int) -> None:
         try:
-            line = pipe.recv()
+            name, arguments = pipe.recv()
         except (EOFError, ConnectionResetError):  # robot 1's process was killed
-            line = None
-        if line is None:
-            ended.append(now_us)
-            del server.clock.readers[pipe.fileno()]
-        else:
-            faults.take(line, now_us)
+            name, arguments = "end", ()
+        calls[name](*arguments)
+
+    def end() -> None:
+        ended.append(plan.number)
+        del server.clock.readers[pipe.fileno()]
 
     ended: list[int] = []
-    server = Server(plan, calling("say"))
+    server = Server(plan, calling("say"), None, partial(calling("hear"), plan.number))
     faults = LiveFaults(server, calling("answer"))
+    calls: dict[str, Call] = {
+        "type": lambda line: faults.take(line, server.lab.now_us),
+        "hear": server.hear_peer,
+        "end": end,
+    }
     try:
         opened = server.open(doors)
         if doors.motive:

@@ -284,7 +284,7 @@ def test_a_rebooted_board_talks_on_its_serial_line_by_the_laboratorys_clock() ->
 def test_a_firmware_without_a_client_can_switch_its_board_off(kind: int, powered: bool) -> None:
     lab = Laboratory(FreeRunning())
     robot = Robot(site_in(lab), Ports(nobody_listens))
-    lab.robots.append(robot)
+    lab.add(robot)
     lab.events.at(SECOND_US, lambda _: robot.board.radio_command(kind, b""))
     lab.end_at(2 * SECOND_US)
     lab.run()

@@ -9,7 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from firmware_py.firmware import Firmware
+from hil.config import load_config
+from hil.crazyflie import syslink
+from hil.devices.board_firmware import PowerOn, PythonBoard
 from hil.servers.dongle_plugin import VARIABLE, Connection
+from hil.servers.server import Doors, Server, Service
+from hil.servers.swarm import Swarm
 from support.serving import PATIENCE_S, Served, serve
 
 SET_CHANNEL, SET_ADDRESS, SET_RATE, SET_ACKS = 1, 2, 3, 16  # vendor requests
@@ -114,7 +120,7 @@ def test_a_typed_line_goes_to_the_robot_whose_number_it_has(served: Served, line
 
 
 def test_ctrl_c_ends_all_processes_in_order_and_keeps_every_robots_memories(tmp_path: Path) -> None:
-    with serve("--boards", "2", "--state", str(tmp_path)) as served:
+    with serve("--boards", "2", "--udp", "0", "--state", str(tmp_path)) as served:
         pids = others(served)
         assert len(pids) == 1
         assert served.interrupt() == 0
@@ -126,7 +132,7 @@ def test_ctrl_c_ends_all_processes_in_order_and_keeps_every_robots_memories(tmp_
 
 
 def test_a_robot_whose_process_dies_ends_the_server_in_one_line() -> None:
-    with serve("--boards", "2") as served:
+    with serve("--boards", "2", "--udp", "0") as served:
         (pid,) = others(served)
         os.kill(pid, signal.SIGKILL)
         assert served.process.wait(PATIENCE_S) == 2
@@ -135,6 +141,39 @@ def test_a_robot_whose_process_dies_ends_the_server_in_one_line() -> None:
 
 
 def test_robots_do_not_outlive_a_server_that_is_killed() -> None:
-    with serve("--boards", "2") as served:
+    with serve("--boards", "2", "--udp", "0") as served:
         served.process.kill()
         served.process.stdout.read()  # until the last process has closed it
+
+
+class Talker(PythonBoard):
+    """Its firmware sends to its peers what a client sends to its application, and prints what it hears of them."""
+
+    def boot(self, start: PowerOn) -> Firmware:
+        firmware = super().boot(start)
+
+        def received(data: bytes, broadcast: bool = False) -> None:
+            if broadcast:
+                start.board.debug_write(f"peer says {data[2:].decode()}")
+            else:
+                start.board.radio_command(syslink.PEER_BROADCAST, b"\x03" + data[1:])
+
+        firmware.radio_received = received
+        return firmware
+
+
+def test_a_peer_packet_of_one_board_reaches_those_of_all_other_processes() -> None:
+    said: list[str] = []
+    plan, doors = Service(load_config(), executor=Talker()), Doors(udp=0)
+    with closing(Swarm(plan, 3, doors, said.append)) as swarm:
+        others = swarm.wait()
+        with closing(Server(plan, said.append, None, swarm.to_peers)) as server:
+            ports = [int(robot.udp.rpartition(":")[2]) for robot in (server.open(doors), *others)]
+            swarm.listen(server, said.append, None)
+            for number, port in enumerate(ports, 1):
+                with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+                    client.sendto(b"\xd0from %d" % number, ("127.0.0.1", port))
+                    expected = {f"board {n}: peer says from {number}" for n in (1, 2, 3) if n != number}
+                    server.run(lambda expected=expected: expected <= set(said))
+    heard = [line for line in said if "peer says" in line]
+    assert len(heard) == 6
