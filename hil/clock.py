@@ -131,7 +131,7 @@ class Paced:
         elif ahead_us > self.SLACK_US:
             time.sleep(ahead_us * 1e-6)
         if self._readable:
-            now_us = max(self._served_us, min(self.now_us(), now_us))
+            now_us = min(now_us, max(self._served_us, self.now_us()))
         self._served_us = now_us
         return now_us
 

@@ -88,6 +88,17 @@ def test_input_that_comes_before_time_starts_is_not_in_the_past(wall: Wall) -> N
     assert heard == [20_000]
 
 
+def test_input_does_not_pass_an_event_that_a_task_has_planned_before_the_last_instant(wall: Wall) -> None:
+    paced, (reader, writer) = Paced(), socket.socketpair()
+    with reader, writer:
+        paced.readers[reader] = lambda now_us: None
+        paced.start(20_000)
+        writer.send(b"input")
+        wall.us += 30_000
+        assert paced.wait_until(50_000) == 50_000
+        assert paced.wait_until(40_000) == 40_000
+
+
 def test_a_machine_that_is_always_too_slow_is_told_once_per_second_and_every_stall_counts(wall: Wall) -> None:
     paced, lines = Paced(), []
     for now_us in range(0, 5_000_000, 50_000):
