@@ -63,8 +63,9 @@ class Paced:
     """One simulated second per real second.
 
     Small delays are caught up. More than `STALL_US` is a stall: simulated time continues without catching up, because
-    outside clients would otherwise get a burst of past data, and a line reports the pause. `readers` are called with the
-    time when their socket or file descriptor is readable.
+    outside clients would otherwise get a burst of past data, and a line reports the pause. Time starts at a multiple of
+    `STALL_US` of the wall clock and stalls for multiples of it, so that cameras in several processes expose together.
+    `readers` are called with the time when their socket or file descriptor is readable.
     """
 
     paced = True
@@ -83,7 +84,9 @@ class Paced:
         self._next_notice_us = 0
 
     def start(self, now_us: int) -> None:
-        self._start_ns = time.monotonic_ns() - now_us * 1000
+        self._served_us = now_us
+        multiple_ns = self.STALL_US * 1000
+        self._start_ns = -((now_us * 1000 - time.monotonic_ns()) // multiple_ns) * multiple_ns
 
     def shift(self, by_us: int) -> None:
         """Shift simulated time on the wall clock, later if positive."""
@@ -96,8 +99,12 @@ class Paced:
 
     def now_us(self) -> int:
         """Return the simulated time by the wall clock; only after `start`."""
-        assert self._start_ns is not None
-        return (time.monotonic_ns() - self._start_ns) // 1000
+        return self.wall_us() - self.began_us
+
+    @property
+    def began_us(self) -> int:
+        """The wall clock at simulated time 0; 0 before `start`."""
+        return 0 if self._start_ns is None else self._start_ns // 1000
 
     @staticmethod
     def wall_us() -> int:
@@ -110,8 +117,10 @@ class Paced:
             self.start(now_us)
         late_us = self.late_us(now_us)
         if late_us > self.STALL_US:
-            self.start(now_us)
-            self.stood_still_us += late_us
+            stalled_us = late_us // self.STALL_US * self.STALL_US
+            self.shift(stalled_us)
+            self.stood_still_us += stalled_us
+            late_us -= stalled_us
         return max(0, -late_us)
 
     def wait_until(self, now_us: int) -> int:
@@ -122,7 +131,7 @@ class Paced:
         elif ahead_us > self.SLACK_US:
             time.sleep(ahead_us * 1e-6)
         if self._readable:
-            now_us = max(self._served_us, min(self.now_us(), now_us))
+            now_us = min(now_us, max(self._served_us, self.now_us()))
         self._served_us = now_us
         return now_us
 

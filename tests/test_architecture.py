@@ -100,7 +100,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
         "ground_station/terminal.py",
     ),
     "prompt_toolkit": ("ground_station/terminal.py",),
-    "multiprocessing": ("hil/campaigns/workers.py",),
+    "multiprocessing": ("hil/campaigns/workers.py", "hil/servers/swarm.py"),
     "concurrent": ("hil/campaigns/workers.py",),
     "unicorn": ("firmware_py/export/cortex_m4.py", "hil/stm32f405/chip.py"),
     "onnx": ("firmware_py/policy/reading.py",),

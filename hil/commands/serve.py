@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
@@ -21,8 +20,9 @@ if TYPE_CHECKING:
     from hil.config import LabConfig
     from hil.devices.board_firmware import Executor
     from hil.live.feed import LiveView
-    from hil.servers.serial_server import Address
-    from hil.servers.server import Ends, Server
+    from hil.servers.motive import VirtualMotive
+    from hil.servers.server import Doors, Opened, Server
+    from hil.servers.swarm import Swarm
 
 UDP_PORT = 19850  # where cflib looks for boards
 RADIO_PORT = 19840
@@ -110,7 +110,8 @@ def serve(asked: ServeOptions) -> int:
     from hil.laboratory.fault_kinds import MARKERS_ON
     from hil.laboratory.faults import check, parse
     from hil.servers.serial_server import parse_addresses
-    from hil.servers.server import Server, Service
+    from hil.servers.server import Doors, Server, Service
+    from hil.servers.swarm import Swarm
 
     markers = (MARKERS_ON,) if asked.motive else ()
     # Bitcraze's programs send absolute poses.
@@ -122,19 +123,12 @@ def serve(asked: ServeOptions) -> int:
     planned = [parse(text) for text in asked.faults]
     check(planned, inf, "mavlink" if serial else "radio", config)
     common.announce_compilation()
-    executor = _executor(asked)
-    view = common.open_live(asked.target)
-    plan = Service(config, asked.boards, asked.seed, bool(serial), planned, asked.state, executor)
-    server = Server(plan, say, view)
-    with closing(server.ends) as ends:
-        _open_ends(ends, asked, serial, config)
-        if station is not None:
-            for robot in ends.robots:
-                robot.fly(station == "poses")
-        _run(server, view)
-    common.close_live(view)
-    if unread := 0 if ends.motive is None else ends.motive.malformed:
-        say(f"motive could not read {unread} packets")
+    plan = Service(config, 1, asked.seed, bool(serial), planned, asked.state, _executor(asked))
+    doors = Doors(asked.udp, asked.radio_port if asked.radio else None, serial, station, asked.motive)
+    with closing(Swarm(plan, asked.boards, doors, say)) as swarm:
+        view = common.open_live(asked.target)
+        with closing(Server(plan, say, view, swarm.to_peers)) as server:
+            _run(server, swarm, doors, view)
     say(f"stopped; time stood still for {server.clock.stood_still_us / 1000:.0f} ms")
     return 0
 
@@ -150,8 +144,8 @@ def _executor(asked: ServeOptions) -> Executor:
     return image_at(asked.board, None, debugger(asked.gdb, Path(asked.board), stack))
 
 
-def _run(server: Server, view: LiveView | None) -> None:
-    """Serve until Ctrl-C, with faults typed at the terminal or in the picture's panel."""
+def _run(server: Server, swarm: Swarm, doors: Doors, view: LiveView | None) -> None:
+    """Open the doors of all robots and serve until Ctrl-C, with faults typed at the terminal or in the picture's panel."""
     from ground_station.program import stop_signals
     from hil.servers.live_faults import LiveFaults
 
@@ -165,11 +159,20 @@ def _run(server: Server, view: LiveView | None) -> None:
             faults.take(line, server.lab.now_us)
         return bool(stops)
 
-    faults = LiveFaults(server, answer)
-    faults.listen(sys.stdin)
-    stops = stop_signals()
-    say("serving; Ctrl-C ends")
-    server.run(stopping)
+    others = swarm.wait()
+    _print_addresses([server.open(doors, [other.dongles for other in others]), *others])
+    motive = _motive(server, 1 + len(others)) if doors.motive else None
+    with nullcontext() if motive is None else closing(motive):
+        swarm.listen(server, answer, motive)
+        faults = LiveFaults(server, answer, swarm.terminals)
+        faults.listen(sys.stdin)
+        stops = stop_signals()
+        say("serving; Ctrl-C ends")
+        server.run(stopping)
+        swarm.close()
+        common.close_live(view)
+        if motive is not None and motive.malformed:
+            say(f"motive could not read {motive.malformed} packets")
 
 
 def _station_of(asked: ServeOptions, config: LabConfig) -> str | None:
@@ -199,24 +202,30 @@ def _check_options(asked: ServeOptions) -> None:
         raise LabError(f"--gdb {gdb}: needs one board and an image as --board")
 
 
-def _open_ends(ends: Ends, asked: ServeOptions, serial: Sequence[Address], config: LabConfig) -> None:
-    """Open what programs connect to, and print its addresses."""
+def _motive(server: Server, count: int) -> VirtualMotive:
+    """Open a Motive that tracks `count` robots, and say where it is."""
     from hil.servers.motive import streaming_of
+    from hil.servers.server import open_motive
 
-    streaming = streaming_of(config.capture) if asked.motive else None
-    if asked.radio:
-        say(radio_hint(ends.serve_radio(asked.radio_port), [robot.uri for robot in ends.robots]))
-    if asked.udp is not None:
-        say(f"udp    {' '.join(ends.serve_udp(asked.udp))}")
-    if serial:
-        say(f"mavlink {' '.join(ends.serve_mavlink(serial))}")
-    if streaming is not None:
-        port = ends.serve_motive(streaming).port
-        options = (",multicast" if streaming.multicast else "") + (",z-up" if streaming.up == "z" else "")
-        say(f"motive optitrack:127.0.0.1:{port}{options}")
+    streaming = streaming_of(server.robot.config.capture)
+    motive = open_motive(streaming, server.robot, server.clock, count)
+    options = (",multicast" if streaming.multicast else "") + (",z-up" if streaming.up == "z" else "")
+    say(f"motive optitrack:127.0.0.1:{motive.port}{options}")
+    return motive
 
 
-def radio_hint(address: str, uris: list[str]) -> str:
+def _print_addresses(robots: list[Opened]) -> None:
+    """Say where clients find the robots."""
+    if robots[0].dongles:
+        say(radio_hint(robots[0].dongles, [robot.radio for robot in robots]))
+    if robots[0].udp:
+        say(f"udp    {' '.join(robot.udp for robot in robots)}")
+    if robots[0].mavlink:
+        say(f"mavlink {' '.join(robot.mavlink for robot in robots)}")
+
+
+def radio_hint(port: int, uris: list[str]) -> str:
     """Return the text to type before a program's name so that it finds the dongle, and the addresses of the boards."""
     folder = Path(__file__).parents[1] / "servers" / "dongle_site"
-    return f"radio  {' '.join(uris)}\nuse    env PYTHONPATH={shlex.quote(str(folder))} FLOATY_DONGLE={address} PROGRAM"
+    variables = f"PYTHONPATH={shlex.quote(str(folder))} FLOATY_DONGLE=127.0.0.1:{port}"
+    return f"radio  {' '.join(uris)}\nuse    env {variables} PROGRAM"

@@ -82,19 +82,33 @@ class PoweredProcessor(Protocol):
         """Note that a client has moved the radio to another channel or data rate."""
 
 
-class Band:
-    """The radio chips within reach of each other; `uniform` draws from 0..1 which packets between them are lost."""
+ToPeers = Callable[[AirSettings, bytes], object]
 
-    def __init__(self, events: EventQueue, uniform: Callable[[], float]) -> None:
+
+class Band:
+    """The radio chips within reach of each other; `uniform` draws from 0..1 which packets between them are lost.
+
+    `elsewhere` gets the packets for those in other processes.
+    """
+
+    def __init__(
+        self, events: EventQueue, uniform: Callable[[], float], elsewhere: ToPeers = lambda *_: None
+    ) -> None:
         self.events = events
         self.boards: list[Nrf51] = []
         self._uniform = uniform
+        self._elsewhere = elsewhere
 
     def send_to_peers(self, now_us: int, sender: Nrf51, packet: bytes) -> None:
         """Send a packet once to all other boards on the sender's channel."""
         own = sender.settings
         settings = AirSettings(own.channel, own.bits_per_second, BROADCAST)
-        heard_us = now_us + TURN_ROUND_US + air_us(len(packet), own.bits_per_second)
+        self.carry(now_us, settings, packet, sender)
+        self._elsewhere(settings, packet)
+
+    def carry(self, now_us: int, settings: AirSettings, packet: bytes, sender: Nrf51 | None = None) -> None:
+        """Carry a packet to all boards here but the sender."""
+        heard_us = now_us + TURN_ROUND_US + air_us(len(packet), settings.bits_per_second)
         for board in self.boards:
             if board is not sender and self._uniform() >= board.air.lost_up(len(packet)):
                 self.events.at(heard_us, partial(self._arrive, board, settings, packet))

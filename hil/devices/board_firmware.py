@@ -76,10 +76,6 @@ class Processor(Protocol):
     def now_us(self) -> int:
         """The current time."""
 
-    @property
-    def next_wake_us(self) -> int | None:
-        """The next time at which it acts without an interrupt."""
-
     def advance(self, now_us: int) -> None:
         """Advance its clock to a time before which nothing is due."""
 

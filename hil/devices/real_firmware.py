@@ -59,8 +59,6 @@ KEPT = 50  # board reports, half a second: the loop's added delay is their mean
 class _Clock:
     """The clock of a processor that is not scheduled here."""
 
-    next_wake_us: ClassVar[None] = None
-
     def __init__(self) -> None:
         self.now_us = 0
 

@@ -102,7 +102,7 @@ class Flight:
         site = Site(request.config, self.events, Streams.of_seed(request.seed), self.note, executor)
         self.line = line_of(request, site, self.lab)
         self.robot = self.line.robot
-        self.lab.robots.append(self.robot)
+        self.lab.add(self.robot)
         self.robot.body.hold()
         self.switchboard = Switchboard(self.robot)
         request.experiment.prepare(self.robot)

@@ -1,7 +1,7 @@
-"""The common time line of robots, cameras, links and stations: hardware events advance time, then firmware runs.
+"""The common time line of robot, cameras, link and station: firmware runs up to the next hardware event, then that happens.
 
-Without a wall clock the firmware runs up to the next hardware event. With one, every event waits for its time, and bytes
-from outside arrive in between.
+With a wall clock every event waits for its time, and bytes from outside arrive in between. IMU samples are events, so
+the firmware acts at most a millisecond late there; its own time is exact.
 """
 
 from collections.abc import Callable
@@ -20,14 +20,18 @@ Progress = Callable[[int], None]  # (now_us)
 
 
 class Laboratory:
-    """Robots on one time line; `add` them before `run`. `end_at` may be called while it runs."""
+    """A robot on its time line; `add` it before `run`. `end_at` may be called while it runs."""
 
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
         self.events = EventQueue()
-        self.robots: list[Robot] = []
         self.now_us = 0
         self.end_us = NEVER_US
+        self._robot: Robot | None = None
+
+    def add(self, robot: Robot) -> None:
+        """Let a robot's firmware run."""
+        self._robot = robot
 
     def run(self, progress: Progress | None = None) -> None:
         """Execute events and firmware in order of time, until `end_us`; may be called again.
@@ -43,12 +47,8 @@ class Laboratory:
         while self.now_us < min(WARM_UP_US, self.end_us):
             self._step(FREE)
         clock.start(self.now_us)
-        alone = not clock.paced and len(self.robots) == 1
         while self.now_us < self.end_us:
-            if alone:
-                self._step_alone()
-            else:
-                self._step(clock)
+            self._step(clock)
             if progress is not None and self.now_us >= next_progress_us:
                 progress(self.now_us)
                 next_progress_us = self.now_us + PROGRESS_PERIOD_US
@@ -62,35 +62,21 @@ class Laboratory:
         """End `run` after the current instant."""
         self.end_us = self.now_us
 
-    def _step_alone(self) -> None:
-        """Run the only robot's firmware up to the hardware's next event, then that event."""
-        robot = self.robots[0]
-        robot.run(self.now_us, self._next_event_us() - 1)
-        now_us = self._next_event_us()
-        robot.advance(now_us)
+    def _step(self, clock: Clock) -> None:
+        """Run the firmware up to the hardware's next event or an earlier input from outside, then that."""
+        until_us = clock.wait_until(self._next_event_us())
+        robot = self._robot
+        if robot is not None:
+            robot.run(self.now_us, until_us - 1)
+        now_us = min(until_us, self._next_event_us())  # a task may have triggered an earlier event
+        if robot is not None:
+            robot.advance(now_us)
+        if now_us == until_us:
+            clock.serve(now_us)
         self.events.run(now_us)
         self.now_us = now_us
-
-    def _step(self, clock: Clock) -> None:
-        events = self.events
-        now_us = self._next_event_us()
-        robot, wake_us, other_us = self._first_to_wake()
-        if robot is not None and wake_us < now_us:
-            if clock.paced:
-                now_us = wake_us
-            else:
-                robot.run(max(wake_us, min(now_us, other_us) - 1))
-                if other_us < now_us or (events.next_us is not None and events.next_us < now_us):
-                    return  # another robot is next, or a task has triggered an earlier hardware event
-        if clock.paced:
-            now_us = clock.wait_until(now_us)
-        for robot in self.robots:
-            robot.advance(now_us)
-        if clock.paced:
-            clock.serve(now_us)
-        events.run(now_us)
-        self.now_us = now_us
-        self._run_firmware()
+        if clock.paced:  # answers to what is outside do not wait for the next event
+            self._run_firmware()
 
     def _next_event_us(self) -> int:
         """Return the next hardware event's time, or the end."""
@@ -99,18 +85,5 @@ class Laboratory:
 
     def _run_firmware(self) -> None:
         """Run the firmware of this instant."""
-        for robot in self.robots:
-            robot.run(self.now_us)
-
-    def _first_to_wake(self) -> tuple[Robot | None, int, int]:
-        """Return the robot whose firmware acts first, its time, and the time of the next robot."""
-        first, first_us, next_us = None, NEVER_US, NEVER_US
-        for robot in self.robots:
-            wake_us = robot.next_wake_us
-            if wake_us is None:
-                continue
-            if wake_us < first_us:
-                first, first_us, next_us = robot, wake_us, first_us
-            elif wake_us < next_us:
-                next_us = wake_us
-        return first, first_us, next_us
+        if self._robot is not None:
+            self._robot.run(self.now_us)

@@ -193,13 +193,6 @@ class Robot:
 
     # Time
 
-    @property
-    def next_wake_us(self) -> int | None:
-        if not self.powered:
-            return None
-        wake_us = self.firmware.kernel.next_wake_us
-        return None if wake_us is None else wake_us + self.booted_us
-
     def run(self, now_us: int, until_us: int = 0) -> None:
         if self.powered:
             self.firmware.kernel.run(now_us - self.booted_us, until_us - self.booted_us)

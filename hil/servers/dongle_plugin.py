@@ -5,7 +5,8 @@ This file needs only the standard library: it is a pytest plugin (`pytest -p hil
 environment variable FLOATY_DONGLE=127.0.0.1:PORT is the server's address. It replaces
 `libusb_package.get_libusb1_backend` by a back end for pyusb that sends each USB transfer over a socket.
 
-A frame on the socket: kind (1 byte), sequence number (1), length (1), data. The client sends `C` (vendor request:
+A frame on the socket: kind (1 byte), sequence number (1), length (1), data. The server first sends `P` with the ports of
+the robots that other processes serve (2 bytes each); the client connects to these, too. It sends `C` (vendor request:
 request, value low and high, then its data) and `W` (packet for the air); the server answers `W` with `R`.
 """
 
@@ -21,9 +22,11 @@ VARIABLE = "FLOATY_DONGLE"
 DEFAULT_SERVER = "127.0.0.1:19840"
 SERIAL = "F10A7Y0001"
 CONNECT_TIMEOUT_S = 2.0
+READY_TIMEOUT_S = 60.0  # a server may compile first
 
-CONTROL, WRITE, READ = b"C", b"W", b"R"
+CONTROL, WRITE, READ, PORTS = b"C", b"W", b"R", b"P"
 HEAD_SIZE = 3
+ACKNOWLEDGED = 0x01  # bit of an answer's first byte
 
 _DEVICE = SimpleNamespace(
     bLength=18, bDescriptorType=1, bcdUSB=0x0200, bDeviceClass=0, bDeviceSubClass=0, bDeviceProtocol=0,
@@ -53,21 +56,30 @@ def frame(kind: bytes, sequence: int, data: bytes) -> bytes:
     return kind + bytes((sequence, len(data))) + data
 
 
-class Connection:
-    """An opened dongle: one socket, one transfer at a time."""
+class Line:
+    """A socket to one process of the server."""
 
     def __init__(self, server: tuple[str, int]) -> None:
         self._socket = socket.create_connection(server, CONNECT_TIMEOUT_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._sequence = 0
         self._received = b""
+        self._requests: dict[int, bytes] = {}  # vendor requests that it has got
 
-    def send(self, kind: bytes, data: bytes) -> None:
+    def write(self, requests: dict[int, bytes], packet: bytes) -> None:
+        """Send a packet, and before it the vendor requests that are new to this process."""
+        for number, data in requests.items():
+            if self._requests.get(number) != data:
+                self._send(CONTROL, data)
+        self._requests = dict(requests)
+        self._send(WRITE, packet)
+
+    def _send(self, kind: bytes, data: bytes) -> None:
         self._sequence = (self._sequence + 1) & 0xFF
         self._socket.sendall(frame(kind, self._sequence, data))
 
     def read(self, timeout_s: float) -> bytes:
-        """Return the answer to the last frame. Raises `TimeoutError` without one."""
+        """Return the answer to the last frame, or the ports. Raises `TimeoutError` without one."""
         self._socket.settimeout(timeout_s)
         while True:
             size = HEAD_SIZE + self._received[2] if len(self._received) >= HEAD_SIZE else HEAD_SIZE
@@ -83,6 +95,53 @@ class Connection:
 
     def close(self) -> None:
         self._socket.close()
+
+
+class Connection:
+    """An opened dongle: a line to each process of the server, one transfer at a time.
+
+    A packet goes to all of them until a board has acknowledged one with these settings; then to its process alone.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._lines = [Line((host, port))]
+        self._requests: dict[int, bytes] = {}
+        self._found: dict[tuple[bytes, ...], list[Line]] = {}  # by the settings of the dongle
+        try:
+            ports = self._lines[0].read(READY_TIMEOUT_S)
+            for other in range(0, len(ports), 2):
+                self._lines.append(Line((host, int.from_bytes(ports[other : other + 2]))))
+        except OSError:
+            self.close()
+            raise
+
+    def control(self, data: bytes) -> None:
+        """Take a vendor request, which acts from the next packet on."""
+        self._requests[data[0]] = data
+
+    def write(self, packet: bytes) -> None:
+        """Send a packet."""
+        for line in self._asked():
+            line.write(self._requests, packet)
+
+    def read(self, timeout_s: float) -> bytes:
+        """Return the acknowledgement of the last packet, else that there is none. Raises `TimeoutError`."""
+        answer = b""
+        for line in self._asked():
+            answer = line.read(timeout_s)
+            if answer[0] & ACKNOWLEDGED:
+                self._found[tuple(self._requests.values())] = [line]
+                return answer
+        self._found.pop(tuple(self._requests.values()), None)
+        return answer
+
+    def _asked(self) -> list[Line]:
+        """Return the processes that get a packet with the present settings."""
+        return self._found.get(tuple(self._requests.values()), self._lines)
+
+    def close(self) -> None:
+        for line in self._lines:
+            line.close()
 
 
 class Backend:
@@ -130,7 +189,7 @@ class Backend:
     def open_device(self, device: object) -> Connection:
         """Connect to the server."""
         try:
-            return Connection(self._server)
+            return Connection(*self._server)
         except OSError as error:
             raise _usb_error(error) from None
 
@@ -164,7 +223,7 @@ class Backend:
     def bulk_write(self, handle: Connection, endpoint: int, interface: int, data: Any, timeout: int) -> int:
         """Hand a packet to the dongle."""
         try:
-            handle.send(WRITE, bytes(data))
+            handle.write(bytes(data))
         except OSError as error:
             raise _usb_error(error) from None
         return len(data)
@@ -192,10 +251,7 @@ class Backend:
             descriptor = bytes((2 + len(text), 3)) + text
             data[: len(descriptor)] = array.array("B", descriptor)
             return len(descriptor)
-        try:
-            handle.send(CONTROL, bytes((request, value & 0xFF, value >> 8 & 0xFF)) + bytes(data))
-        except OSError as error:
-            raise _usb_error(error) from None
+        handle.control(bytes((request, value & 0xFF, value >> 8 & 0xFF)) + bytes(data))
         return len(data)
 
 

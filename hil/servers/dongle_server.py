@@ -5,20 +5,27 @@ sockets are readable. Frames: see `dongle_plugin`.
 """
 
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 from hil.clock import Readers
 from hil.devices.dongle import VirtualDongle
 from hil.errors import LabError
-from hil.servers.dongle_plugin import CONTROL, HEAD_SIZE, READ, WRITE, frame
+from hil.servers.dongle_plugin import CONTROL, HEAD_SIZE, PORTS, READ, WRITE, frame
 
 HOST = "127.0.0.1"
 
 
 class DongleServer:
-    """Listens on a port (0: any) of the loopback interface and plugs a new dongle in for every connection."""
+    """Listens on a port (0: any) of the loopback interface and plugs a new dongle in for every connection.
 
-    def __init__(self, port: int, readers: Readers, new_dongle: Callable[[], VirtualDongle]) -> None:
+    `others` are the ports of such servers in other processes, which a client also connects to.
+    """
+
+    def __init__(
+        self, port: int, readers: Readers, new_dongle: Callable[[], VirtualDongle], others: Sequence[int] = ()
+    ) -> None:
+        self._others = b"".join(other.to_bytes(2) for other in others)
         self._readers = readers
         self._new_dongle = new_dongle
         self._cables: list[_UsbCable] = []
@@ -26,12 +33,14 @@ class DongleServer:
             self._socket = socket.create_server((HOST, port))
         except OSError as error:
             raise LabError(f"radio port {port}: {error.strerror or error}") from None
-        self.address = "{}:{}".format(*self._socket.getsockname())
+        self.port: int = self._socket.getsockname()[1]
         readers[self._socket] = self._accept
 
     def _accept(self, now_us: int) -> None:
         connection, _ = self._socket.accept()
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        with suppress(OSError):  # a client that only looks whether it is there
+            connection.sendall(frame(PORTS, 0, self._others))
         self._cables = [cable for cable in self._cables if cable.plugged]
         self._cables.append(_UsbCable(connection, self._readers, self._new_dongle()))
 

@@ -28,11 +28,12 @@ from hil.laboratory.lockstep import image_at
 from hil.laboratory.request import Request
 from hil.laboratory.robot import PYTHON_BOARD, Site
 from hil.servers.dongle_plugin import VARIABLE
+from hil.servers.dongle_server import HOST
 from hil.servers.holder import HOLD_US, Holder
-from hil.servers.motive import Streaming
+from hil.servers.motive import Streaming, name_of
 from hil.servers.serial_server import Address
 from hil.servers.served_robot import ServedRobot
-from hil.servers.server import Ends, name_of
+from hil.servers.server import open_motive
 from hil.world.body import Channel, Quantity
 
 SITE = Path(__file__).parent / "dongle_site"
@@ -62,8 +63,7 @@ class StationProcess:
         self._say = site.say
         self._served = ServedRobot(1, site, partial(site.say, "lab"), uri.startswith(SERIAL))
         self.robot = self._served.robot
-        self._ends = Ends(lab, lab.clock.readers, config, request.seed)
-        self._ends.robots.append(self._served)
+        self._readers = lab.clock.readers
         self._experiment = request.experiment
         self.record: Path | None = telemetry
         self._home = Goal(config.flight.home, 0.0)
@@ -72,7 +72,7 @@ class StationProcess:
         self._heard = 0  # bytes of the station's output
         self._said = ""  # its last line
         station_uri, self._environment = self._serve(uri, config.serial.baud)
-        motive = self._ends.serve_motive(Streaming(0, (4, 1), multicast=False))
+        motive = self._motive = open_motive(Streaming(0, (4, 1), multicast=False), self.robot, lab.clock)
         self._command = [
             sys.executable, "-m", "hil.commands", "station", request.experiment.reference, "--link", station_uri,
             "--mocap", f"optitrack:127.0.0.1:{motive.port},body={name_of(1)},y-up",
@@ -92,14 +92,14 @@ class StationProcess:
         """Open the board's end of a URI; return the station's URI and its environment variables."""
         if uri == self._served.uri:
             paths = [str(SITE), os.environ.get("PYTHONPATH", "")]
-            server = self._ends.serve_radio(0)
+            server = f"{HOST}:{self._served.serve_radio(0, self._readers)}"
             return uri, {"PYTHONPATH": os.pathsep.join(filter(None, paths)), VARIABLE: server}
         if uri.startswith(SERIAL):
-            (master,) = self._ends.serve_mavlink([_pty(uri)])
+            master = self._served.serve_mavlink(_pty(uri), self._readers)
             return f"{SERIAL}{master},{baud}", {}
         prefix, _, port = uri.rpartition(":")
         if prefix == "udp://127.0.0.1" and port.isdigit() and 0 < int(port) < 65536:
-            self._ends.serve_udp(int(port))
+            self._served.serve_udp(int(port), self._readers)
             return uri, {}
         raise LabError(
             f"--link {uri}: expected radio, mavlink, {self._served.uri}, udp://127.0.0.1:PORT, mavlink:pty or mavlink:PATH"
@@ -208,7 +208,8 @@ class StationProcess:
         self._kill()
         self._output.close()
         self._typed.close()
-        self._ends.close()
+        self._served.close()
+        self._motive.close()
 
 
 def linked_flight(request: Request, telemetry: Path | None, stack: ExitStack) -> Flight:

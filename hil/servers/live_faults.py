@@ -2,7 +2,7 @@
 
 import difflib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import IO
 
 from firmware_py.wire.supervisor import Cause
@@ -23,11 +23,17 @@ COMMANDS = ("clear", "status", "restart", "kinds", "help")
 
 
 class LiveFaults:
-    """Reads lines; answers by `say`."""
+    """Reads lines for a server's robot; answers by `say`. `others` take the lines for other robots, by their numbers."""
 
-    def __init__(self, server: Server, say: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        server: Server,
+        say: Callable[[str], None],
+        others: Mapping[int, Callable[[str], None]] | None = None,
+    ) -> None:
         self._server = server
         self._say = say
+        self._others = others or {}
         self._rest = b""
 
     def listen(self, stream: IO[str]) -> None:
@@ -64,12 +70,13 @@ class LiveFaults:
 
     def _act(self, line: str, now_us: int) -> None:
         first, _, rest = line.partition(" ")
-        boards = self._server.switchboards
+        board, served, robot = self._server.switchboard, self._server.served, self._server.robot
         number, text = (int(first), rest.strip()) if first.isdecimal() else (1, line)
-        if not 1 <= number <= len(boards):
-            raise LabError(f"robot {number}: expected 1..{len(boards)}")
-        board, served = boards[number - 1], self._server.ends.robots[number - 1]
-        robot = served.robot
+        if number in self._others:
+            self._others[number](line)
+            return
+        if number != served.number:
+            raise LabError(f"robot {number}: expected 1..{1 + len(self._others)}")
         if text == "status":
             faults = ", ".join(map(str, board.active)) or "none"
             self._say(f"robot {number}: {_status(robot)}; faults: {faults}; {served.uri}")

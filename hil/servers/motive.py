@@ -125,11 +125,21 @@ def _group_sender(interface: str) -> socket.socket:
     return sender
 
 
+def name_of(number: int) -> str:
+    """Return the name of body 1, 2, ...."""
+    return "floaty" if number == 1 else f"floaty{number}"
+
+
 class VirtualMotive:
-    """Tracks `bodies` (names by id), each with the same `markers`, (N, 3) [m] in B."""
+    """Tracks `count` bodies, each with the same `markers`, (N, 3) [m] in B; `period_us` is that of the cameras."""
 
     def __init__(
-        self, settings: Streaming, bodies: dict[int, str], readers: Readers, markers: Points = NO_POINTS
+        self,
+        settings: Streaming,
+        count: int,
+        readers: Readers,
+        markers: Points = NO_POINTS,
+        period_us: int = 10_000,
     ) -> None:
         self.malformed = 0
         self._version = settings.version
@@ -141,15 +151,22 @@ class VirtualMotive:
         )
         self._models = ModelDefinition(
             tuple(
-                BodyDescription(name, number, _NO_PARENT, (0.0, 0.0, 0.0), described)
-                for number, name in bodies.items()
+                BodyDescription(name_of(number), number, _NO_PARENT, (0.0, 0.0, 0.0), described)
+                for number in range(1, count + 1)
             )
         )
         self._readers = readers
         self._clients: dict[Address, _Client] = {}  # the latest sender is last
+        self._missing = {
+            number: BodyPose(number, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.0, valid=False)
+            for number in range(1, count + 1)
+        }
         self._number = 0
         # Of the frame being assembled.
-        self._seen: list[BodyPose] = []
+        self._tolerance_us = period_us // 2
+        self._exposure_us = 0
+        self._seen: dict[int, BodyPose] = {}
+        self._exposed = self._received = 0  # ticks
         self._labelled: list[LabelledMarker] = []
         self._unlabelled: list[Vector] = []
         self._start_us = clock_us()
@@ -173,35 +190,54 @@ class VirtualMotive:
         for each in (self._socket, *self._groups):
             each.close()
 
-    def take(self, body: int, frame: MocapFrame, now_us: int, sighting: Sighting | None = None) -> None:
-        """Take a body's frame of another clock, whose time is `now_us`; the last body completes a frame."""
+    def take(
+        self,
+        body: int,
+        frame: MocapFrame,
+        now_us: int,
+        sighting: Sighting | None = None,
+        began_us: int = 0,
+    ) -> None:
+        """Take a body's frame of another clock, whose time is `now_us`, and which began at `began_us` of all bodies' clock.
+
+        The last body completes a frame; so does one of a later exposure. A body that comes after that is not tracked.
+        """
+        sent, later_us = self._ticks(), began_us + frame.t_us - self._exposure_us
+        if later_us < -self._tolerance_us:
+            return
+        if later_us > self._tolerance_us:
+            if self._seen:
+                self._stream(sent)
+            self._exposure_us += later_us
+        arrival_us = now_us if frame.received_us is None else frame.received_us
+        self._exposed, self._received = (
+            max(0, sent - (now_us - t_us) * _TICKS_PER_US)  # not before the start
+            for t_us in (frame.t_us, arrival_us)
+        )
         p, q = in_axes(self._up, frame.p_WB, frame.q_WB)
         error = 0.0 if sighting is None else sighting.error
-        self._seen.append(BodyPose(body, p, q, error, frame.valid))
+        self._seen[body] = BodyPose(body, p, q, error, frame.valid)
         if sighting is not None:
             self._unlabelled += self._all_turned(sighting.unlabelled)
             self._labelled += self._labels(body, sighting) if frame.valid else ()
-        if len(self._seen) < len(self._models.bodies):
-            return
-        bodies, labelled, unlabelled = tuple(self._seen), tuple(self._labelled), tuple(self._unlabelled)
-        self._seen, self._labelled, self._unlabelled = [], [], []
+        if len(self._seen) == len(self._missing):
+            self._stream(sent)
+
+    def _stream(self, sent: int) -> None:
+        """Send the assembled frame and begin the next."""
         self._number += 1
-        sent = self._ticks()
-        exposed, received = (
-            max(0, sent - (now_us - t_us) * _TICKS_PER_US)  # not before the start
-            for t_us in (frame.t_us, now_us if frame.received_us is None else frame.received_us)
-        )
         whole = Frame(
             self._number,
-            bodies,
-            unlabelled,
-            labelled,
-            exposed * 1e-6 / _TICKS_PER_US,
-            exposed,
-            received,
+            tuple((self._missing | self._seen).values()),
+            tuple(self._unlabelled),
+            tuple(self._labelled),
+            self._exposed * 1e-6 / _TICKS_PER_US,
+            self._exposed,
+            self._received,
             sent,
             parameters=0,
         )
+        self._seen, self._labelled, self._unlabelled = {}, [], []
         if self._multicast:
             data = encode_frame(whole, self._version)
             for group in self._groups:

@@ -1,4 +1,4 @@
-"""A robot for clients outside: its radio chip with the power switch, its UDP port, the far end of its serial line.
+"""A robot for clients outside: its radio chip with the power switch, dongles, its UDP port, the far end of its serial line.
 
 Its EEPROM and deck memory survive a restart of the server, in two files of a folder.
 """
@@ -18,15 +18,17 @@ from ground_station.tracker import tracker_of
 from ground_station.trajectory import Goal, Hold
 from hil.clock import Readers
 from hil.config import LabConfig
-from hil.crazyflie.nrf51 import RATES, AirSettings, Band, Nrf51
+from hil.crazyflie.nrf51 import RATES, AirSettings, Band, Nrf51, ToPeers
 from hil.crazyflie.radio_line import POLL_PERIOD_US
 from hil.crazyflie.shockburst import Air
 from hil.devices.board import InjectFailure, KeptMemory, unsupported
 from hil.devices.board_firmware import BoardFirmware
+from hil.devices.dongle import VirtualDongle
 from hil.devices.radio import VirtualRadio
 from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
 from hil.laboratory.robot import Ports, Robot, Site
+from hil.servers.dongle_server import DongleServer
 from hil.servers.serial_server import Address, Endpoint
 from hil.servers.udp_server import UdpServer
 
@@ -84,6 +86,8 @@ def address_of(number: int) -> bytes:
     return bytes((0xE7, 0xE7, 0xE7, 0xE7, 0xE7 if number == 1 else number))
 
 
+# Of each USB transfer: cflib and the dongle's socket, unpaced, reach 4500 exchanges per second.
+HOST_SHARE_US = 110
 WORLD = Goal((0.0, 0.0, 0.0), 0.0)  # relative to this goal a pose is absolute
 
 
@@ -121,9 +125,10 @@ class ServedRobot:
         mavlink: bool = False,
         state: Path | None = None,
         fail: InjectFailure = unsupported,
-        band: Band | None = None,
+        to_peers: ToPeers = lambda *_: None,
     ) -> None:
         config, events, rng = site.config, site.events, site.streams.radio
+        self._rng = rng
         memory = self._memory = KeptMemory()
         air, wire_us = Air.of(config.radio), site.executor.wire_us
         uart = VirtualSerial(config.serial, events, site.streams.serial) if mavlink else None
@@ -132,12 +137,13 @@ class ServedRobot:
         self._say = say
         self._udp_awaited = False  # another program has the port
         self._line_end: Endpoint | None = None
+        self._dongles: DongleServer | None = None
         patient = config.radio.model_copy(update={"uplink_queue": UDP_QUEUE})
         self.udp_radio = VirtualRadio(patient, events, rng, air, wire_us)
         settings = AirSettings(CHANNEL, config.radio.bits_per_second, address_of(number))
         chip = bytes((number, 0x10, 0xA7, 0xF1, 0x0A, 0xC0))
-        band = band or Band(events, rng.random)
-        self.nrf51 = Nrf51(settings, chip, config.radio.downlink_queue, band, self, air, wire_us)
+        self.band = Band(events, rng.random, to_peers)
+        self.nrf51 = Nrf51(settings, chip, config.radio.downlink_queue, self.band, self, air, wire_us)
         memory.eeprom[:CONFIG_SIZE] = _factory_config(number, config)
         self._files = BoardFiles(state, number, memory) if state is not None else None
         if self._files is not None:
@@ -159,6 +165,20 @@ class ServedRobot:
         radio = self.nrf51.settings
         rate = RATE_NAMES[RATES.index(radio.bits_per_second)]
         return f"radio://0/{radio.channel}/{rate}/{radio.address.hex().upper()}"
+
+    def serve_radio(self, port: int, readers: Readers, others: Sequence[int] = ()) -> int:
+        """Offer Crazyradios on a port (0: any), which also reach the robots on the ports `others`; return the port."""
+        self._dongles = DongleServer(port, readers, self._new_dongle, others)
+        return self._dongles.port
+
+    def _new_dongle(self) -> VirtualDongle:
+        """Return a dongle at a real host, which takes real time in every exchange."""
+        radio = self.robot.config.radio
+        at_real_host = radio.model_copy(
+            update={"usb_us": max(0, radio.usb_us - HOST_SHARE_US), "usb_jitter_us": 0}
+        )
+        (rng,) = self._rng.spawn(1)
+        return VirtualDongle(at_real_host, self.robot.events, rng, [self.nrf51])
 
     def serve_udp(self, port: int, readers: Readers) -> str:
         """Serve it over UDP, too; return the URI."""
@@ -193,6 +213,8 @@ class ServedRobot:
         if self._line_end is not None:
             self._line_end.close()
             self._line_end = None
+        if self._dongles is not None:
+            self._dongles.close()
 
     def fly(self, absolute: bool = False) -> None:
         """Send poses from a ground station on a link hidden from clients: corrections for home, or absolute poses.

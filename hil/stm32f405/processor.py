@@ -12,7 +12,6 @@ from hil.stm32f405.chip import CYCLES_PER_US, Chip
 from hil.stm32f405.freertos import FreeRtos
 
 NEVER_US = 1 << 62
-SLICE_US = 100  # short against a millisecond's work, and within the wall clock's own jitter
 IDLE = "IDLE"
 TICK_US = 1_000
 INTERRUPTS = 6  # above the priorities of all tasks
@@ -73,19 +72,6 @@ class ChipProcessor:
     def now_us(self) -> int:
         """The current time; the chip itself may have finished a block of code beyond it."""
         return min(self.chip.now_us - self.ahead_us, self._target_us)
-
-    @property
-    def next_wake_us(self) -> int:
-        """The next time at which the chip runs without an event; a busy chip runs in slices.
-
-        A flight in lockstep runs it from event to event and does not use this. With several robots or a wall clock,
-        packets sent within a slice count as sent at the slice's end.
-        """
-        own_us = NEVER_US if self._own.next_us is None else self._own.next_us - self.ahead_us
-        state, ready_us = self.chip.state, self.chip.now_us - self.ahead_us + SLICE_US
-        if state.asleep or state.locked:
-            ready_us = -(-int(state.next_due) // CYCLES_PER_US) - self.ahead_us
-        return min(own_us, ready_us)
 
     def advance(self, now_us: int) -> None:
         self.run(now_us)

@@ -25,7 +25,6 @@ from hil.laboratory.laboratory import NEVER_US, Laboratory
 from hil.laboratory.robot import Site, Streams
 from hil.servers.dongle_plugin import VARIABLE
 from hil.servers.served_robot import ServedRobot
-from hil.servers.server import Ends
 from support.crazyflie_app import App
 from support.paths import TESTS
 from support.serving import PATIENCE_S, Served
@@ -50,7 +49,7 @@ class AppBoard:
 class AppFirmware:
     """The app that has booted, stepped with every sample of the IMU, which has its own gyro."""
 
-    flashed = scheduler = usage = clock_us = mavlink = next_wake_us = None
+    flashed = scheduler = usage = clock_us = mavlink = None
     overrun = ""
     variables = ()
 
@@ -103,11 +102,9 @@ def main(library: str, *overrides: str) -> None:
         served = ServedRobot(1, site, print)
         served.robot.body.hold()
         served.robot.watch(0)
-        ends = Ends(lab, clock.readers, config, 1)
-        ends.robots.append(served)
-        lab.robots.append(served.robot)
-        print("use", f"{VARIABLE}={ends.serve_radio(0)}")
-        print("udp", *ends.serve_udp(0))
+        lab.add(served.robot)
+        print("use", f"{VARIABLE}=127.0.0.1:{served.serve_radio(0, clock.readers)}")
+        print("udp", served.serve_udp(0, clock.readers))
         print("radio", served.uri)
         print("serving", flush=True)
         lab.end_at(NEVER_US)

@@ -33,9 +33,9 @@ def served_image(elf: str, profile: str) -> Iterator[Server]:
     """Serve an image in lockstep with poses of the cameras; it has run for a second."""
     server = Server(Service(load_config(profile), executor=image_at(elf, None)), lambda text: None)
     try:
-        server.ends.robots[0].fly(absolute=True)
+        server.served.fly(absolute=True)
         server.lab.end_at(1_000_000)
         server.lab.run()
         yield server
     finally:
-        server.ends.close()
+        server.close()

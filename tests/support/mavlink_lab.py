@@ -21,7 +21,7 @@ class MavlinkLab:
         self._codec, self._parser = codec(*STATION), codec(0, 0)
         self.server = Server(Service(load_config("floaty", settings), mavlink=True), self.said.append)
         self.server.lab.clock = FreeRunning()
-        (self.served,) = self.server.ends.robots
+        self.served = self.server.served
         self.robot: Robot = self.served.robot
         self.served.serve_mavlink(self, {})  # type: ignore[arg-type]
         if flying:
@@ -35,7 +35,7 @@ class MavlinkLab:
     @property
     def faults(self) -> dict[str, float]:
         """The faults in force, and their sizes."""
-        active = self.server.switchboards[0].active
+        active = self.server.switchboard.active
         assert len({fault.kind for fault in active}) == len(active)
         return {fault.kind: fault.size for fault in active}
 

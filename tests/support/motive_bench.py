@@ -50,7 +50,7 @@ class MotiveBench:
     ) -> None:
         self.readers: Readers = {}
         places = PLACES if markers else NO_POINTS
-        self.motive = VirtualMotive(Streaming(0, version, multicast, up), {1: "floaty"}, self.readers, places)
+        self.motive = VirtualMotive(Streaming(0, version, multicast, up), 1, self.readers, places)
         self.number = 0
         self.markers = markers
 

@@ -57,7 +57,7 @@ def test_without_decks_and_without_poses_it_does_not_hold_its_place(tmp_path: Pa
 @needs_image
 def test_drivers_read_the_walls_and_the_floor_where_they_are() -> None:
     with served_image(ELF, PROFILE) as server:
-        served = server.ends.robots[0]
+        served = server.served
         served.robot.body.put_back((0.6, -0.5, 1.0))
         server.lab.end_at(1_600_000)
         server.lab.run()

@@ -23,16 +23,13 @@ SECOND_US = 1_000_000
 
 
 class Bench:
-    """Robots that fly with stations of their own, served, on a free-running clock."""
+    """A robot that flies with a station of its own, served, on a free-running clock."""
 
-    def __init__(self, count: int = 1, seed: int = 1, faults: tuple[Fault, ...] = (), *settings: str) -> None:
+    def __init__(self, faults: tuple[Fault, ...] = (), number: int = 1, seed: int = 1) -> None:
         self.said: list[str] = []
-        self.server = Server(
-            Service(load_config("floaty", settings), count, seed, faults=faults), self.said.append
-        )
+        self.server = Server(Service(load_config(), number, seed, faults=faults), self.said.append)
         self.server.lab.clock = FreeRunning()
-        for robot in self.server.ends.robots:
-            robot.fly()
+        self.server.served.fly()
 
     def fly(self, duration_s: float) -> list[str]:
         """Go on for a while; returns what was said meanwhile."""
@@ -42,12 +39,13 @@ class Bench:
         lab.run()
         return self.said[before:]
 
-    def robot(self, number: int = 1) -> Robot:
-        return self.server.lab.robots[number - 1]
+    @property
+    def robot(self) -> Robot:
+        return self.server.robot
 
 
 def test_a_robot_flies_in_its_holder_for_a_second_before_each_release() -> None:
-    bench = Bench(1, 1, (parse("push.x@0:0.1=5"),))
+    bench = Bench((parse("push.x@0:0.1=5"),))
 
     def heard_s(words: str) -> float:
         while not any(words in text for text in bench.fly(0.01)):
@@ -63,23 +61,22 @@ def test_a_robot_flies_in_its_holder_for_a_second_before_each_release() -> None:
 
 @pytest.mark.long
 def test_a_robot_that_is_lost_is_put_back_after_a_second_and_flies_again_among_the_same_faults() -> None:
-    bench = Bench(1, 1, (parse("push.x@0.5:0.5=20"), parse("servo.slow.1@0.2=0.9")))
+    bench = Bench((parse("push.x@0.5:0.5=20"), parse("servo.slow.1@0.2=0.9")))
     said = bench.fly(12.0)
     assert sum("it is put back" in text for text in said) == 1
     assert sum(text.endswith("released") for text in said) == 2
-    assert bench.robot().free
-    assert bench.robot().body.servo_speed[0] == pytest.approx(0.9)  # the servo is as slow as before
+    assert bench.robot.free
+    assert bench.robot.body.servo_speed[0] == pytest.approx(0.9)  # the servo is as slow as before
 
 
-def test_robots_on_one_time_line_fly_as_each_does_alone() -> None:
-    together = Bench(3, 5)
-    together.fly(3.0)
-    for number in (1, 2, 3):
-        alone = Bench(1, 4 + number)
-        alone.fly(3.0)
-        ours, theirs = together.robot(number), alone.robot()
-        assert ours.body.state.tolist() == theirs.body.state.tolist()
-        assert ours.firmware.signals.estimate.tolist() == theirs.firmware.signals.estimate.tolist()
+def test_a_robot_of_a_swarm_flies_as_one_alone_with_its_seed() -> None:
+    third, alone = Bench(number=3, seed=5), Bench(seed=7)
+    for bench in (third, alone):
+        bench.fly(3.0)
+    ours, theirs = third.robot, alone.robot
+    assert ours.body.state.tolist() == theirs.body.state.tolist()
+    assert ours.firmware.signals.estimate.tolist() == theirs.firmware.signals.estimate.tolist()
+    assert third.server.served.uri == "radio://0/80/2M/E7E7E7E703"
 
 
 def test_firmware_that_waits_for_every_instant_flies_as_one_that_runs_ahead() -> None:
@@ -93,21 +90,18 @@ def test_firmware_that_waits_for_every_instant_flies_as_one_that_runs_ahead() ->
     waiting.server.lab.clock = Instant()
     ahead.fly(2.5)
     waiting.fly(2.5)
-    assert ahead.robot().body.state.tolist() == waiting.robot().body.state.tolist()
-    assert (
-        ahead.robot().firmware.signals.estimate.tolist() == waiting.robot().firmware.signals.estimate.tolist()
-    )
+    assert ahead.robot.body.state.tolist() == waiting.robot.body.state.tolist()
+    assert ahead.robot.firmware.signals.estimate.tolist() == waiting.robot.firmware.signals.estimate.tolist()
 
 
 def test_power_off_stops_a_board_which_boots_with_its_memories_and_a_new_clock() -> None:
     bench = Bench()
     bench.fly(3.0)
-    served, robot = bench.server.ends.robots[0], bench.robot()
+    served, robot = bench.server.served, bench.robot
     robot.board.eeprom[100:103] = b"abc"
     before, counts = robot.firmware, robot.firmware.signals.count.tolist()
     served.nrf51.hear(bench.server.lab.now_us, b"\xff\xfe\x02")  # the power switch: system off
     assert served.nrf51.power is Power.RADIO_ONLY
-    assert robot.next_wake_us is None
     bench.fly(0.5)
     assert before.signals.count.tolist() == counts
     served.nrf51.hear(bench.server.lab.now_us, b"\xff\xfe\x03")  # system on
@@ -119,19 +113,19 @@ def test_power_off_stops_a_board_which_boots_with_its_memories_and_a_new_clock()
 
 
 def test_a_processor_that_hangs_is_reset_by_its_watchdog_and_goes_on_under_the_same_load() -> None:
-    bench = Bench(1, 1, (parse("cpu.load@0.5:0.4=1"),))
+    bench = Bench((parse("cpu.load@0.5:0.4=1"),))
     said = bench.fly(8.0)
     assert sum("watchdog" in text for text in said) == 1
     assert sum("gyro zero found" in text for text in said) == 2  # it booted again
-    assert bench.robot().thief.share == 0.0
+    assert bench.robot.thief.share == 0.0
 
 
 def test_the_battery_of_a_served_robot_empties() -> None:
     bench = Bench()
-    full = bench.robot().battery.charge
+    full = bench.robot.battery.charge
     bench.fly(4.0)
-    assert bench.robot().battery.charge < full
-    assert bench.robot().board.battery_mv == bench.robot().battery.millivolts
+    assert bench.robot.battery.charge < full
+    assert bench.robot.board.battery_mv == bench.robot.battery.millivolts
 
 
 def live(bench: Bench) -> tuple[Callable[[str], None], list[str]]:
@@ -141,19 +135,18 @@ def live(bench: Bench) -> tuple[Callable[[str], None], list[str]]:
 
 
 def test_a_typed_fault_acts_at_once_and_ends_by_itself() -> None:
-    bench = Bench(2)
+    bench = Bench()
     type_line, answers = live(bench)
     bench.fly(3.0)
-    type_line("2 push.y:0.2=0.5")
-    assert bench.robot(2).body.pushes.tolist() == [0.0, 0.5, 0.0, 0.0, 0.0, 0.0]
-    assert bench.robot(1).body.pushes.tolist() == [0.0] * 6
+    type_line("1 push.y:0.2=0.5")
+    assert bench.robot.body.pushes.tolist() == [0.0, 0.5, 0.0, 0.0, 0.0, 0.0]
     bench.fly(0.3)
-    assert bench.robot(2).body.pushes.tolist() == [0.0] * 6
+    assert bench.robot.body.pushes.tolist() == [0.0] * 6
     type_line("wind.side_y=0.5")
     type_line("wind.side_y=0.25")
-    assert bench.robot(1).body.tunnel.side_wind[1] == pytest.approx(0.75)
+    assert bench.robot.body.tunnel.side_wind[1] == pytest.approx(0.75)
     type_line("clear")
-    assert bench.robot(1).body.tunnel.side_wind[1] == 0.0
+    assert bench.robot.body.tunnel.side_wind[1] == 0.0
     assert answers == []
     assert any(text.endswith("fault push.y:0.2=0.5 ends") for text in bench.said)
 
@@ -167,7 +160,7 @@ def test_a_typed_status_lists_the_faults_and_whether_the_robot_is_held() -> None
     type_line("status")
     assert answers[1].startswith("robot 1: held, ")
     assert answers[1].endswith("; faults: mocap.dropout:inf=1; radio://0/80/2M/E7E7E7E7E7")
-    bench.robot().cut_power()
+    bench.robot.cut_power()
     type_line("status")
     assert answers[2].startswith("robot 1: without power")
 
@@ -175,7 +168,7 @@ def test_a_typed_status_lists_the_faults_and_whether_the_robot_is_held() -> None
 def test_a_radio_that_a_client_has_moved_is_reported_where_it_stays_and_returns_with_a_restart() -> None:
     bench = Bench()
     type_line, answers = live(bench)
-    served = bench.server.ends.robots[0]
+    served = bench.server.served
     bench.fly(1.0)
     for channel in (
         3,
@@ -227,14 +220,14 @@ def test_an_impossible_typed_line_is_answered_and_changes_nothing(line: str, ans
     type_line, answers = live(bench)
     type_line(line)
     assert answer in " ".join(answers)
-    assert bench.server.switchboards[0].active == []
+    assert bench.server.switchboard.active == []
 
 
 def test_a_packet_to_a_board_without_power_is_lost() -> None:
     bench = Bench()
-    bench.robot().cut_power()
-    bench.robot().packet_received(0, bytes((PORT_CONSOLE << 4,)))
-    bench.robot().uart_ready(0)
+    bench.robot.cut_power()
+    bench.robot.packet_received(0, bytes((PORT_CONSOLE << 4,)))
+    bench.robot.uart_ready(0)
     assert bench.fly(0.1) == []
 
 
@@ -258,7 +251,7 @@ def test_a_holder_releases_only_a_flying_robot() -> None:
     lab = Laboratory(FreeRunning())
     robot = ServedRobot(1, site_in(lab), print).robot
     robot.body.hold()
-    lab.robots.append(robot)
+    lab.add(robot)
     gone: list[int] = []
     Holder(robot, gone.append)
     robot.watch(0)
@@ -274,7 +267,7 @@ def test_a_rebooted_board_talks_on_its_serial_line_by_the_laboratorys_clock() ->
     robot = Robot(site, Ports(nobody_listens, uart=uart))
     heard: list[int] = []
     uart.connect(robot.uart_ready, lambda now_us, data: heard.append(now_us))
-    lab.robots.append(robot)
+    lab.add(robot)
     robot.watch(0)
     lab.events.at(2 * SECOND_US, lambda _: robot.cut_power())
     lab.events.at(3 * SECOND_US, robot.boot)
@@ -289,7 +282,7 @@ def test_a_rebooted_board_talks_on_its_serial_line_by_the_laboratorys_clock() ->
 def test_a_firmware_without_a_client_can_switch_its_board_off(kind: int, powered: bool) -> None:
     lab = Laboratory(FreeRunning())
     robot = Robot(site_in(lab), Ports(nobody_listens))
-    lab.robots.append(robot)
+    lab.add(robot)
     lab.events.at(SECOND_US, lambda _: robot.board.radio_command(kind, b""))
     lab.end_at(2 * SECOND_US)
     lab.run()

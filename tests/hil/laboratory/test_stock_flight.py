@@ -152,7 +152,7 @@ def test_same_seed_has_the_same_hash_and_an_unknown_parameter_one_line(tmp_path:
 @needs_image
 def test_served_robot_stands_on_the_floor_with_the_profiles_parameters_and_feels_its_height() -> None:
     with served_image(ELF, PROFILE) as server:
-        served = server.ends.robots[0]
+        served = server.served
         robot = served.robot
         assert robot.free
         assert robot.firmware.flashed is not None

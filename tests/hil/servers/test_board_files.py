@@ -10,33 +10,31 @@ from hil.errors import LabError
 from hil.servers.server import Server, Service
 
 
-def serve(state: Path | None, boards: int = 1) -> Server:
-    return Server(Service(load_config(), boards, state=state), lambda line: None)
+def serve(state: Path | None, number: int = 1) -> Server:
+    return Server(Service(load_config(), number, state=state), lambda line: None)
 
 
 def test_eeprom_and_deck_memory_of_each_board_are_kept_over_a_restart(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "boards"
-    first = serve(folder, 2)
-    one, two = (served.robot.board for served in first.ends.robots)
+    servers = [serve(folder, number) for number in (1, 2)]
+    one, two = (server.robot.board for server in servers)
     ParameterStorage(one.eeprom).store("supervisor.poseTimeout", (321).to_bytes(2, "little"))
     one.deck_memory[100:103] = b"abc"
     two.eeprom[8000:8003] = b"two"
-    first.ends.close()
+    for server in servers:
+        server.close()
 
-    again = serve(folder, 2)
-    for served, before in zip(again.ends.robots, (one, two), strict=True):
-        assert served.robot.board.eeprom == before.eeprom
-        assert served.robot.board.deck_memory == before.deck_memory
-    values = {
-        parameter.name: parameter.read() for parameter in again.ends.robots[0].robot.firmware.parameters
-    }
+    again = [serve(folder, number).robot for number in (1, 2)]
+    for robot, before in zip(again, (one, two), strict=True):
+        assert robot.board.eeprom == before.eeprom
+        assert robot.board.deck_memory == before.deck_memory
+    values = {parameter.name: parameter.read() for parameter in again[0].firmware.parameters}
     assert values["supervisor.poseTimeout"] == 321
-    again.ends.close()
 
 
 def test_changes_are_written_at_once(tmp_path: Path) -> None:
     server = serve(tmp_path)
-    server.ends.robots[0].robot.board.eeprom[8000:8003] = b"new"
+    server.robot.board.eeprom[8000:8003] = b"new"
     server.lab.end_at(30_000)
     server.lab.run()
     assert (tmp_path / "board-1.eeprom").read_bytes()[8000:8003] == b"new"
@@ -45,9 +43,9 @@ def test_changes_are_written_at_once(tmp_path: Path) -> None:
 
 def test_without_a_folder_every_server_begins_with_new_boards() -> None:
     server = serve(None)
-    server.ends.robots[0].robot.board.eeprom[8000:8003] = b"new"
-    server.ends.close()
-    assert serve(None).ends.robots[0].robot.board.eeprom[8000:8003] == b"\xff" * 3
+    server.robot.board.eeprom[8000:8003] = b"new"
+    server.close()
+    assert serve(None).robot.board.eeprom[8000:8003] == b"\xff" * 3
 
 
 def test_an_invalid_memory_file_is_refused(tmp_path: Path) -> None:

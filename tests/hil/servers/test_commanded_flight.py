@@ -39,10 +39,10 @@ class Script:
         self.said: list[str] = []
         self.server = Server(Service(load_config()), self.said.append)
         self.server.lab.clock = FreeRunning()
-        self.robot = self.server.lab.robots[0]
+        self.robot = self.server.robot
         self._next_us = 0
         if station:
-            self.server.ends.robots[0].fly(absolute=True)
+            self.server.served.fly(absolute=True)
         else:
             self.robot.seen_by(lambda frame, now_us, _: self._feed(frame, now_us))
         self.cf = SimpleNamespace(

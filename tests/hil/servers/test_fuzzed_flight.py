@@ -28,7 +28,7 @@ class Fuzzed:
         config = load_config("floaty", [f"predictor.absolute={absolute}"])
         self.server = Server(Service(config), self.said.append)
         self.server.lab.clock = FreeRunning()
-        (self.served,) = self.server.ends.robots
+        self.served = self.server.served
         self.served.fly(absolute)
         self.rng = np.random.default_rng(seed)
         if absolute:

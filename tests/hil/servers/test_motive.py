@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -234,9 +235,8 @@ def test_markers_of_a_body_that_is_not_tracked_have_no_label(start) -> None:
 
 
 def test_markers_of_all_bodies_share_a_frame_and_are_distinguishable(start) -> None:
-    names = {1: "floaty", 2: "floaty2"}
     one = Streaming(0, (3, 1), False)
-    lab, client = start(lambda lab: VirtualMotive(one, names, lab.readers, PLACES))
+    lab, client = start(lambda lab: VirtualMotive(one, 2, lab.readers, PLACES))
     client.connect()
     for _ in range(2):  # nothing is left of the frame before
         lab.motive.take(1, seen(1), 0, sighted(1))
@@ -251,8 +251,8 @@ def test_markers_of_all_bodies_share_a_frame_and_are_distinguishable(start) -> N
 
 
 def test_bodies_of_one_exposure_share_a_frame(start) -> None:
-    names, one = {1: "floaty", 2: "floaty2"}, Streaming(0, (3, 1), False)
-    lab, client = start(lambda lab: VirtualMotive(one, names, lab.readers))
+    one = Streaming(0, (3, 1), False)
+    lab, client = start(lambda lab: VirtualMotive(one, 2, lab.readers))
     client.connect()
     lab.motive.take(1, seen(1), 0)
     assert client.hears_nothing()
@@ -261,6 +261,33 @@ def test_bodies_of_one_exposure_share_a_frame(start) -> None:
     assert [body.id for body in found] == [1, 2]
     client.say(MessageId.REQUEST_MODELDEF)
     assert [body.name for body in decode(client.hear(), (3, 1)).bodies] == ["floaty", "floaty2"]
+
+
+def test_a_body_whose_process_is_late_is_not_tracked_in_one_frame_and_is_in_time_in_the_next(start) -> None:
+    one = Streaming(0, (4, 1), False)
+    lab, client = start(lambda lab: VirtualMotive(one, 3, lab.readers))
+    client.connect()
+
+    def expose(body: int, count: int) -> None:
+        """Clocks of their own, which began at different times."""
+        frame = replace(seen(10 * count + body), t_us=1_000_000 * body + 10_000 * count)
+        lab.motive.take(body, frame, frame.t_us, None, 50_000_000 - 1_000_000 * body)
+
+    for body in (3, 1):
+        expose(body, 1)
+    assert client.hears_nothing()
+    expose(1, 2)
+    late = decode(client.hear(), (4, 1))
+    assert [(body.id, body.valid) for body in late.bodies] == [(1, True), (2, False), (3, True)]
+    assert late.bodies[2].p == pytest.approx(FROM_MOTIVE.T @ seen(13).p_WB, abs=1e-6)
+    for body, count in ((2, 1), (3, 2)):
+        expose(body, count)
+    assert client.hears_nothing()
+    expose(2, 2)
+    bodies = decode(client.hear(), (4, 1)).bodies
+    assert [body.valid for body in bodies] == [True] * 3
+    assert bodies[1].p == pytest.approx(FROM_MOTIVE.T @ seen(22).p_WB, abs=1e-6)
+    assert client.hears_nothing()
 
 
 def test_the_bitstream_is_changed_for_the_client_that_asks(lab: MotiveBench, client: NatNetSocket) -> None:
@@ -324,7 +351,7 @@ def test_a_taken_port_is_one_line(lab: MotiveBench) -> None:
     with pytest.raises(
         LabError, match=rf"^natnet port {lab.motive.port}: Address already in use; --set capture.port=0 takes"
     ):
-        VirtualMotive(Streaming(lab.motive.port, (4, 1), False), {1: "floaty"}, {})
+        VirtualMotive(Streaming(lab.motive.port, (4, 1), False), 1, {})
 
 
 @pytest.mark.parametrize("interface", [HOST, "0.0.0.0"], ids=["loopback", "any"])

@@ -14,9 +14,9 @@ def test_rows_of_a_served_robot_describe_its_look() -> None:
     server = Server(Service(load_config()), lambda text: None, watcher)
     server.lab.end_at(1_000_000)
     server.lab.run()
-    server.ends.close()
+    server.close()
     look = Look.read(stored_in(watcher.batches[0].schema.metadata, "look"))
-    own = server.ends.robots[0].robot.body.look
+    own = server.robot.body.look
     assert [part.name for part in look.parts] == [part.name for part in own.parts]
     assert len(look.outline) == len(own.outline) > 0
 
@@ -26,9 +26,7 @@ def test_rows_of_a_served_robot_describe_its_look() -> None:
 
 @pytest.mark.parametrize(("spacing", "sides"), [(0.0, (0.0, 0.0, 0.0, 0.0)), (0.5, (0.0, 0.5, -0.5, 1.0))])
 def test_robots_of_one_room_start_side_by_side(spacing: float, sides: tuple[float, ...]) -> None:
-    server = Server(Service(load_config("floaty", [f"flight.spacing={spacing}"]), 4), lambda line: None)
-    try:
-        places = [served.robot.body.p_WB.tolist() for served in server.ends.robots]
-        assert places == [[0.0, side, 1.15] for side in sides]
-    finally:
-        server.ends.close()
+    config = load_config("floaty", [f"flight.spacing={spacing}"])
+    for number, side in enumerate(sides, 1):
+        server = Server(Service(config, number), lambda line: None)
+        assert server.robot.body.p_WB.tolist() == [0.0, side, 1.15]

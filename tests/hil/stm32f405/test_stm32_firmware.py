@@ -114,18 +114,6 @@ def test_a_step_into_an_interrupt_ends_in_front_of_its_handler() -> None:
     assert chip.state.instructions > instructions
 
 
-def test_a_busy_chip_wants_its_turn_ten_times_a_millisecond() -> None:
-    machine = FirmwareOnChip()
-    processor = machine.processor()
-    processor.run(20_000)
-    turns = 0
-    while processor.now_us < 30_000:
-        assert not machine.chip.state.asleep  # two of its tasks never wait
-        processor.run(processor.next_wake_us)
-        turns += 1
-    assert turns <= 101
-
-
 @pytest.mark.parametrize("taken_us", [0, 400, 900])
 def test_processor_load_takes_time_only_from_tasks(taken_us: int) -> None:
     machine = FirmwareOnChip()

@@ -1,0 +1,179 @@
+"""Robots of one server, each in a process of its own: dongles, UDP, typed lines, failures and the end; at any pace."""
+
+import os
+import signal
+import socket
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from firmware_py.firmware import Firmware
+from hil.config import load_config
+from hil.crazyflie import syslink
+from hil.devices.board_firmware import PowerOn, PythonBoard
+from hil.servers.dongle_plugin import VARIABLE, Connection
+from hil.servers.server import Doors, Server, Service
+from hil.servers.swarm import Swarm
+from support.serving import PATIENCE_S, Served, serve
+
+SET_CHANNEL, SET_ADDRESS, SET_RATE, SET_ACKS = 1, 2, 3, 16  # vendor requests
+NULL = b"\xff"
+EVERYBODY = bytes.fromhex("FFE7E7E7E7")
+ACKNOWLEDGED, NOT_ACKNOWLEDGED = 1, 0
+MOVED = 37
+
+
+class Dongle(Connection):
+    """A client's dongle, tuned as cflib does before every packet."""
+
+    def __init__(self, served: Served) -> None:
+        host, port = served.environment[VARIABLE].split(":")
+        super().__init__(host, int(port))
+
+    def request(self, number: int, value: int, data: bytes = b"") -> None:
+        self.control(bytes((number, value, 0)) + data)
+
+    def send(self, last: int, packet: bytes = NULL, channel: int = 80) -> int:
+        """Send a packet to the address that ends so; return the status that comes back."""
+        self.request(SET_CHANNEL, channel)
+        self.request(SET_ADDRESS, 0, b"\xe7" * 4 + bytes((last,)))
+        self.request(SET_RATE, 2)
+        self.write(packet)
+        return self.read(PATIENCE_S)[0] & 1
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with serve("--boards", "2", "--radio", "--radio-port", "0", "--udp", "0") as served:
+        yield served
+
+
+def others(served: Served) -> list[int]:
+    """The processes of the robots 2, 3, ...."""
+    pid = served.process.pid
+    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def test_one_dongle_reaches_every_robot_by_its_address_and_nobody_by_another(served: Served) -> None:
+    with closing(Dongle(served)) as dongle:
+        for _ in range(3):
+            assert [dongle.send(last) for last in (0xE7, 0x02, 0x03)] == [1, 1, 0]
+
+
+def test_a_robot_that_a_client_moves_is_found_on_its_new_channel(served: Served) -> None:
+    with closing(Dongle(served)) as dongle, closing(Dongle(served)) as other:
+        assert other.send(0x02) == ACKNOWLEDGED
+        dongle.send(0x02, bytes((0xFF, 3, 1, MOVED)))
+        served.wait_for(r"board 2: a client moved the radio to radio://0/37/2M/E7E7E7E702", PATIENCE_S)
+        for client in (dongle, other):
+            assert client.send(0x02) == NOT_ACKNOWLEDGED
+            assert client.send(0x02, channel=MOVED) == ACKNOWLEDGED
+        served.type("2 restart")
+        served.type("2 status")
+        served.wait_for(r"robot 2: .*; radio://0/80/2M/E7E7E7E702", PATIENCE_S)
+        assert other.send(0x02) == ACKNOWLEDGED
+
+
+def test_a_packet_to_all_reaches_all_and_none_answers(served: Served) -> None:
+    with closing(Dongle(served)) as dongle:
+        dongle.request(SET_CHANNEL, 80)
+        dongle.request(SET_RATE, 2)
+        dongle.request(SET_ADDRESS, 0, EVERYBODY)
+        dongle.request(SET_ACKS, 0)
+        dongle.write(bytes((0xFF, 3, 1, MOVED)))
+        for uri in ("radio://0/37/2M/E7E7E7E7E7", "radio://0/37/2M/E7E7E7E702"):
+            served.wait_for(f"a client moved the radio to {uri}", PATIENCE_S)
+        served.forget()
+        dongle.request(SET_CHANNEL, MOVED)
+        dongle.write(bytes((0xFF, 3, 1, 80)))
+        for number in (1, 2):
+            served.wait_for(f"board {number}: a client moved the radio back", PATIENCE_S)
+    served.forget()
+
+
+def test_every_robot_answers_on_its_own_udp_port(served: Served) -> None:
+    assert len(set(served.udp_uris)) == 2
+    for uri in served.udp_uris:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+            client.settimeout(PATIENCE_S)
+            client.sendto(NULL, ("127.0.0.1", int(uri.rpartition(":")[2])))
+            assert client.recv(64) == NULL
+
+
+@pytest.mark.parametrize(
+    ("line", "answer"),
+    [
+        ("status", "robot 1: held, .*; radio://0/80/2M/E7E7E7E7E7"),
+        ("2 status", "robot 2: held, .*; radio://0/80/2M/E7E7E7E702"),
+        ("2 mocap.dropout:0.1", "robot 2 is held: what moves it has no effect before it is released"),
+        ("2 push.w=2", "unknown kind 'push.w'"),
+        ("3 status", r"robot 3: expected 1\.\.2"),
+        ("2 3 status", "'3 status' is unknown; did you mean status?"),
+    ],
+)
+def test_a_typed_line_goes_to_the_robot_whose_number_it_has(served: Served, line: str, answer: str) -> None:
+    served.forget()
+    served.type(line)
+    served.wait_for(answer, PATIENCE_S)
+
+
+def test_ctrl_c_ends_all_processes_in_order_and_keeps_every_robots_memories(tmp_path: Path) -> None:
+    with serve("--boards", "2", "--udp", "0", "--state", str(tmp_path)) as served:
+        pids = others(served)
+        assert len(pids) == 1
+        assert served.interrupt() == 0
+        assert served.lines[-1].startswith("stopped; time stood still for")
+        assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        f"board-{number}.{memory}" for number in (1, 2) for memory in ("deck", "eeprom")
+    ]
+
+
+def test_a_robot_whose_process_dies_ends_the_server_in_one_line() -> None:
+    with serve("--boards", "2", "--udp", "0") as served:
+        (pid,) = others(served)
+        os.kill(pid, signal.SIGKILL)
+        assert served.process.wait(PATIENCE_S) == 2
+        served.listen()
+        assert served.lines[-1] == "floaty: robot 2: its process has ended"
+
+
+def test_robots_do_not_outlive_a_server_that_is_killed() -> None:
+    with serve("--boards", "2", "--udp", "0") as served:
+        served.process.kill()
+        served.process.stdout.read()  # until the last process has closed it
+
+
+class Talker(PythonBoard):
+    """Its firmware sends to its peers what a client sends to its application, and prints what it hears of them."""
+
+    def boot(self, start: PowerOn) -> Firmware:
+        firmware = super().boot(start)
+
+        def received(data: bytes, broadcast: bool = False) -> None:
+            if broadcast:
+                start.board.debug_write(f"peer says {data[2:].decode()}")
+            else:
+                start.board.radio_command(syslink.PEER_BROADCAST, b"\x03" + data[1:])
+
+        firmware.radio_received = received
+        return firmware
+
+
+def test_a_peer_packet_of_one_board_reaches_those_of_all_other_processes() -> None:
+    said: list[str] = []
+    plan, doors = Service(load_config(), executor=Talker()), Doors(udp=0)
+    with closing(Swarm(plan, 3, doors, said.append)) as swarm:
+        others = swarm.wait()
+        with closing(Server(plan, said.append, None, swarm.to_peers)) as server:
+            ports = [int(robot.udp.rpartition(":")[2]) for robot in (server.open(doors), *others)]
+            swarm.listen(server, said.append, None)
+            for number, port in enumerate(ports, 1):
+                with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+                    client.sendto(b"\xd0from %d" % number, ("127.0.0.1", port))
+                    expected = {f"board {n}: peer says from {number}" for n in (1, 2, 3) if n != number}
+                    server.run(lambda expected=expected: expected <= set(said))
+    heard = [line for line in said if "peer says" in line]
+    assert len(heard) == 6
