@@ -141,12 +141,15 @@ class ModelledLine:
         """Return the station's end of the serial line. Raises `LabError` when it is too slow for a flight."""
         from ground_station.links.mavlink import MavlinkLink  # its package is an extra
 
-        self._frames = FrameLog(telemetry.with_name(FRAME_LOG)) if telemetry is not None else None
-        settings = site.config.ground.links(self._frames.note if self._frames else None)
         with refusing("--link mavlink: ", LinkError):
-            link = MavlinkLink(uart.uplink, settings)
+            link = MavlinkLink(uart.uplink, site.config.ground.links(self._note_frame))
+        self._frames = FrameLog(telemetry.with_name(FRAME_LOG)) if telemetry is not None else None
         site.events.at(0, lambda now_us: site.say("lab", link.budget.text))
         return link, serial_channel(uart, self.robot.firmware, link)
+
+    def _note_frame(self, now_us: int, frame: bytes) -> None:
+        if self._frames is not None:
+            self._frames.note(now_us, frame)
 
     def steer(self, trajectory: Trajectory) -> None:
         """Fly another trajectory from now on."""

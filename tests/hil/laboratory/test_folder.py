@@ -95,7 +95,7 @@ def test_a_refused_flight_leaves_no_folder() -> None:
 def test_the_command_names_the_folder_that_stays(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     fly("hover", duration_s=SHORT)
     kept = stored("runs/hover-1")
-    monkeypatch.setattr("hil.commands.fly.write_pictures", lambda folder, experiment: None)
+    monkeypatch.setattr("hil.commands.options.write_pictures", lambda folder, experiment: None)
     cli("fly", "hover", "--duration", "0.1")
     assert cli.err.splitlines() == [
         "runs/hover-1 holds another flight (duration 0.05 s); this flight is in runs/hover-1-2"
