@@ -14,6 +14,7 @@ from math import comb
 from firmware_py.geometry import Vector, rotate, wrap_angle, yaw_quaternion
 
 AXES = 4  # x, y, z, yaw
+SHORTEST_S = 1e-3  # a path that takes less time jumps to its end
 SAMPLES = 16  # positions of a piece that are compared with the box
 Coefficients = tuple[float, ...]  # ascending powers of the time in a piece
 
@@ -166,7 +167,7 @@ def go_to(
         position, yaw = _sum(begin.position, position), begin.yaw + yaw
     turn = wrap_angle(yaw - begin.yaw)
     end = PathPoint(position, begin.yaw + turn)
-    if linear and duration > 0.0:
+    if linear and duration >= SHORTEST_S:
         velocity = _scaled(_sum(position, _scaled(begin.position, -1.0)), 1.0 / duration)
         rate = turn / duration
         begin = PathPoint(begin.position, begin.yaw, velocity, (0.0, 0.0, 0.0), rate)
@@ -176,7 +177,7 @@ def go_to(
 
 def between(begin: PathPoint, end: PathPoint, duration: float) -> Path:
     """Return the piece between two motions with zero jerk at its ends; without time for it, the end at once."""
-    if duration <= 0.0:
+    if duration < SHORTEST_S:
         axes = ((end.position[0],), (end.position[1],), (end.position[2],), (end.yaw,))
         return Path((Piece(0.0, axes),))
     first, second, third = (

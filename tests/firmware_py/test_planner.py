@@ -120,6 +120,18 @@ def test_up_and_down_keep_the_place_and_turn_on_the_shorter_side() -> None:
     assert path.at(2.0).yaw == pytest.approx(2 * pi - 3.0)
 
 
+@pytest.mark.parametrize("duration", [0.0, 5e-324, 2.9e-59, 0.9e-3])
+@pytest.mark.parametrize("linear", [False, True])
+def test_a_path_without_time_is_its_end(duration: float, linear: bool) -> None:
+    begin = PathPoint((0.0, 0.0, 1.0), 0.0)
+    for path in (
+        straight_up(begin, 2.0, 0.5, duration),
+        go_to(begin, (0.0, 0.0, 2.0), 0.5, duration, relative=False, linear=linear),
+    ):
+        assert (path.at(0.0).position, path.at(0.0).yaw) == ((0.0, 0.0, 2.0), 0.5)
+        assert path.duration == 0.0
+
+
 def test_going_there_is_absolute_or_relative_smooth_or_straight() -> None:
     smooth = go_to(REST, (1.0, 0.0, 0.0), 0.0, 2.0, relative=False, linear=False)
     assert smooth.at(2.0).position == pytest.approx((1.0, 0.0, 0.0))

@@ -90,5 +90,5 @@ def test_random_messages_and_bytes_on_the_serial_line_lose_nothing() -> None:
         lab.run(0.1)
         assert np.abs(lab.place - lab.robot.config.flight.home).max() < 0.15, lab.said[-5:]
     assert lab.robot.firmware.mavlink is not None
-    assert lab.robot.firmware.mavlink.bad > 500
+    assert lab.robot.firmware.mavlink.counters.bad > 500
     assert not any("lost" in line or "failsafe" in line for line in lab.said)
