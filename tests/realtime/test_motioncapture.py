@@ -130,7 +130,7 @@ def test_poses_come_through_the_package_s_own_process_and_a_killed_one_comes_bac
         assert os.getsid(process_of(source)) != os.getsid(0)  # Ctrl-C does not reach it
         os.kill(process_of(source), signal.SIGKILL)
         assert_one_notice(source, "motion capture: no frames; calling the server again")
-        await_notice(source, "frames again")
+        await_notice(source, "frames arrive again")
         assert any(frame.valid for frame in received(source, 20))
 
 
@@ -179,7 +179,7 @@ def test_vrpn_poses_come_from_a_server_over_its_own_protocol() -> None:
             assert all(frame.valid for frame in await_notice(source, "no frames"))
             assert source.receive(0.1) is None  # VRPN does not say that a body is lost: it says nothing
             silent.clear()
-            await_notice(source, "frames again")
+            await_notice(source, "frames arrive again")
 
 
 @needs("motioncapture")
@@ -205,7 +205,7 @@ def test_qualisys_poses_come_from_a_server_over_its_own_protocol() -> None:
             state.append("stopped")
             await_notice(source, "no frames")
             state.clear()
-            await_notice(source, "frames again")
+            await_notice(source, "frames arrive again")
 
 
 @needs("motioncapture")
