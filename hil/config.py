@@ -294,7 +294,7 @@ def _explain(tree: Mapping[str, Any], detail: ErrorDetails) -> str:
 
 
 def keys_at(model: Any, location: list[str]) -> list[str]:
-    """Return the keys at a place in a model, past keys and indices of its own values; none where no model is."""
+    """Return the keys of the model at a location, which may pass dict keys and list indices; empty without a model."""
     for part in location:
         if part in model.model_fields:
             annotation = model.model_fields[part].annotation

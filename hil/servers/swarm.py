@@ -1,4 +1,4 @@
-"""The robots 2, 3, ... of `floaty serve --boards N`: each has a process of its own, forked from that of robot 1.
+"""Robots 2, 3, ... of `floaty serve --boards N`: each runs in a separate process, forked from that of robot 1.
 
 Each process opens its robot's connections. A pipe to robot 1's process carries what all share: where clients find the
 robot, lines for the user, poses for Motive, packets between boards, and typed lines. A message is the name of a call and

@@ -5,6 +5,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Unpack
 
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hil.api import Run, column
 from hil.config import load_config
 from hil.experiments import Experiment, find_experiment
 from hil.laboratory.lockstep import image_at
@@ -39,3 +44,17 @@ def served_image(elf: str, profile: str) -> Iterator[Server]:
         yield server
     finally:
         server.close()
+
+
+def check_hover(run: Run, motor_V: float) -> NDArray[np.bool_]:
+    """Check a Crazyflie's hover from floor to floor and its motors' mean voltage [V]; return the rows at rest in the air."""
+    assert run.result.outcome == "completed"
+    held = [verdict for verdict in run.result.verdicts if verdict.metric in ("max_x", "max_y")]
+    assert all(verdict.holds for verdict in held), held
+    log = run.log
+    assert column(log, "truth.z").max() > 0.9
+    assert column(log, "truth.z")[-1] < 0.02
+    in_air = (column(log, "truth.z") > 0.9) & (abs(column(log, "truth.vz")) < 0.02)
+    share = column(log, "motor.m1", "motor.m2", "motor.m3", "motor.m4")[in_air].mean() / 65535
+    assert share * column(log, "battery.voltage")[in_air].mean() == pytest.approx(motor_V, rel=0.03)
+    return in_air

@@ -95,7 +95,7 @@ struct esc { /* of a motor, at a timer's output */
     const double *rpm;
     uint32_t timer, channel, poles;
     uint32_t bits, frame, refused, throttle; /* `refused`: frames with a wrong checksum */
-    uint32_t ready;                          /* it was told to stop since the last silence */
+    uint32_t ready;                          /* a zero has arrived since the last silence: it may start */
     uint32_t reply, left, high;              /* the reply, how many bits of it have yet to leave, and the level */
     uint64_t reply_bit;                      /* [cycles] */
 };

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from hil.api import Request, column, fly
+from hil.api import Request, fly
 from hil.crazyflie.log_table import log_table
 from hil.errors import LabError
 from hil.experiments.position import HOVER
 from hil.laboratory.fault_kinds import KINDS
-from support.flights import served_image
+from support.flights import check_hover, served_image
 from support.stm32_firmware import build
 
 ELF = os.environ.get("FLOATY_BRUSHLESS_ELF", "")
@@ -52,16 +52,7 @@ def test_takes_off_holds_and_lands_with_each_tuned_controller(controller: int, t
     """INDI has the gains of the 2.1 alone: it holds 18 cm too high, and the firmware stops its motors there."""
     settings = {"pilot.parameters.stabilizer.controller": controller}
     run = fly("hover", tmp_path / "run", profile=PROFILE, board=ELF, overrides=settings, duration_s=12.0)
-    assert run.result.outcome == "completed"
-    held = [verdict for verdict in run.result.verdicts if verdict.metric in ("max_x", "max_y")]
-    assert all(verdict.holds for verdict in held), held
-    log = run.log
-    assert column(log, "truth.z").max() > 0.9
-    assert column(log, "truth.z")[-1] < 0.02
-    in_air = (column(log, "truth.z") > 0.9) & (abs(column(log, "truth.vz")) < 0.02)
-    share = column(log, "motor.m1", "motor.m2", "motor.m3", "motor.m4")[in_air].mean() / 65535
-    volts = column(log, "battery.voltage")[in_air].mean()
-    assert share * volts == pytest.approx(2.02, rel=0.03)  # [V] of Bitcraze's curve at a quarter of 39.3 g
+    check_hover(run, 2.02)  # [V] of Bitcraze's curve at a quarter of 39.3 g
 
 
 @needs_image
@@ -81,7 +72,7 @@ def test_hover_with_a_failed_motor_is_lost_where_that_is_stated(kind: str, tmp_p
 @needs_image
 def test_armed_motors_idle_and_the_firmware_knows_their_speeds() -> None:
     with served_image(ELF, PROFILE) as server:
-        robot = server.ends.robots[0].robot
+        robot = server.served.robot
         robot.packet_received(1_000_000, ARM)
         server.lab.end_at(2_000_000)
         server.lab.run()

@@ -23,7 +23,7 @@ SECOND_US = 1_000_000
 
 
 class Bench:
-    """A robot that flies with a station of its own, served, on a free-running clock."""
+    """A served robot that flies with the built-in station, on a free-running clock."""
 
     def __init__(self, faults: tuple[Fault, ...] = (), number: int = 1, seed: int = 1) -> None:
         self.said: list[str] = []

@@ -1,4 +1,4 @@
-"""Robots of one server, each in a process of its own: dongles, UDP, typed lines, failures and the end; at any pace."""
+"""Robots of one server, each in a separate process: dongles, UDP, typed lines, failures and shutdown, at any pace."""
 
 import os
 import signal
