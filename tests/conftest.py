@@ -35,8 +35,8 @@ METER_PERIOD_S = 0.005
 STEADY_MS, STEADY_S = 20, 5.0  # a machine runs steadily when a busy process misses no longer time for so long
 PATIENCE_S = 600.0  # that the tests of one session wait for a steady machine, together
 LIMITS_S = {
-    "realtime": 1800.0,
-    "long": 1800.0,
+    "realtime": 600.0,
+    "long": 600.0,
     "fast": 300.0,
 }  # of one test with its fixtures, on a busy machine
 GRACE_S = (

@@ -1,7 +1,8 @@
 """Worker processes that fly: on this computer, or of a Dask scheduler.
 
-A process of this computer flies one flight at a time. A dead process is replaced and its flight is repeated; if it dies
-again, the flight becomes a row.
+A process of this computer flies one flight at a time; a worker of a scheduler has a second one waiting. A dead process is
+replaced. Its flights are repeated when all others have ended, one at a time: the one with which a process dies again
+becomes a row.
 """
 
 from __future__ import annotations
@@ -12,22 +13,24 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from hil.campaigns.jobs import Job, Row, failed, fly_job
 from hil.errors import LabError, require
 
 if TYPE_CHECKING:
     from distributed import Client
+    from distributed import Future as ClusterFuture
 
 LOOK_S = 0.2  # how often Ctrl-C is checked
 PER_WORKER = 2  # of a scheduler: one flies and one waits, so that no worker idles while a row is sent
-CONNECT_S = 30.0
+CONNECT_S = 30.0  # a cluster without workers for so long is lost
 DIED = "the process that flew it died, also when it flew it again"
 FlyOne = Callable[[Job], Row]
+Handle: TypeAlias = "Future[Row] | ClusterFuture[Row]"
 
 _ALONE = threading.Lock()  # one flight per process at a time: the process has one time limit
 
@@ -52,10 +55,12 @@ class Workers:
     def __init__(self, count: int, address: str = "") -> None:
         self._client: Client | None = None
         self._address = address
-        self._executors: list[Executor] = []
-        self._room = 1  # flights at a time for each executor
+        self._processes: list[ProcessPoolExecutor] = []
+        self._bell = threading.Event()  # set when a flight has ended
+        self._looks = 0  # since the cluster had a worker
+        self._room = 1  # flights at a time for each process, or for the cluster
         if not address:
-            self._executors += [_process() for _ in range(count)]
+            self._processes += [_process() for _ in range(count)]
             return
         require(f"--cluster {address}", "campaign", "distributed")
         from distributed import Client
@@ -66,7 +71,6 @@ class Workers:
             self._client.wait_for_workers(1, timeout=CONNECT_S)
         except (OSError, TimeoutError, ValueError) as error:
             raise LabError(f"--cluster {address}: no workers ({error})") from None
-        self._executors.append(self._client.get_executor(pure=False))
         self._room = PER_WORKER * sum(self._client.nthreads().values())
 
     def close(self) -> None:
@@ -74,8 +78,8 @@ class Workers:
         if self._client is not None:
             self._client.close()
             return
-        for executor in self._executors:
-            executor.shutdown(wait=False, cancel_futures=True)
+        for process_of_one in self._processes:
+            process_of_one.shutdown(wait=False, cancel_futures=True)
         for process in multiprocessing.active_children():
             process.kill()
 
@@ -86,48 +90,70 @@ class Workers:
 
         `stopped` counts the requests to end: the first starts no more flights, the second does not wait for running ones.
         """
-        free = [number for number in range(len(self._executors)) for _ in range(self._room)]
-        flying: dict[Future[Row], tuple[int, Job]] = {}
-        again: list[Job] = []
-        died: set[int] = set()  # flights whose process died
+        free = list(range(max(1, len(self._processes)))) * self._room
+        flying: dict[Handle, tuple[int, Job]] = {}
+        died: list[Job] = []  # their process died, perhaps by another flight's fault
+        alone = False  # only those are left
         while stopped() < 2:
-            while free and not stopped() and (job := again.pop() if again else next(jobs, None)) is not None:
-                executor = self._executors[free[-1]]
-                flying[executor.submit(fly_alone, job, fly_one)] = free.pop(), job
+            while free and not stopped() and (job := next(jobs, None)) is not None:
+                number = free.pop()
+                flying[self._submit(number, job, fly_one)] = number, job
+            if not flying and died and not stopped():
+                alone, number, job = True, free.pop(), died.pop(0)
+                flying[self._submit(number, job, fly_one)] = number, job
             if not flying:
                 return
-            for future in wait(flying, LOOK_S, FIRST_COMPLETED).done:
+            for future in self._done(flying):
+                try:
+                    row = self._row_of(future, flying[future][1])
+                except TimeoutError:
+                    continue  # its worker died with the row: the scheduler lets another one fly it
                 number, job = flying.pop(future)
                 free.append(number)
-                row = self._row_of(future, job)
-                if row is not None:
-                    yield row
-                    continue
-                if self._client is None:
-                    self._executors[number] = _process()
-                if job.index in died:
-                    yield failed(job, DIED)
+                if row is None and not alone:
+                    died.append(job)
                 else:
-                    died.add(job.index)
-                    again.append(job)
+                    yield row or failed(job, DIED)
+                if row is None and self._processes:
+                    self._processes[number] = _process()
 
-    def _row_of(self, future: Future[Row], job: Job) -> Row | None:
-        """Return the row of a flight; None when its process has died."""
+    def _submit(self, number: int, job: Job, fly_one: FlyOne) -> Handle:
+        future: Handle
+        if self._client is None:
+            future = self._processes[number].submit(fly_alone, job, fly_one)
+        else:
+            future = self._client.submit(fly_alone, job, fly_one, pure=False)
+        future.add_done_callback(lambda _: self._bell.set())
+        return future
+
+    def _done(self, flying: Iterable[Handle]) -> list[Handle]:
+        """Return the flights that have ended, after a wait for one. Raises `LabError` for a lost cluster."""
+        self._bell.wait(LOOK_S)
+        self._bell.clear()
+        done = [future for future in flying if future.done()]
+        if self._client is not None:
+            self._looks = 0 if done or self._client.scheduler_info()["workers"] else self._looks + 1
+            if self._client.status != "running" or self._looks * LOOK_S > CONNECT_S:
+                raise LabError(
+                    f"--cluster {self._address}: lost; --resume continues with the flights that are kept"
+                )
+        return done
+
+    def _row_of(self, future: Handle, job: Job) -> Row | None:
+        """Return the row of a flight; None when its process has died. Raises `TimeoutError` when the row is lost."""
         try:
-            return future.result()
-        except LabError:
+            error = future.exception(LOOK_S)
+            if error is None:
+                return future.result(LOOK_S)
+        except TimeoutError:
             raise
-        except (BrokenProcessPool, CancelledError):
-            died = True
-        except Exception as error:
-            died = type(error).__name__ == "KilledWorker"  # of `distributed`
-            if not died:
-                return failed(job, f"{type(error).__name__}: {error}")
-        if self._client is not None and self._client.status != "running":
-            raise LabError(
-                f"--cluster {self._address}: lost; --resume continues with the flights that are kept"
-            )
-        return None
+        except Exception as raised:
+            error = raised
+        if isinstance(error, LabError):
+            raise error
+        if isinstance(error, BrokenProcessPool | CancelledError) or type(error).__name__ == "KilledWorker":
+            return None
+        return failed(job, f"{type(error).__name__}: {error}")
 
 
 def _process() -> ProcessPoolExecutor:

@@ -133,7 +133,27 @@ def test_a_flight_that_kills_the_cluster_s_worker_each_time_is_a_row(tmp_path: P
         rows = rows_of(crew, spec, killing)
         crew.close()
     assert sorted(rows) == list(range(6))
-    assert rows[3].error == DIED
+    assert {n: row.error for n, row in rows.items() if row.error} == {3: DIED}, (
+        "none that was on the same worker"
+    )
+
+
+def test_a_cluster_that_loses_its_workers_or_itself_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    for loss in (lambda there: there.scale(0), lambda there: there.close()):
+        with LocalCluster(
+            n_workers=1, threads_per_worker=1, dashboard_address=":0", silence_logs=50
+        ) as there:  # fmt: skip
+            crew = Workers(0, there.scheduler_address)
+            flights = crew.fly(map(plan_of(spec_of(flights=500)).job, range(500)), lambda: 0, planted)
+            next(flights)
+            monkeypatch.setattr("hil.campaigns.workers.CONNECT_S", 1.0)
+            loss(there)
+            with pytest.raises(
+                LabError, match=r"^--cluster tcp://127\.0\.0\.1:\d+: lost; --resume continues"
+            ):
+                list(flights)
+            monkeypatch.undo()
+            crew.close()
 
 
 def _nothing(standing: Standing) -> None:
