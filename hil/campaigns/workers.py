@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.2  # how often Ctrl-C is checked
 PER_WORKER = 2  # of a scheduler: one flies and one waits, so that no worker idles while a row is sent
-CONNECT_S = 30.0  # a cluster without workers for so long is lost
+CONNECT_S = 30.0
+LOST_S = 300.0  # a cluster without workers for so long is lost; dead ones may be replaced
 DIED = "the process that flew it died, also when it flew it again"
 FlyOne = Callable[[Job], Row]
 Handle: TypeAlias = "Future[Row] | ClusterFuture[Row]"
@@ -133,7 +134,7 @@ class Workers:
         done = [future for future in flying if future.done()]
         if self._client is not None:
             self._looks = 0 if done or self._client.scheduler_info()["workers"] else self._looks + 1
-            if self._client.status != "running" or self._looks * LOOK_S > CONNECT_S:
+            if self._client.status != "running" or self._looks * LOOK_S > LOST_S:
                 raise LabError(
                     f"--cluster {self._address}: lost; --resume continues with the flights that are kept"
                 )
