@@ -6,7 +6,7 @@ from hashlib import sha256
 from typing import Any
 
 import numpy as np
-import pymavlink.dialects.v20.common as dialect
+import pymavlink.dialects.v20.development as dialect
 import pytest
 
 from firmware_py.wire import WireError, mavlink
@@ -149,8 +149,6 @@ def test_a_field_that_does_not_fit_is_refused_and_takes_no_sequence_number() -> 
     sender = FrameSender(7, 9)
     with pytest.raises(WireError, match="PARAM_VALUE"):
         sender.encode(0, dialect.MAVLink_param_value_message(b"X", 1e300, 9, 1, 0))
-    with pytest.raises(WireError, match="12345678"):
-        sender.encode(0, dialect.MAVLink_message(12345678, "NONE"))
     assert sender.encode(0, services.timesync(0, 1)) == golden(peer(), [services.timesync(0, 1)])[0]
 
 
