@@ -126,7 +126,8 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "cflib": ("ground_station/links/crazyradio.py", "ground_station/links/packets.py", "ground_station/flashing.py"),
     "serial": ("ground_station/links/mavlink_serial.py",),
     "pymavlink": (
-        "firmware_py/wire/mavlink.py", "firmware_py/wire/mavlink_layouts.py", "firmware_py/wire/mavlink_services.py",
+        "firmware_py/wire/mavlink.py", "firmware_py/wire/mavlink_dialect.py", "firmware_py/wire/mavlink_frames.py",
+        "firmware_py/wire/mavlink_services.py",
     ),
     "filterpy": (),
     "motioncapture": ("ground_station/sources/motioncapture_process.py",),

@@ -16,7 +16,7 @@ from firmware_py.links.parameters import Parameter, ParameterStorage
 from firmware_py.supervisor import CoreSupervisor
 from firmware_py.wire import mavlink
 from firmware_py.wire import mavlink_services as services
-from firmware_py.wire.mavlink_layouts import NUMBERS, Message
+from firmware_py.wire.mavlink_dialect import NUMBERS, Message
 from firmware_py.wire.mavlink_numbers import WRITE_ALL, Command, CommandResult, Mode
 
 FORCE = 21196  # MAVLink's magic number for disarming in flight

@@ -14,7 +14,7 @@ from firmware_py.links.mavlink_stack import MavlinkStack, Task
 from firmware_py.links.parameters import Parameter
 from firmware_py.wire import WireError
 from firmware_py.wire import mavlink_services as services
-from firmware_py.wire.mavlink_layouts import Message
+from firmware_py.wire.mavlink_dialect import Message
 from firmware_py.wire.parameters import OK
 
 HASH_NAME = "_HASH_CHECK"

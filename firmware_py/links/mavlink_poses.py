@@ -22,7 +22,7 @@ from firmware_py.rtos import Queue
 from firmware_py.wire import mavlink
 from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.crtp import Correction
-from firmware_py.wire.mavlink_layouts import Message
+from firmware_py.wire.mavlink_dialect import Message
 
 WINDOW = 16  # exchanges
 DRIFT_PPM = 100  # of both clocks together: two crystals of 50 ppm

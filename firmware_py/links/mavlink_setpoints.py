@@ -17,7 +17,7 @@ from firmware_py.planner import PathPoint, stay
 from firmware_py.rtos import FOREVER, TICK_US
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire import mavlink_services as services
-from firmware_py.wire.mavlink_layouts import Message
+from firmware_py.wire.mavlink_dialect import Message
 from firmware_py.wire.mavlink_numbers import Command, CommandResult, Mode
 
 SILENCE_US = 500_000  # of set-points, which ends offboard; PX4: COM_OF_LOSS_T is 1 s

@@ -17,8 +17,8 @@ from firmware_py.rtos import Kernel, Queue
 from firmware_py.rtos.scheduler import GO_ON
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire import mavlink_services as services
+from firmware_py.wire.mavlink_dialect import NUMBERS, Message
 from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Signing
-from firmware_py.wire.mavlink_layouts import NUMBERS, Message
 
 Task = Generator[int, None, None]
 Handler = Callable[[Message], object]

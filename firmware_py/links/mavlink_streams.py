@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from firmware_py.links.mavlink_stack import MavlinkStack, Task
 from firmware_py.rtos import FOREVER, TICK_US
-from firmware_py.wire.mavlink_layouts import NUMBERS, Message
+from firmware_py.wire.mavlink_dialect import NUMBERS, Message
 
 DEFAULT, OFF = 0, -1  # intervals in SET_MESSAGE_INTERVAL
 NONE_SUCH = 0  # interval in MESSAGE_INTERVAL

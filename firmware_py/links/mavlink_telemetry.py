@@ -29,7 +29,7 @@ from firmware_py.rtos.statistics import ProcessorLoad
 from firmware_py.supervisor import CoreSupervisor
 from firmware_py.wire import mavlink, telemetry
 from firmware_py.wire import mavlink_services as services
-from firmware_py.wire.mavlink_layouts import Message
+from firmware_py.wire.mavlink_dialect import Message
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from itertools import islice
 from math import degrees, hypot, isfinite, isnan, nan
 
-import pymavlink.dialects.v20.common as dialect
+import pymavlink.dialects.v20.development as dialect
 
 from firmware_py.geometry import Quaternion, Vector, from_euler_zyx
 from firmware_py.wire import WireError
 from firmware_py.wire.crtp import check_place, check_pose
-from firmware_py.wire.mavlink_layouts import Message
+from firmware_py.wire.mavlink_dialect import Message
 from firmware_py.wire.mavlink_services import u16, u32
 from firmware_py.wire.telemetry import BATTERY, BLOCKS, LOAD, TIMESTAMP_MASK, Sample
 

@@ -1,8 +1,8 @@
 """MAVLink 2 frames, sans I/O: bytes that arrive become messages, messages become bytes, counters report what was lost.
 
-The dialect is pymavlink's `common`: its classes hold the fields, their layout and the CRC seeds. Framing is our own,
-because pymavlink's parser drops whole supposed frames after a bad byte, lets one forged time stamp lock the true sender
-out, and counts a reordered pair as 256 lost frames. Here
+pymavlink makes frames and decodes them. Finding them and judging signatures is our own, because pymavlink's parser drops
+whole supposed frames after a bad byte, lets one forged time stamp lock the true sender out, and counts a reordered pair as
+256 lost frames. Here
 
 - bytes that are no frame are skipped one at a time, so that no good frame after them is lost;
 - half a frame waits for its rest until 100 ms of silence have passed (call `feed` with no data to let time pass); then its
@@ -17,10 +17,12 @@ import re
 import struct
 from dataclasses import dataclass
 from hashlib import sha256
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import pymavlink.dialects.v20.development as dialect
 
 from firmware_py.wire import WireError
-from firmware_py.wire.mavlink_layouts import LAYOUTS, Message, crc16
+from firmware_py.wire.mavlink_dialect import KINDS, Message
 
 KEY_SIZE = 32
 SIGNATURE_SIZE = 13  # link id, 6 bytes of time stamp, 6 bytes of digest
@@ -42,20 +44,21 @@ class Signing:
         if len(key) != KEY_SIZE:
             raise WireError(f"a signing key of {len(key)} bytes: {KEY_SIZE} are needed")
         self._key = key
-        self._link_id = bytes((link_id,))
+        self._link_id = link_id
         self._start = start
         self._newest = 0  # of all stamps, sent and received
         self._streams: dict[tuple[int, int, int], int] = {}  # (system, component, link id): newest stamp
 
-    def sign(self, now_us: int, frame: bytes) -> bytes:
-        """Return the signature to send behind `frame`, which ends with its CRC."""
+    def prepare(self, now_us: int, state: Any) -> None:
+        """Set pymavlink's state of signing for the next frame."""
         self._newest = min(_STAMP_MAX, max(self._start + now_us // 10, self._newest + 1))
-        head = self._link_id + self._newest.to_bytes(6, "little")
-        return head + self._digest(frame + head)
+        state.secret_key, state.link_id, state.timestamp = self._key, self._link_id, self._newest
+        state.sign_outgoing = True
 
     def is_genuine(self, frame: bytes) -> bool:
         """Return whether `frame`, its signature included, was made with the key."""
-        return self._digest(frame[:-_DIGEST_SIZE]) == frame[-_DIGEST_SIZE:]
+        digest = sha256(self._key + frame[:-_DIGEST_SIZE]).digest()
+        return digest[:_DIGEST_SIZE] == frame[-_DIGEST_SIZE:]
 
     def is_new(self, now_us: int, system: int, component: int, frame: bytes) -> bool:
         """Return whether a genuine frame is newer than the last of its stream, and note it as the last.
@@ -71,9 +74,6 @@ class Signing:
         self._streams[stream] = stamp
         self._newest = max(self._newest, stamp)
         return True
-
-    def _digest(self, data: bytes) -> bytes:
-        return sha256(self._key + data).digest()[:_DIGEST_SIZE]
 
 
 HALF_FRAME_US = 100_000  # silence after which half a frame is dropped; 280 bytes last 49 ms at 57600 baud
@@ -113,37 +113,19 @@ class FrameSender:
     """Makes the frames of one sender on one link, and counts them."""
 
     def __init__(self, system: int, component: int, signing: Signing | None = None) -> None:
-        self._system = system
-        self._component = component
+        self._codec = dialect.MAVLink(None, system, component)
         self._signing = signing
-        self._sequence = 0
 
     def encode(self, now_us: int, message: Message) -> bytes:
-        """Return the frame of `message`, which is not changed; `WireError` when a field does not fit its type."""
-        number = message.get_msgId()
-        layout = LAYOUTS.get(number)
-        if layout is None:
-            raise WireError(f"message {number}: not in the dialect")
+        """Return the frame of `message`; `WireError` when a field does not fit its type."""
+        if self._signing is not None:
+            self._signing.prepare(now_us, self._codec.signing)
         try:
-            full = layout.pack(message)
+            frame: bytes = message.pack(self._codec)
         except (struct.error, OverflowError, TypeError, ValueError) as error:
             raise WireError(f"{message.get_type()}: {error}") from error
-        payload = full.rstrip(b"\0") or full[:1]
-        flags = _SIGNED if self._signing else 0
-        head = _HEAD_2.pack(
-            len(payload),
-            flags,
-            0,
-            self._sequence,
-            self._system,
-            self._component,
-            number & 0xFFFF,
-            number >> 16,
-        )
-        self._sequence = (self._sequence + 1) & 0xFF
-        body = head[1:] + payload
-        frame = _START_2 + body + crc16(body + layout.crc_seed).to_bytes(_CRC_SIZE, "little")
-        return frame + self._signing.sign(now_us, frame) if self._signing else frame
+        self._codec.seq = (self._codec.seq + 1) & 0xFF
+        return frame
 
 
 class _Sequence:
@@ -173,7 +155,6 @@ class _Head(NamedTuple):
 
     length: int  # of the payload
     flags: int  # that must be understood
-    compatible: int  # flags that may be ignored
     sequence: int
     system: int
     component: int
@@ -182,23 +163,10 @@ class _Head(NamedTuple):
 
 def _read_head(buffer: bytes, start: int) -> _Head:
     if buffer[start] == _START_2[0]:
-        length, flags, compatible, sequence, system, component, low, high = _HEAD_2.unpack_from(buffer, start)
-        return _Head(length, flags, compatible, sequence, system, component, low | high << 16)
+        length, flags, _, sequence, system, component, low, high = _HEAD_2.unpack_from(buffer, start)
+        return _Head(length, flags, sequence, system, component, low | high << 16)
     length, sequence, system, component, number = _HEAD_1.unpack_from(buffer, start)
-    return _Head(length, 0, 0, sequence, system, component, number)
-
-
-def _mark(message: Message, head: _Head, frame: bytes, crc: int) -> None:
-    """Note the origin in the message, as pymavlink's own decoder does."""
-    header = message.get_header()
-    header.mlen, header.seq, header.srcSystem, header.srcComponent = (
-        head.length,
-        head.sequence,
-        head.system,
-        head.component,
-    )
-    header.incompat_flags, header.compat_flags = head.flags, head.compatible
-    message._msgbuf, message._crc = frame, crc
+    return _Head(length, 0, sequence, system, component, number)
 
 
 class FrameReceiver:
@@ -206,6 +174,7 @@ class FrameReceiver:
 
     def __init__(self, signing: Signing | None = None) -> None:
         self.counters = FrameCounters()
+        self._codec = dialect.MAVLink(None)
         self._signing = signing
         self._held = b""  # half a frame
         self._last_us = 0  # when bytes were last received
@@ -246,31 +215,25 @@ class FrameReceiver:
         head = _read_head(buffer, start)
         if head.flags & ~_SIGNED or not head.system:
             return _NO_FRAME
-        layout = LAYOUTS.get(head.number)
-        if layout is None:
+        kind = KINDS.get(head.number)
+        if kind is None:
             self._note_unknown(head)
             return _NO_FRAME
-        if head_size == _HEAD_1.size and head.length > layout.payload.size:
+        if head_size == _HEAD_1.size and head.length > kind.unpacker.size:
             return _NO_FRAME  # version 1 has no extensions
-
-        first = start + head_size
-        crc_at = first + head.length
-        crc_end = crc_at + _CRC_SIZE
-        end = crc_end + SIGNATURE_SIZE if head.flags else crc_end
+        end = start + head_size + head.length + _CRC_SIZE + (SIGNATURE_SIZE if head.flags else 0)
         if len(buffer) < end:
             return _INCOMPLETE
-        crc = int.from_bytes(buffer[crc_at:crc_end], "little")
-        if crc != crc16(buffer[start + 1 : crc_at] + layout.crc_seed):
+        frame = buffer[start:end]
+        try:
+            message = self._codec.decode(bytearray(frame))
+        except dialect.MAVError:
             self.counters.bad_crc += 1
             return _NO_FRAME
-
-        frame = buffer[start:end]
         if self._signing is not None:
             refused = self._refuse(self._signing, now_us, head, frame)
             if refused:
                 return refused
-        message = layout.unpack(buffer[first:crc_at])
-        _mark(message, head, frame, crc)
         self._note(head)
         messages.append(message)
         return end - start

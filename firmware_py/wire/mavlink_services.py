@@ -3,9 +3,9 @@
 Nothing here has an axis; flight data is in `mavlink`.
 """
 
-import pymavlink.dialects.v20.common as dialect
+import pymavlink.dialects.v20.development as dialect
 
-from firmware_py.wire.mavlink_layouts import AvailableModes, CurrentMode, Message, ProtocolVersion
+from firmware_py.wire.mavlink_dialect import Message, ProtocolVersion
 from firmware_py.wire.mavlink_numbers import Mode
 
 NAME_SIZE = 16  # of a parameter
@@ -125,7 +125,7 @@ def read_heartbeat(message: Message) -> int | None:
 def available_mode(mode: Mode) -> Message:
     """Return one of the board's modes; their indices begin at 1."""
     modes = tuple(Mode)
-    return AvailableModes(
+    return dialect.MAVLink_available_modes_message(
         len(modes),
         modes.index(mode) + 1,
         dialect.MAV_STANDARD_MODE_NON_STANDARD,
@@ -137,7 +137,7 @@ def available_mode(mode: Mode) -> Message:
 
 def current_mode(mode: Mode) -> Message:
     """Return the mode in force: the one that was chosen last, or its replacement."""
-    return CurrentMode(dialect.MAV_STANDARD_MODE_NON_STANDARD, mode, mode)
+    return dialect.MAVLink_current_mode_message(dialect.MAV_STANDARD_MODE_NON_STANDARD, mode, mode)
 
 
 def no_control(request: Message) -> Message:
@@ -225,7 +225,7 @@ def autopilot_version(version: tuple[int, int, int], revision: bytes, uid: int) 
 
 def protocol_version() -> Message:
     """Return MAVLink 2, and the versions that are read: 1 as well; the revisions of the standard are not stated."""
-    return ProtocolVersion(200, 100, 200, [0] * 8, [0] * 8)
+    return ProtocolVersion(200, 100, 200)
 
 
 def message_interval(number: int, interval_us: int) -> Message:

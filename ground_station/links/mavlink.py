@@ -14,8 +14,8 @@ from collections.abc import Callable, Sequence
 
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire import mavlink_services as services
+from firmware_py.wire.mavlink_dialect import NUMBERS, Message
 from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Signing
-from firmware_py.wire.mavlink_layouts import NUMBERS, Message
 from firmware_py.wire.telemetry import Sample, state_in
 from ground_station.config import LinkSettings
 from ground_station.latency import LinkLatency

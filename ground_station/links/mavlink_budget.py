@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from firmware_py.wire import mavlink
 from firmware_py.wire import mavlink_services as services
+from firmware_py.wire.mavlink_dialect import Message
 from firmware_py.wire.mavlink_frames import SIGNATURE_SIZE, FrameSender
-from firmware_py.wire.mavlink_layouts import Message
 from firmware_py.wire.mavlink_numbers import Mode
 from ground_station.errors import LinkError
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator
 from typing import Any
 
 from firmware_py.wire import mavlink_services as services
-from firmware_py.wire.mavlink_layouts import Message
+from firmware_py.wire.mavlink_dialect import Message
 from firmware_py.wire.mavlink_numbers import WRITE_ALL, Command, CommandResult
 from firmware_py.wire.scalars import Scalar
 from ground_station.controls import ControlAction, ControlRequest, ControlsError, Dialogue, Exchange, Script

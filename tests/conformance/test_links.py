@@ -8,7 +8,7 @@ import struct
 from collections.abc import Callable
 from typing import Any, Protocol
 
-import pymavlink.dialects.v20.common as dialect
+import pymavlink.dialects.v20.development as dialect
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

@@ -6,7 +6,7 @@ import io
 from math import pi
 
 import numpy as np
-import pymavlink.dialects.v20.common as dialect
+import pymavlink.dialects.v20.development as dialect
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

@@ -4,7 +4,7 @@ import math
 import os
 from pathlib import Path
 
-import pymavlink.dialects.v20.common as dialect
+import pymavlink.dialects.v20.development as dialect
 import pytest
 from cflib.utils.power_switch import PowerSwitch
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import pymavlink.dialects.v20.common as dialect
+import pymavlink.dialects.v20.development as dialect
 import pytest
 import serial
 from serial.rfc2217 import PortManager

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
-import pymavlink.dialects.v20.common as dialect
+import pymavlink.dialects.v20.development as dialect
 
 from firmware_py.firmware import Firmware
 from hil.config import load_config
@@ -13,7 +13,7 @@ from support.firmware_bench import LEVEL, FirmwareBench
 STATION = (255, 190)
 STREAMS = (
     "HEARTBEAT", "SYS_STATUS", "BATTERY_STATUS", "ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED",
-    "SERVO_OUTPUT_RAW", "ESTIMATOR_STATUS", "NAMED_VALUE_FLOAT", "SYSTEM_TIME", "UNKNOWN_436",  # CURRENT_MODE
+    "SERVO_OUTPUT_RAW", "ESTIMATOR_STATUS", "NAMED_VALUE_FLOAT", "SYSTEM_TIME", "CURRENT_MODE",
     "POSITION_TARGET_LOCAL_NED", "VFR_HUD", "ACTUATOR_OUTPUT_STATUS", "HOME_POSITION", "ODOMETRY",
 )  # fmt: skip
 GYRO_ZERO_US = 600_000  # the gyro's zero is found by then

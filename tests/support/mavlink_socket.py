@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import pymavlink.dialects.v20.common as dialect
+import pymavlink.dialects.v20.development as dialect
 import serial
 
 from support.serving import PATIENCE_S

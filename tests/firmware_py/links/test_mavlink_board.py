@@ -6,13 +6,13 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import pymavlink.dialects.v20.common as dialect
+import pymavlink.dialects.v20.development as dialect
 import pytest
 from scipy.spatial.transform import Rotation
 
 from firmware_py.wire import telemetry
 from firmware_py.wire.mavlink import POSES
-from firmware_py.wire.mavlink_layouts import NUMBERS
+from firmware_py.wire.mavlink_dialect import NUMBERS
 from firmware_py.wire.supervisor import Cause, State
 from support.firmware_bench import LEVEL, FirmwareBench
 from support.mavlink_client import GYRO_ZERO_US, STREAMS, MavlinkClient, codec, count
@@ -191,7 +191,7 @@ def test_after_boot_every_stream_keeps_its_rate() -> None:
     assert counts == {
         "HEARTBEAT": 5, "SYS_STATUS": 5, "BATTERY_STATUS": 5, "ATTITUDE": 20, "ATTITUDE_QUATERNION": 20,
         "LOCAL_POSITION_NED": 20, "SERVO_OUTPUT_RAW": 10, "ESTIMATOR_STATUS": 5, "NAMED_VALUE_FLOAT": 25,
-        "SYSTEM_TIME": 1, "UNKNOWN_436": 1, "POSITION_TARGET_LOCAL_NED": 1, "VFR_HUD": 1,
+        "SYSTEM_TIME": 1, "CURRENT_MODE": 1, "POSITION_TARGET_LOCAL_NED": 1, "VFR_HUD": 1,
         "ACTUATOR_OUTPUT_STATUS": 1, "HOME_POSITION": 1, "ODOMETRY": 1,
     }  # fmt: skip
     assert client.of("HEARTBEAT")[0].autopilot == dialect.MAV_AUTOPILOT_GENERIC

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-import pymavlink.dialects.v20.common as dialect
+import pymavlink.dialects.v20.development as dialect
 import pytest
 
 from support.mavlink_client import STATION, STREAMS, MavlinkClient
@@ -41,7 +41,7 @@ def test_a_connection_as_qgroundcontrol_makes_it_meets_no_silence(client: Mavlin
     assert request(PROTOCOL_VERSION) == (ACCEPTED, ["UNKNOWN_300"])  # to pymavlink
     for number in (COMPONENT_METADATA, COMPONENT_INFORMATION):
         assert request(number) == (DENIED, [])
-    assert request(AVAILABLE_MODES) == (ACCEPTED, ["UNKNOWN_435", "UNKNOWN_435"])
+    assert request(AVAILABLE_MODES) == (ACCEPTED, ["AVAILABLE_MODES", "AVAILABLE_MODES"])
     assert client.command(519)[0].result == ACCEPTED  # the older request for PROTOCOL_VERSION
     (nak,) = answers(
         client, "FILE_TRANSFER_PROTOCOL", "file_transfer_protocol", 0, 1, 1, [1, 0, 0, 4] + [0] * 247

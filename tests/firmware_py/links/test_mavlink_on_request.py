@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
-import pymavlink.dialects.v20.common as dialect
+import pymavlink.dialects.v20.development as dialect
 import pytest
 from scipy.spatial.transform import Rotation
 

@@ -1,9 +1,7 @@
 """Requests that the board does not serve, and its modes: every sender gets an answer."""
 
-from collections.abc import Sequence
 from typing import Any
 
-import pymavlink.dialects.v20.development as development
 import pytest
 
 from support.mavlink_client import LEVEL, STATION, MavlinkClient, codec, lines
@@ -148,16 +146,9 @@ def test_a_pose_that_is_refused_is_reported(client: MavlinkClient) -> None:
 # Modes
 
 
-def decoded(messages: Sequence[Any]) -> list[Any]:
-    """The messages about modes as pymavlink's dialect of the future reads them."""
-    parser = development.MAVLink(None)
-    modes = [message for message in messages if message.get_type() in ("UNKNOWN_435", "UNKNOWN_436")]
-    return [parser.decode(bytearray(message.get_msgbuf())) for message in modes]
-
-
 def current(client: MavlinkClient) -> int:
     """The mode that CURRENT_MODE and the next heartbeat report."""
-    (found,) = decoded(client.command(REQUEST_MESSAGE, CURRENT_MODE))
+    _, found = client.command(REQUEST_MESSAGE, CURRENT_MODE)
     assert found.intended_custom_mode == found.custom_mode
     (beat,) = [a for a in client.command(REQUEST_MESSAGE, 0) if a.get_type() == "HEARTBEAT"]
     assert beat.custom_mode == found.custom_mode
@@ -171,7 +162,7 @@ def offboard(client: MavlinkClient, *params: float) -> None:
 
 @pytest.mark.parametrize(("index", "names"), [(0, ["Hold", "Offboard"]), (1, ["Hold"]), (2, ["Offboard"])])
 def test_modes_are_listed(client: MavlinkClient, index: int, names: list[str]) -> None:
-    found = decoded(client.command(REQUEST_MESSAGE, AVAILABLE_MODES, index))
+    _, *found = client.command(REQUEST_MESSAGE, AVAILABLE_MODES, index)
     assert [mode.mode_name for mode in found] == names
     assert {mode.number_modes for mode in found} == {2}
     numbers = {"Hold": (1, HOLD), "Offboard": (2, OFFBOARD)}
@@ -184,7 +175,7 @@ def test_offboard_starts_and_ends_by_command(client: MavlinkClient, params: tupl
     assert current(client) == HOLD
     client.messages.clear()
     offboard(client, *params)
-    assert [mode.custom_mode for mode in decoded([m for _, m in client.messages])] == [OFFBOARD]  # unasked
+    assert [mode.custom_mode for mode in client.of("CURRENT_MODE")] == [OFFBOARD]  # unasked
     assert client.texts() == ["mode: offboard"]
     assert current(client) == OFFBOARD
     assert client.command(DO_SET_MODE, 1, 4, 3)[0].result == ACCEPTED

@@ -1,12 +1,11 @@
 """MAVLink frames: pymavlink's bytes, any chunks, damaged streams, signatures, loss counters, fuzzing."""
 
-import struct
 from collections.abc import Iterable, Sequence
 from hashlib import sha256
 from typing import Any
 
 import numpy as np
-import pymavlink.dialects.v20.common as dialect
+import pymavlink.dialects.v20.development as dialect
 import pytest
 
 from firmware_py.wire import WireError, mavlink
@@ -15,7 +14,6 @@ from firmware_py.wire.mavlink_frames import HALF_FRAME_US, FrameReceiver, FrameS
 
 KEY = sha256(b"floaty").digest()
 STAMP = 370_000_000_000_00  # 10 us since 2015: 2026
-DIALECT = sorted(dialect.mavlink_map.items())
 
 
 def peer(key: bytes | None = None, system: int = 7, component: int = 9, link_id: int = 0) -> Any:
@@ -35,32 +33,6 @@ def golden(codec: Any, messages: Iterable[Any]) -> list[bytes]:
         frames.append(message.pack(codec))
         codec.seq = (codec.seq + 1) % 256
     return frames
-
-
-def fields_of(kind: Any) -> list[tuple[str, int]]:
-    """Types and array lengths (0: no array) in the constructor's order."""
-    lengths = [kind.array_lengths[kind.ordered_fieldnames.index(name)] for name in kind.fieldnames]
-    return list(zip(kind.fieldtypes, lengths, strict=True))
-
-
-def any_message(kind: Any, rng: np.random.Generator) -> Any:
-    """A message with random contents in all its fields."""
-    limits = {"uint8_t": "B", "int8_t": "b", "uint16_t": "H", "int16_t": "h", "uint32_t": "I", "int32_t": "i"}
-    limits |= {"uint64_t": "Q", "int64_t": "q", "double": "d"}
-
-    def value(type: str) -> Any:
-        if type == "float":
-            return float(np.float32(rng.normal()))
-        code = limits["uint8_t" if type == "char" else type]
-        return rng.normal() if code == "d" else struct.unpack(code, rng.bytes(struct.calcsize(code)))[0]
-
-    fields: list[Any] = []
-    for type, length in fields_of(kind):
-        if type == "char":
-            fields.append(bytes(rng.integers(65, 91, length).tolist()))
-        else:
-            fields.append([value(type) for _ in range(length)] if length else value(type))
-    return kind(*fields)
 
 
 def rotation(rng: np.random.Generator) -> tuple[float, ...]:
@@ -94,23 +66,6 @@ def feed_all(receiver: FrameReceiver, stream: bytes, chunk: int, now_us: int = 0
     for start in range(0, len(stream), chunk):
         messages += receiver.feed(now_us, stream[start : start + chunk])
     return received(messages + receiver.feed(now_us + HALF_FRAME_US + 1, b""))
-
-
-@pytest.mark.parametrize(("number", "kind"), DIALECT, ids=[kind.msgname for _, kind in DIALECT])
-def test_every_message_of_the_dialect_has_pymavlinks_bytes_and_fields(number: int, kind: Any) -> None:
-    message = any_message(kind, np.random.default_rng(number))
-    frame = golden(peer(), [message])[0]
-    assert FrameSender(7, 9).encode(0, message) == frame
-    (mine,) = FrameReceiver().feed(0, frame)
-    theirs = peer().decode(bytearray(frame))
-    assert mine.to_dict() == theirs.to_dict()
-    assert mine == theirs
-    assert (mine.get_msgId(), mine.get_srcSystem(), mine.get_srcComponent(), mine.get_seq()) == (
-        number,
-        7,
-        9,
-        0,
-    )
 
 
 @pytest.mark.parametrize("key", [None, KEY], ids=["unsigned", "signed"])
@@ -149,8 +104,6 @@ def test_a_field_that_does_not_fit_is_refused_and_takes_no_sequence_number() -> 
     sender = FrameSender(7, 9)
     with pytest.raises(WireError, match="PARAM_VALUE"):
         sender.encode(0, dialect.MAVLink_param_value_message(b"X", 1e300, 9, 1, 0))
-    with pytest.raises(WireError, match="12345678"):
-        sender.encode(0, dialect.MAVLink_message(12345678, "NONE"))
     assert sender.encode(0, services.timesync(0, 1)) == golden(peer(), [services.timesync(0, 1)])[0]
 
 

@@ -4,7 +4,7 @@ from math import inf, nan
 from typing import Any
 
 import numpy as np
-import pymavlink.dialects.v20.common as dialect
+import pymavlink.dialects.v20.development as dialect
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
