@@ -55,7 +55,9 @@ class Why(IntEnum):
 
 
 def build_machine(folder: Path) -> Path:
-    """Compile `native/` for this machine into `folder`. Raises `ExportError`."""
+    """Compile `native/` for this machine into `folder`. Raises `ExportError`, also when a chip lacks a package."""
+    find_emulator()
+    declared()
     texts = {path.name: path.read_text(encoding="utf-8") for path in sorted(SOURCES.glob("*.[ch]"))}
     return compile_texts(
         texts, [name for name in texts if name.endswith(".c")], HOST_FLAGS, "machine.so", folder, zig()
@@ -80,13 +82,13 @@ class Chip:
     """One microcontroller with an image in flash, in reset; `state` has the clock and the machine's state.
 
     `code` begins with the vector table at address `base`; `constants` are the half words without instructions, counted
-    from there. Raises `ExportError` when unicorn is missing.
+    from there. `build_machine` has looked for the packages that it needs.
     """
 
     def __init__(
         self, code: bytes, base: int, library: Path, constants: frozenset[int] = frozenset()
     ) -> None:
-        unicorn = find_emulator()
+        import unicorn
         from unicorn import arm_const, unicorn_const
         from unicorn.unicorn_py3.unicorn import uclib
 

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,12 +13,14 @@ pytest.importorskip("cffi")
 from hil.commands.tables import print_result
 from hil.errors import LabError
 from hil.experiments import find_experiment
+from hil.laboratory.lockstep import image_at
 from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import Request
 from hil.laboratory.result import Result
 from hil.laboratory.run import fly
 from hil.laboratory.schedule import load_schedule, runs
 from hil.pictures.compare import load_flown
+from hil.stm32f405.chip import declared
 from hil.studies.two_boards import two_boards
 from support.flights import hover
 
@@ -160,6 +163,19 @@ def test_an_image_is_reached_over_radio_and_udp(link: str) -> None:
 def test_an_elf_beside_another_board_is_refused() -> None:
     with pytest.raises(LabError, match=r"--elf x\.elf: goes with an image as --board, not with python"):
         Request.of(HOVER, elf=Path("x.elf"))
+
+
+@pytest.mark.parametrize("package", ["unicorn", "cffi"])
+def test_without_a_package_images_are_refused_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, package: str
+) -> None:
+    from support.stm32_firmware import build
+
+    elf = build("clang")
+    declared.cache_clear()
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(LabError, match=rf"--board .*: {package} is missing"):
+        image_at(str(elf), None)
 
 
 def test_without_a_compiler_images_fail_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
