@@ -103,7 +103,6 @@ class Flight:
         self.line = line_of(request, site, self.lab)
         self.robot = self.line.robot
         self.lab.add(self.robot)
-        self.robot.body.hold()
         self.switchboard = Switchboard(self.robot)
         request.experiment.prepare(self.robot)
         self.switchboard.prepare(self.faults)

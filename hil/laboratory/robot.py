@@ -109,6 +109,7 @@ class Robot:
         self.free = False
         self.powered = True
         self.body: Body = make_body(config, streams.gusts, self.start_W)
+        self.body.hold()
         at_rest = self.body.draw(0, open_circuit_voltage(config.battery.charge))
         self.battery: Battery = Battery(config.battery, at_rest)
         self.imu: VirtualImu = VirtualImu(config.imu, streams.imu)
@@ -148,6 +149,7 @@ class Robot:
             self._carrier,
         )  # fmt: skip
         self.firmware = self.executor.boot(start)
+        self.imu.continue_from(specimen)
         self.board.run_on(self.firmware.kernel, self.events)
         if self._thief is not None:
             self._occupy(self._thief)

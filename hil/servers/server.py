@@ -150,7 +150,6 @@ class Server:
         site = Site(config, self.lab.events, streams, self._note, plan.executor)
         self.served = ServedRobot(number, site, say, plan.mavlink, plan.state, self._fail, to_peers)
         robot = self.robot = self.served.robot
-        robot.body.hold()
         self.lab.add(robot)
         self.switchboard = Switchboard(robot)
         self._holder = Holder(robot, self._let_go)

@@ -1,7 +1,8 @@
 """Flights that tests ask for in a line."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from math import hypot
 from pathlib import Path
 from typing import Unpack
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from hil.api import Run, column
 from hil.config import load_config
+from hil.crazyflie.log_table import ImageVariable
 from hil.experiments import Experiment, find_experiment
 from hil.laboratory.lockstep import image_at
 from hil.laboratory.request import Options, Request
@@ -44,6 +46,11 @@ def served_image(elf: str, profile: str) -> Iterator[Server]:
         yield server
     finally:
         server.close()
+
+
+def check_calibrated(table: Mapping[str, ImageVariable]) -> None:
+    """Check that the stock firmware of a robot at rest takes what its accelerometer measures for 1 g."""
+    assert hypot(*(table[f"acc.{axis}"].read() for axis in "xyz")) == pytest.approx(1.0, abs=0.003)
 
 
 def check_hover(run: Run, motor_V: float) -> NDArray[np.bool_]:

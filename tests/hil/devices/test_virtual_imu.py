@@ -115,6 +115,14 @@ def test_a_smaller_range_bounds_the_gyro_alone_and_full_scale_always() -> None:
         assert settled(imu, plant)[2] == full_scale
 
 
+def test_a_specimen_that_continues_does_not_settle_again() -> None:
+    plant = still_plant()
+    earlier, later = (VirtualImu(SILENT, np.random.default_rng(1)) for _ in range(2))
+    settled(earlier, plant)
+    later.continue_from(earlier)
+    assert later.sample(plant) == earlier.sample(plant)
+
+
 def test_a_frozen_sensor_repeats_itself_until_it_thaws() -> None:
     plant, imu = still_plant(), VirtualImu(SILENT, np.random.default_rng(1))
     before = settled(imu, plant)

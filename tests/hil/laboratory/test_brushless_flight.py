@@ -10,7 +10,7 @@ from hil.crazyflie.log_table import log_table
 from hil.errors import LabError
 from hil.experiments.position import HOVER
 from hil.laboratory.fault_kinds import KINDS
-from support.flights import check_hover, served_image
+from support.flights import check_calibrated, check_hover, served_image
 from support.stm32_firmware import build
 
 ELF = os.environ.get("FLOATY_BRUSHLESS_ELF", "")
@@ -77,6 +77,7 @@ def test_armed_motors_idle_and_the_firmware_knows_their_speeds() -> None:
         server.lab.end_at(2_000_000)
         server.lab.run()
         table = {v.name: v for v in log_table(robot.firmware.image, robot.firmware.chip)}
+        check_calibrated(table)
         speeds = [table[f"motor.m{motor}_rpm"].read() for motor in (1, 2, 3, 4)]
         assert speeds == pytest.approx(robot.body.rpm.tolist(), rel=0.01)
         assert min(speeds) > 1000
