@@ -38,6 +38,12 @@ class PilotConfig(Section):
     settle_s: float = number(2.0, "[0, 60]", "at home before the experiment's trajectory begins [s]; chosen")
     land_s: float = number(2.0, "[0.5, 20]", "from the last goal to the floor [s]; cflib's examples")
 
+    @property
+    def values(self) -> dict[str, float]:
+        """The parameters by their full names, `group.name`."""
+        groups = self.parameters.items()
+        return {f"{group}.{name}": value for group, one in groups for name, value in one.items()}
+
 
 class TrackerConfig(Section):
     """Which poses of the robot the ground station accepts."""

@@ -136,6 +136,12 @@ class LabConfig(FirmwareConfig):
                 "--profile crazyflie --board FILE"
             )
 
+    def check_effect(self, start: str, overrides: Iterable[str], profile: str) -> None:
+        """Raise `LabError`, whose text begins with `start`, for an override of a section that does not affect this robot."""
+        for override in overrides:
+            if not self.reads(override.partition(".")[0].strip()):
+                raise LabError(f"{start}{override}: has no effect on the robot of profile {profile}")
+
     def reads(self, section: str) -> bool:
         """Whether a section affects this robot; a user's body may read them all."""
         if self.pilot.enabled:  # not Floaty's body or firmware

@@ -128,10 +128,9 @@ class CrazyflieLink:
         """Do what is due, and yield the next due instant [us]; the board's answers are awaited in between."""
         times, config = self._times, self._config
         yield 0
-        for group, values in config.parameters.items():
-            for name, value in values.items():
-                self._ask(ControlRequest(ControlAction.WRITE, f"{group}.{name}", value))
-                yield 0
+        for name, value in config.values.items():
+            self._ask(ControlRequest(ControlAction.WRITE, name, value))
+            yield 0
         for value in (1.0, 0.0):
             self._ask(ControlRequest(ControlAction.WRITE, ESTIMATOR, value))
             yield 0

@@ -30,6 +30,13 @@ class TocEntry:
     writable: bool
     persistent: bool
 
+    def check(self, name: str, value: float) -> None:
+        """Raise `ControlsError` if it cannot hold a value."""
+        if not self.writable:
+            raise ControlsError(f"{name}: can only be read")
+        if not (self.scalar.is_float or self.scalar.cast(value) == value):
+            raise ControlsError(f"{name} = {value:g}: not a value of type {self.scalar.name}")
+
 
 class CrtpControls(Dialogue[crtp.Packet]):
     """`transmit` takes packets' bytes; `table` is the board's table of contents, known once connected."""
@@ -68,11 +75,8 @@ class CrtpControls(Dialogue[crtp.Packet]):
 
     def _write(self, name: str, value: float) -> Script[crtp.Packet]:
         entry = self._find(name)
-        if not entry.writable:
-            raise ControlsError(f"{name}: can only be read")
+        entry.check(name, value)
         wanted = entry.scalar.cast(value)
-        if not (wanted == value or entry.scalar.is_float):
-            raise ControlsError(f"{name} = {value:g}: not a value of type {entry.scalar.name}")
         reply = yield self._exchange_for(parameters.CHANNEL_WRITE, entry, entry.scalar.pack(value))
         in_force = entry.scalar.unpack(reply.data[2 : 2 + entry.scalar.size])
         if in_force != wanted:

@@ -117,6 +117,7 @@ def serve(asked: ServeOptions) -> int:
     # Bitcraze's programs send absolute poses.
     poses = () if asked.station == "corrections" else ("predictor.absolute=true",)
     config = load_config(asked.profile, (*markers, *poses, *asked.overrides))
+    config.check_effect("--set ", asked.overrides, asked.profile)
     config.check_decks(asked.board is not None)
     station = _station_of(asked, config)
     serial = parse_addresses(asked.mavlink, asked.boards) if asked.mavlink is not None else []

@@ -9,12 +9,39 @@ from collections.abc import Callable, Mapping
 from firmware_py.config import FirmwareConfig
 from firmware_py.table import OF_PROFILE, value_in
 from firmware_py.wire.crtp import decode
-from ground_station.controls import ControlAction, ControlRequest
+from ground_station.config import PilotConfig
+from ground_station.controls import ControlAction, ControlRequest, ControlsError
 from ground_station.links.crtp_controls import PORTS, CrtpControls, TocEntry
 from hil.crazyflie.log_table import ImageParameter
+from hil.errors import LabError, hint, refusing
 from hil.events import EventQueue
 
 TURN_US = 10_000  # between checks for an overdue answer
+APP_PARAMETER = "floaty.armed"  # which every image with Floaty's app has
+NO_APP = (
+    "the image lacks Floaty's app: the servos move only if its own code moves them; Bitcraze's firmware flies with "
+    "--profile crazyflie"
+)
+
+
+def contents(table: Mapping[str, ImageParameter]) -> dict[str, TocEntry]:
+    """Return an image's parameters as its table of contents reports them."""
+    return {name: TocEntry(one.number, one.scalar, one.writable, False) for name, one in table.items()}
+
+
+def stock_contents(table: Mapping[str, ImageParameter], pilot: PilotConfig) -> dict[str, TocEntry]:
+    """Return the `contents` of a Crazyflie's own firmware. Raises `LabError` unless it takes the profile's parameters."""
+    if APP_PARAMETER in table:
+        raise LabError(
+            "--board: the image has Floaty's app, which drives servos; a Crazyflie takes Bitcraze's firmware as it is"
+        )
+    entries = contents(table)
+    for name, value in pilot.values.items():
+        if name not in entries:
+            raise LabError(f"pilot.parameters.{name}: the image has no such parameter; {hint(name, entries)}")
+        with refusing("pilot.parameters.", ControlsError):
+            entries[name].check(name, value)
+    return entries
 
 
 def board_values(config: FirmwareConfig) -> dict[str, float]:
@@ -47,7 +74,7 @@ class ImageSettings:
         report: Callable[[str], None],
     ) -> None:
         self._differences, self._config, self._events, self._report = differences, config, events, report
-        entries = {name: TocEntry(one.number, one.scalar, one.writable, False) for name, one in table.items()}
+        entries = contents(table)
         self._controls = CrtpControls(lambda data: uplink(events.now_us, data), lambda: entries)
         self._left = to_set(table, config)
         self._set: list[str] = []

@@ -13,7 +13,6 @@ from firmware_py.export.boards import runner_of
 from firmware_py.wire.telemetry import ALL_BLOCKS, CRAZYFLIE_BLOCKS
 from ground_station.errors import LinkError
 from ground_station.links.crazyflie_link import CrazyflieLink, FlightTimes
-from ground_station.links.crtp_controls import TocEntry
 from ground_station.links.frame_log import FRAME_LOG, FrameLog
 from ground_station.links.loopback import LoopbackLink
 from ground_station.station import GroundStation, Link
@@ -24,28 +23,22 @@ from hil.clock import Clock, FreeRunning, Paced
 from hil.crazyflie.shockburst import Air
 from hil.devices.board_firmware import Executor, Flashed, PythonBoard
 from hil.devices.image_firmware import ChipImage
-from hil.devices.image_settings import ImageSettings
+from hil.devices.image_settings import APP_PARAMETER, NO_APP, ImageSettings, stock_contents
 from hil.devices.radio import Receiver, VirtualRadio
 from hil.devices.real_core import is_link, real_core
 from hil.devices.uart import VirtualSerial
-from hil.errors import LabError, hint, refusing
+from hil.errors import LabError, refusing
 from hil.laboratory.channels import radio_channel, serial_channel, tracker_channel
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import Laboratory
 from hil.laboratory.recorder import SETTINGS
-from hil.laboratory.request import MAVLINK, Request, check_image
+from hil.laboratory.request import MAVLINK, Request
 from hil.laboratory.robot import PYTHON_BOARD, Ports, Robot, Site
 from hil.stm32f405.chip import SOURCES
 from hil.stm32f405.gdb import GdbServer
 from hil.world.body import Channel
 
 BUILD = Path("runs/build")
-
-APP_PARAMETER = "floaty.armed"  # which every image with Floaty's app has
-NO_APP = (
-    "the image lacks Floaty's app: the servos move only if its own code moves them; Bitcraze's firmware flies with "
-    "--profile crazyflie"
-)
 
 
 class ModelledLine:
@@ -112,26 +105,14 @@ class ModelledLine:
         return link, radio_channel(self.radio)
 
     def _crazyflie_link(self, request: Request, times: FlightTimes, latency_us: int) -> CrazyflieLink:
-        """Return the link to the stock firmware. Raises `LabError` for a parameter that the image lacks."""
+        """Return the link to the stock firmware. Raises `LabError` for an image that does not fit the profile."""
         config, flashed = request.config, self.robot.firmware.flashed
-        table = {} if flashed is None else flashed.parameters
-        if APP_PARAMETER in table:
-            raise LabError(
-                f"--board {request.bench.board}: it has Floaty's app, which drives servos; the robot of profile "
-                f"{request.profile} takes Bitcraze's firmware as it is"
-            )
-        for group, values in config.pilot.parameters.items():
-            for name in values:
-                if f"{group}.{name}" not in table:
-                    raise LabError(
-                        f"pilot.parameters.{group}.{name}: the image has no such parameter; "
-                        f"{hint(f'{group}.{name}', [*table])}"
-                    )
+        entries = stock_contents({} if flashed is None else flashed.parameters, config.pilot)
         return CrazyflieLink(
             self.radio.uplink,
             latency_us,
             lambda: self.robot.firmware.log_numbers,
-            {name: TocEntry(one.number, one.scalar, one.writable, False) for name, one in table.items()},
+            entries,
             config.pilot,
             Goal(config.flight.home, 0.0),
             times,
@@ -211,7 +192,6 @@ def _executor(request: Request, stack: ExitStack) -> Executor:
 
 def image_at(board: str, elf: Path | None, debugger: GdbServer | None = None) -> ChipImage:
     """Return the image that `--board` and `--elf` name. Raises `LabError` if it cannot run here."""
-    check_image(board)
     with refusing(f"--board {board}: ", FirmwareError):
         return ChipImage.load(Path(board), elf, _folder_of_machines(), debugger)
 

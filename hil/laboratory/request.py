@@ -190,9 +190,9 @@ class Request:
             raise LabError(
                 f"--duration {self.duration_s:g}: expected seconds, above 0 and up to {DURATION_MAX_S:g}"
             )
-        for override in self.overrides[len(self.experiment.settings) :]:
-            if not self.config.reads(override.partition(".")[0].strip()):
-                raise LabError(f"--set {override}: has no effect on the robot of profile {self.profile}")
+        own = len(self.experiment.settings)
+        self.config.check_effect(f"experiment {self.experiment.name}: ", self.overrides[:own], self.profile)
+        self.config.check_effect("--set ", self.overrides[own:], self.profile)
         self.config.check_decks(self.bench.is_image)
         on_top = self.planned_faults[len(self.experiment.faults) :]
         check(on_top, self.duration_s, self.bench.link, self.config)
@@ -314,6 +314,6 @@ def check_image(board: str) -> None:
     """Raise `LabError` when the file of `--board` is missing."""
     if not Path(board).is_file():
         raise LabError(
-            f"--board {board}: expected {', '.join(BOARDS)}, an image of a Crazyflie's firmware: an ELF file, or the link "
-            "to a real board"
+            f"--board {board}: no such file; expected {', '.join(BOARDS)}, an image of a Crazyflie's firmware: an ELF "
+            "file, or the link to a real board"
         )

@@ -24,6 +24,7 @@ from hil.crazyflie.shockburst import Air
 from hil.devices.board import InjectFailure, KeptMemory, unsupported
 from hil.devices.board_firmware import BoardFirmware
 from hil.devices.dongle import VirtualDongle
+from hil.devices.image_settings import APP_PARAMETER, NO_APP, stock_contents
 from hil.devices.radio import VirtualRadio
 from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
@@ -156,7 +157,11 @@ class ServedRobot:
         if uart is not None:
             uart.connect(self.robot.uart_ready, self._from_line)
         flashed = self.robot.firmware.flashed
-        if flashed is not None and (stays := flashed.differences(config)):
+        if flashed is not None and config.pilot.enabled:
+            stock_contents(flashed.parameters, config.pilot)
+        elif flashed is not None and APP_PARAMETER not in flashed.parameters:
+            say(NO_APP)
+        elif flashed is not None and (stays := flashed.differences(config)):
             say(f"the image has its own {stays}")
 
     @property
@@ -237,14 +242,10 @@ class ServedRobot:
         if firmware in told or firmware.flashed is None:
             return ()
         told[:] = [firmware]
-        table, parameters = firmware.flashed.parameters, self.robot.config.pilot.parameters
-        wanted = {
-            f"{group}.{name}": value for group, one in parameters.items() for name, value in one.items()
-        }
+        table = firmware.flashed.parameters
         return [
             encode_set_by_name(SetByName(name, table[name].scalar, value))
-            for name, value in wanted.items()
-            if name in table
+            for name, value in self.robot.config.pilot.values.items()
         ]
 
     def _wire(self, now_us: int, data: bytes) -> None:

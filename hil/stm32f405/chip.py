@@ -88,7 +88,7 @@ class Chip:
     def __init__(
         self, code: bytes, base: int, library: Path, constants: frozenset[int] = frozenset()
     ) -> None:
-        import unicorn
+        unicorn = find_emulator()
         from unicorn import arm_const, unicorn_const
         from unicorn.unicorn_py3.unicorn import uclib
 

@@ -71,6 +71,8 @@ def test_a_station_refuses_a_port_on_which_no_board_listens(cli: Cli) -> None:
         ),
         (["fly", "hover", "--profile", "crazyflie"], "--board FILE: the image, an ELF file"),
         (["fly", "hover", "--profile", "crazyflie", "--board", "no.elf"], "--board no.elf"),
+        (["serve", "--board", "x.elf"], "x.elf: No such file"),
+        (["serve", "--set", "quadrotor.mass=0.03"], "quadrotor.mass=0.03: has no effect on the robot of profile floaty"),
         (["serve", "--udp", "65530", "--boards", "10"], "--udp 65530"),
         (["serve", "--mavlink", "usb"], "--mavlink usb: expected pty"),
         (["serve", "--mavlink", "udp:70000"], "--mavlink udp:70000: port 70000"),

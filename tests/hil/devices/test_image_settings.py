@@ -8,10 +8,12 @@ import pytest
 
 from firmware_py.config import parameters_of
 from firmware_py.links.parameters import TYPE_READ_ONLY
-from firmware_py.wire.scalars import PARAMETER_SCALARS
+from firmware_py.wire.scalars import PARAMETER_SCALARS, Scalar
+from ground_station.config import PilotConfig
 from hil.config import LabConfig, load_config
 from hil.crazyflie.log_table import ImageParameter
-from hil.devices.image_settings import ImageSettings
+from hil.devices.image_settings import ImageSettings, stock_contents
+from hil.errors import LabError
 from support.crtp_client import CrtpClient
 
 OTHER = (
@@ -19,6 +21,37 @@ OTHER = (
     "estimator.gate_sigma=7", "predictor.default_age_us=41500", "servo.trim=[10,-20,30,-40]",
     "supervisor.pose_timeout_us=700000",
 )  # fmt: skip
+
+
+ENTRIES = {
+    "stabilizer.controller": ImageParameter(7, Scalar.U8, True, lambda: 0.0),
+    "firmware.revision0": ImageParameter(8, Scalar.U32, False, lambda: 0.0),
+    "posCtlPid.xKp": ImageParameter(9, Scalar.F32, True, lambda: 0.0),
+}
+
+
+def pilot(**parameters: dict[str, float]) -> PilotConfig:
+    return PilotConfig(enabled=True, parameters=parameters)
+
+
+@pytest.mark.parametrize(("parameters", "text"), [
+    ({"stabilizer": {"controler": 1}}, "stabilizer.controler: the image has no such parameter; did you mean"),
+    ({"stabilizer": {"controller": 300}}, "stabilizer.controller = 300: not a value of type U8"),
+    ({"stabilizer": {"controller": 1.5}}, "stabilizer.controller = 1.5: not a value of type U8"),
+    ({"firmware": {"revision0": 1}}, "firmware.revision0: can only be read"),
+])  # fmt: skip
+def test_a_parameter_that_the_image_cannot_take_is_refused(
+    parameters: dict[str, dict[str, float]], text: str
+) -> None:
+    with pytest.raises(LabError, match=f"^pilot.parameters.{text}"):
+        stock_contents(ENTRIES, pilot(**parameters))
+
+
+def test_parameters_that_the_image_takes_are_in_its_table_of_contents() -> None:
+    entries = stock_contents(ENTRIES, pilot(stabilizer={"controller": 255}, posCtlPid={"xKp": 2.1}))
+    assert [(name, one.number) for name, one in entries.items()] == [
+        (name, one.number) for name, one in ENTRIES.items()
+    ]
 
 
 class Told(CrtpClient):

@@ -87,7 +87,7 @@ def test_the_report_shows_what_the_board_takes(tmp_path: Path) -> None:
 
 
 def test_an_unknown_board_is_refused() -> None:
-    with pytest.raises(LabError, match="--board stm8: expected python, c, cortex-m4, an image"):
+    with pytest.raises(LabError, match="--board stm8: no such file; expected python, c, cortex-m4, an image"):
         Request.of(HOVER, board="stm8")
 
 

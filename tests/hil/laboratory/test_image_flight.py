@@ -63,7 +63,7 @@ def test_the_image_falls_into_its_failsafe_when_poses_stop_and_recovers(tmp_path
 
 @flies
 def test_an_image_with_the_app_flies_no_crazyflie(tmp_path: Path) -> None:
-    with pytest.raises(LabError, match=r"it has Floaty's app, which drives servos"):
+    with pytest.raises(LabError, match=r"the image has Floaty's app, which drives servos"):
         hover(tmp_path / "run", profile="crazyflie", board=ELF)
 
 

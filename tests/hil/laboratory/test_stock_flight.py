@@ -13,10 +13,11 @@ from hil.config import load_config
 from hil.crazyflie.log_table import log_table
 from hil.devices.image_firmware import stock_signals
 from hil.errors import LabError
+from hil.experiments import find_experiment
 from hil.experiments.position import HOVER
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.request import why_left
-from support.flights import check_hover, served_image
+from support.flights import check_calibrated, check_hover, served_image
 
 ELF = os.environ.get("FLOATY_STOCK_ELF", "")
 needs_image = pytest.mark.skipif(
@@ -51,6 +52,14 @@ def test_a_setting_that_the_robot_ignores_is_refused(profile: str, override: str
         LabError, match=rf"^--set {override}: has no effect on the robot of profile {profile}$"
     ):
         Request.of(HOVER, profile=profile, board=str(image), overrides=[override])
+
+
+@pytest.mark.parametrize("experiment", ["take-off-landing", "airspeed-9", "identify"])
+def test_an_experiment_for_flaps_is_refused(experiment: str, tmp_path: Path) -> None:
+    image = tmp_path / "cf2.elf"
+    image.write_bytes(b"")
+    with pytest.raises(LabError, match=rf"^experiment {experiment}: .*has no effect on the robot of profile"):
+        Request.of(find_experiment(experiment), profile=PROFILE, board=str(image))
 
 
 def test_goals_stay_in_the_room() -> None:
@@ -147,15 +156,16 @@ def test_served_robot_stands_on_the_floor_with_the_profiles_parameters_and_feels
         assert robot.firmware.flashed is not None
         assert robot.firmware.flashed.parameters["stabilizer.estimator"].read() == 2
         assert robot.body.p_WB[2] == pytest.approx(0.0145, abs=1e-3)
-        table = robot.firmware.signals.estimate
-        assert table[:3] == pytest.approx(robot.body.p_WB, abs=0.02)  # by the poses
-        asl = next(v for v in log_table(robot.firmware.image, robot.firmware.chip) if v.name == "baro.asl")
+        estimate = robot.firmware.signals.estimate
+        assert estimate[:3] == pytest.approx(robot.body.p_WB, abs=0.02)  # by the poses
+        table = {v.name: v for v in log_table(robot.firmware.image, robot.firmware.chip)}
+        check_calibrated(table)
         heights = []
         for second, height in enumerate((0.0, 2.0)):
             robot.body.put_back((0.0, 0.0, height))
             end_us = (2 + second) * 1_000_000
             server.lab.end_at(end_us)
             server.lab.run()
-            heights.append(asl.read())
+            heights.append(table["baro.asl"].read())
         assert heights[0] == pytest.approx(0.0, abs=0.5)
         assert heights[1] - heights[0] == pytest.approx(2.0, abs=0.5)

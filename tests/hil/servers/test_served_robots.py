@@ -3,9 +3,12 @@
 import pytest
 
 from hil.config import load_config
+from hil.errors import LabError
+from hil.laboratory.lockstep import image_at
 from hil.laboratory.recorder import stored_in
 from hil.scene import Look
 from hil.servers.server import Server, Service
+from support.stm32_firmware import build
 from support.watching import Watcher
 
 
@@ -19,6 +22,20 @@ def test_rows_of_a_served_robot_describe_its_look() -> None:
     own = server.robot.body.look
     assert [part.name for part in look.parts] == [part.name for part in own.parts]
     assert len(look.outline) == len(own.outline) > 0
+
+
+def test_an_image_without_the_profiles_parameters_is_not_served() -> None:
+    pytest.importorskip("unicorn")
+    image = image_at(str(build(flags=("-g", '-DDEVICE_TYPE="CF21"'))), None)
+    with pytest.raises(LabError, match=r"^pilot.parameters.stabilizer.estimator: the image has no such"):
+        Server(Service(load_config("crazyflie"), executor=image), lambda text: None)
+
+
+def test_firmware_without_the_app_is_reported() -> None:
+    pytest.importorskip("unicorn")
+    lines: list[str] = []
+    Server(Service(load_config(), executor=image_at(str(build()), None)), lines.append).close()
+    assert [line for line in lines if "the image lacks Floaty's app" in line]
 
 
 # Where several robots of one server start
