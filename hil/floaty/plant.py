@@ -13,7 +13,7 @@ from hil.floaty.geometry import weigh
 from hil.floaty.shape import SIGNS, place_plates
 from hil.scene import Look, Markers
 from hil.world import layout as at
-from hil.world.body import Channel, Failure, Quantity, Vector, View
+from hil.world.body import ACTUATORS, Channel, Failure, Quantity, Vector, View, of_each_actuator
 from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 from hil.world.in_tunnel import AT_REST, UPRIGHT, InTunnel
 from hil.world.motion import advance, evaluate
@@ -21,33 +21,18 @@ from hil.world.plates import State
 from hil.world.servos import OUTPUTS, commanded_angles, next_period_us
 from hil.world.tunnel import Tunnel
 
-NUMBERS = (1, 2, 3, 4)  # of the servos and their flaps
 DEG = math.radians(1.0)
 LOADS = BatteryConfig()
-FLAPS = tuple(f"truth.flap_{number}" for number in NUMBERS)
+FLAPS = tuple(f"truth.flap_{number}" for number in ACTUATORS)
 PARTS = ("base", "flap1", "flap2", "flap3", "flap4")
 PLATES = tuple(f"force.{part}_{axis}" for part in PARTS for axis in "xyz")
-SERVO_FAILURES: dict[str, Failure] = {
-    **{
-        f"servo.stuck.{number}": Failure(
-            f"flap {number} is stuck", "", 0.0, 0.0, 0.0, f"servo.pace.{number}", "times", "degrades"
-        )
-        for number in NUMBERS
-    },
-    **{
-        f"servo.slow.{number}": Failure(
-            f"factor on the pace of servo {number}", "", 0.5, 0.01, 4.0, f"servo.pace.{number}", "times", "holds"
-        )
-        for number in NUMBERS
-    },
-    **{
-        f"servo.trim.{number}": Failure(
-            f"flap {number} deviates this far from its command", "deg", 5.0, -45.0, 45.0, f"servo.trim.{number}", "add",
-            "holds", DEG,
-        )
-        for number in NUMBERS
-    },
-}  # fmt: skip
+SERVO_FAILURES = of_each_actuator({
+    "servo.stuck.{}": Failure("flap {} is stuck", "", 0.0, 0.0, 0.0, "servo.pace.{}", "times", "degrades"),
+    "servo.slow.{}": Failure("factor on the pace of servo {}", "", 0.5, 0.01, 4.0, "servo.pace.{}", "times", "holds"),
+    "servo.trim.{}": Failure(
+        "flap {} deviates this far from its command", "deg", 5.0, -45.0, 45.0, "servo.trim.{}", "add", "holds", DEG
+    ),
+})  # fmt: skip
 
 
 def assemble(geometry: GeometryConfig, config: PlantConfig, tunnel: TunnelConfig) -> tuple[State, Tunnel]:
@@ -109,7 +94,7 @@ class Plant(InTunnel):
         self.plate_forces_W = self._view(at.PLATE_FORCES, 15).reshape(5, 3)
         start = (0.0, 0.0, tunnel.hover_height) if p_WB is None else p_WB
         self.place(start, UPRIGHT, flaps=self._commanded)
-        self._at_rest = loads.electronics_power + len(NUMBERS) * loads.servo_power  # [W]
+        self._at_rest = loads.electronics_power + len(ACTUATORS) * loads.servo_power  # [W]
         self._servo_energy, self._power = loads.servo_energy, self._at_rest
         self._drawn_us, self._drawn_travel = 0, float(s[at.TRAVEL])
 

@@ -23,12 +23,13 @@ from numpy.typing import NDArray
 
 from hil.config import LabConfig
 from hil.design.authority import pressure_at, wrenches
-from hil.floaty.plant import NUMBERS, Plant
+from hil.floaty.plant import Plant
 from hil.floaty.shape import SIGNS
 from hil.laboratory.robot import Streams
 from hil.pictures import curves
 from hil.pictures.drawing import WIDTH
 from hil.pictures.pages import saved, write_page
+from hil.world.body import ACTUATORS
 from hil.world.fixed_order import normal
 from hil.world.layout import STEP_US
 
@@ -87,7 +88,7 @@ def measure(config: LabConfig, seed: int) -> Iterator[MountedRow]:
         pressure = pressure_at(geometry, body.hover_angle)
         plant = Plant(geometry, body, config.tunnel, config.actuators, streams.gusts)
         plant.hold()
-        for servo in NUMBERS:
+        for servo in ACTUATORS:
             plant.settings[f"servo.pace.{servo}"].turn(0.0)  # the flaps stay at the set angles
         for index, (sweep, angle_deg) in enumerate(product(SWEEPS, ANGLES_DEG)):
             flaps = SIGNS * body.hover_angle

@@ -7,7 +7,7 @@ the centre of mass). Times are the laboratory's, in whole microseconds.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -18,6 +18,7 @@ from hil.world.room import Room
 from hil.world.tunnel import Tunnel
 
 Vector = Sequence[float]
+ACTUATORS = (1, 2, 3, 4)  # the numbers of a body's servos or motors, as in their names
 View = NDArray[np.float64]  # read-only, of memory that lives as long as the body
 
 
@@ -60,6 +61,17 @@ class Failure:
     blend: Literal["add", "times"]  # combines sizes with one another and with the setting
     outcome: Literal["holds", "degrades", "failsafe", "lost"]  # of the hover, as of `Kind`
     scale: float = 1.0
+
+
+def of_each_actuator(kinds: Mapping[str, Failure]) -> dict[str, Failure]:
+    """Return the kinds for each of the four actuators: its number takes the place of {} in names and texts."""
+    return {
+        name.format(number): replace(
+            kind, meaning=kind.meaning.format(number), setting=kind.setting.format(number)
+        )
+        for name, kind in kinds.items()
+        for number in ACTUATORS
+    }
 
 
 class Motion(Protocol):
