@@ -85,43 +85,22 @@ class PoweredProcessor(Protocol):
 ToPeers = Callable[[AirSettings, bytes], object]
 
 
+@dataclass(frozen=True, slots=True)
 class Band:
-    """The radio chips within reach of each other; `uniform` draws from 0..1 which packets between them are lost.
+    """What is around a radio chip; `uniform` draws from 0..1 which packets of other boards are lost.
 
-    `elsewhere` gets the packets for those in other processes.
+    `to_peers` gets the packets for other boards.
     """
 
-    def __init__(
-        self, events: EventQueue, uniform: Callable[[], float], elsewhere: ToPeers = lambda *_: None
-    ) -> None:
-        self.events = events
-        self.boards: list[Nrf51] = []
-        self._uniform = uniform
-        self._elsewhere = elsewhere
-
-    def send_to_peers(self, now_us: int, sender: Nrf51, packet: bytes) -> None:
-        """Send a packet once to all other boards on the sender's channel."""
-        own = sender.settings
-        settings = AirSettings(own.channel, own.bits_per_second, BROADCAST)
-        self.carry(now_us, settings, packet, sender)
-        self._elsewhere(settings, packet)
-
-    def carry(self, now_us: int, settings: AirSettings, packet: bytes, sender: Nrf51 | None = None) -> None:
-        """Carry a packet to all boards here but the sender."""
-        heard_us = now_us + TURN_ROUND_US + air_us(len(packet), settings.bits_per_second)
-        for board in self.boards:
-            if board is not sender and self._uniform() >= board.air.lost_up(len(packet)):
-                self.events.at(heard_us, partial(self._arrive, board, settings, packet))
-
-    def _arrive(self, board: Nrf51, settings: AirSettings, packet: bytes, now_us: int) -> None:
-        if board.hears_all(settings):
-            board.overhear(now_us, packet)
+    events: EventQueue
+    uniform: Callable[[], float]
+    to_peers: ToPeers = lambda *_: None
 
 
 class Nrf51:
     """One board's radio chip; `settings` are those of its firmware, `chip` the 6 bytes of its factory address.
 
-    `air` has the losses of packets between it and its partner. It joins the `band`.
+    `air` has the losses of packets between it and its partner.
     """
 
     def __init__(
@@ -146,7 +125,6 @@ class Nrf51:
         self._band, self._events = band, band.events
         self._processor = processor
         self._forget()
-        band.boards.append(self)
 
     def _forget(self) -> None:
         """Clear the memory."""
@@ -163,7 +141,7 @@ class Nrf51:
         """Execute a command of the STM32, as in syslink."""
         if kind == syslink.PEER_BROADCAST and data:
             packet = bytes((NULL | 0x0C, PEERS | data[0] & 0x0F)) + data[1:]
-            self._band.send_to_peers(now_us, self, packet)
+            self._band.to_peers(replace(self.settings, address=BROADCAST), packet)
         elif kind in (syslink.RADIO_CHANNEL, syslink.RADIO_RATE) and len(data) == 1:
             self.settings = self._tuned(SET_CHANNEL if kind == syslink.RADIO_CHANNEL else SET_RATE, data[0])
         elif kind == syslink.RADIO_ADDRESS and len(data) == 5:
@@ -181,9 +159,8 @@ class Nrf51:
 
     def hears_all(self, settings: AirSettings) -> bool:
         """Whether a packet to all boards sent with these settings reaches this board."""
-        own = self.settings
         firmware = self.power in (Power.RADIO_ONLY, Power.RUNNING)
-        return firmware and settings == AirSettings(own.channel, own.bits_per_second, BROADCAST)
+        return firmware and settings == replace(self.settings, address=BROADCAST)
 
     def send(self, now_us: int, data: bytes) -> bool:
         """Take a packet of the STM32 for the ground; False when the queue is full."""
@@ -217,6 +194,16 @@ class Nrf51:
         if end.takes(data[0] >> 3 & 1):
             self._take(now_us, data, broadcast=False)
         return self._next_answer(now_us) if end.answered(data[0] >> 2 & 1) else self._answer
+
+    def hear_peer(self, now_us: int, settings: AirSettings, packet: bytes) -> None:
+        """Let a packet of another board arrive, unless it is lost."""
+        if self._band.uniform() >= self.air.lost_up(len(packet)):
+            heard_us = now_us + TURN_ROUND_US + air_us(len(packet), settings.bits_per_second)
+            self._events.at(heard_us, partial(self._take_of_peer, settings, packet))
+
+    def _take_of_peer(self, settings: AirSettings, packet: bytes, now_us: int) -> None:
+        if self.hears_all(settings):
+            self.overhear(now_us, packet)
 
     def overhear(self, now_us: int, data: bytes) -> None:
         """Take a packet to all boards from the air."""

@@ -1,11 +1,11 @@
-"""A Crazyradio dongle: vendor requests in, one packet and its acknowledgement per exchange, boards within reach.
+"""A Crazyradio dongle: vendor requests in, one packet and its acknowledgement per exchange, a board within reach.
 
 The host is real software, so every exchange is simulated, including empty polls. `hil.crazyflie.shockburst` models radio
-loss. With acknowledgements off, a packet is sent once and the host reads nothing. A broadcast packet reaches every board
-on that channel, and none answers.
+loss. With acknowledgements off, a packet is sent once and the host reads nothing. A board on its channel takes a
+broadcast packet and does not answer.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -25,14 +25,14 @@ NOWHERE = Air(1.0, 1.0, 0.0, 0.0, 0.0, 0.0)  # to an absent board
 
 
 class VirtualDongle:
-    """One dongle that reaches `boards`, each through its own air."""
+    """One dongle that reaches a board, unless that is tuned elsewhere."""
 
     def __init__(
-        self, config: RadioConfig, events: EventQueue, rng: np.random.Generator, boards: Sequence[Nrf51]
+        self, config: RadioConfig, events: EventQueue, rng: np.random.Generator, board: Nrf51
     ) -> None:
         self._rng = rng
         self._transmitter = Transmitter(config, events, rng.random)
-        self._boards = boards
+        self._board = board
         self._settings = AirSettings(2, 2_000_000, b"\xe7" * 5)
         self._retries = RETRIES
         self._acks = True
@@ -59,19 +59,18 @@ class VirtualDongle:
         packet = packet[:MAX_PACKET]
         settings, acks = self._settings, self._acks
         retries = self._retries if acks else 0
-        for any_board in self._boards:
-            if packet and any_board.hears_all(settings):
-                hear_too, size = partial(any_board.overhear, data=packet), len(packet)
-                ether = (size, settings.bits_per_second, any_board.air, retries)
-                self._transmitter.send(now_us, RadioExchange(*ether, hear_too, lambda *_: None))
+        board, size = self._board, len(packet)
+        if packet and board.hears_all(settings):
+            overhear = partial(board.overhear, data=packet)
+            ether = (size, settings.bits_per_second, board.air, retries)
+            self._transmitter.send(now_us, RadioExchange(*ether, overhear, lambda *_: None))
         payload: bytes | None = None  # of the last answer
-        board = next((board for board in self._boards if packet and board.hears(settings)), None)
-        air = NOWHERE if board is None else board.air
+        air = board.air if packet and board.hears(settings) else NOWHERE
 
         def hear(now_us: int) -> int | None:
             nonlocal payload
             payload = None
-            if board is None or not board.hears(settings):  # switched off meanwhile
+            if air is NOWHERE or not board.hears(settings):  # switched off meanwhile
                 return None
             payload = board.hear(now_us, packet)
             return len(payload) if acks else None
@@ -83,5 +82,5 @@ class VirtualDongle:
                 answer(now_us, NOT_ACKNOWLEDGED)
 
         jitter_us = int(self._rng.random() * air.uplink_jitter_us) if air.uplink_jitter_us else 0
-        exchange = RadioExchange(len(packet), settings.bits_per_second, air, retries, hear, ended)
+        exchange = RadioExchange(size, settings.bits_per_second, air, retries, hear, ended)
         self._transmitter.send(now_us + jitter_us, exchange)

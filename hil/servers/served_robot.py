@@ -143,8 +143,8 @@ class ServedRobot:
         self.udp_radio = VirtualRadio(patient, events, rng, air, wire_us)
         settings = AirSettings(CHANNEL, config.radio.bits_per_second, address_of(number))
         chip = bytes((number, 0x10, 0xA7, 0xF1, 0x0A, 0xC0))
-        self.band = Band(events, rng.random, to_peers)
-        self.nrf51 = Nrf51(settings, chip, config.radio.downlink_queue, self.band, self, air, wire_us)
+        band = Band(events, rng.random, to_peers)
+        self.nrf51 = Nrf51(settings, chip, config.radio.downlink_queue, band, self, air, wire_us)
         memory.eeprom[:CONFIG_SIZE] = _factory_config(number, config)
         self._files = BoardFiles(state, number, memory) if state is not None else None
         if self._files is not None:
@@ -183,7 +183,7 @@ class ServedRobot:
             update={"usb_us": max(0, radio.usb_us - HOST_SHARE_US), "usb_jitter_us": 0}
         )
         (rng,) = self._rng.spawn(1)
-        return VirtualDongle(at_real_host, self.robot.events, rng, [self.nrf51])
+        return VirtualDongle(at_real_host, self.robot.events, rng, self.nrf51)
 
     def serve_udp(self, port: int, readers: Readers) -> str:
         """Serve it over UDP, too; return the URI."""

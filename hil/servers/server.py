@@ -173,7 +173,7 @@ class Server:
 
     def hear_peer(self, settings: AirSettings, packet: bytes) -> None:
         """Let the board hear a packet of another robot's board."""
-        self.served.band.carry(self.lab.now_us, settings, packet)
+        self.served.nrf51.hear_peer(self.lab.now_us, settings, packet)
 
     def close(self) -> None:
         """Close what is open to clients."""

@@ -55,28 +55,20 @@ class Stm:
         self.polls += 1
 
 
-class DongleWithBoards:
-    """One dongle, one or more boards."""
+class DongleAndBoard:
+    """One dongle and one board; `to_peers` are the packets that the board sends to others."""
 
-    def __init__(self, boards: int = 1, seed: int = 1, **radio: float) -> None:
+    def __init__(self, seed: int = 1, **radio: float) -> None:
         config = RadioConfig.model_validate(
             {"uplink_loss": 0.0, "downlink_loss": 0.0, "usb_jitter_us": 0, **radio}
         )
-        self.events = EventQueue()
-        band = Band(self.events, np.random.default_rng(seed).random)
-        self.stms = [Stm() for _ in range(boards)]
-        self.boards = [
-            Nrf51(
-                AirSettings(80, 2_000_000, ADDRESS[:4] + bytes((0xE7 - n,))),
-                CHIP,
-                8,
-                band,
-                stm,
-                Air.of(config),
-            )
-            for n, stm in enumerate(self.stms)
-        ]
-        self.dongle = VirtualDongle(config, self.events, np.random.default_rng(seed), self.boards)
+        self.events, self.stm = EventQueue(), Stm()
+        self.to_peers: list[tuple[AirSettings, bytes]] = []
+        uniform = np.random.default_rng(seed).random
+        band = Band(self.events, uniform, lambda *sent: self.to_peers.append(sent))
+        settings = AirSettings(80, 2_000_000, ADDRESS)
+        self.board = Nrf51(settings, CHIP, 8, band, self.stm, Air.of(config))
+        self.dongle = VirtualDongle(config, self.events, np.random.default_rng(seed), self.board)
         self.tune(80, 2, ADDRESS)
 
     def tune(self, channel: int, rate: int, address: bytes) -> None:
@@ -106,27 +98,27 @@ class DongleWithBoards:
 
 
 def test_a_packet_arrives_and_the_answer_is_the_signal_strength() -> None:
-    bench = DongleWithBoards()
+    bench = DongleAndBoard()
     answer = bench.exchange(b"\x10hello")
     assert (answer[0], answer[1] & 0xF3, answer[2:]) == (1, 0xF3, bytes((1, 40)))
     bench.wait(1000)
-    assert bench.stms[0].packets == [b"\x10hello"]
+    assert bench.stm.packets == [b"\x10hello"]
 
 
 def test_empty_packets_do_not_reach_the_processor() -> None:
-    bench = DongleWithBoards()
+    bench = DongleAndBoard()
     for header in (0xFF, 0xF3, 0xF7, 0xFB):
         bench.exchange(bytes((header,)))
     bench.wait(1000)
-    assert bench.stms[0].packets == []
-    assert bench.stms[0].polls == 4
+    assert bench.stm.packets == []
+    assert bench.stm.polls == 4
 
 
 @pytest.mark.parametrize(("rate", "bits_per_second"), [(0, 250_000), (1, 1_000_000), (2, 2_000_000)])
 @pytest.mark.parametrize("size", [1, 4, 28, 31])
 def test_an_exchange_takes_its_time_on_the_air_and_on_usb(rate: int, bits_per_second: int, size: int) -> None:
-    bench = DongleWithBoards()
-    bench.boards[0].settings = AirSettings(80, bits_per_second, ADDRESS)
+    bench = DongleAndBoard()
+    bench.board.settings = AirSettings(80, bits_per_second, ADDRESS)
     bench.tune(80, rate, ADDRESS)
     bench.exchange(bytes([0x10] * size))
     assert bench.events.now_us == pytest.approx(
@@ -135,7 +127,7 @@ def test_an_exchange_takes_its_time_on_the_air_and_on_usb(rate: int, bits_per_se
 
 
 def test_the_hosts_jitter_delays_answers_and_stays_within_its_bound() -> None:
-    bench, waits = DongleWithBoards(usb_jitter_us=400), []
+    bench, waits = DongleAndBoard(usb_jitter_us=400), []
     for _ in range(300):
         start_us = bench.events.now_us
         bench.exchange(NULL)
@@ -147,11 +139,11 @@ def test_the_hosts_jitter_delays_answers_and_stays_within_its_bound() -> None:
 
 @pytest.mark.parametrize("setting", [(81, 2, ADDRESS), (80, 1, ADDRESS), (80, 2, b"\xe7\xe7\xe7\xe7\x00")])
 def test_no_board_answers_on_another_channel_rate_or_address(setting: tuple[int, int, bytes]) -> None:
-    bench = DongleWithBoards()
+    bench = DongleAndBoard()
     bench.tune(*setting)
     assert bench.exchange(b"\x10hello") == b"\x00"
     bench.wait(1000)
-    assert bench.stms[0].packets == []
+    assert bench.stm.packets == []
 
 
 @pytest.mark.parametrize(
@@ -164,8 +156,8 @@ def test_no_board_answers_on_another_channel_rate_or_address(setting: tuple[int,
 def test_giving_up_takes_as_long_as_the_tries(
     rate: int, bits_per_second: int, retry_us: int, retries: int, channel: int, lost: dict[str, float]
 ) -> None:
-    bench = DongleWithBoards(**lost)
-    bench.boards[0].settings = AirSettings(80, bits_per_second, ADDRESS)
+    bench = DongleAndBoard(**lost)
+    bench.board.settings = AirSettings(80, bits_per_second, ADDRESS)
     bench.tune(channel, rate, ADDRESS)
     bench.dongle.control(0x06, retries, b"")
     assert bench.exchange(b"\x10hello") == b"\x00"
@@ -173,32 +165,30 @@ def test_giving_up_takes_as_long_as_the_tries(
     assert bench.events.now_us == pytest.approx(500 + (retries + 1) * try_us, abs=retries + 1)
 
 
-def test_ten_boards_receive_only_their_packets() -> None:
-    bench = DongleWithBoards(boards=10)
-    for n, board in enumerate(bench.boards):
-        bench.tune(80, 2, board.settings.address)
-        assert bench.exchange(bytes((0x10, n)))[0] & 1
+def test_a_packet_to_another_board_is_neither_heard_nor_answered() -> None:
+    bench = DongleAndBoard()
+    bench.tune(80, 2, ADDRESS[:4] + b"\x02")
+    assert bench.exchange(b"\x10other") == b"\x00"
     bench.wait(1000)
-    assert [stm.packets for stm in bench.stms] == [[bytes((0x10, n))] for n in range(10)]
+    assert bench.stm.packets == []
 
 
-def test_a_broadcast_reaches_every_board_on_its_channel_once_unanswered() -> None:
-    bench = DongleWithBoards(boards=3)
-    bench.boards[2].settings = AirSettings(81, 2_000_000, ADDRESS)
-    bench.tune(80, 2, bytes.fromhex("FFE7E7E7E7"))
+@pytest.mark.parametrize(("channel", "hears"), [(80, True), (81, False)])
+def test_a_broadcast_reaches_a_board_on_its_channel_once_unanswered(channel: int, hears: bool) -> None:
+    bench = DongleAndBoard()
+    bench.tune(channel, 2, bytes.fromhex("FFE7E7E7E7"))
     bench.dongle.control(0x10, 0, b"")
     answers: list[bytes] = []
     first, second = b"\x85" + bytes(range(31)), b"\x85" + bytes(range(31, 62))
     for transfer in (b"\x6d\x08pose", first + second):  # longer ones are two packets
         bench.dongle.transmit(bench.events.now_us, transfer, lambda _, answer: answers.append(answer))
         bench.wait(5000)
-    assert [stm.broadcasts for stm in bench.stms] == [[b"\x6d\x08pose", first, second]] * 2 + [[]]
-    assert [stm.packets for stm in bench.stms] == [[]] * 3
-    assert answers == []
+    assert bench.stm.broadcasts == ([b"\x6d\x08pose", first, second] if hears else [])
+    assert bench.stm.packets == answers == []
 
 
 def test_a_broadcast_does_not_count_in_the_conversation_with_one_board() -> None:
-    bench = DongleWithBoards()
+    bench = DongleAndBoard()
     host = cflib_host(bench)
     next(host)
     for number in range(10):
@@ -210,20 +200,18 @@ def test_a_broadcast_does_not_count_in_the_conversation_with_one_board() -> None
         bench.dongle.control(0x10, 1, b"")
         host.send(bytes((0x10, number)))
     bench.wait(1000)
-    assert [packet[1] for packet in bench.stms[0].packets] == list(range(10))
-    assert len(bench.stms[0].broadcasts) == 10
+    assert [packet[1] for packet in bench.stm.packets] == list(range(10))
+    assert len(bench.stm.broadcasts) == 10
 
 
-def test_a_broadcast_is_lost_for_each_board_on_its_own() -> None:
-    bench = DongleWithBoards(boards=2, uplink_loss=0.4)
+def test_a_broadcast_is_lost_like_a_packet_without_repetitions() -> None:
+    bench = DongleAndBoard(uplink_loss=0.4)
     bench.tune(80, 2, bytes.fromhex("FFE7E7E7E7"))
     bench.dongle.control(0x10, 0, b"")
     for number in range(2000):
         bench.dongle.transmit(bench.events.now_us, struct.pack("<BH", 0x10, number), lambda _, answer: None)
         bench.wait(2000)
-    heard = [set(stm.broadcasts) for stm in bench.stms]
-    assert [len(packets) / 2000 for packets in heard] == pytest.approx([0.6, 0.6], abs=0.04)
-    assert len(heard[0] & heard[1]) / 2000 == pytest.approx(0.36, abs=0.04)
+    assert len(bench.stm.broadcasts) / 2000 == pytest.approx(0.6, abs=0.04)
 
 
 @pytest.mark.parametrize(
@@ -232,10 +220,10 @@ def test_a_broadcast_is_lost_for_each_board_on_its_own() -> None:
     ids=["channel", "no channel", "250K", "1M", "no rate", "power"],
 )
 def test_a_command_tunes_the_radio_until_the_reset(command: int, value: int, channel: int, rate: int) -> None:
-    bench = DongleWithBoards()
+    bench = DongleAndBoard()
     assert bench.exchange(bytes((0xFF, 0x03, command, value)))[0] & 1  # answered where it was asked
     bench.wait(5000)
-    assert bench.stms[0].packets == []
+    assert bench.stm.packets == []
     bench.tune(channel, rate, ADDRESS)
     assert bench.exchange(NULL)[0] & 1
     if (channel, rate) != (80, 2):
@@ -243,7 +231,7 @@ def test_a_command_tunes_the_radio_until_the_reset(command: int, value: int, cha
         assert bench.exchange(NULL) == b"\x00"
 
 
-def cflib_host(bench: DongleWithBoards) -> Iterator[bytes | None]:
+def cflib_host(bench: DongleAndBoard) -> Iterator[bytes | None]:
     """cflib's driver with safelink: takes packets by `send`, yields what it would hand to its client."""
     driver = _RadioDriverThread(bench, None, None, None, None, None, None)
     for _ in range(10):
@@ -266,7 +254,7 @@ def cflib_host(bench: DongleWithBoards) -> Iterator[bytes | None]:
     [(0.0, 0.0, 0.0), (0.1, 0.1, 0.0), (0.5, 0.0, 0.0), (0.0, 0.5, 0.0), (0.3, 0.3, 1e-3)],
 )
 def test_safelink_brings_everything_once_and_in_order(up: float, down: float, ber: float) -> None:
-    bench = DongleWithBoards(
+    bench = DongleAndBoard(
         uplink_loss=up, downlink_loss=down, uplink_bit_error_rate=ber, downlink_bit_error_rate=ber
     )
     host = cflib_host(bench)
@@ -275,29 +263,29 @@ def test_safelink_brings_everything_once_and_in_order(up: float, down: float, be
     sent_down = [struct.pack("<BH", 0x50, n) for n in range(300)]
     waiting, received = list(sent_down), []
     for packet in [*sent_up, *[None] * 320]:
-        while waiting and bench.boards[0].send(bench.events.now_us, waiting[0]):
+        while waiting and bench.board.send(bench.events.now_us, waiting[0]):
             waiting.pop(0)
         answer = host.send(packet)
         if answer is not None:
             received.append(bytes((answer[0] & 0xF3,)) + answer[1:])
     bench.wait(1000)
     assert received == sent_down
-    assert [bytes((packet[0] & 0xF3,)) + packet[1:] for packet in bench.stms[0].packets] == sent_up
+    assert [bytes((packet[0] & 0xF3,)) + packet[1:] for packet in bench.stm.packets] == sent_up
 
 
 def test_without_acknowledgements_a_packet_is_sent_once_unanswered() -> None:
-    bench, answers = DongleWithBoards(uplink_loss=0.5), []
+    bench, answers = DongleAndBoard(uplink_loss=0.5), []
     bench.dongle.control(0x10, 0, b"")
     for _ in range(2000):
         bench.dongle.transmit(bench.events.now_us, b"\x10hello", lambda _, answer: answers.append(answer))
         bench.wait(5000)
-    assert len(bench.stms[0].packets) / 2000 == pytest.approx(0.5, abs=0.04)
+    assert len(bench.stm.packets) / 2000 == pytest.approx(0.5, abs=0.04)
     assert answers == []
 
 
 @pytest.mark.parametrize("direction", ["uplink_loss", "downlink_loss"])
 def test_retries_are_counted_in_the_status_and_take_time(direction: str) -> None:
-    bench = DongleWithBoards(**{direction: 0.5})
+    bench = DongleAndBoard(**{direction: 0.5})
     seen = set()
     for _ in range(200):
         start_us = bench.events.now_us
@@ -311,8 +299,8 @@ def test_retries_are_counted_in_the_status_and_take_time(direction: str) -> None
 
 
 def test_the_ninth_packet_finds_the_queue_full_until_the_first_has_arrived() -> None:
-    bench = DongleWithBoards()
-    board, events = bench.boards[0], bench.events
+    bench = DongleAndBoard()
+    board, events = bench.board, bench.events
     assert [board.send(0, b"\x50") for _ in range(9)] == [True] * 8 + [False]
     assert bench.exchange(NULL) == b"\x01\x50"
     assert not board.send(events.now_us, b"\x50")
@@ -322,8 +310,8 @@ def test_the_ninth_packet_finds_the_queue_full_until_the_first_has_arrived() -> 
 
 @pytest.mark.parametrize(("size", "carried"), [(31, True), (32, False)])
 def test_an_answer_carries_only_what_the_radio_chip_has_by_then(size: int, carried: bool) -> None:
-    bench, packet = DongleWithBoards(usb_us=200), bytes([0x50] * size)
-    assert bench.boards[0].send(0, packet)
+    bench, packet = DongleAndBoard(usb_us=200), bytes([0x50] * size)
+    assert bench.board.send(0, packet)
     heard_us = 200 + 130 + air_us(1, 2_000_000)
     assert (syslink_us(packet) <= heard_us) is carried
     assert (bench.exchange(NULL)[1:] == packet) is carried
@@ -335,7 +323,7 @@ def boot_address(answer: bytes) -> bytes:
     return bytes.fromhex("B1" + answer[3:7][::-1].hex())
 
 
-def into_bootloader(bench: DongleWithBoards) -> None:
+def into_bootloader(bench: DongleAndBoard) -> None:
     bench.exchange(b"\xff\xfe\xff")
     answer = bench.exchange(NULL)[1:]
     assert answer == b"\xff\xfe\xff" + CHIP
@@ -345,55 +333,55 @@ def into_bootloader(bench: DongleWithBoards) -> None:
 
 
 def test_the_bootloader_is_at_the_address_that_cflib_computes_and_back() -> None:
-    bench = DongleWithBoards()
+    bench = DongleAndBoard()
     into_bootloader(bench)
-    assert bench.boards[0].power is Power.BOOTLOADER
-    assert len(bench.stms[0].stops) == 1
+    assert bench.board.power is Power.BOOTLOADER
+    assert len(bench.stm.stops) == 1
     assert bench.exchange(b"\xff\xff\x10") == b"\x01"  # no contents: anything else breaks cflib's flashing
     info = bench.exchange(NULL)
     assert info[1:4] == b"\xff\xff\x10"
     bench.exchange(b"\xff\xfe\xf0\x01")
     bench.wait(RESET_DELAY_US + 1000)
-    assert bench.boards[0].power is Power.RUNNING
-    assert len(bench.stms[0].starts) == 1
+    assert bench.board.power is Power.RUNNING
+    assert len(bench.stm.starts) == 1
     assert bench.exchange(NULL) == b"\x00"  # not there any more
     bench.tune(80, 2, ADDRESS)
     assert bench.exchange(NULL)[0] & 1
 
 
 def test_the_bootloader_does_not_know_safelink() -> None:
-    bench = DongleWithBoards()
+    bench = DongleAndBoard()
     into_bootloader(bench)
     assert all(bench.exchange(b"\xff\x05\x01") == b"\x01" for _ in range(10))
 
 
 @pytest.mark.parametrize(("safelink", "passed_on"), [(0, 4), (1, 1)])
 def test_every_received_try_is_passed_on_unless_safelink_knows_it(safelink: int, passed_on: int) -> None:
-    bench = DongleWithBoards(downlink_loss=1.0)
+    bench = DongleAndBoard(downlink_loss=1.0)
     bench.exchange(bytes((0xFF, 0x05, safelink)))
     assert bench.exchange(b"\x14hello") == b"\x00"
     bench.wait(1000)
-    assert bench.stms[0].packets == [b"\x14hello"] * passed_on
+    assert bench.stm.packets == [b"\x14hello"] * passed_on
 
 
 def test_an_unknown_command_does_nothing() -> None:
-    bench = DongleWithBoards()
+    bench = DongleAndBoard()
     assert bench.exchange(b"\xff\xfe")[0] == 1
     bench.wait(RESET_DELAY_US + 1000)
-    assert bench.boards[0].power is Power.RUNNING
-    assert bench.stms[0].stops == []
+    assert bench.board.power is Power.RUNNING
+    assert bench.stm.stops == []
 
 
 def test_a_reset_needs_its_announcement() -> None:
-    bench = DongleWithBoards()
+    bench = DongleAndBoard()
     bench.exchange(b"\xff\xfe\xf0\x00")
     bench.wait(RESET_DELAY_US + 1000)
-    assert bench.boards[0].power is Power.RUNNING
+    assert bench.board.power is Power.RUNNING
 
 
 def test_power_switch() -> None:
-    bench = DongleWithBoards()
-    board, stm = bench.boards[0], bench.stms[0]
+    bench = DongleAndBoard()
+    board, stm = bench.board, bench.stm
     bench.exchange(b"\xf3\xfe\x02")
     assert (board.power, len(stm.stops), len(stm.starts)) == (Power.RADIO_ONLY, 1, 0)
     assert bench.exchange(b"\x10lost")[0] & 1  # the radio chip still answers
@@ -410,33 +398,42 @@ def test_power_switch() -> None:
 
 
 def test_the_battery_voltage_is_answered() -> None:
-    bench = DongleWithBoards()
+    bench = DongleAndBoard()
     bench.exchange(b"\xf3\xfe\x04")
     assert bench.exchange(NULL)[1:] == b"\xff\xfe\x04" + struct.pack("<f", 3.75)
 
 
-def test_a_packet_to_peers_reaches_all_other_boards_on_the_channel() -> None:
-    bench = DongleWithBoards(boards=4)
-    bench.boards[3].command(0, syslink.RADIO_CHANNEL, b"\x51")
-    bench.boards[0].command(0, syslink.PEER_BROADCAST, b"\x03hello")
+def test_a_packet_to_peers_goes_to_all_boards_on_the_channel() -> None:
+    bench = DongleAndBoard()
+    bench.board.command(0, syslink.RADIO_CHANNEL, b"\x51")
+    bench.board.command(0, syslink.PEER_BROADCAST, b"\x03hello")
+    to_all = AirSettings(81, 2_000_000, bytes.fromhex("FFE7E7E7E7"))
+    assert bench.to_peers == [(to_all, b"\xff\x83hello")]
+
+
+@pytest.mark.parametrize(("channel", "heard"), [(80, [b"\xff\x83hello"]), (81, [])])
+def test_a_packet_of_a_peer_reaches_a_board_on_its_channel(channel: int, heard: list[bytes]) -> None:
+    bench = DongleAndBoard()
+    settings = AirSettings(channel, 2_000_000, bytes.fromhex("FFE7E7E7E7"))
+    bench.board.hear_peer(0, settings, b"\xff\x83hello")
     bench.wait(2_000)
-    heard = [stm.broadcasts for stm in bench.stms]
-    assert heard == [[], [b"\xff\x83hello"], [b"\xff\x83hello"], []]
+    assert bench.stm.broadcasts == heard
 
 
-def test_packets_to_peers_are_lost_like_others() -> None:
-    bench = DongleWithBoards(boards=2, uplink_loss=0.25)
+def test_packets_of_peers_are_lost_like_others() -> None:
+    bench = DongleAndBoard(uplink_loss=0.25)
+    settings = AirSettings(80, 2_000_000, bytes.fromhex("FFE7E7E7E7"))
     for _ in range(400):
-        bench.boards[0].command(bench.events.now_us, syslink.PEER_BROADCAST, b"\x00x")
+        bench.board.hear_peer(bench.events.now_us, settings, b"\xff\x80x")
         bench.wait(1_000)
-    assert len(bench.stms[1].broadcasts) == pytest.approx(300, abs=4 * (400 * 0.25 * 0.75) ** 0.5)
+    assert len(bench.stm.broadcasts) == pytest.approx(300, abs=4 * (400 * 0.25 * 0.75) ** 0.5)
 
 
 def test_a_peer_packet_of_a_host_is_passed_on_and_answered_at_once_without_contents() -> None:
-    bench = DongleWithBoards()
+    bench = DongleAndBoard()
     assert bench.exchange(b"\xf3\x81hi") == b"\x01"
     bench.wait(1_000)
-    assert bench.stms[0].packets == [b"\xf3\x81hi"]
+    assert bench.stm.packets == [b"\xf3\x81hi"]
 
 
 @pytest.mark.parametrize(
@@ -451,18 +448,18 @@ def test_a_peer_packet_of_a_host_is_passed_on_and_answered_at_once_without_conte
     ],
 )
 def test_the_processor_tunes_its_radio(kind: int, data: bytes, settings: AirSettings) -> None:
-    bench = DongleWithBoards()
-    bench.boards[0].command(0, kind, data)
-    assert bench.boards[0].settings == settings
+    bench = DongleAndBoard()
+    bench.board.command(0, kind, data)
+    assert bench.board.settings == settings
 
 
 @pytest.mark.parametrize(
     ("kind", "power"), [(syslink.SWITCH_OFF, Power.OFF), (syslink.STM32_OFF, Power.RADIO_ONLY)]
 )
 def test_the_processor_switches_the_board_off(kind: int, power: Power) -> None:
-    bench = DongleWithBoards()
-    bench.boards[0].command(500, kind, b"")
-    assert bench.stms[0].stops == []  # not within the processor's own step
+    bench = DongleAndBoard()
+    bench.board.command(500, kind, b"")
+    assert bench.stm.stops == []  # not within the processor's own step
     bench.wait(1_000)
-    assert bench.stms[0].stops == [500]
-    assert bench.boards[0].power is power
+    assert bench.stm.stops == [500]
+    assert bench.board.power is power
