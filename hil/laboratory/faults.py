@@ -57,6 +57,13 @@ class Fault:
             )
             raise LabError(f"fault {self.kind}: size {self.size:g}: expected {allowed}")
 
+    @property
+    def span_us(self) -> tuple[int, float]:
+        """Begin and end after the release; inf when it has no end."""
+        begin_us = round(self.start_s * 1e6)
+        endless = math.isinf(self.duration_s)
+        return begin_us, math.inf if endless else begin_us + round(self.duration_s * 1e6)
+
     def __str__(self) -> str:
         kind = KINDS[self.kind]
         duration = "" if self.duration_s == kind.duration_s else f":{_number(self.duration_s)}"
@@ -67,11 +74,11 @@ class Fault:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """When a fault acts, in simulated time; `end_us` is inf when it has no end."""
+    """When a fault acts, from the release; `end_s` is inf when it has no end."""
 
     fault: Fault
-    begin_us: float
-    end_us: float
+    begin_s: float
+    end_s: float
 
 
 @checked
@@ -119,15 +126,6 @@ def why_not(kind: Kind, links: str, config: LabConfig) -> str:
     return ""
 
 
-def spans(faults: Iterable[Fault], release_us: int) -> list[Span]:
-    """Return when faults act in a flight released at `release_us`."""
-    times = [(fault, release_us + round(fault.start_s * 1e6)) for fault in faults]
-    return [
-        Span(fault, begin_us, begin_us + round(fault.duration_s * 1e6) if math.isfinite(fault.duration_s) else math.inf)
-        for fault, begin_us in times
-    ]  # fmt: skip
-
-
 def switched_on(events: Iterable[Mapping[str, Any]]) -> dict[bytes, bytes]:
     """Return the live faults among the events of a flight as metadata of its log, for `spans_of`."""
     found: list[list[Any]] = []  # fault, begin and end [us]
@@ -144,11 +142,12 @@ def switched_on(events: Iterable[Mapping[str, Any]]) -> dict[bytes, bytes]:
 def spans_of(metadata: Mapping[bytes, bytes] | None) -> list[Span]:
     """Return when the faults of a flight act, from the metadata of its log; omit those of unknown kinds."""
     texts = stored_in(metadata, "request").get("faults", ())
-    faults = [parse(text) for text in texts if text.partition("@")[0] in KINDS]
+    planned = [parse(text) for text in texts if text.partition("@")[0] in KINDS]
     live = json.loads((metadata or {}).get(SWITCHED_ON, b"[]"))
     known = [one for one in live if re.split("[:=]", one[0])[0] in KINDS]
-    return spans(faults, release_of(metadata)) + [
-        Span(parse(text, live=True), *times) for text, *times in known
+    release_us = release_of(metadata)
+    return [Span(fault, *(1e-6 * us for us in fault.span_us)) for fault in planned] + [
+        Span(parse(text, live=True), *(1e-6 * (us - release_us) for us in times)) for text, *times in known
     ]
 
 
@@ -173,12 +172,13 @@ class Switchboard:
 
     def plan(self, faults: Iterable[Fault], release_us: int, end_us: int) -> None:
         """Plan begin and end of faults that begin before `end_us`; skip those that cannot act on the robot."""
-        for span in spans(faults, release_us):
-            if self._why_not(KINDS[span.fault.kind]) or span.begin_us >= end_us:
+        for fault in faults:
+            begins_us, ends_us = (release_us + us for us in fault.span_us)
+            if self._why_not(KINDS[fault.kind]) or begins_us >= end_us:
                 continue
-            self._robot.events.at(int(span.begin_us), partial(self.begin, span.fault))
-            if span.end_us < end_us:
-                self._robot.events.at(int(span.end_us), partial(self.end, span.fault))
+            self._robot.events.at(int(begins_us), partial(self.begin, fault))
+            if ends_us < end_us:
+                self._robot.events.at(int(ends_us), partial(self.end, fault))
 
     def act(self, fault: Fault, now_us: int) -> None:
         """Begin a fault now, ignoring its start. Raises `LabError` if it cannot act on this robot."""

@@ -47,10 +47,10 @@ def course_of(rows: pa.Table) -> FlownPath:
     """Return the path of the body and of its goal after the release [cm], from the first goal in W."""
     flight = free_flight(rows)
     goal = 100 * column(flight, "goal.x", "goal.y", "goal.z")
-    times = column(flight, "t")
+    times = since_release(flight)
     troubled = np.zeros(len(times), np.bool_)
     for span in spans_of(rows.schema.metadata):
-        troubled |= (times >= span.begin_us) & (times <= span.end_us)
+        troubled |= (times >= span.begin_s) & (times <= span.end_s)
     return FlownPath(100 * body(flight, "x", "y", "z") - goal[:1], goal - goal[:1], troubled, 100 * BOX)
 
 

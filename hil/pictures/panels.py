@@ -148,9 +148,8 @@ def marks_of_flight(log: pa.Table, lost: str | None = None) -> Marks:
     spells = [Spell("held", held[0], held[-1])] if len(held) > 1 else []
     release_us = release_of(log.schema.metadata)
     for span in spans_of(log.schema.metadata):
-        begin_s, end_s = (1e-6 * (us - release_us) for us in (span.begin_us, span.end_us))
-        if begin_s < times[-1]:
-            spells.append(Spell("fault", begin_s, min(end_s, float(times[-1])), str(span.fault)))
+        if span.begin_s < times[-1]:
+            spells.append(Spell("fault", span.begin_s, min(span.end_s, float(times[-1])), str(span.fault)))
     spells += _spells("failsafe", times, column(log, "supervisor.state") == State.FAILSAFE)
     for name, at_limit in saturated(log):
         spells += _spells("limit", times, at_limit & (times > 0.0), name)

@@ -74,7 +74,7 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
         result=result,
         found=experiment.is_known,
         rows=metric_rows(result),
-        faults=fault_rows(spans_of(log.schema.metadata), release_us),
+        faults=fault_rows(spans_of(log.schema.metadata)),
         events=events,
         release_us=release_us,
         failures=failures,
@@ -132,13 +132,12 @@ def metric_rows(result: Result) -> list[MetricRow]:
     return sorted(rows, key=lambda row: row.mark is None)
 
 
-def fault_rows(spans: Iterable[Span], release_us: int) -> list[FaultRow]:
+def fault_rows(spans: Iterable[Span]) -> list[FaultRow]:
     """Return one row per fault, with its times from the release."""
     rows = []
     for span in spans:
         kind = KINDS[span.fault.kind]
         size = f"{span.fault.size:g} {kind.unit}".strip() if kind.sized else ""
-        begin_s, end_s = (1e-6 * (us - release_us) for us in (span.begin_us, span.end_us))
-        end = f"{end_s:.3f}" if end_s < math.inf else "with the flight"
-        rows.append(FaultRow(span.fault.kind, f"{begin_s:.3f}", end, size, kind.meaning))
+        end = f"{span.end_s:.3f}" if span.end_s < math.inf else "with the flight"
+        rows.append(FaultRow(span.fault.kind, f"{span.begin_s:.3f}", end, size, kind.meaning))
     return rows

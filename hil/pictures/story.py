@@ -52,9 +52,8 @@ def story_of(log: pa.Table, result: Result, events: Iterable[Mapping[str, Any]] 
     seconds = 1e-6 * (metrics.column(free, "t") - release_us)
     moments = [Moment(0.0, "released")]
     for span in spans_of(log.schema.metadata):
-        begin_s, end_s = (1e-6 * (us - release_us) for us in (span.begin_us, span.end_us))
-        moments += [Moment(begin_s, f"fault {span.fault} begins")] if begin_s <= seconds[-1] else []
-        moments += [Moment(end_s, f"fault {span.fault} ends")] if end_s <= seconds[-1] else []
+        turns = ((span.begin_s, "begins"), (span.end_s, "ends"))
+        moments += [Moment(at_s, f"fault {span.fault} {turn}") for at_s, turn in turns if at_s <= seconds[-1]]
     passed = [(_first(wrong), name) for name, wrong in _passed(free, result)]
     if passed:
         row, name = min(passed)
@@ -148,12 +147,10 @@ def failures_of(log: pa.Table, result: Result) -> list[FailedLimit]:
 
 def _before(log: pa.Table, at_s: float) -> str:
     """Return which fault was in force, or had ended shortly before an instant: the one that began last."""
-    release_us = release_of(log.schema.metadata)
-    spans = [(1e-6 * (span.begin_us - release_us), span) for span in spans_of(log.schema.metadata)]
     recent = [
-        (begin_s, str(span.fault), _meaning(span))
-        for begin_s, span in spans
-        if begin_s <= at_s <= 1e-6 * (span.end_us - release_us) + RECENT_S
+        (span.begin_s, str(span.fault), _meaning(span))
+        for span in spans_of(log.schema.metadata)
+        if span.begin_s <= at_s <= span.end_s + RECENT_S
     ]
     if not recent:
         return "no fault was in force"

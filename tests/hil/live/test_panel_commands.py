@@ -92,7 +92,7 @@ def test_goal_fault_and_note_act_and_are_events(tmp_path: Path) -> None:
     ]  # fmt: skip
     (close,) = close_ups(log, marks_of_flight(log))
     assert close.figure.title == "mocap.dropout:0.2=1"
-    (row,) = fault_rows(spans_of(log.schema.metadata), 1_000_000)
+    (row,) = fault_rows(spans_of(log.schema.metadata))
     assert float(row.end_s) - float(row.begin_s) == pytest.approx(0.2)
     assert len(view.answers) == 5
     assert view.answers[0] == "goal 9 9 9: more than 1 m from home, 0 0 1.15"
