@@ -90,17 +90,6 @@ def test_any_changed_cell_is_found(runs: dict[str, Path], data: st.DataObject) -
     assert compare(other, other).identical, "NaN equals NaN"
 
 
-def test_a_log_that_ends_earlier_differs_where_it_ends(runs: dict[str, Path]) -> None:
-    run = load_flown(runs["one"])
-    short = FlownRun(run.log.slice(0, 20), run.result)
-    for a, b, ended in ((run, short, 1), (short, run, 0)):
-        first = compare(a, b).first
-        assert first is not None
-        assert (first.row, first.t_s) == (20, pytest.approx(-0.79975))
-        assert first.values[ended] is None
-        assert "the log has ended" in str(first)
-
-
 def test_a_missing_column_is_reported(runs: dict[str, Path]) -> None:
     run = load_flown(runs["one"])
     less = FlownRun(run.log.drop_columns(["truth.x"]), run.result)

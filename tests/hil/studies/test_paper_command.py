@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 import re
 import statistics
 from pathlib import Path
@@ -19,7 +18,7 @@ from hil.laboratory.metrics import METRICS
 from hil.laboratory.request import Options
 from hil.pictures.panels import Instant
 from hil.studies.catalogue import PROFILES
-from hil.studies.paper import Paper, Spread, Trials
+from hil.studies.paper import Paper, Trials
 from hil.studies.paper_report import write_paper
 from hil.studies.paper_rows import OUTSIDE, ROWS, MetricClaim, PaperRow
 from hil.studies.study import Curve, Expected, Study, StudyResult, Variant, VariantOutcome
@@ -135,28 +134,6 @@ def test_every_seed_of_the_default_profile_must_hold(result: Row) -> None:
     assert bad.failed == ["max_x 1×"]
 
 
-def test_a_miss_of_the_paper_is_reported_beside_the_limits(result: Row) -> None:
-    row = PaperRow(
-        "t",
-        "c",
-        "p",
-        {"settle": MetricClaim("< 0.5 s", 0.5), "peak_rate": MetricClaim("> 80 deg/s", math.radians(80))},
-        "why",
-    )
-    slow, fast = (
-        dataclasses.replace(result, passed=True, holds={}, metrics={"settle": settle, "peak_rate": rate})
-        for settle, rate in ((0.75, math.radians(70)), (0.45, math.radians(90)))
-    )
-    good, bad = Trials("floaty", (fast, fast)), Trials("as-flown", (slow, fast))  # the mean: 0.6 s, 80 deg/s
-    assert bad.holds
-    assert [good.missed(row, metric) for metric in row.claims] == ["", ""]
-    assert bad.missed(row, "settle") == "misses by 0.1 s"
-    assert Trials("floaty", (slow,)).missed(row, "peak_rate") == "misses by 10 deg/s"
-    assert [(profile, what) for _, profile, what in Paper((("x", row, (good, bad)),), (), False).misses] == [
-        ("as-flown", ["settle misses by 0.1 s"])
-    ]
-
-
 @pytest.mark.long
 def test_the_badges_name_their_kind_of_verdict(result: Row, tmp_path: Path) -> None:
     good = trials(result, True, True)
@@ -192,20 +169,6 @@ def test_the_badges_name_their_kind_of_verdict(result: Row, tmp_path: Path) -> N
     studies = Page((tmp_path / "studies.html").read_text(encoding="utf-8"))
     assert len(studies.pictures) == 1
     assert studies.links == ["report.html", "t.html"]
-
-
-def test_the_representative_trial_has_the_median_error(result: Row) -> None:
-    flights = [
-        dataclasses.replace(result, metrics={**result.metrics, "rms_x": error})
-        for error in (0.5, 0.1, 0.3, 0.2, 0.4)
-    ]
-    ordered = Trials("floaty", tuple(flights)).representative_first()
-    assert [one.metrics["rms_x"] for one in ordered] == [0.3, 0.1, 0.2, 0.4, 0.5]
-
-
-def test_a_figure_that_no_flight_has_is_a_dash(result: Row) -> None:
-    assert str(Spread.of("held_up_to", [result])) == "–"
-    assert str(Spread.of("lost", [result])) == "0"
 
 
 @pytest.mark.parametrize(
