@@ -200,15 +200,15 @@ def declare(name: str, kind: ValueType, written: bool) -> str:
     return f"{C_TYPES[kind.base]} {name}"
 
 
-def block_comment(text: str, indent: str = "") -> str:
+def block_comment(text: str) -> str:
     """Return a text as a C comment block, empty for no text."""
     if not text:
         return ""
     lines: list[str] = []
     for paragraph in text.split("\n\n"):
         lines += ["", *textwrap.wrap(paragraph, WIDTH - 6)] if lines else textwrap.wrap(paragraph, WIDTH - 6)
-    body = "\n".join(f"{indent} * {line}".rstrip() for line in lines[1:])
-    return f"{indent}/* {lines[0]}" + (f"\n{body}\n{indent} */\n" if body else " */\n")
+    body = "\n".join(f" * {line}".rstrip() for line in lines[1:])
+    return f"/* {lines[0]}" + (f"\n{body}\n */\n" if body else " */\n")
 
 
 def constant_definition(constant: Constant) -> str:

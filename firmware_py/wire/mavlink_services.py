@@ -8,6 +8,7 @@ import pymavlink.dialects.v20.development as dialect
 from firmware_py.wire.mavlink_dialect import Message, ProtocolVersion
 from firmware_py.wire.mavlink_numbers import Mode
 
+BOARD_COMPONENT = 1  # autopilot
 NAME_SIZE = 16  # of a parameter
 
 PREFIXES = {  # of parameters, by group
@@ -82,10 +83,10 @@ def station_heartbeat() -> Message:
     )
 
 
-def command(system: int, component: int, number: int, *params: float) -> Message:
-    """Return a COMMAND_LONG with at most seven parameters; those left out are zero."""
+def command(system: int, number: int, *params: float) -> Message:
+    """Return a COMMAND_LONG to a board with at most seven parameters; those left out are zero."""
     padded = (*params, *(0.0,) * (7 - len(params)))
-    return dialect.MAVLink_command_long_message(system, component, number, 0, *padded)
+    return dialect.MAVLink_command_long_message(system, BOARD_COMPONENT, number, 0, *padded)
 
 
 def timesync(tc1_ns: int, ts1_ns: int) -> Message:
@@ -178,21 +179,21 @@ def parameter(name: str, value: float, index: int, count: int) -> Message:
     )
 
 
-def parameter_list(system: int, component: int) -> Message:
-    """Return a request for all parameters."""
-    return dialect.MAVLink_param_request_list_message(system, component)
+def parameter_list(system: int) -> Message:
+    """Return a request for all parameters of a board."""
+    return dialect.MAVLink_param_request_list_message(system, BOARD_COMPONENT)
 
 
-def parameter_read(system: int, component: int, which: str | int) -> Message:
+def parameter_read(system: int, which: str | int) -> Message:
     """Return a request for one parameter, by name or by its index."""
     name, index = (which, -1) if isinstance(which, str) else ("", which)
-    return dialect.MAVLink_param_request_read_message(system, component, _text(name, NAME_SIZE), index)
+    return dialect.MAVLink_param_request_read_message(system, BOARD_COMPONENT, _text(name, NAME_SIZE), index)
 
 
-def parameter_set(system: int, component: int, name: str, value: float) -> Message:
+def parameter_set(system: int, name: str, value: float) -> Message:
     """Return a request to change a parameter, as REAL32."""
     return dialect.MAVLink_param_set_message(
-        system, component, _text(name, NAME_SIZE), value, dialect.MAV_PARAM_TYPE_REAL32
+        system, BOARD_COMPONENT, _text(name, NAME_SIZE), value, dialect.MAV_PARAM_TYPE_REAL32
     )
 
 

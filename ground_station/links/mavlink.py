@@ -20,7 +20,7 @@ from firmware_py.wire.telemetry import Sample, state_in
 from ground_station.config import LinkSettings
 from ground_station.latency import LinkLatency
 from ground_station.links.mavlink_budget import STANDING_GOAL_HZ, link_budget
-from ground_station.links.mavlink_controls import BOARD_COMPONENT, MavlinkControls
+from ground_station.links.mavlink_controls import MavlinkControls
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
@@ -122,7 +122,7 @@ class MavlinkLink:
         rate_hz = self.budget.telemetry_hz
         if self._asked and self._samples < rate_hz / 2:
             wanted = (SET_MESSAGE_INTERVAL, NUMBERS["DEBUG_FLOAT_ARRAY"], 1_000_000 // rate_hz)
-            self._send(now_us, services.command(self._addressee, BOARD_COMPONENT, *wanted))
+            self._send(now_us, services.command(self._addressee, *wanted))
         self._samples = 0
 
     # Downlink
@@ -148,7 +148,7 @@ class MavlinkLink:
 
     def _is_of_board(self, message: Message) -> bool:
         system = message.get_srcSystem()
-        return message.get_srcComponent() == BOARD_COMPONENT and self.board in (None, system)
+        return message.get_srcComponent() == services.BOARD_COMPONENT and self.board in (None, system)
 
     def _on_heartbeat(self, now_us: int, message: Message) -> None:
         if message.autopilot != NO_AUTOPILOT:

@@ -13,7 +13,6 @@ from firmware_py.wire.scalars import Scalar
 from ground_station.controls import ControlAction, ControlRequest, ControlsError, Dialogue, Exchange, Script
 from ground_station.links.crtp_controls import unknown
 
-BOARD_COMPONENT = 1  # autopilot
 ARM, TERMINATE = 1, 1
 WARNING = 4  # MAV_SEVERITY
 REASON_US = 200_000  # after a refusal, for the board's reason
@@ -53,14 +52,10 @@ class MavlinkControls(Dialogue[Message]):
         def missing() -> int:
             return next(number for number in range(len(found) + 1) if number not in found)
 
-        last = yield Exchange(
-            lambda now_us: self._send(now_us, services.parameter_list(self._board(), BOARD_COMPONENT)), take
-        )
+        last = yield Exchange(lambda now_us: self._send(now_us, services.parameter_list(self._board())), take)
         while len(found) < last.param_count:
             last = yield Exchange(
-                lambda now_us: self._send(
-                    now_us, services.parameter_read(self._board(), BOARD_COMPONENT, missing())
-                ),
+                lambda now_us: self._send(now_us, services.parameter_read(self._board(), missing())),
                 take,
                 waits=True,
             )
@@ -70,13 +65,13 @@ class MavlinkControls(Dialogue[Message]):
 
     def _read(self, name: str) -> Script[Message]:
         name = yield from self._find(name)
-        message = services.parameter_read(self._board(), BOARD_COMPONENT, name)
+        message = services.parameter_read(self._board(), name)
         reply = yield self._until(message, lambda got: _is_value_of(got, name))
         return ((name, reply.param_value),)
 
     def _write(self, name: str, value: float) -> Script[Message]:
         name = yield from self._find(name)
-        message = services.parameter_set(self._board(), BOARD_COMPONENT, name, value)
+        message = services.parameter_set(self._board(), name, value)
         reply = yield self._until(message, lambda got: _is_value_of(got, name))
         if reply.param_value != Scalar.F32.cast(value):
             raise ControlsError(f"{name} = {value:g}: refused, it stays {reply.param_value:g}")
@@ -89,7 +84,7 @@ class MavlinkControls(Dialogue[Message]):
         return (yield from self._command(Command.COMPONENT_ARM_DISARM, ARM))
 
     def _command(self, number: int, *params: float) -> Script[Message]:
-        message = services.command(self._board(), BOARD_COMPONENT, number, *params)
+        message = services.command(self._board(), number, *params)
         reply = yield self._until(
             message, lambda got: got.get_type() == "COMMAND_ACK" and got.command == number
         )

@@ -60,15 +60,15 @@ class Battery:
         return 0.5 * (open_circuit + math.sqrt(max(open_circuit * open_circuit - drop, 0.0)))
 
 
-def endurance(config: BatteryConfig, power: float, empty_V: float, step: float = 1.0) -> float:
+def endurance(config: BatteryConfig, power: float, empty_V: float) -> float:
     """Return for how long [s] the battery supplies `power` [W] until a cell falls below `empty_V`; inf for no power."""
     if power <= 0.0:
         return math.inf
     battery = Battery(config)
     elapsed = 0.0
     while battery.charge > 0.0:
-        battery.spend(power, step)
+        battery.spend(power, 1.0)
         if battery.voltage < empty_V:
             break
-        elapsed += step
+        elapsed += 1.0
     return elapsed

@@ -227,8 +227,8 @@ def test_a_masked_part_may_hold_anything() -> None:
 
 
 def test_command_pads_its_parameters() -> None:
-    message = over_the_wire(services.command(3, 4, 511, 30, 20_000))
-    assert (message.target_system, message.target_component, message.command) == (3, 4, 511)
+    message = over_the_wire(services.command(3, 511, 30, 20_000))
+    assert (message.target_system, message.target_component, message.command) == (3, 1, 511)
     assert vector(message, "param1 param2 param3 param4 param5 param6 param7") == [30, 20_000, 0, 0, 0, 0, 0]
 
 
