@@ -1,11 +1,11 @@
-"""A client of Foxglove's WebSocket protocol, as far as the tests need one: RFC 6455 frames, JSON and binary messages."""
+"""A client of Foxglove's WebSocket protocol, as far as the tests need one: JSON and binary messages."""
 
-import base64
 import json
-import os
-import socket
 import struct
 from typing import Any
+
+from tornado.ioloop import IOLoop
+from tornado.websocket import websocket_connect
 
 PROTOCOL = "foxglove.sdk.v1"
 MESSAGE = struct.Struct("<BIQ")  # operation 1, subscription, log time [ns]
@@ -15,35 +15,21 @@ class FoxgloveClient:
     """Connects to a `ws://HOST:PORT`."""
 
     def __init__(self, address: str) -> None:
-        host, _, port = address.removeprefix("ws://").partition(":")
-        self._socket = socket.create_connection((host, int(port)), timeout=20)
-        key = base64.b64encode(os.urandom(16)).decode()
-        request = (
-            f"GET / HTTP/1.1\r\nHost: {host}:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-            f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: {PROTOCOL}\r\n\r\n"
+        self._loop = IOLoop(make_current=True)
+        self._socket = self._loop.run_sync(
+            lambda: websocket_connect(address, subprotocols=[PROTOCOL]), timeout=20
         )
-        self._socket.sendall(request.encode())
-        self._stream = self._socket.makefile("rb")
-        assert b" 101 " in self._stream.readline()
-        while self._stream.readline() != b"\r\n":
-            pass
         self.channels: dict[str, int] = {}  # by topic
 
     def send(self, **message: Any) -> None:
-        """Send a JSON message in a masked frame."""
-        data = json.dumps(message).encode()
-        size = bytes([0x80 | len(data)]) if len(data) < 126 else b"\xfe" + struct.pack(">H", len(data))
-        self._socket.sendall(b"\x81" + size + bytes(4) + data)
+        """Send a JSON message."""
+        self._loop.run_sync(lambda: self._socket.write_message(json.dumps(message)), timeout=20)
 
     def receive(self, operation: str) -> Any:
         """The next JSON message of that kind, or for "message" the next data: (log time [ns], payload)."""
         while True:
-            first, size = self._stream.read(2)
-            size &= 0x7F
-            if size >= 126:
-                size = int.from_bytes(self._stream.read(2 if size == 126 else 8))
-            data = self._stream.read(size)
-            if first & 0x0F == 2:
+            data = self._loop.run_sync(self._socket.read_message, timeout=20)
+            if isinstance(data, bytes):
                 if operation == "message" and data[0] == 1:
                     return MESSAGE.unpack_from(data)[2], data[MESSAGE.size :]
                 continue
@@ -54,5 +40,5 @@ class FoxgloveClient:
                 return message
 
     def close(self) -> None:
-        self._stream.close()
         self._socket.close()
+        self._loop.close(all_fds=True)
