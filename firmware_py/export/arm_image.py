@@ -61,5 +61,5 @@ def read_image(path: Path, alone: bool = True) -> CoreImage:
     try:
         entries = {name: addresses[f"floaty_core_{name}"] | 1 for name in CALLS}
     except KeyError as error:
-        raise ExportError(f"{path}: there is no function {error.args[0]}") from None
+        raise ExportError(f"{path}: there is no function {error.args[0]}: it lacks Floaty's core") from None
     return CoreImage(path, code, entries, elf.constants(FLASH, len(code)))
