@@ -82,8 +82,8 @@ class Look:
         return cls(parts, frame, outline, knot, markers)
 
 
-def ball(radius: float) -> Part:
-    """Return a ball around the centre of mass."""
+def ball(radius: float, centre: Three = CENTRE, colour: str = PALE) -> Part:
+    """Return a ball."""
 
     def point(row: int, turn: int) -> Three:
         down, around = math.pi * row / DOWN, 2.0 * math.pi * turn / AROUND
@@ -94,7 +94,7 @@ def ball(radius: float) -> Part:
         for row in range(DOWN)
         for turn in range(AROUND)
     ]
-    return Part("ball", _halved(quads), PALE, CENTRE, closed=True)
+    return Part("ball", _halved(quads), colour, centre, closed=True)
 
 
 def box(size: Three, centre: Three = CENTRE, colour: str = PALE) -> Part:
