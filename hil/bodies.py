@@ -1,5 +1,6 @@
 """The bodies that can fly: shipped ones by name, and a user's in a file (docs/tutorials/your-own-robot.md)."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -97,6 +98,13 @@ def _check(body: Any) -> None:
         if not (isinstance(value, np.ndarray) and value.shape == (size,) and value.dtype == np.float64):
             raise LabError(f"{kind}.{name} = {value!r}: expected an array of {size} float64")
     body.draw(0, open_circuit_voltage(1.0))
+    columns = [
+        name for channel in body.channels() for quantity in channel.quantities for name in quantity.names
+    ]
+    for name, count in Counter(columns).items():
+        if count > 1:
+            raise LabError(f"{kind} logs {name} {count} times: expected different names")
+    body.look.stored()
     for channel in body.channels():
         channel.read()
     if body.lost is not None:

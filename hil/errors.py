@@ -74,7 +74,8 @@ def blame(error: BaseException) -> str:
     """Return an error of the user's code as one line: file, line and message."""
     text = " ".join(str(error).split()) or type(error).__name__
     if isinstance(error, SyntaxError):
-        return f"{Path(error.filename or '?').name}:{error.lineno}: {error.msg}"
+        place = f"{Path(error.filename).name}:{error.lineno}: " if error.filename else ""
+        return f"{place}{error.msg}"
     frames = traceback.extract_tb(error.__traceback__)
     theirs = [frame for frame in frames if not _is_known(Path(frame.filename))]
     if not theirs:

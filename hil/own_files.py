@@ -27,7 +27,7 @@ def load_file(what: str, path: Path) -> tuple[ModuleType, str]:
     sys.modules[name] = module  # pickled objects refer to it
     try:
         exec(compile(content, place, "exec"), vars(module))
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # its exit code would be taken for the command's
         raise LabError(f"{what} {path}: {blame(error)}") from error
     _LOADED[place] = digest, module
     return module, digest

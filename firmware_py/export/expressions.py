@@ -134,8 +134,14 @@ class Expressions:
         text = array.text
         for axis, index in enumerate(indices):
             text += f"[{self.scalar(index, I32, 'an index').text}]"
-            least, most = self._reach(index) or (0, 0)
+            reached = self._reach(index)
             size = array.kind.shape[axis] if array.kind.shape else 2**31
+            if reached is None and self.module.own:
+                name = ast.unparse(index)
+                raise self.refuse(
+                    index, f"index {name}: it may be outside 0..{size - 1} in flight: write {name} % {size}"
+                )
+            least, most = reached or (0, 0)
             if not 0 <= least <= most < size:
                 reach = f"{least}..{most}" if least < most else str(least)
                 which = "" if ast.unparse(index) == reach else f", which is {reach}"
@@ -146,8 +152,14 @@ class Expressions:
         return Value(text, ValueType(array.kind.base))
 
     def _reach(self, node: ast.expr) -> tuple[int, int] | None:
-        """Return the least and the greatest value of an index made of numbers, constants and loop variables, else None."""
+        """Return the least and the greatest value of an integer, or None where they are known in flight only.
+
+        Known are numbers, constants, loop variables, and remainders of a division by them.
+        """
         match node:
+            case ast.BinOp(op=ast.Mod()):
+                divisor = self._reach(node.right)
+                return (0, divisor[1] - 1) if divisor and divisor[0] > 0 else None
             case ast.Name(id=name) if name in self.loops:
                 return self.loops[name]
             case ast.Name(id=name) if name not in self.names:
@@ -179,8 +191,21 @@ class Expressions:
         operators = FLOAT_OPERATORS if left.kind == F32 else INTEGER_OPERATORS
         if type(node.op) not in operators:
             raise self.refuse(node, f"{name} of {describe(left.kind)}{instead(CONSTRUCTS, name)}")
+        if self.module.own and isinstance(node.op, ast.FloorDiv | ast.Mod):
+            return self._rounded_down(node, left, right)
         sign, strength = operators[type(node.op)]
         return Value(f"{left.within(strength)} {sign} {right.within(strength + 1)}", left.kind, strength)
+
+    def _rounded_down(self, node: ast.BinOp, left: Value, right: Value) -> Value:
+        """Return `//` or `%` of any integer as Python computes it: C rounds towards zero."""
+        divisor = self._reach(node.right)
+        if divisor is None or divisor[0] <= 0:
+            reason = f"{ast.unparse(node)}: the divisor must be a constant above 0"
+            raise self.refuse(node, reason)
+        over, by = left.within(PRODUCT), right.within(UNARY)
+        if isinstance(node.op, ast.Mod):
+            return Value(f"({over} % {by} + {by}) % {by}", I32, PRODUCT)
+        return Value(f"{over} / {by} - ({over} % {by} < 0)", I32, SUM)
 
     def _unary(self, node: ast.UnaryOp) -> Value:
         operand = self.value(node.operand)

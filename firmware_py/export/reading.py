@@ -62,7 +62,7 @@ def _read_after_imports(
     try:
         tree = ast.parse(texts[name], path)
     except SyntaxError as error:
-        raise ExportError(f"{path}:{error.lineno}: {error.msg}") from None
+        raise ExportError(f"{path}:{error.lineno or 1}: {error.msg}") from None
     for node in tree.body:
         for needed in _imported_modules(node):
             if needed in chain or needed == name or needed not in texts:
@@ -274,4 +274,8 @@ class _Reader:
     def _identifier(self, name: str, node: ast.AST) -> str:
         if name in C_KEYWORDS:
             raise refusal(self.module.path, node, f"{name} is a word of C")
+        if not name.isascii() or name.startswith("__"):
+            raise refusal(
+                self.module.path, node, f"{name}: expected a name of a-z, 0-9 and _ without __ in front"
+            )
         return name

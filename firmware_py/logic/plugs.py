@@ -10,6 +10,7 @@ A hook is a kernel with a fixed name. It takes those of these arguments that it 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from inspect import signature
+from math import isfinite
 from types import FunctionType
 
 import numpy as np
@@ -125,6 +126,12 @@ def _parameters(
         if not isinstance(mark, Tunable) or field.kind.rank:
             form = 'Annotated[f32, Tunable(default, "unit", low=.., high=..)]'
             raise _refusal(module, field.line, f"{name}: a parameter is {form}")
+        scalar = SCALARS[field.kind.base]
+        for number in (mark.default, mark.low, mark.high):
+            held = scalar.cast(number)
+            if not isfinite(held) or not (scalar.is_float or held == number):
+                kind = "finite" if scalar.is_float else "whole"
+                raise _refusal(module, field.line, f"{name}: {number:g}: expected a {kind} number of 32 bits")
         if not mark.low <= mark.default <= mark.high:
             text = f"{name}: default {mark.default:g} is outside {mark.low:g}..{mark.high:g}"
             raise _refusal(module, field.line, text)
@@ -133,7 +140,6 @@ def _parameters(
         if len(name) > PARAMETER_ROOM:
             text = f"{name}: {len(name)} characters; MAVLink leaves a parameter's name {PARAMETER_ROOM}"
             raise _refusal(module, field.line, text)
-        scalar = SCALARS[field.kind.base]
         yield CoreParameter(
             f"{GROUP}.{name}", scalar, mark.unit, Place(f"{point.name}_{OWN}", name, scalar),
             low=mark.low, high=mark.high, default=mark.default,

@@ -49,7 +49,7 @@ def deploy() -> None:
 @click.option(
     "--duration",
     "duration_s",
-    type=click.FloatRange(0, 86_400, min_open=True),
+    type=common.Number(0, 86_400, min_open=True),
     metavar="S",
     help="Free flight [s]; default: the experiment's.",
 )

@@ -52,13 +52,13 @@ out_option = click.option("--out", type=PATH, default=Path("runs/design"), show_
 @click.group(invoke_without_command=True)
 @click.pass_context
 @common.profile_options
-@click.option("--speed", type=click.FloatRange(1, 40), help="Updraft [m/s]: the hover angle follows.")
-@click.option("--angle", type=click.FloatRange(0, 70), help="Hover angle [deg]: the updraft follows.")
+@click.option("--speed", type=common.Number(1, 40), help="Updraft [m/s]: the hover angle follows.")
+@click.option("--angle", type=common.Number(0, 70), help="Hover angle [deg]: the updraft follows.")
 @click.option(
-    "--length", type=click.FloatRange(0.1, 10), default=1.0, help="The similar robot: lengths times this."
+    "--length", type=common.Number(0.1, 10), default=1.0, help="The similar robot: lengths times this."
 )
 @click.option(
-    "--mass", type=click.FloatRange(0.01, 100), default=1.0, help="The similar robot: masses times this."
+    "--mass", type=common.Number(0.01, 100), default=1.0, help="The similar robot: masses times this."
 )
 @write_option
 @out_option
@@ -70,6 +70,7 @@ def design(context: click.Context, robot: DesignOptions) -> None:
         return
     from hil.design.analysis import analyse, write
 
+    common.check_profile("--write", robot.write_to)
     point = point_of(robot)
     common.announce_compilation()
     if robot.write_to is not None:
@@ -95,7 +96,7 @@ def design(context: click.Context, robot: DesignOptions) -> None:
 )
 @click.option(
     "--updrafts",
-    type=click.FloatRange(1, 60),
+    type=common.Number(1, 60),
     nargs=2,
     default=(8.0, 11.0),
     show_default=True,
@@ -114,6 +115,7 @@ def optimise(asked: Search) -> None:
     profile, figure, updrafts = asked.profile, asked.figure, asked.updrafts
     if updrafts[0] >= updrafts[1]:
         raise LabError(f"--updrafts {updrafts[0]:g} {updrafts[1]:g}: expected the least first")
+    common.check_profile("--write", asked.write_to)
     common.announce_compilation()
     found = search.optimise(point_of(asked), figure, asked.seed, asked.generations)
     best, front = found.best, search.front(found.tried, figure)

@@ -50,7 +50,7 @@ def identify(
     from hil.identify.record import load_record, profile_of
     from hil.identify.robots import write_profile
 
-    _check_profile("--profile-out", profile_out)
+    common.check_profile("--profile-out", profile_out)
     profile = profile or profile_of(runs[0])
     records = [load_record(run, profile) for run in runs]
     held_out = None if validate is None else load_record(validate, profile)
@@ -66,14 +66,6 @@ def identify(
             say(f"  {notice}")
         say(f"  {profile_out}   (floaty fly hover --profile {profile_out})")
     return 0 if any(constant.verdict == IDENTIFIED for constant in found.constants) else 1
-
-
-def _check_profile(option: str, path: Path | None) -> None:
-    """Refuse what no profile can be written to, before anything is flown or fitted."""
-    if path is not None and path.suffix != ".toml":
-        raise LabError(f"{option} {path}: a profile's name ends in .toml")
-    if path is not None and not path.parent.is_dir():
-        raise LabError(f"{option} {path}: cannot be written ({path.parent} is not a folder)")
 
 
 def _print_constants(found: "Identification") -> None:
@@ -138,7 +130,7 @@ def tune(
     from hil.config import load_config
     from hil.studies.tuning import TuningFlights, fly_round, rounds, write_tuned
 
-    _check_profile("--out", out)
+    common.check_profile("--out", out)
     made_folder("--runs", runs)
     common.announce_compilation()
     best: Round | None = None

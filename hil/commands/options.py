@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -28,6 +29,19 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 console = Console(highlight=False)
 notices = Console(stderr=True, highlight=False)
+
+
+class Number(click.FloatRange):
+    """A number within bounds; click's own class lets NaN pass."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number."""
+        number: float = super().convert(value, param, ctx)
+        if math.isnan(number):
+            self.fail(f"{number} is not in the range {self._describe_range()}.", param, ctx)
+        return number
+
+
 PATH, FILE = click.Path(path_type=Path), click.Path(path_type=Path, dir_okay=False)
 
 
@@ -107,6 +121,14 @@ def asked_as(kind: type[Asked]) -> Callable[[Callable[..., int | None]], Callabl
         return call
 
     return decorator
+
+
+def check_profile(option: str, path: Path | None) -> None:
+    """Refuse what no profile can be written to, before anything is flown or computed."""
+    if path is not None and path.suffix != ".toml":
+        raise LabError(f"{option} {path}: a profile's name ends in .toml")
+    if path is not None and not path.parent.is_dir():
+        raise LabError(f"{option} {path}: cannot be written ({path.parent} is not a folder)")
 
 
 def announce_compilation() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from hil.commands.options import run_folder, say
-from hil.errors import LabError
+from hil.errors import LabError, writing
 from hil.live.window import show
 
 
@@ -38,7 +38,8 @@ def report(run: Path) -> None:
     """Write the report of RUN, a run folder, again."""
     from hil.pictures.report import write_report
 
-    say(f"report  {write_report(run)}")
+    with writing("RUN", run):
+        say(f"report  {write_report(run)}")
 
 
 @click.command()
@@ -63,4 +64,5 @@ def export(run: Path, as_csv: bool, as_mcap: bool, as_tlog: bool, as_video: bool
         raise LabError(f"export {run}: no format given: --csv, --mcap, --tlog, --video, --gif")
     for place in (place for place, chosen in wanted.items() if chosen):
         module, _, write = place.rpartition(".")
-        say(f"  {getattr(import_module(f'hil.{module}'), write)(run)}")
+        with writing("RUN", run):
+            say(f"  {getattr(import_module(f'hil.{module}'), write)(run)}")

@@ -56,11 +56,11 @@ class StationOptions:
 )  # fmt: skip
 @click.argument("named", metavar="[EXPERIMENT]", default="hover")
 @click.option(
-    "--start", "start_s", type=click.FloatRange(0, 3600), default=1.0, show_default=True, metavar="S",
+    "--start", "start_s", type=common.Number(0, 3600), default=1.0, show_default=True, metavar="S",
     help="When the trajectory begins, after the board first flies.",
 )  # fmt: skip
 @click.option(
-    "--duration", type=click.FloatRange(min=0, min_open=True), metavar="S", help="[default: until Ctrl-C]"
+    "--duration", type=common.Number(min=0, min_open=True), metavar="S", help="[default: until Ctrl-C]"
 )
 @click.option("--log", type=FILE, metavar="FILE", help="Telemetry as CSV.")
 @click.option(

@@ -86,6 +86,11 @@ class Experiment:
             raise LabError(
                 f"experiment {self.name}: duration_s = {self.duration_s}: expected seconds, above 0"
             )
+        for fault in self.faults:
+            if fault.start_s >= self.duration_s:
+                raise LabError(
+                    f"experiment {self.name}: fault {fault}: the flight ends {self.duration_s:g} s after the release"
+                )
         for name in self.metrics:
             if name in METRICS:
                 raise LabError(f"experiment {self.name}: metric {name}: every flight has one of that name")

@@ -360,8 +360,10 @@ def short_of(metric: Metric, value: float, flown_s: float, duration_s: float) ->
 
 
 def check_limits(limits: Mapping[str, float], own: Mapping[str, Metric]) -> None:
-    """Raise `LabError` for a limit on a metric that neither METRICS nor the experiment has."""
+    """Raise `LabError` for a limit of NaN, or on a metric that neither METRICS nor the experiment has."""
     known = [*own, *METRICS]
-    for name in limits:
+    for name, bound in limits.items():
         if name not in known:
             raise LabError(f"limit on {name!r}: no such metric; {hint(name, known)}")
+        if np.isnan(bound):
+            raise LabError(f"limit on {name!r} = {bound}: expected a number")

@@ -23,6 +23,7 @@ from hil.world.servos import OUTPUTS
 from hil.world.tunnel import Tunnel
 
 STEP_S = at.STEP_US * 1e-6
+MOST = 1e6  # [N], [N m] a larger force moves the body to where no picture can be drawn
 EXPECTED = "expected force and torque, each of three numbers"
 
 
@@ -108,7 +109,11 @@ class RigidBody(InTunnel):
 
     @property
     def look(self) -> Look:
-        """Its parts; the ghost at the goal is a cross."""
+        """Its parts; the ghost at the goal is a cross. Raises `LabError` for anything else as parts."""
+        if not (isinstance(self.parts, Sequence) and all(isinstance(part, Part) for part in self.parts)):
+            raise LabError(
+                f"{type(self).__name__}.parts = {self.parts!r}: expected (ball(..), box(..), Part(..))"
+            )
         cross = tuple(np.array((-line, line)) for line in self.radius * np.eye(3))
         return Look(self.parts, (), cross, (0.0, 0.0, 0.0), tuple(map(tuple, self.markers.places.tolist())))
 
@@ -170,7 +175,7 @@ class RigidBody(InTunnel):
             force, torque = (_numbers(part, 3) for part in parts) if len(parts) == 2 else ([], [])
             if not (force and torque):
                 self._fail(f"{type(self).__name__}.wrench returned {given!r}: {EXPECTED}")
-            elif not all(map(math.isfinite, force + torque)):
+            elif not all(abs(number) < MOST for number in force + torque):
                 self._fail(f"{type(self).__name__}.wrench returned force {force} N, torque {torque} N m")
             else:
                 s[at.DRAG : at.DRAG + 6] = force + torque

@@ -129,6 +129,8 @@ def test_a_torque_turns_it_and_a_push_moves_it(tmp_path: Path) -> None:
         (HEAD, "Robot has no method wrench"),
         (FLOATING + "\n    def power(self):\n        return 'much'\n", "Robot.power is 'much': expected a number"),
         (FLOATING + "\n    logged = {'mass': ('a b', '')}\n", "Robot.mass is 0.1: expected 2 numbers"),
+        (FLOATING + "\n    logged = {'mass': ('a', ''), 'radius': ('a', '')}\n", "Robot logs robot.a 2 times"),
+        (FLOATING + "\n    parts = 3\n", "Robot.parts = 3: expected (ball(..), box(..), Part(..))"),
         (FLOATING + "\n    logged = {'spin': ('a', '')}\n", "'Robot' object has no attribute 'spin'"),
     ],
 )  # fmt: skip
@@ -151,6 +153,7 @@ def test_a_missing_file_and_an_unknown_name_are_one_line(tmp_path: Path) -> None
     ("value", "cause"),
     [
         ("float('nan')", "Robot.wrench returned force [0.0, 0.0, nan] N, torque [0.0, 0.0, 0.0] N m"),
+        ("1e300", "Robot.wrench returned force [0.0, 0.0, 1e+300] N, torque [0.0, 0.0, 0.0] N m"),
         ("1 / 0", "robot.py:6: ZeroDivisionError: division by zero"),
     ],
 )

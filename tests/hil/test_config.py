@@ -104,6 +104,7 @@ def test_a_profile_builds_on_another(tmp_path: Path) -> None:
         ("[controller\n", "not TOML"),
         ('base = "self.toml"\n', "leads back to itself"),
         ("base = 3\n", "expected the name or path"),
+        (f"base = {'[' * 5000}", "not TOML: maximum recursion depth"),
         ("[tunnel]\nspeed = 10\n", r"model: missing"),
     ],
 )

@@ -40,7 +40,7 @@ class Memory(Struct):
 
 @kernel
 def element(matrix: F32s, row: i32, column: i32) -> f32:
-    return matrix[row, column]
+    return matrix[row % {ROWS}, column % {COLUMNS}]
 
 
 @kernel

@@ -50,6 +50,13 @@ IN_THE_LAW = [
     ("for flap in range(2, 5):\n    control.u[flap - 1] = control.u[flap]", 1,
      "index flap, which is 2..4: f32 array of 4 has 0..3"),
     ("for flap in range(4):\n    control.u[flap - 1] = ZERO", 1, "index flap - 1, which is -1..2: f32 array of 4 has 0..3"),
+    ("control.u[memory.ticks] = ZERO", 0,
+     "index memory.ticks: it may be outside 0..3 in flight: write memory.ticks % 4"),
+    ("for flap in range(memory.ticks):\n    control.u[flap] = ZERO", 1, "index flap: it may be outside 0..3 in flight"),
+    ("control.u[memory.ticks % 5] = ZERO", 0, "index memory.ticks % 5, which is 0..4: f32 array of 4 has 0..3"),
+    ("a = i32(7 // memory.ticks)", 0, "7 // memory.ticks: the divisor must be a constant above 0"),
+    ("a = i32(memory.ticks % 0)", 0, "memory.ticks % 0: the divisor must be a constant above 0"),
+    ("a = i32(memory.ticks // -2)", 0, "memory.ticks // -2: the divisor must be a constant above 0"),
     ("control.u[1] = own.gain_jy", 0, "own.gain_jy is no field of a struct"),
     ("a = [v * v for v in control.u]", 0, "list comprehension: write a loop over range(..)"),
     ("a = {v for v in control.u}", 0, "set comprehension: write a loop over range(..)"),
@@ -146,6 +153,16 @@ MISTAKES = [
     ),
     (*gain("    gain_iy: Annotated[f32, Tunable(0.4, low=0.0, high=1.0)]\n"), "expected Tunable(default,"),
     (*gain(GAIN.replace("-0.4", "-2.4")), "gain_iy: default -2.4 is outside -2..2"),
+    (*gain(GAIN.replace("high=2.0", "high=1e39")), "gain_iy: 1e+39: expected a finite number of 32 bits"),
+    (*gain(GAIN.replace("high=2.0", "high=1e999")), "gain_iy: inf: expected a finite number of 32 bits"),
+    (*gain(GAIN.replace("f32", "i32")), "gain_iy: -0.4: expected a whole number of 32 bits"),
+    (*gain(GAIN.replace("gain_iy", "größe"), "    größe"), "größe: expected a name of a-z, 0-9 and _"),
+    (
+        "hidden: f32",
+        "__hidden: f32",
+        "    __hidden",
+        "__hidden: expected a name of a-z, 0-9 and _ without __ in front",
+    ),
     (
         *gain(GAIN.replace("gain_iy", "a_gain_of_mine"), "    a_gain"),
         "a_gain_of_mine: 14 characters; MAVLink leaves a parameter's name 12",
@@ -185,6 +202,7 @@ MISTAKES = [
         ": write allocate, from firmware_py.core.guard",
     ),
     (DT, "DT = f32(0.01", "DT", "'(' was never closed"),
+    (DT, f"{DT}\0", "", "source code string cannot contain null bytes"),
 ]
 
 

@@ -49,6 +49,12 @@ UDP = ("--link", "udp://127.0.0.1:1")
         (["fly", "hover", "--duration", "-1"], "--duration -1"),
         (["fly", "hover", "--duration", "nan"], "--duration nan"),
         (["fly", "hover", "--duration", "soon"], "'soon' is not a valid float"),
+        (["design", "--angle", "nan"], "'--angle': nan is not in the range 0<=x<=70"),
+        (["design", "--write", "mine.txt"], "--write mine.txt: a profile's name ends in .toml"),
+        (
+            ["station", "--link", "udp://127.0.0.1:9", "--duration", "nan"],
+            "'--duration': nan is not in the range x>0",
+        ),
         (["fly", "hover", "--seed", "-1"], "-1"),
         (["fly", "hover", "--profile", "flaoty"], "did you mean floaty?"),
         (["fly", "hover", "--set", "controller.gain_z=nan"], "controller.gain_z = nan"),

@@ -46,3 +46,15 @@ def test_no_runs_are_one_line(cli: Cli, folder: str) -> None:
 def test_a_missing_run_folder_is_called_missing(cli: Cli, command: str) -> None:
     assert cli(command, "runs/hover-7") == 2
     assert "runs/hover-7: there is no such run folder" in cli.err
+
+
+@pytest.mark.parametrize(
+    ("command", "file"), [(("report",), "report.html"), (("export", "--csv"), "flight.csv")]
+)
+def test_a_file_that_cannot_be_written_is_one_line(cli: Cli, command: tuple[str, ...], file: str) -> None:
+    run = fly("hover", duration_s=0.1)
+    (run.folder / file).unlink(missing_ok=True)
+    (run.folder / file).mkdir()
+    said = cli.refusal(*command, run.folder)
+    assert said.startswith(f"floaty: RUN {run.folder}: cannot be written (")
+    assert "s a directory" in said
