@@ -185,7 +185,10 @@ def test_app_and_laboratory_turn_the_same_samples_into_the_same_bits(app: App) -
 STEP = "    memory.ticks = i32(memory.ticks + 1)\n"
 ENDLESS = LAW.replace(
     STEP,
-    f"{STEP}    for i in range(memory.ticks // (own.after + 1) * 2000000000):\n        memory.hidden = memory.hidden + DT\n",
+    f"""{STEP}    if memory.ticks > own.after:
+        for i in range(memory.ticks + 2000000000):
+            memory.hidden = memory.hidden + DT
+""",
 )
 
 
