@@ -98,8 +98,9 @@ def _read(telemetry: Path, titles: tuple[str, ...]) -> NDArray[np.float64]:
     types = dict.fromkeys(titles, pa.float64())
     convert = csv.ConvertOptions(include_columns=titles, column_types=types, include_missing_columns=True)
     parse = csv.ParseOptions(invalid_row_handler=lambda row: "skip")
+    read = csv.ReadOptions(use_threads=False)  # a thread that still has the handler aborts Python's exit
     try:
-        table = csv.read_csv(telemetry, parse_options=parse, convert_options=convert)
+        table = csv.read_csv(telemetry, read, parse, convert)
     except (FileNotFoundError, pa.ArrowInvalid):  # no telemetry, not even a complete line
         return np.empty((0, len(titles)))
     columns = np.column_stack([table.column(title).to_numpy() for title in titles])
