@@ -14,13 +14,14 @@ class ProtocolVersion(dialect.MAVLink_message):  # type: ignore[misc]
 
     id = 300
     msgname = "PROTOCOL_VERSION"
+    crc_extra = 217
 
     def __init__(self, version: int, least: int, most: int) -> None:
         super().__init__(self.id, self.msgname)
         self._payload = struct.pack("<HHH16x", version, least, most)
 
     def pack(self, codec: Any) -> bytes:
-        frame: bytes = self._pack(codec, 217, self._payload)
+        frame: bytes = self._pack(codec, self.crc_extra, self._payload)
         return frame
 
 

@@ -8,6 +8,8 @@ import math
 from firmware_py.elementary import exp
 from hil.world.config import BatteryConfig
 
+STEP_S = 1.0  # of the search for the end of a charge
+
 
 def open_circuit_voltage(charge: float) -> float:
     """Return the voltage [V] of a cell without load at a `charge` of 0..1.
@@ -67,8 +69,8 @@ def endurance(config: BatteryConfig, power: float, empty_V: float) -> float:
     battery = Battery(config)
     elapsed = 0.0
     while battery.charge > 0.0:
-        battery.spend(power, 1.0)
+        battery.spend(power, STEP_S)
         if battery.voltage < empty_V:
             break
-        elapsed += 1.0
+        elapsed += STEP_S
     return elapsed
