@@ -20,11 +20,14 @@ from hil.stm32f405.freertos import FreeRtos
 from hil.stm32f405.gdb import DebuggedChip, GdbServer
 from hil.stm32f405.image import Image
 from hil.stm32f405.processor import ChipProcessor
+from hil.stm32f405.stopped_tasks import TaskWatch
 from hil.world.body import Carrier
 
-LOOK_PERIOD_US = 100_000  # for tasks that do not wait
-# So long is a hang (a start waits busily for 0.2 s); so long explains a crash.
+LOOK_PERIOD_US = 100_000  # for tasks that do not wait, or wait for ever
+# Busy for HANG_US: report a hang (a start waits busily for 0.2 s). Busy for AT_CRASH_US: the explanation of a crash.
 HANG_US, AT_CRASH_US = 1_000_000, 5_000
+# Functions of Bitcraze's firmware, and the low address that each writes to without effect, on every board.
+KNOWN_WRITES = {("ledInit", 0x1A)}
 CLOCK_HIGH, TIM7_COUNT = "usecTimerHighCount", 0x4000_1424  # of the firmware's usec_time.c
 ASSERTION = "assertFail"
 PLATFORM = "platformInit"  # refuses to start on a board whose device type its table lacks
@@ -73,12 +76,15 @@ class Crazyflie:
         self._outside, self._outputs = outside, outputs
         self._crashes = CrashReports(image, chip, self.tasks, ASSERTION)
         chip.crash_points |= self._crashes.addresses
+        self.failures: list[str] = []  # since power-on: what stopped the firmware or one of its tasks
+        self.known: list[str] = []  # since power-on: harmless mistakes of Bitcraze's firmware
         self._crashed = False  # since the reset
+        self._watch = None if self.tasks is None else TaskWatch(chip, self.tasks)
         self._hanging: set[int] = set()  # tasks, since the reset
         self._counts: tuple[int, ...] = ()
         self._unknown = 0
         self.processor.every(barometer.PERIOD_US, lambda now_us: self.parts.measure_pressure())
-        self.processor.every(LOOK_PERIOD_US, lambda now_us: self._look_for_hang(HANG_US))
+        self.processor.every(LOOK_PERIOD_US, lambda now_us: self._look_at_tasks(HANG_US))
 
     def report_unknown(self) -> None:
         """Say which peripherals the image has used that are not there."""
@@ -113,13 +119,14 @@ class Crazyflie:
                 self._counts = counts
                 self._outside.write_compare(counts)
         if why & (Why.LOW_READ | Why.LOW_WRITE):
-            self._report(self._crashes.low_access(self.chip.state.fault_address, bool(why & Why.LOW_WRITE)))
+            address = self.chip.state.fault_address
+            self._report_access(address, self._crashes.low_access(address, bool(why & Why.LOW_WRITE)))
         if why & Why.DIVISION:
-            self._report(self._crashes.division())
+            self._outside.debug_write(str(self._crashes.division()))
         if why & Why.OVERFLOW:
             self._report(self._crashes.overflow(self.chip.state.overflow))
         if why & Why.BREAK:
-            self._look_for_hang(AT_CRASH_US)
+            self._look_at_tasks(AT_CRASH_US)
             self._report(self._crashes.here())
             self._crashed = True
             self.chip.crash_points.clear()  # a handler may be a loop of one instruction
@@ -127,25 +134,39 @@ class Crazyflie:
             self._report(self._crashes.lockup())
             self._crashed = True
         if why & Why.WATCHDOG:
-            self._look_for_hang(AT_CRASH_US)
+            self._look_at_tasks(AT_CRASH_US)
             self._report(self._crashes.watchdog())
             self._reset(WATCHDOG)
         elif why & Why.RESET:
-            self._outside.debug_write("reset by software")
+            self._report(self._crashes.software_reset())
             self._reset(SOFTWARE)
 
     def _report(self, crash: Crash) -> None:
+        self.failures.append(str(crash))
         self._outside.debug_write(str(crash))
 
-    def _look_for_hang(self, least_us: int) -> None:
-        """Report a task that keeps the others from running, once, before anything else has gone wrong."""
+    def _report_access(self, address: int, crash: Crash) -> None:
+        """Report an access that has no effect; keep one that Bitcraze's firmware is known for."""
+        if any((place.split()[0], address) in KNOWN_WRITES for place in crash.trace):
+            self.known.append(str(crash))
+        else:
+            self._outside.debug_write(str(crash))
+
+    def _look_at_tasks(self, least_us: int) -> None:
+        """Report tasks that stopped, or keep the others from running, once, before anything else has gone wrong."""
+        if self._crashed:
+            return
         busy = self.processor.longest_busy(least_us)
-        if busy is not None and not self._crashed and busy[0] not in self._hanging:
+        if busy is not None and busy[0] not in self._hanging:
             self._hanging.add(busy[0])
             self._report(self._crashes.hang(*busy))
+        for task in self._watch.look() if self._watch is not None else ():
+            self._report(self._crashes.stopped(task.block, task.silent_us, task.period_us, task.reason))
 
     def _reset(self, cause: int) -> None:
         self._crashed = False
+        if self._watch is not None:
+            self._watch.restart()
         self._hanging.clear()
         self.resets[cause] += 1
         self.chip.reset(cause)

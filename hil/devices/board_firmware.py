@@ -156,6 +156,14 @@ class Flashed(Protocol):
     def resets(self) -> int:
         """How often it has restarted by itself since power-on."""
 
+    @property
+    def failures(self) -> Sequence[str]:
+        """What stopped it or one of its tasks since power-on, in order, each as one line."""
+
+    @property
+    def known_findings(self) -> Sequence[str]:
+        """Harmless mistakes that its makers' firmware is known for, each as one line."""
+
     def differences(self, config: FirmwareConfig) -> str:
         """Return the differences between its core and a profile in one line; empty if none."""
 

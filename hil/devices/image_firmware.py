@@ -216,6 +216,14 @@ class ImageFirmware:
     def resets(self) -> int:
         return sum(self._crazyflie.resets.values())
 
+    @property
+    def failures(self) -> Sequence[str]:
+        return self._crazyflie.failures
+
+    @property
+    def known_findings(self) -> Sequence[str]:
+        return self._crazyflie.known
+
     def report(self) -> ImageReport:
         kernel, resets = self._crazyflie.tasks, self._crazyflie.resets
         stacks: dict[str, int] = {}

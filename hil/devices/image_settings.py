@@ -18,6 +18,7 @@ from hil.events import EventQueue
 
 TURN_US = 10_000  # between checks for an overdue answer
 APP_PARAMETER = "floaty.armed"  # which every image with Floaty's app has
+STOCK_SUPERVISOR, FIRST_RELEASE = "supervisor.info", "2023.06"
 NO_APP = (
     "the image lacks Floaty's app: the servos move only if its own code moves them; Bitcraze's firmware flies with "
     "--profile crazyflie"
@@ -29,11 +30,21 @@ def contents(table: Mapping[str, ImageParameter]) -> dict[str, TocEntry]:
     return {name: TocEntry(one.number, one.scalar, one.writable, False) for name, one in table.items()}
 
 
-def stock_contents(table: Mapping[str, ImageParameter], pilot: PilotConfig) -> dict[str, TocEntry]:
-    """Return the `contents` of a Crazyflie's own firmware. Raises `LabError` unless it takes the profile's parameters."""
+def stock_contents(
+    table: Mapping[str, ImageParameter], log: Mapping[str, int], pilot: PilotConfig
+) -> dict[str, TocEntry]:
+    """Return the `contents` of a Crazyflie's own firmware with these parameters and log variables.
+
+    Raises `LabError` for an older release than the laboratory supports, and unless it takes the profile's parameters.
+    """
     if APP_PARAMETER in table:
         raise LabError(
             "--board: the image has Floaty's app, which drives servos; a Crazyflie takes Bitcraze's firmware as it is"
+        )
+    if STOCK_SUPERVISOR not in log:
+        raise LabError(
+            f"--board: the image has no log variable {STOCK_SUPERVISOR}: its supervisor is older than that of release "
+            f"{FIRST_RELEASE}, the first one that flies here"
         )
     entries = contents(table)
     for name, value in pilot.values.items():

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from firmware_py.signals import COUNTERS
 from firmware_py.wire.supervisor import Cause
 from ground_station.trajectory import Trajectory
 from hil.clock import Clock
@@ -26,6 +27,7 @@ from hil.world.body import Channel
 RECORD_PERIOD_US = 10_000
 RECORD_PHASE_US = 250  # just after the controller
 DROP_NOTE_PERIOD_US = 1_000_000
+BROKEN = COUNTERS.index("resets")  # of the estimate
 NOT_FINITE = (Cause.CONTROLLER_NOT_FINITE, Cause.ESTIMATOR_NOT_FINITE)
 
 
@@ -90,13 +92,14 @@ class Flight:
         self.faults = request.planned_faults
         self.lab = Laboratory(clock)
         self.lost: str | None = None
-        self.logic_failed: str | None = None  # how own logic failed, and when
+        self.logic_failed: str | None = None  # how own logic or the core's estimate failed, and when
         self.over = False
         self._recorder: Recorder | None = None
         self._early: list[tuple[str, str]] = []  # messages from before there was a recorder
         self._release_us: int | None = None
         self._duration_us = round(request.duration_s * 1e6)
         self._trace_all = request.bench.trace
+        self._broken_estimates = 0  # since the boot
         self._drops_noted: dict[str, int] = {}
         self._next_drop_note_us = 0
         site = Site(request.config, self.events, Streams.of_seed(request.seed), self.note, executor)
@@ -175,6 +178,9 @@ class Flight:
         except KeyboardInterrupt:
             interrupted = True
             self.note("lab", "interrupted by the user")
+        flashed = self.robot.firmware.flashed
+        for text in flashed.known_findings if flashed is not None else ():
+            self.note("board", f"known in Bitcraze's firmware, without effect on the flight: {text}")
         outcome = Outcome(self.now_us, self.lost, interrupted)
         self.over = True
         self.line.finish(self.lab)
@@ -198,6 +204,7 @@ class Flight:
             self._recorder.row(now_us)
         self.robot.firmware.check_watchdog()
         self._watch_logic(now_us)
+        self._watch_estimate(now_us)
         self._note_drops(now_us)
         for source, text in self.line.look(now_us):
             self.note(source, text)
@@ -215,6 +222,18 @@ class Flight:
             what = self.robot.firmware.overrun or f"own {cause.name.lower().replace('_', ' ')}"
             self.logic_failed = f"{what} at {now_us * 1e-6:.2f} s of simulated time: failsafe"
             self.note("lab", self.logic_failed)
+
+    def _watch_estimate(self, now_us: int) -> None:
+        """Note when the core's estimate was NaN or infinite: the core begins it again without a message."""
+        counters = self.robot.firmware.signals.counters  # empty for firmware without the core
+        count = int(counters[BROKEN]) if len(counters) else 0
+        if count > self._broken_estimates:
+            text = (
+                f"the estimate was NaN or infinite at {now_us * 1e-6:.2f} s of simulated time and began again"
+            )
+            self.note("board", text)
+            self.logic_failed = self.logic_failed or text
+        self._broken_estimates = count
 
     def _note_drops(self, now_us: int) -> None:
         """Report which queue drops, at most once per second."""

@@ -106,8 +106,9 @@ class ModelledLine:
 
     def _crazyflie_link(self, request: Request, times: FlightTimes, latency_us: int) -> CrazyflieLink:
         """Return the link to the stock firmware. Raises `LabError` for an image that does not fit the profile."""
-        config, flashed = request.config, self.robot.firmware.flashed
-        entries = stock_contents({} if flashed is None else flashed.parameters, config.pilot)
+        config, firmware = request.config, self.robot.firmware
+        parameters = {} if firmware.flashed is None else firmware.flashed.parameters
+        entries = stock_contents(parameters, firmware.log_numbers, config.pilot)
         return CrazyflieLink(
             self.radio.uplink,
             latency_us,

@@ -25,7 +25,7 @@ from hil.laboratory.flight import RECORD_PERIOD_US
 from hil.laboratory.metrics import check_limits, measure
 from hil.laboratory.recorder import Onlooker, Recorder, load_log
 from hil.laboratory.request import Request, why_left
-from hil.laboratory.result import Outcome, Program, Result, judged, metadata_of, write_result
+from hil.laboratory.result import Outcome, Program, Result, judged, metadata_of, with_resets, write_result
 from hil.laboratory.robot import Streams
 
 
@@ -172,7 +172,7 @@ class RealFlight:
             self._say(f"{self._experiment.name}: its own metrics need {error}, which a real flight lacks")
         cut_short: Outcome = "error" if failure else "interrupted" if interrupted else "completed"
         outcome: Outcome = "lost" if self._lost else "completed" if self._whole else cut_short
-        ended = outcome, self._lost or failure or None
+        ended = with_resets(outcome, self._lost or failure or None, metrics["resets"])
         return judged(self._request, self._program, ended, metrics, log, digest, folder)
 
 

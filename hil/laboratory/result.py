@@ -6,7 +6,7 @@ from the log.
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -93,6 +93,7 @@ class Result:
     stood_still_ms: Figure = math.nan  # of simulated time, while the machine was too slow for a paced flight
     folder: Annotated[Path, Field(exclude=True)] = Path()  # its run folder
     image: ImageReport | None = None  # of a board that executes an image
+    failures: tuple[str, ...] = ()  # what stopped an image or one of its tasks, in order
     not_shown: int | None = None  # rows of the log that the live viewer did not take; null without one
 
     @computed_field  # type: ignore[prop-decorator]
@@ -109,6 +110,15 @@ class Result:
         return tuple(verdict for verdict in self.verdicts if verdict.applies and not verdict.holds)
 
 
+def with_failures(outcome: Outcome, cause: str | None, failures: Sequence[str]) -> tuple[Outcome, str | None]:
+    """Return outcome and cause of a flight in which firmware failed: the first failure, which may explain the others."""
+    if not failures:
+        return outcome, cause
+    more = f"{len(failures) - 1} more in events.jsonl" if len(failures) > 1 else None
+    outcome = "error" if outcome == "completed" else outcome
+    return outcome, "; ".join(filter(None, (failures[0], more, cause)))
+
+
 def with_resets(outcome: Outcome, cause: str | None, resets: float) -> tuple[Outcome, str | None]:
     """Return outcome and cause of a flight with this number of resets."""
     if not resets > 0:
@@ -120,7 +130,7 @@ def with_resets(outcome: Outcome, cause: str | None, resets: float) -> tuple[Out
 def judged(
     request: Request,
     program: Program,
-    ended: tuple[Outcome, str | None],  # before resets are considered
+    ended: tuple[Outcome, str | None],
     metrics: Mapping[str, float],
     log: pa.Table,
     digest: str,
@@ -128,7 +138,7 @@ def judged(
 ) -> Result:
     """Return the result of a flight by the limits of its request."""
     own = request.experiment.metrics
-    outcome, cause = with_resets(*ended, metrics["resets"])
+    outcome, cause = ended
     return Result(
         request=request,
         program=program,

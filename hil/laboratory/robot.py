@@ -123,6 +123,7 @@ class Robot:
         self._thief: Thief | None = None
         self._seen_by: list[See] = []
         self._resets = 0
+        self._failures: tuple[str, ...] = ()  # of the firmware before the last power-on
         self.board = VirtualBoard(
             self.body.set_counts,
             ports.send_packet,
@@ -138,6 +139,8 @@ class Robot:
         """Start the firmware; its clock begins here. EEPROM and deck memory keep their content."""
         self.booted_us = now_us
         self.powered = True
+        if now_us:
+            self._failures = self.failures
         if self.uart is not None:
             self.uart.read()  # a booted processor starts with an empty buffer
         self.board.boot(now_us)
@@ -192,6 +195,12 @@ class Robot:
         """How often the processor was reset."""
         flashed = self.firmware.flashed
         return self._resets + (0 if flashed is None else flashed.resets)
+
+    @property
+    def failures(self) -> tuple[str, ...]:
+        """What stopped the firmware or one of its tasks, in order, each as one line; only images report it."""
+        flashed = self.firmware.flashed
+        return self._failures + (() if flashed is None else tuple(flashed.failures))
 
     # Time
 

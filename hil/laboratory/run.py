@@ -22,7 +22,17 @@ from hil.laboratory.laboratory import Progress
 from hil.laboratory.lockstep import in_lockstep
 from hil.laboratory.recorder import Onlooker, Recorder, load_log
 from hil.laboratory.request import Request
-from hil.laboratory.result import Outcome, Program, QueueReport, Result, judged, metadata_of, write_result
+from hil.laboratory.result import (
+    Outcome,
+    Program,
+    QueueReport,
+    Result,
+    judged,
+    metadata_of,
+    with_failures,
+    with_resets,
+    write_result,
+)
 
 LOADED_US = 250_000  # every part of the core has run by then
 
@@ -63,12 +73,14 @@ def fly(
         finally:
             factor = pace.factor(flight.now_us)
             digest = _close(flight, recorder, folder)
-    log, firmware = load_log(folder), flight.robot.firmware
+    log, firmware, failures = load_log(folder), flight.robot.firmware, flight.robot.failures
     lost = ended[0] == "lost" or flight.lost is not None
     metrics = request.experiment.metrics_of(log, lost, flight.resets)
+    ended = with_failures(*with_resets(*ended, metrics["resets"]), failures)
     queues = firmware.scheduler.queues if firmware.scheduler is not None else ()
     result = replace(
         judged(request, program, ended, metrics, log, digest, folder),
+        failures=failures,
         tasks=tuple(firmware.reports()),
         queues=tuple(QueueReport(one.name, one.length, one.high_water, one.dropped) for one in queues),
         usage=firmware.usage,

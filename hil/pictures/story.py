@@ -45,7 +45,7 @@ def story_of(log: pa.Table, result: Result, events: Iterable[Mapping[str, Any]] 
     """Return release, faults, the first limit passed and the end of that, the first command at its limit, failsafes and
     loss, in order; `events` are those of the run, which have the causes of failsafes.
     """
-    release_us = release_of(log.schema.metadata)
+    release_us, events = release_of(log.schema.metadata), list(events)
     free = metrics.free_flight(log)
     if free.num_rows == 0:
         return []
@@ -70,6 +70,9 @@ def story_of(log: pa.Table, result: Result, events: Iterable[Mapping[str, Any]] 
         why = [cause for at_s, cause in causes.items() if cause and abs(at_s - seconds[row]) < ROW_S]
         text = f"failsafe begins{''.join(f': {MEANING.get(one, one)}' for one in why)}"
         moments.append(Moment(seconds[row], text if failsafe[row] else "failsafe ends"))
+    for one in events:
+        if one["text"] in result.failures:
+            moments.append(Moment(1e-6 * (one["t_us"] - release_us), one["text"]))
     if result.outcome == "lost":
         moments.append(Moment(seconds[-1], f"lost: {result.cause}"))
     return sorted(moments, key=lambda moment: moment.t_s)

@@ -158,7 +158,7 @@ class ServedRobot:
             uart.connect(self.robot.uart_ready, self._from_line)
         flashed = self.robot.firmware.flashed
         if flashed is not None and config.pilot.enabled:
-            stock_contents(flashed.parameters, config.pilot)
+            stock_contents(flashed.parameters, self.robot.firmware.log_numbers, config.pilot)
         elif flashed is not None and APP_PARAMETER not in flashed.parameters:
             say(NO_APP)
         elif flashed is not None and (stays := flashed.differences(config)):

@@ -93,6 +93,15 @@ class CrashReports:
         what = f"hang: busy for {busy_us // 1000} ms without waiting for anything"
         return Crash(what, self._task(task), self._trace(self._registers_of(task)))
 
+    def stopped(self, task: int, silent_us: int, period_us: int, reason: str) -> Crash:
+        """Return the place where a task waits that used to run every `period_us`."""
+        what = f"stopped: silent for {silent_us // 1000} ms after running every {period_us * 1e-3:.3g} ms, {reason}"
+        return Crash(what, self._task(task), self._trace(self._registers_of(task)))
+
+    def software_reset(self) -> Crash:
+        """Return the code that requested a reset of the chip."""
+        return self._here("reset by software")
+
     def low_access(self, address: int, writes: bool) -> Crash:
         """Return the code that uses a null pointer, or an offset from it."""
         pointer = "null pointer" if address < NULL_SIZE else "wild pointer"

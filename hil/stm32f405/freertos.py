@@ -19,6 +19,9 @@ FRAME, FLOATS, PADDED = 0x20, 0x48, 1 << 9  # of an exception, ARMv7-M Architect
 UNUSED = b"\xa5"  # fills a new stack
 WAITING_FOR_NOTIFICATION = 1
 STACK_CHUNK, MOST_TASKS = 64, 256
+LONGEST_DELAY_MS = 3_600_000  # of a task that will run again
+LONGEST_QUEUE, LARGEST_ITEM = 1 << 16, 1 << 12  # of a plausible queue
+QUEUE_CODE = "xQueueGenericSend"  # in queue.c
 RUNNING_TASK = "pxCurrentTCB"
 SWITCH = "vTaskSwitchContext"
 HEAP, HEAP_LEAST = "xFreeBytesRemaining", "xMinimumEverFreeBytesRemaining"  # of heap_4
@@ -36,6 +39,14 @@ class TaskView:
     block: int  # address of its control block
 
 
+@dataclass(frozen=True, slots=True)
+class Wait:
+    """What a task waits for without a time-out; `for_messages`: its senders may just have nothing to send."""
+
+    reason: str
+    for_messages: bool = False
+
+
 class FreeRtos:
     """The kernel of an image; `read` reads the machine's memory. Raises `LabError` for an image without FreeRTOS."""
 
@@ -47,6 +58,11 @@ class FreeRtos:
         self._item = image.debug.structure("xLIST_ITEM", kernel)
         self._container = "pvContainer" if "pvContainer" in self._item.members else "pxContainer"
         self._current = image.symbol(RUNNING_TASK).address
+        self._queue = (
+            image.debug.structure("QueueDefinition", image.symbol(QUEUE_CODE).address)
+            if image.has(QUEUE_CODE)
+            else None
+        )
 
     @classmethod
     def of(cls, image: Image, read: Read) -> FreeRtos | None:
@@ -102,6 +118,47 @@ class FreeRtos:
         event = self._word(task + self._task[f"xEventListItem.{self._container}"].offset)
         notified = self._read(task + self._task["ucNotifyState"].offset, 1)[0]
         return event != 0 or notified == WAITING_FOR_NOTIFICATION
+
+    def endless_wait(self, task: int) -> Wait | None:
+        """Return what a task waits for that no time-out ends; None for a task that runs, is ready or will wake up."""
+        item = self._task["xStateListItem.xItemValue"].offset
+        container = self._word(task + self._task[f"xStateListItem.{self._container}"].offset)
+        where = self._image.variable_at(container) if container else "xTasksWaitingTermination"
+        if where == "xTasksWaitingTermination":
+            return Wait("it was deleted")
+        if where.startswith("xDelayedTaskList"):
+            ticks = self._word(task + item) - self._word(self._image.symbol("xTickCount").address)
+            return Wait("it is delayed for ever") if ticks % (1 << 32) > LONGEST_DELAY_MS else None
+        if where != "xSuspendedTaskList":
+            return None
+        if event := self._word(task + self._task[f"xEventListItem.{self._container}"].offset):
+            return self._wait_in(event)
+        return Wait("it waits for a notification" if self._waits(task) else "it is suspended")
+
+    def _wait_in(self, event: int) -> Wait:
+        """Return the wait of a task in a list of waiting tasks: a queue's, or that of another object."""
+        for member, full in (("xTasksWaitingToReceive", False), ("xTasksWaitingToSend", True)):
+            if self._queue is None:
+                break
+            queue = event - self._queue[member].offset
+            head, length, waiting, size = (
+                self._word(queue + self._queue[name].offset)
+                for name in ("pcHead", "uxLength", "uxMessagesWaiting", "uxItemSize")
+            )
+            if not (
+                0 < length < LONGEST_QUEUE and size < LARGEST_ITEM and waiting == (length if full else 0)
+            ):
+                continue
+            name = self._image.name_of(queue, self._word)
+            if full:
+                return Wait(f"it waits for room in queue {name}")
+            if size:
+                return Wait(f"it waits for an item of queue {name}", for_messages=True)
+            holder = self._word(queue + self._queue["u.xSemaphore.xMutexHolder"].offset)
+            if head == 0 and holder:
+                return Wait(f"it waits for mutex {name}, which task {self.name(holder)} holds")
+            return Wait(f"it waits for {'semaphore' if head else 'mutex'} {name}")
+        return Wait(f"it waits at {self._image.name_of(event, self._word)}")
 
     def task(self, task: int, state: str) -> TaskView:
         """Return the task with the control block at an address."""

@@ -4,7 +4,7 @@ An image that cannot run here, or be inspected while it runs, is refused in one 
 """
 
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -94,6 +94,22 @@ class Image:
     def has(self, name: str) -> bool:
         """Return whether exactly one variable or function has that name."""
         return len(self._called(name)) == 1
+
+    def variable_at(self, address: int) -> str:
+        """Return the name of the variable around an address, empty outside all of them."""
+        found = (one for one in self._all_variables() if one.address <= address < one.address + one.size)
+        return next((one.name for one in found), "")
+
+    def name_of(self, address: int, read_word: Callable[[int], int]) -> str:
+        """Return the name of an object: that of a variable that points to it, else its own, else its address."""
+        for symbol in self._all_variables():
+            in_memory = any(base <= symbol.address < base + size for _, base, size in MEMORIES)
+            if symbol.size == 4 and in_memory and read_word(symbol.address) == address:
+                return symbol.name
+        return self.variable_at(address) or f"0x{address:08x}"
+
+    def _all_variables(self) -> Iterator[Symbol]:
+        return (symbol for named in self._variables.values() for symbol in named)
 
     def function_at(self, address: int) -> str:
         """Return the name of the function around an address, empty outside all of them."""

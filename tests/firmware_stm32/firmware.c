@@ -18,7 +18,7 @@
 
 enum planted {
   NOTHING, BUS_FAULT, UNDEFINED, ASSERTION, HUNGRY_WATCHDOG, NULL_CALL, NULL_READ, NULL_WRITE, DIVISION, HANG, OVERFLOW,
-  BRIEF_OVERFLOW, LAST_CALL
+  BRIEF_OVERFLOW, LAST_CALL, MUTEX, SUSPENDED, DELAYED, DELETED
 };
 enum { ASSERTED = 1 };
 
@@ -49,6 +49,17 @@ typedef struct tskTaskControlBlock {
   volatile uint8_t ucNotifyState[1];
 } TCB_t;
 
+typedef struct QueueDefinition {
+  uint32_t uxItemSize, uxLength, uxMessagesWaiting;
+  List_t xTasksWaitingToReceive, xTasksWaitingToSend;
+  union {
+    struct {
+      TCB_t *xMutexHolder;
+    } xSemaphore;
+  } u;
+  int8_t *pcHead; /* none for a mutex */
+} Queue_t;
+
 struct SNAPSHOT_DATA {
   uint32_t magicNumber, type;
   union {
@@ -67,6 +78,8 @@ KEPT struct SNAPSHOT_DATA snapshot;
 TCB_t *volatile pxCurrentTCB;
 volatile uint32_t xTickCount, uxCurrentNumberOfTasks, xSchedulerRunning;
 static List_t pxReadyTasksLists[4], xDelayedTaskList1, xSuspendedTaskList, xPendingReadyList, waiting_for_samples;
+static List_t xTasksWaitingTermination;
+static Queue_t bus_guard;
 static List_t *volatile pxDelayedTaskList = &xDelayedTaskList1;
 static uint32_t stacks[6][STACK_WORDS] __attribute__((aligned(8)));
 static TCB_t tasks[6];
@@ -184,6 +197,26 @@ __attribute__((used)) static void tick(void) {
 
 __attribute__((naked)) void SysTick_Handler(void) {
   __asm volatile("ldr r0, =scenario\n ldr r0, [r0]\n cbnz r0, 1f\n b tick\n 1: b Scenario_SysTick\n .ltorg");
+}
+
+__attribute__((noinline)) static void leave_for(List_t *list) {
+  uint32_t before = mask();
+  take(&pxCurrentTCB->xStateListItem);
+  put(list, &pxCurrentTCB->xStateListItem);
+  SCB_ICSR = PENDSVSET;
+  unmask(before);
+}
+
+/* The name in FreeRTOS's queue.c by which the structure of its queues is found. */
+__attribute__((noinline, used)) void xQueueGenericSend(Queue_t *queue) { queue->uxMessagesWaiting++; }
+
+/* Waits for a mutex that another task holds for ever. */
+__attribute__((noinline)) static void lock_bus(void) {
+  bus_guard.uxLength = 1;
+  bus_guard.u.xSemaphore.xMutexHolder = &tasks[1];
+  empty(&bus_guard.xTasksWaitingToReceive);
+  put(&bus_guard.xTasksWaitingToReceive, &pxCurrentTCB->xEventListItem);
+  leave_for(&xSuspendedTaskList);
 }
 
 /* One kHz: the gyro has a sample. */
@@ -426,6 +459,18 @@ __attribute__((noinline)) static uint32_t go_wrong(uint32_t how) {
       break;
     case ASSERTION:
       assert_that(how != ASSERTION);
+      break;
+    case MUTEX:
+      lock_bus();
+      break;
+    case SUSPENDED:
+      leave_for(&xSuspendedTaskList);
+      break;
+    case DELAYED:
+      delay(0x7FFFFFFF);
+      break;
+    case DELETED:
+      leave_for(&xTasksWaitingTermination);
   }
   return 0;
 }
@@ -541,6 +586,7 @@ void Reset_Handler(void) {
     empty(&pxReadyTasksLists[i]);
   }
   empty(&xDelayedTaskList1), empty(&xSuspendedTaskList), empty(&xPendingReadyList), empty(&waiting_for_samples);
+  empty(&xTasksWaitingTermination);
   start(0, "REPORT", report, 2);
   start(1, "SPIN-0", spin_0, 1);
   start(2, "SPIN-1", spin_1, 1);

@@ -205,6 +205,7 @@ static void look_at_task(struct machine *m)
         return;
     if (m->task_count) {
         m->task[m->running].cycles += m->now - m->running_since;
+        m->task[m->running].ran = m->now;
         if (waits(m, m->task[m->running].block))
             m->task[m->running].busy_since = 0;
     }

@@ -139,6 +139,7 @@ struct dma {
 
 struct task { /* by its control block: cycles of processor time, including interrupts */
     uint64_t cycles, busy_since; /* since when it has not waited; 0: it waits */
+    uint64_t ran;                /* when it last stopped running */
     uint32_t block, times;
 };
 

@@ -30,6 +30,9 @@ ENTRIES = {
 }
 
 
+LOG = {"supervisor.info": 3, "stateEstimate.x": 4}
+
+
 def pilot(**parameters: dict[str, float]) -> PilotConfig:
     return PilotConfig(enabled=True, parameters=parameters)
 
@@ -44,11 +47,18 @@ def test_a_parameter_that_the_image_cannot_take_is_refused(
     parameters: dict[str, dict[str, float]], text: str
 ) -> None:
     with pytest.raises(LabError, match=f"^pilot.parameters.{text}"):
-        stock_contents(ENTRIES, pilot(**parameters))
+        stock_contents(ENTRIES, LOG, pilot(**parameters))
+
+
+def test_an_image_from_before_the_present_supervisor_is_refused_with_the_first_release_that_flies() -> None:
+    with pytest.raises(
+        LabError, match=r"no log variable supervisor\.info: .* release 2023\.06, the first one"
+    ):
+        stock_contents(ENTRIES, {"stateEstimate.x": 4}, pilot())
 
 
 def test_parameters_that_the_image_takes_are_in_its_table_of_contents() -> None:
-    entries = stock_contents(ENTRIES, pilot(stabilizer={"controller": 255}, posCtlPid={"xKp": 2.1}))
+    entries = stock_contents(ENTRIES, LOG, pilot(stabilizer={"controller": 255}, posCtlPid={"xKp": 2.1}))
     assert [(name, one.number) for name, one in entries.items()] == [
         (name, one.number) for name, one in ENTRIES.items()
     ]

@@ -14,7 +14,7 @@ from hil.commands.tables import print_result, print_seeds
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_again
 from hil.laboratory.flight import Flight
-from hil.laboratory.lockstep import lockstep_flight
+from hil.laboratory.lockstep import in_lockstep, lockstep_flight
 from hil.laboratory.metrics import ALWAYS, METRICS, column, judge
 from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import LOCKSTEP, Bench, Request
@@ -39,6 +39,26 @@ def test_flight_without_a_recorder_keeps_what_is_noted() -> None:
     flight.note("lab", "before the start")
     assert flight.run().lost is None
     flight.close()
+
+
+@pytest.mark.parametrize("board", ["python", "c"])
+def test_an_estimate_that_is_not_finite_fails_the_flight_and_is_reported(tmp_path: Path, board: str) -> None:
+    def made(*arguments: object) -> Flight:
+        flight = in_lockstep(*arguments)  # type: ignore[arg-type]
+
+        def spoil(now_us: int) -> None:
+            flight.robot.firmware._core.estimator.fields.x[0] = np.nan
+
+        flight.events.at(1_500_000, spoil)
+        return flight
+
+    request = Request.of(HOVER, duration_s=1.0, board=board)
+    result = fly(request, tmp_path / "run", flight_of=made)
+    assert (result.outcome, result.passed) == ("error", False)
+    texts = [event["text"] for event in load_events(result.folder)]
+    (text,) = (text for text in texts if "NaN" in text)
+    assert text.startswith("the estimate was NaN or infinite at 1.5")
+    assert text in str(result.cause)
 
 
 def test_flight_makes_no_garbage_that_only_the_collector_frees() -> None:

@@ -59,21 +59,27 @@ def said(result: Result) -> list[str]:
         (HUNGRY_WATCHDOG, r"watchdog reset: nobody fed it in time; this ran then, in task SPIN-[01]: "),
     ],
 )
-def test_a_crash_s_cause_is_an_event(
+def test_a_crash_s_cause_is_an_event_and_the_cause_of_the_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, planted: int, expected: str
 ) -> None:
     result = flown(tmp_path, planted, 0.3, monkeypatch)
     texts = said(result)
     assert any(re.match(expected, text) for text in texts), texts
-    # It is told once per reset, though the fault's handler is a loop of one instruction.
+    # It is reported once per reset, though the fault's handler is a loop of one instruction.
     resets = sum("reset" in text for text in texts)
     assert sum(text.startswith(("HardFault", "assertion")) for text in texts) <= resets + 1
+    assert not result.passed
+    assert any(re.match(expected, text) for text in result.failures)
+    assert str(result.cause).startswith(result.failures[0])
+    assert texts.index(result.failures[0]) == min(texts.index(one) for one in result.failures)
+    assert read_result(result.folder).failures == result.failures
+    by_software = sum(text.startswith("reset by software, in task REPORT: assertFail (") for text in texts)
     if planted == ASSERTION:
-        assert "reset by software" in texts
+        assert by_software > 0
     assert result.image is not None
     counted = result.image.software_resets, result.image.watchdog_resets
     by_watchdog = sum(text.startswith("watchdog reset") for text in texts)
-    assert counted == (texts.count("reset by software"), by_watchdog)
+    assert counted == (by_software, by_watchdog)
     assert by_watchdog > 0 if planted == HUNGRY_WATCHDOG else sum(counted) > 0 or planted == BUS_FAULT
 
 

@@ -2,25 +2,28 @@
 
 import os
 import re
+from dataclasses import astuple
 from pathlib import Path
 from struct import pack
 
 import pytest
 
 from hil.crazyflie.log_table import log_table, parameter_table
+from hil.stm32f405 import stopped_tasks
 from hil.stm32f405.chip import Why
 from hil.stm32f405.crash import CrashReports
-from hil.stm32f405.freertos import FreeRtos
+from hil.stm32f405.freertos import FreeRtos, Wait
 from hil.stm32f405.image import Image
 from hil.stm32f405.processor import ChipProcessor
+from hil.stm32f405.stopped_tasks import StoppedTask, TaskWatch
 from support.stm32_firmware import SOURCES
 from support.stm32_machine import FirmwareOnChip
 
 MS = 1000
 (
     BUS_FAULT, UNDEFINED, ASSERTION, HUNGRY_WATCHDOG, NULL_CALL, NULL_READ, NULL_WRITE, DIVISION, HANG, OVERFLOW,
-    BRIEF_OVERFLOW, LAST_CALL,
-) = range(1, 13)  # fmt: skip
+    BRIEF_OVERFLOW, LAST_CALL, MUTEX, SUSPENDED, DELAYED, DELETED,
+) = range(1, 17)  # fmt: skip
 FIRMWARE = (SOURCES / "firmware.c").read_text(encoding="utf-8").splitlines()
 COMPILERS = pytest.mark.parametrize("compiler", ["clang", pytest.param("gcc", marks=pytest.mark.long)])
 
@@ -326,6 +329,54 @@ def test_a_real_crazyflie_image_is_read() -> None:
     memory[image.symbol("xTickCount").address - 0x2000_0000 :][:4] = pack("<I", 0)
     assert image.place(image.symbol("assertFail").address).startswith("assertFail (cfassert.c:")
     assert kernel.heap_bytes[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("planted", "reason"),
+    [
+        (MUTEX, "it waits for mutex bus_guard, which task SPIN-0 holds"),
+        (SUSPENDED, "it is suspended"),
+        (DELAYED, "it is delayed for ever"),
+        (DELETED, "it was deleted"),
+    ],
+)
+def test_a_regular_task_that_waits_for_ever_is_named_with_what_it_waits_for(
+    monkeypatch: pytest.MonkeyPatch, planted: int, reason: str
+) -> None:
+    monkeypatch.setattr(stopped_tasks, "SETTLED_US", 0)
+    machine = FirmwareOnChip()
+    machine.processor()  # counts what tasks do
+    kernel = FreeRtos(machine.image, machine.chip.read)
+    watch = TaskWatch(machine.chip, kernel)
+
+    def look_until(end_ms: int) -> list[StoppedTask]:
+        found = []
+        for ms in range(machine.chip.now_us // MS + 40, end_ms, 40):
+            run_to_end(machine, ms)
+            found += watch.look()
+        return found
+
+    assert not look_until(600)  # FROZEN never ran regularly
+    machine.poke("planted", planted)
+    stopped = look_until(795)
+    assert [kernel.name(task.block) for task in stopped] == ["REPORT"]
+    assert stopped[0].reason == reason
+    assert 3_000 < stopped[0].period_us < 20_000
+    assert stopped[0].silent_us >= 10 * stopped[0].period_us
+    crash = str(reports_of(machine).stopped(*astuple(stopped[0])))
+    assert re.match(
+        rf"stopped: silent for \d+ ms .*{reason}, in task REPORT: .* < report \(firmware.c:", crash
+    ), crash
+
+
+def test_a_task_without_samples_is_named_with_the_list_where_it_waits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    machine = FirmwareOnChip()
+    kernel = FreeRtos(machine.image, machine.chip.read)
+    run_to_end(machine, 30)
+    (task,) = (one for one in kernel.tasks() if one.name == "FILTER")
+    assert kernel.endless_wait(task.block) == Wait("it waits at waiting_for_samples")
 
 
 @COMPILERS
