@@ -1,12 +1,13 @@
 """Clocks: simulated time runs freely, or follows the wall clock step by step. The only file that sleeps."""
 
 import os
-import select
 import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
+
+from ground_station.clock import readable as readable
 
 PROCESS = Path("/proc/self/stat")
 START_TIME = 19  # index of the field after the process's name, in ticks since the machine's boot
@@ -127,7 +128,7 @@ class Paced:
         """Sleep until the wall clock reaches the time, or a reader has input."""
         ahead_us = self.ahead_us(now_us)
         if self.readers:
-            self._readable, _, _ = select.select(self.readers, (), (), ahead_us * 1e-6)
+            self._readable = readable(self.readers, ahead_us * 1e-6)
         elif ahead_us > self.SLACK_US:
             time.sleep(ahead_us * 1e-6)
         if self._readable:
@@ -137,9 +138,9 @@ class Paced:
 
     def serve(self, now_us: int) -> None:
         """Call the readers that have input."""
-        for readable in self._readable:
-            if readable in self.readers:  # not closed by another reader
-                self.readers[readable](now_us)
+        for reader in self._readable:
+            if reader in self.readers:  # not closed by another one
+                self.readers[reader](now_us)
         self._readable = []
 
     def pause(self, wait: Callable[[], None]) -> None:

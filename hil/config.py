@@ -274,7 +274,7 @@ def _apply(tree: dict[str, Any], override: str) -> None:
         return
     items = tree.get(leaf)
     position = index.rstrip("]")
-    if not isinstance(items, list) or not position.isdigit() or int(position) >= len(items):
+    if not isinstance(items, list) or position not in map(str, range(len(items))):
         raise LabError(f"--set {override}: {leaf} has no element [{position}] in this profile")
     tree[leaf] = [*items[: int(position)], value, *items[int(position) + 1 :]]
 

@@ -6,7 +6,6 @@ A thread reads and notes the time; the caller of `receive` decodes. The only fil
 import os
 import queue
 import re
-import select
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -16,7 +15,7 @@ from functools import partial
 import serial
 
 from firmware_py.wire.telemetry import Sample
-from ground_station.clock import clock_us, signing_start
+from ground_station.clock import clock_us, readable, signing_start
 from ground_station.config import LinkSettings
 from ground_station.controls import Answer, ControlRequest
 from ground_station.errors import LinkError
@@ -42,7 +41,7 @@ def parse_uri(uri: str, default_baud: int) -> tuple[str, int]:
             f"{uri}: expected mavlink:DEVICE[,BAUD] with a DEVICE like /dev/ttyUSB0, COM3, socket://HOST:PORT "
             "or rfc2217://HOST:PORT"
         )
-    if comma and not (digits.isdecimal() and BAUD_MIN <= int(digits) <= BAUD_MAX):
+    if comma and not (re.fullmatch(r"[0-9]{1,7}", digits) and BAUD_MIN <= int(digits) <= BAUD_MAX):
         raise LinkError(f"{uri}: baud rate {digits!r}: expected {BAUD_MIN}..{BAUD_MAX}")
     return device, int(digits) if comma else default_baud
 
@@ -89,7 +88,7 @@ class _Port:
 
     def _read_once(self) -> None:
         if self._polled:
-            select.select((self._serial.fileno(),), (), (), POLL_S)
+            readable((self._serial.fileno(),), POLL_S)
         data = self._serial.read(READ_SIZE)
         if data:
             self.bytes += len(data)

@@ -62,6 +62,6 @@ def _option(option: str, system: str) -> dict[str, Any]:
 
 
 def _port(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and 0 < int(text) < 65536):
+    if not (text.isascii() and text.isdigit() and len(text) <= 5 and 0 < int(text) < 65536):
         raise MocapError(f"expected {FORMS}")
     return int(text)

@@ -7,11 +7,10 @@ frames arrive.
 
 import math
 import os
-import select
 import subprocess
 import sys
 
-from ground_station.clock import clock_us
+from ground_station.clock import clock_us, readable
 from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame
@@ -160,7 +159,7 @@ class MotioncaptureSource:
     def _read(self, timeout_s: float) -> None:
         """Wait for bytes and split them into lines."""
         pipe = self._process.stdout if self._process is not None else None
-        ready = select.select([pipe] if pipe is not None else [], (), (), timeout_s)[0]
+        ready = readable([pipe] if pipe is not None else [], timeout_s)
         if pipe is None or not ready:
             return
         data = os.read(pipe.fileno(), LINE_MAX)

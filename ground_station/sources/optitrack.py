@@ -1,10 +1,9 @@
 """OptiTrack: the sockets of a NatNet client. Frames arrive at the command socket or, by multicast, at another one."""
 
-import select
 import socket
 from contextlib import suppress
 
-from ground_station.clock import clock_us
+from ground_station.clock import clock_us, readable
 from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame
@@ -103,7 +102,7 @@ class OptitrackSource:
     def _next_packet(self, timeout_s: float) -> bytes | None:
         """Return the next packet of the server, None when none comes in time."""
         if not self._waiting:
-            self._waiting = select.select(self._sockets, (), (), timeout_s)[0]
+            self._waiting = readable(self._sockets, timeout_s)
         while self._waiting:
             try:
                 data, (address, _) = self._waiting.pop().recvfrom(PACKET_MAX)

@@ -6,6 +6,7 @@ for a second; this starts the experiment's script and faults, and the station's 
 """
 
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -98,7 +99,7 @@ class StationProcess:
             master = self._served.serve_mavlink(_pty(uri), self._readers)
             return f"{SERIAL}{master},{baud}", {}
         prefix, _, port = uri.rpartition(":")
-        if prefix == "udp://127.0.0.1" and port.isdigit() and 0 < int(port) < 65536:
+        if prefix == "udp://127.0.0.1" and re.fullmatch(r"[0-9]{1,5}", port) and 0 < int(port) < 65536:
             self._served.serve_udp(int(port), self._readers)
             return uri, {}
         raise LabError(

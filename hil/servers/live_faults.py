@@ -13,6 +13,7 @@ from hil.laboratory.robot import Robot
 from hil.servers.server import Server
 
 READ_SIZE = 4096
+LINE_MAX = 200  # characters
 HELP = """[N] KIND[:DURATION][=SIZE]  lets a fault act on robot N (1) from now on: push.y=2, 2 mocap.dropout:0.5
 [N] clear                   ends all faults of robot N
 [N] status                  what robot N does, its faults, and where its radio is
@@ -49,7 +50,8 @@ class LiveFaults:
             if not data:
                 del readers[descriptor]
                 return
-            *lines, self._rest = (self._rest + data).split(b"\n")
+            *lines, rest = (self._rest + data).split(b"\n")
+            self._rest = rest[: LINE_MAX + 1]  # what is too long already stays so
             for line in lines:
                 self.take(line.decode(errors="backslashreplace").strip(), now_us)
 
@@ -62,6 +64,8 @@ class LiveFaults:
             self._say(HELP)
         elif line == "kinds":
             self._say(" ".join(KINDS))
+        elif len(line) > LINE_MAX:
+            self._say(f"{line[:20]}…: expected at most {LINE_MAX} characters")
         elif line:
             try:
                 self._act(line, now_us)

@@ -1,6 +1,8 @@
 """Simulated time against the wall clock, on a wall clock that only moves when it is told to."""
 
+import fcntl
 import math
+import resource
 import socket
 from pathlib import Path
 
@@ -86,6 +88,23 @@ def test_input_that_comes_before_time_starts_is_not_in_the_past(wall: Wall) -> N
         writer.send(b"early")
         paced.serve(paced.wait_until(30_000))
     assert heard == [20_000]
+
+
+def test_input_of_a_high_descriptor_is_read() -> None:
+    """`select` refuses those above 1023."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, 2048)), hard))
+    paced, (reader, writer), heard = Paced(), socket.socketpair(), []
+    high = socket.socket(fileno=fcntl.fcntl(reader, fcntl.F_DUPFD_CLOEXEC, 1200))
+    with reader, writer, high:
+        paced.readers[high] = heard.append
+        paced.start(20_000)
+        paced.serve(paced.wait_until(20_000))
+        assert heard == []
+        writer.send(b"input")
+        paced.serve(paced.wait_until(10_000_000))
+    assert len(heard) == 1
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def test_input_does_not_pass_an_event_that_a_task_has_planned_before_the_last_instant(wall: Wall) -> None:

@@ -35,6 +35,7 @@ def without_a_dongle(monkeypatch: pytest.MonkeyPatch, empty_folder: Path) -> Non
         ("mavlink:/nowhere/tty", "mavlink:/nowhere/tty: No such file or directory"),
         ("mavlink:/dev/null", "mavlink:/dev/null: not a serial port"),
         ("mavlink:/dev/null,fast", "baud rate 'fast': expected 9600..3000000"),
+        (f"mavlink:/dev/null,{'9' * 5000}", "9': expected 9600..3000000"),
         ("mavlink:/dev/null,300", "baud rate '300': expected 9600..3000000"),
         ("mavlink:/dev/null,9600", "9600 baud: 50 poses/s need 2.63 kB/s"),
         ("mavlink:", f"mavlink:: {EXPECTED}"),

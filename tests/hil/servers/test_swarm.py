@@ -110,6 +110,8 @@ def test_every_robot_answers_on_its_own_udp_port(served: Served) -> None:
         ("2 mocap.dropout:0.1", "robot 2 is held: what moves it has no effect before it is released"),
         ("2 push.w=2", "unknown kind 'push.w'"),
         ("3 status", r"robot 3: expected 1\.\.2"),
+        ("1" * 5000, "1{20}…: expected at most 200 characters"),
+        ("9" * 200, r"robot 9{200}: expected 1\.\.2"),
         ("2 3 status", "'3 status' is unknown; did you mean status?"),
     ],
 )
