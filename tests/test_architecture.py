@@ -115,10 +115,12 @@ CONFINED: dict[str, tuple[str, ...]] = {
     ),
     "socket": (
         "hil/clock.py", "hil/stm32f405/gdb.py",
-        "hil/live/window.py", "hil/servers/dongle_plugin.py", "hil/servers/dongle_server.py",
+        "hil/live/window.py", "hil/servers/dongle_plugin.py", "hil/servers/tcp_port.py",
         "hil/servers/udp_server.py", "hil/servers/serial_server.py", "hil/servers/motive.py",
         "ground_station/sources/optitrack.py", "ground_station/sources/motioncapture_process.py",
     ),
+    "select": ("ground_station/clock.py",),
+    "selectors": ("ground_station/clock.py",),
     "random": (),
     "secrets": (),
     "numpy.random.default_rng": ("hil/laboratory/robot.py", "hil/campaigns/sampling.py"),

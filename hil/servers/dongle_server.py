@@ -1,19 +1,19 @@
 """The USB side of the virtual dongles: a localhost socket on which `dongle_plugin` sends its transfers.
 
-Each connection is a separate dongle. Nothing here blocks: the board server calls `accept` and the connections when their
+Each connection is a separate dongle. Nothing here blocks: the board server calls the port and the connections when their
 sockets are readable. Frames: see `dongle_plugin`.
 """
 
-import socket
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 
 from hil.clock import Readers
 from hil.devices.dongle import VirtualDongle
 from hil.errors import LabError
 from hil.servers.dongle_plugin import CONTROL, HEAD_SIZE, PORTS, READ, WRITE, frame
+from hil.servers.tcp_port import Receive, TcpClient, TcpPort, TcpProtocol
 
 HOST = "127.0.0.1"
+PROTOCOL = TcpProtocol("radio", CONTROL + WRITE, 4096)
 
 
 class DongleServer:
@@ -23,53 +23,40 @@ class DongleServer:
     """
 
     def __init__(
-        self, port: int, readers: Readers, new_dongle: Callable[[], VirtualDongle], others: Sequence[int] = ()
+        self,
+        port: int,
+        readers: Readers,
+        new_dongle: Callable[[], VirtualDongle],
+        say: Callable[[str], None],
+        others: Sequence[int] = (),
     ) -> None:
         self._others = b"".join(other.to_bytes(2) for other in others)
-        self._readers = readers
         self._new_dongle = new_dongle
-        self._cables: list[_UsbCable] = []
         try:
-            self._socket = socket.create_server((HOST, port))
+            self._port = TcpPort((HOST, port), readers, PROTOCOL, self._plug_in, say)
         except OSError as error:
             raise LabError(f"radio port {port}: {error.strerror or error}") from None
-        self.port: int = self._socket.getsockname()[1]
-        readers[self._socket] = self._accept
+        self.port = self._port.port
 
-    def _accept(self, now_us: int) -> None:
-        connection, _ = self._socket.accept()
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        with suppress(OSError):  # a client that only looks whether it is there
-            connection.sendall(frame(PORTS, 0, self._others))
-        self._cables = [cable for cable in self._cables if cable.plugged]
-        self._cables.append(_UsbCable(connection, self._readers, self._new_dongle()))
+    def _plug_in(self, client: TcpClient) -> Receive:
+        client.offer(frame(PORTS, 0, self._others))
+        return _UsbCable(client, self._new_dongle()).receive
 
     def close(self) -> None:
         """Unplug all dongles and stop listening."""
-        for cable in self._cables:
-            cable.unplug()
-        del self._readers[self._socket]
-        self._socket.close()
+        self._port.close()
 
 
 class _UsbCable:
     """One connection and its dongle."""
 
-    def __init__(self, connection: socket.socket, readers: Readers, dongle: VirtualDongle) -> None:
-        self._socket = connection
-        self._readers = readers
+    def __init__(self, client: TcpClient, dongle: VirtualDongle) -> None:
+        self._client = client
         self._dongle = dongle
         self._received = b""
-        readers[connection] = self._read
 
-    def _read(self, now_us: int) -> None:
-        try:
-            data = self._socket.recv(4096)
-        except OSError:
-            data = b""
-        if not data:
-            self.unplug()
-            return
+    def receive(self, now_us: int, data: bytes) -> None:
+        """Execute the frames that are complete."""
         self._received += data
         while len(self._received) >= HEAD_SIZE and len(self._received) >= HEAD_SIZE + self._received[2]:
             size = HEAD_SIZE + self._received[2]
@@ -81,22 +68,7 @@ class _UsbCable:
         if kind == CONTROL and len(data) >= 3:
             self._dongle.control(data[0], data[1] | data[2] << 8, data[3:])
         elif kind == WRITE and data:
-            self._dongle.transmit(now_us, data, lambda t_us, answer: self._answer(sequence, answer))
+            self._dongle.transmit(now_us, data, lambda t_us, answer: self._answer(t_us, sequence, answer))
 
-    def _answer(self, sequence: int, answer: bytes) -> None:
-        if not self.plugged:
-            return
-        try:
-            self._socket.send(frame(READ, sequence, answer))
-        except OSError:
-            self.unplug()
-
-    @property
-    def plugged(self) -> bool:
-        """Whether the host still holds the connection."""
-        return self._socket in self._readers
-
-    def unplug(self) -> None:
-        """Unplug the dongle."""
-        self._readers.pop(self._socket, None)
-        self._socket.close()
+    def _answer(self, now_us: int, sequence: int, answer: bytes) -> None:
+        self._client.send(now_us, frame(READ, sequence, answer))

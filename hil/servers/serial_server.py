@@ -17,13 +17,15 @@ from typing import Protocol
 from hil.clock import Readers
 from hil.errors import LabError
 from hil.servers.dongle_server import HOST
+from hil.servers.tcp_port import TcpPort, TcpProtocol
 
 Received = Callable[[int, bytes], object]  # (now_us, data)
 
 READ_SIZE = 4096
-WHOLE_SIZE = (
-    1 << 18
-)  # more than a client's socket buffers on the loopback interface in one turn of the server
+# More than a client's socket buffers on the loopback interface in one turn of the server: all that a client has sent is
+# read, so that another client's frames do not split its own.
+WHOLE_SIZE = 1 << 18
+MAVLINK_CLIENTS = TcpProtocol("mavlink tcp", b"\xfd\xfe", WHOLE_SIZE)
 UDP_PORT = 14550  # where ground stations listen
 TCP_PORT = 5760  # where vehicles listen
 PTYS = "/dev/pts/"
@@ -51,15 +53,15 @@ class Address:
     port: int = 0
     path: Path | None = None  # of a link to the pty
 
-    def open(self, readers: Readers, received: Received) -> Endpoint:
-        """Open it; `received` gets the clients' bytes. Raises `LabError` on failure."""
+    def open(self, readers: Readers, received: Received, say: Callable[[str], None]) -> Endpoint:
+        """Open it; `received` gets the clients' bytes, `say` lines for the user. Raises `LabError` on failure."""
         where = self.path or f"{self.host}:{self.port}"
         try:
             if self.kind == "pty":
                 return PtyEnd(self.path, readers, received)
             if self.kind == "udp":
                 return UdpEnd(self.host, self.port, readers, received)
-            return TcpEnd(self.host, self.port, readers, received)
+            return TcpEnd(self.host, self.port, readers, received, say)
         except OSError as error:
             raise LabError(f"mavlink {self.kind} {where}: {error.strerror or error}") from None
 
@@ -75,7 +77,7 @@ def parse_addresses(text: str, count: int) -> list[Address]:
         raise LabError(f"--mavlink {text}: {EXPECTED}")
     host, _, number = rest.rpartition(":")
     default = UDP_PORT if kind == "udp" else TCP_PORT
-    if number and not (number.isascii() and number.isdigit()):
+    if number and not (number.isascii() and number.isdigit() and len(number) <= 5):
         raise LabError(f"--mavlink {text}: {EXPECTED}")
     port = int(number) if number else default
     if port + count - 1 > 65535 or (kind == "udp" and port == 0):
@@ -170,52 +172,17 @@ class UdpEnd:
 class TcpEnd:
     """Listens for any number of clients: all hear the board, and it hears them all."""
 
-    def __init__(self, host: str, port: int, readers: Readers, received: Received) -> None:
-        self._listener = socket.create_server((host, port))
-        self.master = f"tcp:{host}:{self._listener.getsockname()[1]}"
-        self._readers = readers
-        self._received = received
-        self._clients: list[socket.socket] = []
-        readers[self._listener] = self._accept
-
-    def _accept(self, now_us: int) -> None:
-        client, _ = self._listener.accept()
-        client.setblocking(False)
-        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._clients.append(client)
-        self._readers[client] = partial(self._read, client)
+    def __init__(
+        self, host: str, port: int, readers: Readers, received: Received, say: Callable[[str], None]
+    ) -> None:
+        self._port = TcpPort((host, port), readers, MAVLINK_CLIENTS, lambda client: received, say)
+        self.master = f"tcp:{host}:{self._port.port}"
 
     def send(self, data: bytes) -> None:
         """Pass bytes on; a slow client loses those it does not read."""
-        for client in self._clients.copy():
-            try:
-                client.send(data)
-            except BlockingIOError:
-                pass
-            except OSError:
-                self._leave(client)
-
-    def _read(self, client: socket.socket, now_us: int) -> None:
-        """Read all that a client has sent, so that another client's frames do not split its own."""
-        try:
-            data = client.recv(WHOLE_SIZE)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b""
-        if data:
-            self._received(now_us, data)
-        else:
-            self._leave(client)
-
-    def _leave(self, client: socket.socket) -> None:
-        del self._readers[client]
-        self._clients.remove(client)
-        client.close()
+        for client in [*self._port.clients]:
+            client.offer(data)
 
     def close(self) -> None:
         """Stop listening; the clients notice."""
-        for client in self._clients.copy():
-            self._leave(client)
-        self._readers.pop(self._listener, None)
-        self._listener.close()
+        self._port.close()

@@ -173,8 +173,11 @@ class ServedRobot:
 
     def serve_radio(self, port: int, readers: Readers, others: Sequence[int] = ()) -> int:
         """Offer Crazyradios on a port (0: any), which also reach the robots on the ports `others`; return the port."""
-        self._dongles = DongleServer(port, readers, self._new_dongle, others)
+        self._dongles = DongleServer(port, readers, self._new_dongle, self._report, others)
         return self._dongles.port
+
+    def _report(self, text: str) -> None:
+        self._say(f"board {self.number}: {text}")
 
     def _new_dongle(self) -> VirtualDongle:
         """Return a dongle at a real host, which takes real time in every exchange."""
@@ -187,9 +190,7 @@ class ServedRobot:
 
     def serve_udp(self, port: int, readers: Readers) -> str:
         """Serve it over UDP, too; return the URI."""
-        self.udp = UdpServer(
-            port, readers, self.udp_radio.uplink, lambda text: self._say(f"board {self.number}: {text}")
-        )
+        self.udp = UdpServer(port, readers, self.udp_radio.uplink, self._report)
         if self.robot.executor.needs_polls:
             self.robot.events.every(POLL_PERIOD_US, self.robot.events.now_us, self._poll)
         return f"udp://127.0.0.1:{self.udp.port}"
@@ -202,7 +203,7 @@ class ServedRobot:
     def serve_mavlink(self, address: Address, readers: Readers) -> str:
         """Open the serial line; return its name for MAVProxy. Only for a robot with a UART."""
         assert self.robot.uart is not None
-        self._line_end = address.open(readers, self.robot.uart.uplink)
+        self._line_end = address.open(readers, self.robot.uart.uplink, self._report)
         return self._line_end.master
 
     def keep(self) -> None:

@@ -4,11 +4,11 @@ While the chip is stopped at a breakpoint the whole laboratory waits: no time pa
 continues as if it had not stopped. Ctrl-C is checked each time the laboratory runs the chip.
 """
 
-import select
 import socket
 from collections.abc import Callable
 from contextlib import suppress
 
+from hil.clock import readable
 from hil.errors import LabError
 from hil.stm32f405.chip import Chip, Why
 from hil.stm32f405.freertos import FreeRtos
@@ -16,6 +16,8 @@ from hil.stm32f405.gdb_protocol import SIGINT, SIGTRAP, Debuggee, RemoteProtocol
 
 HOST = "127.0.0.1"
 READ_SIZE = 4096
+BEGINS = (b"+", b"-", b"$", b"\x03")  # what a debugger may send first
+FIRST_TIMEOUT_S = 0.5  # for it
 
 
 class GdbServer:
@@ -45,9 +47,8 @@ class GdbServer:
         """Stop the machine until the debugger runs, steps, leaves or ends it; wait for a debugger first."""
         if self._client is None:
             self._waiting(self.port)
-            self._client, _ = self._listener.accept()
-            self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._protocol = RemoteProtocol(self._debuggee, self._kernel)
+            while not self._admit():
+                pass
         elif self._protocol.wish in (Wish.RUN, Wish.STEP):
             self._send(self._protocol.stopped(signal, watched))
         while self._client is not None and self._protocol.wish is Wish.STOP:
@@ -58,14 +59,27 @@ class GdbServer:
         return wish
 
     def wants_to_stop(self) -> bool:
-        """Return whether the debugger sent Ctrl-C, or a new one connected, while the machine ran. Never blocks."""
+        """Return whether the debugger sent Ctrl-C, or a new one connected, while the machine ran."""
         waiting = self._listener if self._client is None else self._client
-        if not select.select([waiting], [], [], 0)[0]:
+        if not readable([waiting], 0):
             return False
         if self._client is None:
-            return True
+            return self._admit()
         self._receive()
         return self._protocol.interrupted
+
+    def _admit(self) -> bool:
+        """Accept the next client; return whether it is a debugger. A browser's page could send packets within HTTP."""
+        client, _ = self._listener.accept()
+        client.settimeout(FIRST_TIMEOUT_S)
+        with suppress(OSError):
+            if client.recv(1, socket.MSG_PEEK) in BEGINS:
+                client.settimeout(None)
+                client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self._client, self._protocol = client, RemoteProtocol(self._debuggee, self._kernel)
+                return True
+        client.close()
+        return False
 
     def close(self) -> None:
         self._disconnect()

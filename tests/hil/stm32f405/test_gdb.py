@@ -235,9 +235,27 @@ def test_after_a_hang_up_the_machine_runs_and_accepts_another(
     assert machine.breakpoints == set()
     assert not server.wants_to_stop()
     with socket.create_connection(("127.0.0.1", server.port)) as other:
+        other.sendall(b"+")
         assert server.wants_to_stop()
         other.sendall(framed(b"k"))
         assert server.hold() is Wish.KILL
+
+
+def test_what_is_not_a_debugger_is_closed_and_writes_nothing(machine: BareCortex) -> None:
+    server = GdbServer(0)
+    server.attach(machine)
+    before = machine.read(RAM + 0x100, 4)
+    page, silent, debugger = (socket.create_connection(("127.0.0.1", server.port), 10.0) for _ in range(3))
+    page.sendall(b"POST / HTTP/1.1\r\n\r\n" + framed(b"M20000100,4:deadbeef"))
+    debugger.sendall(framed(b"D"))
+    assert server.hold() is Wish.DETACH
+    assert machine.read(RAM + 0x100, 4) == before
+    for closed in (page, silent, debugger):
+        closed.close()
+    with socket.create_connection(("127.0.0.1", server.port)) as page:
+        page.sendall(b"GET / HTTP/1.1\r\n")
+        assert not server.wants_to_stop()
+    server.close()
 
 
 def test_leaving_removes_the_breakpoints(protocol: RemoteProtocol, machine: BareCortex) -> None:
