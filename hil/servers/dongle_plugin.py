@@ -15,6 +15,7 @@ import errno
 import os
 import socket
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from types import SimpleNamespace
 from typing import Any
 
@@ -27,6 +28,7 @@ READY_TIMEOUT_S = 60.0  # a server may compile first
 CONTROL, WRITE, READ, PORTS = b"C", b"W", b"R", b"P"
 HEAD_SIZE = 3
 ACKNOWLEDGED = 0x01  # bit of an answer's first byte
+NOT_ACKNOWLEDGED = b"\x00"
 
 _DEVICE = SimpleNamespace(
     bLength=18, bDescriptorType=1, bcdUSB=0x0200, bDeviceClass=0, bDeviceSubClass=0, bDeviceProtocol=0,
@@ -100,17 +102,20 @@ class Line:
 class Connection:
     """An opened dongle: a line to each process of the server, one transfer at a time.
 
-    A packet goes to all of them until a board has acknowledged one with these settings; then to its process alone.
+    A packet goes to all of them until a board has acknowledged one with these settings; then to its process alone. A
+    process that has ended is left out; without the first one the dongle is gone.
     """
 
     def __init__(self, host: str, port: int) -> None:
         self._lines = [Line((host, port))]
         self._requests: dict[int, bytes] = {}
-        self._found: dict[tuple[bytes, ...], list[Line]] = {}  # by the settings of the dongle
+        self._found: dict[tuple[bytes, ...], Line] = {}  # by the settings of the dongle
+        self._asked: list[Line] = []  # those that got the last packet
         try:
             ports = self._lines[0].read(READY_TIMEOUT_S)
             for other in range(0, len(ports), 2):
-                self._lines.append(Line((host, int.from_bytes(ports[other : other + 2]))))
+                with suppress(ConnectionRefusedError):
+                    self._lines.append(Line((host, int.from_bytes(ports[other : other + 2]))))
         except OSError:
             self.close()
             raise
@@ -121,23 +126,35 @@ class Connection:
 
     def write(self, packet: bytes) -> None:
         """Send a packet."""
-        for line in self._asked():
-            line.write(self._requests, packet)
+        found = self._found.get(tuple(self._requests.values()))
+        self._asked = []
+        for line in self._lines.copy() if found is None else [found]:
+            with self._dropping(line):
+                line.write(self._requests, packet)
+                self._asked.append(line)
 
     def read(self, timeout_s: float) -> bytes:
         """Return the acknowledgement of the last packet, else that there is none. Raises `TimeoutError`."""
-        answer = b""
-        for line in self._asked():
-            answer = line.read(timeout_s)
-            if answer[0] & ACKNOWLEDGED:
-                self._found[tuple(self._requests.values())] = [line]
-                return answer
+        for line in self._asked:
+            with self._dropping(line):
+                answer = line.read(timeout_s)
+                if answer[0] & ACKNOWLEDGED:
+                    self._found[tuple(self._requests.values())] = line
+                    return answer
         self._found.pop(tuple(self._requests.values()), None)
-        return answer
+        return NOT_ACKNOWLEDGED
 
-    def _asked(self) -> list[Line]:
-        """Return the processes that get a packet with the present settings."""
-        return self._found.get(tuple(self._requests.values()), self._lines)
+    @contextmanager
+    def _dropping(self, line: Line) -> Iterator[None]:
+        """Leave a process out that has ended."""
+        try:
+            yield
+        except ConnectionError:
+            if line is self._lines[0]:
+                raise
+            self._lines.remove(line)
+            self._found = {settings: found for settings, found in self._found.items() if found is not line}
+            line.close()
 
     def close(self) -> None:
         for line in self._lines:

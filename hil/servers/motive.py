@@ -161,6 +161,7 @@ class VirtualMotive:
             number: BodyPose(number, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.0, valid=False)
             for number in range(1, count + 1)
         }
+        self._awaited = set(self._missing)
         self._number = 0
         # Of the frame being assembled.
         self._tolerance_us = period_us // 2
@@ -220,8 +221,12 @@ class VirtualMotive:
         if sighting is not None:
             self._unlabelled += self._all_turned(sighting.unlabelled)
             self._labelled += self._labels(body, sighting) if frame.valid else ()
-        if len(self._seen) == len(self._missing):
+        if self._awaited <= self._seen.keys():
             self._stream(sent)
+
+    def lose(self, body: int) -> None:
+        """Report a body as not tracked from now on, without waiting for it."""
+        self._awaited.discard(body)
 
     def _stream(self, sent: int) -> None:
         """Send the assembled frame and begin the next."""

@@ -2,7 +2,7 @@
 
 Each process opens its robot's connections. A pipe to robot 1's process carries what all share: where clients find the
 robot, lines for the user, poses for Motive, packets between boards, and typed lines. A message is the name of a call and
-its arguments.
+its arguments. A robot whose process ends is reported; the others continue.
 """
 
 import multiprocessing
@@ -29,7 +29,7 @@ class Swarm:
 
     def __init__(self, plan: Service, count: int, doors: Doors, say: Call) -> None:
         self._pipes: dict[int, Connection] = {}
-        self._processes: list[multiprocessing.process.BaseProcess] = []
+        self._processes: dict[int, multiprocessing.process.BaseProcess] = {}
         self._opened: dict[int, Opened] = {}
         self._say = say
         self._calls: dict[str, Call] = {"say": say, "opened": self._opened.__setitem__, "fail": _fail}
@@ -37,7 +37,7 @@ class Swarm:
             near, far = FORK.Pipe()
             self._pipes[number] = near
             process = FORK.Process(target=self._serve, args=(replace(plan, number=number), doors, far))
-            self._processes.append(process)
+            self._processes[number] = process
             process.start()
             far.close()
 
@@ -45,7 +45,10 @@ class Swarm:
         """Wait until the robots are open to clients. Raises `LabError` if one cannot be."""
         for number in self._pipes:
             while number not in self._opened:
-                self._read(number, 0)
+                try:
+                    self._read(number)
+                except LabError as error:
+                    raise LabError(f"robot {number}: {error}") from None
         return list(self._opened.values())
 
     def listen(self, server: Server, answer: Call, motive: VirtualMotive | None) -> None:
@@ -55,12 +58,23 @@ class Swarm:
             server.hear_peer(settings, packet)
             self.to_peers(settings, packet, number)
 
+        def read(number: int, now_us: int) -> None:
+            try:
+                self._read(number)
+            except LabError as error:
+                self._say(f"robot {number}: {error}; the others continue")
+                del server.clock.readers[self._pipes[number].fileno()]
+                self._pipes.pop(number).close()
+                self._processes[number].kill()
+                if motive is not None:
+                    motive.lose(number)
+
         self._calls |= {"answer": answer, "hear": hear}
         if motive is not None:
             self._calls["take"] = motive.take
         for number, pipe in self._pipes.items():
-            server.clock.readers[pipe.fileno()] = partial(self._read, number)
-            pipe.send(("type", ("",)))
+            server.clock.readers[pipe.fileno()] = partial(read, number)
+            self._send(number, "type", "")
 
     @property
     def terminals(self) -> dict[int, Callable[[str], None]]:
@@ -68,35 +82,42 @@ class Swarm:
         return {number: partial(self._type, number) for number in self._pipes}
 
     def _type(self, number: int, line: str) -> None:
-        self._pipes[number].send(("type", (line,)))
+        if number not in self._pipes:
+            raise LabError(f"robot {number}: its process has ended")
+        self._send(number, "type", line)
+
+    def _send(self, number: int, name: str, *arguments: object) -> None:
+        with suppress(OSError):  # its process has ended, which `listen` reports
+            self._pipes[number].send((name, arguments))
 
     def to_peers(self, settings: AirSettings, packet: bytes, sender: int = 1) -> None:
         """Pass a board's packet to those of the other processes."""
-        for number, pipe in self._pipes.items():
+        for number in self._pipes:
             if number != sender:
-                pipe.send(("hear", (settings, packet)))
+                self._send(number, "hear", settings, packet)
 
     def close(self) -> None:
         """Let the processes end in order."""
-        for pipe in self._pipes.values():
-            with suppress(OSError):
-                pipe.send(("end", ()))
-        for pipe, process in zip(self._pipes.values(), self._processes, strict=True):
+        for number in self._pipes:
+            self._send(number, "end")
+        for number, pipe in self._pipes.items():
             with suppress(EOFError, OSError):
                 while pipe.poll(END_TIMEOUT_S):
                     name, arguments = pipe.recv()
                     if name == "say":
                         self._say(*arguments)
-                process.kill()
+                self._processes[number].kill()
             pipe.close()
+        for process in self._processes.values():
             process.join()
-        self._pipes, self._processes = {}, []
+        self._pipes, self._processes = {}, {}
 
-    def _read(self, number: int, now_us: int) -> None:
+    def _read(self, number: int) -> None:
+        """Execute the next call of a robot's process. Raises `LabError` when it has ended or fails."""
         try:
             name, arguments = self._pipes[number].recv()
         except (EOFError, OSError):
-            raise LabError(f"robot {number}: its process has ended") from None
+            raise LabError("its process has ended") from None
         self._calls[name](*arguments)
 
     def _serve(self, plan: Service, doors: Doors, pipe: Connection) -> None:

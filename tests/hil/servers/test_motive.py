@@ -261,6 +261,9 @@ def test_bodies_of_one_exposure_share_a_frame(start) -> None:
     assert [body.id for body in found] == [1, 2]
     client.say(MessageId.REQUEST_MODELDEF)
     assert [body.name for body in decode(client.hear(), (3, 1)).bodies] == ["floaty", "floaty2"]
+    lab.motive.lose(2)
+    lab.motive.take(1, replace(seen(1), t_us=1_000_000), 0)
+    assert [body.valid for body in decode(client.hear(), (3, 1)).bodies] == [True, False]
 
 
 def test_a_body_whose_process_is_late_is_not_tracked_in_one_frame_and_is_in_time_in_the_next(start) -> None:

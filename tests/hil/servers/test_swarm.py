@@ -133,13 +133,21 @@ def test_ctrl_c_ends_all_processes_in_order_and_keeps_every_robots_memories(tmp_
     ]
 
 
-def test_a_robot_whose_process_dies_ends_the_server_in_one_line() -> None:
-    with serve("--boards", "2", "--udp", "0") as served:
-        (pid,) = others(served)
-        os.kill(pid, signal.SIGKILL)
-        assert served.process.wait(PATIENCE_S) == 2
-        served.listen()
-        assert served.lines[-1] == "floaty: robot 2: its process has ended"
+def test_a_robot_whose_process_dies_is_named_and_the_others_continue() -> None:
+    with serve("--boards", "3", "--radio", "--radio-port", "0") as served, closing(Dongle(served)) as dongle:
+        assert [dongle.send(last) for last in (0xE7, 0x02, 0x03)] == [1, 1, 1]
+        os.kill(others(served)[0], signal.SIGKILL)
+        served.wait_for(r"^robot 2: its process has ended; the others continue$", PATIENCE_S)
+        with closing(Dongle(served)) as later:
+            for client in (dongle, later, dongle):
+                assert [client.send(last) for last in (0xE7, 0x02, 0x03)] == [1, 0, 1]
+        served.forget()
+        served.type("2 status")
+        served.wait_for(r"^robot 2: its process has ended$", PATIENCE_S)
+        served.type("3 status")
+        served.wait_for(r"^robot 3: held, ", PATIENCE_S)
+        assert served.interrupt() == 0
+        assert served.lines[-1].startswith("stopped; time stood still for")
 
 
 def test_robots_do_not_outlive_a_server_that_is_killed() -> None:
