@@ -84,9 +84,9 @@ def needs(client: str) -> pytest.MarkDecorator:
 
 
 @contextlib.contextmanager
-def moving(stands: Callable[[], bool] = lambda: False) -> Iterator[MotiveBench]:
+def moving(stands: Callable[[], bool] = lambda: False, multicast: bool = False) -> Iterator[MotiveBench]:
     """A Motive that streams in a thread, without the body while it `stands`."""
-    lab, stop = MotiveBench(), threading.Event()
+    lab, stop = MotiveBench(multicast=multicast), threading.Event()
 
     def pump() -> None:
         while not stop.wait(0.005):
