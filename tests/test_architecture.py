@@ -86,7 +86,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "foxglove": ("hil/exports/mcap.py", "hil/live/foxglove_server.py"),
     "gymnasium": ("hil/learn/",),
     "av": ("hil/pictures/video.py",),
-    "tornado": ("hil/live/panel.py",),
+    "tornado": ("hil/live/panel.py", "hil/live/local_server.py", "hil/live/foxglove_server.py"),
     "youplot": ("hil/pictures/pages.py",),
     "time": (
         "hil/clock.py", "hil/commands/listing.py",
@@ -95,7 +95,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "datetime": (),
     "asyncio": (),
     "threading": (
-        "hil/live/feed.py", "hil/live/panel.py", "hil/campaigns/workers.py",
+        "hil/live/feed.py", "hil/live/local_server.py", "hil/campaigns/workers.py",
         "ground_station/links/live_link.py", "ground_station/links/crazyradio.py", "ground_station/links/mavlink_serial.py",
         "ground_station/terminal.py",
     ),

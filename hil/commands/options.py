@@ -78,8 +78,9 @@ set_option = click.option(
     help="Override a value of the profile; repeatable.",
 )
 view_option = click.option(
-    "--view", "target", is_flag=False, flag_value="window", metavar="[web|connect:HOST:PORT|foxglove]",
-    help="Watch live: in the rerun viewer, in a browser, in a viewer that is open somewhere, in Foxglove.",
+    "--view", "target", is_flag=False, flag_value="window", metavar="[web|connect:HOST:PORT|foxglove[:parameters]]",
+    help="Watch live: in the rerun viewer, in a browser, in a viewer that is open somewhere, in Foxglove, which with "
+    ":parameters also changes those of the board.",
 )  # fmt: skip
 gdb_option = click.option(
     "--gdb", type=click.IntRange(0, 65535), metavar="PORT",

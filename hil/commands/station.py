@@ -99,7 +99,7 @@ def station(asked: StationOptions) -> int:
     view = common.open_live(asked.target)
     flight = _recorded(asked, experiment, view)
     desk = Desk(flight, view)
-    know = view.know if view is not None and asked.target == "foxglove" else None
+    know = view.know if view is not None and asked.target == "foxglove:parameters" else None
     operator = Operator(_trajectory_of, desk.reply, desk.note, know)
     log = flight.telemetry if flight is not None and asked.out is not None else asked.log
     session = Session(

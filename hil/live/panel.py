@@ -7,21 +7,15 @@ becomes a line for `typed`; state and answers go to the page, and a newer one re
 
 import io
 import json
-import os
-import threading
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import partial
-from hmac import compare_digest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from tornado.httpserver import HTTPServer
 from tornado.ioloop import IOLoop
-from tornado.netutil import bind_sockets
-from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from firmware_py.table import OF_PROFILE
@@ -29,8 +23,9 @@ from hil.errors import LabError
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.metrics import body, column
 from hil.laboratory.recorder import stored_in
+from hil.live.local_server import Guarded, LocalServer
 from hil.live.rerun_screen import RerunScreen
-from hil.live.window import LOOPBACK, free_port
+from hil.live.window import LOOPBACK
 from hil.pictures import curves
 from hil.pictures.pages import data_uri, library
 from hil.pictures.video import GOAL_COLUMNS, VideoScene
@@ -58,18 +53,14 @@ class PanelScreen:
         self.wants_viewer = False
         self._past: list[pa.Table] = []  # the rows of the last seconds
         self._goals: list[Points] = []  # (3,) [m] each, of the whole flight: the picture shows them all
-        self.typed, self.token = typed, os.urandom(16).hex()
+        self.typed = typed
         self.pages: set[_Socket] = set()
         self.texts: list[str] = []
         self.values: dict[str, float] = {}
-        self.origin = f"http://{LOOPBACK}:{(port := free_port(PORT))}"
-        self.address = f"{self.origin}/?token={self.token}"
         self._content = _content(program)
-        self._loop: IOLoop | None = None
-        opened = threading.Event()
-        self._thread = threading.Thread(target=self._serve, args=(port, opened), name="panel", daemon=True)
-        self._thread.start()
-        opened.wait()
+        self._server = LocalServer(PORT, self, {"/": _Page, "/socket": _Socket})
+        self.token, self.origin = self._server.token, f"http://{self._server.host}"
+        self.address = f"{self.origin}/?token={self.token}"
 
     def show(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
         texts = list(events)
@@ -82,7 +73,7 @@ class PanelScreen:
             self._past = [*self._past, rows][-BATCHES_KEPT:]
             if self.pages:
                 message |= self._drawn(rows)
-        self._call(partial(self._tell, message))
+        self._server.call(partial(self._tell, message))
 
     def _open_viewer(self) -> dict[str, Any]:
         self.wants_viewer = False
@@ -107,11 +98,10 @@ class PanelScreen:
         return message
 
     def know(self, values: Mapping[str, float]) -> None:
-        self._call(partial(self._tell, {"values": dict(values)}))
+        self._server.call(partial(self._tell, {"values": dict(values)}))
 
     def close(self) -> None:
-        self._call(self._stop)
-        self._thread.join()
+        self._server.close()
         if self._viewer is not None:
             self._viewer.close()
 
@@ -122,49 +112,16 @@ class PanelScreen:
 
     # In the thread of the server
 
-    def _serve(self, port: int, opened: threading.Event) -> None:
-        self._loop = IOLoop()
-        server = HTTPServer(
-            Application([("/", _Page, {"panel": self}), ("/socket", _Socket, {"panel": self})])
-        )
-        server.add_sockets(bind_sockets(port, LOOPBACK))
-        opened.set()
-        self._loop.start()
-        server.stop()
-        self._loop.close(all_fds=True)
-
-    def _call(self, act: Callable[[], None]) -> None:
-        assert self._loop is not None
-        self._loop.add_callback(act)
-
     def _tell(self, message: dict[str, Any]) -> None:
         self.texts = [*self.texts, *message.get("texts", ())][-TEXTS_MOST:]
         self.values |= message.get("values", {})
         for page in self.pages.copy():
             page.tell(message)
 
-    def _stop(self) -> None:
-        assert self._loop is not None
-        self._loop.stop()
 
+class _Page(Guarded):
+    owner: PanelScreen
 
-class _Guarded(RequestHandler):
-    """Refuses a request without the token, or by another name of this computer."""
-
-    def initialize(self, panel: PanelScreen) -> None:
-        self.panel = panel
-
-    def prepare(self) -> None:
-        known = compare_digest(self.get_query_argument("token", "").encode(), self.panel.token.encode())
-        if not known or f"http://{self.request.host}" != self.panel.origin:
-            raise HTTPError(403)
-
-    def write_error(self, status_code: int, **_: Any) -> None:
-        self.set_header("Content-Type", "text/plain")
-        self.finish("The panel opens with the address that floaty prints, token and all.\n")
-
-
-class _Page(_Guarded):
     def get(self) -> None:
         self.set_header("Content-Security-Policy", (
             "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
@@ -172,33 +129,35 @@ class _Page(_Guarded):
         ))  # fmt: skip
         self.set_header("Referrer-Policy", "no-referrer")
         self.set_header("Cache-Control", "no-store")
-        self.finish(self.panel.page())
+        self.finish(self.owner.page())
 
 
-class _Socket(_Guarded, WebSocketHandler):
+class _Socket(Guarded, WebSocketHandler):
+    owner: PanelScreen
+
     def check_origin(self, origin: str) -> bool:
         """Whether a page may connect: the panel's own."""
-        return origin == self.panel.origin
+        return origin == self.owner.origin
 
     def open(self, *_: str) -> None:
         self._sending = False
         self._late: dict[str, Any] = {}
-        self.panel.pages.add(self)
-        self.tell({"texts": self.panel.texts, "values": self.panel.values})
+        self.owner.pages.add(self)
+        self.tell({"texts": self.owner.texts, "values": self.owner.values})
 
     def on_message(self, message: str | bytes) -> None:
         """Pass a line on."""
         line = message if isinstance(message, str) else ""
         if line == "viewer":
-            self.panel.wants_viewer = True
+            self.owner.wants_viewer = True
         elif line.isprintable() and 0 < len(line) <= LINE_MOST:
-            self.panel.typed(line)
+            self.owner.typed(line)
         else:
             text = f"panel: a line of {len(message)} characters: expected 1..{LINE_MOST} printable ones"
             self.tell({"texts": [text]})
 
     def on_close(self) -> None:
-        self.panel.pages.discard(self)
+        self.owner.pages.discard(self)
 
     def tell(self, message: dict[str, Any]) -> None:
         """Send a message; while the last one is under way, only the newest state waits, with all texts and values."""

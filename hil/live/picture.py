@@ -1,8 +1,8 @@
 """The process that shows a live flight: `python -m hil.live.picture TARGET PROGRAM`, fed by `hil.live.feed`.
 
 A TARGET is `window` (rerun's viewer), `web` (the same in a browser, with the commands of PROGRAM: fly, serve or station),
-`connect:HOST:PORT` (a viewer that is already open) or
-`foxglove` (a WebSocket server for Foxglove). It reads rows from standard input and writes lines to standard output.
+`connect:HOST:PORT` (a viewer that is already open), `foxglove` (a WebSocket server for Foxglove) or `foxglove:parameters`
+(which also shows and changes the board's). It reads rows from standard input and writes lines to standard output.
 """
 
 import json
@@ -19,6 +19,7 @@ from firmware_py.extras import install_command
 from hil.errors import LabError
 from hil.live.feed import EVENTS, FAILED, PARAMETERS, READY, TAKEN, TYPED
 
+WITH_PARAMETERS = "foxglove:parameters"
 NICE = 5  # lower priority than everything that flies
 Say = Callable[[str, str], None]  # (first word, text)
 
@@ -46,10 +47,12 @@ def open_screen(target: str, program: str, typed: Callable[[str], None]) -> Scre
         except ImportError as error:
             raise LabError(f"--view web: {error}: {install_command('view')}") from None
         return PanelScreen(program, typed)
-    if target == "foxglove":
-        from hil.live.foxglove_server import FoxgloveScreen
-
-        return FoxgloveScreen(typed)
+    if target in ("foxglove", WITH_PARAMETERS):
+        try:
+            from hil.live.foxglove_server import FoxgloveScreen
+        except ImportError as error:
+            raise LabError(f"--view {target}: {error}: {install_command('export')}") from None
+        return FoxgloveScreen(typed if target == WITH_PARAMETERS else None)
     from hil.live.rerun_screen import RerunScreen
 
     return RerunScreen(target)

@@ -4,7 +4,7 @@ import re
 import signal
 from collections.abc import Callable
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, HTTPServer
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 from hil.errors import LabError
@@ -14,6 +14,7 @@ from hil.pictures.links import HOST, PORT, key_of
 from hil.pictures.report import REPORT
 from hil.pictures.viewer.recording import ServedRecording
 
+IDLE_S = 5.0  # for a connection without a request
 ROUTE = re.compile(r"/(\w+)/(-?\d+(?:\.\d+)?)")
 
 
@@ -44,8 +45,12 @@ def browse(run: Path, at_s: float, say: Callable[[str], None]) -> None:
             end(viewer)
 
 
-class Links(HTTPServer):
-    """Leads from the links of one report to the pages that `page_at` returns for an instant [s]."""
+class Links(ThreadingHTTPServer):
+    """Leads from the links of one report to the pages that `page_at` returns for an instant [s].
+
+    Each connection has a thread. A request by another name of this computer is refused: a page of another site may have a
+    name of its own that leads here (DNS rebinding), and read the report.
+    """
 
     def __init__(self, run: Path, page_at: Callable[[float], str], port: int = PORT) -> None:
         self.run, self.page_at = run, page_at
@@ -61,8 +66,13 @@ class Links(HTTPServer):
 
 class _Visit(BaseHTTPRequestHandler):
     server: Links
+    timeout = IDLE_S
 
     def do_GET(self) -> None:
+        names = [f"{name}:{self.server.server_port}" for name in (HOST, "localhost")]
+        if self.headers.get("Host") not in names:
+            self._respond(HTTPStatus.FORBIDDEN, "text/plain", b"Use the address that floaty prints.\n")
+            return
         found, report = ROUTE.fullmatch(self.path), self.server.run / REPORT
         if found is not None and found[1] == self.server.key:
             self.send_response(HTTPStatus.FOUND)

@@ -54,7 +54,7 @@ def _there(target: str) -> str:
     """Return the address of a viewer that is open at HOST:PORT."""
     found = re.fullmatch(r"connect:(.+):(\d{1,5})", target)
     if found is None or not 0 < int(found[2]) < 65536:
-        raise LabError(f"--view {target}: expected nothing, web, connect:HOST:PORT or foxglove")
+        raise LabError(f"--view {target}: expected nothing, web, connect:HOST:PORT or foxglove[:parameters]")
     host, port = found[1], int(found[2])
     if not is_open(host, port):
         raise LabError(f"--view {target}: no viewer listens there (rerun --port {port} opens one)")

@@ -4,6 +4,7 @@ import json
 import struct
 from typing import Any
 
+from tornado.httpclient import HTTPRequest
 from tornado.ioloop import IOLoop
 from tornado.websocket import websocket_connect
 
@@ -14,12 +15,19 @@ MESSAGE = struct.Struct("<BIQ")  # operation 1, subscription, log time [ns]
 class FoxgloveClient:
     """Connects to a `ws://HOST:PORT`."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, **headers: str) -> None:
         self._loop = IOLoop(make_current=True)
-        self._socket = self._loop.run_sync(
-            lambda: websocket_connect(address, subprotocols=[PROTOCOL]), timeout=20
-        )
+        request = HTTPRequest(address, headers=headers)
+        try:
+            self._socket = self._loop.run_sync(
+                lambda: websocket_connect(request, subprotocols=[PROTOCOL]), timeout=20
+            )
+        except BaseException:
+            self._loop.close(all_fds=True)
+            raise
+        self.selected = self._socket.selected_subprotocol
         self.channels: dict[str, int] = {}  # by topic
+        self.described: dict[str, dict[str, str]] = {}  # without their numbers
 
     def send(self, **message: Any) -> None:
         """Send a JSON message."""
@@ -35,7 +43,8 @@ class FoxgloveClient:
                 continue
             message = json.loads(data)
             if message["op"] == "advertise":
-                self.channels |= {channel["topic"]: channel["id"] for channel in message["channels"]}
+                self.channels |= {channel["topic"]: channel.pop("id") for channel in message["channels"]}
+                self.described |= {channel["topic"]: channel for channel in message["channels"]}
             if message["op"] == operation:
                 return message
 

@@ -2,11 +2,15 @@
 
 import json
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
+import foxglove
 import pytest
+from tornado.httpclient import HTTPClientError
 
 from hil.experiments import EXPERIMENTS
+from hil.exports.mcap import log_rows
 from hil.laboratory.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
@@ -31,6 +35,7 @@ def screen(typed: list[str]) -> Iterator[FoxgloveScreen]:
 def client(screen: FoxgloveScreen) -> Iterator[FoxgloveClient]:
     client = FoxgloveClient(screen.address)
     assert "parameters" in client.receive("serverInfo")["capabilities"]
+    assert client.selected == "foxglove.sdk.v1"
     yield client
     client.close()
 
@@ -51,6 +56,75 @@ def test_changed_parameter_is_shown(screen: FoxgloveScreen, client: FoxgloveClie
     screen.know({"extCtrl.y_P": 2.5})
     while values(client.receive("parameterValues")) != {"extCtrl.y_P": 2.5}:
         pass
+    client.send(op="setParameters", parameters=[{"name": "extCtrl.y_P", "value": "stop"}])
+    assert values(client.receive("parameterValues")) == {"extCtrl.y_P": 2.5}
+    for malformed in ({"op": "format"}, {"op": "subscribe"}, {"parameters": 1}):
+        client.send(**malformed)
+        assert client.receive("status")["level"] == 2
+    assert typed == ["set extCtrl.y_P 2.5"]
+
+
+def test_parameters_that_nobody_asked_for_are_neither_shown_nor_changed() -> None:
+    screen = FoxgloveScreen(None)
+    client = FoxgloveClient(screen.address)
+    assert client.receive("serverInfo")["capabilities"] == []
+    screen.know({"extCtrl.y_P": 1.6})
+    for request in ("getParameters", "setParameters"):
+        client.send(
+            op=request, parameterNames=[], parameters=[{"name": "extCtrl.y_P", "value": 2.5}], id="any"
+        )
+        assert client.receive("status")["level"] == 2
+    client.close()
+    screen.close()
+
+
+@pytest.mark.parametrize(
+    ("refused", "token", "headers"),
+    [
+        (True, "guessed", {}),
+        (True, None, {"Origin": "http://evil.example"}),
+        (True, None, {"Origin": "https://app.foxglove.dev.evil.example"}),
+        (True, None, {"Origin": "null"}),
+        (True, None, {"Host": "evil.example:8765"}),
+        (False, None, {"Origin": "https://app.foxglove.dev"}),
+        (False, None, {"Origin": "http://localhost:8080"}),
+        (False, None, {"Origin": "file://"}),
+    ],
+)
+def test_only_programs_with_the_token_and_foxglove_s_pages_connect(
+    screen: FoxgloveScreen, refused: bool, token: str | None, headers: dict[str, str]
+) -> None:
+    address = screen.address if token is None else f"{screen.address.partition('=')[0]}={token}"
+    with pytest.raises(HTTPClientError, match="403") if refused else nullcontext():
+        client = FoxgloveClient(address, **headers)
+        client.receive("serverInfo")
+        client.close()
+
+
+def test_channels_and_messages_are_those_of_foxglove_s_own_server(tmp_path: Path) -> None:
+    fly(Request.of(EXPERIMENTS["hover"], duration_s=0.1), tmp_path / "run")
+    rows, context = load_log(tmp_path / "run").slice(0, 5), foxglove.Context()
+    screen, own = FoxgloveScreen(None), foxglove.start_server(port=0, context=context)
+    found, topics = [], ("/truth/pose", "/battery")
+    for address, show in (
+        (screen.address, lambda rows: screen.show(rows, [])),
+        (f"ws://127.0.0.1:{own.port}", lambda rows: log_rows(rows, context)),
+    ):
+        client = FoxgloveClient(address)
+        show(rows)
+        while not client.channels.keys() >= set(topics):
+            client.receive("advertise")
+        for number, topic in enumerate(topics):
+            client.send(op="subscribe", subscriptions=[{"id": number, "channelId": client.channels[topic]}])
+        client.send(op="nonsense")
+        client.receive("status")  # it has subscribed by now
+        show(rows)
+        messages = sorted(client.receive("message") for _ in range(2 * rows.num_rows))
+        found.append(({topic: client.described[topic] for topic in topics}, messages))
+        client.close()
+    screen.close()
+    own.stop()
+    assert found[0] == found[1]
 
 
 def test_the_rows_are_those_of_mcap(screen: FoxgloveScreen, client: FoxgloveClient, tmp_path: Path) -> None:

@@ -69,10 +69,7 @@ def test_a_page_without_the_token_or_by_another_name_is_refused(panel: PanelScre
     with pytest.raises(urllib.error.HTTPError) as refused:
         urllib.request.urlopen(request, timeout=20)
     assert refused.value.code == 403
-    assert (
-        refused.value.read().decode()
-        == "The panel opens with the address that floaty prints, token and all.\n"
-    )
+    assert refused.value.read().decode() == "Use the address that floaty prints, token and all.\n"
     refused.value.close()
 
 

@@ -1,6 +1,7 @@
 """Links of a report into the recording: each leads to its instant in the viewer's own words, others nowhere."""
 
 import http.client
+import socket
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -35,10 +36,10 @@ def links(run: Path) -> Iterator[Links]:
         thread.join()
 
 
-def answer(links: Links, path: str) -> tuple[int, str | None, str]:
+def answer(links: Links, path: str, **headers: str) -> tuple[int, str | None, str]:
     """Status, where it leads, and what it says."""
     connection = http.client.HTTPConnection(HOST, links.server_port, timeout=10)
-    connection.request("GET", path)
+    connection.request("GET", path, headers=headers)
     response = connection.getresponse()
     told = response.status, response.headers["Location"], response.read().decode()
     connection.close()
@@ -63,6 +64,20 @@ def test_the_report_is_there_too(links: Links, run: Path) -> None:
     assert answer(links, "/report.html") == (200, None, "what was flown")
 
 
+@pytest.mark.parametrize("name", ["evil.example", "127.0.0.1", "localhost:1", ""])
+def test_a_request_by_another_name_of_this_computer_is_refused(links: Links, run: Path, name: str) -> None:
+    (run / "report.html").write_text("what was flown")
+    assert answer(links, "/report.html", Host=name) == (403, None, "Use the address that floaty prints.\n")
+    assert answer(links, "/report.html", Host=f"localhost:{links.server_port}")[0] == 200
+
+
+def test_idle_connections_delay_nobody(links: Links) -> None:
+    idle = [socket.create_connection((HOST, links.server_port)) for _ in range(20)]
+    assert answer(links, "/")[0] == 404
+    for one in idle:
+        one.close()
+
+
 def test_a_port_that_is_taken_is_one_line(links: Links, run: Path) -> None:
     with pytest.raises(LabError, match=f"port {links.server_port}, which is taken"):
         Links(run, str, links.server_port)
@@ -75,3 +90,18 @@ def test_a_recording_is_served_with_the_time_at_an_instant(run: Path) -> None:
     assert at.startswith("rerun+http://127.0.0.1:")
     assert at.endswith("#when=from_release@+0.250s")
     assert recording.at(-0.5) == at.replace("+0.250", "-0.500")
+    port = int(at.split(":")[2].partition("/")[0])
+    assert allowed_origins(port) == ["http://127.0.0.1:9090", "http://localhost:9090"]
+
+
+def allowed_origins(port: int) -> list[str]:
+    """Those of some pages that rerun's server on a port lets read from it."""
+    allowed = []
+    for origin in ("http://127.0.0.1:9090", "http://localhost:9090", "http://evil.example", "null"):
+        asker = http.client.HTTPConnection(HOST, port, timeout=10)
+        asker.request("OPTIONS", "/", headers={"Origin": origin, "Access-Control-Request-Method": "POST"})
+        response = asker.getresponse()
+        response.read()
+        allowed += [origin] if response.headers["Access-Control-Allow-Origin"] in (origin, "*") else []
+        asker.close()
+    return allowed
