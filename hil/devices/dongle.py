@@ -35,7 +35,7 @@ class VirtualDongle:
         self._board = board
         self._settings = AirSettings(2, 2_000_000, b"\xe7" * 5)
         self._retries = RETRIES
-        self._acks = True
+        self.acknowledges = True  # then each packet is answered
 
     def control(self, request: int, value: int, data: bytes) -> None:
         """Execute a vendor request; accept those without effect here (power, retry delay, carrier)."""
@@ -48,16 +48,16 @@ class VirtualDongle:
         elif request == SET_RETRIES:
             self._retries = value & 0x0F
         elif request == SET_ACKS:
-            self._acks = bool(value)
+            self.acknowledges = bool(value)
 
     def transmit(self, now_us: int, packet: bytes, answer: Answer) -> None:
         """Send a packet of 1..32 bytes; call `answer` once, unless acknowledgements are switched off."""
-        if not self._acks and len(packet) > MAX_PACKET:  # two packets in one transfer
+        if not self.acknowledges and len(packet) > MAX_PACKET:  # two packets in one transfer
             half = len(packet) // 2
             self.transmit(now_us, packet[:half], answer)
             packet = packet[half:]
         packet = packet[:MAX_PACKET]
-        settings, acks = self._settings, self._acks
+        settings, acks = self._settings, self.acknowledges
         retries = self._retries if acks else 0
         board, size = self._board, len(packet)
         if packet and board.hears_all(settings):

@@ -13,7 +13,9 @@ from hil.servers.dongle_plugin import CONTROL, HEAD_SIZE, PORTS, READ, WRITE, fr
 from hil.servers.tcp_port import Receive, TcpClient, TcpPort, TcpProtocol
 
 HOST = "127.0.0.1"
-PROTOCOL = TcpProtocol("radio", CONTROL + WRITE, 4096)
+PROTOCOL = TcpProtocol(
+    "radio", CONTROL + WRITE, 4096, send_buffer=8192
+)  # a client awaits one answer at a time
 
 
 class DongleServer:
@@ -48,27 +50,41 @@ class DongleServer:
 
 
 class _UsbCable:
-    """One connection and its dongle."""
+    """One connection and its dongle, which does one transfer at a time, as over USB: a client that is ahead waits."""
 
     def __init__(self, client: TcpClient, dongle: VirtualDongle) -> None:
         self._client = client
         self._dongle = dongle
         self._received = b""
+        self._awaits = False  # an answer of the dongle
 
     def receive(self, now_us: int, data: bytes) -> None:
-        """Execute the frames that are complete."""
+        """Take bytes of the client."""
         self._received += data
-        while len(self._received) >= HEAD_SIZE and len(self._received) >= HEAD_SIZE + self._received[2]:
+        if self._awaits:
+            self._client.pause()
+        else:
+            self._work(now_us)
+
+    def _work(self, now_us: int) -> None:
+        """Execute the frames that are complete, up to one that is answered."""
+        while not self._awaits and len(self._received) >= HEAD_SIZE:
             size = HEAD_SIZE + self._received[2]
-            self._execute(now_us, self._received[:size])
-            self._received = self._received[size:]
+            if len(self._received) < size:
+                break
+            request, self._received = self._received[:size], self._received[size:]
+            self._execute(now_us, request)
 
     def _execute(self, now_us: int, request: bytes) -> None:
         kind, sequence, data = request[:1], request[1], request[HEAD_SIZE:]
         if kind == CONTROL and len(data) >= 3:
             self._dongle.control(data[0], data[1] | data[2] << 8, data[3:])
         elif kind == WRITE and data:
+            self._awaits = self._dongle.acknowledges
             self._dongle.transmit(now_us, data, lambda t_us, answer: self._answer(t_us, sequence, answer))
 
     def _answer(self, now_us: int, sequence: int, answer: bytes) -> None:
+        self._awaits = False
         self._client.send(now_us, frame(READ, sequence, answer))
+        self._client.listen(self.receive)
+        self._work(now_us)

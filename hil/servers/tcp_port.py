@@ -2,7 +2,7 @@
 
 A page in any browser of this computer can send HTTP, with anything in its body, to every port. So a client is closed whose
 first byte does not begin a message of the protocol; one that sends nothing first may listen. Beyond `CLIENTS_MAX` a new
-client replaces the one silent for longest. Each of these is reported in a line, at most one in `REPORT_US`.
+client replaces the one silent for longest. Each of these is reported in a line, at most one of a kind in `REPORT_US`.
 """
 
 import os
@@ -28,6 +28,7 @@ class TcpProtocol:
     name: str  # of the port, for the user
     begins: bytes  # the first bytes that a message may have
     read_size: int
+    send_buffer: int | None = None  # bytes for a client that does not read, None: the system's choice
 
 
 class TcpPort:
@@ -53,17 +54,18 @@ class TcpPort:
         self._spare = os.open(
             os.devnull, os.O_RDONLY
         )  # closed to refuse a client when no other descriptor is left
-        self._quiet_until_us, self._unsaid = 0, 0
+        self._reported: dict[str, tuple[int, int]] = {}  # by kind: when last, and how many since
         readers[self._listener] = self._accept
 
-    def report(self, now_us: int, text: str) -> None:
+    def report(self, now_us: int, client: str, kind: str, detail: str = "") -> None:
         """Tell the user about a client; of many such lines only some."""
-        if now_us < self._quiet_until_us:
-            self._unsaid += 1
+        last_us, unsaid = self._reported.get(kind, (now_us - REPORT_US, 0))
+        if now_us < last_us + REPORT_US:
+            self._reported[kind] = last_us, unsaid + 1
             return
-        more = f" ({self._unsaid} such lines before)" if self._unsaid else ""
-        self._quiet_until_us, self._unsaid = now_us + REPORT_US, 0
-        self._say(f"{self.protocol.name} port {self.port}: {text}{more}")
+        self._reported[kind] = now_us, 0
+        more = f" ({unsaid} such lines before)" if unsaid else ""
+        self._say(f"{self.protocol.name} port {self.port}: {client} {kind}{detail}{more}")
 
     def _accept(self, now_us: int) -> None:
         try:
@@ -72,17 +74,17 @@ class TcpPort:
             return
         except OSError as error:
             self._refuse()
-            self.report(now_us, f"a client was refused ({error.strerror})")
+            self.report(now_us, "a client", f"was refused: {error.strerror}")
             return
         if len(self.clients) >= CLIENTS_MAX:
             silent = next(iter(self.clients))
             silent.close()
             self.report(
-                now_us, f"more than {CLIENTS_MAX} clients; {silent.name}, silent for longest, was closed"
+                now_us, silent.name, f"was closed: silent for longest of more than {CLIENTS_MAX} clients"
             )
         client = TcpClient(self, connection, "{}:{}".format(*address))
         self.clients[client] = None
-        self.readers[connection] = partial(client.read, self._join(client))
+        client.listen(self._join(client))
 
     def _refuse(self) -> None:
         """Close the next client without a free descriptor: otherwise it stays readable, and time is spent on it."""
@@ -109,6 +111,8 @@ class TcpClient:
     def __init__(self, port: TcpPort, connection: socket.socket, name: str) -> None:
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if port.protocol.send_buffer is not None:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, port.protocol.send_buffer)
         self.name = name
         self._port, self._socket = port, connection
         self._begun = False
@@ -129,9 +133,18 @@ class TcpClient:
         """Send bytes, none of which may be lost: a client whose buffers are full does not read, and is closed."""
         if self.offer(data) < len(data) and self in self._port.clients:
             self.close()
-            self._port.report(now_us, f"{self.name} does not read its answers and was closed")
+            self._port.report(now_us, self.name, "was closed: it does not read its answers")
 
-    def read(self, receive: Receive, now_us: int) -> None:
+    def listen(self, receive: Receive) -> None:
+        """Let `receive` take what arrives from now on."""
+        if self in self._port.clients:
+            self._port.readers[self._socket] = partial(self._read, receive)
+
+    def pause(self) -> None:
+        """Read no more before `listen`; the client's writes wait meanwhile."""
+        self._port.readers.pop(self._socket, None)
+
+    def _read(self, receive: Receive, now_us: int) -> None:
         """Pass on what has arrived."""
         try:
             data = self._socket.recv(self._port.protocol.read_size)
@@ -145,7 +158,7 @@ class TcpClient:
         if not self._begun and data[0] not in self._port.protocol.begins:
             self.close()
             self._port.report(
-                now_us, f"{self.name} was closed: it begins with {data[:FIRST_SHOWN]!r}, unlike the protocol"
+                now_us, self.name, "was closed: not of this protocol", f": {data[:FIRST_SHOWN]!r}"
             )
             return
         self._begun = True
@@ -155,5 +168,6 @@ class TcpClient:
     def close(self) -> None:
         """Disconnect it; closing again has no effect."""
         if self in self._port.clients:
-            del self._port.clients[self], self._port.readers[self._socket]
+            del self._port.clients[self]
+            self.pause()
             self._socket.close()

@@ -4,7 +4,7 @@ import os
 import signal
 import socket
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
@@ -13,7 +13,7 @@ from firmware_py.firmware import Firmware
 from hil.config import load_config
 from hil.crazyflie import syslink
 from hil.devices.board_firmware import PowerOn, PythonBoard
-from hil.servers.dongle_plugin import VARIABLE, Connection
+from hil.servers.dongle_plugin import CONTROL, VARIABLE, WRITE, Connection, frame
 from hil.servers.server import Doors, Server, Service
 from hil.servers.swarm import Swarm
 from support.serving import PATIENCE_S, Served, serve
@@ -91,6 +91,19 @@ def test_a_packet_to_all_reaches_all_and_none_answers(served: Served) -> None:
         for number in (1, 2):
             served.wait_for(f"board {number}: a client moved the radio back", PATIENCE_S)
     served.forget()
+
+
+def test_a_client_that_writes_and_never_reads_is_closed_in_one_line(served: Served) -> None:
+    served.forget()
+    host, port = served.environment[VARIABLE].split(":")
+    with socket.socket() as deaf, suppress(ConnectionError), closing(Dongle(served)) as dongle:
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+        deaf.connect((host, int(port)))
+        deaf.settimeout(PATIENCE_S)
+        while True:
+            deaf.sendall(frame(CONTROL, 1, bytes((SET_CHANNEL, 80, 0))) + frame(WRITE, 1, NULL))
+            assert dongle.send(0xE7) == ACKNOWLEDGED
+    served.wait_for("board 1: radio port .* was closed: it does not read its answers", PATIENCE_S)
 
 
 def test_every_robot_answers_on_its_own_udp_port(served: Served) -> None:

@@ -83,7 +83,7 @@ def test_a_client_of_another_protocol_is_closed_and_not_heard(bench: Bench, begi
     assert bench.received == b""
     name = "{}:{}".format(*client.getsockname())
     assert bench.said == [
-        f"test port {bench.port.port}: {name} was closed: it begins with {begin[:16]!r}, unlike the protocol"
+        f"test port {bench.port.port}: {name} was closed: not of this protocol: {begin[:16]!r}"
     ]
     for one in [*bench.port.clients]:
         one.offer(b"to all that listen")
@@ -111,7 +111,7 @@ def test_a_client_that_writes_and_never_reads_is_closed_in_one_line(bench: Bench
             break
         bench.serve()
     assert len(bench.said) == 1
-    assert bench.said[0].endswith("does not read its answers and was closed")
+    assert bench.said[0].endswith(" was closed: it does not read its answers")
     other.sendall(b"M")
     bench.serve()
     assert other.recv(2000) == ANSWER
@@ -129,7 +129,7 @@ def test_one_client_more_replaces_the_one_silent_for_longest(bench: Bench) -> No
         bench.serve()
         assert client.recv(2000) == ANSWER
     assert len(bench.said) == 1
-    assert f"more than {CLIENTS_MAX} clients" in bench.said[0]
+    assert f"was closed: silent for longest of more than {CLIENTS_MAX} clients" in bench.said[0]
 
 
 def test_a_thousand_clients_are_reported_in_one_line_a_second(bench: Bench) -> None:
@@ -155,7 +155,7 @@ def test_a_client_without_a_free_descriptor_is_refused_and_the_next_one_is_serve
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
         assert is_closed(refused)
-    assert bench.said == [f"test port {bench.port.port}: a client was refused (Too many open files)"]
+    assert bench.said == [f"test port {bench.port.port}: a client was refused: Too many open files"]
     client = bench.connect()
     client.sendall(b"M")
     bench.serve()
