@@ -536,3 +536,30 @@ def test_a_planted_loan_is_caught() -> None:
     assert borrows("from test_firmware import Bench") == ["test_firmware.Bench"]
     assert borrows("import tests.hil.world.test_plant as plant") == ["tests.hil.world.test_plant"]
     assert borrows("from support.firmware_bench import FirmwareBench") == []
+
+
+LISTENERS = re.compile(r"create_server\(|bind_sockets\(|HTTPServer\b|\.Server\(|openpty\(|\"--bind\"")
+PORTS = re.compile(r"^(?:\w+, )?(?:\w+_)?PORT = .*?\b(\d{4,5})\b", re.MULTILINE)
+
+
+def listens(source: str) -> bool:
+    """Whether a file opens what others can connect to."""
+    return LISTENERS.search(source) is not None or ("import socket" in source and ".bind(" in source)
+
+
+def test_every_file_that_listens_and_every_port_is_in_the_table_of_who_can_connect() -> None:
+    page = (ROOT / "docs" / "explanation" / "security.md").read_text(encoding="utf-8")
+    rows = [
+        line for line in page.split("## Who can connect")[1].split("## ")[0].splitlines() if line[:1] == "|"
+    ]
+    read = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in sources()}
+    named = set(re.findall(r"`([\w/]+\.py)`", "".join(rows)))
+    assert named == {name for name, source in read.items() if listens(source)}
+    ports = {port for name, source in read.items() for port in PORTS.findall(source)}
+    assert len(ports) == 10
+    assert {port for port in ports if port not in "".join(rows)} == set()
+
+
+@pytest.mark.parametrize("source", ["import socket\nsocket.create_server(at)", "import socket\nown.bind(at)"])
+def test_a_planted_listener_is_found(source: str) -> None:
+    assert listens(source)
