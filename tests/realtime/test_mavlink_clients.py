@@ -29,7 +29,7 @@ def address(end: str) -> str:
     return {"pty": "pty", "udp": f"udp:{free_port()}", "tcp": "tcp:0"}[end]
 
 
-@pytest.fixture(params=["pty", "udp"])
+@pytest.fixture(params=["pty", "udp", "tcp"])
 def proxied(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Served, MavProxy]]:
     with serve("--mavlink", address(request.param)) as served:
         proxy = MavProxy(served.line("mavlink ")[0], tmp_path)
