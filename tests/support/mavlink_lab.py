@@ -41,7 +41,9 @@ class MavlinkLab:
 
     # The end of the line
 
-    def open(self, readers: Readers, received: Callable[[int, bytes], object]) -> "MavlinkLab":
+    def open(
+        self, readers: Readers, received: Callable[[int, bytes], object], say: Callable[[str], None]
+    ) -> "MavlinkLab":
         self._uplink = received
         return self
 
