@@ -24,10 +24,10 @@ def test_rows_of_a_served_robot_describe_its_look() -> None:
     assert len(look.outline) == len(own.outline) > 0
 
 
-def test_an_image_without_the_profiles_parameters_is_not_served() -> None:
+def test_an_image_of_an_unsupported_release_is_not_served() -> None:
     pytest.importorskip("unicorn")
     image = image_at(str(build(flags=("-g", '-DDEVICE_TYPE="CF21"'))), None)
-    with pytest.raises(LabError, match=r"^pilot.parameters.stabilizer.estimator: the image has no such"):
+    with pytest.raises(LabError, match=r"^--board: the image has no log variable supervisor.info"):
         Server(Service(load_config("crazyflie"), executor=image), lambda text: None)
 
 
