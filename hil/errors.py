@@ -34,6 +34,21 @@ def refusing(start: str, *kinds: type[Exception]) -> Iterator[None]:
 
 
 @contextmanager
+def reading(what: object) -> Iterator[None]:
+    """Turn what damaged content causes while a folder or file of somebody else is read into a `LabError`.
+
+    Errors of the operating system pass: they may concern what is written meanwhile.
+    """
+    try:
+        yield
+    except (LabError, OSError):
+        raise
+    except Exception as error:
+        text = " ".join(str(error).split())
+        raise LabError(f"{what}: damaged, or of another version ({type(error).__name__}: {text})") from error
+
+
+@contextmanager
 def writing(option: str, path: Path | None) -> Iterator[None]:
     """Turn an `OSError` while writing to an option's path into a `LabError` that names the option."""
     try:
