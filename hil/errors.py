@@ -57,6 +57,12 @@ def writing(option: str, path: Path | None) -> Iterator[None]:
         raise LabError(f"{option} {path}: cannot be written ({error.strerror or error})") from None
 
 
+def unlinked(path: Path) -> Path:
+    """Return a path whose file was deleted: in a folder of somebody else it could be a link to a file of the user."""
+    path.unlink(missing_ok=True)
+    return path
+
+
 def made_folder(option: str, path: Path) -> Path:
     """Make an option's folder if it is missing, and return it. Raises `LabError`."""
     with writing(option, path):

@@ -92,9 +92,8 @@ def app() -> None:
 
 def main() -> None:
     """Run the command line and exit with its code."""
-    os.environ["PYTHONSAFEPATH"] = (
-        "1"  # the Python processes that this one starts import nothing from the current folder
-    )
+    # The Python processes that this one starts import nothing from the current folder.
+    os.environ["PYTHONSAFEPATH"] = "1"
     gc.set_threshold(100_000, 20, 50)  # imports alone would cause 0.3 s of collections
     atexit.register(gc.freeze)  # Python's last collection would delay the prompt by 0.5 s
     if STALE:

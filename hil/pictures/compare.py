@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from hil.errors import LabError, writing
+from hil.errors import LabError, unlinked, writing
 from hil.experiments import find_shipped
 from hil.laboratory.metrics import METRICS, SHOWN, column, free_flight, is_real, measure, rows_where
 from hil.laboratory.recorder import load_log, release_of, stored_in
@@ -150,7 +150,7 @@ def write_comparison(
         ))  # fmt: skip
     with writing("--out", folder):
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / PICTURE).write_bytes(png(lambda: plot))
+        unlinked(folder / PICTURE).write_bytes(png(lambda: plot))
         return write_page(
             folder / PAGE, "compare.html.j2", a=a, b=b, comparison=comparison, why=why, figures=figures,
             zoomable=zoomable(figures),

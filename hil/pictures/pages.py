@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from youplot.vendor import uplot_css, uplot_js
 
 from firmware_py.kept_code import kept_folder, may_load
+from hil.errors import unlinked
 from hil.pictures.panels import Marks, Panel, Picture, Plot, Series, Signal, Still
 
 STRETCHES = 1500  # of a thinned line
@@ -59,7 +60,7 @@ def _environment() -> Environment:
 
 def write_page(path: Path, template: str, **content: Any) -> Path:
     """Write a template with its content and return the path."""
-    path.write_text(_environment().get_template(template).render(content), encoding="utf-8")
+    unlinked(path).write_text(_environment().get_template(template).render(content), encoding="utf-8")
     return path
 
 
@@ -73,7 +74,7 @@ def saved(folder: Path, name: str, title: str, caption: str, draw: Callable[[], 
     from hil.pictures.drawing import png
 
     content = png(draw)
-    (folder / f"{name}.png").write_bytes(content)
+    unlinked(folder / f"{name}.png").write_bytes(content)
     return PageFigure(name, title, caption, data_uri(content))
 
 

@@ -247,3 +247,24 @@ def test_the_line_that_was_being_written_is_no_damage(copy: Callable[[], Path]) 
     whole = load_events(run)
     cut(run / "events.jsonl")
     assert load_events(run) == whole[:-1]
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        ("report.html", ("report", "RUN")), ("compare.html", ("compare", "FLOWN", "RUN")),
+        ("compare.png", ("compare", "FLOWN", "RUN")), ("flight.csv", ("export", "RUN", "--csv")),
+        ("flight.mcap", ("export", "RUN", "--mcap")), ("flight.tlog", ("export", "RUN", "--tlog")),
+    ],
+)  # fmt: skip
+def test_a_link_in_a_run_folder_is_replaced_not_followed(
+    file: str, words: tuple[str, ...], flown: Path, copy: Callable[[], Path], tmp_path: Path
+) -> None:
+    mine = tmp_path / "mine"
+    mine.write_text("mine")
+    run = copy()
+    (run / file).symlink_to(mine)
+    command(*words)(run, flown)
+    assert mine.read_text() == "mine"
+    assert (run / file).is_file()
+    assert not (run / file).is_symlink()
