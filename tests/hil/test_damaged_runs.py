@@ -195,7 +195,11 @@ READERS: dict[str, Read] = {
     ("read", "examples"),
     [
         pytest.param(load_everything, 50, id="load_run"),
-        *(pytest.param(read, 40, id=name, marks=pytest.mark.long) for name, read in READERS.items()),
+        *(
+            # two plots by matplotlib per comparison
+            pytest.param(read, 8 if "compare" in name else 40, id=name, marks=pytest.mark.long)
+            for name, read in READERS.items()
+        ),
     ],
 )
 def test_a_damaged_run_is_read_or_refused_in_one_line(
