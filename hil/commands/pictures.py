@@ -24,7 +24,7 @@ def view(run: Path, at_s: float | None, target: str) -> None:
     from hil.live.recording import browse, show_at
     from hil.pictures.viewer.recording import recording_of
 
-    with reading(run):
+    with writing("RUN", run), reading(run):
         if target == "web":
             browse(run, at_s or 0.0, say)
         elif at_s is not None:
