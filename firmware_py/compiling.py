@@ -3,7 +3,7 @@
 Without fast maths LLVM neither reorders nor fuses, so every processor computes the same bits. A call on memory that does not
 move (`bound`) is kept as machine code, which a later process loads without numba: loading numba takes longer than a
 short flight. Every other call goes through numba's dispatcher and its own cache. Kept code is valid for the content of all
-sources, wherever it lies (`kept_folders`). Stale code is overwritten.
+sources; `firmware_py/kept_code.py` has its folders. Stale code is overwritten.
 """
 
 import ctypes
@@ -12,7 +12,8 @@ import inspect
 import os
 import struct
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache, cached_property, partial, update_wrapper
 from importlib.machinery import SourceFileLoader
 from importlib.util import find_spec
@@ -23,6 +24,8 @@ from typing import Any, ClassVar, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_py.kept_code import keep, kept_folder, may_load
+
 PLAIN = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 SUFFIX = ".machine"
 WHOLE = ("None", "bool", "int", "i32", "int32")  # what a bound function may return
@@ -32,6 +35,7 @@ FOREIGN = {"NRT_MemInfo_call_dtor": "abort", "numba_ldexp": "ldexp"} | {
 }
 METHOD = "kept_method"
 NO_ARGUMENTS = 4  # `METH_NOARGS`
+SHIPPED = ("firmware_py", "hil")
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 ctypes.pythonapi.PyCFunction_NewEx.restype = ctypes.py_object
@@ -53,10 +57,16 @@ def compiler(*sources: Path) -> Callable[[Function], Function]:
         stamp = shared.copy()
         # The kept code contains this name; own logic's has a hash of all its modules.
         stamp.update(function.__module__.encode())
-        stamp.update(Path(inspect.getfile(function)).read_bytes())
+        source = inspect.getfile(function)
+        stamp.update(_content(source, os.stat(source).st_mtime_ns))
         return cast(Function, Compiled(function, stamp.hexdigest()))
 
     return compiled
+
+
+@cache
+def _content(source: str, _changed_ns: int) -> bytes:
+    return Path(source).read_bytes()
 
 
 @cache
@@ -84,11 +94,19 @@ class Compiled:
         returned = function.__annotations__.get("return")
         self.whole = getattr(returned, "__name__", str(returned)) in WHOLE
 
+    @property
+    def folder(self) -> Path:
+        """The folder of its kept code: one per folder of ours, or per content of a user's file, which may be anywhere."""
+        shipped = self.__wrapped__.__module__.partition(".")[0] in SHIPPED
+        return kept_folder(
+            "numba", str(Path(inspect.getfile(self.__wrapped__)).parent) if shipped else self.stamp
+        )
+
     @cached_property
     def dispatcher(self) -> Any:
         """Numba's dispatcher, whose cache follows all sources; numba itself checks the function's file only."""
-        dispatcher = _numba().njit(cache=True, error_model="numpy", fastmath=False)(self.__wrapped__)
-        dispatcher._cache._cache_file._source_stamp = self.stamp
+        dispatcher = _numba().njit(error_model="numpy", fastmath=False)(self.__wrapped__)
+        _enable_cache(dispatcher, self.folder, self.stamp)
         return dispatcher
 
     @property
@@ -99,10 +117,10 @@ class Compiled:
         """Call the function through numba."""
         return self.dispatcher(*arguments)
 
-    def files(self, kinds: str = "*") -> list[Path]:
-        """Return the files of kept code for arguments of certain kinds, in each folder where it may lie."""
+    def file(self, kinds: str) -> Path:
+        """Return the file of kept code for arguments of certain kinds."""
         name = f"{self.__wrapped__.__module__}.{self.__name__}-{kinds}-{self.stamp[:24]}{SUFFIX}"
-        return [folder / name for folder in kept_folders(Path(inspect.getfile(self.__wrapped__)).parent)]
+        return self.folder / name
 
 
 def bound(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
@@ -125,33 +143,11 @@ def is_kept(function: Callable[..., Any]) -> bool:
     """Return whether a function has been compiled on this machine already."""
     if not isinstance(function, Compiled):
         return True
-    return any(next(path.parent.glob(path.name), None) for path in function.files())
+    return any(function.folder.glob(function.file("*").name))
 
 
 def _stays(argument: Any) -> bool:
     return isinstance(argument, np.void) or (isinstance(argument, np.ndarray) and argument.flags.c_contiguous)
-
-
-def kept_folders(sources: Path) -> list[Path]:
-    """Return where the compiled code of a folder may be kept, the first choice first: beside it, or the user's cache."""
-    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
-        return [Path(chosen)]
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    hashed = hashlib.sha256(str(sources).encode()).hexdigest()[:16]
-    return [sources / "__pycache__", home / "floaty" / hashed]
-
-
-def keep(files: list[Path], content: bytes) -> Path | None:
-    """Write the first of these files that can be written, which may be read meanwhile; None: no folder allows it."""
-    for path in files:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            partial_file = path.with_name(f"{path.name}.{os.getpid()}")
-            partial_file.write_bytes(content)
-            return partial_file.replace(path)
-        except OSError:
-            continue
-    return None
 
 
 class _Method(ctypes.Structure):
@@ -174,13 +170,14 @@ def _kept(function: Compiled, arguments: tuple[NDArray[Any], ...]) -> _Method | 
     digest = hashlib.sha256(f"{kinds} {_processor()}".encode()).hexdigest()[:16]
     key = (function.__wrapped__.__module__, function.__name__, digest)
     if key not in _LOADED:
-        files = function.files(digest)
-        content = next((path.read_bytes() for path in files if path.is_file()), b"")
+        path = function.file(digest)
+        content = path.read_bytes() if may_load(path) else b""
         if not content:
             content = _machine_code(function, arguments)
             if not content:
                 return None
-            if path := keep(files, content):
+            with suppress(OSError):
+                keep(path, content)
                 for older in path.parent.glob(f"{path.name.rsplit('-', 1)[0]}-*{SUFFIX}"):
                     if older != path:
                         older.unlink(missing_ok=True)
@@ -279,6 +276,50 @@ def _load(function: str, content: bytes) -> tuple[_Method, Any]:
     engine.add_object_file(binding.ObjectFileRef.from_data(content))
     engine.finalize_object()
     return _Method(function.encode(), engine.get_function_address(METHOD), NO_ARGUMENTS, None), engine
+
+
+def _enable_cache(dispatcher: Any, folder: Path, stamp: str) -> None:
+    """Let numba keep what a dispatcher compiles in a folder, and load from there."""
+    config = _numba().config
+    before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
+    try:
+        dispatcher.enable_caching()
+    finally:
+        config.CACHE_DIR = before
+    kept = dispatcher._cache
+    kept._cache_file = _kept_file()(kept.cache_path, kept._impl.filename_base, stamp)
+    if not Path(kept.cache_path).is_relative_to(
+        folder
+    ):  # numba prefers a folder beside the source to a full disk
+        kept.disable()
+
+
+@cache
+def _kept_file() -> Any:
+    """Return numba's class for the files of one function, with the checks of `kept_code`."""
+    _numba()
+    from numba.core.caching import IndexDataCacheFile
+
+    class KeptFile(IndexDataCacheFile):
+        def save(self, key: object, data: object) -> None:
+            with suppress(OSError):
+                super().save(key, data)  # type: ignore[no-untyped-call]
+
+        def _load_index(self) -> Any:
+            return super()._load_index() if may_load(Path(self._index_path)) else {}  # type: ignore[no-untyped-call]
+
+        def _load_data(self, name: str) -> Any:
+            if not may_load(Path(self._cache_path, name)):
+                raise FileNotFoundError(name)  # numba compiles it again
+            return super()._load_data(name)  # type: ignore[no-untyped-call]
+
+        @contextmanager
+        def _open_for_write(self, filepath: str) -> Iterator[Any]:
+            with super()._open_for_write(filepath) as file:
+                os.fchmod(file.fileno(), 0o600)
+                yield file
+
+    return KeptFile
 
 
 @cache

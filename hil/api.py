@@ -20,10 +20,10 @@ import pyarrow as pa
 from firmware_py.export.boards import PYTHON
 from ground_station import trajectory
 from hil.arguments import Known, checked
-from hil.config import DEFAULT_PROFILE
+from hil.config import DEFAULT_PROFILE, LabConfig
 from hil.demonstrations import Demonstrations, demonstrations_of
-from hil.errors import LabError
-from hil.experiments import find_again, find_experiment
+from hil.errors import LabError, reading
+from hil.experiments import check_flown, find_again, find_experiment, find_shipped, finder_of
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.fault_kinds import Kind, Knob, declare, knob
 from hil.laboratory.faults import Fault
@@ -32,7 +32,7 @@ from hil.laboratory.flight import Flight
 from hil.laboratory.folder import folder_of, reserved
 from hil.laboratory.lockstep import in_lockstep
 from hil.laboratory.metrics import METRICS, Metric, Verdict, column, free_flight, position_error
-from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.recorder import config_of, load_events, load_log
 from hil.laboratory.request import RADIO, Options, Request
 from hil.laboratory.result import Outcome, Result, read_result
 from hil.laboratory.run import MakeFlight
@@ -125,9 +125,19 @@ def maker_of(request: Request) -> MakeFlight:
 
 
 @checked
-def load_run(folder: Path | str) -> Run:
-    """Return an earlier run. Raises `LabError` when the folder has none."""
-    return Run(read_result(Path(folder), find_again))
+def load_run(folder: Path | str, experiment: Experiment | str | None = None) -> Run:
+    """Return an earlier run. Raises `LabError` when the folder has none.
+
+    Nothing of the folder is executed, and nothing that it names. An experiment of a file or package is therefore unknown
+    unless you give it: an `Experiment`, or its name or FILE.py:NAME, which is executed.
+    """
+    place = Path(folder)
+    if experiment is None:
+        return Run(read_result(place, find_shipped))
+    given = find_experiment(experiment) if isinstance(experiment, str) else experiment
+    run = Run(read_result(place, finder_of(given)))
+    check_flown(given, run.result)
+    return run
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,13 +148,18 @@ class Run:
 
     @property
     def request(self) -> Request:
-        """The request, equal to the flown one if its experiment is still known here."""
+        """The request, equal to the flown one if its experiment is known."""
         return self.result.request
 
     @property
     def experiment(self) -> Experiment | None:
-        """The experiment; None when it is no longer known here."""
+        """The experiment; None when it neither ships nor was given to `load_run`."""
         return self.request.experiment if self.request.experiment.is_known else None
+
+    @cached_property
+    def config(self) -> LabConfig:
+        """The configuration of the flight, from its log. Raises `LabError` for one of another version."""
+        return config_of(self.folder, self.log.schema.metadata)
 
     @property
     def folder(self) -> Path:
@@ -203,13 +218,14 @@ class Run:
 
     def to_dataset(self) -> Demonstrations:
         """Return the control law's data for imitation learning: observations (N, 20), actions (N, 4)."""
-        return demonstrations_of(self.log, self.request.config)
+        with reading(self.folder):
+            return demonstrations_of(self.log, self.config)
 
     @property
     def units(self) -> Mapping[str, str]:
         """The unit of every column of the log, empty for a pure number."""
-        fields = [self.log.schema.field(name) for name in self.log.column_names]
-        return Known("column", {field.name: field.metadata[b"unit"].decode() for field in fields})
+        with reading(self.folder):
+            return Known("column", {one.name: one.metadata[b"unit"].decode() for one in self.log.schema})
 
     @checked
     def unit_of(self, metric: str) -> str:
@@ -234,13 +250,20 @@ class Run:
         """
         from hil.pictures.drawing import plotted
 
-        return plotted(self.log, columns)
+        with reading(self.folder):
+            return plotted(self.log, columns)
 
     def write_report(self) -> Path:
-        """Write `report.html` with all figures, and return its path."""
-        from hil.pictures.report import write_report  # loads matplotlib
+        """Write `report.html` with all figures, and return its path.
 
-        return write_report(self.folder, self.experiment)
+        What needs the code of an unknown experiment is left out and reported on standard error.
+        """
+        from hil.pictures.report import not_executed, write_report  # loads matplotlib
+
+        if missing := not_executed(self.request.experiment, self.request.faults):
+            print(f"{self.folder}: {missing}", file=sys.stderr)
+        with reading(self.folder):
+            return write_report(self.folder, self.experiment)
 
     def __repr__(self) -> str:
         failed = "; ".join(map(str, self.result.failed))
@@ -261,9 +284,9 @@ class Run:
 
 @checked
 def command_of(request: Request) -> str | None:
-    """Return the command that repeats a flight bit for bit; None for an experiment that no command can name."""
+    """Return the command that repeats a flight bit for bit; None for an experiment that is unknown or without a name."""
     experiment = request.experiment
-    if find_again(experiment.name, experiment.source) != experiment:
+    if not experiment.is_known or find_again(experiment.name, experiment.source) != experiment:
         return None
     words = ["floaty", "fly", experiment.reference, "--seed", str(request.seed)]
     words += ["--duration", repr(request.duration_s)] if request.duration_s != experiment.duration_s else []

@@ -154,14 +154,31 @@ def profile_names() -> list[str]:
 
 
 def load_config(profile: str = DEFAULT_PROFILE, overrides: Iterable[str] = ()) -> LabConfig:
-    """Return the configuration of a profile (a shipped name, or a path) with `section.key=value` overrides."""
+    """Return the configuration of a profile that flies: as `read_config`, with the modules of `[logic]` executed."""
+    config = read_config(profile, overrides)
+    check_logic(config)
+    return config
+
+
+def check_logic(config: LabConfig) -> None:
+    """Execute the modules of `[logic]`. Raises `LabError` for one that cannot fly."""
+    try:
+        load_logic(config.logic)
+    except FirmwareError as error:
+        raise LabError(str(error)) from None
+
+
+def read_config(profile: str = DEFAULT_PROFILE, overrides: Iterable[str] = ()) -> LabConfig:
+    """Return the configuration of a profile (a shipped name, or a path) with `section.key=value` overrides.
+
+    Nothing that the profile names is executed.
+    """
     tree = _read_profile(profile, ())
     for override in overrides:
         _apply(tree, override)
     _locate_files(tree, Path.cwd())
     try:
         config = LabConfig.model_validate(tree)
-        load_logic(config.logic)
         check(config.geometry)
         check_hover(config.geometry, config.plant)
     except ValidationError as error:

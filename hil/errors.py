@@ -34,12 +34,33 @@ def refusing(start: str, *kinds: type[Exception]) -> Iterator[None]:
 
 
 @contextmanager
+def reading(what: object) -> Iterator[None]:
+    """Turn what damaged content causes while a folder or file of somebody else is read into a `LabError`.
+
+    Errors of the operating system pass: they may concern what is written meanwhile.
+    """
+    try:
+        yield
+    except (LabError, OSError):
+        raise
+    except Exception as error:
+        text = " ".join(str(error).split())
+        raise LabError(f"{what}: damaged, or of another version ({type(error).__name__}: {text})") from error
+
+
+@contextmanager
 def writing(option: str, path: Path | None) -> Iterator[None]:
     """Turn an `OSError` while writing to an option's path into a `LabError` that names the option."""
     try:
         yield
     except OSError as error:
         raise LabError(f"{option} {path}: cannot be written ({error.strerror or error})") from None
+
+
+def unlinked(path: Path) -> Path:
+    """Return a path whose file was deleted: in a folder of somebody else it could be a link to a file of the user."""
+    path.unlink(missing_ok=True)
+    return path
 
 
 def made_folder(option: str, path: Path) -> Path:

@@ -16,7 +16,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "firmware_py.wire": ("firmware_py.wire", "firmware_py.geometry", "firmware_py.elementary"),
     "firmware_py.geometry": ("firmware_py.elementary",),
     "firmware_py.elementary": (),
-    "firmware_py.compiling": (),
+    "firmware_py.compiling": ("firmware_py.kept_code",),
+    "firmware_py.kept_code": (),
     "firmware_py.extras": (),
     "firmware_py.fast": (),
     "firmware_py.section": (),
@@ -38,7 +39,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "firmware_py.config", "firmware_py.signals", "firmware_py.rtos",
         "firmware_py.wire", "firmware_py.geometry", "firmware_py.elementary", "firmware_py.compiling",
         "firmware_py.errors", "firmware_py.extras", "firmware_py.fast", "firmware_py.logic", "firmware_py.policy",
-        "firmware_py.section", "firmware_py.table",
+        "firmware_py.section", "firmware_py.table", "firmware_py.kept_code",
     ),
 }  # fmt: skip
 
@@ -121,6 +122,11 @@ CONFINED: dict[str, tuple[str, ...]] = {
     ),
     "select": ("ground_station/clock.py",),
     "selectors": ("ground_station/clock.py",),
+    "platformdirs": ("firmware_py/kept_code.py",),
+    "jinja2.FileSystemBytecodeCache": ("hil/pictures/pages.py",),
+    "pickle": (),  # loading one executes what it names
+    "marshal": (),
+    "shelve": (),
     "random": (),
     "secrets": (),
     "numpy.random.default_rng": ("hil/laboratory/robot.py", "hil/campaigns/sampling.py"),

@@ -1,6 +1,6 @@
 """Train a hover policy from scratch on the fast model, and write it as ONNX for `floaty policy`.
 
-    pip install "floaty-hil[learn]" stable-baselines3 torch onnx onnxscript
+    pip install -e ".[learn]" stable-baselines3 torch onnx onnxscript
     python tools/train_policy.py --out hover.onnx            # 6 minutes of processor time
     floaty policy hover.onnx --out mylaw && floaty fly hover --profile mylaw/profile.toml
 

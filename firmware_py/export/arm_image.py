@@ -1,7 +1,7 @@
 """The exported core as machine code of a Cortex-M4F, hard float, linked alone for the flash of an STM32F405.
 
 The compiler is the clang inside the package `ziglang`. An image that was already built from the same
-text, flags and compiler is taken from the build folder.
+text, flags and compiler is not built again.
 """
 
 from dataclasses import dataclass
@@ -31,20 +31,18 @@ class CoreImage:
     constants: frozenset[int]  # half words of `code` that are not instructions
 
 
-def build_image(source: str, header: str, folder: Path, optimisation: str = "-Os") -> CoreImage:
-    """Compile and link the core for size, like the Crazyflie's firmware; `folder` keeps it. Raises `ExportError`."""
+def build_image(source: str, header: str, optimisation: str = "-Os") -> CoreImage:
+    """Compile and link the core for size, like the Crazyflie's firmware. Raises `ExportError`."""
     texts = {"floaty_core.c": source, "floaty_core.h": header}
     texts.update({name: (SOURCES / name).read_text(encoding="utf-8") for name in ("rt.c", "flash.ld")})
     flags = (*TARGET_FLAGS, optimisation, "-fno-builtin", "-T", "flash.ld")
-    return read_image(
-        compile_texts(texts, ("floaty_core.c", "rt.c"), flags, "floaty_core.elf", folder, zig())
-    )
+    return read_image(compile_texts(texts, ("floaty_core.c", "rt.c"), flags, "floaty_core.elf", zig()))
 
 
-def build_meter(folder: Path) -> Path:
+def build_meter() -> Path:
     """Compile arm/meter.c into a library for this machine. Raises `ExportError`."""
     text = (SOURCES / "meter.c").read_text(encoding="utf-8")
-    return compile_texts({"meter.c": text}, ("meter.c",), HOST_FLAGS, "meter.so", folder, zig())
+    return compile_texts({"meter.c": text}, ("meter.c",), HOST_FLAGS, "meter.so", zig())
 
 
 def read_image(path: Path, alone: bool = True) -> CoreImage:

@@ -1,7 +1,6 @@
 """The boards that fly in the emulator, by what executes the flight core."""
 
 from functools import partial
-from pathlib import Path
 
 from firmware_py.config import LogicConfig
 from firmware_py.core_runner import PythonRunner, RunnerFactory
@@ -14,8 +13,8 @@ PYTHON, C, CORTEX_M4 = "python", "c", "cortex-m4"
 BOARDS = (PYTHON, C, CORTEX_M4)
 
 
-def runner_of(board: str, folder: Path, logic: LogicConfig) -> RunnerFactory:
-    """Return the runner of the core on a board; `folder` keeps compiled files.
+def runner_of(board: str, logic: LogicConfig) -> RunnerFactory:
+    """Return the runner of the core on a board, compiled if necessary.
 
     Raises `ExportError`, and `LogicError` as `load_logic` does.
     """
@@ -25,6 +24,6 @@ def runner_of(board: str, folder: Path, logic: LogicConfig) -> RunnerFactory:
         find_emulator()
     core = translation_of(logic)
     if board == C:
-        return partial(NativeRunner, library=build(core, folder))
-    image = build_image(core.source, core.header, folder)
-    return partial(CortexM4Runner, image=image, meter=build_meter(folder))
+        return partial(NativeRunner, library=build(core))
+    image = build_image(core.source, core.header)
+    return partial(CortexM4Runner, image=image, meter=build_meter())

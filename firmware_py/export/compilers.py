@@ -1,6 +1,5 @@
 """The C compilers of this machine, and their outputs, which are kept by a hash of all inputs."""
 
-import hashlib
 import importlib.util
 import os
 import shutil
@@ -15,6 +14,7 @@ from typing import Any
 
 from firmware_py.export.errors import ExportError
 from firmware_py.extras import install_command
+from firmware_py.kept_code import kept_folder, may_load
 
 SYSTEM_COMPILERS = ("gcc", "clang", "cc")
 HOST_FLAGS = (
@@ -61,35 +61,29 @@ def find_compiler(name: str = "") -> Compiler:
 
 
 def compile_texts(
-    texts: dict[str, str],
-    inputs: Sequence[str],
-    flags: Sequence[str],
-    output: str,
-    folder: Path,
-    compiler: Compiler,
+    texts: dict[str, str], inputs: Sequence[str], flags: Sequence[str], output: str, compiler: Compiler
 ) -> Path:
     """Compile texts in a separate folder, unless that was done before; return the path of the output.
 
     Raises `ExportError` with the compiler's first complaint.
     """
-    folder, command = folder.absolute(), (*compiler.command, *flags)
-    made_from = repr((compiler.version, sys.platform, command, sorted(texts.items()), inputs))
-    place = folder / hashlib.sha256(made_from.encode()).hexdigest()[:16]
+    command = (*compiler.command, *flags)
+    place = kept_folder("c", repr((compiler.version, sys.platform, command, sorted(texts.items()), inputs)))
     result = place / output
-    if result.is_file():
+    if may_load(result):
         return result
     partial = f"{output}.{os.getpid()}"  # another process may write it, too
     try:
-        place.mkdir(parents=True, exist_ok=True)
         for name, text in texts.items():
             (place / name).write_text(text, encoding="utf-8")
     except OSError as error:
         raise ExportError(f"{place}: cannot be written ({error.strerror or error})") from None
-    caches = {name: str(folder / "zig") for name in ("ZIG_LOCAL_CACHE_DIR", "ZIG_GLOBAL_CACHE_DIR")}
+    caches = {name: str(kept_folder("zig")) for name in ("ZIG_LOCAL_CACHE_DIR", "ZIG_GLOBAL_CACHE_DIR")}
     done = _run((*command, "-o", partial, *inputs), cwd=place, env=os.environ | caches)
     if done.returncode:
         complaints = [line for line in done.stderr.splitlines() if "error" in line]
         raise ExportError(f"{compiler.name}: {(complaints or [f'exit {done.returncode}'])[0]}")
+    (place / partial).chmod(0o700)
     (place / partial).replace(result)
     return result
 

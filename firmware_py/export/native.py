@@ -19,17 +19,16 @@ ZIG_FLAGS = ("-fno-sanitize=all",)  # zig checks for undefined behaviour by defa
 
 def build(
     translation: Translation,
-    folder: Path,
     optimisation: str = "-O2",
     compiler: Compiler | None = None,
     flags: tuple[str, ...] = (),
 ) -> Path:
-    """Return the shared library of the core; it is compiled unless the folder has it."""
+    """Return the shared library of the core; it is compiled unless it is kept."""
     compiler = compiler or find_compiler()
     no_traps = ZIG_FLAGS if compiler.name == "zig" else ()
     texts = {"floaty_core.h": translation.header, "floaty_core.c": translation.source}
     command = (optimisation, *FLAGS, *LIBRARY_FLAGS, *no_traps, *flags)
-    return compile_texts(texts, ("floaty_core.c",), command, "floaty_core.so", folder, compiler)
+    return compile_texts(texts, ("floaty_core.c",), command, "floaty_core.so", compiler)
 
 
 class NativeRunner:

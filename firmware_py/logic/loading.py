@@ -8,14 +8,12 @@ import difflib
 import hashlib
 import sys
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from firmware_py.compiling import keep, kept_folders
 from firmware_py.config import LogicConfig
 from firmware_py.core.budget import CALL_CYCLES, LoopBudget
 from firmware_py.core.guard import Guard
@@ -24,6 +22,7 @@ from firmware_py.errors import LogicError
 from firmware_py.export.c99 import Translation, core_texts, translate
 from firmware_py.export.reading import read_modules
 from firmware_py.export.syntax import OWN as PACKAGE
+from firmware_py.kept_code import keep, kept_folder
 from firmware_py.logic.budget import ARGUMENT, budgeted
 from firmware_py.logic.entry import GUARD, compose
 from firmware_py.logic.plugs import GROUP, POINTS, Plug, read_plug
@@ -199,7 +198,7 @@ def _execute(modules: tuple[tuple[str, str, str], ...], entry: str, package: str
             raise LogicError(f"{_shown(file)}: {type(error).__name__}: {error}") from error
         setattr(parent, f"own_{name}", module)
     stems = "_".join(Path(file).stem for _, file, _ in modules)
-    path = _written(Path(modules[0][1]).parent, f"floaty_entry_{stems}.py", entry)
+    path = _written(kept_folder("numba", package) / f"floaty_entry_{stems}.py", entry)
     return _run(f"{package}.entry", path, entry)
 
 
@@ -211,16 +210,15 @@ def _run(name: str, path: Path, text: str) -> ModuleType:
     return module  # type: ignore[no-any-return]
 
 
-def _written(folder: Path, name: str, text: str) -> Path:
-    """Write a text where compiled code of that folder is kept, if it is not there already; return its path."""
-    content, paths = text.encode(), [place / name for place in kept_folders(folder)]
-    for path in paths:
-        with suppress(OSError):
-            if path.read_bytes() == content:
-                return path
-    if path_written := keep(paths, content):
-        return path_written
-    raise LogicError(f"{' and '.join(str(path.parent) for path in paths)}: cannot be written")
+def _written(path: Path, text: str) -> Path:
+    """Write the text of a module, which numba reads, if it is not there already; return its path."""
+    content = text.encode()
+    try:
+        if not path.is_file() or path.read_bytes() != content:
+            keep(path, content)
+    except OSError as error:
+        raise LogicError(f"{path}: cannot be written ({error.strerror})") from None
+    return path
 
 
 def _shown(file: str) -> str:

@@ -5,7 +5,6 @@ which five cycles are added per line of 16 bytes: the emulator counts the waits 
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -48,15 +47,15 @@ class LawFigures:
         return f"{time}, {slot}; flash {self.flash_bytes} B, RAM {self.ram_bytes} B"
 
 
-def measure(config: FirmwareConfig, policy: Policy, build: Path) -> LawFigures:
-    """Call the law of a profile on states all over the flight envelope; `build` keeps compiled files.
+def measure(config: FirmwareConfig, policy: Policy) -> LawFigures:
+    """Call the law of a profile on states all over the flight envelope.
 
     Raises `ExportError` when the emulator or the compiler is missing.
     """
     find_emulator()
     core, flown = translate(), translation_of(config.logic)
-    default = build_image(core.source, core.header, build)
-    image, meter = build_image(flown.source, flown.header, build), build_meter(build)
+    default = build_image(core.source, core.header)
+    image, meter = build_image(flown.source, flown.header), build_meter()
     blocks = CoreBlocks(
         parameters_of(config), lambda blocks: CortexM4Runner(blocks, image, meter), load_logic(config.logic)
     )

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import click
 from rich.table import Table
 
-from hil.commands.options import PATH, console, right, say, wide_console
+from hil.commands.options import PATH, code_option, console, right, say, warn, wide_console
+from hil.errors import reading
 
 if TYPE_CHECKING:
     from hil.pictures.compare import Comparison
@@ -22,7 +23,8 @@ NAMED = 5  # columns that only one run has
 @click.option(
     "--out", type=PATH, metavar="DIR", help="For compare.png and compare.html [the second run's folder]."
 )
-def compare(first: Path, second: Path, out: Path | None) -> int:
+@code_option
+def compare(first: Path, second: Path, out: Path | None, named: str | None) -> int:
     """Compare one flight with another: first difference, metrics, settings, both in one plot.
 
     For flights that differ only in their boards: the first different servo count, and why. For two folders of such runs
@@ -30,20 +32,31 @@ def compare(first: Path, second: Path, out: Path | None) -> int:
 
     Exit code 0: the logs are identical; 1: they differ; 2: bad input.
     """
+    from hil.experiments import check_flown, find_experiment, find_shipped, finder_of
     from hil.pictures.compare import compare as compare_runs
     from hil.pictures.compare import load_flown, write_comparison
     from hil.studies.two_boards import comparable, seeds_of, two_boards
 
-    if all(folder.is_dir() and not any(folder.glob("log.*")) for folder in (first, second)):
-        return _print_seeds(first, second, seeds_of(first, second))
-    a, b = load_flown(first), load_flown(second)
-    comparison = compare_runs(a, b)
-    boards = two_boards(a, b) if comparable(a, b) else None
-    why = () if boards is None else (str(boards.first or "no servo count differs"), *boards.causes)
-    page = write_comparison(out or second, a, b, comparison, why)
-    _print_comparison(first, second, comparison)
+    given = None if named is None else find_experiment(named)
+    with reading(f"{first}, {second}"):
+        if all(folder.is_dir() and not any(folder.glob("log.*")) for folder in (first, second)):
+            return _print_seeds(first, second, seeds_of(first, second))
+        find = find_shipped if given is None else finder_of(given)
+        a, b = load_flown(first, find), load_flown(second, find)
+        if given is not None and a.result.request.experiment is not given:
+            check_flown(given, b.result)
+        comparison = compare_runs(a, b)
+        boards = two_boards(a, b) if comparable(a, b) else None
+        why = () if boards is None else (str(boards.first or "no servo count differs"), *boards.causes)
+        page = write_comparison(out or second, a, b, comparison, why)
+        _print_comparison(first, second, comparison)
     for line in why:
         say(line)
+    for reference in comparison.unmeasured:
+        command = f"--experiment {reference}"
+        warn(
+            f"without the own metrics of this span, which need the experiment's code: {command!r} executes it"
+        )
     say(f"  {page}")
     return 0 if comparison.identical else 1
 

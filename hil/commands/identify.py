@@ -10,7 +10,7 @@ from rich.table import Table
 
 from hil.commands import options as common
 from hil.commands.options import PATH, say, warn
-from hil.errors import LabError, made_folder, require, writing
+from hil.errors import LabError, made_folder, reading, require, writing
 
 if TYPE_CHECKING:
     from hil.design.margins import Margins
@@ -51,16 +51,17 @@ def identify(
     from hil.identify.robots import write_profile
 
     common.check_profile("--profile-out", profile_out)
-    profile = profile or profile_of(runs[0])
-    records = [load_record(run, profile) for run in runs]
-    held_out = None if validate is None else load_record(validate, profile)
-    if held_out is not None:
-        check_held_out(held_out, records)
-    found = identify_records(records)
-    _print_constants(found)
-    if found.excited or found.free:
-        with writing("--out", made_folder("--out", out)):
-            say(f"  {write_pages(out, found, held_out)}")
+    with reading(", ".join(map(str, (*runs, *filter(None, [validate]))))):
+        profile = profile or profile_of(runs[0])
+        records = [load_record(run, profile) for run in runs]
+        held_out = None if validate is None else load_record(validate, profile)
+        if held_out is not None:
+            check_held_out(held_out, records)
+        found = identify_records(records)
+        _print_constants(found)
+        if found.excited or found.free:
+            with writing("--out", made_folder("--out", out)):
+                say(f"  {write_pages(out, found, held_out)}")
     if profile_out is not None:
         if notice := write_profile(profile_out, profile, found):
             say(f"  {notice}")

@@ -56,7 +56,6 @@ def policy(file: Path, folder: Path) -> None:
     from firmware_py.policy.measuring import LawFigures, measure
     from firmware_py.policy.reading import LIBRARIES, read_policy
     from hil.config import load_config
-    from hil.laboratory.lockstep import BUILD
 
     if file.suffix in LIBRARIES:
         require(f"policy {file}", "policy", LIBRARIES[file.suffix])
@@ -72,7 +71,7 @@ def policy(file: Path, folder: Path) -> None:
             write_project(
                 "policy", POLICY_TEMPLATES, Path(scratch), **values, figures=LawFigures(0, 0, 0, 0.0)
             )
-            figures = measure(load_config(f"{scratch}/profile.toml"), network, BUILD)
+            figures = measure(load_config(f"{scratch}/profile.toml"), network)
         except (FirmwareError, LabError) as error:
             raise LabError(f"policy {file}: {str(error).replace(f'{scratch}/', '')}") from None
     if figures.share > ROOM:

@@ -55,6 +55,11 @@ def right(*headings: str) -> list[Column]:
     return [Column(heading, justify="right") for heading in headings]
 
 
+code_option = click.option(
+    "--experiment", "named", metavar="FILE.py:NAME",
+    help="Execute the code of the flown experiment, for its own picture, metrics and kinds of faults. Without this option "
+    "nothing is executed that a run folder names.",
+)  # fmt: skip
 run_folder = click.argument("run", metavar="RUN", type=PATH)
 seed_option = click.option(
     "--seed", type=click.IntRange(0, 2**62), default=1, show_default=True, help="Seed of all random numbers."

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import click
 
-from hil.commands.options import run_folder, say
-from hil.errors import LabError, writing
+from hil.commands.options import code_option, run_folder, say
+from hil.errors import LabError, reading, writing
 from hil.live.window import show
 
 
@@ -24,22 +24,24 @@ def view(run: Path, at_s: float | None, target: str) -> None:
     from hil.live.recording import browse, show_at
     from hil.pictures.viewer.recording import recording_of
 
-    if target == "web":
-        browse(run, at_s or 0.0, say)
-    elif at_s is not None:
-        show_at(run, at_s)
-    else:
-        show(str(recording_of(run)))
+    with writing("RUN", run), reading(run):
+        if target == "web":
+            browse(run, at_s or 0.0, say)
+        elif at_s is not None:
+            show_at(run, at_s)
+        else:
+            show(str(recording_of(run)))
 
 
 @click.command()
 @run_folder
-def report(run: Path) -> None:
+@code_option
+def report(run: Path, named: str | None) -> None:
     """Write the report of RUN, a run folder, again."""
-    from hil.pictures.report import write_report
+    from hil.api import load_run
 
-    with writing("RUN", run):
-        say(f"report  {write_report(run)}")
+    with writing("RUN", run), reading(run):
+        say(f"report  {load_run(run, named).write_report()}")
 
 
 @click.command()
@@ -64,5 +66,5 @@ def export(run: Path, as_csv: bool, as_mcap: bool, as_tlog: bool, as_video: bool
         raise LabError(f"export {run}: no format given: --csv, --mcap, --tlog, --video, --gif")
     for place in (place for place, chosen in wanted.items() if chosen):
         module, _, write = place.rpartition(".")
-        with writing("RUN", run):
+        with writing("RUN", run), reading(run):
             say(f"  {getattr(import_module(f'hil.{module}'), write)(run)}")

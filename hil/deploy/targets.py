@@ -17,7 +17,6 @@ from firmware_py.export.usage import EntryLoad
 from firmware_py.logic.loading import translation_of
 from hil.devices.real_core import RealCore, is_link, open_real_core
 from hil.errors import LabError
-from hil.laboratory.lockstep import BUILD
 
 PLAIN, C_O0, C_O2, CORTEX_M4 = TARGETS = ("plain", "c-O0", "c-O2", "cortex-m4")
 Loads = dict[str, EntryLoad]  # by entry point
@@ -100,12 +99,12 @@ class Toolbox:
             c = c if source is None else replace(c, source=source)
             for name in names:
                 if name in OPTIMISATION:
-                    library = build(c, BUILD, OPTIMISATION[name])
+                    library = build(c, OPTIMISATION[name])
                     self._native[name] = partial(NativeRunner, library=library)
                 elif name == CORTEX_M4:
                     find_emulator()
-                    self._image = read_image(elf, False) if elf else build_image(c.source, c.header, BUILD)
-                    self._meter = build_meter(BUILD)
+                    self._image = read_image(elf, False) if elf else build_image(c.source, c.header)
+                    self._meter = build_meter()
                     flash = None if elf else len(self._image.code)
                     self.machine_code = MachineCode(flash, EntryLoad())
         except ExportError as error:

@@ -112,9 +112,9 @@ class ChipImage:
     needs_polls: ClassVar[bool] = True
 
     @classmethod
-    def load(cls, path: Path, elf: Path | None, folder: Path, debugger: GdbServer | None = None) -> ChipImage:
-        """Read an image and compile the machine into a folder. Raises `LabError` and `ExportError`."""
-        return cls(Image(path, elf), build_machine(folder), debugger)
+    def load(cls, path: Path, elf: Path | None, debugger: GdbServer | None = None) -> ChipImage:
+        """Read an image and compile the machine. Raises `LabError` and `ExportError`."""
+        return cls(Image(path, elf), build_machine(), debugger)
 
     def wire_us(self, data: bytes) -> int:
         return 0  # the chip simulates its serial line itself

@@ -11,6 +11,8 @@ from hil.experiments.power import ENDURANCE, POWER
 from hil.experiments.take_off import TAKE_OFF_LANDING
 from hil.experiments.yaw import YAW_SINES, YAW_STEP, YAW_STEP_0
 from hil.laboratory.experiment import Experiment, Source
+from hil.laboratory.request import Find
+from hil.laboratory.result import Result
 
 EXPERIMENTS: dict[str, Experiment] = {
     experiment.name: experiment
@@ -20,7 +22,9 @@ EXPERIMENTS: dict[str, Experiment] = {
     )
 }  # fmt: skip
 
-__all__ = ["EXPERIMENTS", "Experiment", "find_again", "find_experiment"]
+__all__ = [
+    "EXPERIMENTS", "Experiment", "check_flown", "find_again", "find_experiment", "find_shipped", "finder_of",
+]  # fmt: skip
 
 
 def find_experiment(name: str) -> Experiment:
@@ -39,8 +43,25 @@ def find_experiment(name: str) -> Experiment:
     raise LabError(f"experiment {name!r}: unknown; {near}; one of your own is FILE.py:NAME")
 
 
+def find_shipped(name: str, source: Source | None) -> Experiment | None:
+    """Return the experiment of a run if it ships. None for one of a file or package: to read a run executes neither."""
+    return EXPERIMENTS.get(name) if source is None else None
+
+
+def finder_of(experiment: Experiment) -> Find:
+    """Return the function that finds an experiment that the user has named, and those that ship."""
+    return lambda name, source: experiment if name == experiment.name else find_shipped(name, source)
+
+
+def check_flown(experiment: Experiment, result: Result) -> None:
+    """Raise `LabError` when a run is a flight of another experiment than the one that the user has named."""
+    if result.request.experiment is not experiment:
+        name = result.request.experiment.name
+        raise LabError(f"experiment {experiment.name}: {result.folder} is a flight of {name}")
+
+
 def find_again(name: str, source: Source | None) -> Experiment | None:
-    """Return the experiment of a run; None when it is unknown here or has changed."""
+    """Return the experiment of a flight for another flight, which executes its file; None when unknown or changed."""
     if source is None:
         return EXPERIMENTS.get(name)
     try:

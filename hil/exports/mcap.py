@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from firmware_py.extras import install_command
 from firmware_py.geometry import from_euler_zyx, yaw_quaternion
-from hil.errors import LabError
+from hil.errors import LabError, unlinked
 from hil.laboratory.metrics import body, column, is_real, known
 from hil.laboratory.recorder import load_events, load_log, release_of
 
@@ -39,7 +39,7 @@ Place = tuple[tuple[float, ...], tuple[float, ...]]  # position [m], quaternion 
 def write_mcap(folder: Path) -> Path:
     """Write `flight.mcap` from the log and the texts of a run folder and return its path. Raises `LabError`."""
     log, events = load_log(folder), load_events(folder)
-    path = folder / FILE
+    path = unlinked(folder / FILE)
     context = foxglove.Context()
     with foxglove.open_mcap(path, allow_overwrite=True, context=context) as writer:
         writer.write_metadata("flight", _metadata(log))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from firmware_py.extras import install_command
-from hil.errors import LabError
+from hil.errors import LabError, unlinked
 from hil.laboratory.schedule import load_schedule, runs
 
 try:
@@ -24,7 +24,7 @@ NS_PER_US = 1000
 
 def write_perfetto(folder: Path) -> Path:
     """Write `flight.perfetto-trace` from the run's schedule and return its path."""
-    path = folder / FILE
+    path = unlinked(folder / FILE)
     with path.open("wb") as file:
         write_trace(load_schedule(folder), StreamingTraceProtoBuilder(file))
     return path

@@ -17,7 +17,7 @@ import pyarrow as pa
 from firmware_py.extras import install_command
 from firmware_py.geometry import rotate, wrap_angle, yaw_quaternion
 from firmware_py.wire.supervisor import State
-from hil.errors import LabError
+from hil.errors import LabError, unlinked
 from hil.laboratory.metrics import body, column, known
 from hil.laboratory.recorder import load_events, load_log
 
@@ -46,7 +46,7 @@ def write_tlog(folder: Path) -> Path:
         for message in services.status_text(INFO, event["text"], number)
     ]
     senders = {who: FrameSender(*who) for who in (BOARD, STATION)}
-    path = folder / FILE
+    path = unlinked(folder / FILE)
     with path.open("wb") as file:
         for us, who, message in sorted((*_flown(log), *texts), key=lambda sent: sent[0]):
             file.write(us.to_bytes(8, "big") + senders[who].encode(us, message))

@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import csv
 
+from hil.errors import unlinked
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_log, release_of
 
@@ -21,6 +22,6 @@ def write_csv(folder: Path) -> Path:
     titles = [f"{field.name} [{(field.metadata or {}).get(b'unit', b'').decode()}]" for field in log.schema]
     seconds = pa.array(np.round(1e-6 * (column(log, "t") - release_of(log.schema.metadata)), 6))
     table = log.rename_columns(titles).set_column(0, "time from the release [s]", seconds)
-    path = folder / FILE
+    path = unlinked(folder / FILE)
     csv.write_csv(table, path)
     return path

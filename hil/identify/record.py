@@ -11,14 +11,13 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from firmware_py.wire.supervisor import State
 from ground_station.telemetry_log import POSE_COLUMNS, TELEMETRY, TIME_COLUMN
-from hil.config import DEFAULT_PROFILE, LabConfig, load_config
+from hil.config import DEFAULT_PROFILE, LabConfig, read_config
 from hil.errors import LabError
 from hil.floaty.shape import MIX, SIGNS
-from hil.laboratory.recorder import load_log, release_of
+from hil.laboratory.recorder import config_of, load_log, release_of
 from hil.laboratory.result import read_result
 
 Array = NDArray[np.float64]
@@ -71,7 +70,7 @@ def load_record(path: Path, profile: str) -> Record:
     if not file.is_file():
         raise LabError(f"{path}: no {TELEMETRY} there; identify takes run folders and telemetry.csv")
     config, simulated, release_s = (
-        _flown_with(folder) if path.is_dir() else (load_config(profile), False, 0.0)
+        _flown_with(folder) if path.is_dir() else (read_config(profile), False, 0.0)
     )
     columns = _read(file)
     state = columns["supervisor.state []"]
@@ -149,14 +148,10 @@ def _flown_with(folder: Path) -> tuple[LabConfig, bool, float]:
     metadata = load_log(folder).schema.metadata or {}
     simulated = not read_result(folder).request.is_real
     try:
-        config = LabConfig.model_validate_json(metadata[b"config"])
-        return config, simulated, 1e-6 * release_of(metadata) if simulated else 0.0
-    except ValidationError as error:
-        key = ".".join(map(str, error.errors()[0]["loc"]))
-        raise LabError(
-            f"{folder}: flown by another version, whose configuration this one does not read ({key}); give its {TELEMETRY} "
-            "and --profile"
-        ) from None
+        config = config_of(folder, metadata)
+    except LabError as error:
+        raise LabError(f"{error}; give its {TELEMETRY} and --profile") from None
+    return config, simulated, 1e-6 * release_of(metadata) if simulated else 0.0
 
 
 def _limited(u: Array, config: LabConfig) -> tuple[Array, float]:

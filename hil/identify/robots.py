@@ -16,7 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 from scipy.stats import qmc
 
 from firmware_py.section import Section
-from hil.config import LabConfig, base_name, load_config
+from hil.config import LabConfig, base_name, read_config
 from hil.design.axes import AXES, DELAY, NUISANCES, robot_of
 from hil.errors import LabError, writing
 from hil.floaty.shape import MIX
@@ -81,7 +81,7 @@ def write_profile(path: Path, profile: str, found: Identification) -> str:
     lines += ["", *trim]
     with writing("--profile-out", path):
         path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
-        config = load_config(str(path))  # an invalid profile is an error now, not at the next flight
+        config = read_config(str(path))  # an invalid profile is an error now, not at the next flight
         _write_known(path, config, found, fitted.values[INPUT_TO_GYRO])
     return f"servo trim changed: {trim[1].partition('# ')[2]}" if trim else ""
 

@@ -18,6 +18,7 @@ from pyarrow import csv
 
 from ground_station.latency import STAGES, Stage, budget_of
 from ground_station.telemetry_log import AGE_COLUMNS, GOAL_COLUMNS, TELEMETRY, TIME_COLUMN
+from hil.errors import refusing
 from hil.laboratory.metrics import column, is_real
 
 # Column of the log: the computer's clock, used in a station's record.
@@ -98,9 +99,11 @@ def _read(telemetry: Path, titles: tuple[str, ...]) -> NDArray[np.float64]:
     types = dict.fromkeys(titles, pa.float64())
     convert = csv.ConvertOptions(include_columns=titles, column_types=types, include_missing_columns=True)
     parse = csv.ParseOptions(invalid_row_handler=lambda row: "skip")
-    read = csv.ReadOptions(use_threads=False)  # a thread that still has the handler aborts Python's exit
+    # A thread that still has the handler aborts Python's exit; bytes that are not UTF-8 would fail in it.
+    read = csv.ReadOptions(use_threads=False, encoding="latin-1")
     try:
-        table = csv.read_csv(telemetry, read, parse, convert)
+        with refusing(f"{telemetry}: ", IsADirectoryError, PermissionError), telemetry.open("rb") as file:
+            table = csv.read_csv(file, read, parse, convert)
     except (FileNotFoundError, pa.ArrowInvalid):  # no telemetry, not even a complete line
         return np.empty((0, len(titles)))
     columns = np.column_stack([table.column(title).to_numpy() for title in titles])

@@ -105,7 +105,14 @@ class Experiment:
     @property
     def is_known(self) -> bool:
         """Whether this is not a stand-in."""
-        return not isinstance(self.trajectory, Unknown)
+        return self.trajectory is not not_executed
+
+    def check_known(self) -> None:
+        """Raise `LabError` for a stand-in, which cannot be flown."""
+        if not self.is_known:
+            raise LabError(
+                f"experiment {self.name}: its code was not executed; load_run(folder, experiment=…) executes what you name"
+            )
 
     def measured(self, flight: pa.Table) -> Mapping[str, float]:
         """Return its own metrics, from the rows after the release. Raises `LabError` for invalid ones."""
@@ -151,17 +158,14 @@ class Experiment:
             ) from error
 
 
-@dataclass(frozen=True, slots=True)
-class Unknown:
-    """The trajectory of an experiment that is unknown here; calling it raises."""
-
-    name: str
-
-    def __call__(self, home: Goal, release_us: int) -> Trajectory:
-        """Raise `LabError`."""
-        raise LabError(f"experiment {self.name}: unknown here, or its file has changed since the flight")
+def not_executed(*_: object) -> Any:
+    """Raise `LabError`: the trajectory, and the picture, of an experiment whose code is not executed."""
+    raise LabError("the experiment's code was not executed")
 
 
-def unknown(name: str, source: Source | None) -> Experiment:
-    """Return the stand-in for an unknown experiment: it has a name, but cannot be flown."""
-    return Experiment(name, "", 1.0, {}, trajectory=Unknown(name), source=source)
+def unknown(
+    name: str, source: Source | None, pictures: tuple[str, ...] = (), draws: bool = False
+) -> Experiment:
+    """Return the stand-in for an experiment whose code is not executed: it has pictures, but cannot be flown."""
+    draw = not_executed if draws else None
+    return Experiment(name, "", 1.0, {}, trajectory=not_executed, pictures=pictures, draw=draw, source=source)

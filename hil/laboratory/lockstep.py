@@ -1,13 +1,11 @@
 """A flight in lockstep: radio or serial line are modelled, and the ground station shares the time line."""
 
-import os
 import shlex
 from collections.abc import Callable
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 
-from firmware_py.compiling import kept_folders
 from firmware_py.errors import FirmwareError
 from firmware_py.export.boards import runner_of
 from firmware_py.wire.telemetry import ALL_BLOCKS, CRAZYFLIE_BLOCKS
@@ -34,11 +32,8 @@ from hil.laboratory.laboratory import Laboratory
 from hil.laboratory.recorder import SETTINGS
 from hil.laboratory.request import MAVLINK, Request
 from hil.laboratory.robot import PYTHON_BOARD, Ports, Robot, Site
-from hil.stm32f405.chip import SOURCES
 from hil.stm32f405.gdb import GdbServer
 from hil.world.body import Channel
-
-BUILD = Path("runs/build")
 
 
 class ModelledLine:
@@ -188,23 +183,13 @@ def _executor(request: Request, stack: ExitStack) -> Executor:
     if bench.is_image:
         return image_at(bench.board, bench.elf, debugger(bench.gdb, bench.elf or Path(bench.board), stack))
     with refusing(f"--board {bench.board}: ", FirmwareError):
-        return PythonBoard(runner_of(bench.board, BUILD, request.config.logic))
+        return PythonBoard(runner_of(bench.board, request.config.logic))
 
 
 def image_at(board: str, elf: Path | None, debugger: GdbServer | None = None) -> ChipImage:
     """Return the image that `--board` and `--elf` name. Raises `LabError` if it cannot run here."""
     with refusing(f"--board {board}: ", FirmwareError):
-        return ChipImage.load(Path(board), elf, _folder_of_machines(), debugger)
-
-
-def _folder_of_machines() -> Path:
-    """Return where the emulated chip is compiled, once for all flights."""
-    for kept in kept_folders(SOURCES):
-        with suppress(OSError):
-            kept.mkdir(parents=True, exist_ok=True)
-        if os.access(kept, os.W_OK):
-            return kept
-    return BUILD
+        return ChipImage.load(Path(board), elf, debugger)
 
 
 def debugger(port: int | None, image: Path, stack: ExitStack) -> GdbServer | None:

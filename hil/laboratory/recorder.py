@@ -25,8 +25,10 @@ import pyarrow as pa
 import pyarrow.ipc
 import pyarrow.parquet
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
-from hil.errors import LabError
+from hil.config import LabConfig
+from hil.errors import LabError, refusing
 from hil.laboratory.ages import at_exposure
 from hil.world.body import Channel, Quantity
 
@@ -47,6 +49,9 @@ ROWS_SHOWN = 20  # given to the onlooker together: five times a second
 SETTINGS = "settings"  # source of the events about what an image took over and what it lacks
 MAPPED: WeakSet[mmap.mmap] = WeakSet()  # the files of long logs that are in use
 OPERATOR = "operator"  # source of the events that an operator caused at the terminal
+TIMES_US = 1 << 53  # of an event
+STORED = ("request", "program", "config", "look")  # in the metadata of a log, as JSON
+ARROW_ERRORS = (pa.ArrowException, ValueError, KeyError, TypeError, NotImplementedError, MemoryError)
 RELEASE_US = b"release_us"  # in the metadata of a log whose flight was released
 PARQUET, STREAM, EVENTS = "log.parquet", "log.arrows", "events.jsonl"
 
@@ -225,11 +230,11 @@ def log_pieces(folder: Path) -> Iterator[pa.Table]:
     if (folder / PARQUET).is_file():
         try:
             with pa.parquet.ParquetFile(folder / PARQUET, pre_buffer=False) as file:
-                yield file.schema_arrow.empty_table()
+                yield _checked(folder / PARQUET, file.schema_arrow).empty_table()
                 for number in range(file.num_row_groups):
                     yield file.read_row_group(number, use_threads=False)
-        except (pa.ArrowInvalid, OSError) as error:
-            raise LabError(f"{folder / PARQUET}: not a flight log ({error})") from None
+        except (*ARROW_ERRORS, OSError) as error:
+            raise LabError(f"{folder / PARQUET}: not a flight log ({_line(error)})") from None
     elif (folder / STREAM).is_file():
         yield from _read_stream(folder / STREAM)
     else:
@@ -238,10 +243,46 @@ def log_pieces(folder: Path) -> Iterator[pa.Table]:
         raise LabError(f"{folder}: no {PARQUET} or {STREAM} in it; expected a run folder")
 
 
+def _checked(path: Path, schema: pa.Schema) -> pa.Schema:
+    """Return the schema of a flight's log. Raises `LabError` for another one."""
+    with refusing(f"{path}: ", LabError):
+        for name in STORED:
+            stored_in(schema.metadata, name)
+        if RELEASE_US in (schema.metadata or {}) and not schema.metadata[RELEASE_US].strip(b"-").isdigit():
+            raise LabError(f"release_us = {schema.metadata[RELEASE_US]!r}: expected microseconds")
+    if "t" not in schema.names:
+        raise LabError(f"{path}: not a flight log (no column t)")
+    for field in schema:
+        kind = field.type
+        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
+            raise LabError(f"{path}: not a flight log ({field.name} is of type {kind}: expected numbers)")
+    return schema
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
 def stored_in(metadata: Mapping[bytes, bytes] | None, name: str) -> dict[str, Any]:
-    """Return what a log's metadata hold as JSON: `request`, `program` or `config`; empty for a log without."""
-    stored: dict[str, Any] = json.loads((metadata or {}).get(name.encode(), b"{}"))
+    """Return what a log's metadata hold as JSON: one of `STORED`; empty for a log without. Raises `LabError`."""
+    try:
+        stored = json.loads((metadata or {}).get(name.encode(), b"{}"))
+    except (ValueError, RecursionError) as error:
+        raise LabError(f"{name} in the log's schema: not JSON: {error}") from None
+    if not isinstance(stored, dict):
+        raise LabError(f"{name} in the log's schema: expected a table")
     return stored
+
+
+def config_of(folder: Path, metadata: Mapping[bytes, bytes] | None) -> LabConfig:
+    """Return the configuration of a flight from its log's metadata. Raises `LabError` for one of another version."""
+    try:
+        return LabConfig.model_validate(stored_in(metadata, "config"))
+    except ValidationError as error:
+        key = ".".join(map(str, error.errors()[0]["loc"]))
+        raise LabError(
+            f"{folder}: flown by another version, whose configuration this one does not read ({key})"
+        ) from None
 
 
 def release_of(metadata: Mapping[bytes, bytes] | None) -> int:
@@ -253,13 +294,24 @@ def release_of(metadata: Mapping[bytes, bytes] | None) -> int:
 
 
 def load_events(folder: Path) -> list[dict[str, Any]]:
-    """Return the texts of a run: dicts with `t_us`, `source` and `text`."""
+    """Return the texts of a run: dicts with `t_us`, `source` and `text`. Raises `LabError` for a line that is no event.
+
+    The last line may be incomplete: it was being written when the process died.
+    """
     path, events = folder / EVENTS, []
-    with suppress(
-        FileNotFoundError, json.JSONDecodeError
-    ):  # the line that was being written when the process died
-        for line in path.read_text(encoding="utf-8").splitlines():
-            events.append(json.loads(line))
+    with refusing(f"{path}: ", OSError):
+        lines = path.read_bytes().split(b"\n") if path.exists() else [b""]
+    for number, line in enumerate(lines[:-1], 1):
+        try:
+            event = json.loads(line)
+            if not (abs(int(event["t_us"])) < TIMES_US and isinstance(event["text"] + event["source"], str)):
+                raise ValueError
+            f"{event['text']}{event['source']}".encode()
+        except (ValueError, TypeError, KeyError, RecursionError):
+            raise LabError(
+                f"{path}:{number}: not an event: expected JSON with t_us, source and text"
+            ) from None
+        events.append(event)
     return events
 
 
@@ -279,15 +331,15 @@ def _read_stream(path: Path) -> Iterator[pa.Table]:
     try:
         # A mapped file would stay in memory.
         with pa.OSFile(str(path)) as file, pa.ipc.open_stream(file) as reader:
-            schema, batches = reader.schema, []
+            schema, batches = _checked(path, reader.schema), []
             real = "cameras.x" in schema.names
-            with suppress(StopIteration, pa.ArrowInvalid, OSError):  # the end, or where a process died
+            with suppress(StopIteration, *ARROW_ERRORS, OSError):  # the end, or where a process died
                 while True:
                     batches.append(reader.read_next_batch())
                     if len(batches) == BATCHES_PER_PIECE and not real:
                         yield pa.Table.from_batches(batches, schema)
                         batches = []
-    except pa.ArrowInvalid as error:
-        raise LabError(f"{path}: not a flight log ({error})") from error
+    except (*ARROW_ERRORS, OSError) as error:
+        raise LabError(f"{path}: not a flight log ({_line(error)})") from None
     table = pa.Table.from_batches(batches, schema)
     yield _with_release(at_exposure(table)) if real else table

@@ -28,7 +28,7 @@ from ground_station.links.crazyflie_link import FlightTimes, FromFloor
 from ground_station.links.schemes import SCHEMES
 from ground_station.trajectory import Goal, Trajectory
 from hil.arguments import checked
-from hil.config import DEFAULT_PROFILE, LabConfig, Overrides, load_config, settings_of
+from hil.config import DEFAULT_PROFILE, LabConfig, Overrides, check_logic, read_config, settings_of
 from hil.devices.real_core import is_link
 from hil.errors import LabError, require
 from hil.laboratory.experiment import Experiment, Source, unknown
@@ -134,12 +134,15 @@ class Named:
 
     experiment: str
     source: Source | None
+    pictures: tuple[str, ...] = ()
+    draws: bool = False  # it has a picture that its own code draws
 
 
 def _found(named: Named, info: ValidationInfo) -> Experiment:
     """Return the experiment of a stored request: found again, or its stand-in."""
     find: Find = info.context or unknown
-    return find(named.experiment, named.source) or unknown(named.experiment, named.source)
+    found = find(named.experiment, named.source)
+    return found or unknown(named.experiment, named.source, named.pictures, named.draws)
 
 
 def _by_name(_: object, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -190,6 +193,7 @@ class Request:
             raise LabError(
                 f"--duration {self.duration_s:g}: expected seconds, above 0 and up to {DURATION_MAX_S:g}"
             )
+        check_logic(self.config)
         own = len(self.experiment.settings)
         self.config.check_effect(f"experiment {self.experiment.name}: ", self.overrides[:own], self.profile)
         self.config.check_effect("--set ", self.overrides[own:], self.profile)
@@ -218,7 +222,7 @@ class Request:
     @cached_property
     def config(self) -> LabConfig:
         """The configuration of the flight. Raises `LabError` for an unknown profile or a wrong override."""
-        return load_config(self.profile, self.overrides)
+        return read_config(self.profile, self.overrides)
 
     @cached_property
     def planned_faults(self) -> tuple[Fault, ...]:
@@ -270,6 +274,7 @@ class Request:
         source, elf = self.experiment.source, self.bench.elf
         return {
             "experiment": self.experiment.name, "source": None if source is None else asdict(source),
+            "pictures": self.experiment.pictures, "draws": self.experiment.draw is not None,
             "profile": self.profile, "overrides": self.overrides, "seed": None if self.is_real else self.seed,
             "duration_s": self.duration_s, "faults": self.faults,
             **asdict(self.bench), "elf": None if elf is None else str(elf),

@@ -22,7 +22,7 @@ from ground_station.latency import Stage
 from hil.bodies import digest_of_body
 from hil.config import LabConfig
 from hil.devices.board_firmware import ImageReport
-from hil.errors import LabError
+from hil.errors import LabError, reading, refusing
 from hil.installation import commit, versions
 from hil.laboratory.ages import ages_of, reported_ages
 from hil.laboratory.experiment import unknown
@@ -168,16 +168,15 @@ def read_result(folder: Path, find: Find = unknown) -> Result:
     Raises `LabError` when the folder holds no run of this version.
     """
     path = folder / RESULT
-    try:
-        if not path.is_file():
+    with reading(folder), refusing(f"{folder}: ", OSError):
+        if not path.exists():
             return _of_killed(folder, find)
-        return _read(from_json(path.read_bytes()), folder, find)
-    except OSError as error:
-        raise LabError(f"{folder}: {error.strerror or error}") from None
-    except ValidationError as error:
-        raise LabError(f"{path}: {_first_of(error)}") from None
-    except ValueError as error:
-        raise LabError(f"{path}: invalid JSON: {error}") from None
+        try:
+            return _read(from_json(path.read_bytes()), folder, find)
+        except ValidationError as error:
+            raise LabError(f"{path}: {_first_of(error)}") from None
+        except ValueError as error:
+            raise LabError(f"{path}: invalid JSON: {error}") from None
 
 
 def _read(values: Any, folder: Path, find: Find) -> Result:

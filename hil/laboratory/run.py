@@ -15,6 +15,7 @@ from firmware_py.rtos import WatchdogError
 from ground_station.errors import LinkError
 from ground_station.telemetry_log import TELEMETRY
 from hil.clock import Pace
+from hil.config import check_logic
 from hil.laboratory.ages import with_goals_sent
 from hil.laboratory.flight import Flight
 from hil.laboratory.folder import replacing_older
@@ -53,6 +54,8 @@ def fly(
 
     `flight_of` assembles the flight. An error of the firmware ends in the outcome "error", Ctrl-C in "interrupted".
     """
+    request.experiment.check_known()  # a request from a run folder was not checked
+    check_logic(request.config)
     with ExitStack() as stack:
         stack.callback(gc.set_threshold, *gc.get_threshold())
         gc.set_threshold(*COLLECTIONS)

@@ -12,6 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from hil.devices.board_firmware import BoardScheduler
+from hil.errors import LabError
+from hil.laboratory.recorder import ARROW_ERRORS
 
 FILE = "schedule.parquet"
 WINDOW_US = 50_000
@@ -59,9 +61,14 @@ class ScheduleTrace:
 
 
 def load_schedule(folder: Path) -> pa.Table:
-    """Return a run's schedule; empty when it has none, as after a kill."""
+    """Return a run's schedule; empty when it has none, as after a kill. Raises `LabError` when it cannot be read."""
     path = folder / FILE
-    return pa.parquet.read_table(path) if path.is_file() else SCHEMA.empty_table()
+    if not path.exists():
+        return SCHEMA.empty_table()
+    try:
+        return pa.parquet.read_table(path, partitioning=None).cast(SCHEMA)
+    except (*ARROW_ERRORS, OSError) as error:
+        raise LabError(f"{path}: not a schedule ({' '.join(str(error).split())})") from None
 
 
 def runs(schedule: pa.Table) -> Iterator[Turn]:

@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from hil.errors import LabError, writing
-from hil.experiments import find_again
+from hil.errors import LabError, unlinked, writing
+from hil.experiments import find_shipped
 from hil.laboratory.metrics import METRICS, SHOWN, column, free_flight, is_real, measure, rows_where
 from hil.laboratory.recorder import load_log, release_of, stored_in
+from hil.laboratory.request import Find
 from hil.laboratory.result import Result, read_result
 from hil.pictures import curves
 from hil.pictures.curves import since_release
@@ -91,6 +92,8 @@ class Comparison:
     apart: tuple[Apart, ...]
     one_is_real: bool  # and the other is not
     settings: tuple[tuple[str, str, str], ...]  # name, first, second: those that differ
+    # Experiments whose own metrics are missing, because the span is not that of the flight and their code not executed.
+    unmeasured: tuple[str, ...]
 
     @property
     def identical(self) -> bool:
@@ -98,9 +101,9 @@ class Comparison:
         return self.first is None and self.missing == ((), ())
 
 
-def load_flown(folder: Path) -> FlownRun:
-    """Return the log and result of a run folder. Raises `LabError` when it cannot be read."""
-    run = FlownRun(load_log(folder), read_result(folder, find_again))
+def load_flown(folder: Path, find: Find = find_shipped) -> FlownRun:
+    """Return the log and result of a run folder; `find` returns its experiment. Raises `LabError` if it cannot be read."""
+    run = FlownRun(load_log(folder), read_result(folder, find))
     if "flight.free" not in run.log.column_names:
         raise LabError(f"{folder}: its log is not that of a flight")
     return run
@@ -121,6 +124,7 @@ def compare(a: FlownRun, b: FlownRun) -> Comparison:
         tuple(_apart(a.log, b.log)),
         is_real(a.log) != is_real(b.log),
         tuple(_differing_settings(a, b)),
+        tuple(filter(None, dict.fromkeys(_unmeasured(run, min(flown_s)) for run in (a, b)))),
     )
 
 
@@ -146,7 +150,7 @@ def write_comparison(
         ))  # fmt: skip
     with writing("--out", folder):
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / PICTURE).write_bytes(png(lambda: plot))
+        unlinked(folder / PICTURE).write_bytes(png(lambda: plot))
         return write_page(
             folder / PAGE, "compare.html.j2", a=a, b=b, comparison=comparison, why=why, figures=figures,
             zoomable=zoomable(figures),
@@ -256,9 +260,20 @@ def _span(first_s: float, second_s: float) -> str:
     )
 
 
+def _is_longer(run: FlownRun, end_s: float) -> bool:
+    return _flown_s(run) >= end_s + ROW_S
+
+
+def _unmeasured(run: FlownRun, end_s: float) -> str:
+    """Return the experiment of a run whose own metrics over its first `end_s` need code that is not executed; or empty."""
+    experiment = run.result.request.experiment
+    needs_code = bool(run.result.own_metrics) and _is_longer(run, end_s)
+    return experiment.reference if needs_code and not experiment.is_known else ""
+
+
 def _up_to(run: FlownRun, end_s: float) -> Result:
     """Return the result of a flight with the metrics of its first `end_s` after the release."""
-    if _flown_s(run) < end_s + ROW_S:
+    if not _is_longer(run, end_s):
         return run.result
     log = rows_where(run.log, since_release(run.log) < end_s + ROW_S / 2)
     metrics = measure(log, lost=False)

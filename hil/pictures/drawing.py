@@ -33,6 +33,7 @@ STYLE: Any = {
     "legend.fontsize": 8.0,
     "legend.frameon": False,
     "lines.linewidth": 0.9,
+    "text.usetex": False,  # a matplotlibrc in the current folder could otherwise have LaTeX executed
 }
 
 

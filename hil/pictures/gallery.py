@@ -97,7 +97,9 @@ GALLERY: dict[str, Picture] = {
 
 
 def pictures_of(experiment: Experiment) -> tuple[Picture, ...]:
-    """Return an experiment's own pictures. Raises `LabError` for an unknown name."""
+    """Return an experiment's own pictures, of a stand-in those that need no code. Raises `LabError` for an unknown name."""
+    if not experiment.is_known:
+        return tuple(GALLERY[name] for name in experiment.pictures if name in GALLERY)
     if unknown := [name for name in experiment.pictures if name not in GALLERY]:
         raise LabError(
             f"experiment {experiment.name}: picture {unknown[0]!r}: there are {', '.join(GALLERY)}"

@@ -8,24 +8,23 @@ youplot), whose script is embedded once per file. A panel's curves are thinned t
 import base64
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from jinja2 import Environment, FileSystemBytecodeCache, FileSystemLoader, StrictUndefined
+from jinja2.bccache import Bucket
 from numpy.typing import NDArray
 from youplot.vendor import uplot_css, uplot_js
 
+from firmware_py.kept_code import kept_folder, may_load
+from hil.errors import unlinked
 from hil.pictures.panels import Marks, Panel, Picture, Plot, Series, Signal, Still
 
 STRETCHES = 1500  # of a thinned line
 NOTHING = Marks()
-_ENVIRONMENT = Environment(
-    loader=FileSystemLoader(Path(__file__).parent / "templates"),
-    bytecode_cache=FileSystemBytecodeCache(),  # compiling them takes as long as filling them
-    autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,9 +41,26 @@ class PageFigure:
     folded: bool = False
 
 
+class _KeptTemplates(FileSystemBytecodeCache):
+    """Templates as bytecode: compiling them takes as long as filling them."""
+
+    def load_bytecode(self, bucket: Bucket) -> None:
+        if may_load(Path(self._get_cache_filename(bucket))):
+            super().load_bytecode(bucket)
+
+
+@cache
+def _environment() -> Environment:
+    return Environment(
+        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        bytecode_cache=_KeptTemplates(str(kept_folder("pages"))),
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+
+
 def write_page(path: Path, template: str, **content: Any) -> Path:
     """Write a template with its content and return the path."""
-    path.write_text(_ENVIRONMENT.get_template(template).render(content), encoding="utf-8")
+    unlinked(path).write_text(_environment().get_template(template).render(content), encoding="utf-8")
     return path
 
 
@@ -58,7 +74,7 @@ def saved(folder: Path, name: str, title: str, caption: str, draw: Callable[[], 
     from hil.pictures.drawing import png
 
     content = png(draw)
-    (folder / f"{name}.png").write_bytes(content)
+    unlinked(folder / f"{name}.png").write_bytes(content)
     return PageFigure(name, title, caption, data_uri(content))
 
 

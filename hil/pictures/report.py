@@ -13,7 +13,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from firmware_py.rtos.statistics import LATENCY_BOUNDS_US
-from hil.experiments import find_again
+from hil.experiments import find_shipped
 from hil.laboratory.ages import ages_in_time_of
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.fault_kinds import KINDS
@@ -59,9 +59,9 @@ class FaultRow:
 def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     """Write `report.html` into a run folder and return its path. Raises `LabError` when the folder holds no log.
 
-    `experiment` is the one flown; by default it is found from the run's reference.
+    `experiment` is the one flown. Without it, one of a file or package is not executed: see `not_executed`.
     """
-    result, events = read_result(folder, find_again), load_events(folder)
+    result, events = read_result(folder, find_shipped), load_events(folder)
     log = with_marks(load_log(folder), events)
     experiment, release_us = experiment or result.request.experiment, release_of(log.schema.metadata)
     marks = marks_of_flight(log, result.cause or "lost" if result.outcome == "lost" else None)
@@ -72,7 +72,7 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
         folder / REPORT,
         "report.html.j2",
         result=result,
-        found=experiment.is_known,
+        missing=not_executed(experiment, result.request.faults),
         rows=metric_rows(result),
         faults=fault_rows(spans_of(log.schema.metadata)),
         events=events,
@@ -89,6 +89,19 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
         log_rows=log.num_rows,
         config=json.dumps(stored_in(log.schema.metadata, "config"), indent=2),
     )
+
+
+def not_executed(experiment: Experiment, faults: Iterable[str]) -> str:
+    """Return what a report lacks because the experiment's code was not executed, as one line; empty: nothing."""
+    if experiment.is_known:
+        return ""
+    own = sorted({text.partition("@")[0] for text in faults} - KINDS.keys())
+    lacking = ["its own picture"] * (experiment.draw is not None)
+    lacking += [f"its own kinds of faults ({', '.join(own)})"] * bool(own)
+    if not lacking:
+        return ""
+    command = f"--experiment {experiment.reference}"
+    return f"without {' and '.join(lacking)}, which need the experiment's code: {command!r} executes it"
 
 
 def _answers(

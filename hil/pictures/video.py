@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw
 
 from firmware_py.extras import install_command
 from firmware_py.geometry import yaw_quaternion
-from hil.errors import LabError, writing
+from hil.errors import LabError, unlinked, writing
 from hil.laboratory.metrics import BOX, body, column, free_flight, known
 from hil.laboratory.recorder import load_log, stored_in
 from hil.pictures import curves, scene
@@ -48,7 +48,7 @@ def write_video(run: Path) -> Path:
     except ImportError as error:
         raise LabError(f"no video without its package ({error}): {install_command('export')}") from None
     path, pictures = run / VIDEO, frames(load_log(run))
-    with writing("--video", path), av.open(str(path), "w") as file:
+    with writing("--video", path), av.open(str(unlinked(path)), "w") as file:
         first = next(pictures)
         stream = file.add_stream("h264", rate=FRAMES_HZ, options={"crf": "22"})
         stream.width, stream.height, stream.pix_fmt = *first.size, "yuv420p"
@@ -72,7 +72,7 @@ def write_gif(run: Path) -> Path:
     first, *rest = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in frames(log))
     lengths = [length for length, _ in zip(cycle(GIF_MS), range(count), strict=False)]
     with writing("--gif", path):
-        first.save(path, save_all=True, append_images=rest, duration=lengths, loop=0, optimize=True)
+        first.save(unlinked(path), save_all=True, append_images=rest, duration=lengths, loop=0, optimize=True)
     return path
 
 

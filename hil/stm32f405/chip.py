@@ -54,13 +54,13 @@ class Why(IntEnum):
     DEVICE = 4096  # a device was written to that acts on it
 
 
-def build_machine(folder: Path) -> Path:
-    """Compile `native/` for this machine into `folder`. Raises `ExportError`, also when a chip lacks a package."""
+def build_machine() -> Path:
+    """Return the library of `native/`, compiled for this machine. Raises `ExportError`, also when a chip lacks a package."""
     find_emulator()
     declared()
     texts = {path.name: path.read_text(encoding="utf-8") for path in sorted(SOURCES.glob("*.[ch]"))}
     return compile_texts(
-        texts, [name for name in texts if name.endswith(".c")], HOST_FLAGS, "machine.so", folder, zig()
+        texts, [name for name in texts if name.endswith(".c")], HOST_FLAGS, "machine.so", zig()
     )
 
 

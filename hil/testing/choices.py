@@ -14,7 +14,6 @@ from firmware_py.export.boards import BOARDS, PYTHON, runner_of
 from firmware_py.export.errors import ExportError
 from hil.config import DEFAULT_PROFILE
 from hil.errors import LabError, hint
-from hil.laboratory.lockstep import BUILD
 from hil.laboratory.request import LOCKSTEP, RADIO, Options
 
 PACKAGES = {"mavlink": "pymavlink", "radio": "cflib"}  # capabilities that a package provides
@@ -109,7 +108,7 @@ def why_not(choice: Options, needs: Iterable[str]) -> str:
 def why_no_board(board: str) -> str:
     """Return why a board is not available on this machine, empty when it is."""
     try:
-        runner_of(board, BUILD, LogicConfig())
+        runner_of(board, LogicConfig())
     except ExportError as error:
         return f"board {board} is not available here: {error}"
     return ""

@@ -16,7 +16,6 @@ from hil.arguments import checked
 from hil.config import Overrides, load_config, settings_of
 from hil.errors import LabError
 from hil.laboratory.experiment import Experiment
-from hil.laboratory.lockstep import BUILD
 from hil.laboratory.request import MAVLINK, RADIO, Options, Request
 from hil.testing.board import BareBoard
 from hil.testing.choices import why_no_board
@@ -111,7 +110,7 @@ class Flights:
             raise LabError(f"board: link {link!r}: expected {RADIO} or {MAVLINK}")
         self._need(self.target)
         config = load_config(self._placed(profile or self.profile), settings_of(overrides))
-        return BareBoard(config, runner_of(self.target, BUILD, config.logic), link == MAVLINK)
+        return BareBoard(config, runner_of(self.target, config.logic), link == MAVLINK)
 
     def _need(self, board: str) -> None:
         if board in BOARDS and (reason := why_no_board(board)):

@@ -20,7 +20,7 @@ from hil.devices.real_firmware import RealBoard
 from hil.events import EventQueue
 from support.app_air import AppAir
 from support.crazyflie_app import App
-from support.stm32_firmware import BUILD, build
+from support.stm32_firmware import build
 
 CONFIG = load_config()
 SAMPLE_US = 1_000
@@ -44,7 +44,7 @@ def image() -> Executor:
     pytest.importorskip("cffi")
     from hil.devices.image_firmware import ChipImage
 
-    return ChipImage.load(build(), None, BUILD)
+    return ChipImage.load(build(), None)
 
 
 @pytest.fixture(params=["python", "image", "real"])

@@ -10,7 +10,6 @@ from firmware_py.export.boards import BOARDS, runner_of
 from firmware_py.export.plain import PlainRunner
 from hil.config import load_config
 from support.core_streams import Recording, blocks_of, fill, record_wild, run_step
-from support.paths import ROOT
 
 PLAIN = "plain"
 RECORDING = 25  # ticks
@@ -26,7 +25,7 @@ def runner(request: pytest.FixtureRequest) -> RunnerFactory:
     """What makes a runner of each kind."""
     if request.param == PLAIN:
         return PlainRunner
-    return runner_of(request.param, ROOT / "runs" / "build", LogicConfig())
+    return runner_of(request.param, LogicConfig())
 
 
 def core_at_start(recording: Recording, runner: RunnerFactory) -> CoreBlocks:

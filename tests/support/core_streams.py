@@ -22,10 +22,8 @@ from hil.config import load_config
 from hil.experiments.position import HOVER
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
-from support.paths import ROOT
 
 CONFIG = load_config()
-BUILD = ROOT / "runs" / "build" / "core"
 # Calls with arbitrary bits in what the tasks write, and their shares; sums of samples would overflow.
 WILD = {
     "reset": 0.02, "file_pose": 0.24, "estimate": 0.3, "control": 0.22, "begin_step": 0.06, "supervise": 0.06,

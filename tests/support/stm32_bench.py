@@ -8,7 +8,6 @@ pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
 from hil.stm32f405.chip import CYCLES_PER_US, FLASH, RAM, Chip, Why, build_machine
-from support.stm32_firmware import BUILD
 
 SLEEP = bytes.fromhex("30bffde7")  # wfi; b to it
 PENDING = 0xE000_E200  # of the interrupts, NVIC_ISPR
@@ -19,7 +18,7 @@ class Bench:
 
     def __init__(self, code: bytes = b"") -> None:
         code = pack("<II", RAM + 0x1000, (FLASH + 8) | 1) + code + SLEEP
-        self.chip = Chip(code, FLASH, build_machine(BUILD))
+        self.chip = Chip(code, FLASH, build_machine())
         self.us = 0
 
     def __getitem__(self, address: int) -> int:

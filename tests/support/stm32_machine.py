@@ -12,7 +12,7 @@ from hil.stm32f405.chip import CYCLES_PER_US, Chip, Why, build_machine
 from hil.stm32f405.freertos import FreeRtos
 from hil.stm32f405.image import Image
 from hil.stm32f405.processor import ChipProcessor
-from support.stm32_firmware import BUILD, build
+from support.stm32_firmware import build
 
 
 class FirmwareOnChip:
@@ -20,7 +20,7 @@ class FirmwareOnChip:
 
     def __init__(self, compiler: str = "clang", **variables: int) -> None:
         self.image = Image(build(compiler))
-        self.chip = Chip(self.image.code, self.image.base, build_machine(BUILD))
+        self.chip = Chip(self.image.code, self.image.base, build_machine())
         self.eeprom = np.full(8192, 0xFF, np.uint8)
         self.chip.add_device(1, 0x50, self.eeprom, 2)
         for name, value in variables.items():

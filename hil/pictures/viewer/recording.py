@@ -13,7 +13,7 @@ import pyarrow as pa
 import rerun as rr
 from rerun_bindings import CatalogClientInternal
 
-from hil.errors import LabError
+from hil.errors import LabError, unlinked
 from hil.laboratory.ages import ages_in_time_of
 from hil.laboratory.recorder import OPERATOR, load_events, log_pieces, stored_in
 from hil.laboratory.schedule import load_schedule
@@ -99,7 +99,7 @@ def write_rrd(
     ages: pa.Table | None = None,
 ) -> None:
     """Write a flight log (in pieces, metadata in their schema), its texts, schedule and ages of poses as a rerun file."""
-    partial = path.with_name(path.name + ".partial")
+    partial = unlinked(path.with_name(path.name + ".partial"))
     recording = rr.RecordingStream(APPLICATION)
     begin = next(pieces)
     recording.save(partial, default_blueprint=blueprint(begin.schema))

@@ -23,9 +23,7 @@ from firmware_py.export.elf import FLASH
 from firmware_py.export.errors import ExportError
 from firmware_py.export.usage import CLOCK_MHZ
 from hil.config import load_config
-from support.paths import ROOT
 
-BUILD = ROOT / "runs" / "build"
 CONFIG = load_config()
 CACHE_LINES, LINE, WAIT_STATES, REFILL = 64, 16, 5, 3  # STM32F405 at 168 MHz, Cortex-M4
 
@@ -53,12 +51,12 @@ def core() -> Translation:
 
 @pytest.fixture(scope="module")
 def image(core: Translation) -> CoreImage:
-    return build_image(core.source, core.header, BUILD)
+    return build_image(core.source, core.header)
 
 
 @pytest.fixture(scope="module")
 def optimised(core: Translation) -> CoreImage:
-    return build_image(core.source, core.header, BUILD, "-O2")
+    return build_image(core.source, core.header, "-O2")
 
 
 @dataclass(frozen=True)
@@ -102,7 +100,7 @@ def cycles_of(name: str, operands: str) -> int:
 
 
 def runner_of(image: CoreImage) -> Callable[[CoreBlocks], CoreRunner]:
-    return lambda blocks: CortexM4Runner(blocks, image, build_meter(BUILD))
+    return lambda blocks: CortexM4Runner(blocks, image, build_meter())
 
 
 def started(image: CoreImage) -> tuple[CoreBlocks, CortexM4Runner]:
@@ -259,10 +257,10 @@ def test_the_core_leaves_room_on_the_board(image: CoreImage) -> None:
 )
 def test_code_that_is_no_core_fails(core: Translation, change: Callable[[str], str], refused: str) -> None:
     with pytest.raises(ExportError, match=refused) as error:
-        build_image(change(core.source), core.header, BUILD)
+        build_image(change(core.source), core.header)
     assert "\n" not in str(error.value)
 
 
 def test_a_build_is_reused(core: Translation, image: CoreImage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("firmware_py.export.compilers.subprocess", None)
-    assert build_image(core.source, core.header, BUILD) == image
+    assert build_image(core.source, core.header) == image

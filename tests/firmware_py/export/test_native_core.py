@@ -18,7 +18,6 @@ from firmware_py.export.errors import ExportError
 from firmware_py.export.native import build
 from support import core_streams
 from support.core_streams import (
-    BUILD,
     Recording,
     first_difference,
     record_flight,
@@ -59,7 +58,7 @@ def plausible() -> Recording:
 def test_c_gives_the_bits_of_python_in_every_call_of_a_flight_and_on_arbitrary_bits(
     compiler: Compiler, optimisation: str, flight: Recording, plausible: Recording, wild: Recording
 ) -> None:
-    library = build(C, BUILD, optimisation, compiler)
+    library = build(C, optimisation, compiler)
     assert len(flight.steps) > 1500
     assert first_difference(flight, library) is None
     assert first_difference(plausible, library) is None
@@ -71,13 +70,10 @@ def test_c_gives_the_bits_of_python_in_every_call_of_a_flight_and_on_arbitrary_b
 @pytest.mark.long
 def test_the_file_itself_forbids_fused_multiplications(flight: Recording) -> None:
     fusing = ("-std=gnu11", "-mfma", "-ffp-contract=fast")
-    assert first_difference(flight, build(C, BUILD, "-O2", GCC, fusing)) is None
+    assert first_difference(flight, build(C, "-O2", GCC, fusing)) is None
     free = C.source.replace('#pragma GCC optimize("fp-contract=off")', "")
     assert free != C.source
-    assert (
-        first_difference(flight, build(Translation(C.header, free, ()), BUILD, "-O2", GCC, fusing))
-        is not None
-    )
+    assert first_difference(flight, build(Translation(C.header, free, ()), "-O2", GCC, fusing)) is not None
 
 
 ARITHMETIC = re.compile(r" ([-+*/]) ")
@@ -106,7 +102,7 @@ def test_a_changed_operator_is_caught(
     for place in map(int, chosen):
         other = {"+": "-", "-": "+", "*": "+", "/": "*"}[C.source[place]]
         changed = Translation(C.header, C.source[:place] + other + C.source[place + 1 :], C.functions)
-        library = build(changed, BUILD, "-O0")
+        library = build(changed, "-O0")
         recordings = (plausible, wild, flight)  # only a flight seeks the gyro's zero to its end
         caught = any(first_difference(recording, library) is not None for recording in recordings)
         line = C.source.count("\n", 0, place) + 1
@@ -117,7 +113,7 @@ def test_a_changed_operator_is_caught(
 @given(seed=st.integers(0, 2**32 - 1))
 def test_arbitrary_bits_give_equal_bits_and_counts_inside_the_servo_limits(seed: int) -> None:
     recording = record_wild(seed, 120)
-    assert first_difference(recording, build(C, BUILD, "-O2")) is None
+    assert first_difference(recording, build(C, "-O2")) is None
     behind = sum(struct.dtype.itemsize for struct in (Control, Sampling, Supervisor, Report))
     at = Control.dtype.fields["count"][1] - behind  # from the end
     for step, after in zip(recording.steps, recording.after, strict=True):
@@ -136,14 +132,14 @@ def in_a_process(library: Path, seed: int) -> subprocess.CompletedProcess[str]:
 @gcc_only
 def test_arbitrary_bits_meet_no_undefined_behaviour_and_an_unclamped_conversion_is_one() -> None:
     flags = ("-fsanitize=undefined,float-cast-overflow,bounds-strict", "-fsanitize-undefined-trap-on-error")
-    done = in_a_process(build(C, BUILD, "-O0", GCC, flags), 3)
+    done = in_a_process(build(C, "-O0", GCC, flags), 3)
     assert done.stdout == "done\n", done.stderr
     start = C.source.index("(int32_t)maths_clamp(")
     end = C.source.index(", 0.0f", start)
     close = C.source.index(");", end)
     free = C.source[:start] + "(int32_t)(" + C.source[start:end].split("maths_clamp(")[1] + C.source[close:]
     broken = Translation(C.header, free, C.functions)
-    done = in_a_process(build(broken, BUILD, "-O0", GCC, (*flags, "-Wno-unused")), 3)
+    done = in_a_process(build(broken, "-O0", GCC, (*flags, "-Wno-unused")), 3)
     assert done.returncode < 0
     assert done.stdout == ""
 

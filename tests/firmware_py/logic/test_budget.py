@@ -43,7 +43,7 @@ def blocks_of(tmp_path: Path) -> Make:
 
     def make(text: str, board: str = "python", estimator: str = "") -> CoreBlocks:
         config = own_config(tmp_path, text, estimator)
-        runner = PlainRunner if board == "plain" else runner_of(board, ROOT / "runs" / "build", config.logic)
+        runner = PlainRunner if board == "plain" else runner_of(board, config.logic)
         blocks = CoreBlocks(parameters_of(config), runner, load_logic(config.logic))
         blocks.data.fields.mode = MODE_FLY
         return blocks

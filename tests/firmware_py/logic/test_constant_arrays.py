@@ -14,7 +14,6 @@ from firmware_py.logic.loading import load_logic
 from hil.config import LabConfig
 from hil.errors import LabError
 from support.own_logic import own_config
-from support.paths import ROOT
 
 ROWS, COLUMNS = 5, 16
 RNG = np.random.default_rng(7)
@@ -70,7 +69,7 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> LabConfig:
 @pytest.mark.parametrize("board", [*BOARDS[1:], "plain"])
 def test_matrix_times_vector_is_equal_everywhere(config: LabConfig, board: str) -> None:
     logic = load_logic(config.logic)
-    other = PlainRunner if board == "plain" else runner_of(board, ROOT / "runs" / "build", config.logic)
+    other = PlainRunner if board == "plain" else runner_of(board, config.logic)
     flown, beside = (CoreBlocks(parameters_of(config), runner, logic) for runner in (PythonRunner, other))
     rng = np.random.default_rng(3)
     for scale in (1e-20, 1e-3, 0.1, 1.0, 10.0, 1e3):

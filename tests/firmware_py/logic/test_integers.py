@@ -10,7 +10,6 @@ from firmware_py.export.plain import PlainRunner
 from firmware_py.logic.loading import load_logic
 from hil.config import LabConfig
 from support.own_logic import own_config
-from support.paths import ROOT
 
 LAW = '''"""Whole numbers of both signs."""
 
@@ -50,7 +49,7 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> LabConfig:
 def test_division_and_remainder_round_down_everywhere(config: LabConfig, board: str) -> None:
     logic = load_logic(config.logic)
     kinds = {"plain": PlainRunner, "python": PythonRunner}
-    runner = kinds.get(board) or runner_of(board, ROOT / "runs" / "build", config.logic)
+    runner = kinds.get(board) or runner_of(board, config.logic)
     blocks = CoreBlocks(parameters_of(config), runner, logic)
     ring = [0] * 5
     for number in range(-13, 14):

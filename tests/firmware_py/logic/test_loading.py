@@ -316,17 +316,18 @@ def test_an_edited_module_is_never_mistaken_for_what_it_was(tmp_path: Path) -> N
         return float(blocks.control.fields.u[0])
 
     assert [after_one_tick(factor) for factor in ("0.25", "0.5", "0.25")] == [0.25, 0.5, 0.25]
+    assert {path.suffix for path in tmp_path.rglob("*")} == {".py", ".toml"}, "compiled code in a project"
 
 
-def test_loading_needs_no_writable_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_project_gets_no_compiled_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     project = tmp_path / "project"
     project.mkdir()
-    (project / "__pycache__").touch()  # no folder can be made there, not even by root
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     config = own_config(project, AS_BUILT_IN)
     logic = load_logic(config.logic)
     assert logic is not None
     assert Path(str(logic.loaded.entry.__file__)).is_relative_to(tmp_path / "cache" / "floaty")
+    assert {path.suffix for path in project.rglob("*")} == {".py", ".toml"}
 
 
 def test_text_outside_the_subset_is_an_export_error(tmp_path: Path) -> None:

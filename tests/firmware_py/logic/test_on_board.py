@@ -19,7 +19,6 @@ from hil.config import LabConfig
 from support.firmware_bench import HOVER_COUNTS, FirmwareBench
 from support.mavlink_client import GYRO_ZERO_US, MavlinkClient
 from support.own_logic import AS_BUILT_IN, ESTIMATOR, LAW, own_config
-from support.paths import ROOT
 
 
 class Bench(FirmwareBench):
@@ -134,7 +133,7 @@ def loop(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     """A law that puts out what the test writes into the input."""
     law = AS_BUILT_IN.replace("(parameters: Parameters,", "(data: Input, parameters: Parameters,") + WHATEVER
     config = own_config(tmp_path_factory.mktemp("loop"), law)
-    runner = runner_of(request.param, ROOT / "runs" / "build", config.logic)
+    runner = runner_of(request.param, config.logic)
     blocks = CoreBlocks(parameters_of(config), runner, load_logic(config.logic))
     blocks.data.fields.mode = MODE_FLY
     return blocks

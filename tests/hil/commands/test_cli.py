@@ -240,3 +240,13 @@ def test_a_viewer_that_fails_is_one_line(cli: Cli, view: list[str], monkeypatch:
     (line,) = [line for line in cli.err.splitlines() if line.startswith("floaty: ")]
     assert "--view web" in line or "--view wbe: expected" in line
     assert not Path("run").exists()
+
+
+@pytest.mark.long
+def test_programs_that_a_command_starts_import_nothing_from_the_current_folder(empty_folder: Path) -> None:
+    for name in ("json", "multiprocessing", "numpy", "hil"):
+        (empty_folder / f"{name}.py").write_text("open('executed', 'w')", encoding="utf-8")
+    command = [Path(sys.executable).with_name("floaty"), "fly", "hover", "--seeds", "2", "--duration", "0.1"]
+    subprocess.run(command, capture_output=True, check=False)
+    assert len(list(Path("runs").glob("hover-*/result.json"))) == 2
+    assert not Path("executed").exists()

@@ -1,6 +1,7 @@
 """`floaty new`: what it makes flies and tests at once, in the clone and where the package is installed as a wheel."""
 
 import sys
+import tomllib
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -36,7 +37,9 @@ def test_a_project_has_everything_that_a_flight_and_a_test_need(cli: Cli) -> Non
     project = Path("deep/My Law")
     assert files_in(project) == sorted(FILES)
     assert "cd deep/My Law; floaty fly hover --profile profile.toml" in cli.out
-    assert 'name = "my-law"' in (project / "pyproject.toml").read_text()
+    about = tomllib.loads((project / "pyproject.toml").read_text())["project"]
+    assert about["name"] == "my-law"
+    assert about["dependencies"] == [], "a requirement by a name that anybody may register"
     assert all("{{" not in (project / name).read_text(encoding="utf-8") for name in FILES)
     assert find_experiment(f"{project}/experiments.py:figure_eight").duration_s == 12.0
 
@@ -108,6 +111,9 @@ def test_a_project_outside_the_clone_flies_tests_checks_and_exports_with_the_whe
 
     run(tmp_path, command, "new", "law")
     project = tmp_path / "law"
+    pip = (sys.executable, "-m", "pip", "--python", python)
+    run(project, *pip, "install", "--quiet", "--no-index", "--no-build-isolation", ".")
+    assert "law-eight" in run(tmp_path, command, "list").stdout, "without any package index"
     run(project, command, "fly", "hover", "--profile", "profile.toml", "--duration", "5")
     run(project, python, "-m", "pytest", "-q", "--junitxml=junit.xml")
     properties = [

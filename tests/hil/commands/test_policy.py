@@ -16,7 +16,6 @@ from hil.config import load_config
 from hil.laboratory.result import read_result
 from support.command import Cli
 from support.installed_wheel import run
-from support.paths import ROOT
 from support.policies import network, write_onnx
 
 pytest.importorskip("onnx")
@@ -41,8 +40,8 @@ def test_a_policy_becomes_a_law_with_the_answers_of_its_framework(cli: Cli) -> N
     assert first.partition(": ")[2] in (Path("law") / FILES[0]).read_text(encoding="utf-8")
 
     config, answer = load_config("law/profile.toml"), read_policy(file).answer
-    logic, build = load_logic(config.logic), ROOT / "runs" / "build"
-    runners = (PythonRunner, runner_of("c", build, config.logic), runner_of("cortex-m4", build, config.logic))
+    logic = load_logic(config.logic)
+    runners = (PythonRunner, runner_of("c", config.logic), runner_of("cortex-m4", config.logic))
     targets = [CoreBlocks(parameters_of(config), runner, logic) for runner in runners]
     rng = np.random.default_rng(1)
     for _ in range(30):

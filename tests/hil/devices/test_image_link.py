@@ -13,7 +13,7 @@ from hil.devices.board import Requests, VirtualBoard
 from hil.devices.image_firmware import ChipImage, ImageFirmware
 from hil.stm32f405.chip import build_machine
 from hil.stm32f405.image import Image
-from support.stm32_firmware import BUILD, build
+from support.stm32_firmware import build
 
 LINE_US = 25_000  # the tests' firmware sends at least this often
 
@@ -25,7 +25,7 @@ class Line:
         self.commands: list[tuple[int, bytes]] = []
         requests = Requests(radio_command=lambda now_us, kind, data: self.commands.append((kind, data)))
         board = VirtualBoard(lambda *_: None, lambda *_: True, lambda *_: None, requests=requests)
-        self.firmware = ImageFirmware(ChipImage(Image(build()), build_machine(BUILD)), board, None)
+        self.firmware = ImageFirmware(ChipImage(Image(build()), build_machine()), board, None)
         self._seen = 0
         self._decoder = syslink.Decoder()
         self.wait(21_000)

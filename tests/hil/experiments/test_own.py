@@ -1,5 +1,6 @@
 """Experiments of one's own: found in files and packages, flown like those that ship, refused in one line."""
 
+import hashlib
 import json
 import math
 import re
@@ -12,7 +13,8 @@ import numpy as np
 import pytest
 
 from ground_station.trajectory import Along, Goal
-from hil import fly
+from hil import fly, load_run
+from hil.api import command_of
 from hil.campaigns.jobs import Job, Plan, fly_job
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_again, find_experiment
@@ -208,12 +210,10 @@ def test_an_own_kind_of_fault_acts_is_listed_and_shown(cli: Cli, monkeypatch: py
     assert cli("list", "mine.py", "--faults") == 0
     assert re.search(r"^wind\.both +0\.2 m/s +-5\.\.5 +to the end +both", cli.out, re.MULTILINE)
     monkeypatch.delitem(KINDS, "wind.both")
-    Path("mine.py").unlink()
     write_report(Path("runs/mine-1"))
-    assert (
-        "it is missing or has changed since, so its own picture and its own kinds of faults are missing here"
-        in Path("runs/mine-1/report.html").read_text("utf-8")
-    )
+    assert "without its own kinds of faults (wind.both), which need the experiment" in Path(
+        "runs/mine-1/report.html"
+    ).read_text("utf-8")
 
 
 def test_an_own_kind_may_be_declared_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -221,6 +221,102 @@ def test_an_own_kind_may_be_declared_again(monkeypatch: pytest.MonkeyPatch) -> N
     declare("push.mine", Kind("", "", 1.0, 0.0, 2.0, KINDS["push.y"].knobs))
     declare("push.mine", Kind("", "", 1.0, 0.0, 5.0, KINDS["push.y"].knobs))
     assert parse("push.mine@1=4").size == 4.0
+
+
+# Run folders
+
+TRAP = "from pathlib import Path\nPath('executed').touch()\n"
+DRAWN = (
+    "from matplotlib.figure import Figure\n"
+    "def draw(flight):\n    figure = Figure()\n    figure.gca().set_title('drawn by mine')\n    return figure\n"
+    "def measure(flight): return {'rows': flight.num_rows}\n"
+    "wide = "
+    + PLAIN
+    % ", measure=measure, metrics={'rows': Metric('', 'min', 'how many')}, draw=draw, pictures=('airspeed',)"
+)
+
+
+@pytest.fixture
+def flown() -> Path:
+    """The run folder of an experiment whose file, as its profile's modules, leaves a file when it is executed."""
+    write(DRAWN)
+    run = fly("mine.py:wide", seed=3)
+    assert not Path("executed").exists()
+    text = Path("mine.py").read_text(encoding="utf-8") + "\n" + TRAP
+    Path("mine.py").write_text(text, encoding="utf-8")
+    Path("trap.py").write_text(TRAP, encoding="utf-8")
+    Path("trap.toml").write_text(
+        'base = "floaty"\n[logic]\ncontroller = "trap.py"\n[robot]\nbody = "trap.py"\n'
+    )
+    # As somebody else might write it: the hash is that of the present file.
+    path = run.folder / "result.json"
+    result = json.loads(path.read_text(encoding="utf-8"))
+    result["source"]["sha256"] = hashlib.sha256(text.encode()).hexdigest()
+    result["profile"] = str(Path("trap.toml").absolute())
+    path.write_text(json.dumps(result), encoding="utf-8")
+    return run.folder
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("report", "RUN"), ("compare", "RUN", "RUN"), ("runs",), ("export", "RUN", "--csv", "--mcap", "--tlog"),
+        ("identify", "RUN"), ("identify", "RUN", "--profile-out", "out.toml"),
+    ],
+    ids=" ".join,
+)  # fmt: skip
+def test_reading_a_run_executes_nothing_that_it_names(
+    command: tuple[str, ...], flown: Path, cli: Cli
+) -> None:
+    cli(*(str(flown) if word == "RUN" else word for word in command))
+    assert not Path("executed").exists()
+
+
+def test_loading_a_run_executes_nothing_that_it_names(flown: Path) -> None:
+    run = load_run(flown)
+    assert (run.experiment, run.metrics["rows"]) == (None, 30.0)
+    assert len(run.to_dataset().t_us) > 0
+    assert run.request.config.logic.controller.endswith("trap.py")
+    assert command_of(run.request) is None
+    assert not Path("executed").exists()
+    with pytest.raises(LabError, match=r"^experiment mine: its code was not executed; load_run"):
+        fly(run.request)
+    assert not Path("executed").exists()
+
+
+def test_a_report_shows_what_needs_no_code_and_names_the_option_for_the_rest(flown: Path, cli: Cli) -> None:
+    assert cli("report", str(flown)) == 0
+    reference = str(Path("mine.py:wide").absolute())
+    (line,) = cli.err.splitlines()
+    assert line.startswith(f"{flown}: without its own picture, which need")
+    assert f"--experiment {reference}" in line
+    page = (flown / "report.html").read_text(encoding="utf-8")
+    assert f"--experiment {reference}" in page
+    assert 'id="airspeed"' in page
+    assert 'id="mine"' not in page
+
+
+def test_what_the_user_names_is_executed(flown: Path, cli: Cli) -> None:
+    assert cli("report", str(flown), "--experiment", "mine.py:wide") == 0
+    assert Path("executed").exists()
+    assert cli.err == ""
+    assert 'id="mine"' in (flown / "report.html").read_text(encoding="utf-8")
+    run = load_run(flown, "mine.py:wide")
+    assert run.experiment == find_experiment("mine.py:wide")
+    with pytest.raises(LabError, match=r"^experiment hover: .*mine-3 is a flight of mine$"):
+        load_run(flown, "hover")
+
+
+def test_two_flights_of_unequal_length_are_compared_without_code_or_with_what_the_user_names(
+    flown: Path, cli: Cli
+) -> None:
+    fly("hover", "hover", duration_s=0.1)
+    assert cli("compare", "hover", str(flown)) == 1
+    assert cli.err.startswith("without the own metrics of this span, which need the experiment's code: ")
+    assert not Path("executed").exists()
+    assert cli("compare", "hover", str(flown), "--experiment", "mine.py:wide") == 1
+    assert cli.err == ""
+    assert re.search(r"rows +│ +– +│ +10 ", cli.out)
 
 
 # Packages

@@ -111,11 +111,9 @@ def test_an_image_without_the_app_is_flown_and_recorded_with_its_tasks_and_repor
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from hil.devices import image_firmware
-    from hil.laboratory import lockstep
-    from support.stm32_firmware import BUILD, build
+    from support.stm32_firmware import build
 
     monkeypatch.setattr(image_firmware, "WARM_UP_US", 20_000)
-    monkeypatch.setattr(lockstep, "BUILD", BUILD)
     elf = build("clang")
     request = Request.of(HOVER, duration_s=0.1, board=str(elf), overrides=("flight.release_us=50000",))
     result = fly(request, tmp_path / "run")

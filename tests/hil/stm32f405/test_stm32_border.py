@@ -11,13 +11,12 @@ from hil.errors import LabError
 from hil.stm32f405 import chip
 from hil.stm32f405.chip import SOURCES, Chip, Why, build_machine, declared
 from support.stm32_bench import Bench
-from support.stm32_firmware import BUILD
 
 
 def constants(prefix: str) -> dict[str, int]:
     """The numbers of machine.h whose names begin so, without that."""
     declarations = declared()
-    library = declarations.dlopen(str(build_machine(BUILD)))
+    library = declarations.dlopen(str(build_machine()))
     return {
         name.removeprefix(prefix): getattr(library, name)
         for name in dir(library)
@@ -50,7 +49,7 @@ def test_python_s_memories_lie_where_the_machine_has_them() -> None:
 def test_a_layout_that_is_not_the_compiled_one_is_refused(
     was: str, is_now: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    library = build_machine(BUILD)
+    library = build_machine()
     header = (SOURCES / "machine.h").read_text()
     assert was in header
     (tmp_path / "machine.h").write_text(header.replace(was, is_now))

@@ -267,7 +267,7 @@ def test_paths_start_at_the_root_folder_and_ini_names_the_profile(pytester: pyte
 
 
 def test_an_absent_board_is_skipped(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
-    def runner_of(board: str, folder: Path, logic: object) -> None:
+    def runner_of(board: str, logic: object) -> None:
         if board != "python":
             raise ExportError("no C compiler on this machine")
 

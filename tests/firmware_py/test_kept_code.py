@@ -1,0 +1,133 @@
+"""Compiled code is loaded only from folders and files that this user alone can have written."""
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py import compiling
+from firmware_py.compiling import bound, compiler
+from firmware_py.kept_code import UNUSED_S, keep, kept_folder, may_load
+
+ABSENT_UID = 12345
+
+
+@pytest.fixture(autouse=True)
+def cache_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """The user's cache folder, and the folder for temporary files, of this test alone."""
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def link_away(path: Path) -> None:
+    moved = path.with_name("moved")
+    path.rename(moved)
+    path.symlink_to(moved)
+
+
+def give_away(path: Path) -> None:
+    if os.geteuid():
+        pytest.skip("only root gives a file away")
+    os.chown(path, ABSENT_UID, ABSENT_UID)
+
+
+DOUBTS = [
+    pytest.param(lambda path: path.chmod(0o770), "others may write it", id="group"),
+    pytest.param(lambda path: path.chmod(0o702), "others may write it", id="all"),
+    pytest.param(link_away, "a link", id="link"),
+    pytest.param(give_away, "belongs to another user", id="owner"),
+]
+
+
+def test_kept_folders_are_private_whatever_the_umask(cache_home: Path) -> None:
+    before = os.umask(0)
+    try:
+        folder = kept_folder("c", "key")
+        keep(folder / "file", b"text")
+    finally:
+        os.umask(before)
+    assert folder.parent.parent == cache_home / "floaty"
+    assert {path.stat().st_mode & 0o777 for path in (folder, folder.parent, folder.parent.parent)} == {0o700}
+    assert (folder / "file").stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.parametrize(("change", "why"), DOUBTS)
+def test_a_folder_that_others_may_have_written_is_not_used(
+    change: Callable[[Path], None], why: str, cache_home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    doubtful = cache_home / "floaty"
+    doubtful.mkdir(parents=True, mode=0o700)
+    change(doubtful)
+    folder = kept_folder("c", "key")
+    assert folder.is_relative_to(Path(tempfile.gettempdir(), f"floaty-{os.geteuid()}"))
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert kept_folder("c", "another").parent == folder.parent
+    assert capsys.readouterr().err == f"floaty: {doubtful}: {why}: compiled code is kept elsewhere\n"
+
+
+def test_where_neither_folder_can_be_used_one_serves_that_ends_with_the_process(
+    cache_home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cache_home.touch()  # no folder can be made there, not even by root
+    Path(tempfile.gettempdir(), f"floaty-{os.geteuid()}").mkdir(mode=0o700)
+    Path(tempfile.gettempdir()).chmod(0o777)
+    assert kept_folder("zig").stat().st_mode & 0o777 == 0o700
+    first, second = capsys.readouterr().err.splitlines()
+    assert first.endswith("/floaty: cannot be used (File exists): compiled code is kept elsewhere")
+    assert second.endswith(": in a folder that all may write: compiled code is kept elsewhere")
+
+
+def test_a_relative_folder_is_never_used(monkeypatch: pytest.MonkeyPatch, empty_folder: Path) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", ".")
+    assert not kept_folder("c", "key").is_relative_to(empty_folder / "floaty")
+    assert not (empty_folder / "floaty").exists()
+
+
+@pytest.mark.parametrize(("change", "why"), DOUBTS)
+def test_a_file_that_others_may_have_written_is_not_loaded(
+    change: Callable[[Path], None], why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = kept_folder("c", "key") / "core.so"
+    assert not may_load(path)
+    keep(path, b"text")
+    assert may_load(path)
+    change(path)
+    assert not may_load(path)
+    assert capsys.readouterr().err == f"floaty: {path}: {why}: it is not loaded\n"
+
+
+def test_doubtful_machine_code_and_pickles_are_compiled_again(
+    cache_home: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def double(x: np.ndarray) -> None:
+        x[0] *= 2.0
+
+    for _ in range(2):
+        monkeypatch.setattr(compiling, "_LOADED", {})  # as in another process
+        x = np.array([4.0])
+        bound(compiler()(double), x)()
+        assert (x[0], compiler()(double)(x), x[0]) == (8.0, None, 16.0)
+        files = [path for path in cache_home.rglob("*") if path.is_file()]
+        assert sorted(path.suffix for path in files) == [".machine", ".nbc", ".nbi"]
+        assert {path.stat().st_mode & 0o777 for path in files} == {0o600}
+        for path in files:
+            path.write_bytes(b"cos\nsystem\n(S'touch stolen'\ntR.")
+            path.chmod(0o666)
+    told = capsys.readouterr().err
+    assert told.count("others may write it: it is not loaded") == told.count("\n") > 0
+
+
+def test_folders_that_nobody_has_used_for_long_are_deleted() -> None:
+    old, used = kept_folder("c", "old"), kept_folder("c", "used")
+    for folder in (old, used):
+        long_ago = folder.stat().st_mtime - UNUSED_S - 1.0
+        os.utime(folder, (long_ago, long_ago))
+    used.touch()
+    kept_folder("c", "new")
+    assert (old.exists(), used.exists()) == (False, True)
