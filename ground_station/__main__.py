@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from ground_station.config import GroundConfig
 from ground_station.controls import ControlsError
+from ground_station.lines import print_line
 from ground_station.operator import Operator, fly_with
 from ground_station.program import Session
 from ground_station.trajectory import Goal, Hold, Trajectory
@@ -46,8 +47,8 @@ def main(arguments: list[str] | None = None) -> int:
     except (OSError, ValueError) as error:
         return _refuse(f"--settings {asked.settings}: {error}")
     session = Session(asked.link, asked.mocap, lambda home, _: Hold(home), log=asked.log, record=asked.record)
-    operator = Operator(_no_experiment, print, lambda _: None)
-    failure, _ = fly_with(operator, settings, session, print, asked.duration)
+    operator = Operator(_no_experiment, print_line, lambda _: None)
+    failure, _ = fly_with(operator, settings, session, print_line, asked.duration)
     return _refuse(failure) if failure else 0
 
 
@@ -56,7 +57,7 @@ def _no_experiment(name: str) -> Callable[[Goal, int], Trajectory]:
 
 
 def _refuse(line: str) -> int:
-    print(line, file=sys.stderr)
+    print_line(line, sys.stderr)
     return 2
 
 

@@ -11,7 +11,7 @@ from importlib import import_module
 import click
 
 from firmware_py.fast import STALE
-from hil.commands.options import INTERRUPTED
+from hil.commands.options import INTERRUPTED, warn
 from hil.errors import LabError
 from hil.installation import describe
 
@@ -94,13 +94,14 @@ def main() -> None:
     gc.set_threshold(100_000, 20, 50)  # imports alone would cause 0.3 s of collections
     atexit.register(gc.freeze)  # Python's last collection would delay the prompt by 0.5 s
     if STALE:
-        print(f"floaty: pure Python, not what `make fast` has compiled: {STALE}", file=sys.stderr)
+        warn(f"floaty: pure Python, not what `make fast` has compiled: {STALE}")
     try:
         code = app.main(standalone_mode=False)
     except LabError as error:
         sys.exit(_refuse(str(error)))
     except click.exceptions.NoArgsIsHelpError as error:
-        print(error.format_message(), file=sys.stderr)
+        for line in error.format_message().splitlines():
+            warn(line)
         sys.exit(2)
     except click.ClickException as error:
         typed = error.option_name if isinstance(error, click.NoSuchOption) else " ".join(sys.argv[1:3])
@@ -112,5 +113,5 @@ def main() -> None:
 
 
 def _refuse(text: str) -> int:
-    print("floaty:", " ".join(text.split()), file=sys.stderr)
+    warn(f"floaty: {' '.join(text.split())}")
     return 2

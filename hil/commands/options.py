@@ -15,7 +15,9 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 from rich.table import Column
+from rich.text import Text
 
+from ground_station.lines import print_line, visible
 from hil.errors import LabError
 
 if TYPE_CHECKING:
@@ -27,8 +29,21 @@ INTERRUPTED = 130
 Asked = TypeVar("Asked")
 Command = TypeVar("Command", bound=Callable[..., Any])
 
-console = Console(highlight=False)
-notices = Console(stderr=True, highlight=False)
+
+class TextConsole(Console):
+    """A console that shows control characters in texts as escapes, and raises `OSError` when its output fails."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Render as rich does."""
+        return super().render_str("\n".join(map(visible, text.split("\n"))), **options)
+
+    def on_broken_pipe(self) -> None:
+        """Raise the error that rich is handling."""
+        raise
+
+
+console = TextConsole(highlight=False)
+notices = TextConsole(stderr=True, highlight=False)
 
 
 class Number(click.FloatRange):
@@ -47,7 +62,7 @@ PATH, FILE = click.Path(path_type=Path), click.Path(path_type=Path, dir_okay=Fal
 
 def wide_console(width: int = 150) -> Console:
     """Return the console for a table of a fixed width, in any terminal."""
-    return Console(highlight=False, width=max(console.width, width))
+    return TextConsole(highlight=False, width=max(console.width, width))
 
 
 def right(*headings: str) -> list[Column]:
@@ -142,12 +157,12 @@ def announce_compilation() -> None:
 
 def say(text: object) -> None:
     """Print a line and flush it: a program may read it."""
-    print(text, flush=True)
+    print_line(text)
 
 
 def warn(text: str) -> None:
     """Print a line on standard error."""
-    print(text, file=sys.stderr)
+    print_line(text, sys.stderr)
 
 
 def progress_bar(*columns: ProgressColumn) -> Progress:

@@ -218,7 +218,8 @@ def _motive(server: Server, count: int) -> VirtualMotive:
 def _print_addresses(robots: list[Opened]) -> None:
     """Say where clients find the robots."""
     if robots[0].dongles:
-        say(radio_hint(robots[0].dongles, [robot.radio for robot in robots]))
+        for line in radio_hint(robots[0].dongles, [robot.radio for robot in robots]).splitlines():
+            say(line)
     if robots[0].udp:
         say(f"udp    {' '.join(robot.udp for robot in robots)}")
     if robots[0].mavlink:

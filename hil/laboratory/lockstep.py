@@ -12,6 +12,7 @@ from firmware_py.errors import FirmwareError
 from firmware_py.export.boards import runner_of
 from firmware_py.wire.telemetry import ALL_BLOCKS, CRAZYFLIE_BLOCKS
 from ground_station.errors import LinkError
+from ground_station.lines import print_line
 from ground_station.links.crazyflie_link import CrazyflieLink, FlightTimes
 from ground_station.links.frame_log import FRAME_LOG, FrameLog
 from ground_station.links.loopback import LoopbackLink
@@ -214,6 +215,6 @@ def debugger(port: int | None, image: Path, stack: ExitStack) -> GdbServer | Non
 
     def waiting(port: int) -> None:
         connect = f"-ex 'target remote 127.0.0.1:{port}'"
-        print(f"waiting for gdb-multiarch {shlex.quote(str(image))} {connect}", flush=True)
+        print_line(f"waiting for gdb-multiarch {shlex.quote(str(image))} {connect}")
 
     return stack.enter_context(closing(GdbServer(port, waiting)))
