@@ -5,7 +5,6 @@ flaps at hover: it stops the corrections first, and closes the link when the boa
 laboratory: its part of a profile arrives as `GroundConfig`.
 """
 
-import signal
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
@@ -214,14 +213,6 @@ def ask(link: LiveLink, request: ControlRequest) -> Answer:
         link.check()
         wait(ASK_PERIOD_S)
     return answer
-
-
-def stop_signals() -> list[int]:
-    """Return a list that receives the signals for an orderly end."""
-    stops: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda received, _: stops.append(received))
-    return stops
 
 
 def run_until(stopping: Callable[[], bool], duration_s: float | None) -> Callable[[], bool]:

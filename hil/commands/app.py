@@ -1,6 +1,7 @@
 """`floaty`: the command group.
 
-Bad input ends in one line on standard error and exit code 2; a failed limit in 1; Ctrl-C in 130 with the log kept.
+Bad input ends in one line on standard error and exit code 2; a failed limit in 1; Ctrl-C, SIGTERM
+and SIGHUP in 130 with the log kept.
 """
 
 import atexit
@@ -11,6 +12,7 @@ from importlib import import_module
 import click
 
 from firmware_py.fast import STALE
+from ground_station.stops import stopped_like_ctrl_c
 from hil.commands.options import INTERRUPTED, warn
 from hil.errors import LabError
 from hil.installation import describe
@@ -96,7 +98,8 @@ def main() -> None:
     if STALE:
         warn(f"floaty: pure Python, not what `make fast` has compiled: {STALE}")
     try:
-        code = app.main(standalone_mode=False)
+        with stopped_like_ctrl_c():
+            code = app.main(standalone_mode=False)
     except LabError as error:
         sys.exit(_refuse(str(error)))
     except click.exceptions.NoArgsIsHelpError as error:

@@ -147,7 +147,7 @@ def _executor(asked: ServeOptions) -> Executor:
 
 def _run(server: Server, swarm: Swarm, doors: Doors, view: LiveView | None) -> None:
     """Open the doors of all robots and serve until Ctrl-C, with faults typed at the terminal or in the picture's panel."""
-    from ground_station.program import stop_signals
+    from ground_station.stops import stop_signals
     from hil.servers.live_faults import LiveFaults
 
     def answer(text: str) -> None:
