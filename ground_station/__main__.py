@@ -16,11 +16,12 @@ from ground_station.controls import ControlsError
 from ground_station.lines import print_line
 from ground_station.operator import Operator, fly_with
 from ground_station.program import Session
+from ground_station.records import INCOMPLETE, Records
 from ground_station.trajectory import Goal, Hold, Trajectory
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Fly until Ctrl-C; return the exit code: 0, or 2 with one line on the error."""
+    """Fly until Ctrl-C; return the exit code: 0, 2 with one line on the error, 3 for an incomplete record."""
     parser = argparse.ArgumentParser(
         "ground_station", description="Send poses to a board that hovers at home."
     )
@@ -46,10 +47,18 @@ def main(arguments: list[str] | None = None) -> int:
         return _refuse(f"--settings {asked.settings}: {key} = {first['input']!r}: {first['msg']}")
     except (OSError, ValueError) as error:
         return _refuse(f"--settings {asked.settings}: {error}")
-    session = Session(asked.link, asked.mocap, lambda home, _: Hold(home), log=asked.log, record=asked.record)
-    operator = Operator(_no_experiment, print_line, lambda _: None)
-    failure, _ = fly_with(operator, settings, session, print_line, asked.duration)
-    return _refuse(failure) if failure else 0
+    records = Records()
+    session = Session(
+        asked.link,
+        asked.mocap,
+        lambda home, _: Hold(home),
+        log=asked.log,
+        record=asked.record,
+        records=records,
+    )
+    operator = Operator(_no_experiment, records.say, lambda _: None)
+    failure, _ = fly_with(operator, settings, session, records.say, asked.duration)
+    return _refuse(failure) if failure else INCOMPLETE if records.incomplete else 0
 
 
 def _no_experiment(name: str) -> Callable[[Goal, int], Trajectory]:

@@ -272,11 +272,14 @@ def fly_with(
 
     failure = ""
     try:
-        fly(settings, session, say, run_until(lambda: bool(stops), duration_s), [*hands, steer])
+        stopping = run_until(lambda: bool(stops), duration_s)
+        fly(settings, session, say, stopping, [*hands, steer])
     except (LinkError, MocapError, OSError, ImportError) as error:
         failure = why(error, session.uri)
     finally:
         terminal.close()
+        for notice in session.records.notices():  # of the files' last bytes
+            say(notice)
     return failure, bool(stops)
 
 

@@ -184,8 +184,8 @@ def exit_code(result: Result) -> int:
     return INTERRUPTED if result.outcome == "interrupted" else 0 if result.passed else 1
 
 
-def open_live(target: str | None) -> LiveView | None:
-    """Open the picture of `--view`; it always closes with the command."""
+def open_live(target: str | None, say: Callable[[str], None] = say) -> LiveView | None:
+    """Open the picture of `--view`; it always closes with the command. `say` gets lines for the user."""
     if target is None:
         return None
     from hil.live.feed import open_view
@@ -194,7 +194,7 @@ def open_live(target: str | None) -> LiveView | None:
     return context.with_resource(closing(open_view(target, str(context.info_name), say)))
 
 
-def close_live(view: LiveView | None, result: Result | None = None) -> None:
+def close_live(view: LiveView | None, result: Result | None = None, say: Callable[[str], None] = say) -> None:
     """Close the picture, and record and report the rows that it missed."""
     if view is None:
         return

@@ -64,9 +64,8 @@ class ModelledLine:
         )
         blocks = CRAZYFLIE_BLOCKS if config.pilot.enabled else ALL_BLOCKS
         self._telemetry = TelemetryLog(telemetry, blocks) if telemetry else None
-        self.station = GroundStation(
-            self._link, self.trajectory, self._telemetry, config.station, self.tracker
-        )
+        write_sample = None if self._telemetry is None else self._telemetry.write
+        self.station = GroundStation(self._link, self.trajectory, write_sample, config.station, self.tracker)
         self._receivers: list[Receiver] = [self.station.on_packet]  # receivers of the board's radio packets
         if self.robot.firmware.flashed is not None and not config.pilot.enabled:
             self._set_up(site, self.robot.firmware.flashed)
