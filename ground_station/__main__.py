@@ -13,13 +13,15 @@ from pydantic import ValidationError
 
 from ground_station.config import GroundConfig
 from ground_station.controls import ControlsError
+from ground_station.lines import print_line
 from ground_station.operator import Operator, fly_with
 from ground_station.program import Session
+from ground_station.records import INCOMPLETE, Records
 from ground_station.trajectory import Goal, Hold, Trajectory
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Fly until Ctrl-C; return the exit code: 0, or 2 with one line on the error."""
+    """Fly until Ctrl-C; return the exit code: 0, 2 with one line on the error, 3 for an incomplete record."""
     parser = argparse.ArgumentParser(
         "ground_station", description="Send poses to a board that hovers at home."
     )
@@ -45,10 +47,18 @@ def main(arguments: list[str] | None = None) -> int:
         return _refuse(f"--settings {asked.settings}: {key} = {first['input']!r}: {first['msg']}")
     except (OSError, ValueError) as error:
         return _refuse(f"--settings {asked.settings}: {error}")
-    session = Session(asked.link, asked.mocap, lambda home, _: Hold(home), log=asked.log, record=asked.record)
-    operator = Operator(_no_experiment, print, lambda _: None)
-    failure, _ = fly_with(operator, settings, session, print, asked.duration)
-    return _refuse(failure) if failure else 0
+    records = Records()
+    session = Session(
+        asked.link,
+        asked.mocap,
+        lambda home, _: Hold(home),
+        log=asked.log,
+        record=asked.record,
+        records=records,
+    )
+    operator = Operator(_no_experiment, records.say, lambda _: None)
+    failure, _ = fly_with(operator, settings, session, records.say, asked.duration)
+    return _refuse(failure) if failure else INCOMPLETE if records.incomplete else 0
 
 
 def _no_experiment(name: str) -> Callable[[Goal, int], Trajectory]:
@@ -56,7 +66,7 @@ def _no_experiment(name: str) -> Callable[[Goal, int], Trajectory]:
 
 
 def _refuse(line: str) -> int:
-    print(line, file=sys.stderr)
+    print_line(line, sys.stderr)
     return 2
 
 

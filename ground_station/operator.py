@@ -16,7 +16,8 @@ from firmware_py.wire.supervisor import State
 from ground_station.config import GroundConfig
 from ground_station.controls import Answer, ControlAction, ControlRequest, ControlsError, Settings
 from ground_station.errors import LinkError, MocapError
-from ground_station.program import Cockpit, Hand, Session, fly, run_until, stop_signals, why
+from ground_station.program import Cockpit, Hand, Session, fly, run_until, why
+from ground_station.stops import stop_signals
 from ground_station.terminal import Terminal
 from ground_station.trajectory import Goal, Hold, Trajectory
 
@@ -257,7 +258,7 @@ def fly_with(
     hands: Sequence[Hand] = (),
     names: Sequence[str] = (),
 ) -> tuple[str, bool]:
-    """Fly with an operator at the terminal, whose lines `names` complete, until Ctrl-C or for a duration.
+    """Fly with an operator at the terminal, whose lines `names` complete, until a signal of `STOPS` or for a duration.
 
     Return why the flight failed, empty if it did not, and whether it was interrupted.
     """
@@ -271,11 +272,14 @@ def fly_with(
 
     failure = ""
     try:
-        fly(settings, session, say, run_until(lambda: bool(stops), duration_s), [*hands, steer])
+        stopping = run_until(lambda: bool(stops), duration_s)
+        fly(settings, session, say, stopping, [*hands, steer])
     except (LinkError, MocapError, OSError, ImportError) as error:
         failure = why(error, session.uri)
     finally:
         terminal.close()
+        for notice in session.records.notices():  # of the files' last bytes
+            say(notice)
     return failure, bool(stops)
 
 

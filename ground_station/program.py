@@ -5,10 +5,9 @@ flaps at hover: it stops the corrections first, and closes the link when the boa
 laboratory: its part of a profile arrives as `GroundConfig`.
 """
 
-import signal
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing, suppress
-from dataclasses import dataclass
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from firmware_py.extras import install_command
@@ -23,8 +22,9 @@ from ground_station.links.frame_log import FrameLog
 from ground_station.links.live_link import LiveLink
 from ground_station.links.schemes import SCHEMES, find_link
 from ground_station.mocap import MocapSource
+from ground_station.records import Records
 from ground_station.sources.address import find_source
-from ground_station.sources.replay import RecordingSource, ReplaySource
+from ground_station.sources.replay import MocapLog, RecordingSource, ReplaySource
 from ground_station.station import GroundStation
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.tracker import tracker_of
@@ -49,6 +49,7 @@ class Session:
     log: Path | None = None  # telemetry
     record: Path | None = None  # frames of motion capture
     tlog: Path | None = None  # frames of MAVLink
+    records: Records = field(default_factory=Records)  # what became of these and of the standard output
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +75,7 @@ class LiveStation:
     say: Callable[[str], None]
     stopping: Callable[[], bool]
     turn: Callable[[int], None]  # called again and again with the instant while the link holds
+    records: Records
 
     def run(self) -> None:
         """Fly until stopped; raises `LinkError` when there are no poses or no board."""
@@ -143,7 +145,8 @@ class LiveStation:
             self.station.on_packet(t_us, packet)
 
     def _report(self) -> None:
-        for notice in self.source.notices() + self.station.notices() + self.link.notices():
+        parts = (self.source, self.station, self.link, self.records)
+        for notice in [notice for part in parts for notice in part.notices()]:
             self.say(notice)
 
     def _show(self) -> None:
@@ -157,14 +160,16 @@ class LiveStation:
 
     def _leave(self) -> None:
         """Stop correcting, wait until the board has put its flaps to hover, disconnect."""
-        self.link.mute()
-        deadline_us = clock_us() + FAILSAFE_TIMEOUT_US
-        while clock_us() < deadline_us and self.link.supervisor_state != State.FAILSAFE:
-            self.source.receive(0.02)
-            self._take_telemetry()
-        if self.link.supervisor_state == State.FAILSAFE:
-            self.say("the board is in failsafe, flaps at hover")
-        self.link.close()
+        try:
+            self.link.mute()
+            deadline_us = clock_us() + FAILSAFE_TIMEOUT_US
+            while clock_us() < deadline_us and self.link.supervisor_state != State.FAILSAFE:
+                self.source.receive(0.02)
+                self._take_telemetry()
+            if self.link.supervisor_state == State.FAILSAFE:
+                self.say("the board is in failsafe, flaps at hover")
+        finally:
+            self.link.close()
 
 
 def fly(
@@ -177,18 +182,29 @@ def fly(
     """Fly until stopped, or to the end of a replay.
 
     Raises `LinkError` or `MocapError` when there is no board or there are no poses, `OSError` for a file that cannot be
-    written, `ImportError` for a package that is missing.
+    opened, `ImportError` for a package that is missing.
     """
+    records = session.records
     with ExitStack() as opened:
-        frames = opened.enter_context(closing(FrameLog(session.tlog, epoch_us()))) if session.tlog else None
-        link = find_link(session.uri, settings.links(frames.note if frames else None))
+        note_frame = write_sample = None
+        if session.tlog is not None:
+            frames = FrameLog(session.tlog, epoch_us())
+            opened.callback(records.attempt, session.tlog, frames.close)
+            note_frame = records.guarded(session.tlog, frames.note)
+        link = find_link(session.uri, settings.links(note_frame))
         tracker = tracker_of(settings.tracker, settings.frame_period_us)
         played = source = _open_source(session.mocap, settings.capture)
-        opened.callback(lambda: source.close())
-        telemetry = opened.enter_context(closing(TelemetryLog(session.log))) if session.log else None
-        source = RecordingSource(source, session.record) if session.record else source
+        opened.callback(played.close)
+        if session.log is not None:
+            telemetry = TelemetryLog(session.log)
+            opened.callback(records.attempt, session.log, telemetry.close)
+            write_sample = records.guarded(session.log, telemetry.write)
+        if session.record is not None:
+            seen = MocapLog(session.record)
+            opened.callback(records.attempt, session.record, seen.close)
+            source = RecordingSource(source, records.guarded(session.record, seen.write))
         plan = FlightPlan(Goal(settings.home, 0.0), session.trajectory)
-        ground = GroundStation(link, plan, telemetry, settings.station, tracker)
+        ground = GroundStation(link, plan, write_sample, settings.station, tracker)
         cockpit = Cockpit(link, ground, plan)
 
         def over() -> bool:
@@ -201,7 +217,7 @@ def fly(
                 hand(cockpit, now_us)
 
         rate = FrameRate(settings.frame_period_us, settings.station.corrections_hz)
-        LiveStation(link, ground, source, rate, say, over, turn).run()
+        LiveStation(link, ground, source, rate, say, over, turn, records).run()
 
 
 def ask(link: LiveLink, request: ControlRequest) -> Answer:
@@ -216,14 +232,6 @@ def ask(link: LiveLink, request: ControlRequest) -> Answer:
     return answer
 
 
-def stop_signals() -> list[int]:
-    """Return a list that receives the signals for an orderly end."""
-    stops: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda received, _: stops.append(received))
-    return stops
-
-
 def run_until(stopping: Callable[[], bool], duration_s: float | None) -> Callable[[], bool]:
     """Return the function that returns whether to end: when stopped, or after a duration from now on."""
     start_us = clock_us()
@@ -235,7 +243,7 @@ def why(error: Exception, uri: str) -> str:
     if isinstance(error, LinkError):
         return f"--link {error}"
     if isinstance(error, OSError):
-        return f"{error.filename}: {error.strerror or error}"
+        return f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror or error)
     if isinstance(error, ImportError):
         extra = SCHEMES[uri.partition(":")[0]][2]
         return f"--link {uri}: {error}: {install_command(extra)}"

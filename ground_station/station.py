@@ -5,7 +5,7 @@ The tracker, if there is one, decides which frames are used. A tracked pose is s
 the original: a new goal counts at once, not after the camera's latency.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,11 +14,13 @@ from firmware_py.wire.telemetry import SLOW_BLOCKS, Sample
 from ground_station.config import StationConfig
 from ground_station.latency import LatencyBudget, LinkLatency
 from ground_station.mocap import MocapFrame, judged
-from ground_station.telemetry_log import TelemetryLog
 from ground_station.tracker import Track, Tracker
 from ground_station.trajectory import Goal, Trajectory
 
 TELEMETRY_TIMEOUT_US = 500_000  # of silence, after which the board is asked again
+
+# Takes a sample of telemetry with the station's own data, as `ground_station.telemetry_log.TelemetryLog.write` does.
+WriteSample = Callable[[int, Sample, Goal, MocapFrame | None, Track | None, LatencyBudget], object]
 
 
 class Link(Protocol):
@@ -80,7 +82,7 @@ class GroundStation:
         self,
         link: Link,
         trajectory: Trajectory,
-        log: TelemetryLog | None,
+        write_sample: WriteSample | None,
         config: StationConfig,
         tracker: Tracker | None = None,
     ) -> None:
@@ -89,7 +91,7 @@ class GroundStation:
         self.budget = LatencyBudget()
         self._link = link
         self._trajectory = trajectory
-        self._log = log
+        self._write_sample = write_sample
         self._slots = Slots(round(1e6 / config.corrections_hz))
         self.frame: MocapFrame | None = None  # the last one used
         self.track: Track | None = None  # the tracker's result for the last frame
@@ -136,6 +138,6 @@ class GroundStation:
             if sample.block not in SLOW_BLOCKS:
                 self._ask_for_telemetry_us = now_us + TELEMETRY_TIMEOUT_US
             self.telemetry[sample.block.id] = sample
-            if self._log is not None:
+            if self._write_sample is not None:
                 goal = self._trajectory.at(now_us)
-                self._log.write(now_us, sample, goal, self.frame, self.track, self.budget)
+                self._write_sample(now_us, sample, goal, self.frame, self.track, self.budget)

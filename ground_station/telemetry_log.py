@@ -38,7 +38,7 @@ _TIMES = (TIME_COLUMN, POSE_COLUMNS[0])  # to the microsecond
 
 
 class TelemetryLog:
-    """Writes the CSV file at `path`, of samples of `blocks`; an unwritable path raises `OSError`."""
+    """Writes the CSV file at `path`, of samples of `blocks`; raises `OSError`."""
 
     def __init__(self, path: Path, blocks: tuple[TelemetryBlock, ...] = ALL_BLOCKS) -> None:
         titles: list[str] = []

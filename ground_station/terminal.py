@@ -35,7 +35,7 @@ class Terminal:
         if os.isatty(descriptor):
             if not _in_foreground(descriptor):  # a background process that reads is stopped
                 return
-            if sys.stdout.isatty():
+            if sys.stdout is not None and sys.stdout.isatty():
                 completer = WordCompleter(lambda: list(words()), WORD=True)
                 self._session = PromptSession(completer=completer, complete_while_typing=False)
                 read = self._prompt

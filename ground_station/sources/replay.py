@@ -1,17 +1,15 @@
 """Frames from a file, at their original pace: a record of `floaty station --record`, or a flight's telemetry.
 
 Telemetry has only the latest frame at the start of each row, which arrived then at the latest. A record has a row
-for every frame, without loss, and is complete to about a second when the process dies. A full disk ends the record,
-not the flight.
+for every frame, without loss, and is complete to about a second when the process dies.
 """
 
 import csv
 import math
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TextIO
 
 from firmware_py.geometry import from_euler_zyx
 from ground_station.clock import clock_us, wait
@@ -26,56 +24,51 @@ COLUMNS = (
 )  # fmt: skip
 
 
-class RecordingSource:
-    """A source, open already, whose frames are also written to `path`; raises `OSError`."""
+class MocapLog:
+    """The record at `path`; raises `OSError`."""
 
-    def __init__(self, source: MocapSource, path: Path) -> None:
-        self._source = source
-        self._path = path
-        self._notices: list[str] = []
+    def __init__(self, path: Path) -> None:
         self._flush_us = 0
-        self._file: TextIO | None = path.open("w", encoding="utf-8", newline="\n")
+        self._file = path.open("w", encoding="utf-8", newline="\n")
         self._file.write(",".join(COLUMNS) + "\n")
 
+    def write(self, frame: MocapFrame) -> None:
+        """Write a frame that arrives now."""
+        now_us = clock_us()
+        numbers = (repr(value) for value in (*frame.p_WB, *frame.q_WB))  # the shortest that reads back equal
+        self._file.write(f"{now_us},{frame.t_us},{','.join(numbers)},{int(frame.valid)}\n")
+        if now_us >= self._flush_us:
+            self._file.flush()
+            self._flush_us = now_us + FLUSH_PERIOD_US
+
+    def close(self) -> None:
+        self._file.close()
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingSource:
+    """A source whose frames also go to `write`."""
+
+    source: MocapSource
+    write: Callable[[MocapFrame], object]
+
     def open(self) -> None:
-        """Connect again and continue the file; raises `MocapError`, `OSError`."""
-        self._source.open()
-        if self._file is None:
-            self._file = self._path.open("a", encoding="utf-8", newline="\n")
+        self.source.open()
 
     def receive(self, timeout_s: float) -> MocapFrame | None:
-        frame = self._source.receive(timeout_s)
-        if frame is not None and self._file is not None:
-            try:
-                self._write(self._file, frame, clock_us())
-            except OSError as error:
-                with suppress(OSError):
-                    self._file.close()
-                self._file = None
-                why = error.strerror or error
-                self._notices.append(f"{self._path}: {why}; frames are not recorded any more")
+        frame = self.source.receive(timeout_s)
+        if frame is not None:
+            self.write(frame)
         return frame
 
     def notices(self) -> list[str]:
-        notices, self._notices = self._notices, []
-        return self._source.notices() + notices
+        return self.source.notices()
 
     def summary(self) -> str:
-        return self._source.summary()
+        return self.source.summary()
 
     def close(self) -> None:
-        self._source.close()
-        file, self._file = self._file, None
-        if file is not None:
-            with suppress(OSError):
-                file.close()
-
-    def _write(self, file: TextIO, frame: MocapFrame, now_us: int) -> None:
-        numbers = (repr(value) for value in (*frame.p_WB, *frame.q_WB))  # the shortest that reads back equal
-        file.write(f"{now_us},{frame.t_us},{','.join(numbers)},{int(frame.valid)}\n")
-        if now_us >= self._flush_us:
-            file.flush()
-            self._flush_us = now_us + FLUSH_PERIOD_US
+        self.source.close()
 
 
 TELEMETRY_COLUMNS = (TIME_COLUMN, *POSE_COLUMNS)

@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
+from ground_station.stops import heeded
 from hil.campaigns.dataset import Dataset
 from hil.campaigns.jobs import LOG_AND_TELEMETRY, Job, Plan, Row
 from hil.campaigns.workers import Workers
@@ -216,7 +217,7 @@ class Runner:
     @contextmanager
     def _stops_noted(self) -> Iterator[None]:
         """Record the signals that request an orderly end."""
-        numbers = (signal.SIGINT, signal.SIGTERM)
+        numbers = heeded()
         before = [signal.signal(number, lambda got, _: self._stops.append(got)) for number in numbers]
         try:
             yield

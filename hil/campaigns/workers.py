@@ -18,6 +18,7 @@ from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import TYPE_CHECKING, TypeAlias
 
+from ground_station.stops import HANGUP
 from hil.campaigns.jobs import Job, Row, failed, fly_job
 from hil.errors import LabError, require
 
@@ -165,8 +166,9 @@ def _process() -> ProcessPoolExecutor:
 
 
 def _begin() -> None:
-    """Leave Ctrl-C to the parent process, and end when that ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Leave Ctrl-C and a lost terminal to the parent process, and end when that ends."""
+    for number in (signal.SIGINT, *HANGUP):
+        signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -1,6 +1,7 @@
 """`floaty`: the command group.
 
-Bad input ends in one line on standard error and exit code 2; a failed limit in 1; Ctrl-C in 130 with the log kept.
+Bad input ends in one line on standard error and exit code 2; a failed limit in 1; Ctrl-C, SIGTERM
+and SIGHUP in 130 with the log kept.
 """
 
 import atexit
@@ -12,7 +13,8 @@ from importlib import import_module
 import click
 
 from firmware_py.fast import STALE
-from hil.commands.options import INTERRUPTED
+from ground_station.stops import stopped_like_ctrl_c
+from hil.commands.options import INTERRUPTED, warn
 from hil.errors import LabError
 from hil.installation import describe
 
@@ -97,13 +99,15 @@ def main() -> None:
     gc.set_threshold(100_000, 20, 50)  # imports alone would cause 0.3 s of collections
     atexit.register(gc.freeze)  # Python's last collection would delay the prompt by 0.5 s
     if STALE:
-        print(f"floaty: pure Python, not what `make fast` has compiled: {STALE}", file=sys.stderr)
+        warn(f"floaty: pure Python, not what `make fast` has compiled: {STALE}")
     try:
-        code = app.main(standalone_mode=False)
+        with stopped_like_ctrl_c():
+            code = app.main(standalone_mode=False)
     except LabError as error:
         sys.exit(_refuse(str(error)))
     except click.exceptions.NoArgsIsHelpError as error:
-        print(error.format_message(), file=sys.stderr)
+        for line in error.format_message().splitlines():
+            warn(line)
         sys.exit(2)
     except click.ClickException as error:
         typed = error.option_name if isinstance(error, click.NoSuchOption) else " ".join(sys.argv[1:3])
@@ -115,5 +119,5 @@ def main() -> None:
 
 
 def _refuse(text: str) -> int:
-    print("floaty:", " ".join(text.split()), file=sys.stderr)
+    warn(f"floaty: {' '.join(text.split())}")
     return 2

@@ -52,11 +52,13 @@ def list_experiments(file: Path | None, faults: bool) -> None:
         say(f"{entry.name:{width}}  {text} ({package_of(entry)})")
     bench = "forces and torques on the mounted robot over flap angles; not a flight: `floaty drag-model`"
     say(f"{'drag-model':{width}}  {bench}")
-    say("\nrobustness, for `floaty study`:")
+    say("")
+    say("robustness, for `floaty study`:")
     for one in STUDIES.values():
         say(f"{one.name:{width}}  {one.question}")
     names = (f"{name} (default)" if name == DEFAULT_PROFILE else name for name in profile_names())
-    say(f"\nprofiles: {', '.join(names)}")
+    say("")
+    say(f"profiles: {', '.join(names)}")
     say("faults: floaty list --faults")
 
 

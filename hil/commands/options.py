@@ -15,7 +15,9 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 from rich.table import Column
+from rich.text import Text
 
+from ground_station.lines import print_line, visible
 from hil.errors import LabError
 
 if TYPE_CHECKING:
@@ -27,8 +29,21 @@ INTERRUPTED = 130
 Asked = TypeVar("Asked")
 Command = TypeVar("Command", bound=Callable[..., Any])
 
-console = Console(highlight=False)
-notices = Console(stderr=True, highlight=False)
+
+class TextConsole(Console):
+    """A console that shows control characters in texts as escapes, and raises `OSError` when its output fails."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Render as rich does."""
+        return super().render_str("\n".join(map(visible, text.split("\n"))), **options)
+
+    def on_broken_pipe(self) -> None:
+        """Raise the error that rich is handling."""
+        raise
+
+
+console = TextConsole(highlight=False)
+notices = TextConsole(stderr=True, highlight=False)
 
 
 class Number(click.FloatRange):
@@ -47,7 +62,7 @@ PATH, FILE = click.Path(path_type=Path), click.Path(path_type=Path, dir_okay=Fal
 
 def wide_console(width: int = 150) -> Console:
     """Return the console for a table of a fixed width, in any terminal."""
-    return Console(highlight=False, width=max(console.width, width))
+    return TextConsole(highlight=False, width=max(console.width, width))
 
 
 def right(*headings: str) -> list[Column]:
@@ -148,12 +163,12 @@ def announce_compilation() -> None:
 
 def say(text: object) -> None:
     """Print a line and flush it: a program may read it."""
-    print(text, flush=True)
+    print_line(text)
 
 
 def warn(text: str) -> None:
     """Print a line on standard error."""
-    print(text, file=sys.stderr)
+    print_line(text, sys.stderr)
 
 
 def progress_bar(*columns: ProgressColumn) -> Progress:
@@ -175,8 +190,8 @@ def exit_code(result: Result) -> int:
     return INTERRUPTED if result.outcome == "interrupted" else 0 if result.passed else 1
 
 
-def open_live(target: str | None) -> LiveView | None:
-    """Open the picture of `--view`; it always closes with the command."""
+def open_live(target: str | None, say: Callable[[str], None] = say) -> LiveView | None:
+    """Open the picture of `--view`; it always closes with the command. `say` gets lines for the user."""
     if target is None:
         return None
     from hil.live.feed import open_view
@@ -185,7 +200,7 @@ def open_live(target: str | None) -> LiveView | None:
     return context.with_resource(closing(open_view(target, str(context.info_name), say)))
 
 
-def close_live(view: LiveView | None, result: Result | None = None) -> None:
+def close_live(view: LiveView | None, result: Result | None = None, say: Callable[[str], None] = say) -> None:
     """Close the picture, and record and report the rows that it missed."""
     if view is None:
         return

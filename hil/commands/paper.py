@@ -127,7 +127,8 @@ def _print_rows(flown: "Paper") -> None:
     for row, profile, what in flown.misses:
         say(f"{row.title}, {profile}: {'; '.join(what)}")
     for why in dict.fromkeys(row.why for row, _, _ in flown.misses if row.why):
-        say(f"\n{why}")
+        say("")
+        say(why)
 
 
 def _print_constants(constants: "Sequence[PaperConstant]") -> None:

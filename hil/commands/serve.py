@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass, replace
 from math import inf
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hil.commands import options as common
-from hil.commands.options import PATH, say
+from hil.commands.options import PATH
 from hil.errors import LabError, require
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from hil.servers.server import Doors, Opened, Server
     from hil.servers.swarm import Swarm
 
+Say = Callable[[str], None]
 UDP_PORT = 19850  # where cflib looks for boards
 RADIO_PORT = 19840
 BOARDS_MAX = 10
@@ -106,6 +108,7 @@ def serve(asked: ServeOptions) -> int:
     _check_options(asked)
     if asked.mavlink is not None:
         require(f"--mavlink {asked.mavlink}", "mavlink", "pymavlink")
+    from ground_station.records import INCOMPLETE, Records
     from hil.config import load_config
     from hil.laboratory.fault_kinds import MARKERS_ON
     from hil.laboratory.faults import check, parse
@@ -126,12 +129,14 @@ def serve(asked: ServeOptions) -> int:
     common.announce_compilation()
     plan = Service(config, 1, asked.seed, bool(serial), planned, asked.state, _executor(asked))
     doors = Doors(asked.udp, asked.radio_port if asked.radio else None, serial, station, asked.motive)
+    records = Records()
+    say = records.say
     with closing(Swarm(plan, asked.boards, doors, say)) as swarm:
-        view = common.open_live(asked.target)
+        view = common.open_live(asked.target, say)
         with closing(Server(plan, say, view, swarm.to_peers)) as server:
-            _run(server, swarm, doors, view)
+            _run(server, swarm, doors, view, say)
     say(f"stopped; time stood still for {server.clock.stood_still_us / 1000:.0f} ms")
-    return 0
+    return INCOMPLETE if records.incomplete else 0
 
 
 def _executor(asked: ServeOptions) -> Executor:
@@ -145,9 +150,9 @@ def _executor(asked: ServeOptions) -> Executor:
     return image_at(asked.board, None, debugger(asked.gdb, Path(asked.board), stack))
 
 
-def _run(server: Server, swarm: Swarm, doors: Doors, view: LiveView | None) -> None:
+def _run(server: Server, swarm: Swarm, doors: Doors, view: LiveView | None, say: Say) -> None:
     """Open the doors of all robots and serve until Ctrl-C, with faults typed at the terminal or in the picture's panel."""
-    from ground_station.program import stop_signals
+    from ground_station.stops import stop_signals
     from hil.servers.live_faults import LiveFaults
 
     def answer(text: str) -> None:
@@ -161,8 +166,8 @@ def _run(server: Server, swarm: Swarm, doors: Doors, view: LiveView | None) -> N
         return bool(stops)
 
     others = swarm.wait()
-    _print_addresses([server.open(doors, [other.dongles for other in others]), *others])
-    motive = _motive(server, 1 + len(others)) if doors.motive else None
+    _print_addresses([server.open(doors, [other.dongles for other in others]), *others], say)
+    motive = _motive(server, 1 + len(others), say) if doors.motive else None
     with nullcontext() if motive is None else closing(motive):
         swarm.listen(server, answer, motive)
         faults = LiveFaults(server, answer, swarm.terminals)
@@ -171,7 +176,7 @@ def _run(server: Server, swarm: Swarm, doors: Doors, view: LiveView | None) -> N
         say("serving; Ctrl-C ends")
         server.run(stopping)
         swarm.close()
-        common.close_live(view)
+        common.close_live(view, say=say)
         if motive is not None and motive.malformed:
             say(f"motive could not read {motive.malformed} packets")
 
@@ -203,7 +208,7 @@ def _check_options(asked: ServeOptions) -> None:
         raise LabError(f"--gdb {gdb}: needs one board and an image as --board")
 
 
-def _motive(server: Server, count: int) -> VirtualMotive:
+def _motive(server: Server, count: int, say: Say) -> VirtualMotive:
     """Open a Motive that tracks `count` robots, and say where it is."""
     from hil.servers.motive import streaming_of
     from hil.servers.server import open_motive
@@ -215,10 +220,11 @@ def _motive(server: Server, count: int) -> VirtualMotive:
     return motive
 
 
-def _print_addresses(robots: list[Opened]) -> None:
+def _print_addresses(robots: list[Opened], say: Say) -> None:
     """Say where clients find the robots."""
     if robots[0].dongles:
-        say(radio_hint(robots[0].dongles, [robot.radio for robot in robots]))
+        for line in radio_hint(robots[0].dongles, [robot.radio for robot in robots]).splitlines():
+            say(line)
     if robots[0].udp:
         say(f"udp    {' '.join(robot.udp for robot in robots)}")
     if robots[0].mavlink:

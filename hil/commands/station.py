@@ -12,13 +12,14 @@ import click
 from ground_station.controls import ControlsError
 from ground_station.trajectory import Goal, Trajectory
 from hil.commands import options as common
-from hil.commands.options import FILE, PATH, say
+from hil.commands.options import FILE, PATH
 from hil.commands.tables import print_result
 from hil.errors import LabError
 
 if TYPE_CHECKING:
     from ground_station.operator import Operator
     from ground_station.program import Cockpit, Hand
+    from ground_station.records import Records
     from hil.laboratory.experiment import Experiment
     from hil.laboratory.real_flight import RealFlight
     from hil.live.feed import LiveView
@@ -87,38 +88,49 @@ def station(asked: StationOptions) -> int:
 
     While it flies, lines like goal 0.1 0 1.15, set controller.gain_y -2.0 or stop act at once; help lists the commands.
 
-    Exit code with --out: as for `floaty fly`, by the limits of EXPERIMENT on the cameras' poses.
+    A file, or the standard output, that can no longer be written ends, with one line; the flight continues.
+
+    Exit code with --out: as for `floaty fly`, by the limits of EXPERIMENT on the cameras' poses; 3: flown, but a file or
+    the output is incomplete.
     """
     from ground_station.operator import Operator, fly_with
     from ground_station.program import Session
+    from ground_station.records import INCOMPLETE, STANDARD_OUTPUT, Records
     from hil.config import load_config
     from hil.experiments import EXPERIMENTS, find_experiment
 
     config, experiment = load_config(asked.profile, asked.overrides), find_experiment(asked.named)
     _check_files(asked)
-    view = common.open_live(asked.target)
-    flight = _recorded(asked, experiment, view)
-    desk = Desk(flight, view)
+    records = Records()
+    view = common.open_live(asked.target, records.say)
+    flight = _recorded(asked, experiment, view, records)
+    desk = Desk(flight, view, records.say)
     know = view.know if view is not None and asked.target == "foxglove:parameters" else None
     operator = Operator(_trajectory_of, desk.reply, desk.note, know)
     log = flight.telemetry if flight is not None and asked.out is not None else asked.log
     session = Session(
-        asked.uri, asked.mocap, experiment.trajectory, asked.start_s, log, asked.record, asked.tlog
+        asked.uri, asked.mocap, experiment.trajectory, asked.start_s, log, asked.record, asked.tlog, records
     )
     failure, interrupted = fly_with(
         operator, config.ground, session, desk.report, asked.duration, desk.hands(operator), [*EXPERIMENTS]
     )
     result = flight.close(failure, interrupted) if flight is not None else None
     if result is not None:
-        common.write_pictures(result.folder, experiment)
-        print_result(result)
-    common.close_live(view, result)
+        records.write(asked.out, common.write_pictures, result.folder, experiment)
+        records.write(STANDARD_OUTPUT, print_result, result)
+    records.write(asked.out, common.close_live, view, result, records.say)
+    for notice in records.notices():
+        records.say(notice)
     if failure:
         raise LabError(failure)
+    if records.incomplete:
+        return INCOMPLETE
     return 0 if result is None else common.exit_code(result)
 
 
-def _recorded(asked: StationOptions, experiment: Experiment, view: LiveView | None) -> RealFlight | None:
+def _recorded(
+    asked: StationOptions, experiment: Experiment, view: LiveView | None, records: Records
+) -> RealFlight | None:
     """Return the record of the flight, None if nobody wants it."""
     from hil.laboratory.real_flight import RealFlight
     from hil.laboratory.request import REAL, Bench, Request
@@ -127,7 +139,7 @@ def _recorded(asked: StationOptions, experiment: Experiment, view: LiveView | No
         return None
     bench = Bench(link=asked.uri, board=REAL)
     request = Request(experiment, asked.profile, asked.overrides, 0, experiment.duration_s, (), bench)
-    return RealFlight(asked.out, request, say, onlooker=view)
+    return RealFlight(asked.out, request, records, records.say, onlooker=view)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,10 +148,11 @@ class Desk:
 
     flight: RealFlight | None
     view: LiveView | None
+    say: Callable[[str], None]
 
     def report(self, text: str) -> None:
         """Print and record a line of the station."""
-        say(text)
+        self.say(text)
         if self.flight is not None:
             self.flight.note("station", text)
 
@@ -152,7 +165,7 @@ class Desk:
 
     def reply(self, text: str) -> None:
         """Print and show an answer to the operator."""
-        say(text)
+        self.say(text)
         if self.view is not None:
             self.view.answer(0 if self.flight is None else self.flight.log_us, text)
 

@@ -10,6 +10,7 @@ from firmware_py.errors import FirmwareError
 from firmware_py.export.boards import runner_of
 from firmware_py.wire.telemetry import ALL_BLOCKS, CRAZYFLIE_BLOCKS
 from ground_station.errors import LinkError
+from ground_station.lines import print_line
 from ground_station.links.crazyflie_link import CrazyflieLink, FlightTimes
 from ground_station.links.frame_log import FRAME_LOG, FrameLog
 from ground_station.links.loopback import LoopbackLink
@@ -58,9 +59,8 @@ class ModelledLine:
         )
         blocks = CRAZYFLIE_BLOCKS if config.pilot.enabled else ALL_BLOCKS
         self._telemetry = TelemetryLog(telemetry, blocks) if telemetry else None
-        self.station = GroundStation(
-            self._link, self.trajectory, self._telemetry, config.station, self.tracker
-        )
+        write_sample = None if self._telemetry is None else self._telemetry.write
+        self.station = GroundStation(self._link, self.trajectory, write_sample, config.station, self.tracker)
         self._receivers: list[Receiver] = [self.station.on_packet]  # receivers of the board's radio packets
         if self.robot.firmware.flashed is not None and not config.pilot.enabled:
             self._set_up(site, self.robot.firmware.flashed)
@@ -199,6 +199,6 @@ def debugger(port: int | None, image: Path, stack: ExitStack) -> GdbServer | Non
 
     def waiting(port: int) -> None:
         connect = f"-ex 'target remote 127.0.0.1:{port}'"
-        print(f"waiting for gdb-multiarch {shlex.quote(str(image))} {connect}", flush=True)
+        print_line(f"waiting for gdb-multiarch {shlex.quote(str(image))} {connect}")
 
     return stack.enter_context(closing(GdbServer(port, waiting)))

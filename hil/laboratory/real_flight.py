@@ -15,15 +15,16 @@ from firmware_py.wire.supervisor import State
 from ground_station.clock import clock_us
 from ground_station.mocap import MocapFrame
 from ground_station.program import Cockpit
+from ground_station.records import Records
 from ground_station.telemetry_log import TELEMETRY
 from hil.bodies import make_body
 from hil.config import LabConfig
-from hil.errors import LabError, made_folder, require_empty, writing
+from hil.errors import LabError, made_folder, require_empty
 from hil.laboratory.ages import STATION_START
 from hil.laboratory.channels import station_channels
 from hil.laboratory.flight import RECORD_PERIOD_US
 from hil.laboratory.metrics import check_limits, measure
-from hil.laboratory.recorder import Onlooker, Recorder, load_log
+from hil.laboratory.recorder import STREAM, Onlooker, Recorder, load_log
 from hil.laboratory.request import Request, why_left
 from hil.laboratory.result import Outcome, Program, Result, judged, metadata_of, with_resets, write_result
 from hil.laboratory.robot import Streams
@@ -32,14 +33,15 @@ from hil.laboratory.robot import Streams
 class RealFlight:
     """Records one flight of `floaty station` into a new `folder`; the station's program calls `turn` in its loop.
 
-    Without a folder nothing is stored, but onlookers get the rows. Raises `LabError` when the folder exists: a real
-    flight cannot be repeated.
+    Without a folder nothing is stored, but onlookers get the rows. A write that fails ends its file by the rule of
+    `records`. Raises `LabError` when the folder exists: a real flight cannot be repeated.
     """
 
     def __init__(
         self,
         folder: Path | None,
         request: Request,
+        records: Records,
         say: Callable[[str], None],
         clock: Callable[[], int] = clock_us,
         onlooker: Onlooker | None = None,
@@ -51,6 +53,7 @@ class RealFlight:
         self._config = request.config
         check_limits(request.limits, request.experiment.metrics)
         self._program = Program.of(request.config)
+        self._records = records
         self._say = say
         self._clock = clock
         self._start_us = clock()
@@ -62,8 +65,8 @@ class RealFlight:
         body = make_body(request.config, Streams.of_seed(0).gusts, request.config.flight.home)
         self._look_of_robot = body.look
         self._lost: str | None = None
+        self._stored: Result | None = None  # in the folder
         self._state: int | None = None  # the supervisor's
-        self._broken = False  # writing has failed
         if folder is not None:
             require_empty("--out", folder)
             made_folder("--out", folder)
@@ -81,7 +84,7 @@ class RealFlight:
         if self._recorder is None:
             self._early.append((now_us, source, text))
             return
-        self._write(lambda recorder: recorder.note(now_us - self._start_us, source, text))
+        self._recorder.note(now_us - self._start_us, source, text)
 
     @property
     def log_us(self) -> int:
@@ -93,13 +96,15 @@ class RealFlight:
         if now_us < self._next_us:
             return
         if self._recorder is None:
-            self._begin(cockpit)
+            self._recorder = self._begin(cockpit)
+            for early in self._early:
+                self._note(*early)
         self._now_us = now_us
         self._next_us = now_us - now_us % RECORD_PERIOD_US + RECORD_PERIOD_US
         self._look(cockpit, now_us)
-        self._write(lambda recorder: recorder.row(now_us - self._start_us))
+        self._recorder.row(now_us - self._start_us)
 
-    def _begin(self, cockpit: Cockpit) -> None:
+    def _begin(self, cockpit: Cockpit) -> Recorder:
         metadata = {
             **metadata_of(self._request, self._program, self._look_of_robot),
             STATION_START.decode(): str(self._start_us),
@@ -107,19 +112,7 @@ class RealFlight:
         channels = station_channels(
             cockpit, lambda: self._is_free, lambda: cockpit.plan.at(self._now_us), self._start_us
         )
-        self._recorder = Recorder(self._folder, channels, metadata, self._onlooker)
-        for early in self._early:
-            self._note(*early)
-
-    def _write(self, write: Callable[[Recorder], None]) -> None:
-        """Write, if possible: a full disk ends the record, not the flight."""
-        if self._recorder is None or self._broken:
-            return
-        try:
-            write(self._recorder)
-        except OSError as error:
-            self._broken = True
-            self._say(f"{self._folder}: no more is recorded: {error.strerror or error}")
+        return Recorder(self._folder, channels, metadata, self._onlooker, self._records)
 
     def _look(self, cockpit: Cockpit, now_us: int) -> None:
         """Note the board's state, the trajectory's begin and end, and a loss."""
@@ -143,23 +136,34 @@ class RealFlight:
                 self._note(now_us, "lab", f"lost: {self._lost}; what follows is not judged")
 
     def close(self, failure: str = "", interrupted: bool = False) -> Result | None:
-        """Finish the log and write `result.json`; None, without a folder, for a flight that never began or is not stored.
+        """Finish the log and write `result.json`; None for a flight that never began or is not stored.
 
-        `failure` is why the station gave up. Raises `LabError` when writing fails.
+        A flight that never began leaves no folder. `failure` is why the station gave up.
         """
-        folder = self._folder
-        if self._recorder is None:
-            if folder is not None:
-                shutil.rmtree(folder)
-            return None
-        self.note("lab", failure or ("interrupted by the user" if interrupted else "the station ends"))
-        with writing("--out", folder):
-            digest = self._recorder.close()
-            if folder is None:
-                return None
-            result = self._result(folder, digest, failure, interrupted)
+        if self._recorder is not None:
+            self.note("lab", failure or ("interrupted by the user" if interrupted else "the station ends"))
+            try:
+                self._records.attempt(self._folder, self._finish, failure, interrupted)
+            except LabError:
+                if not self._ends_early:
+                    raise  # else not even the log's head was stored
+        elif self._folder is not None:
+            shutil.rmtree(self._folder)
+        return self._stored
+
+    @property
+    def _ends_early(self) -> bool:
+        """Whether rows are missing at the log's end."""
+        return self._folder is not None and self._records.failed(self._folder / STREAM)
+
+    def _finish(self, failure: str, interrupted: bool) -> None:
+        """Finish the files; raises `OSError`, with the log as it is on disk."""
+        assert self._recorder is not None
+        digest = self._recorder.close()
+        if self._folder is not None:
+            result = self._result(self._folder, digest, failure, interrupted)
             write_result(result)
-        return result
+            self._stored = result
 
     def _result(self, folder: Path, digest: str, failure: str, interrupted: bool) -> Result:
         """Return the result, from the log."""
@@ -172,6 +176,8 @@ class RealFlight:
             self._say(f"{self._experiment.name}: its own metrics need {error}, which a real flight lacks")
         cut_short: Outcome = "error" if failure else "interrupted" if interrupted else "completed"
         outcome: Outcome = "lost" if self._lost else "completed" if self._whole else cut_short
+        if self._ends_early:
+            outcome, failure = "error", "; ".join(filter(None, (failure, "the log ends before the flight")))
         ended = with_resets(outcome, self._lost or failure or None, metrics["resets"])
         return judged(self._request, self._program, ended, metrics, log, digest, folder)
 

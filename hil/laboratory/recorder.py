@@ -17,7 +17,7 @@ from itertools import chain, islice
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from types import ModuleType
-from typing import IO, Any, Protocol
+from typing import IO, Any, ParamSpec, Protocol
 from weakref import WeakSet
 
 import numpy as np
@@ -27,6 +27,7 @@ import pyarrow.parquet
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from ground_station.records import Records
 from hil.config import LabConfig
 from hil.errors import LabError, refusing
 from hil.laboratory.ages import at_exposure
@@ -55,6 +56,8 @@ ARROW_ERRORS = (pa.ArrowException, ValueError, KeyError, TypeError, NotImplement
 RELEASE_US = b"release_us"  # in the metadata of a log whose flight was released
 PARQUET, STREAM, EVENTS = "log.parquet", "log.arrows", "events.jsonl"
 
+P = ParamSpec("P")
+
 
 class Onlooker(Protocol):
     """Watches a flight while it is recorded. Neither call blocks or raises."""
@@ -67,7 +70,11 @@ class Onlooker(Protocol):
 
 
 class Recorder:
-    """Writes one flight into its run folder, and passes it to an onlooker; without a folder nothing is stored."""
+    """Writes one flight into its run folder, and passes it to an onlooker; without a folder nothing is stored.
+
+    A write that fails raises `OSError`; or, with the `records` of a real flight, it ends its file by their rule, while the
+    onlooker sees the rest.
+    """
 
     def __init__(
         self,
@@ -75,7 +82,9 @@ class Recorder:
         channels: tuple[Channel, ...],
         metadata: Mapping[str, str],
         onlooker: Onlooker | None = None,
+        records: Records | None = None,
     ) -> None:
+        self._records = records
         self.release_us: int | None = None
         self._onlooker = onlooker
         self._folder = folder
@@ -106,10 +115,24 @@ class Recorder:
         self._stream: Any = None
         self._events: IO[str] | None = None
         if folder is not None:
-            self._file = pa.output_stream(str(folder / STREAM), buffer_size=BUFFER_BYTES)
-            self._stream = pa.ipc.new_stream(self._file, self._schema)
-            self._file.flush()
-            self._events = (folder / EVENTS).open("w", encoding="utf-8")
+            self._write(STREAM, self._open_stream, folder / STREAM)
+            self._write(EVENTS, self._open_events, folder / EVENTS)
+
+    def _open_stream(self, path: Path) -> None:
+        self._file = pa.output_stream(str(path), buffer_size=BUFFER_BYTES)
+        self._stream = pa.ipc.new_stream(self._file, self._schema)
+        self._file.flush()
+
+    def _open_events(self, path: Path) -> None:
+        self._events = path.open("w", encoding="utf-8")
+
+    def _write(self, name: str, write: Callable[P, object], *what: P.args, **more: P.kwargs) -> None:
+        """Write to a file of the folder."""
+        if self._records is None:
+            write(*what, **more)
+        else:
+            assert self._folder is not None
+            self._records.write(self._folder / name, write, *what, **more)
 
     def released(self, at_us: int) -> None:
         """Note when the robot is released."""
@@ -138,8 +161,8 @@ class Recorder:
         if self._onlooker is not None:
             self._onlooker.note(now_us, source, text)
         if self._events is not None:
-            self._events.write(json.dumps({"t_us": now_us, "source": source, "text": text}) + "\n")
-            self._events.flush()
+            line = json.dumps({"t_us": now_us, "source": source, "text": text}) + "\n"
+            self._write(EVENTS, self._write_line, self._events, line)
 
     def close(self, correct: Callable[[pa.Table], pa.Table] | None = None) -> str:
         """Finish the files; returns the SHA-256 over times, names and values of all columns as they were recorded.
@@ -147,9 +170,9 @@ class Recorder:
         `correct` may add what became known only after the flight.
         """
         with ExitStack() as closing:  # all of them, even on a full disk
-            for written in (self._file, self._stream, self._events):
+            for name, written in ((STREAM, self._file), (STREAM, self._stream), (EVENTS, self._events)):
                 if written is not None:
-                    closing.callback(written.close)
+                    closing.callback(self._close, name, written)
             if self._row:
                 self._write_batch()
         if self._folder is not None:
@@ -163,8 +186,23 @@ class Recorder:
         for columns in self._columns:
             self._hash.update(columns[:, :count].tobytes())
         if self._stream is not None:
-            self._stream.write_batch(self._batch.slice(0, count))
-            self._file.flush()
+            self._write(STREAM, self._store, count)
+
+    def _store(self, count: int) -> None:
+        self._stream.write_batch(self._batch.slice(0, count))
+        self._file.flush()
+
+    def _write_line(self, file: IO[str], line: str) -> None:
+        file.write(line)
+        file.flush()
+
+    def _close(self, name: str, file: Any) -> None:
+        """Close a file, which may have failed before."""
+        if self._records is None:
+            file.close()
+        else:
+            assert self._folder is not None
+            self._records.attempt(self._folder / name, file.close)
 
     def show(self) -> None:
         """Pass the rows that it has not seen to the onlooker, which may keep them."""
@@ -185,10 +223,14 @@ def finish_log(
     first = next(pieces)
     more = {} if release_us is None else {RELEASE_US: str(release_us).encode()}
     schema = _with_metadata(first, more).schema
-    with pa.parquet.ParquetWriter(partial, schema, compression="zstd", use_dictionary=False) as writer:
-        for table in chain([first], pieces):
-            writer.write_table(table)
-    partial.replace(folder / PARQUET)
+    try:
+        with pa.parquet.ParquetWriter(partial, schema, compression="zstd", use_dictionary=False) as writer:
+            for table in chain([first], pieces):
+                writer.write_table(table)
+        partial.replace(folder / PARQUET)
+    except OSError:  # a full disk keeps the stream
+        partial.unlink(missing_ok=True)
+        raise
     stream.unlink()
 
 

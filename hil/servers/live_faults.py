@@ -61,7 +61,8 @@ class LiveFaults:
     def take(self, line: str, now_us: int) -> None:
         """Execute a line; answer an invalid line without changing anything."""
         if line == "help":
-            self._say(HELP)
+            for listed in HELP.splitlines():
+                self._say(listed)
         elif line == "kinds":
             self._say(" ".join(KINDS))
         elif len(line) > LINE_MAX:

@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import partial
 from multiprocessing.connection import Connection
 
+from ground_station.stops import STOPS
 from hil.crazyflie.nrf51 import AirSettings
 from hil.errors import LabError
 from hil.servers.live_faults import LiveFaults
@@ -122,7 +123,7 @@ class Swarm:
 
     def _serve(self, plan: Service, doors: Doors, pipe: Connection) -> None:
         """Serve a robot in this process."""
-        for number in (signal.SIGINT, signal.SIGTERM):  # robot 1's process ends the others
+        for number in STOPS:  # robot 1's process ends the others
             signal.signal(number, signal.SIG_IGN)
         for other in self._pipes.values():
             other.close()

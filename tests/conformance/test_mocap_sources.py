@@ -15,7 +15,7 @@ from ground_station.config import CaptureConfig
 from ground_station.mocap import MocapFrame, MocapSource
 from ground_station.sources.motioncapture_client import MotioncaptureSource
 from ground_station.sources.optitrack import OptitrackSource
-from ground_station.sources.replay import COLUMNS, RecordingSource, ReplaySource
+from ground_station.sources.replay import COLUMNS, MocapLog, RecordingSource, ReplaySource
 from support.motive_bench import moving, needs, seen
 
 FRAMES = 20
@@ -41,7 +41,9 @@ def recorded(folder: Path) -> Iterator[MocapSource]:
     with replay(folder) as source:
         source.open()
         source.notices()
-        yield RecordingSource(source, folder / "again.csv")
+        log = MocapLog(folder / "again.csv")
+        yield RecordingSource(source, log.write)
+        log.close()
 
 
 @contextmanager

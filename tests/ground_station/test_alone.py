@@ -9,12 +9,13 @@ from pathlib import Path
 import pytest
 
 from ground_station import __main__ as alone
+from ground_station.stops import STOPS
 
 
 @pytest.fixture(autouse=True)
 def handlers() -> Iterator[None]:
     """Keep the test runner's own way to be interrupted."""
-    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    kept = {number: signal.getsignal(number) for number in STOPS}
     yield
     for number, handler in kept.items():
         signal.signal(number, handler)

@@ -198,7 +198,7 @@ def rows(path):
 
 def test_log_has_one_row_per_time_stamp_with_what_the_ground_knew(tmp_path):
     log = TelemetryLog(tmp_path / "telemetry.csv")
-    bench = StationWithPackets(log=log)
+    bench = StationWithPackets(log=log.write)
     bench.frames(1, p=lambda number: (0.25, 0.0, 1.15))
     for timestamp_ms in (0, 20):  # a board that has just booted, too
         for data in telemetry_packets(timestamp_ms):
@@ -218,7 +218,7 @@ def test_log_has_one_row_per_time_stamp_with_what_the_ground_knew(tmp_path):
 
 def test_times_are_to_the_microsecond_on_a_computer_that_has_run_for_days(tmp_path):
     log = TelemetryLog(tmp_path / "telemetry.csv")
-    bench = StationWithPackets(log=log)
+    bench = StationWithPackets(log=log.write)
     now_us = 1_000_000_123_457
     bench.station.on_frame(MocapFrame(now_us - 38_001, (0.0, 0.0, 1.15), UPRIGHT, True), now_us)
     for data in telemetry_packets(20):
@@ -231,7 +231,7 @@ def test_times_are_to_the_microsecond_on_a_computer_that_has_run_for_days(tmp_pa
 
 def test_a_lost_block_leaves_nan_in_its_own_row_only(tmp_path):
     log = TelemetryLog(tmp_path / "telemetry.csv")
-    bench = StationWithPackets(log=log)
+    bench = StationWithPackets(log=log.write)
     for timestamp_ms, blocks in (
         (20, START_ORDER),
         (40, [b for b in START_ORDER if b is not telemetry.MOTION]),
@@ -248,7 +248,7 @@ def test_a_lost_block_leaves_nan_in_its_own_row_only(tmp_path):
 
 def test_log_knows_velocity_and_quality_of_the_track_and_the_last_usable_pose(tmp_path):
     log = TelemetryLog(tmp_path / "telemetry.csv")
-    bench = StationWithPackets(log=log, tracker=Tracker(TrackerConfig(), 5000))
+    bench = StationWithPackets(log=log.write, tracker=Tracker(TrackerConfig(), 5000))
     packet = next(telemetry_packets(20))
     bench.frames(100)
     bench.hear(500_000, packet)
@@ -268,7 +268,7 @@ def test_log_knows_velocity_and_quality_of_the_track_and_the_last_usable_pose(tm
 
 def test_log_on_disk_is_never_much_more_than_a_second_old(tmp_path):
     log = TelemetryLog(tmp_path / "telemetry.csv")
-    bench = StationWithPackets(log=log)
+    bench = StationWithPackets(log=log.write)
     for timestamp_ms in range(0, 10_000, 500):  # few bytes: no buffer is ever full
         for data in telemetry_packets(timestamp_ms):
             bench.hear(timestamp_ms * 1000, data)

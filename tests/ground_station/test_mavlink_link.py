@@ -197,7 +197,7 @@ def test_battery_and_load_belong_to_the_preceding_row(tmp_path):
     bench = LinkWithCodec()
     assert bench.hear(0, status(3_900, 250)) == []  # there is no row yet
     log = TelemetryLog(tmp_path / "telemetry.csv")
-    station = GroundStation(bench.link, Hold(HOME), log, StationConfig())
+    station = GroundStation(bench.link, Hold(HOME), log.write, StationConfig())
     for message in (*telemetry(20), status(3_900, 250), *telemetry(40), status(0xFFFF, 500), *telemetry(60)):
         station.on_packet(0, message.pack(bench.codec))
     log.close()

@@ -1,4 +1,5 @@
-"""Ctrl-C ends a flight at once, whatever executes the flight core and however long its calls are; the run keeps its log."""
+"""Ctrl-C and the signals of a lost session end a flight at once, whatever executes the flight core and however long its
+calls are; the run keeps its log."""
 
 import json
 import os
@@ -25,9 +26,19 @@ BUSY = LAW.replace(
 
 
 @pytest.mark.parametrize(
-    ("board", "plain"), [("python", "0"), ("python", "1"), ("c", "0"), ("cortex-m4", "0")]
+    ("board", "plain", "number"),
+    [
+        ("python", "0", signal.SIGINT),
+        ("python", "1", signal.SIGINT),
+        ("c", "0", signal.SIGINT),
+        ("cortex-m4", "0", signal.SIGINT),
+        ("python", "0", signal.SIGTERM),
+        ("c", "0", signal.SIGHUP),
+    ],
 )
-def test_ctrl_c_ends_a_flight_on_any_board_and_keeps_the_log(tmp_path: Path, board: str, plain: str) -> None:
+def test_ctrl_c_ends_a_flight_on_any_board_and_keeps_the_log(
+    tmp_path: Path, board: str, plain: str, number: signal.Signals
+) -> None:
     profile = make_project(tmp_path, BUSY, "", "after = 130000")
     process = subprocess.Popen(
         (sys.executable, "-m", "hil.commands", "fly", "hover", "--duration", "600", "--profile", profile, "--board", board,
@@ -38,7 +49,9 @@ def test_ctrl_c_ends_a_flight_on_any_board_and_keeps_the_log(tmp_path: Path, boa
     end_s = time.monotonic() + 4 * PATIENCE_S  # the first flight on a machine compiles
     while "released" not in _events(tmp_path / "run") and process.poll() is None and time.monotonic() < end_s:
         time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
+    if number != signal.SIGINT:  # as a terminal and a shell that end together
+        process.send_signal(number)
     try:
         shown, _ = process.communicate(timeout=PATIENCE_S)
     finally:

@@ -15,6 +15,7 @@ from ground_station.frame_rate import FrameRate
 from ground_station.latency import LinkLatency
 from ground_station.mocap import MocapFrame
 from ground_station.program import LiveStation
+from ground_station.records import Records
 from ground_station.sources.address import find_source
 from ground_station.sources.replay import read_frames
 from ground_station.station import GroundStation
@@ -76,6 +77,7 @@ def test_while_the_board_connects_the_cameras_are_served() -> None:
             said.append,
             lambda: time.monotonic() > end,
             lambda now_us: None,
+            Records(),
         ).run()
         source.close()
     assert 10 < link.sent < 20  # of 0.3 s, not of the 1.5 s before

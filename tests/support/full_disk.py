@@ -1,9 +1,14 @@
 """A disk that is full: files cannot become larger."""
 
+import os
 import resource
 import signal
+import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+
+SMALL_KB = 100
 
 
 @contextmanager
@@ -17,3 +22,20 @@ def small_files(limit: int) -> Iterator[None]:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, before)
+
+
+@contextmanager
+def small_disk(folder: Path) -> Iterator[tuple[str, ...]]:
+    """Make `folder` a file system of 100 kB; yield what to type before a program so that it sees a full disk.
+
+    A user who may not mount gets a limit for each file instead.
+    """
+    folder.mkdir()
+    mount = ("mount", "-t", "tmpfs", "-o", f"size={SMALL_KB}k", "tmpfs", folder)
+    if os.geteuid() or subprocess.run(mount, stderr=subprocess.DEVNULL, check=False).returncode:
+        yield "prlimit", f"--fsize={SMALL_KB * 1024}"
+        return
+    try:
+        yield ()
+    finally:
+        subprocess.run(("umount", folder), check=True)

@@ -78,6 +78,7 @@ UDP = ("--link", "udp://127.0.0.1:1")
         (["deploy", "export", "app"], "deploy export: now floaty deploy write DIR"),
         (["fly"], "Missing argument"),
         (["report", "nowhere"], "nowhere"),
+        (["report", "\x1b]0;x\x07"], r"\x1b]0;x\x07"),
         (["view", "nowhere"], "nowhere"),
         (["view", __file__], "expected a run folder"),
         (["flyy"], "No such command"),

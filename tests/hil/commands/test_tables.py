@@ -1,5 +1,8 @@
 """What `floaty fly` and `compare` print and return for several seeds: means, verdicts, exit codes."""
 
+import os
+import sys
+from contextlib import suppress
 from dataclasses import replace
 from math import radians
 from pathlib import Path
@@ -50,6 +53,29 @@ def test_means_are_those_of_the_completed_flights(capsys: pytest.CaptureFixture[
     )
     assert " 9.0 " in shown, "degrees"
     assert "fails: rms_x" in shown
+
+
+def test_a_table_shows_control_characters_and_no_writer_can_send_them(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    print_seeds([replace(made(0.01, True, "error"), passed=False, error="a\x1b[2J\x9b\nb")])
+    shown = capsys.readouterr().out
+    assert r"a\x1b[2J\x9b" in shown
+    assert "\x1b[2J" not in shown
+
+
+def test_a_table_into_a_closed_pipe_is_an_error_that_a_flight_handles(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Rich would end the program, while it flies or before it has closed its files."""
+    read, write = os.pipe()
+    os.close(read)
+    output = os.fdopen(write, "w")
+    monkeypatch.setattr(sys, "stdout", output)
+    with pytest.raises(BrokenPipeError):
+        print_seeds([made(0.01, True)])
+    with suppress(BrokenPipeError):
+        output.close()
 
 
 def test_a_held_limit_is_ok_and_a_missed_one_fails(flown: Result, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from mcap.reader import make_reader
 from pymavlink import mavutil
@@ -21,6 +22,7 @@ from ground_station.latency import LinkLatency
 from ground_station.links.loopback import LoopbackLink
 from ground_station.mocap import MocapFrame
 from ground_station.program import Cockpit
+from ground_station.records import Records
 from ground_station.station import GroundStation
 from ground_station.trajectory import FlightPlan, Goal
 from hil.config import load_config
@@ -34,7 +36,7 @@ from hil.laboratory.channels import Unwrapped
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import ALWAYS, body, free_flight, known, measure
 from hil.laboratory.real_flight import RealFlight
-from hil.laboratory.recorder import Recorder, load_events, load_log
+from hil.laboratory.recorder import Onlooker, Recorder, load_events, load_log
 from hil.laboratory.request import REAL, Bench, Request
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.run import fly
@@ -56,11 +58,18 @@ TURN_US = 5_000
 AGE_US = 40_000
 
 
-def recorder_of(folder: Path, experiment: str, clock: Any, said: list[str]) -> RealFlight:
+def recorder_of(
+    folder: Path,
+    experiment: str,
+    clock: Any,
+    said: list[str],
+    records: Records | None = None,
+    onlooker: Onlooker | None = None,
+) -> RealFlight:
     chosen = EXPERIMENTS[experiment]
     bench = Bench("udp://127.0.0.1:19850", REAL)
     request = Request(chosen, "floaty", (), 0, chosen.duration_s, (), bench)
-    return RealFlight(folder, request, said.append, clock)
+    return RealFlight(folder, request, records or Records(), said.append, clock, onlooker)
 
 
 class Link:
@@ -217,13 +226,31 @@ def test_a_real_flight_is_exported_as_what_the_cameras_saw(both: tuple[Path, Pat
     assert "cameras.x [m]" in write_csv(folder).read_text().splitlines()[0]
 
 
+class Watcher:
+    """An onlooker that counts."""
+
+    def __init__(self) -> None:
+        self.rows_seen = 0
+        self.texts: list[str] = []
+
+    def rows(self, batch: pa.RecordBatch) -> None:
+        self.rows_seen += batch.num_rows
+
+    def note(self, t_us: int, source: str, text: str) -> None:
+        self.texts.append(text)
+
+
 class StationBench:
     """A station that sees what the test says; nothing flies."""
 
     def __init__(self, folder: Path, experiment: str = "hover") -> None:
         self.now_us = 7_000_000
         self.said: list[str] = []
-        self.record = recorder_of(folder, experiment, lambda: self.now_us, self.said)
+        self.records = Records()
+        self.onlooker = Watcher()
+        self.record = recorder_of(
+            folder, experiment, lambda: self.now_us, self.said, self.records, self.onlooker
+        )
         self.plan = FlightPlan(HOME, EXPERIMENTS[experiment].trajectory)
         link = LoopbackLink(lambda now_us, data: None, 1_400, dict)
         self.ground = GroundStation(link, self.plan, None, StationConfig())
@@ -387,13 +414,33 @@ def test_a_real_flight_overwrites_nothing(tmp_path: Path) -> None:
 
 def test_a_full_disk_ends_the_record_and_not_the_flight(tmp_path: Path) -> None:
     bench = StationBench(tmp_path / "run")
+    bench.plan.start(bench.now_us)
     with small_files(150_000):
         bench.fly(5.0)
-        assert len(bench.said) == 1
-        assert "no more is recorded" in bench.said[0]
         assert 100 <= load_log(tmp_path / "run").num_rows < 500
-    bench.result()
+    assert bench.records.notices() == [
+        f"{tmp_path / 'run' / 'log.arrows'}: File too large; no more is written to it"
+    ]
+    result = bench.result()  # there is space again
+    assert (result.outcome, result.cause) == ("error", "the log ends before the flight")
+    assert not result.passed
     assert read_result(tmp_path / "run").metrics["lost"] == 0.0
+
+
+def test_a_disk_that_stays_full_keeps_what_is_on_it_and_the_picture_goes_on(tmp_path: Path) -> None:
+    bench = StationBench(tmp_path / "run")
+    bench.plan.start(bench.now_us)
+    with small_files(0):
+        bench.fly(1.5)
+        assert bench.record.close() is None
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"events.jsonl", "log.arrows"}
+    notices = bench.records.notices()
+    assert [line.split(": ")[0] for line in notices] == [
+        str(tmp_path / "run" / name) for name in ("events.jsonl", "log.arrows")
+    ]
+    assert bench.onlooker.rows_seen > 140
+    assert "hover begins" in bench.onlooker.texts
+    assert bench.records.incomplete
 
 
 def test_the_station_s_records_have_the_time_of_the_log(both: tuple[Path, Path], tmp_path: Path) -> None:

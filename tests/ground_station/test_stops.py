@@ -1,0 +1,45 @@
+"""The signals that end a flight: all in order, and a terminal that hangs up only where the user has not ruled that out."""
+
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from ground_station.stops import STOPS, heeded, stop_signals, stopped_like_ctrl_c
+
+
+@pytest.fixture(autouse=True)
+def handlers() -> Iterator[None]:
+    """Keep the test runner's own handlers."""
+    kept = {number: signal.getsignal(number) for number in STOPS}
+    yield
+    for number, handler in kept.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number", STOPS)
+def test_each_signal_is_noted_and_interrupts_nothing(number: int) -> None:
+    stops = stop_signals()
+    signal.raise_signal(number)
+    signal.raise_signal(number)
+    assert stops == [number, number]
+
+
+@pytest.mark.parametrize("number", STOPS[1:])
+def test_a_lost_session_is_like_ctrl_c_but_only_once(number: int) -> None:
+    before = [signal.getsignal(each) for each in STOPS]
+    with stopped_like_ctrl_c():
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(number)
+        for each in STOPS[1:]:  # the result is being written
+            signal.raise_signal(each)
+    assert [signal.getsignal(each) for each in STOPS] == before
+
+
+def test_what_nohup_has_started_survives_its_terminal() -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    assert heeded() == [signal.SIGINT, signal.SIGTERM]
+    stops = stop_signals()
+    with stopped_like_ctrl_c():
+        signal.raise_signal(signal.SIGHUP)
+    assert stops == []
