@@ -10,7 +10,7 @@ PARTIAL = ".partial"  # the end of the name of a file that is being written
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield the path of a temporary file in the same folder, which replaces `path` at the end; an error deletes it."""
-    place = path.resolve()  # a link stays
+    place = path.resolve() if path.is_symlink() else path  # the link stays
     partial = place.with_name(place.name + PARTIAL)
     try:
         yield partial

@@ -39,7 +39,8 @@ def report(run: Path) -> None:
     from hil.pictures.report import write_report
 
     with writing("RUN", run):
-        say(f"report  {write_report(run)}")
+        page = write_report(run)
+    say(f"report  {page}")
 
 
 @click.command()
@@ -65,4 +66,5 @@ def export(run: Path, as_csv: bool, as_mcap: bool, as_tlog: bool, as_video: bool
     for place in (place for place, chosen in wanted.items() if chosen):
         module, _, write = place.rpartition(".")
         with writing("RUN", run):
-            say(f"  {getattr(import_module(f'hil.{module}'), write)(run)}")
+            file = getattr(import_module(f"hil.{module}"), write)(run)
+        say(f"  {file}")
