@@ -26,7 +26,9 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
 
 ROOT = Path(hil.__file__).parents[1]
 # Packages of packages, and those of the pytest plugin.
-WITH_OTHERS = {"PIL", "libusb_package", "llvmlite", "pydantic_core", "rerun_bindings", "usb", "hypothesis", "pytest"}
+WITH_OTHERS = {
+    "PIL", "libusb_package", "llvmlite", "pydantic_core", "rerun_bindings", "usb", "hypothesis", "pytest",
+}  # fmt: skip
 
 
 def test_fly_writes_everything_and_prints_where(cli: Cli, tmp_path: Path) -> None:
