@@ -17,6 +17,10 @@ class LabError(Exception):
     """A user's request is invalid; the text has the key, the value, and what is allowed."""
 
 
+class OutputError(OSError):
+    """The standard output cannot be written, unlike the file that a command writes meanwhile."""
+
+
 def require(what: str, extra: str, *modules: str) -> None:
     """Raise `LabError` with the command that installs an extra when `what` needs a missing module."""
     for module in modules:
@@ -53,6 +57,8 @@ def writing(option: str, path: Path | None) -> Iterator[None]:
     """Turn an `OSError` while writing to an option's path into a `LabError` that names the option."""
     try:
         yield
+    except OutputError:
+        raise
     except OSError as error:
         raise LabError(f"{option} {path}: cannot be written ({error.strerror or error})") from None
 

@@ -31,8 +31,17 @@ def commit() -> str:
         return COMMIT.read_text(encoding="utf-8").strip()
     if not (ROOT / ".git").exists():
         return ""
-    describe = ("describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+")
-    return _output("git", "-C", str(ROOT), *describe, timeout_s=10.0)
+    # `git describe --dirty` would write the index, and leave its lock on a full disk.
+    status = ("status", "--porcelain=v2", "--branch", "--no-ahead-behind", "--untracked-files=no")
+    shown = _output("git", "--no-optional-locks", "-C", str(ROOT), *status, timeout_s=10.0)
+    if (head := re.search(r"^# branch\.oid ([0-9a-f]{12})", shown, re.MULTILINE)) is None:
+        return ""
+    return head[1] + "+" * bool(re.search("^[^#]", shown, re.MULTILINE))
+
+
+def has_git() -> bool:
+    """Whether there is a repository, and git to ask for its commit."""
+    return (ROOT / ".git").exists() and shutil.which("git") is not None
 
 
 def versions() -> dict[str, str]:

@@ -45,7 +45,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
 
 # The rooms of hil from the ground up: a room imports from itself and from floors below, a `config` also from other configs.
 FLOORS = (
-    ("errors", "clock", "events", "installation", "scene"),
+    ("errors", "clock", "events", "installation", "scene", "whole_files"),
     ("arguments", "own_files", "world", "stm32f405"),
     ("crazyflie", "floaty"),
     ("devices",),

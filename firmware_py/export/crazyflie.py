@@ -42,7 +42,8 @@ def write_app(config: FirmwareConfig, profile: str, folder: Path) -> tuple[Path,
     try:
         if folder.exists() and any(folder.iterdir()) and not (folder / MARKER).is_file():
             raise ExportError(f"{folder}: neither empty nor an app of Floaty: nothing is written there")
-        for name, text in files.items():
+        # The marker first: an app that was not written to its end may be written again.
+        for name, text in sorted(files.items(), key=lambda file: file[0] != str(MARKER)):
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, "utf-8")

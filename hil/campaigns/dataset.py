@@ -24,8 +24,9 @@ from hil.campaigns.jobs import Plan, Row
 from hil.config import load_config
 from hil.errors import LabError, writing
 from hil.experiments import find_experiment
-from hil.installation import commit, versions
+from hil.installation import ROOT, commit, has_git, versions
 from hil.laboratory.metrics import METRICS, limits_of
+from hil.whole_files import PARTIAL, write_whole
 
 ABOUT, ARRIVING, FLIGHTS = "campaign.json", "arriving.jsonl", Path("flights", "all.parquet")
 AT_ONCE = 500  # lines read at a time
@@ -44,14 +45,12 @@ class Dataset:
         with writing("--out", folder):
             folder.mkdir(parents=True, exist_ok=True)
             if replace and not resume:
-                for name in (ABOUT, ARRIVING, FLIGHTS):
+                for name in (FLIGHTS, ARRIVING, ABOUT):  # no plan without its description
                     (folder / name).unlink(missing_ok=True)
             if not (folder / ABOUT).is_file():
-                if not replace and any(folder.iterdir()):
+                if not replace and any(path.name != ABOUT + PARTIAL for path in folder.iterdir()):
                     raise LabError(f"--out {folder}: the folder is not empty and holds no campaign")
-                partial = folder / f"{ABOUT}.partial"
-                partial.write_text(json.dumps(about(plan), indent=2) + "\n", encoding="utf-8")
-                partial.replace(folder / ABOUT)
+                write_whole(folder / ABOUT, json.dumps(about(plan), indent=2) + "\n")
             elif not resume:
                 raise LabError(f"--out {folder}: holds a campaign; --resume continues it")
         self._check_resumed()
@@ -130,9 +129,17 @@ def about(plan: Plan) -> dict[str, Any]:
         "experiments": [source and source.sha256 for source in sources],
         "image": hashlib.sha256(board.read_bytes()).hexdigest()[:16] if board.is_file() else "",
         "profiles": {name: _digest_of(name) for name in plan.profiles},
-        "commit": commit(),
+        "commit": _commit(),
         "versions": versions(),
     }
+
+
+def _commit() -> str:
+    """Return the commit, `unknown` without git or a repository; a campaign that cannot be compared is not begun."""
+    found = commit()
+    if not found and has_git():
+        raise LabError(f"git does not name the commit, which a campaign stores: try `git -C {ROOT} status`")
+    return found or "unknown"
 
 
 def _digest_of(profile: str) -> str:

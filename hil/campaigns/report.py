@@ -22,6 +22,7 @@ from hil.laboratory.metrics import SHOWN
 from hil.pictures import curves
 from hil.pictures.drawing import WIDTH, png
 from hil.pictures.pages import data_uri, write_page
+from hil.whole_files import write_whole
 
 REPORT, RESULT = "report.html", "result.json"
 IN_A_ROW = 3
@@ -50,7 +51,7 @@ def write_report(named: str, spec: Spec, dataset: Dataset, complete: bool) -> tu
         named=quote(named), begun=about(dataset.plan)["commit"], folder=quote(str(folder)),
     )  # fmt: skip
     text = json.dumps(_content(spec, findings, complete), indent=2)
-    (folder / RESULT).write_text(text + "\n", encoding="utf-8")
+    write_whole(folder / RESULT, text + "\n")
     return page, findings
 
 

@@ -7,15 +7,20 @@ and SIGHUP in 130 with the log kept.
 import atexit
 import gc
 import os
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
+from typing import Any, TextIO
 
 import click
 
+from firmware_py.extras import why_missing
 from firmware_py.fast import STALE
 from ground_station.stops import stopped_like_ctrl_c
 from hil.commands.options import INTERRUPTED, warn
-from hil.errors import LabError
+from hil.errors import LabError, OutputError
 from hil.installation import describe
 
 # File and function of each command, in the order of the help.
@@ -92,6 +97,53 @@ def app() -> None:
     """Floaty virtual laboratory: firmware, ground station and wind tunnel, connected by real bytes."""
 
 
+class Output:
+    """A standard output that raises `OutputError`."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write a text."""
+        with self._failing():
+            return self._stream.write(text)
+
+    def flush(self) -> None:
+        """Write what was kept."""
+        with self._failing():
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise OutputError(os.strerror(error.errno or 0)) from error
+
+
+@contextmanager
+def _printing() -> Iterator[None]:
+    """Print to an `Output`, up to the last line. Raises `LabError`, and `SystemExit` when a reader like `head` has ended."""
+    stream = sys.stdout
+    if stream is None:  # it is closed
+        yield
+        return
+    try:
+        sys.stdout = output = Output(stream)
+        yield
+        output.flush()
+    except OutputError as error:
+        _silence(stream)
+        if isinstance(error.__cause__, BrokenPipeError):
+            sys.exit(128 + signal.SIGPIPE)
+        raise LabError(f"standard output: {error}") from None
+    finally:
+        sys.stdout = stream
+
+
 def main() -> None:
     """Run the command line and exit with its code."""
     # The Python processes that this one starts import nothing from the current folder.
@@ -101,10 +153,15 @@ def main() -> None:
     if STALE:
         warn(f"floaty: pure Python, not what `make fast` has compiled: {STALE}")
     try:
-        with stopped_like_ctrl_c():
+        _check_names(sys.argv[1:])
+        with stopped_like_ctrl_c(), _printing():
             code = app.main(standalone_mode=False)
     except LabError as error:
         sys.exit(_refuse(str(error)))
+    except ImportError as error:
+        if not (missing := why_missing(error)):
+            raise
+        sys.exit(_refuse(missing))
     except click.exceptions.NoArgsIsHelpError as error:
         for line in error.format_message().splitlines():
             warn(line)
@@ -118,6 +175,25 @@ def main() -> None:
     sys.exit(code if isinstance(code, int) else 0)
 
 
+def _check_names(arguments: list[str]) -> None:
+    """Raise `LabError` for an argument that is not UTF-8, which logs and reports cannot store."""
+    for argument in arguments:
+        try:
+            argument.encode()
+        except UnicodeEncodeError:
+            raise LabError(f"{os.fsencode(argument)!r}: expected a name in UTF-8") from None
+
+
 def _refuse(text: str) -> int:
-    warn(f"floaty: {' '.join(text.split())}")
+    try:
+        warn(f"floaty: {' '.join(text.split())}")
+    except OSError:  # only the exit code is left
+        _silence(sys.stderr)
     return 2
+
+
+def _silence(stream: TextIO) -> None:
+    """Lead a stream nowhere: at the end Python writes again what it could not write."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)

@@ -142,10 +142,11 @@ def optimise(asked: Search) -> None:
 def write_profile(point: "Point", path: Path, about: str, length: float = 1.0) -> None:
     """Write a profile that flies the robot."""
     from hil.design.gains import gains_of, profile_text
+    from hil.whole_files import write_whole
 
     text = profile_text(point, gains_of(point.linear), about, length)
     with writing("--write", path):
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text)
     say(f"profile {path}")
 
 

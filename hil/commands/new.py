@@ -104,12 +104,16 @@ def write_project(command: str, templates: Path, folder: Path, **values: object)
     )
     require_empty(command, folder)
     with refusing(f"{command} {folder}: ", OSError):
-        for template in sorted(templates.rglob("*.in")):
-            place = template.relative_to(templates).with_suffix("")
-            path = folder / NAMED.get(str(place), place)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            text = environment.from_string(template.read_text(encoding="utf-8")).render(values)
-            path.write_text(text, encoding="utf-8")
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=folder, prefix=".") as scratch:  # all files or none
+            for template in sorted(templates.rglob("*.in")):
+                place = template.relative_to(templates).with_suffix("")
+                path = Path(scratch) / NAMED.get(str(place), place)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                text = environment.from_string(template.read_text(encoding="utf-8")).render(values)
+                path.write_text(text, encoding="utf-8")
+            for path in Path(scratch).iterdir():
+                path.rename(folder / path.name)
 
 
 def _constant(values: NDArray[np.float32]) -> str:

@@ -41,7 +41,8 @@ def report(run: Path, named: str | None) -> None:
     from hil.api import load_run
 
     with writing("RUN", run), reading(run):
-        say(f"report  {load_run(run, named).write_report()}")
+        page = load_run(run, named).write_report()
+    say(f"report  {page}")
 
 
 @click.command()
@@ -67,4 +68,5 @@ def export(run: Path, as_csv: bool, as_mcap: bool, as_tlog: bool, as_video: bool
     for place in (place for place, chosen in wanted.items() if chosen):
         module, _, write = place.rpartition(".")
         with writing("RUN", run), reading(run):
-            say(f"  {getattr(import_module(f'hil.{module}'), write)(run)}")
+            file = getattr(import_module(f"hil.{module}"), write)(run)
+        say(f"  {file}")

@@ -15,6 +15,7 @@ from hil.design.linear import Point, calm_plates
 from hil.design.sweeps import hover_angles, scaling, stability
 from hil.floaty.shape import SIGNS
 from hil.pictures.pages import saved, write_page
+from hil.whole_files import write_whole
 from hil.world import layout as at
 from hil.world.motion import evaluate
 
@@ -103,5 +104,5 @@ def write(analysis: Analysis, folder: Path) -> Path:
         "robot": dict(analysis.robot),
         "claims": [asdict(claim) for claim in analysis.claims],
     }
-    (folder / "design.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write_whole(folder / "design.json", json.dumps(result, indent=1) + "\n")
     return write_page(folder / "design.html", "design.html.j2", analysis=analysis, pictures=pictures)

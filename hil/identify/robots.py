@@ -25,6 +25,7 @@ from hil.identify.record import Array
 from hil.identify.response import DELAY as INPUT_TO_GYRO
 from hil.identify.response import LAG, TICK_DELAYS_S
 from hil.identify.two_controllers import SIGMAS
+from hil.whole_files import write_whole
 from hil.world.servos import WORDS_PER_RADIAN
 
 UNKNOWN_SHARE = 0.2  # half a 95 % interval over the value, for a constant of unknown uncertainty
@@ -80,7 +81,7 @@ def write_profile(path: Path, profile: str, found: Identification) -> str:
     trim = _trim(found)
     lines += ["", *trim]
     with writing("--profile-out", path):
-        path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+        write_whole(path, "\n".join(lines).rstrip() + "\n")
         config = read_config(str(path))  # an invalid profile is an error now, not at the next flight
         _write_known(path, config, found, fitted.values[INPUT_TO_GYRO])
     return f"servo trim changed: {trim[1].partition('# ')[2]}" if trim else ""
@@ -113,7 +114,7 @@ def _write_known(path: Path, config: LabConfig, found: Identification, delay_s: 
         covariance=(own * np.outer(grown, grown)).tolist(),
         delay=delay_s,
     )
-    beside(str(path)).write_text(known.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    write_whole(beside(str(path)), known.model_dump_json(indent=1) + "\n")
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,8 @@
 """The folder of a flight: its name, an older run in it, and the lock that admits one flight at a time.
 
 No flight replaces one of another request. An older run of the same request is set aside until the flight begins, and
-restored when no board or link is available.
+restored when no board or link is available, or when the process was killed before. What a flight leaves that was killed
+before it recorded anything may be replaced by every flight.
 """
 
 import fcntl
@@ -12,13 +13,18 @@ from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
+from ground_station.links.frame_log import FRAME_LOG
+from ground_station.telemetry_log import TELEMETRY
 from hil.errors import LabError, writing
-from hil.laboratory.recorder import EVENTS
+from hil.laboratory.recorder import EVENTS, PARQUET, STREAM, log_pieces
 from hil.laboratory.request import Request
 from hil.laboratory.result import RESULT, read_result
 
 RUNS = Path("runs")
 OLDER = "older-run"  # in a run folder, until the next flight begins
+OBSOLETE = "older-run.obsolete"  # its name while it is deleted
+DECIDING = (RESULT, PARQUET, STREAM)  # each describes its run
+EARLY = (TELEMETRY, FRAME_LOG, EVENTS)  # files that a flight opens before it records; empty until then
 
 
 @contextmanager
@@ -31,30 +37,50 @@ def replacing_older(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         _bring_back(folder)  # from an attempt that never began
         if older := list(folder.iterdir()):
-            if not any((folder / name).exists() for name in (RESULT, EVENTS)):
+            if not (any((folder / name).exists() for name in (*DECIDING, EVENTS)) or _is_blank(folder)):
                 raise LabError(
                     f"--out {folder}: the folder is not empty and holds no run; choose another one"
                 )
             (folder / OLDER).mkdir()
-            for path in older:
+            # The first file to arrive describes the run.
+            for path in sorted(older, key=lambda path: path.name not in DECIDING):
                 path.rename(folder / OLDER / path.name)
     try:
         yield
     except BaseException:
         _bring_back(folder)
         raise
-    shutil.rmtree(folder / OLDER, ignore_errors=True)
+    if (folder / OLDER).exists():
+        (folder / OLDER).rename(folder / OBSOLETE)  # at once: a half deleted run is not restored
+        shutil.rmtree(folder / OBSOLETE, ignore_errors=True)
 
 
 def _bring_back(folder: Path) -> None:
     """Restore the older run, and delete the files of a failed attempt."""
+    shutil.rmtree(folder / OBSOLETE, ignore_errors=True)
     if (folder / OLDER).exists():
         for path in folder.iterdir():
-            if path.name != OLDER:
+            if _is_new(path):
                 path.unlink()
         for path in (folder / OLDER).iterdir():
             path.rename(folder / path.name)
         (folder / OLDER).rmdir()
+
+
+def _is_new(file: Path) -> bool:
+    return file.name in EARLY and file.stat().st_size == 0
+
+
+def _is_blank(folder: Path) -> bool:
+    """Whether a folder has at most the files of a flight that recorded nothing, as after an early kill or a full disk."""
+    for path in folder.iterdir():
+        if not (_is_new(path) or path.name in (STREAM, OLDER, OBSOLETE)):
+            return False
+    try:
+        next(log_pieces(folder))
+    except LabError:
+        return True
+    return False
 
 
 def folder_of(request: Request, parent: Path = RUNS) -> Path:
@@ -75,10 +101,11 @@ def other_in(folder: Path, request: Request) -> str:
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return ""
     older = folder / OLDER
+    held = older if older.is_dir() and any(older.iterdir()) else folder
     try:
-        flown = read_result(older if older.exists() else folder).request.parts()
+        flown = read_result(held).request.parts()
     except LabError:
-        return "something else"
+        return "" if held.is_dir() and _is_blank(held) else "something else"
     asked = request.parts()
     differing = [f"{name} {flown[name] or 'none'}".strip() for name in flown if flown[name] != asked[name]]
     return f"another flight ({'; '.join(differing)})" if differing else ""

@@ -31,6 +31,7 @@ from ground_station.records import Records
 from hil.config import LabConfig
 from hil.errors import LabError, refusing
 from hil.laboratory.ages import at_exposure
+from hil.whole_files import replacing
 from hil.world.body import Channel, Quantity
 
 if "pandas" not in sys.modules:
@@ -121,6 +122,7 @@ class Recorder:
     def _open_stream(self, path: Path) -> None:
         self._file = pa.output_stream(str(path), buffer_size=BUFFER_BYTES)
         self._stream = pa.ipc.new_stream(self._file, self._schema)
+        self._stream.write_batch(self._batch.slice(0, 0))  # the schema, which describes the flight
         self._file.flush()
 
     def _open_events(self, path: Path) -> None:
@@ -216,21 +218,19 @@ def finish_log(
     folder: Path, release_us: int | None = None, correct: Callable[[pa.Table], pa.Table] | None = None
 ) -> None:
     """Convert the stream into `log.parquet`, even when the flight ended in the middle of a batch."""
-    stream, partial = folder / STREAM, folder / (PARQUET + ".partial")
+    stream = folder / STREAM
     pieces = _read_stream(stream)
     if correct is not None:
         pieces = iter([correct(pa.concat_tables(pieces))])
     first = next(pieces)
     more = {} if release_us is None else {RELEASE_US: str(release_us).encode()}
     schema = _with_metadata(first, more).schema
-    try:
-        with pa.parquet.ParquetWriter(partial, schema, compression="zstd", use_dictionary=False) as writer:
-            for table in chain([first], pieces):
-                writer.write_table(table)
-        partial.replace(folder / PARQUET)
-    except OSError:  # a full disk keeps the stream
-        partial.unlink(missing_ok=True)
-        raise
+    with (
+        replacing(folder / PARQUET) as partial,
+        pa.parquet.ParquetWriter(partial, schema, compression="zstd", use_dictionary=False) as writer,
+    ):
+        for table in chain([first], pieces):
+            writer.write_table(table)
     stream.unlink()
 
 

@@ -30,6 +30,7 @@ from hil.laboratory.metrics import Figure, Metric, Verdict, judge, measure
 from hil.laboratory.recorder import load_log, stored_in
 from hil.laboratory.request import Find, Request, StoredRequest
 from hil.scene import Look
+from hil.whole_files import write_whole
 
 RESULT = "result.json"
 PARTS = ("request", "program", "experiment", "bench")  # their fields are on the top level of the file
@@ -159,7 +160,7 @@ _RESULT = TypeAdapter(Result)
 def write_result(result: Result) -> None:
     values = _RESULT.dump_python(result, mode="json")
     flat = {**values.pop("request"), **values.pop("program"), **values}
-    (result.folder / RESULT).write_text(json.dumps(flat, indent=2) + "\n", encoding="utf-8")
+    write_whole(result.folder / RESULT, json.dumps(flat, indent=2) + "\n")
 
 
 def read_result(folder: Path, find: Find = unknown) -> Result:

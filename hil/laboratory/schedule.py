@@ -14,6 +14,7 @@ import pyarrow.parquet
 from hil.devices.board_firmware import BoardScheduler
 from hil.errors import LabError
 from hil.laboratory.recorder import ARROW_ERRORS
+from hil.whole_files import replacing
 
 FILE = "schedule.parquet"
 WINDOW_US = 50_000
@@ -54,7 +55,8 @@ class ScheduleTrace:
         """Write `schedule.parquet`."""
         columns = list(zip(*self._rows, strict=True)) or [()] * len(SCHEMA)
         table = pa.table([pa.array(c, f.type) for c, f in zip(columns, SCHEMA, strict=True)], schema=SCHEMA)
-        pa.parquet.write_table(table, folder / FILE, compression="zstd")
+        with replacing(folder / FILE) as partial:
+            pa.parquet.write_table(table, partial, compression="zstd")
 
     def _take(self, us: int, event: str, who: str, a: int, b: int) -> None:
         self._rows.append((us, event, who, a, b))

@@ -15,7 +15,7 @@ from typing import IO, Any, Protocol
 
 import pyarrow as pa
 
-from firmware_py.extras import install_command
+from firmware_py.extras import why_missing
 from hil.errors import LabError
 from hil.live.feed import EVENTS, FAILED, PARAMETERS, READY, TAKEN, TYPED
 
@@ -42,16 +42,12 @@ class Screen(Protocol):
 def open_screen(target: str, program: str, typed: Callable[[str], None]) -> Screen:
     """Return the screen of a target; `typed` takes the typed lines. Raises `LabError`."""
     if target == "web":
-        try:
-            from hil.live.panel import PanelScreen
-        except ImportError as error:
-            raise LabError(f"--view web: {error}: {install_command('view')}") from None
+        from hil.live.panel import PanelScreen
+
         return PanelScreen(program, typed)
     if target in ("foxglove", WITH_PARAMETERS):
-        try:
-            from hil.live.foxglove_server import FoxgloveScreen
-        except ImportError as error:
-            raise LabError(f"--view {target}: {error}: {install_command('export')}") from None
+        from hil.live.foxglove_server import FoxgloveScreen
+
         return FoxgloveScreen(typed if target == WITH_PARAMETERS else None)
     from hil.live.rerun_screen import RerunScreen
 
@@ -96,7 +92,8 @@ def main() -> int:
         say(FAILED, str(error))
         return 1
     except Exception as error:  # the flight goes on after any error, which is reported
-        say(FAILED, f"{type(error).__name__}: {error}")
+        missing = why_missing(error) if isinstance(error, ImportError) else ""
+        say(FAILED, f"--view {sys.argv[1]}: {missing}" if missing else f"{type(error).__name__}: {error}")
         return 1
     return 0
 

@@ -11,6 +11,7 @@ from firmware_py.wire import WireError
 from firmware_py.wire.memories import CONFIG_SIZE, decode_config, encode_config
 from firmware_py.wire.memories import RadioSettings as EepromSettings
 from firmware_py.wire.parameters import SetByName, encode_pose_kind, encode_set_by_name
+from firmware_py.wire.telemetry import Sample
 from ground_station.links.loopback import LoopbackLink
 from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation
@@ -92,7 +93,7 @@ HOST_SHARE_US = 110
 WORLD = Goal((0.0, 0.0, 0.0), 0.0)  # relative to this goal a pose is absolute
 
 
-class _PosesOnly(LoopbackLink):
+class _PosesOnly:
     """Carries corrections, or absolute poses, or with `poses` false nothing; telemetry belongs to the clients."""
 
     def __init__(
@@ -102,17 +103,22 @@ class _PosesOnly(LoopbackLink):
         settings: Callable[[], Sequence[bytes]],
         poses: bool,
     ) -> None:
-        super().__init__(transmit, latency_us, dict)
-        self._settings, self._poses = settings, poses
+        self._link = LoopbackLink(transmit, latency_us, dict)
+        self.latency = self._link.latency
+        self._transmit, self._settings, self._poses = transmit, settings, poses
 
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
         if self._poses:
-            super().send(now_us, frame, goal)
+            self._link.send(now_us, frame, goal)
 
     def start_telemetry(self, now_us: int) -> None:
         """Send the settings instead."""
         for packet in self._settings():
             self._transmit(now_us, packet)
+
+    def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
+        """Return nothing."""
+        return ()
 
 
 class ServedRobot:

@@ -41,6 +41,7 @@ from hil.studies.paper import Paper, Spread, Trials
 from hil.studies.paper_identification import COLUMNS, WHY, PaperConstant
 from hil.studies.paper_rows import PaperRow
 from hil.studies.study import OUTCOMES, StudyResult
+from hil.whole_files import write_whole
 
 REPORT = "report.html"
 # Names of the pages beside those of the experiments.
@@ -66,7 +67,7 @@ def write_paper(
     content = _content(paper) | ({"design": [asdict(claim) for claim in shape.claims]} if shape else {})
     if constants:
         content["identification"] = [asdict(one) for one in constants]
-    (out / RESULT).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_whole(out / RESULT, json.dumps(content, indent=1) + "\n")
     pages = [(name, row.title) for name, row, _ in paper.rows]
     if mounted:
         pages.append((DRAG_MODEL, "Drag model"))

@@ -26,6 +26,7 @@ from hil.identify.robots import FLAP_RATE, Robots, robots_of, write_profile
 from hil.laboratory.request import Options
 from hil.laboratory.result import read_result
 from hil.studies.study import distance
+from hil.whole_files import write_whole
 from hil.world.config import ConstantName
 
 HOVER_S = 60.0
@@ -129,7 +130,7 @@ def write_tuned(path: Path, base: str, config: LabConfig, about: str) -> None:
         name: changes(getattr(config, name), getattr(old, name)) for name in ("model", "servo", "controller")
     }
     with writing("--out", path):
-        path.write_text(toml_text(about, base_name(base), sections), encoding="utf-8")
+        write_whole(path, toml_text(about, base_name(base), sections))
     load_config(str(path))
 
 

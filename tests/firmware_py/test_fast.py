@@ -1,5 +1,6 @@
 """Compiled modules are used while they fit their sources, and fly the same bits; `make fast`."""
 
+import ast
 import json
 import os
 import shutil
@@ -20,7 +21,6 @@ from hil.experiments import find_experiment
 from hil.laboratory.result import read_result
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
-from hil.servers import served_robot  # inherits from modules of the loop
 for number, link in enumerate(("radio", "mavlink")):
     request = Request.of(
         find_experiment("hover"), overrides=["markers.enabled=true"], seed=4, duration_s=3.0, link=link,
@@ -76,6 +76,34 @@ def test_modules_of_another_python_are_not_used(tree: Path) -> None:
 def test_pure_python_can_be_demanded(tree: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(SWITCH, "1")
     assert usable(tree / "compiled", tree) == ({}, "")
+
+
+def test_no_class_inherits_from_a_compiled_one() -> None:
+    """Such a class raises TypeError when the first object of it is made."""
+    text = (ROOT / "tools/fast.py").read_text(encoding="utf-8").partition("\nMODULES = ")[2].partition("}")[0]
+    folders = ast.literal_eval(text + "}")
+    compiled = {
+        f"{folder.replace('/', '.')}.{name}" for folder in folders for name in folders[folder].split()
+    }
+    found = []
+    for path in sorted(ROOT.glob("[fgh]*/**/*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        names = {
+            alias.asname or alias.name
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom) and node.module in compiled
+            for alias in node.names
+        }
+        bases = {
+            base.id: node.name
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ClassDef) and module not in compiled
+            for base in node.bases
+            if isinstance(base, ast.Name)
+        }
+        found += [f"{module}.{bases[name]}({name})" for name in sorted(names & bases.keys())]
+    assert found == []
 
 
 @pytest.mark.long

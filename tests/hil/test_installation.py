@@ -1,6 +1,8 @@
 """`floaty --version`: version, commit, packages and programs, whatever is missing."""
 
+import os
 import re
+import subprocess
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
@@ -10,7 +12,11 @@ import pytest
 from firmware_py import extras
 from firmware_py.fast import STATE
 from hil import installation
+from hil.campaigns.dataset import about
+from hil.campaigns.jobs import Job, Plan
+from hil.errors import LabError
 from hil.installation import commit, describe
+from support.full_disk import small_files
 
 Program = Callable[[str, str], None]
 
@@ -82,6 +88,35 @@ def test_a_package_reports_the_commit_that_it_was_built_from(
     (tmp_path / "commit.txt").write_text("0123456789ab\n")
     monkeypatch.setattr(installation, "COMMIT", tmp_path / "commit.txt")
     assert commit() == "0123456789ab"
+
+
+def test_git_locks_nothing_in_the_repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would refresh its index, whose lock stays where the disk is full."""
+    who = ("-c", "user.name=x", "-c", "user.email=x")
+    (tmp_path / "file").write_text("x")
+    for command in (["init", "-q"], ["add", "file"], [*who, "commit", "-q", "-m", "x"]):
+        subprocess.run(["git", "-C", tmp_path, *command], check=True)
+    os.utime(tmp_path / "file", (1, 1))
+    monkeypatch.setattr(installation, "ROOT", tmp_path)
+    index = (tmp_path / ".git/index").read_bytes()
+    with small_files(10):
+        assert re.fullmatch(r"[0-9a-f]{12}", commit())
+    assert (tmp_path / ".git/index").read_bytes() == index
+    assert not (tmp_path / ".git/index.lock").exists()
+    (tmp_path / "file").write_text("y")
+    assert re.fullmatch(r"[0-9a-f]{12}\+", commit())
+
+
+def test_a_campaign_is_not_stored_without_its_commit(
+    program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = Plan.of([Job(0, "hover", {}, {})])
+    assert about(plan)["commit"] == "unknown", "no git"
+    program("git", "exit 1")
+    with pytest.raises(LabError, match="git does not name the commit"):
+        about(plan)
+    monkeypatch.setattr(installation, "ROOT", tmp_path)
+    assert about(plan)["commit"] == "unknown", "no repository"
 
 
 def test_a_surrounding_repository_s_commit_is_not_the_package_s(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -186,6 +186,9 @@ def test_a_folder_is_not_mistaken_for_another_campaign(tmp_path: Path) -> None:
         flown_into(tmp_path / "out", spec, workers(1))
     with pytest.raises(LabError, match=r"--resume: spec\.seed was 1 and is 9: choose another --out"):
         flown_into(tmp_path / "out", spec_of(seed=9), workers(1), resume=True)
+    (tmp_path / "begun").mkdir()
+    (tmp_path / "begun" / "campaign.json.partial").write_text("{")  # of a process that was killed
+    assert flown_into(tmp_path / "begun", spec, workers(1)).complete
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "mine.txt").touch()
     with pytest.raises(LabError, match="not empty and holds no campaign"):

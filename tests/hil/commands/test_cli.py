@@ -1,14 +1,21 @@
 """The command line as a user meets it: exit codes, one-line errors, files where it says they are."""
 
+import ast
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
+import tomllib
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
 
-from firmware_py.extras import install_command
+import hil
+from firmware_py.extras import EXTRAS, install_command, why_missing
+from hil import fly
 from hil.errors import LabError
 from hil.laboratory.recorder import load_log
 from hil.live.window import DISPLAYS
@@ -16,6 +23,12 @@ from support.command import Cli
 from support.serving import FLOATY
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
+
+ROOT = Path(hil.__file__).parents[1]
+# Packages of packages, those of the pytest plugin, and one for mypy.
+WITH_OTHERS = {
+    "PIL", "libusb_package", "llvmlite", "pydantic_core", "rerun_bindings", "usb", "hypothesis", "pytest", "_typeshed",
+}  # fmt: skip
 
 
 def test_fly_writes_everything_and_prints_where(cli: Cli, tmp_path: Path) -> None:
@@ -76,6 +89,7 @@ UDP = ("--link", "udp://127.0.0.1:1")
         (["fly", "hover", "--bogus"], "No such option"),
         (["serve", "--baud", "9600"], "--baud: now --set serial.baud=N"),
         (["deploy", "export", "app"], "deploy export: now floaty deploy write DIR"),
+        (["fly", "hover", "--out", "runs/\udcff"], "b'runs/\\xff': expected a name in UTF-8"),
         (["fly"], "Missing argument"),
         (["report", "nowhere"], "nowhere"),
         (["report", "\x1b]0;x\x07"], r"\x1b]0;x\x07"),
@@ -171,6 +185,136 @@ def test_a_missing_package_is_one_line_before_anything_is_flown_or_deleted(
     monkeypatch.setitem(sys.modules, module, None)
     assert cli.refusal(*arguments).endswith(f": {module} is missing: {install_command(extra)}\n")
     assert Path("runs/hover-1/log.parquet").is_file()
+
+
+def imported(file: Path) -> set[str]:
+    """Return the packages that a file imports, here or in a function."""
+    nodes = list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+    named = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    named += [
+        node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module and not node.level
+    ]
+    return {name.partition(".")[0] for name in named}
+
+
+def test_every_package_of_an_extra_has_its_line_when_it_is_missing() -> None:
+    ours = ("firmware_py", "ground_station", "hil")
+    files = [file for one in ours for file in (ROOT / one).rglob("*.py") if "__pycache__" not in file.parts]
+    foreign = set().union(*map(imported, files)).difference(ours, sys.stdlib_module_names, WITH_OTHERS)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    required = {re.split(r"[^\w-]", one)[0] for one in project["dependencies"]}
+    assert foreign - EXTRAS.keys() <= required
+    packages = packages_distributions()
+    for module, extra in EXTRAS.items():
+        of_extra = " ".join(project["optional-dependencies"][extra]).lower()
+        assert any(name.lower() in of_extra for name in packages.get(module, (module,))), module
+        assert (
+            why_missing(ImportError(name=f"{module}.part"))
+            == f"{module} is missing: {install_command(extra)}"
+        )
+    assert why_missing(ImportError(name="hil.gone")) == ""
+
+
+# Commands that load a package late; the others are above.
+LATE = [
+    ("view runs/hover-1", "rerun"), ("view runs/hover-1 --view web", "rerun"), ("fly hover --perfetto", "perfetto"),
+    ("fly hover --perfetto", "google"), ("fly hover --view web", "tornado"), ("serve --view foxglove", "foxglove"),
+    ("fly hover --view connect:127.0.0.1:1", "rerun"), ("fly hover --view foxglove", "foxglove"),
+    ("export runs/hover-1 --mcap", "foxglove"), ("export runs/hover-1 --video", "av"),
+    ("export runs/hover-1 --tlog", "pymavlink"), ("policy x.onnx --out p", "onnx"), ("study latency", "scipy"),
+    ("policy x.safetensors --out p", "safetensors"), ("campaign table", "SALib"), ("deploy check", "unicorn"),
+    ("campaign table --cluster tcp://127.0.0.1:1", "distributed"), ("station --link udp://127.0.0.1:1", "cflib"),
+    ("station --link mavlink:/dev/null", "serial"), ("param list --link udp://127.0.0.1:1", "cflib"),
+    ("station --link udp://127.0.0.1:1 --mocap vicon:127.0.0.1", "motioncapture"),
+    ("board doctor udp://127.0.0.1:1", "cflib"), ("deploy flash x.bin --uri radio://0/80/2M/E7E7E7E7E7", "cflib"),
+]  # fmt: skip
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("command", "module"), LATE)
+def test_a_package_that_is_loaded_late_has_its_line_too(command: str, module: str, tmp_path: Path) -> None:
+    """In processes of their own, so that nothing is loaded yet; those that they start miss it as well."""
+    fly("hover", duration_s=0.05)
+    for name in ("x.onnx", "x.safetensors", "x.bin"):
+        Path(name).touch()
+    (tmp_path / "without").mkdir()
+    (tmp_path / "without/sitecustomize.py").write_text(f"import sys\nsys.modules[{module!r}] = None\n")
+    path = os.pathsep.join((str(tmp_path / "without"), str(ROOT)))
+    ended = subprocess.run(
+        [*FLOATY, *command.split()],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 2, ended.stderr
+    line = ended.stderr.splitlines()[-1]
+    assert re.match(rf"floaty: .*\b{module}\b.*-m pip install ", line), ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["list", "--help", "fly hover --duration 0.05", "report runs/hover-1", "export runs/hover-1 --csv", "new mine"],
+)  # fmt: skip
+def test_an_output_that_is_full_is_one_line_after_the_work(
+    cli: Cli, command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fly("hover", duration_s=0.05)
+    (Path("runs/hover-1") / "report.html").unlink(missing_ok=True)
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert cli.refusal(*command.split()) == "floaty: standard output: No space left on device\n"
+    written = {"fly": "runs/hover-1/result.json", "report": "runs/hover-1/report.html"}
+    written |= {"export": "runs/hover-1/flight.csv", "new": "mine/controller.py"}
+    assert Path(written.get(command.split()[0], ".")).exists()
+
+
+def test_an_output_whose_reader_has_ended_is_as_in_other_programs(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w") as broken:
+        monkeypatch.setattr(sys, "stdout", broken)
+        assert (cli("list"), cli.err) == (128 + signal.SIGPIPE, "")
+    monkeypatch.setattr(sys, "stdout", None)
+    assert (cli("list"), cli.err) == (0, "")
+
+
+NOBODY = 54_321  # a user without a name, a home folder or a cache
+
+
+@pytest.mark.long
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+def test_a_user_without_a_name_and_a_home_flies_beside_the_folders_of_others(tmp_path: Path) -> None:
+    own = tmp_path / "own"
+    for folder in (
+        own,
+        tmp_path / "tmp",
+        tmp_path / f"tmp/_jinja2-cache-{NOBODY}",
+        tmp_path / f"tmp/floaty-{NOBODY}",
+    ):
+        folder.mkdir()
+    own.chmod(0o777)
+    (tmp_path / "tmp").chmod(0o1777)
+    for parent in (tmp_path, *tmp_path.parents[:-1]):
+        if not parent.stat().st_mode & 0o001:
+            pytest.skip(f"other users do not reach {parent}")
+
+    def ran(*command: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            command, user=NOBODY, group=NOBODY, extra_groups=[], cwd=own, capture_output=True, text=True, check=False,
+            env={"PATH": os.defpath, "TMPDIR": str(tmp_path / "tmp"), "PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
+
+    if (started := ran(sys.executable, "-c", "import numpy")).returncode:
+        pytest.skip(f"other users do not reach this Python: {started.stderr[-200:]}")
+    flown = ran(*FLOATY, "fly", "hover", "--duration", "0.1")
+    assert flown.returncode == 0, flown.stderr
+    assert "Traceback" not in flown.stderr
+    assert (own / "runs/hover-1/report.html").is_file()
+    assert {path.name for path in own.iterdir()} == {"runs"}
 
 
 HEAVY = {

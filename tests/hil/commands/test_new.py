@@ -12,6 +12,7 @@ from hil.experiments import find_experiment
 from hil.laboratory.recorder import load_log
 from hil.laboratory.result import read_result
 from support.command import Cli
+from support.full_disk import small_files
 from support.installed_wheel import install, run
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -74,6 +75,13 @@ def test_an_impossible_folder_is_one_line(cli: Cli, tmp_path: Path, folder: str,
     assert cli.err == told
     assert files_in(tmp_path) == ["file", "taken/controller.py"]
     assert Path("taken/controller.py").read_text() == "years of work"
+
+
+@pytest.mark.parametrize("command", [("new",), ("deploy", "write")])
+def test_after_a_full_disk_the_same_folder_can_be_written(cli: Cli, command: tuple[str, ...]) -> None:
+    with small_files(1500):
+        assert "mine: File too large" in cli.refusal(*command, "mine")
+    assert cli(*command, "mine") == 0
 
 
 @pytest.mark.long

@@ -2,9 +2,11 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import FrameType
 
 import pytest
 
@@ -84,6 +86,66 @@ def test_a_flight_whose_process_was_killed_is_known_by_its_log() -> None:
     assert (run.folder / PARQUET).exists()
     assert folder_of(request_of("hover", duration_s=SHORT)) == Path("runs/hover-1")
     assert folder_of(request_of("hover", duration_s=0.1)) == Path("runs/hover-1-2")
+
+
+def fly_until_killed(function: str, file: str, call: int) -> int:
+    """Fly in another process, which is killed at a call of a function, and return the signal."""
+    child = os.fork()
+    if child == 0:
+        calls = []
+
+        def kill(frame: FrameType, event: str, _: object) -> None:
+            if (
+                event == "call"
+                and frame.f_code.co_name == function
+                and frame.f_code.co_filename.endswith(file)
+            ):
+                calls.append(event)
+                if len(calls) == call:
+                    os.kill(os.getpid(), signal.SIGKILL)
+
+        try:
+            sys.setprofile(kill)
+            fly("hover", duration_s=SHORT)
+        finally:
+            os._exit(1)
+    return -os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+@pytest.mark.parametrize(
+    ("older", "function", "file", "call"),
+    [
+        (False, "__init__", "telemetry_log.py", 1),  # into an empty folder
+        (False, "__init__", "ground_station/station.py", 1),  # the telemetry log is empty
+        (False, "__init__", "recorder.py", 1),
+        (False, "row", "recorder.py", 20),  # before the first second is on disk
+        (False, "replacing", "whole_files.py", 1),  # before the log is converted
+        (False, "replacing", "whole_files.py", 3),  # before the result is written
+        (True, "rename", "pathlib.py", 3),  # the older run is half set aside
+        (True, "__init__", "ground_station/station.py", 1),
+        (True, "rmtree", "shutil.py", 2),  # the older run is to be deleted
+        (True, "_rmtree_safe_fd", "shutil.py", 1),
+    ],
+)
+def test_a_killed_flight_is_repeated_in_its_folder(older: bool, function: str, file: str, call: int) -> None:
+    if older:
+        fly("hover", duration_s=SHORT)
+    assert fly_until_killed(function, file, call) == signal.SIGKILL
+    again = fly("hover", duration_s=SHORT)
+    assert (again.folder, again.outcome) == (Path("runs/hover-1"), "completed")
+    assert {path.name for path in again.folder.iterdir()} == {
+        "log.parquet", "events.jsonl", "telemetry.csv", "schedule.parquet", "result.json"
+    }  # fmt: skip
+
+
+def test_a_file_of_somebody_else_beside_an_unfinished_flight_is_kept() -> None:
+    fly_until_killed("__init__", "ground_station/station.py", 1)
+    assert os.listdir("runs/hover-1") == ["telemetry.csv"]
+    assert folder_of(request_of("hover", duration_s=0.1)) == Path("runs/hover-1")
+    for name, content in (("telemetry.csv", "of a station"), ("notes.txt", "")):
+        Path("runs/hover-1/telemetry.csv").write_text("")
+        Path("runs/hover-1", name).write_text(content)
+        assert folder_of(request_of("hover", duration_s=SHORT)) == Path("runs/hover-1-2")
 
 
 def test_a_refused_flight_leaves_no_folder() -> None:
