@@ -21,17 +21,44 @@ void set_register(struct machine *m, int number, uint32_t value)
     m->engine.reg_write(m->engine.uc, number, &value);
 }
 
+/* Writing XPSR changes the exception number; only writing its flags tells unicorn whether it is in handler mode. */
+void set_xpsr(struct machine *m, uint32_t value)
+{
+    set_register(m, R_XPSR, value);
+    set_register(m, R_FLAGS, value);
+}
+
+/* Registers by their numbers in an instruction. */
+static int named(unsigned number)
+{
+    return number == 13 ? R_SP : number == 14 ? R_LR : number == 15 ? R_PC : R_R0 + (int)number;
+}
+
+uint32_t get_core_register(struct machine *m, unsigned number)
+{
+    return get_register(m, named(number));
+}
+
+void set_core_register(struct machine *m, unsigned number, uint32_t value)
+{
+    set_register(m, named(number), value);
+}
+
+/* Return the bytes at an address, 0 where there is no memory. */
+uint8_t *memory_at(struct machine *m, uint32_t address, uint32_t size)
+{
+    if (address - RAM_BASE <= RAM_SIZE - size)
+        return m->ram + (address - RAM_BASE);
+    if (address - CCM_BASE <= CCM_SIZE - size)
+        return m->ccm + (address - CCM_BASE);
+    if (address - FLASH_BASE <= FLASH_SIZE - size)
+        return m->flash + (address - FLASH_BASE);
+    return address <= FLASH_SIZE - size ? m->flash + address : 0;
+}
+
 static uint32_t *word(struct machine *m, uint32_t address)
 {
-    if (address - RAM_BASE <= RAM_SIZE - 4)
-        return (uint32_t *)(void *)(m->ram + (address - RAM_BASE));
-    if (address - CCM_BASE <= CCM_SIZE - 4)
-        return (uint32_t *)(void *)(m->ccm + (address - CCM_BASE));
-    if (address - FLASH_BASE <= FLASH_SIZE - 4)
-        return (uint32_t *)(void *)(m->flash + (address - FLASH_BASE));
-    if (address <= FLASH_SIZE - 4)
-        return (uint32_t *)(void *)(m->flash + address);
-    return 0;
+    return (uint32_t *)(void *)memory_at(m, address, 4);
 }
 
 /* The running task has written below its stack: record it. */
@@ -111,12 +138,11 @@ unsigned next_exception(struct machine *m, int waking)
     int own = best_urgency < 0 ? best_urgency : group(m, best_urgency);
     if (own >= running_urgency(m))
         return 0;
-    uint32_t base = get_register(m, R_BASEPRI);
-    if (base && own >= group(m, (int)base))
+    if (m->basepri && own >= group(m, (int)m->basepri))
         return 0;
     if (!waking && own >= 0 && get_register(m, R_PRIMASK) & 1)
         return 0;
-    if (!waking && own >= -1 && get_register(m, R_FAULTMASK) & 1)
+    if (!waking && own >= -1 && m->faultmask)
         return 0;
     return best;
 }
@@ -165,7 +191,7 @@ void enter(struct machine *m, unsigned exception, uint32_t return_address)
     }
     uint32_t exc_return = 0xFFFFFFE1 | (handler ? 0 : TO_THREAD) | (process ? USE_PSP : 0) | (floats ? 0 : NO_FLOATS);
     set_register(m, R_CONTROL, control & ~(uint32_t)(SPSEL | FPCA));
-    set_register(m, R_XPSR, (xpsr & 0xF80F0000) | THUMB | exception);
+    set_xpsr(m, (xpsr & 0xF80F0000) | THUMB | exception);
     set_register(m, R_LR, exc_return);
     if (process)
         m->task_return = exc_return;
@@ -232,7 +258,7 @@ void leave(struct machine *m, uint32_t exc_return)
     int process = exc_return & USE_PSP, floats = !(exc_return & NO_FLOATS), stack = process ? R_PSP : R_MSP;
     m->active[exception >> 6] &= ~(1ull << (exception & 63));
     if (exception != NMI)
-        set_register(m, R_FAULTMASK, 0);
+        m->faultmask = 0;
     if (m->line[exception >> 6] >> (exception & 63) & 1)
         set_pending(m, exception);
     uint32_t frame = get_register(m, stack), *place = word(m, frame), *end = word(m, frame + (floats ? 0x64 : 0x1C));
@@ -254,7 +280,7 @@ void leave(struct machine *m, uint32_t exc_return)
     }
     set_register(m, stack, frame + (floats ? 0x68 : 0x20) + (saved[7] & ALIGNED ? 4 : 0));
     uint32_t number = exc_return & TO_THREAD ? 0 : saved[7] & 0x1FF;
-    set_register(m, R_XPSR, (saved[7] & ~0x3FFu) | THUMB | number);
+    set_xpsr(m, (saved[7] & ~0x3FFu) | THUMB | number);
     set_register(m, R_CONTROL, (control & 1) | (!number && process ? SPSEL : 0) | (floats ? FPCA : 0));
     m->now += RETURN_CYCLES;
     m->pc = saved[6];
@@ -267,6 +293,7 @@ void leave(struct machine *m, uint32_t exc_return)
 void raise_fault(struct machine *m, unsigned exception, uint32_t status, uint32_t pc)
 {
     m->cfsr |= status;
+    m->masks = 0; /* the end of the block was not reached */
     if (running_urgency(m) <= -1) {
         lock_up(m, pc);
         return;
