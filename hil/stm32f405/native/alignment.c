@@ -7,7 +7,7 @@ BASEPRI and no FAULTMASK either. They are kept here. */
 
 #include <string.h>
 
-enum { HOOK_CODE = 4, TO_BASEPRI = 17, TO_BASEPRI_MAX, TO_FAULTMASK };
+enum { HOOK_CODE = 4, TO_MSP = 8, TO_PSP, TO_BASEPRI = 17, TO_BASEPRI_MAX, TO_FAULTMASK };
 
 struct access {
     uint32_t address, size, loads, is_signed, target, base, moved, writes_back, length;
@@ -127,7 +127,7 @@ void on_unaligned(struct machine *m, uint32_t pc)
     set_register(m, R_PC, m->pc | 1);
 }
 
-/* The last block has ended: carry out its MSR or CPS, if it was one to a register that is kept here (B5.2.1, B5.2.3). */
+/* The last block has ended: carry out its MSR or CPS, as far as unicorn does not (B5.2.1, B5.2.3). */
 void set_masks(struct machine *m)
 {
     uint8_t *end = memory_at(m, (uint32_t)m->next_address - 4, 4);
@@ -144,6 +144,8 @@ void set_masks(struct machine *m)
             m->basepri = priority;
         else if (which == TO_FAULTMASK)
             m->faultmask = value & 1;
+        else if (which == TO_MSP || which == TO_PSP) /* their two lowest bits are always 0, B1.4.1 */
+            set_register(m, which == TO_MSP ? R_MSP : R_PSP, value & ~3u);
     }
 }
 

@@ -59,7 +59,11 @@ enum {
 /* Errors of unicorn. */
 enum { READ_UNMAPPED = 6, WRITE_UNMAPPED, FETCH_UNMAPPED, INVALID = 10, WRITE_PROTECTED = 12, FETCH_PROTECTED = 14 };
 
-enum { UNALIGNED = 1 << 24, UNALIGN_TRP = 8 }; /* bits of CFSR and CCR, B3.2 */
+/* Bits of CFSR and CCR, B3.2. */
+enum {
+    IACCVIOL = 1, IBUSERR = 1 << 8, PRECISERR = 1 << 9, BFARVALID = 1 << 15, UNDEFINSTR = 1 << 16, INVSTATE = 1 << 17,
+    INVPC = 1 << 18, NOCP = 1 << 19, UNALIGNED = 1 << 24, DIVBYZERO = 1 << 25, UNALIGN_TRP = 8, DIV_0_TRP = 16,
+};
 enum { IT_STATE = 0x0600FC00 };                /* bits of XPSR, B1.4.2 */
 
 #define NEVER UINT64_MAX
@@ -174,7 +178,7 @@ struct machine {
     uint64_t next_due;
     uint32_t pc, why, asleep, watchdog_on;
     uint32_t fault_address, unknown_count;
-    uint32_t unknown[16];
+    uint32_t unknown[16]; /* peripherals that were used: not modelled, or with 1 added those without a clock */
     uint64_t owed, taken; /* cycles that an outside load takes before all tasks, but not before interrupts; has taken */
     uint32_t tracing, task_count, switch_count;
     struct kernel kernel;
@@ -202,6 +206,7 @@ struct machine {
     uint32_t break_address[BREAKPOINTS];
     struct watchpoint watchpoint[WATCHPOINTS];
     uint32_t low_writers[LOW_WRITERS], low_writer_count; /* reported instructions */
+    uint64_t float_hook; /* while the floating-point unit is off */
     uint32_t canary; /* the last word of the running task's stack was unused when it got the processor */
 
     uint32_t input[PORTS];
@@ -258,6 +263,7 @@ unsigned next_exception(struct machine *m, int waking);
 void enter(struct machine *m, unsigned exception, uint32_t return_address);
 void leave(struct machine *m, uint32_t exc_return);
 void note_overflow(struct machine *m);
+void call_supervisor(struct machine *m, uint32_t return_address);
 void raise_fault(struct machine *m, unsigned exception, uint32_t status, uint32_t pc);
 uint64_t system_read(uc_engine *uc, uint64_t offset, unsigned size, void *user);
 void system_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t value, void *user);
@@ -312,6 +318,11 @@ int dma_put(struct machine *m, uint32_t peripheral, uint32_t item, int *last);
 int dma_take(struct machine *m, uint32_t peripheral, uint32_t *item);
 
 /* peripherals.c */
+void note_unknown(struct machine *m, uint32_t address);
+uint64_t ram_bit_read(uc_engine *uc, uint64_t offset, unsigned size, void *user);
+void ram_bit_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t value, void *user);
+uint64_t peripheral_bit_read(uc_engine *uc, uint64_t offset, unsigned size, void *user);
+void peripheral_bit_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t value, void *user);
 uint64_t peripheral_read(uc_engine *uc, uint64_t offset, unsigned size, void *user);
 void peripheral_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t value, void *user);
 uint64_t usb_read(uc_engine *uc, uint64_t offset, unsigned size, void *user);

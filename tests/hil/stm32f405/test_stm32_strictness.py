@@ -6,15 +6,22 @@ import pytest
 
 from hil.errors import LabError
 from hil.stm32f405 import chip as chip_module
+from hil.stm32f405.chip import Why
 from support.stm32_bench import FLASH, RAM, Bench
 
 START, VECTORS, DATA = FLASH + 8, RAM + 0x4000, RAM + 0x2000
-VTOR, CCR, SHCSR = 0xE000_ED08, 0xE000_ED14, 0xE000_ED24
-GPIOA = 0x4002_0000
+VTOR, CCR, SHPR2, SHCSR, CPACR, MPU_CTRL = (
+    0xE000_E000 + offset for offset in (0xD08, 0xD14, 0xD1C, 0xD24, 0xD88, 0xD94)
+)
+GPIOA, TIM3_ARR, APB1ENR = 0x4002_0000, 0x4000_042C, 0x4002_3840
+CCM, NO_MEMORY = 0x1000_0000, 0x3000_0000
 HARD_FAULT, MEM_MANAGE, BUS_FAULT, USAGE_FAULT = 3, 4, 5, 6
-UNDEFINED, UNALIGNED = 1 << 16, 1 << 24  # in CFSR
-UNALIGN_TRP = 1 << 3
-FORCED = 1 << 30  # in HFSR
+IACCVIOL, IBUSERR, PRECISERR, STKERR, BFARVALID = 1, 1 << 8, 1 << 9, 1 << 12, 1 << 15  # in CFSR
+UNDEFINED, INVSTATE, INVPC, NOCP, UNALIGNED, DIVBYZERO = (1 << bit for bit in (16, 17, 18, 19, 24, 25))
+UNALIGN_TRP, DIV_0_TRP, STKALIGN = 1 << 3, 1 << 4, 1 << 9  # in CCR
+VECTTBL, FORCED, DEBUGEVT = 1 << 1, 1 << 30, 1 << 31  # in HFSR
+HANDLED = 0b111 << 16  # in SHCSR: the three faults have handlers of their own
+FLOATS = 0xF << 20  # in CPACR
 WORDS = bytes(range(0x81, 0xC1))  # in memory, from DATA on
 RUN_US = 10
 
@@ -22,13 +29,15 @@ RUN_US = 10
 class Strict(Bench):
     """Instructions on a chip whose exceptions all end in a sleeping handler."""
 
-    def __init__(self, code: str, registers: dict[str, int] | None = None, ccr: int = 0x200) -> None:
+    def __init__(
+        self, code: str, registers: dict[str, int] | None = None, ccr: int = STKALIGN, cpacr: int = FLOATS
+    ) -> None:
         instructions = bytes.fromhex(code)
         super().__init__(instructions)
         self.handler = START + len(instructions)
         self.chip.write(VECTORS, pack("<16I", *[self.handler | 1] * 16))
         self.chip.write(DATA, WORDS)
-        self[VTOR], self[CCR] = VECTORS, ccr
+        self[VTOR], self[CCR], self[CPACR] = VECTORS, ccr, cpacr
         for name, value in (registers or {}).items():
             self.chip.set_register(name, value)
 
@@ -79,7 +88,7 @@ def test_an_unaligned_multiple_floating_or_exclusive_access_is_a_usage_fault(
     code: str, enabled: bool
 ) -> None:
     bench = Strict(code, {"r4": DATA + 1})
-    bench[SHCSR] = 1 << 18 if enabled else 0
+    bench[SHCSR] = HANDLED if enabled else 0
     assert bench.run() == (USAGE_FAULT if enabled else HARD_FAULT)
     assert (bench.cfsr, bench.chip.state.hfsr) == (UNALIGNED, 0 if enabled else FORCED)
     assert bench.stacked_pc == START
@@ -172,7 +181,7 @@ SINGLE = {name: row[0] for name, row in (LOADS | STORES).items()}
 
 @pytest.mark.parametrize("code", **ids(SINGLE))
 def test_unalign_trp_forbids_every_unaligned_access(code: str) -> None:
-    bench = Strict(code, {"r4": DATA + 5, "r5": 2}, ccr=0x200 | UNALIGN_TRP)
+    bench = Strict(code, {"r4": DATA + 5, "r5": 2}, ccr=STKALIGN | UNALIGN_TRP)
     assert bench.run() == HARD_FAULT
     assert (bench.cfsr, bench.stacked_pc) == (UNALIGNED, START)
 
@@ -214,7 +223,7 @@ def test_a_step_over_an_unaligned_load_ends_after_it() -> None:
 def test_a_watchpoint_sees_an_unaligned_access(code: str, kind: int) -> None:
     bench = Strict(code, {"r4": DATA + 5})
     bench.chip.watch(kind, DATA + 8, 1, True)
-    assert bench.chip.run(1680) & chip_module.Why.WATCHPOINT
+    assert bench.chip.run(1680) & Why.WATCHPOINT
     assert bench.chip.state.watch_address == DATA + 8
 
 
@@ -243,7 +252,210 @@ def test_an_instruction_of_a_later_core_is_undefined(code: str) -> None:
     assert (bench.cfsr, bench.stacked_pc) == (UNDEFINED, START)
 
 
+def test_a_stack_pointer_is_a_multiple_of_four() -> None:
+    bench = Strict("80f3 0888 80f3 0988", {"r0": DATA + 3})  # msr msp, r0; msr psp, r0
+    assert bench.run() == 0
+    assert [bench.chip.register(name) for name in ("msp", "psp")] == [DATA, DATA]
+
+
 def test_an_unknown_unicorn_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(chip_module, "CORTEX_M4_FEATURES", 0x1234_5678_9ABC_DEF0)
     with pytest.raises(LabError, match="this version of unicorn"):
         Bench()
+
+
+# Floats, divisions, breakpoints
+
+
+FLOAT_INSTRUCTIONS = {
+    "vldr s0, [r4]": "94ed 000a",
+    "vadd.f32 s0, s0, s0": "30ee 000a",
+    "vmov s0, r0": "00ee 100a",
+    "vpush {d8}": "2ded 028b",
+    "vmrs r0, fpscr": "f1ee 100a",
+}
+
+
+@pytest.mark.parametrize("code", **ids(FLOAT_INSTRUCTIONS))
+def test_floats_before_they_are_enabled_are_a_usage_fault(code: str) -> None:
+    bench = Strict(code, {"r4": DATA}, cpacr=0)
+    assert bench.run() == HARD_FAULT
+    assert (bench.cfsr, bench.stacked_pc) == (NOCP, START)
+    assert Strict(code, {"r4": DATA}).run() == 0
+
+
+def test_floats_are_enabled_and_disabled_by_the_code_itself() -> None:
+    # str r1, [r0]; dsb; isb; vmov s0, r0; str r2, [r0]; dsb; isb; vmov s0, r0
+    barriers = "bff3 4f8f bff3 6f8f"
+    code = f"0160 {barriers} 00ee 100a 0260 {barriers} 00ee 100a"
+    bench = Strict(code, {"r0": CPACR, "r1": FLOATS, "r2": 0}, cpacr=0)
+    assert bench.run() == HARD_FAULT
+    assert (bench.cfsr, bench.stacked_pc) == (NOCP, START + 24)
+
+
+@pytest.mark.parametrize("code", ["91fb f2f0", "b1fb f2f0"], ids=["sdiv", "udiv"])
+def test_a_division_by_zero_is_a_usage_fault_if_the_firmware_wants_it_so(code: str) -> None:
+    bench = Strict(code, {"r1": 7}, ccr=STKALIGN | DIV_0_TRP)
+    assert bench.run() == HARD_FAULT
+    assert (bench.cfsr, bench.stacked_pc) == (DIVBYZERO, START)
+    bench = Strict(code, {"r0": 1, "r1": 7})
+    assert (bench.run(), bench.chip.register("r0")) == (0, 0)
+
+
+def test_a_breakpoint_instruction_without_a_debugger_is_a_hard_fault() -> None:
+    bench = Strict("00be")
+    assert bench.run() == HARD_FAULT
+    assert (bench.cfsr, bench.chip.state.hfsr, bench.stacked_pc) == (0, DEBUGEVT, START)
+
+
+# Memory
+
+
+@pytest.mark.parametrize(
+    ("target", "exception", "status"),
+    [
+        (GPIOA, MEM_MANAGE, IACCVIOL),
+        (0x5000_0000, MEM_MANAGE, IACCVIOL),
+        (0xA000_0000, MEM_MANAGE, IACCVIOL),
+        (0xE000_E000, MEM_MANAGE, IACCVIOL),
+        (0xFFFF_FFF8, MEM_MANAGE, IACCVIOL),  # as a return from an exception, outside of one
+        (CCM, BUS_FAULT, IBUSERR),
+        (NO_MEMORY, BUS_FAULT, IBUSERR),
+        (0x6000_0000, BUS_FAULT, IBUSERR),
+    ],
+    ids=hex,
+)
+def test_no_code_is_fetched_from_devices_and_from_where_no_bus_leads(
+    target: int, exception: int, status: int
+) -> None:
+    bench = Strict("2047", {"r4": target | 1})  # bx r4
+    bench[SHCSR] = HANDLED
+    assert bench.run() == exception
+    assert (bench.cfsr, bench.stacked_pc) == (status, target)
+
+
+@pytest.mark.parametrize("code", ["2068", "2060"], ids=["read", "written"])
+@pytest.mark.parametrize(
+    "address", [NO_MEMORY, RAM + 0x2_0000, 0x4008_0000, 0x6000_0000, 0xC000_0000], ids=hex
+)
+def test_an_access_to_where_nothing_is_is_a_bus_fault_with_its_address(code: str, address: int) -> None:
+    bench = Strict(code, {"r4": address})
+    bench[SHCSR] = HANDLED
+    assert bench.run() == BUS_FAULT
+    assert (bench.cfsr, bench.chip.state.bfar, bench.stacked_pc) == (PRECISERR | BFARVALID, address, START)
+
+
+def test_a_store_to_locked_flash_has_no_effect() -> None:
+    bench = Strict("2060", {"r4": FLASH + 0x8000})
+    assert bench.run() == 0
+    assert bench.chip.read(FLASH + 0x8000, 4) == b"\xff" * 4
+
+
+def test_a_bit_of_memory_is_a_word_of_its_own() -> None:
+    # str r1, [r4]; ldr r0, [r5]: bit 6 of WORDS[2] = 0x83 is set, bit 7 of WORDS[1] = 0x82 is read
+    alias = 0x2200_0000 + (DATA - RAM) * 32
+    bench = Strict("2160 2868", {"r1": 1, "r4": alias + 2 * 32 + 6 * 4, "r5": alias + 32 + 7 * 4})
+    assert bench.run() == 0
+    assert bench.chip.read(DATA, 4) == bytes((0x81, 0x82, 0xC3, 0x84))
+    assert bench.chip.register("r0") == 1
+
+
+def test_a_bit_of_a_peripheral_is_a_word_of_its_own() -> None:
+    bench = Strict(
+        "2160 2868", {"r1": 1, "r4": 0x4200_0000 + (APB1ENR - 0x4000_0000) * 32 + 4, "r5": APB1ENR}
+    )
+    assert bench.run() == 0
+    assert bench.chip.register("r0") == 2
+
+
+def test_a_peripheral_without_a_clock_reads_as_zero_and_keeps_nothing() -> None:
+    for clocks, expected in ((0, 0), (1 << 1, 100)):
+        bench = Strict("2160 2068", {"r0": 1, "r1": 100, "r4": TIM3_ARR})  # str r1, [r4]; ldr r0, [r4]
+        bench[APB1ENR] = clocks
+        assert bench.run() == 0
+        assert bench.chip.register("r0") == expected
+        assert bench.chip.state.unknown_count == (0 if clocks else 1)
+
+
+def test_a_memory_protection_unit_is_reported_as_missing() -> None:
+    bench = Strict("2160", {"r1": 1, "r4": MPU_CTRL})
+    assert bench.run() == 0
+    assert bench.chip.state.unknown[0] == MPU_CTRL
+
+
+# Exceptions
+
+
+def with_handler(code: str, handler: str, **registers: int) -> Strict:
+    """`svc #0` and its handler, which follows `code`; the other exceptions sleep."""
+    bench = Strict(f"{code} 00df fee7 {handler}", registers)  # fee7: b to itself
+    bench.chip.write(VECTORS + 4 * 11, pack("<I", (START + len(bytes.fromhex(code)) + 4) | 1))
+    bench[SHCSR] = HANDLED
+    return bench
+
+
+INVALID_RETURNS = {  # handlers
+    "to a handler that did not run": ("8ef0 080e 7047", INVPC),  # eor lr, #8
+    "to nothing": ("8ef0 020e 7047", INVPC),  # eor lr, #2
+    "with a frame of a handler": (
+        "0798 0330 0790 7047",
+        INVPC,
+    ),  # ldr r0, [sp, #28]; adds r0, #3; str r0, [sp, #28]
+    "with a frame of no Thumb code": ("0020 0790 7047", INVSTATE),  # movs r0, #0; str r0, [sp, #28]
+}
+
+
+@pytest.mark.parametrize(("handler", "status"), INVALID_RETURNS.values(), ids=INVALID_RETURNS.keys())
+def test_an_invalid_return_from_an_exception_is_a_usage_fault(handler: str, status: int) -> None:
+    bench = with_handler("", handler)
+    assert bench.run() == USAGE_FAULT
+    assert bench.cfsr == status
+
+
+@pytest.mark.parametrize(("ccr", "padding"), [(STKALIGN, 4), (0, 0)])
+def test_a_frame_is_aligned_to_eight_bytes_unless_that_is_switched_off(ccr: int, padding: int) -> None:
+    bench = Strict("01b4 00df", ccr=ccr)  # push {r0}; svc
+    before = bench.chip.register("msp") - 4
+    assert bench.run() == 11
+    frame = bench.chip.register("msp")
+    assert before - frame == 0x20 + padding
+    assert bench[frame + 28] >> 9 & 1 == (padding == 4)
+
+
+@pytest.mark.parametrize(
+    ("code", "priority", "exception"),
+    [("72b6 00df", 0, HARD_FAULT), ("81f3 1188 00df", 0x60, HARD_FAULT), ("81f3 1188 00df", 0x40, 11)],
+    ids=["primask", "basepri", "more urgent"],
+)
+def test_a_supervisor_call_where_it_may_not_interrupt_is_a_hard_fault(
+    code: str, priority: int, exception: int
+) -> None:
+    bench = Strict(code, {"r1": 0x50})  # cpsid i, or msr basepri, r1
+    bench[SHPR2] = priority << 24
+    assert bench.run() == exception
+    assert bench.chip.state.hfsr == (FORCED if exception == HARD_FAULT else 0)
+
+
+def test_a_fault_while_interrupts_are_masked_is_a_hard_fault() -> None:
+    bench = Strict("72b6 00de")  # cpsid i; udf
+    bench[SHCSR] = HANDLED
+    assert bench.run() == HARD_FAULT
+    assert (bench.cfsr, bench.chip.state.hfsr) == (UNDEFINED, FORCED)
+
+
+@pytest.mark.parametrize("code", ["71b6 00de", "71b6 00df"], ids=["udf", "svc"])
+def test_a_fault_while_faults_are_masked_locks_up(code: str) -> None:
+    assert Strict(code).wait(RUN_US) & Why.LOCKUP  # cpsid f
+
+
+def test_a_vector_table_without_memory_locks_up() -> None:
+    bench = Strict("00df")
+    bench[VTOR] = NO_MEMORY
+    assert bench.wait(RUN_US) & Why.LOCKUP
+    assert bench.chip.state.hfsr & VECTTBL
+
+
+def test_an_exception_whose_frame_has_no_memory_is_a_hard_fault() -> None:
+    bench = Strict("00df", {"msp": RAM + 0x10})
+    assert bench.run() == HARD_FAULT
+    assert (bench.cfsr, bench.chip.state.hfsr) == (STKERR, FORCED)
