@@ -58,10 +58,8 @@ class CortexM4Runner:
         self.load = {name: EntryLoad() for name in image.entries}
         self._fault = unicorn.UcError
         self._result, self._pc = arm_const.UC_ARM_REG_R0, arm_const.UC_ARM_REG_PC
-        self._cpu = unicorn.Uc(
-            unicorn_const.UC_ARCH_ARM, unicorn_const.UC_MODE_THUMB | unicorn_const.UC_MODE_MCLASS
-        )
-        self._cpu.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
+        self._cpu = unicorn.Uc(unicorn_const.UC_ARCH_ARM, unicorn_const.UC_MODE_THUMB)
+        self._cpu.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)  # UC_MODE_MCLASS would make it an M33
         self._cpu.mem_map(FLASH, FLASH_SIZE, unicorn_const.UC_PROT_READ | unicorn_const.UC_PROT_EXEC)
         self._cpu.mem_write(FLASH, image.code.ljust(FLASH_SIZE, UNDEFINED))
         self._ram = np.frombuffer(mmap.mmap(-1, RAM_SIZE), np.uint8)

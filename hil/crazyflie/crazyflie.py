@@ -90,8 +90,11 @@ class Crazyflie:
         """Say which peripherals the image has used that are not there."""
         state = self.chip.state
         for address in state.unknown[self._unknown : state.unknown_count]:
+            clocked = not address & 1
+            what = "that is not modelled" if clocked else "whose clock is off (RCC)"
+            effect = "it reads as 0" if clocked else "it reads as 0 and keeps nothing"
             self._outside.debug_write(
-                f"the image uses a peripheral that is not modelled, at 0x{address:08x}: it reads as 0"
+                f"the image uses a peripheral {what}, at 0x{address & ~1:08x}: {effect}"
             )
         self._unknown = state.unknown_count
 

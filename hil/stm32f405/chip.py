@@ -29,8 +29,11 @@ OTP, UNIQUE_ID, FLASH_KBYTES = 0x1FFF_7800, 0x1FFF_7A10, 0x1FFF_7A22
 WINDOWS = (
     (0x4000_0000, 0x8_0000, "peripheral"), (0x5000_0000, 0x8_0000, "usb"), (0xE000_0000, 0x10_0000, "system"),
 )  # fmt: skip
+STATE_REGISTERS = ("pc", "basepri", "faultmask")  # all others are unicorn's
 SOURCES = Path(__file__).parent / "native"
 NOWHERE = 0xFF  # no address on I2C
+# What unicorn (2.1.3, 2.1.4) knows of a Cortex-M4, by the bits of its `enum arm_features`.
+CORTEX_M4_FEATURES, MAIN_EXTENSION = 0x54_0102_C2E8, 1 << 38
 # Causes of a reset in RCC_CSR, with the pin's.
 POWER_ON, SOFTWARE, WATCHDOG = 0x0C00_0000, 0x1400_0000, 0x2400_0000
 
@@ -96,10 +99,9 @@ class Chip:
         self.flash[:] = 0xFF
         self.vectors = base
         self.flash[base - FLASH : base - FLASH + len(code)] = np.frombuffer(code, np.uint8)
-        self._cpu = unicorn.Uc(
-            unicorn_const.UC_ARCH_ARM, unicorn_const.UC_MODE_THUMB | unicorn_const.UC_MODE_MCLASS
-        )
-        self._cpu.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
+        self._cpu = unicorn.Uc(unicorn_const.UC_ARCH_ARM, unicorn_const.UC_MODE_THUMB)
+        self._cpu.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)  # UC_MODE_MCLASS would make it an M33
+        let_unaligned_trap(self._cpu)
         self._cpu.ctl_set_tlb_mode(unicorn_const.UC_TLB_VIRTUAL)  # machine.c decides what is executable
         self._numbers = _register_numbers(arm_const)
         self._map(unicorn_const)
@@ -284,11 +286,13 @@ class Chip:
 
     def register(self, name: str) -> int:
         """Return a register: r0..r12, sp, lr, pc, xpsr, msp, psp, primask, basepri, control, s0..s31, d0..d15, fpscr."""
-        return int(self.state.pc) if name == "pc" else int(self._cpu.reg_read(self._numbers[name]))
+        if name in STATE_REGISTERS:
+            return int(getattr(self.state, name))
+        return int(self._cpu.reg_read(self._numbers[name]))
 
     def set_register(self, name: str, value: int) -> None:
-        if name == "pc":
-            self.state.pc = value & ~1
+        if name in STATE_REGISTERS:
+            setattr(self.state, name, value & ~1 if name == "pc" else value)
         else:
             self._cpu.reg_write(self._numbers[name], value)
 
@@ -304,6 +308,21 @@ class Chip:
                 raise LabError("more breakpoints than there is room for")
         self._planted = addresses
         self._cpu.ctl_flush_tb()  # hooks act on code translated after them
+
+
+def let_unaligned_trap(cpu: Any) -> None:
+    """Let unicorn stop before every unaligned access of a word or half word, which alignment.c then judges.
+
+    Only cores without the Main Extension do so. Among the features of the core, in the context that unicorn saves and
+    restores, one bit makes it such a core. Raises `LabError` when this unicorn keeps them in another form.
+    """
+    context = cpu.context_save()
+    saved, features = bytes(context), CORTEX_M4_FEATURES.to_bytes(8, "little")
+    if saved.count(features) != 1:
+        raise LabError("this version of unicorn is unknown here: install unicorn 2.1.3 or 2.1.4")
+    changed = saved.replace(features, (CORTEX_M4_FEATURES & ~MAIN_EXTENSION).to_bytes(8, "little"))
+    context.__setstate__((changed, *context.__getstate__()[1:]))
+    cpu.context_restore(context)
 
 
 def _memory(size: int) -> NDArray[np.uint8]:
@@ -322,6 +341,6 @@ def _sums_before(code: bytes, base: int, constants: frozenset[int], first_bit: i
 def _register_numbers(arm_const: Any) -> dict[str, int]:
     names = (
         *(f"r{i}" for i in range(13)), *(f"s{i}" for i in range(32)), *(f"d{i}" for i in range(16)),
-        "sp", "lr", "xpsr", "msp", "psp", "primask", "basepri", "faultmask", "control", "fpscr",
+        "sp", "lr", "xpsr", "msp", "psp", "primask", "control", "fpscr",
     )  # fmt: skip
     return {name: getattr(arm_const, f"UC_ARM_REG_{name.upper()}") for name in names}

@@ -38,7 +38,7 @@ CFSR_WORDS = {
     19: "the floating-point unit is switched off", 24: "unaligned access", 25: "division by zero",
 }  # fmt: skip
 MMFAR_VALID, BFAR_VALID = 1 << 7, 1 << 15
-VECTOR_UNREADABLE = 1 << 1  # in HFSR
+VECTOR_UNREADABLE, ESCALATED, BREAKPOINT = 1 << 1, 1 << 30, 1 << 31  # in HFSR
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,6 +155,10 @@ class CrashReports:
         reasons = [words for bit, words in CFSR_WORDS.items() if status >> bit & 1]
         if hard & VECTOR_UNREADABLE:
             reasons.append("the vector of an exception could not be read")
+        if hard & BREAKPOINT:
+            reasons.append("a breakpoint instruction without a debugger")
+        if hard & ESCALATED and not reasons:
+            reasons.append("a supervisor call where its priority does not allow it")
         what = " and ".join(reasons) or "for a reason that its registers do not say"
         if status & (BFAR_VALID | MMFAR_VALID):
             return f"{what} at 0x{self._word(BFAR if status & BFAR_VALID else MMFAR):08x}"

@@ -18,7 +18,7 @@
 
 enum planted {
   NOTHING, BUS_FAULT, UNDEFINED, ASSERTION, HUNGRY_WATCHDOG, NULL_CALL, NULL_READ, NULL_WRITE, DIVISION, HANG, OVERFLOW,
-  BRIEF_OVERFLOW, LAST_CALL, MUTEX, SUSPENDED, DELAYED, DELETED
+  BRIEF_OVERFLOW, LAST_CALL, MUTEX, SUSPENDED, DELAYED, DELETED, UNALIGNED, BREAKPOINT, MASKED_CALL
 };
 enum { ASSERTED = 1 };
 
@@ -448,6 +448,15 @@ __attribute__((noinline)) static uint32_t go_wrong(uint32_t how) {
       return dig(20);
     case BRIEF_OVERFLOW:
       touch(pxCurrentTCB->pxStack);
+      break;
+    case UNALIGNED:
+      __asm volatile("vldr s0, [%0]" ::"r"(&eeprom[1]) : "s0", "memory");
+      break;
+    case BREAKPOINT:
+      __asm volatile("bkpt #0");
+      break;
+    case MASKED_CALL:
+      __asm volatile("cpsid i\n svc #0\n nop");
       break;
     case LAST_CALL:
       check_last(how);

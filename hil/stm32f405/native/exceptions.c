@@ -5,8 +5,9 @@ would only reserve their space. */
 #include "machine.h"
 
 enum { SPSEL = 2, FPCA = 4, ENTRY_CYCLES = 12, RETURN_CYCLES = 10, ALIGNED = 1 << 9 };
+enum { NONBASETHRDENA = 1, STKALIGN = 1 << 9 }; /* bits of CCR, B3.2.8 */
 enum { USE_PSP = 4, NO_FLOATS = 16, TO_THREAD = 8 }; /* bits of EXC_RETURN */
-enum { FORCED = 1 << 30 };
+enum { VECTTBL = 1 << 1, FORCED = 1 << 30 };
 #define UNUSED 0xA5A5A5A5u /* what FreeRTOS fills a stack with */
 
 uint32_t get_register(struct machine *m, int number)
@@ -21,17 +22,44 @@ void set_register(struct machine *m, int number, uint32_t value)
     m->engine.reg_write(m->engine.uc, number, &value);
 }
 
+/* Writing XPSR changes the exception number; only writing its flags tells unicorn whether it is in handler mode. */
+void set_xpsr(struct machine *m, uint32_t value)
+{
+    set_register(m, R_XPSR, value);
+    set_register(m, R_FLAGS, value);
+}
+
+/* Registers by their numbers in an instruction. */
+static int named(unsigned number)
+{
+    return number == 13 ? R_SP : number == 14 ? R_LR : number == 15 ? R_PC : R_R0 + (int)number;
+}
+
+uint32_t get_core_register(struct machine *m, unsigned number)
+{
+    return get_register(m, named(number));
+}
+
+void set_core_register(struct machine *m, unsigned number, uint32_t value)
+{
+    set_register(m, named(number), value);
+}
+
+/* Return the bytes at an address, 0 where there is no memory. */
+uint8_t *memory_at(struct machine *m, uint32_t address, uint32_t size)
+{
+    if (address - RAM_BASE <= RAM_SIZE - size)
+        return m->ram + (address - RAM_BASE);
+    if (address - CCM_BASE <= CCM_SIZE - size)
+        return m->ccm + (address - CCM_BASE);
+    if (address - FLASH_BASE <= FLASH_SIZE - size)
+        return m->flash + (address - FLASH_BASE);
+    return address <= FLASH_SIZE - size ? m->flash + address : 0;
+}
+
 static uint32_t *word(struct machine *m, uint32_t address)
 {
-    if (address - RAM_BASE <= RAM_SIZE - 4)
-        return (uint32_t *)(void *)(m->ram + (address - RAM_BASE));
-    if (address - CCM_BASE <= CCM_SIZE - 4)
-        return (uint32_t *)(void *)(m->ccm + (address - CCM_BASE));
-    if (address - FLASH_BASE <= FLASH_SIZE - 4)
-        return (uint32_t *)(void *)(m->flash + (address - FLASH_BASE));
-    if (address <= FLASH_SIZE - 4)
-        return (uint32_t *)(void *)(m->flash + address);
-    return 0;
+    return (uint32_t *)(void *)memory_at(m, address, 4);
 }
 
 /* The running task has written below its stack: record it. */
@@ -93,7 +121,20 @@ static int running_urgency(struct machine *m)
     return least;
 }
 
-/* Return the exception to enter now, 0 if none; `waking`: as for WFI, which ignores PRIMASK (B1.5.17). */
+/* Priority of what runs now (B1.5.4); `waking`: as for WFI, which ignores PRIMASK (B1.5.17). */
+static int execution_priority(struct machine *m, int waking)
+{
+    int least = running_urgency(m), base = m->basepri ? group(m, (int)m->basepri) : 256;
+    if (base < least)
+        least = base;
+    if (!waking && least > 0 && get_register(m, R_PRIMASK) & 1)
+        least = 0;
+    if (!waking && least > -1 && m->faultmask)
+        least = -1;
+    return least;
+}
+
+/* Return the exception to enter now, 0 if none. */
 unsigned next_exception(struct machine *m, int waking)
 {
     unsigned best = 0;
@@ -109,16 +150,7 @@ unsigned next_exception(struct machine *m, int waking)
     if (!best)
         return 0;
     int own = best_urgency < 0 ? best_urgency : group(m, best_urgency);
-    if (own >= running_urgency(m))
-        return 0;
-    uint32_t base = get_register(m, R_BASEPRI);
-    if (base && own >= group(m, (int)base))
-        return 0;
-    if (!waking && own >= 0 && get_register(m, R_PRIMASK) & 1)
-        return 0;
-    if (!waking && own >= -1 && get_register(m, R_FAULTMASK) & 1)
-        return 0;
-    return best;
+    return own < execution_priority(m, waking) ? best : 0;
 }
 
 static void lock_up(struct machine *m, uint32_t pc)
@@ -135,7 +167,7 @@ void enter(struct machine *m, unsigned exception, uint32_t return_address)
     uint32_t control = get_register(m, R_CONTROL), xpsr = get_register(m, R_XPSR);
     int handler = xpsr & 0x1FF, process = !handler && control & SPSEL, floats = control & FPCA;
     int stack = process ? R_PSP : R_MSP;
-    uint32_t sp = get_register(m, stack), padding = sp & 4, frame = (sp - (floats ? 0x68 : 0x20)) & ~7u;
+    uint32_t sp = get_register(m, stack), padding = floats || m->ccr & STKALIGN ? sp & 4 : 0, frame = sp - padding - (floats ? 0x68 : 0x20);
     uint32_t *place = word(m, frame), *end = word(m, frame + (floats ? 0x64 : 0x1C));
     if (process && m->canary && *word(m, m->stack_begin) != UNUSED) /* it overflowed, and may have returned since */
         note_overflow(m);
@@ -165,7 +197,7 @@ void enter(struct machine *m, unsigned exception, uint32_t return_address)
     }
     uint32_t exc_return = 0xFFFFFFE1 | (handler ? 0 : TO_THREAD) | (process ? USE_PSP : 0) | (floats ? 0 : NO_FLOATS);
     set_register(m, R_CONTROL, control & ~(uint32_t)(SPSEL | FPCA));
-    set_register(m, R_XPSR, (xpsr & 0xF80F0000) | THUMB | exception);
+    set_xpsr(m, (xpsr & 0xF80F0000) | THUMB | exception);
     set_register(m, R_LR, exc_return);
     if (process)
         m->task_return = exc_return;
@@ -175,7 +207,12 @@ void enter(struct machine *m, unsigned exception, uint32_t return_address)
     m->exceptions++;
     m->now += ENTRY_CYCLES;
     uint32_t *vector = word(m, m->vtor + 4 * exception);
-    m->pc = vector ? *vector : 0;
+    if (!vector) { /* nor is there one for the HardFault that follows */
+        m->hfsr |= VECTTBL;
+        lock_up(m, return_address);
+        return;
+    }
+    m->pc = *vector;
     set_register(m, R_PC, m->pc);
 }
 
@@ -225,19 +262,41 @@ static void look_at_task(struct machine *m)
         m->task_switch[m->switch_count++] = (struct task_switch){.now = m->now, .block = *current};
 }
 
+/* Whether an exception may return so (ExceptionReturn, B1.5.8); `others`: more exceptions are active. */
+static int may_return(struct machine *m, uint32_t exc_return, unsigned exception, int others)
+{
+    if (!(m->active[exception >> 6] >> (exception & 63) & 1) || (exc_return & 0x0FFFFFE0) != 0x0FFFFFE0)
+        return 0;
+    switch (exc_return & 15) {
+    case 1: return others;
+    case 9: case 13: return !others || m->ccr & NONBASETHRDENA;
+    default: return 0;
+    }
+}
+
 void leave(struct machine *m, uint32_t exc_return)
 {
     unsigned exception = get_register(m, R_XPSR) & 0x1FF;
+    int active = __builtin_popcountll(m->active[0]) + __builtin_popcountll(m->active[1]);
+    int valid = may_return(m, exc_return, exception, active > 1);
     uint32_t control = get_register(m, R_CONTROL);
     int process = exc_return & USE_PSP, floats = !(exc_return & NO_FLOATS), stack = process ? R_PSP : R_MSP;
     m->active[exception >> 6] &= ~(1ull << (exception & 63));
     if (exception != NMI)
-        set_register(m, R_FAULTMASK, 0);
+        m->faultmask = 0;
     if (m->line[exception >> 6] >> (exception & 63) & 1)
         set_pending(m, exception);
+    if (!valid) {
+        raise_fault(m, USAGE_FAULT, INVPC, exc_return);
+        return;
+    }
     uint32_t frame = get_register(m, stack), *place = word(m, frame), *end = word(m, frame + (floats ? 0x64 : 0x1C));
     if (!place || !end) {
         raise_fault(m, BUS_FAULT, 1 << 11, exc_return); /* UNSTKERR */
+        return;
+    }
+    if (!(exc_return & TO_THREAD) != !!(place[7] & 0x1FF)) {
+        raise_fault(m, USAGE_FAULT, INVPC, exc_return);
         return;
     }
     uint32_t saved[8];
@@ -254,11 +313,15 @@ void leave(struct machine *m, uint32_t exc_return)
     }
     set_register(m, stack, frame + (floats ? 0x68 : 0x20) + (saved[7] & ALIGNED ? 4 : 0));
     uint32_t number = exc_return & TO_THREAD ? 0 : saved[7] & 0x1FF;
-    set_register(m, R_XPSR, (saved[7] & ~0x3FFu) | THUMB | number);
+    set_xpsr(m, (saved[7] & ~0x3FFu) | THUMB | number);
     set_register(m, R_CONTROL, (control & 1) | (!number && process ? SPSEL : 0) | (floats ? FPCA : 0));
     m->now += RETURN_CYCLES;
     m->pc = saved[6];
     set_register(m, R_PC, m->pc | 1);
+    if (!(saved[7] & THUMB)) {
+        raise_fault(m, USAGE_FAULT, INVSTATE, m->pc);
+        return;
+    }
     if (m->kernel.current_place && (exception == PENDSV || exception == SVC))
         look_at_task(m);
 }
@@ -267,16 +330,27 @@ void leave(struct machine *m, uint32_t exc_return)
 void raise_fault(struct machine *m, unsigned exception, uint32_t status, uint32_t pc)
 {
     m->cfsr |= status;
-    if (running_urgency(m) <= -1) {
+    m->masks = 0; /* the end of the block was not reached */
+    int priority = execution_priority(m, 0);
+    if (priority <= -1) {
         lock_up(m, pc);
         return;
     }
-    int on = exception == HARD_FAULT || (m->shcsr >> (12 + exception) & 1);
-    if (exception != HARD_FAULT && (!on || urgency(m, exception) >= running_urgency(m))) {
+    int on = exception == HARD_FAULT || (exception != SVC && m->shcsr >> (12 + exception) & 1);
+    if (exception != HARD_FAULT && (!on || group(m, urgency(m, exception)) >= priority)) {
         m->hfsr |= FORCED;
         exception = HARD_FAULT;
     }
     enter(m, exception, pc);
+}
+
+/* SVC, which becomes a HardFault where its own exception may not interrupt (B1.5.14). */
+void call_supervisor(struct machine *m, uint32_t return_address)
+{
+    if (group(m, urgency(m, SVC)) < execution_priority(m, 0))
+        enter(m, SVC, return_address);
+    else
+        raise_fault(m, SVC, 0, return_address);
 }
 
 static void start_tick(struct machine *m)
@@ -429,6 +503,10 @@ void system_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t given,
     case 0xED28: m->cfsr &= ~value; break;
     case 0xED2C: m->hfsr &= ~value; break;
     case 0xED88: m->cpacr = value; break;
+    case 0xED94: /* MPU_CTRL */
+        if (value & 1)
+            note_unknown(m, 0xE000ED94);
+        break;
     case 0xEF00: set_pending(m, IRQ + (value & 0x7F)); break; /* STIR */
     case 0xEF34: m->fpccr = value; break;
     default: break;

@@ -5,10 +5,9 @@
 #include <string.h>
 
 enum { HOOK_INTR = 1, HOOK_CODE = 4, HOOK_BLOCK = 8, HOOK_READ = 0x400, HOOK_WRITE = 0x800, HOOK_TLB = 0x20000, HOOK_INVALID = 0x3F0 /* accesses to unmapped memory */ };
-enum { READ_UNMAPPED = 6, WRITE_UNMAPPED, FETCH_UNMAPPED, INVALID = 10, WRITE_PROTECTED = 12, FETCH_PROTECTED = 14 };
-enum { ACCESS_FETCH = 18, RIGHT_READ = 1, RIGHT_WRITE = 2, RIGHT_EXECUTE = 4, FLUSH_TLB = 11 | 1 << 30 };
-enum { TRAP_SVC = 2, TRAP_BREAKPOINT = 7, TRAP_RETURN = 8, TRAP_NO_FLOATS = 17, TRAP_STATE = 18 };
-enum { REFILL = 3, NOWHERE = 0xFFFFFFFE, IT_STATE = 0x0600FC00 /* bits of XPSR, B1.4.2 */ };
+enum { ACCESS_FETCH = 18, RIGHT_READ = 1, RIGHT_WRITE = 2, RIGHT_EXECUTE = 4, FLUSH_TLB = 11 | 1 << 30, FLUSH_CODE = 10 | 1 << 30 };
+enum { TRAP_SVC = 2, TRAP_UNALIGNED = 4, TRAP_BREAKPOINT = 7, TRAP_RETURN = 8, TRAP_NO_FLOATS = 17, TRAP_STATE = 18 };
+enum { REFILL = 3, NOWHERE = 0xFFFFFFFE };
 
 struct page { /* uc_tlb_entry */
     uint64_t address;
@@ -67,7 +66,7 @@ static void let_happen(struct machine *m)
     }
 }
 
-static void stop(struct machine *m, uint32_t pc)
+void stop(struct machine *m, uint32_t pc)
 {
     m->pc = pc;
     m->stopping = 1;
@@ -80,12 +79,13 @@ static void count(struct machine *m, uint64_t address, uint32_t size)
     if (begin + size <= FLASH_SIZE) {
         uint64_t passed = m->before[(begin + size) / 2] - m->before[begin / 2];
         m->now += passed & ((1u << SUM_INSTRUCTIONS) - 1);
-        m->instructions += passed >> SUM_INSTRUCTIONS & ((1u << (SUM_STACKERS - SUM_INSTRUCTIONS)) - 1);
+        m->instructions += passed >> SUM_INSTRUCTIONS & ((1u << (SUM_MASKS - SUM_INSTRUCTIONS)) - 1);
+        m->masks = passed >> SUM_MASKS & ((1u << (SUM_STACKERS - SUM_MASKS)) - 1);
         m->stacks = passed >> SUM_STACKERS != 0;
     } else { /* in RAM: as if all were narrow */
         m->instructions += size / 2;
         m->now += size / 2;
-        m->stacks = 1;
+        m->stacks = m->masks = 1;
     }
     if (address != m->next_address)
         m->now += REFILL;
@@ -109,11 +109,15 @@ static void on_block(uc_engine *uc, uint64_t address, uint32_t size, void *user)
     struct machine *m = user;
     uint32_t resumed = m->resume;
     m->resume = NOWHERE;
-    if (m->stepping && m->stepping++ > 1) { /* the instruction was the last of its block */
+    int counted = resumed == (uint32_t)address; /* in the middle of a block, which was counted as a whole at its begin */
+    if (m->masks && !counted)
+        set_masks(m);
+    if (m->stepping && m->stepping++ > 1) { /* the instruction was the last of its block, or was carried out here */
+        m->resume = counted ? resumed : NOWHERE;
         stop(m, (uint32_t)address);
         return;
     }
-    if (resumed == (uint32_t)address) /* in the middle of a block, which was counted as a whole at its begin */
+    if (counted)
         return;
     if (m->stacks && m->stack_begin && !m->overflow && in_task(m))
         look_at_stack_pointer(m);
@@ -140,16 +144,17 @@ static void on_trap(uc_engine *uc, uint32_t number, void *user)
     struct machine *m = user;
     uint32_t pc = get_register(m, R_PC);
     switch (number) {
-    case TRAP_SVC: enter(m, SVC, pc); break;
+    case TRAP_UNALIGNED: on_unaligned(m, pc); break;
+    case TRAP_SVC: call_supervisor(m, pc); break;
     case TRAP_RETURN:
         leave(m, pc | 1);
         if (m->owed && in_task(m) && !m->stepping)
             stop(m, m->pc);
         break;
     case TRAP_BREAKPOINT: m->hfsr |= 1u << 31; raise_fault(m, HARD_FAULT, 0, pc); break;
-    case TRAP_NO_FLOATS: raise_fault(m, USAGE_FAULT, 1 << 19, pc); break;
-    case TRAP_STATE: raise_fault(m, USAGE_FAULT, 1 << 17, pc); break;
-    default: raise_fault(m, USAGE_FAULT, 1 << 16, pc); break;
+    case TRAP_NO_FLOATS: raise_fault(m, USAGE_FAULT, NOCP, pc); break;
+    case TRAP_STATE: raise_fault(m, USAGE_FAULT, INVSTATE, pc); break;
+    default: raise_fault(m, USAGE_FAULT, UNDEFINSTR, pc); break;
     }
 }
 
@@ -231,17 +236,51 @@ static void on_sleep(uc_engine *uc, uint64_t address, uint32_t size, void *user)
     }
 }
 
-/* A division by zero results in 0 (unless CCR.DIV_0_TRP is set): stop before the first one. */
+/* A division by zero is a fault if the firmware wants it so, else its result is 0: stop before the first one. */
 static void on_division(uc_engine *uc, uint64_t address, uint32_t size, void *user)
 {
     struct machine *m = user;
     uint32_t at = (uint32_t)address & (FLASH_SIZE - 1), number = m->flash[at + 2] & 15;
-    if (get_register(m, number == 14 ? R_LR : R_R0 + (int)number) || m->divided || m->stepping)
+    if (get_core_register(m, number))
+        return;
+    if (m->ccr & DIV_0_TRP) {
+        raise_fault(m, USAGE_FAULT, DIVBYZERO, (uint32_t)address);
+        return;
+    }
+    if (m->divided || m->stepping)
         return;
     m->divided = 1;
     m->resume = (uint32_t)address;
     m->why |= WHY_DIVISION;
     stop(m, (uint32_t)address);
+}
+
+/* Before an instruction while the floating-point unit is off (B1.4.5). */
+static void on_float(uc_engine *uc, uint64_t address, uint32_t size, void *user)
+{
+    struct machine *m = user;
+    uint16_t at[2];
+    uint8_t *code = size == 4 && !(m->cpacr >> 20 & 1) ? memory_at(m, (uint32_t)address, 4) : 0;
+    if (!code)
+        return;
+    memcpy(at, code, sizeof at);
+    if ((at[0] & 0xEC00) == 0xEC00 && (at[1] & 0x0E00) == 0x0A00) /* coprocessors 10 and 11 */
+        raise_fault(m, USAGE_FAULT, NOCP, (uint32_t)address);
+}
+
+/* Hook every instruction while the floating-point unit is off: it is for a moment after a reset. */
+static void watch_floats(struct machine *m)
+{
+    int off = !(m->cpacr >> 20 & 1);
+    if (off == (m->float_hook != 0))
+        return;
+    if (off) {
+        m->engine.hook_add(m->engine.uc, &m->float_hook, HOOK_CODE, (void *)on_float, m, (uint64_t)1, (uint64_t)0);
+    } else {
+        m->engine.hook_del(m->engine.uc, m->float_hook);
+        m->float_hook = 0;
+    }
+    m->engine.ctl(m->engine.uc, FLUSH_CODE);
 }
 
 /* Return whether an instruction may lower the stack pointer, by its first half word: PUSH, SUB, MOV or ADD to SP, and
@@ -256,7 +295,7 @@ static int lowers_stack(uint16_t first)
 static int look_at_code(struct machine *m)
 {
     uint16_t at[2];
-    uint64_t hook, stackers = 0;
+    uint64_t hook, stackers = 0, masks = 0;
     int failed = 0;
     for (uint64_t i = 0; i + sizeof at <= FLASH_SIZE; i += sizeof *at) {
         memcpy(at, m->flash + i, sizeof at);
@@ -265,10 +304,11 @@ static int look_at_code(struct machine *m)
             failed |= m->engine.hook_add(m->engine.uc, &hook, HOOK_CODE, divides ? (void *)on_division : (void *)on_sleep, m,
                                          FLASH_BASE + i, FLASH_BASE + i);
         stackers += lowers_stack(at[0]);
-        m->before[i / 2 + 1] += stackers << SUM_STACKERS;
+        masks += (at[0] & 0xFFF0) == 0xF380 || (at[0] & 0xFFED) == 0xB661; /* MSR and CPS, B5.2 */
+        m->before[i / 2 + 1] += (stackers << SUM_STACKERS) + (masks << SUM_MASKS);
     }
-    m->before[FLASH_SIZE / 2] += stackers << SUM_STACKERS;
-    return failed;
+    m->before[FLASH_SIZE / 2] += (stackers << SUM_STACKERS) + (masks << SUM_MASKS);
+    return failed | watch_alignment(m);
 }
 
 uint64_t machine_size(void)
@@ -293,6 +333,8 @@ int machine_attach(struct machine *m, const struct engine *engine, uint8_t *flas
     uc_engine *uc = engine->uc;
     int failed = engine->mmio_map(uc, 0x40000000, PERIPHERALS_SIZE, peripheral_read, m, peripheral_write, m);
     failed |= engine->mmio_map(uc, 0x50000000, PERIPHERALS_SIZE, usb_read, m, usb_write, m);
+    failed |= engine->mmio_map(uc, 0x22000000, RAM_SIZE * 32, ram_bit_read, m, ram_bit_write, m);
+    failed |= engine->mmio_map(uc, 0x42000000, PERIPHERALS_SIZE * 32, peripheral_bit_read, m, peripheral_bit_write, m);
     failed |= engine->mmio_map(uc, 0xE0000000, 0x100000, system_read, m, system_write, m);
     failed |= engine->hook_add(uc, &hook, HOOK_BLOCK, (void *)on_block, m, everywhere[0], everywhere[1]);
     failed |= engine->hook_add(uc, &hook, HOOK_INTR, (void *)on_trap, m, everywhere[0], everywhere[1]);
@@ -331,12 +373,11 @@ void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause)
     memcpy(words, m->flash + (vectors - FLASH_BASE), sizeof words);
     words[0] &= ~3u; /* as the register does, B1.4.7 */
     m->resume = m->skip_at = NOWHERE;
+    m->masks = 0;
     for (int i = 0; i < 13; i++)
         set_register(m, R_R0 + i, 0);
-    set_register(m, R_XPSR, THUMB);
+    set_xpsr(m, THUMB);
     set_register(m, R_PRIMASK, 0);
-    set_register(m, R_BASEPRI, 0);
-    set_register(m, R_FAULTMASK, 0);
     set_register(m, R_CONTROL, 0);
     set_register(m, R_MSP, words[0]);
     m->pc = words[1] & ~1u;
@@ -354,12 +395,12 @@ static int is_new_low_writer(struct machine *m)
     return 1;
 }
 
-static void fault_of(struct machine *m, int error)
+void fault_of(struct machine *m, int error)
 {
     uint32_t pc = get_register(m, R_PC);
     m->pc = pc & ~1u;
     if (!(get_register(m, R_XPSR) & THUMB)) { /* no matter what is at that address */
-        raise_fault(m, USAGE_FAULT, 1 << 17, pc);
+        raise_fault(m, USAGE_FAULT, INVSTATE, pc);
     } else if ((error == READ_UNMAPPED || error == FETCH_UNMAPPED) && m->fault_address < FLASH_SIZE) {
         m->resume = m->pc; /* the alias of flash, mapped after this report */
         m->why |= WHY_LOW_READ;
@@ -374,17 +415,19 @@ static void fault_of(struct machine *m, int error)
         memcpy(&first, m->flash + (m->pc & (FLASH_SIZE - 1)), sizeof first);
         m->pc += first >> 11 > 0x1C ? 4 : 2;
     } else if (error == FETCH_UNMAPPED || error == FETCH_PROTECTED) {
-        raise_fault(m, BUS_FAULT, 1 << 8, pc);
+        int never = pc >> 29 == 2 || pc >> 29 >= 5; /* devices, B3.1 */
+        raise_fault(m, never ? MEMORY_FAULT : BUS_FAULT, never ? IACCVIOL : IBUSERR, pc);
     } else if (error == INVALID || error == 21) {
-        raise_fault(m, USAGE_FAULT, 1 << 16, pc);
+        raise_fault(m, USAGE_FAULT, UNDEFINSTR, pc);
     } else {
         m->bfar = m->fault_address;
-        raise_fault(m, BUS_FAULT, 1 << 9 | 1 << 15, pc);
+        raise_fault(m, BUS_FAULT, PRECISERR | BFARVALID, pc);
     }
 }
 
 static void execute(struct machine *m, uint64_t count_of)
 {
+    watch_floats(m);
     m->stopping = 0;
     int error = m->engine.emu_start(m->engine.uc, m->pc | 1, NOWHERE, 0, count_of);
     if (error && !m->stopping) {
@@ -497,9 +540,13 @@ int machine_break(struct machine *m, uint32_t address, int on)
 static void on_access(uc_engine *uc, int type, uint64_t address, int size, int64_t value, void *user)
 {
     struct watchpoint *w = user;
-    uint32_t first = (uint32_t)address;
     forget_condition(w->machine);
-    if (first >= w->address + w->size || first + (uint32_t)size <= w->address)
+    note_access(w, (uint32_t)address, (uint32_t)size);
+}
+
+void note_access(struct watchpoint *w, uint32_t first, uint32_t size)
+{
+    if (first >= w->address + w->size || first + size <= w->address)
         return;
     w->machine->watch_address = first > w->address ? first : w->address;
     w->machine->why |= WHY_WATCHPOINT;

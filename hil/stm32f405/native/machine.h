@@ -23,8 +23,9 @@ enum {
     DEVICES = 16, ESCS = 4, BREAKPOINTS = 64, LOW_WRITERS = 16, WATCHPOINTS = 8, LINE_BYTES = 4096, TASKS = 32, SWITCHES = 4096,
 };
 
-/* Three sums in one number, from these bits on: cycles, instructions, and modulo 2^16 those that may lower a stack pointer. */
-enum { SUM_CYCLES = 0, SUM_INSTRUCTIONS = 28, SUM_STACKERS = 48 };
+/* Sums in one number, from these bits on: cycles, instructions, those that may write BASEPRI or FAULTMASK, and those that
+   may lower a stack pointer. A block has at most one of the third, at its end, and few of the fourth. */
+enum { SUM_CYCLES = 0, SUM_INSTRUCTIONS = 28, SUM_MASKS = 48, SUM_STACKERS = 50 };
 
 /* Exceptions, B1.5.2. */
 enum { RESET = 1, NMI, HARD_FAULT, MEMORY_FAULT, BUS_FAULT, USAGE_FAULT, SVC = 11, PENDSV = 14, SYSTICK };
@@ -51,9 +52,19 @@ enum {
 
 /* Registers by unicorn's numbers. */
 enum {
-    R_FPSCR = 6, R_LR = 10, R_PC = 11, R_SP = 12, R_D0 = 14, R_R0 = 66, R_R12 = 78, R_MSP = 115, R_PSP = 116, R_CONTROL = 117,
-    R_XPSR = 120, R_PRIMASK = 123, R_BASEPRI = 124, R_FAULTMASK = 126, THUMB = 1 << 24, /* the last is a bit of XPSR */
+    R_FLAGS = 2, R_FPSCR = 6, R_LR = 10, R_PC = 11, R_SP = 12, R_D0 = 14, R_R0 = 66, R_R12 = 78, R_MSP = 115, R_PSP = 116, R_CONTROL = 117,
+    R_XPSR = 120, R_PRIMASK = 123, THUMB = 1 << 24, /* the last is a bit of XPSR */
 };
+
+/* Errors of unicorn. */
+enum { READ_UNMAPPED = 6, WRITE_UNMAPPED, FETCH_UNMAPPED, INVALID = 10, WRITE_PROTECTED = 12, FETCH_PROTECTED = 14 };
+
+/* Bits of CFSR and CCR, B3.2. */
+enum {
+    IACCVIOL = 1, IBUSERR = 1 << 8, PRECISERR = 1 << 9, BFARVALID = 1 << 15, UNDEFINSTR = 1 << 16, INVSTATE = 1 << 17,
+    INVPC = 1 << 18, NOCP = 1 << 19, UNALIGNED = 1 << 24, DIVBYZERO = 1 << 25, UNALIGN_TRP = 8, DIV_0_TRP = 16,
+};
+enum { IT_STATE = 0x0600FC00 };                /* bits of XPSR, B1.4.2 */
 
 #define NEVER UINT64_MAX
 
@@ -72,6 +83,8 @@ struct engine {
     int (*hook_add)(uc_engine *, uint64_t *, int, void *, void *, uint64_t, uint64_t, ...);
     int (*hook_del)(uc_engine *, uint64_t);
     int (*ctl)(uc_engine *, uint32_t, ...);
+    int (*mem_read)(uc_engine *, uint64_t, void *, uint64_t);
+    int (*mem_write)(uc_engine *, uint64_t, const void *, uint64_t);
 };
 
 struct timer {
@@ -165,7 +178,7 @@ struct machine {
     uint64_t next_due;
     uint32_t pc, why, asleep, watchdog_on;
     uint32_t fault_address, unknown_count;
-    uint32_t unknown[16];
+    uint32_t unknown[16]; /* peripherals that were used: not modelled, or with 1 added those without a clock */
     uint64_t owed, taken; /* cycles that an outside load takes before all tasks, but not before interrupts; has taken */
     uint32_t tracing, task_count, switch_count;
     struct kernel kernel;
@@ -184,6 +197,7 @@ struct machine {
     uint64_t until, due[SLOTS];
     uint64_t *before; /* sums of `SUM_...` over instructions before each half word of flash */
     uint32_t stacks;  /* whether the last block may lower a stack pointer */
+    uint32_t masks;   /* whether the last block may end with a write to BASEPRI or FAULTMASK */
     uint64_t next_address;
     uint8_t *flash, *ram, *ccm;
     uint8_t executed[RAM_SIZE / PAGE_SIZE]; /* pages of RAM from which code was executed */
@@ -192,6 +206,7 @@ struct machine {
     uint32_t break_address[BREAKPOINTS];
     struct watchpoint watchpoint[WATCHPOINTS];
     uint32_t low_writers[LOW_WRITERS], low_writer_count; /* reported instructions */
+    uint64_t float_hook; /* while the floating-point unit is off */
     uint32_t canary; /* the last word of the running task's stack was unused when it got the processor */
 
     uint32_t input[PORTS];
@@ -204,6 +219,7 @@ struct machine {
     uint64_t enabled[2], pending[2], active[2], line[2];
     uint8_t priority[EXCEPTIONS];
     uint32_t vtor, aircr, shcsr, cfsr, hfsr, bfar, scr, ccr, cpacr, fpccr;
+    uint32_t basepri, faultmask; /* unicorn's own have no effect: see alignment.c */
 
     uint32_t tick_ctrl, tick_load;
     uint64_t tick_since;
@@ -236,20 +252,33 @@ uint32_t usart_feed(struct machine *m, unsigned n, const uint8_t *bytes, uint32_
 
 /* exceptions.c */
 uint32_t get_register(struct machine *m, int number);
+uint32_t get_core_register(struct machine *m, unsigned number);
+void set_core_register(struct machine *m, unsigned number, uint32_t value);
+uint8_t *memory_at(struct machine *m, uint32_t address, uint32_t size);
 void set_register(struct machine *m, int number, uint32_t value);
+void set_xpsr(struct machine *m, uint32_t value);
 void set_line(struct machine *m, unsigned irq, int high);
 void set_pending(struct machine *m, unsigned exception);
 unsigned next_exception(struct machine *m, int waking);
 void enter(struct machine *m, unsigned exception, uint32_t return_address);
 void leave(struct machine *m, uint32_t exc_return);
 void note_overflow(struct machine *m);
+void call_supervisor(struct machine *m, uint32_t return_address);
 void raise_fault(struct machine *m, unsigned exception, uint32_t status, uint32_t pc);
 uint64_t system_read(uc_engine *uc, uint64_t offset, unsigned size, void *user);
 void system_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t value, void *user);
 
 void tick_due(struct machine *m);
 
+/* alignment.c */
+void on_unaligned(struct machine *m, uint32_t pc);
+void set_masks(struct machine *m);
+int watch_alignment(struct machine *m);
+
 /* machine.c */
+void stop(struct machine *m, uint32_t pc);
+void fault_of(struct machine *m, int error);
+void note_access(struct watchpoint *w, uint32_t first, uint32_t size);
 void plan(struct machine *m, unsigned slot, uint64_t due);
 
 /* timers.c */
@@ -289,6 +318,11 @@ int dma_put(struct machine *m, uint32_t peripheral, uint32_t item, int *last);
 int dma_take(struct machine *m, uint32_t peripheral, uint32_t *item);
 
 /* peripherals.c */
+void note_unknown(struct machine *m, uint32_t address);
+uint64_t ram_bit_read(uc_engine *uc, uint64_t offset, unsigned size, void *user);
+void ram_bit_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t value, void *user);
+uint64_t peripheral_bit_read(uc_engine *uc, uint64_t offset, unsigned size, void *user);
+void peripheral_bit_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t value, void *user);
 uint64_t peripheral_read(uc_engine *uc, uint64_t offset, unsigned size, void *user);
 void peripheral_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t value, void *user);
 uint64_t usb_read(uc_engine *uc, uint64_t offset, unsigned size, void *user);

@@ -27,13 +27,37 @@ static const struct range {
     AT(0x26000) = {DMA, 0}, AT(0x26400) = {DMA, 1},
 };
 
-static void note_unknown(struct machine *m, uint32_t address)
+void note_unknown(struct machine *m, uint32_t address)
 {
     for (uint32_t i = 0; i < m->unknown_count; i++)
         if (m->unknown[i] == address)
             return;
     if (m->unknown_count < 16)
         m->unknown[m->unknown_count++] = address;
+}
+
+/* Whether RCC clocks a peripheral (chapter 7.3.10 to 7.3.14): most have the bit of their place on their bus. */
+static int has_clock(const struct machine *m, uint32_t offset)
+{
+    static const uint32_t REGISTERS[3] = {0x23840, 0x23844, 0x23830}; /* APB1ENR, APB2ENR, AHB1ENR */
+    static const uint32_t ALWAYS[3] = {1 << 10 | 1 << 12, 1 << 15, 1 << 14 | 1 << 15}; /* RTC, IWDG; EXTI; RCC, FLASH */
+    uint32_t bus = offset >> 16, place = (offset & 0xFFFF) / STEP, bits = 1u << (place & 31);
+    if (bus > 2 || place > 31 || ALWAYS[bus] & bits)
+        return 1;
+    if (bus == 1 && place == 8)
+        bits = 7 << 8; /* any of three ADCs */
+    else if (bus == 2 && place >= 24)
+        bits = 1u << (place - 3); /* DMA */
+    return (m->plain[REGISTERS[bus] / 4] & bits) != 0;
+}
+
+/* Whether an access by the core has no effect because the peripheral's clock is off; one by Python always has. */
+static int is_dead(uc_engine *uc, struct machine *m, uint32_t offset, struct range range)
+{
+    if (!uc || range.kind == NONE || has_clock(m, offset))
+        return 0;
+    note_unknown(m, (0x40000000 + (offset & ~0x3FFu)) | 1);
+    return 1;
 }
 
 /* GPIO */
@@ -149,6 +173,8 @@ uint64_t peripheral_read(uc_engine *uc, uint64_t where, unsigned size, void *use
     struct machine *m = user;
     uint32_t offset = (uint32_t)where & ~3u, at = offset & 0x3FF, shift = 8 * ((uint32_t)where & 3), value;
     struct range range = RANGES[offset / STEP];
+    if (is_dead(uc, m, offset, range))
+        return 0;
     switch (range.kind) {
     case TIMER: value = timer_read(m, range.index, at); break;
     case BUS: value = bus_read(m, range.index, at); break;
@@ -175,6 +201,8 @@ void peripheral_write(uc_engine *uc, uint64_t where, unsigned size, uint64_t giv
     struct machine *m = user;
     uint32_t offset = (uint32_t)where, at = offset & 0x3FF, value = (uint32_t)given;
     struct range range = RANGES[offset / STEP];
+    if (is_dead(uc, m, offset, range))
+        return;
     switch (range.kind) {
     case TIMER: timer_write(m, range.index, at, value); break;
     case BUS: bus_write(m, range.index, at, value); break;
@@ -188,6 +216,32 @@ void peripheral_write(uc_engine *uc, uint64_t where, unsigned size, uint64_t giv
     case PWR: case FLASH: case ADC: case PLAIN: m->plain[offset / 4] = value; break;
     default: note_unknown(m, 0x40000000 + (offset & ~0x3FFu));
     }
+}
+
+/* Bit-banding: each bit of RAM and of the peripherals also has a word (PM0214, chapter 2.2.5). */
+
+uint64_t ram_bit_read(uc_engine *uc, uint64_t where, unsigned size, void *user)
+{
+    struct machine *m = user;
+    return m->ram[where >> 5] >> (where >> 2 & 7) & 1;
+}
+
+void ram_bit_write(uc_engine *uc, uint64_t where, unsigned size, uint64_t value, void *user)
+{
+    struct machine *m = user;
+    uint8_t bit = (uint8_t)(1 << (where >> 2 & 7)), *byte = m->ram + (where >> 5);
+    *byte = value & 1 ? *byte | bit : (uint8_t)(*byte & ~bit);
+}
+
+uint64_t peripheral_bit_read(uc_engine *uc, uint64_t where, unsigned size, void *user)
+{
+    return peripheral_read(uc, where >> 5 & ~3u, 4, user) >> (where >> 2 & 31) & 1;
+}
+
+void peripheral_bit_write(uc_engine *uc, uint64_t where, unsigned size, uint64_t value, void *user)
+{
+    uint64_t place = where >> 5 & ~3u, bit = 1ull << (where >> 2 & 31), word = peripheral_read(uc, place, 4, user);
+    peripheral_write(uc, place, 4, value & 1 ? word | bit : word & ~bit, user);
 }
 
 uint64_t usb_read(uc_engine *uc, uint64_t where, unsigned size, void *user)

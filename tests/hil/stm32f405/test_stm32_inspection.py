@@ -22,8 +22,8 @@ from support.stm32_machine import FirmwareOnChip
 MS = 1000
 (
     BUS_FAULT, UNDEFINED, ASSERTION, HUNGRY_WATCHDOG, NULL_CALL, NULL_READ, NULL_WRITE, DIVISION, HANG, OVERFLOW,
-    BRIEF_OVERFLOW, LAST_CALL, MUTEX, SUSPENDED, DELAYED, DELETED,
-) = range(1, 17)  # fmt: skip
+    BRIEF_OVERFLOW, LAST_CALL, MUTEX, SUSPENDED, DELAYED, DELETED, UNALIGNED, BREAKPOINT, MASKED_CALL,
+) = range(1, 20)  # fmt: skip
 FIRMWARE = (SOURCES / "firmware.c").read_text(encoding="utf-8").splitlines()
 COMPILERS = pytest.mark.parametrize("compiler", ["clang", pytest.param("gcc", marks=pytest.mark.long)])
 
@@ -104,10 +104,19 @@ def test_a_bus_fault_is_reported_with_address_task_function_line_and_callers(com
 
 
 @COMPILERS
-def test_an_undefined_instruction_is_reported_with_its_place(compiler: str) -> None:
-    text = crashed(FirmwareOnChip(compiler, planted=UNDEFINED))
-    place = f"go_wrong (firmware.c:{line_of('udf #7')})"
-    assert text.startswith(f"HardFault: undefined instruction, in task REPORT: {place} < report (firmware.c:")
+@pytest.mark.parametrize(
+    ("planted", "reason", "text"),
+    [
+        (UNDEFINED, "undefined instruction", "udf #7"),
+        (UNALIGNED, "unaligned access", "vldr s0, [%0]"),
+        (BREAKPOINT, "a breakpoint instruction without a debugger", "bkpt #0"),
+        (MASKED_CALL, "a supervisor call where its priority does not allow it", "svc #0"),
+    ],
+)
+def test_a_fault_is_reported_with_its_place(compiler: str, planted: int, reason: str, text: str) -> None:
+    crash = crashed(FirmwareOnChip(compiler, planted=planted))
+    place = f"go_wrong (firmware.c:{line_of(text)})"
+    assert crash.startswith(f"HardFault: {reason}, in task REPORT: {place} < report (firmware.c:")
 
 
 @COMPILERS

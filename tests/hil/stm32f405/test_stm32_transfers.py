@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("unicorn")
 
-from hil.stm32f405.chip import RAM
+from hil.stm32f405.chip import CCM, RAM
 from support.stm32_bench import Bench
 
 DMAS = (0x4002_6000, 0x4002_6400)
@@ -219,3 +219,14 @@ def test_a_missing_acknowledgement_is_cleared_by_writing_0_and_nothing_else_is(b
     assert bench[I2C1 + 0x14] == 1 << 10 | 1
     bench[I2C1 + 0x14] = 0
     assert bench[I2C1 + 0x14] == 1
+
+
+def test_dma_cannot_reach_the_core_coupled_memory(bench: Bench) -> None:
+    stream = stream_of(1, 1)
+    receive_by_dma(bench, 4, INCREMENT)
+    bench[stream + M0AR] = CCM
+    bench.chip.feed(6, b"a")
+    bench.wait(BYTE_US + 1)
+    assert not bench[stream + CR] & ENABLED
+    assert bench[DMAS[1]] == 1 << 9  # TEIF1
+    assert bench.chip.read(CCM, 1) == b"\0"
