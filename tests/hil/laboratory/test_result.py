@@ -26,7 +26,7 @@ from support.command import Cli
 KEYS = """
     experiment profile overrides seed duration_s link board faults source logic outcome cause metrics
     own_metrics verdicts passed tasks queues usage ages hash versions commit real_time_factor robot
-    stood_still_ms image not_shown elf in_loop gdb realtime trace pictures draws
+    stood_still_ms image failures not_shown elf in_loop gdb realtime trace pictures draws
 """.split()  # noqa: SIM905  of result.json, which programs of users read
 
 
