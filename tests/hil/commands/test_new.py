@@ -119,9 +119,6 @@ def test_a_project_outside_the_clone_flies_tests_checks_and_exports_with_the_whe
 
     run(tmp_path, command, "new", "law")
     project = tmp_path / "law"
-    pip = (sys.executable, "-m", "pip", "--python", python)
-    run(project, *pip, "install", "--quiet", "--no-index", "--no-build-isolation", ".")
-    assert "law-eight" in run(tmp_path, command, "list").stdout, "without any package index"
     run(project, command, "fly", "hover", "--profile", "profile.toml", "--duration", "5")
     run(project, python, "-m", "pytest", "-q", "--junitxml=junit.xml")
     properties = [
