@@ -6,13 +6,14 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from ground_station.records import INCOMPLETE
 from hil.laboratory.recorder import load_events
-from support.full_disk import small_disk
+from support.full_disk import SMALL_KB, small_disk
 from support.serving import FLOATY, PATIENCE_S, Served, serve, station
 
 ENDS: dict[str, tuple[str, ...]] = {
@@ -21,7 +22,8 @@ ENDS: dict[str, tuple[str, ...]] = {
     "mavlink pty": ("--mavlink", "pty"),
     "mavlink tcp": ("--mavlink", "tcp:0"),
 }
-DURATION_S = 6.0
+AFTERWARDS_S = 2.0  # that the flight outlives the disk
+PAGE = 4096  # bytes, with which a file grows
 LEFT = "the board is in failsafe, flaps at hover"
 
 
@@ -38,27 +40,50 @@ def uri_of(lab: Served) -> str:
     return next(line.split()[1] for line in lab.lines if line.startswith(("radio ", "udp ")))
 
 
-def typed(lab: Served, disk: Path, *arguments: str | Path) -> list[str]:
-    """A flight whose files are on `disk`: the command."""
+@contextmanager
+def flying(
+    lab: Served, disk: Path, *options: str | Path, output: int = subprocess.PIPE
+) -> Iterator["subprocess.Popen[bytes]"]:
+    """A flight whose files are on `disk`, from when it flies and the disk is full."""
     uri = uri_of(lab)
     files = ["--record", disk / "frames.csv"] + (["--tlog", disk / "tlog"] if "mavlink" in uri else [])
-    options = ("--link", uri, "--mocap", lab.motive, "--duration", str(DURATION_S), *files, *arguments)
-    return [*FLOATY, "station", *map(str, options)]
+    command = [*FLOATY, "station", "--link", uri, "--mocap", lab.motive, *files, *options]
+    lab.forget()
+    with small_disk(disk) as limited:
+        process = subprocess.Popen(
+            [*limited, *map(str, command)], env=lab.environment, stdout=output, stderr=subprocess.PIPE
+        )
+        try:
+            lab.wait_for("supervisor: flying", PATIENCE_S)
+            deadline = time.monotonic() + PATIENCE_S
+            while not is_full(disk):
+                assert time.monotonic() < deadline
+                assert process.poll() is None
+                time.sleep(0.1)
+            time.sleep(AFTERWARDS_S)
+            yield process
+        finally:
+            process.kill()
+            print(*process.communicate())  # shown where a test fails
+
+
+def is_full(disk: Path) -> bool:
+    """Whether no more fits on it, or into the largest file."""
+    space = os.statvfs(disk)
+    largest = max(path.stat().st_size for path in disk.iterdir())
+    return min(space.f_bavail * space.f_frsize, 1024 * SMALL_KB - largest) < PAGE
 
 
 @pytest.mark.long
 def test_a_full_disk_ends_the_files_and_not_the_flight(lab: Served, tmp_path: Path) -> None:
-    with small_disk(tmp_path / "small") as limited:
-        disk = tmp_path / "small"
-        begin_s = time.monotonic()
-        shown = subprocess.run(
-            [*limited, *typed(lab, disk, "--log", disk / "log.csv")],
-            env=lab.environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
-        )  # fmt: skip
-        assert time.monotonic() - begin_s > DURATION_S
-    assert (shown.returncode, shown.stderr) == (INCOMPLETE, "")
-    assert LEFT in shown.stdout
-    ended = [line.split(": ")[0] for line in shown.stdout.splitlines() if "no more is written" in line]
+    disk = tmp_path / "small"
+    with flying(lab, disk, "--log", disk / "log.csv") as flown:
+        assert flown.poll() is None
+        flown.send_signal(signal.SIGINT)
+        shown, errors = (data.decode() for data in flown.communicate(timeout=PATIENCE_S))
+    assert (flown.returncode, errors) == (INCOMPLETE, "")
+    assert LEFT in shown
+    ended = [line.split(": ")[0] for line in shown.splitlines() if "no more is written" in line]
     assert f"{disk / 'frames.csv'}" in ended
     assert len(ended) == len(set(ended))
 
@@ -78,19 +103,13 @@ def test_with_a_full_disk_and_no_standard_output_a_flight_is_flown_to_its_end(
 ) -> None:
     disk = tmp_path / "small"
     output, why = broken_output(lab)
-    lab.forget()
-    begin_s = time.monotonic()
-    with small_disk(disk) as limited:
-        flown = subprocess.run(
-            [*limited, *typed(lab, disk, "--out", disk / "run")],
-            env=lab.environment, stdout=output, stderr=subprocess.PIPE, text=True, timeout=PATIENCE_S, check=False,
-        )  # fmt: skip
+    with flying(lab, disk, "--out", disk / "run", output=output) as flown:
         os.close(output)
-        assert time.monotonic() - begin_s > DURATION_S
-        assert flown.returncode == INCOMPLETE, flown.stderr
-        assert flown.stderr == f"standard output: {why}; no more is written to it\n"
-        assert (disk / "run").is_dir()
-    lab.wait_for("supervisor: flying", PATIENCE_S)
+        flown.send_signal(signal.SIGINT)
+        _, errors = flown.communicate(timeout=PATIENCE_S)
+        assert (disk / "run" / "events.jsonl").is_file()
+    assert errors.decode() == f"standard output: {why}; no more is written to it\n"
+    assert flown.returncode == INCOMPLETE
     lab.wait_for("supervisor: failsafe", PATIENCE_S)
 
 
