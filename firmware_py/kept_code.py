@@ -87,7 +87,10 @@ def _in_cache(chosen: str) -> Path:
         return Path(chosen, "floaty")
     from platformdirs import user_cache_path  # reads XDG_CACHE_HOME
 
-    return user_cache_path("floaty", appauthor=False)
+    try:
+        return user_cache_path("floaty", appauthor=False)
+    except RuntimeError:  # of a user without a home folder; older versions return this
+        return Path("~/.cache/floaty")
 
 
 @cache

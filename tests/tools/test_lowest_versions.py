@@ -18,7 +18,7 @@ from pkgutil import walk_packages
 import firmware_py, ground_station, hil
 for package in (firmware_py, ground_station, hil):
     for module in walk_packages(package.__path__, package.__name__ + "."):
-        if not module.name.endswith("__main__"):
+        if not module.name.startswith("hil.testing.") and not module.name.endswith("__main__"):
             import_module(module.name)
 """
 LEARN = """
