@@ -37,6 +37,15 @@ class TextConsole(Console):
         """Render as rich does."""
         return super().render_str("\n".join(map(visible, text.split("\n"))), **options)
 
+    def print(self, *shown: Any, **options: Any) -> None:
+        """Print as rich does, but do not keep what could not be printed for the next time."""
+        try:
+            super().print(*shown, **options)
+        except OSError:
+            with self.capture():
+                pass
+            raise
+
     def on_broken_pipe(self) -> None:
         """Raise the error that rich is handling."""
         raise

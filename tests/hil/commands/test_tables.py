@@ -1,5 +1,6 @@
 """What `floaty fly` and `compare` print and return for several seeds: means, verdicts, exit codes."""
 
+import io
 import os
 import sys
 from contextlib import suppress
@@ -65,17 +66,20 @@ def test_a_table_shows_control_characters_and_no_writer_can_send_them(
 
 
 def test_a_table_into_a_closed_pipe_is_an_error_that_a_flight_handles(
-    monkeypatch: pytest.MonkeyPatch,
+    flown: Result, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Rich would end the program, while it flies or before it has closed its files."""
+    """Rich would end the program, while it flies or before it has closed its files, and print the table again later."""
     read, write = os.pipe()
     os.close(read)
     output = os.fdopen(write, "w")
     monkeypatch.setattr(sys, "stdout", output)
     with pytest.raises(BrokenPipeError):
-        print_seeds([made(0.01, True)])
+        print_result(flown)
     with suppress(BrokenPipeError):
         output.close()
+    monkeypatch.setattr(sys, "stdout", shown := io.StringIO())
+    print_result(flown)
+    assert shown.getvalue().count("rms_x") == 1
 
 
 def test_a_held_limit_is_ok_and_a_missed_one_fails(flown: Result, capsys: pytest.CaptureFixture[str]) -> None:
