@@ -139,4 +139,4 @@ def _why_not_in(parent: Path) -> str:
 
 
 def _report(line: str) -> None:
-    print(f"floaty: {line}", file=sys.stderr)
+    print("floaty:", line.encode("unicode_escape").decode("ascii"), file=sys.stderr)

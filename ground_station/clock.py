@@ -4,7 +4,7 @@ import select
 import selectors
 import time
 from collections.abc import Collection
-from typing import TYPE_CHECKING, TypeVar
+from typing import IO, TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from _typeshed import FileDescriptorLike
@@ -36,6 +36,16 @@ def readable(files: Collection[F], timeout_s: float) -> list[F]:
             for each in files:
                 selector.register(each, selectors.EVENT_READ)
             return [key.fileobj for key, _ in selector.select(timeout_s)]  # type: ignore[misc]
+
+
+def is_writable(file: IO[str]) -> bool:
+    """Return whether a write to an open file would not wait for its reader; True where the system cannot tell."""
+    try:
+        output = select.poll()
+        output.register(file.fileno(), select.POLLOUT)
+    except (AttributeError, OSError, ValueError):  # no file, or no such call on this system
+        return True
+    return bool(output.poll(0))
 
 
 def epoch_us() -> int:

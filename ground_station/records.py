@@ -6,11 +6,11 @@ a connection that hangs, does not stop the flight either: its lines are dropped 
 """
 
 import os
-import select
 import sys
 from collections.abc import Callable
 from typing import ParamSpec
 
+from ground_station.clock import is_writable
 from ground_station.lines import print_line
 
 INCOMPLETE = 3  # exit code
@@ -55,7 +55,7 @@ class Records:
 
     def say(self, text: object) -> None:
         """Print a line on the standard output, unless nobody reads it."""
-        if _is_stuck():
+        if not is_writable(sys.stdout):
             self._dropped += 1
             return
         if self._dropped > self._reported:
@@ -80,16 +80,6 @@ class Records:
         if name == STANDARD_OUTPUT:
             _discard_output()
             self.attempt("standard error", print_line, line, sys.stderr)
-
-
-def _is_stuck() -> bool:
-    """Whether a line on the standard output would wait for its reader."""
-    try:
-        output = select.poll()
-        output.register(sys.stdout.fileno(), select.POLLOUT)
-    except (AttributeError, OSError, ValueError):  # no standard output, or no such call on this system
-        return False
-    return not output.poll(0)
 
 
 def _discard_output() -> None:

@@ -180,8 +180,8 @@ DRAWS = (
     "poisson",
     "multivariate_normal",
 )
-# Only the first prints what others have sent; the next prints to a pipe, the last its own progress.
-PRINTERS = ("ground_station/lines.py", "hil/live/picture.py", "hil/api.py")
+# Only the first prints texts of others; the next prints to a pipe, the third its own progress, the last paths in ASCII.
+PRINTERS = ("ground_station/lines.py", "hil/live/picture.py", "hil/api.py", "firmware_py/kept_code.py")
 SUBSET = "firmware_py/core/subset.py"  # the border of the subset: it may use the standard library
 
 

@@ -104,7 +104,7 @@ def test_a_server_names_the_port_that_another_program_has(cli: Cli, taken: str) 
     said = cli.refusal("serve", "--no-motive", "--udp", taken)
     assert said == f"floaty: udp port {taken}: Address already in use\n"
     said = cli.refusal("serve", "--no-motive", "--boards", "2", "--udp", str(int(taken) - 1))
-    assert said == f"floaty: udp port {taken}: Address already in use\n"
+    assert said == f"floaty: robot 2: udp port {taken}: Address already in use\n"
     said = cli.refusal("serve", "--udp", "0", "--set", f"capture.port={taken}")
     assert said.startswith(
         f"floaty: natnet port {taken}: Address already in use; --set capture.port=0 takes a free one"
