@@ -37,7 +37,7 @@ def test_firmware_of_another_board_is_one_clear_line(
         LabError, match=f"built for boards of device type unknown here, but this robot's is {board}$"
     ):
         fly("hover", tmp_path / "b", profile=profile, board=unknown)
-    with pytest.raises(LabError, match="no log variable supervisor.info"):  # the next thing that it lacks
+    with pytest.raises(LabError, match=r"no log variable supervisor\.info"):  # the next thing that it lacks
         fly("hover", tmp_path / "c", profile=profile, board=right)
 
 
