@@ -308,7 +308,7 @@ class Chip:
 
 def _memory(size: int) -> NDArray[np.uint8]:
     """Return zeroed memory, aligned to a page of this machine."""
-    return np.frombuffer(mmap.mmap(-1, size), np.uint8)
+    return np.frombuffer(mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS), np.uint8)
 
 
 def _sums_before(code: bytes, base: int, constants: frozenset[int], first_bit: int) -> NDArray[np.uint64]:
