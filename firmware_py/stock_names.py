@@ -83,7 +83,7 @@ SETTINGS = (
     InertGroup("velCtlPid.vxKp vxKi vxKd vxKFF", F32, (25, 1, 0, 0), True),
     InertGroup("velCtlPid.vyKp vyKi vyKd vyKFF", F32, (25, 1, 0, 0), True),
     InertGroup("velCtlPid.vzKp vzKi vzKd", F32, (25, 15, 0), True),
-    InertGroup("ring.effect", U8, (0,), True),
+    InertGroup("ring.effect", U8, (6,), True),
     InertGroup("ring.fadeColor", U32, (0,)),
     InertGroup("ring.fadeTime", F32, (0.5,), unit="s"),
     InertGroup("ring.headlightEnable", U8, (0,)),
@@ -126,7 +126,7 @@ def stock_variables(running: Running) -> Iterator[LogVariable]:
 
 def _target(running: Running) -> tuple[Vector, float]:
     """Return the target in the frame of the poses, position and yaw."""
-    frame = running.pilot.frame(running.stack.kernel.now_us)
+    frame = running.pilot.frame()
     if frame is not None:
         return frame.position, frame.yaw
     x, y, z, yaw = running.core.parameters.fields.target.tolist()
