@@ -4,7 +4,9 @@ Hardware calls `imu_ready`, `radio_received` and `uart_ready` (interrupts), then
 `Board`.
 """
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from numpy.typing import NDArray
 
 from firmware_py.board import Board
 from firmware_py.config import FirmwareConfig, MavlinkConfig, parameters_of
@@ -15,7 +17,7 @@ from firmware_py.export.usage import Usage
 from firmware_py.geometry import Vector
 from firmware_py.links.console import Console, Notices
 from firmware_py.links.crtp_stack import CrtpStack
-from firmware_py.links.high_level import MEMORY_SIZE, HighLevelService
+from firmware_py.links.high_level import CommanderService
 from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.log import LogService
 from firmware_py.links.memories import MemoryService, Tester, memories
@@ -80,8 +82,10 @@ class Firmware:
         self.link = CrtpStack(self.kernel, config.cpu, board)
         self._console = Console(self.link, board)
         self._notices = Notices(self.kernel, self._console.write)
-        self.pilot = Pilot(core)
-        self._supervisor = CoreSupervisor(core, self._console.write, self.pilot, self._client_is_there)
+        self._supervisor = CoreSupervisor(core, self._console.write, self._client_is_there)
+        self.pilot = Pilot(
+            core, self._supervisor, lambda: acceleration(board.read_imu()), self._notices.refuse
+        )
         self._imu_ready = self.kernel.create_binary_semaphore("imuReady")
         data_ready = self.kernel.create_binary_semaphore("dataReady")
         estimator_run = self.kernel.create_binary_semaphore("runTaskSemaphore")
@@ -93,11 +97,11 @@ class Firmware:
         )  # fmt: skip
         kernel.create_task(
             "STABILIZER", 5, stabilizer_task,
-            kernel, cost, board, data_ready, estimator_run, self._supervisor, core, costs,
+            kernel, cost, board, data_ready, estimator_run, self._supervisor, core, costs, self.pilot,
         )  # fmt: skip
         kernel.create_task(
             "KALMAN", 2, estimator_task,
-            kernel, cost, estimator_run, self.measurements, core, costs, self.pilot, self._pose_refused,
+            kernel, cost, estimator_run, self.measurements, core, costs, self._pose_refused,
         )  # fmt: skip
         kernel.create_task("PWRMGNT", 0, power_task, kernel, board, core)
         self.mavlink = self._mavlink_stack(config) if mavlink else None
@@ -113,9 +117,9 @@ class Firmware:
         if board.deck_memory == b"\xff" * len(board.deck_memory):
             board.deck_memory[:] = encode_one_wire(*DECK)
         tester, storage = Tester(), ParameterStorage(board.eeprom)
-        trajectories = bytearray(MEMORY_SIZE)
         pilot, notices = self.pilot, self._notices
-        high_level = HighLevelService(link, pilot, supervisor, trajectories, notices)
+        stabilizer, high_level = pilot.stabilizer, pilot.stabilizer.high_level
+        CommanderService(link, stabilizer)
         running = Running(
             board=board,
             core=core,
@@ -123,9 +127,9 @@ class Firmware:
             measurements=self.measurements,
             stack=link,
             localisation=LocalisationService(
-                link, self.measurements, supervisor, pilot, settings.address & 0xFF
+                link, self.measurements, stabilizer.supervisor, pilot, settings.address & 0xFF
             ),
-            platform=PlatformService(link, supervisor, pilot),
+            platform=PlatformService(link, stabilizer.supervisor),
             tester=tester,
             storage=storage,
             pilot=pilot,
@@ -139,7 +143,7 @@ class Firmware:
         self.parameters = (*own, *stock_parameters(running))
         LogService(link, self.variables)
         ParameterService(link, self.parameters, storage, notices)
-        MemoryService(link, memories(board.eeprom, board.deck_memory, tester, trajectories))
+        MemoryService(link, memories(board.eeprom, board.deck_memory, tester, high_level.memory))
         if self.mavlink is not None:
             self._start_mavlink_services(self.mavlink, config.mavlink, running, own)
 
@@ -173,6 +177,15 @@ class Firmware:
     @property
     def log_numbers(self) -> dict[str, int]:
         return {variable.name: number for number, variable in enumerate(self.variables)}
+
+    @property
+    def parameter_numbers(self) -> dict[str, int]:
+        return {parameter.name: number for number, parameter in enumerate(self.parameters)}
+
+    @property
+    def inputs(self) -> NDArray[Any]:
+        """The core's input, (1,)."""
+        return self._core.data.memory
 
     @property
     def usage(self) -> Usage | None:

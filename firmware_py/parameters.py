@@ -67,11 +67,11 @@ def _kalman(running: Running) -> Iterator[Parameter]:
 
 def _supervision(running: Running) -> Iterator[Parameter]:
     """Yield the stops. That of the Crazyflie firmware holds until a reboot, Floaty's own can be undone."""
-    supervisor = running.supervisor
+    supervisor, crazyflie = running.supervisor, running.pilot.stabilizer.supervisor
 
     def lock(value: float) -> None:
         if value:
-            supervisor.emergency_stop()
+            crazyflie.stop_wanted = True
 
     def stop(value: float) -> None:
         if value:

@@ -1,131 +1,162 @@
-"""The target of the high-level commander: the goal that a pose is compared with, and set-points for the core.
+"""Joins the Crazyflie's commanders to the flight core, as the exported app does on the flashed board.
 
-Poses are in a frame X: corrections in the goal frame of the ground station, absolute poses in that of the cameras.
-The planner moves the goal in X; a pose is compared with the goal at the instant when it was measured. While the planner
-is idle, corrections are errors already (the goal is X's origin); with absolute poses there is no target: the goal stays
-under the robot, and the supervisor keeps the flaps at hover.
+The set-point of the commanders moves the core's goal; a pose is compared with the goal in force when it is filed. While
+nothing is commanded the goal stays. With corrections the goal belongs to their sender, and set-points are not followed.
 
 A pose travels as `Arrived` through the measurement queue, from the radio or the UART to the estimator.
 """
+
+from collections.abc import Callable, Sequence
 
 from firmware_py.core.structs import (
     GOAL_ABSOLUTE,
     GOAL_NONE,
     GOAL_OF_CORRECTIONS,
+    SETPOINT_OF_CORRECTIONS,
     SETPOINT_OTHER,
+    SETPOINT_OUTSIDE,
     SETPOINT_POSITION,
     Input,
 )
 from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks
-from firmware_py.geometry import Vector, to_euler_zyx
-from firmware_py.planner import Path, PathPoint, Phase, Planner, stay
+from firmware_py.crazyflie.commander import Setpoint
+from firmware_py.crazyflie.planner import PathPoint
+from firmware_py.crazyflie.stabilizer import Stabilizer
+from firmware_py.crazyflie.supervisor import State
+from firmware_py.geometry import Vector
+from firmware_py.supervisor import CoreSupervisor
 from firmware_py.wire.crtp import Correction
 
-# Arrival of a pose on board [us], the pose, whether it is absolute, and the goal at the instant when it was measured, in
-# the frame of the pose; None: the goal is not known.
+# Arrival of a pose on board [us], the pose, whether it is absolute, and its own goal (of MAVLink); None: that in force.
 Arrived = tuple[int, Correction, bool, PathPoint | None]
 
-ORIGIN = PathPoint((0.0, 0.0, 0.0), 0.0)
-SETPOINT_SILENCE_US = 2_000_000  # Crazyflie firmware: COMMANDER_WDT_TIMEOUT_SHUTDOWN
+BOX = "it leaves the box, see box.radius, box.below and box.above"
+REASONS = {
+    SETPOINT_OTHER: "only positions are",
+    SETPOINT_OUTSIDE: BOX,
+    SETPOINT_OF_CORRECTIONS: "poses are corrections, see extPose.absolute",
+}
 
 
 class Pilot:
-    """`goal` is the one for the last pose, None for an unchanged correction."""
+    """`stabilizer` is the Crazyflie's part; `refuse` takes the kind and the text of what is not flown."""
 
-    def __init__(self, core: CoreBlocks) -> None:
-        self.planner = Planner()
-        self.goal: PathPoint | None = None
-        self.here: PathPoint | None = None  # the last absolute pose
-        self.seen_us = -1  # arrival of the last pose
-        self._setpoint_us: int | None = None  # arrival of the last set-point, while they lead
-        self._core = core
+    def __init__(
+        self,
+        core: CoreBlocks,
+        supervisor: CoreSupervisor,
+        acceleration: Callable[[], Vector],
+        refuse: Callable[[str, str], None],
+    ) -> None:
+        self.stabilizer = Stabilizer(self, lambda kind, text: refuse(kind, f"commander: {text}"))
+        self.seen_us = -1  # arrival of the last pose over CRTP
+        self._core, self._data = core, core.data.fields
+        self._supervisor = supervisor
+        self._acceleration = acceleration
+        self._refuse = refuse
+        self._state = State.NOT_INITIALIZED
+        self._reason = ""  # why the last set-point is not followed
+        self._held = False  # the Crazyflie's supervisor is kept disarmed
+        self._waits = False  # and waits for the request to arm
 
     @property
     def absolute(self) -> bool:
         """Whether poses over CRTP are absolute."""
-        return bool(self._core.data.fields.absolute)
+        return bool(self._data.absolute)
 
-    def has_target(self, now_us: int) -> bool:
-        """Return whether there is a target; poses from links other than CRTP do not pass the pilot."""
-        idle = self.planner.phase(now_us) is Phase.IDLE
-        return not (idle and self.here is not None and self.absolute)
+    def step(self, now_us: int) -> None:
+        """Move the goal as the commanders want, and stop as their supervisor wants; called every 10 ms."""
+        self._match_arming()
+        turning = bool(self._core.supervisor.fields.led)
+        setpoint = self.stabilizer.step(now_us, turning, self._acceleration)
+        crazyflie = self.stabilizer.supervisor
+        if crazyflie.stop_wanted or crazyflie.locked:
+            self._supervisor.emergency_stop()
+        if crazyflie.state is not self._state:
+            self._state = crazyflie.state
+            if self._state is State.LEVEL_OUT:
+                self._refuse(
+                    "silence", "commander: set-points stopped without their notice; 1.5 s more lock the board"
+                )
+        if self._state is not State.LEVEL_OUT:
+            self._follow(setpoint)
 
-    @property
-    def led(self) -> bool:
-        """Whether set-points lead."""
-        return self._setpoint_us is not None
-
-    def setpoints_stopped(self, now_us: int) -> bool:
-        """Return whether set-points lead and have stopped arriving."""
-        return self._setpoint_us is not None and now_us - self._setpoint_us >= SETPOINT_SILENCE_US
-
-    def evaluate(self, setpoint: tuple[Vector, float] | None, now_us: int) -> int:
-        """Return the outcome for a set-point, `SETPOINT_...`; None: it gives no position."""
-        data = self._core.data.fields
-        data.poses_absolute = i32(self.absolute)
-        data.setpoint_kind = i32(SETPOINT_OTHER)
-        if setpoint is not None:
-            data.setpoint_kind = i32(SETPOINT_POSITION)
-            data.setpoint[:3], data.setpoint[3] = setpoint
-        put_goal(data, self.begin(now_us))
-        return self._core.run.call("follow")
-
-    def admits(self, path: Path) -> bool:
+    def admits(self, places: Sequence[Vector]) -> bool:
         """Return whether a path ends in the box and is never further outside than at its beginning."""
-        begin, *places = path.places()
-        return all(self.admits_place(place, begin, self.absolute) for place in places) and self.admits_place(
-            places[-1], None, self.absolute
-        )
+        if not self.absolute:
+            return True  # it is not followed
+        begin, *rest = places
+        inside = all(self.admits_place(place, begin, True) for place in rest)
+        if inside and self.admits_place(rest[-1], None, True):
+            return True
+        self._refuse("path in the box", f"commander: path refused: {BOX}")
+        return False
 
     def admits_place(self, place: Vector, goal: Vector | None, absolute: bool) -> bool:
         """Return whether a place is in the box, or at most as far outside as a goal."""
-        data = self._core.data.fields
+        data = self._data
+        kept = data.goal.tolist(), data.goal_velocity.tolist(), data.goal_kind, data.poses_absolute
         data.poses_absolute = i32(absolute)
         data.setpoint[:3] = place
         put_goal(data, None if goal is None else PathPoint(goal, 0.0))
-        return bool(self._core.run.call("admits"))
+        admitted = bool(self._core.run.call("admits"))
+        data.goal[:], data.goal_velocity[:], data.goal_kind, data.poses_absolute = kept
+        return admitted
 
-    def follow(self, path: Path, now_us: int, lands: bool = False) -> None:
-        """Start a path of the high-level commander, which needs no further messages."""
-        self.planner.follow(path, now_us, lands)
-        self._setpoint_us = None
+    def lead(self, position: Vector, yaw: float) -> None:
+        """Make a target of another link the goal, in the frame of the poses over CRTP."""
+        self._data.poses_absolute = i32(self.absolute)
+        put_goal(self._data, PathPoint(position, yaw))
 
-    def hold(self, position: Vector, yaw: float, now_us: int) -> None:
-        """Fly to a set-point; the next one has to arrive soon."""
-        self.planner.follow(stay(position, yaw), now_us)
-        self._setpoint_us = now_us
+    def estimate(self) -> PathPoint:
+        """Return the estimated motion in the frame of the poses."""
+        report = self._core.report.fields
+        x, y, z = report.position.tolist()
+        vx, vy, vz = report.velocity.tolist()
+        return PathPoint((x, y, z), float(report.attitude[2]), (vx, vy, vz))
 
-    def release(self) -> None:
-        """Note that no further set-points will come; the last one stays in force."""
-        self._setpoint_us = None
-
-    def abort(self) -> None:
-        """Give up the path or set-point."""
-        self.planner.stop()
-        self._setpoint_us = None
-
-    def begin(self, now_us: int) -> PathPoint | None:
-        """Return the start of a new path: a point of the present path, else the robot's place; None when unknown."""
-        if self.planner.phase(now_us) is not Phase.IDLE:
-            return self.planner.at(now_us)
-        return self.here if self.absolute else ORIGIN
-
-    def frame(self, now_us: int) -> PathPoint | None:
-        """Return the origin of the estimate in X now; None while they are the same."""
-        return self.planner.at(now_us) if self.planner.phase(now_us) is not Phase.IDLE else self.goal
+    def frame(self) -> PathPoint | None:
+        """Return the goal of poses over CRTP; None while it is theirs."""
+        data = self._data
+        if data.goal_kind == GOAL_NONE:
+            return None
+        x, y, z, yaw = data.goal.tolist()
+        return PathPoint((x, y, z), yaw)
 
     def measured(self, pose: Correction, now_us: int) -> Arrived:
-        """Return a pose that has just arrived over CRTP, with its goal."""
+        """Return a pose that has just arrived over CRTP."""
         self.seen_us = now_us
-        age_us = int(self._core.parameters.fields.default_age_us) if pose.age_us is None else pose.age_us
-        if self.absolute:
-            self.here = PathPoint(pose.p_GB, to_euler_zyx(pose.q_GB)[2])
-        if self.planner.phase(now_us) is not Phase.IDLE:
-            self.goal = self.planner.at(now_us - age_us)
-        else:
-            self.goal = self.here if self.absolute else None
-        return now_us, pose, self.absolute, self.goal
+        return now_us, pose, self.absolute, None
+
+    def _follow(self, setpoint: Setpoint) -> None:
+        """Hand the core a set-point; report one that is not followed."""
+        reason = ""
+        if setpoint.place is not None or setpoint.other:
+            data = self._data
+            data.poses_absolute = i32(self.absolute)
+            data.setpoint_kind = i32(SETPOINT_OTHER if setpoint.place is None else SETPOINT_POSITION)
+            data.setpoint[:3], data.setpoint[3] = setpoint.place or (0.0, 0.0, 0.0), setpoint.yaw
+            data.setpoint_velocity[:] = setpoint.velocity
+            reason = REASONS.get(self._core.run.call("follow"), "")
+        if reason and reason != self._reason:
+            self._refuse(f"set-point: {reason}", f"commander: set-point not followed: {reason}")
+        self._reason = reason
+
+    def _match_arming(self) -> None:
+        """Disarm and arm together with the Crazyflie's supervisor, which arms itself: a client's disarming lasts."""
+        own, other = self._supervisor, self.stabilizer.supervisor
+        if own.armed and other.armed:
+            self._held = False
+        elif own.armed and self._held:
+            other.request_arming(True)
+        elif own.armed and (other.can_fly or other.can_arm):
+            own.arm(False)
+        elif other.armed and self._waits:
+            own.arm(True)
+        if not own.armed:
+            other.request_arming(False)
+            self._held, self._waits = True, other.can_arm
 
 
 def put_goal(data: Input, goal: PathPoint | None) -> None:

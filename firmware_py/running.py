@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from firmware_py.board import Board
 from firmware_py.core_runner import CoreBlocks
+from firmware_py.crazyflie.high_level_commander import Defaults
 from firmware_py.links.crtp_stack import CrtpStack
-from firmware_py.links.high_level import Defaults
 from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.memories import Tester
 from firmware_py.links.parameters import ParameterStorage

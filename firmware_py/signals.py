@@ -6,10 +6,14 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.core.structs import Control, Estimator
+from firmware_py.core.structs import Control, Estimator, Input
 from firmware_py.wire.supervisor import Cause, State
 
-ESTIMATOR, CONTROL = Estimator.dtype, Control.dtype  # how they lie in memory, here and in an image
+ESTIMATOR, CONTROL, INPUT = (
+    Estimator.dtype,
+    Control.dtype,
+    Input.dtype,
+)  # how they lie in memory, here and in an image
 COUNTERS = ("fused", "refused", "jumps", "too_old", "invalid", "bounded", "resets", "horizon", "pose_age_us")
 
 

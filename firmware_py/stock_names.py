@@ -126,7 +126,7 @@ def stock_variables(running: Running) -> Iterator[LogVariable]:
 
 def _target(running: Running) -> tuple[Vector, float]:
     """Return the target in the frame of the poses, position and yaw."""
-    frame = running.pilot.frame(running.stack.kernel.now_us)
+    frame = running.pilot.frame()
     if frame is not None:
         return frame.position, frame.yaw
     x, y, z, yaw = running.core.parameters.fields.target.tolist()

@@ -12,8 +12,8 @@ from firmware_py.config import CpuConfig
 from firmware_py.core.structs import POSE_NO_CORRECTION
 from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks, CoreCosts
+from firmware_py.crazyflie.planner import PathPoint
 from firmware_py.pilot import Arrived, Pilot, put_goal
-from firmware_py.planner import PathPoint
 from firmware_py.rtos import Kernel, Queue, Semaphore
 from firmware_py.supervisor import CoreSupervisor, wrapped
 from firmware_py.wire.crtp import Correction
@@ -54,6 +54,7 @@ def stabilizer_task(  # noqa: PLR0913 - what a task uses is wired once
     supervisor: CoreSupervisor,
     core: CoreBlocks,
     costs: CoreCosts,
+    pilot: Pilot,
 ) -> Task:
     """Run at 1 kHz on the tick edge after each IMU sample; control at 100 Hz."""
     cost_us, tick = cost.stabilizer_us, core.data.cell("tick")
@@ -68,20 +69,20 @@ def stabilizer_task(  # noqa: PLR0913 - what a task uses is wired once
         yield from estimator_run.give_nowait()
         if control_runs:
             yield from kernel.work(costs.control_us())
+            pilot.step(kernel.now_us)
             supervisor.update(kernel.now_us)
             yield from kernel.yield_if_pending()
             core.run.call("control")
             board.write_compare(core.control.fields.count.tolist())
 
 
-def estimator_task(  # noqa: PLR0913 - what a task uses is wired once
+def estimator_task(
     kernel: Kernel,
     cost: CpuConfig,
     estimator_run: Semaphore,
     measurements: Queue[Arrived],
     core: CoreBlocks,
     costs: CoreCosts,
-    pilot: Pilot,
     pose_refused: Callable[[Correction], None],
 ) -> Task:
     """Take poses at 1 kHz, estimate at 100 Hz."""
@@ -96,7 +97,6 @@ def estimator_task(  # noqa: PLR0913 - what a task uses is wired once
                 yield from kernel.yield_if_pending()
         if estimate_due[0]:
             yield from kernel.work(costs.estimate_us())
-            put_goal(core.data.fields, pilot.frame(kernel.now_us))
             core.run.call("estimate")
 
 
@@ -120,10 +120,14 @@ def hand_pose_to_core(
     """Hand a pose to the core; return the result, `POSE_...`."""
     data = core.data.fields
     data.poses_absolute = i32(absolute)
-    put_goal(data, goal)
+    if goal is not None:
+        put_goal(data, goal)
     data.now_us = wrapped(kernel.now_us)
     data.pose_waited_us = i32(kernel.now_us - arrived_us)
     data.pose_position[:] = pose.p_GB
     data.pose_quaternion[:] = pose.q_GB
     data.pose_age_us = i32(-1 if pose.age_us is None else pose.age_us)
-    return core.run.call("file_pose")
+    answer = core.run.call("file_pose")
+    if goal is not None:
+        put_goal(data, None)  # it was that of this pose only: the estimate is reported from the goal
+    return answer

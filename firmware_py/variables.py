@@ -17,7 +17,6 @@ from firmware_py.rtos.statistics import ProcessorLoad
 from firmware_py.running import Running
 from firmware_py.table import CORE_VARIABLES, CoreVariable
 from firmware_py.wire.scalars import Scalar
-from firmware_py.wire.supervisor import State
 from firmware_py.wire.telemetry import LEGACY_DEGREES
 
 BATTERY_FULL_MV = 4200
@@ -30,7 +29,7 @@ F32, U8, I8, U16, I16, U32 = Scalar.F32, Scalar.U8, Scalar.I8, Scalar.U16, Scala
 
 def log_variables(running: Running) -> tuple[LogVariable, ...]:
     """Return the table, in the order of the log TOC."""
-    core, supervisor = running.core, running.supervisor
+    core, crazyflie = running.core, running.pilot.stabilizer.supervisor
     control = core.control.fields
     own = () if core.logic is None else core.logic.loaded.variables
     return (
@@ -40,9 +39,9 @@ def log_variables(running: Running) -> tuple[LogVariable, ...]:
         LogVariable("motors_ctrp.min_angle", F32, "rad", lambda: control.flap.min()),
         LogVariable("motors_ctrp.max_angle", F32, "rad", lambda: control.flap.max()),
         LogVariable("supervisor.info", U16, "", running.platform.bits),
-        LogVariable("sys.canfly", U8, "", partial(getattr, supervisor, "can_fly")),
-        LogVariable("sys.isFlying", U8, "", lambda: supervisor.state is State.FLYING),
-        LogVariable("sys.isTumbled", U8, "", lambda: 0),
+        LogVariable("sys.canfly", U8, "", partial(getattr, crazyflie, "can_fly")),
+        LogVariable("sys.isFlying", U8, "", partial(getattr, crazyflie, "flying")),
+        LogVariable("sys.isTumbled", U8, "", partial(getattr, crazyflie, "tumbled")),
         *_localisation(running.localisation),
         *_counters(running),
     )

@@ -14,6 +14,9 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "firmware_py.core.subset": ("firmware_py.compiling",),
     "firmware_py.core": ("firmware_py.core",),
     "firmware_py.wire": ("firmware_py.wire", "firmware_py.geometry", "firmware_py.elementary"),
+    "firmware_py.crazyflie": (
+        "firmware_py.crazyflie", "firmware_py.wire", "firmware_py.geometry", "firmware_py.elementary",
+    ),
     "firmware_py.geometry": ("firmware_py.elementary",),
     "firmware_py.elementary": (),
     "firmware_py.compiling": ("firmware_py.kept_code",),

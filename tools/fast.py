@@ -28,7 +28,8 @@ from firmware_py.fast import FOLDER, RECORD, digest  # noqa: E402 - from this tr
 
 PACKAGES = ("firmware_py", "ground_station", "hil")
 MODULES = {
-    "firmware_py": "elementary firmware geometry pilot planner supervisor tasks",
+    "firmware_py": "elementary firmware geometry pilot supervisor tasks",
+    "firmware_py/crazyflie": "commander planner stabilizer supervisor",
     "firmware_py/links": "crtp_stack localisation log",
     "firmware_py/rtos": "control_block kernel queue scheduler semaphore task timer",
     "firmware_py/wire": "crtp log telemetry",

@@ -32,7 +32,7 @@ MANUAL_ANGLES = 1  # angles from outside, with or without poses, while a client 
 MANUAL_HOVER = 2
 
 STATE_CALIBRATING = 0  # the gyro's zero is unknown: flaps at hover
-STATE_WAITING = 1  # no pose yet, or no target: flaps at hover
+STATE_WAITING = 1  # no pose yet: flaps at hover
 STATE_FLYING = 2  # loop closed
 STATE_FAILSAFE = 3  # flaps at hover, see the cause
 
@@ -52,7 +52,6 @@ REQUEST_LOCK = 2  # stop until the board reboots
 REQUEST_RECOVER = 3
 REQUEST_ARM = 4
 REQUEST_DISARM = 5
-REQUEST_FEED = 6  # the watchdog of the emergency stop
 
 POSE_ON_TIME = 0
 POSE_TOO_OLD = 1
@@ -62,6 +61,7 @@ POSE_NO_CORRECTION = 3  # too far from the goal
 GOAL_NONE = 0
 GOAL_OF_CORRECTIONS = 1  # in the frame of the corrections
 GOAL_ABSOLUTE = 2  # in W
+GOAL_STALE = 3  # likewise; the next pose becomes the goal
 
 SETPOINT_NONE = 0  # no command, the goal stays
 SETPOINT_POSITION = 1  # a position, perhaps with a yaw
@@ -209,7 +209,6 @@ class Input(Struct):
     pose_age_us: i32  # at its arrival, then at the next tick; negative: unknown
     battery_mv: i32
     connected: i32  # a client is connected
-    idle: i32  # there is no target
     goal_kind: i32  # GOAL_...
     goal: Annotated[F32s, 4]  # x, y, z [m] and yaw [rad]
     goal_velocity: Annotated[F32s, 3]  # [m/s]
@@ -336,8 +335,6 @@ class Supervisor(Struct):
     silent_us: i32  # since the last accepted pose
     low_us: i32  # since the battery's voltage was good
     down_us: i32  # since the robot was disarmed or stopped
-    watchdog_on: i32
-    watchdog_us: i32  # since it was fed
     bounded: i32  # the estimator's counter
     gap_us: i32  # until a bounded step begins a new episode
     episode_us: i32  # since it began

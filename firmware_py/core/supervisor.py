@@ -7,12 +7,11 @@ Every cause against it sets the flaps to the hover angles. How it ends depends o
     out of bounds   the estimator was held at its bounds for 200 ms: ends after 500 ms inside them
     disarmed        by request: ends with the request to arm
     not finite      own logic returned NaN or infinity, the controller or the estimator: ends with a request to recover
-    emergency stop  by request, or because a started emergency stop watchdog was not fed for 1 s: ends only with a reboot.
-                    A stop that is not locked ends with a request to recover, too
+    emergency stop  by request: ends only with a reboot. A stop that is not locked ends with a request to recover, too
     low battery     below the limit for 5 s: ends only with a request to recover when the voltage is back above it
     no control      no controller asked for the mode for 50 ms: ends when one does
 
-The supervisor waits before the first pose and while there is no target. The estimator's gate refuses a single outlier
+The supervisor waits before the first pose. The estimator's gate refuses a single outlier
 pose, which has no effect here. Times are summed from call to call, so that a clock that wraps does no harm.
 """
 
@@ -26,6 +25,8 @@ from firmware_py.core.structs import (
     CAUSE_NONE,
     CAUSE_OUT_OF_BOUNDS,
     CAUSE_SILENCE,
+    GOAL_ABSOLUTE,
+    GOAL_STALE,
     MANUAL_ANGLES,
     MANUAL_HOVER,
     MODE_FLY,
@@ -33,7 +34,6 @@ from firmware_py.core.structs import (
     MODE_MANUAL,
     REQUEST_ARM,
     REQUEST_DISARM,
-    REQUEST_FEED,
     REQUEST_LOCK,
     REQUEST_RECOVER,
     REQUEST_STOP,
@@ -49,7 +49,6 @@ from firmware_py.core.structs import (
 )
 from firmware_py.core.subset import Integer, elapsed, i32, kernel
 
-WATCHDOG_US = 1000000  # Crazyflie firmware
 BATTERY_LOW_US = 5000000  # original firmware
 CONTROL_US = 50000  # without a call the controller has stopped, or another one runs in its place
 EPISODE_GAP_US = 50000  # two bounded steps no further apart belong to one episode
@@ -98,7 +97,6 @@ def pass_time(data: Input, supervisor: Supervisor) -> None:
     supervisor.silent_us = longer(supervisor.silent_us, by_us)
     supervisor.low_us = longer(supervisor.low_us, by_us)
     supervisor.down_us = longer(supervisor.down_us, by_us)
-    supervisor.watchdog_us = longer(supervisor.watchdog_us, by_us)
     supervisor.episode_us = longer(supervisor.episode_us, by_us)
     supervisor.gap_us = shorter(supervisor.gap_us, by_us)
     supervisor.outside_us = shorter(supervisor.outside_us, by_us)
@@ -148,19 +146,13 @@ def update_ready(sampling: Sampling, supervisor: Supervisor) -> None:
 
 
 @kernel
-def is_waiting(data: Input, supervisor: Supervisor) -> bool:
-    """Return whether there is no pose yet, or no target."""
-    return bool(supervisor.pose_seen == 0 or data.idle != 0)
-
-
-@kernel
-def cause_of_failsafe(parameters: Parameters, data: Input, sampling: Sampling, supervisor: Supervisor) -> i32:
+def cause_of_failsafe(parameters: Parameters, sampling: Sampling, supervisor: Supervisor) -> i32:
     """Return the cause against closing the loop, `CAUSE_NONE` if the robot only waits."""
     if supervisor.lasting != CAUSE_NONE:
         return i32(supervisor.lasting)
     if supervisor.armed == 0:
         return i32(CAUSE_DISARMED)
-    if sampling.calibrated == 0 or is_waiting(data, supervisor):
+    if sampling.calibrated == 0 or supervisor.pose_seen == 0:
         return i32(CAUSE_NONE)
     if sampling.recovering > 0:
         return i32(CAUSE_IMU_STALE)
@@ -172,13 +164,13 @@ def cause_of_failsafe(parameters: Parameters, data: Input, sampling: Sampling, s
 
 
 @kernel
-def state_of(data: Input, sampling: Sampling, supervisor: Supervisor, cause: Integer) -> i32:
+def state_of(sampling: Sampling, supervisor: Supervisor, cause: Integer) -> i32:
     """Return the state that a cause leads to."""
     if cause != CAUSE_NONE:
         return i32(STATE_FAILSAFE)
     if sampling.calibrated == 0:
         return i32(STATE_CALIBRATING)
-    if is_waiting(data, supervisor):
+    if supervisor.pose_seen == 0:
         return i32(STATE_WAITING)
     return i32(STATE_FLYING)
 
@@ -223,12 +215,9 @@ def supervise(
     pass_time(data, supervisor)
     watch_bounds(estimator, supervisor)
     watch_battery(parameters, data, supervisor)
-    if supervisor.watchdog_on != 0 and supervisor.watchdog_us >= WATCHDOG_US:
-        supervisor.stopped = i32(1)
-        supervisor.locked = i32(1)
     update_ready(sampling, supervisor)
-    cause = cause_of_failsafe(parameters, data, sampling, supervisor)
-    state = state_of(data, sampling, supervisor, cause)
+    cause = cause_of_failsafe(parameters, sampling, supervisor)
+    state = state_of(sampling, supervisor, cause)
     changed = i32(0)
     if state != supervisor.state or cause != supervisor.cause:
         changed = i32(1)
@@ -260,8 +249,17 @@ def recover(parameters: Parameters, data: Input, supervisor: Supervisor) -> i32:
 
 
 @kernel
+def renew_goal(data: Input, supervisor: Supervisor) -> None:
+    """Let a robot that was disarmed or stopped stay where it is: its next pose is the goal."""
+    if data.goal_kind == GOAL_ABSOLUTE and (supervisor.armed == 0 or supervisor.stopped != 0):
+        data.goal_kind = i32(GOAL_STALE)
+
+
+@kernel
 def execute(parameters: Parameters, data: Input, supervisor: Supervisor) -> i32:
     """Execute a request; return whether that was possible."""
+    if data.request == REQUEST_ARM or data.request == REQUEST_RECOVER:
+        renew_goal(data, supervisor)
     if data.request == REQUEST_RECOVER:
         return recover(parameters, data, supervisor)
     if data.request == REQUEST_ARM and lasting_cause(supervisor) != CAUSE_NONE:
@@ -275,9 +273,6 @@ def execute(parameters: Parameters, data: Input, supervisor: Supervisor) -> i32:
         supervisor.armed = i32(1)
     elif data.request == REQUEST_DISARM:
         supervisor.armed = i32(0)
-    elif data.request == REQUEST_FEED:
-        supervisor.watchdog_on = i32(1)
-        supervisor.watchdog_us = i32(-since_last_look(data, supervisor))
     return i32(1)
 
 

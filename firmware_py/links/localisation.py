@@ -4,10 +4,10 @@ A position without attitude is counted and logged but not fused, as in the origi
 carry the last byte of the board's radio address. The pilot adds the goal of each pose.
 """
 
+from firmware_py.crazyflie.supervisor import Supervisor
 from firmware_py.links.crtp_stack import CrtpStack, Task
 from firmware_py.pilot import Arrived, Pilot
 from firmware_py.rtos import Queue
-from firmware_py.supervisor import CoreSupervisor
 from firmware_py.wire import WireError, crtp, localisation
 from firmware_py.wire.crtp import Correction, Packet
 
@@ -21,7 +21,7 @@ class LocalisationService:
         self,
         stack: CrtpStack,
         measurements: Queue[Arrived],
-        supervisor: CoreSupervisor,
+        supervisor: Supervisor,
         pilot: Pilot,
         address: int,
     ) -> None:
@@ -50,9 +50,9 @@ class LocalisationService:
                 if address == self._address:
                     yield from self._measure(now_us, pose)
         elif data == bytes((localisation.EMERGENCY_STOP,)):
-            self._supervisor.emergency_stop()
+            self._supervisor.stop_wanted = True
         elif data == bytes((localisation.EMERGENCY_STOP_WATCHDOG,)):
-            self._supervisor.feed_watchdog(now_us)
+            self._supervisor.feed_watchdog(self._stack.kernel.tick_count)
         elif kind == crtp.EXT_POSE:
             yield from self._measure(now_us, crtp.decode_ext_pose(data))
         else:

@@ -1,7 +1,8 @@
 """The log service: clients group variables into blocks, the board sends each block at its period.
 
-Periods count in 10 ms, or with the newer command in 1 ms; 0 sends a block once. A refused request changes nothing. When the
-partner is gone, the next block that is due deletes them all, as in the Crazyflie firmware.
+Periods count in 10 ms, or with the newer command in 1 ms; 0 sends a block once. As in the Crazyflie firmware, items are
+added one by one: those before a refused one stay, and so does a block whose creation failed. When the partner is gone, the
+next block that is due deletes them all.
 """
 
 import struct
@@ -103,28 +104,25 @@ class LogService:
             return EEXIST
         if len(self.blocks) >= MAX_BLOCKS:
             return ENOMEM
-        block = LogBlock()
-        status = self._append(block, rest)
-        if status == OK:
-            self.blocks[number] = block
-        return status
+        block = self.blocks[number] = LogBlock()
+        return self._append(block, rest)
 
     def _append(self, block: LogBlock, rest: bytes) -> int:
         """Add the complete items in `rest`: a full packet of cflib's ends with the type byte of one more."""
-        items: list[Item] = []
         for offset in range(0, len(rest) - ITEM.size + 1, ITEM.size):
             kind, number = ITEM.unpack_from(rest, offset)
             scalar = LOG_SCALARS.get(kind & 0x0F)
-            if scalar is None or number >= len(self._variables):
+            if scalar is None:
                 return ENOENT
-            items.append((scalar, self._variables[number].read))
-        layout = struct.Struct(block.layout.format + "".join(scalar.format for scalar, _ in items))
-        if layout.size > log.MAX_VALUES:
-            return E2BIG
-        if sum(len(other.items) for other in self.blocks.values()) + len(items) > MAX_VARIABLES:
-            return ENOMEM
-        block.items += items
-        block.layout = layout
+            layout = struct.Struct(block.layout.format + scalar.format)
+            if layout.size > log.MAX_VALUES:
+                return E2BIG
+            if sum(len(other.items) for other in self.blocks.values()) == MAX_VARIABLES:
+                return ENOMEM
+            if number >= len(self._variables):
+                return ENOENT
+            block.items.append((scalar, self._variables[number].read))
+            block.layout = layout
         return OK
 
     def _start(self, block: LogBlock, command: int, rest: bytes) -> None:

@@ -10,10 +10,10 @@ goal; its origin is home while they are corrections.
 
 from collections.abc import Sequence
 
+from firmware_py.crazyflie.planner import PathPoint
 from firmware_py.geometry import Vector
 from firmware_py.links.mavlink_stack import INFO, WARNING, MavlinkStack, Task
 from firmware_py.pilot import Pilot
-from firmware_py.planner import PathPoint, stay
 from firmware_py.rtos import FOREVER, TICK_US
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire import mavlink_services as services
@@ -70,7 +70,7 @@ class SetpointService:
         """The origin of the estimate: the goal of the last pose."""
         if not self._piloted:
             return self._seen_from
-        motion = self._pilot.frame(self._stack.kernel.now_us)
+        motion = self._pilot.frame()
         if motion is None:
             return self.home, 0.0
         x, y, z = motion.position
@@ -92,15 +92,15 @@ class SetpointService:
         self._goal = (p_WG if target.p_WG is None else target.p_WG, yaw if target.yaw is None else target.yaw)
         self._led_us = now_us
         if self._piloted:
-            self._lead(now_us)
+            self._lead()
         if target.moves:
             self._stack.notice(message, "only position and yaw of targets are flown")
 
-    def _lead(self, now_us: int) -> None:
+    def _lead(self) -> None:
         """Have the pilot fly to the goal."""
         (x, y, z), yaw = self._goal
         ox, oy, oz = self._origin
-        self._pilot.follow(stay((x - ox, y - oy, z - oz), yaw), now_us)
+        self._pilot.lead((x - ox, y - oy, z - oz), yaw)
 
     @property
     def _origin(self) -> Vector:

@@ -1,4 +1,5 @@
-"""Memories on port 4: the EEPROM, a deck's one-wire memory, the memory tester, the commander's trajectories.
+"""Memories on port 4, in the order of the Crazyflie firmware: the EEPROM, the commander's trajectories, the memory tester,
+the memories of decks and of their bootloaders, which no deck here has, and the deck's one-wire memory.
 
 Channel 0 lists them, 1 reads, 2 writes. The tester's byte at any address is the address modulo 256: reading
 returns it, writing compares with it and counts differences.
@@ -10,12 +11,22 @@ from collections.abc import Sequence
 from firmware_py.links.crtp_stack import CrtpStack
 from firmware_py.wire import WireError
 from firmware_py.wire.crtp import PORT_MEMORIES, Packet
-from firmware_py.wire.memories import TYPE_EEPROM, TYPE_ONE_WIRE, TYPE_TESTER, TYPE_TRAJECTORIES
+from firmware_py.wire.memories import (
+    TYPE_DECK_BOOTLOADERS,
+    TYPE_DECKS,
+    TYPE_EEPROM,
+    TYPE_ONE_WIRE,
+    TYPE_TESTER,
+    TYPE_TRAJECTORIES,
+)
 
 INFO, READ, WRITE = 0, 1, 2  # channels
 GET_COUNT, GET_INFO = 1, 2
 MAX_READ = 24
 TESTER_SIZE = 0x1000
+EEPROM_SIZE = 0x1FFF  # one byte less than the chip has
+DECKS_VERSION, DECKS_SIZE = 3, 0x5000_0000
+BOOTLOADERS_VERSION, BOOTLOADERS_SIZE = 1, 0x1_8000
 OK, EIO = 0, 5
 
 _INFO = struct.Struct("<BBBI8s")
@@ -27,9 +38,11 @@ _DECK_SERIAL = bytes((0x0D, 0xF1, 0x0A, 0x7B, 0, 0, 0, 1))  # of the one-wire ch
 class ClientMemory:
     """A memory of real bytes as clients see it; the service checks addresses."""
 
-    def __init__(self, type: int, content: bytearray, serial: bytes = _NO_SERIAL) -> None:
+    def __init__(
+        self, type: int, content: bytearray, serial: bytes = _NO_SERIAL, size: int | None = None
+    ) -> None:
         self.type = type
-        self.size = len(content)
+        self.size = len(content) if size is None else size
         self.serial = serial
         self._content = content
 
@@ -40,6 +53,19 @@ class ClientMemory:
     def write(self, address: int, data: bytes) -> None:
         """Store bytes."""
         self._content[address : address + len(data)] = data
+
+
+class NoDecks(ClientMemory):
+    """A memory of decks where there are none: a version, then zeros."""
+
+    def __init__(self, type: int, version: int, size: int) -> None:
+        super().__init__(type, bytearray((version,)), size=size)
+
+    def read(self, address: int, length: int) -> bytes:
+        return super().read(address, length).ljust(length, b"\0")
+
+    def write(self, address: int, data: bytes) -> None:
+        """Ignore it."""
 
 
 class Tester(ClientMemory):
@@ -100,8 +126,10 @@ def memories(
 ) -> tuple[ClientMemory, ...]:
     """Return the memories of a Floaty board."""
     return (
-        ClientMemory(TYPE_EEPROM, eeprom),
-        ClientMemory(TYPE_ONE_WIRE, deck_memory, _DECK_SERIAL),
-        tester,
+        ClientMemory(TYPE_EEPROM, eeprom, size=EEPROM_SIZE),
         ClientMemory(TYPE_TRAJECTORIES, trajectories),
+        tester,
+        NoDecks(TYPE_DECKS, DECKS_VERSION, DECKS_SIZE),
+        NoDecks(TYPE_DECK_BOOTLOADERS, BOOTLOADERS_VERSION, BOOTLOADERS_SIZE),
+        ClientMemory(TYPE_ONE_WIRE, deck_memory, _DECK_SERIAL),
     )

@@ -177,7 +177,9 @@ class ParameterService:
         assert packet.channel == CHANNEL_WRITE
         if parameter.write is None:
             return ()
-        self._set(parameter, parameter.scalar.unpack(data[2:]))
+        # The Crazyflie firmware reads whatever its buffer holds behind a write that is too short; zeros here.
+        value = data[2 : 2 + parameter.scalar.size].ljust(parameter.scalar.size, b"\0")
+        self._set(parameter, parameter.scalar.unpack(value))
         return (ident + parameter.value(),)
 
     def _set(self, parameter: Parameter, value: float) -> int:
@@ -221,7 +223,7 @@ class ParameterService:
             return (head + (b"" if command == Misc.DEFAULT else bytes((OK,))) + self._defaults[number],)
         if command not in (Misc.STORE, Misc.STATE, Misc.CLEAR):
             raise WireError(f"parameter command {command} is unknown")
-        if not persistent:
+        if not known:
             return (head + bytes((ENOENT,)),)
         if command == Misc.STATE:
             stored = self._storage.load().get(parameter.name)

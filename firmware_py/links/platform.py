@@ -1,10 +1,8 @@
 """The board's identity and rights: link, platform and supervisor services, and the application channel."""
 
+from firmware_py.crazyflie.supervisor import Supervisor
 from firmware_py.links.crtp_stack import CrtpStack, Task
-from firmware_py.pilot import Pilot
-from firmware_py.planner import Phase
 from firmware_py.rtos import Queue
-from firmware_py.supervisor import CoreSupervisor
 from firmware_py.wire import WireError, check_size
 from firmware_py.wire.crtp import MAX_DATA, PORT_LINK, PORT_PLATFORM, PORT_SUPERVISOR, Packet, encode
 from firmware_py.wire.supervisor import (
@@ -25,7 +23,6 @@ from firmware_py.wire.supervisor import (
     VERSION_DEVICE,
     VERSION_FIRMWARE,
     VERSION_PROTOCOL,
-    State,
 )
 
 PROTOCOL_VERSION = 12
@@ -40,10 +37,9 @@ SOURCE_TEXT = b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0")  # by which clients k
 class PlatformService:
     """Answers on the ports of link, platform and supervisor. The application echoes what it receives on its channel."""
 
-    def __init__(self, stack: CrtpStack, supervisor: CoreSupervisor, pilot: Pilot) -> None:
+    def __init__(self, stack: CrtpStack, supervisor: Supervisor) -> None:
         self._stack = stack
         self._supervisor = supervisor
-        self._pilot = pilot
         kernel = stack.kernel
         self._app: Queue[bytes] = kernel.create_queue(APP_QUEUE, "app")
         self._requests = stack.open_port(PORT_PLATFORM)
@@ -58,8 +54,8 @@ class PlatformService:
         return self._app.dropped
 
     def bits(self) -> int:
-        """Return the Crazyflie's bit field for the state of the board and its commander."""
-        return supervisor_bits(self._supervisor) | commander_bits(self._pilot, self._stack.kernel.now_us)
+        """Return the bit field of the supervisor and the high-level commander, as of the supervisor's last look."""
+        return self._supervisor.bits
 
     def answer_platform(self, packet: Packet) -> tuple[bytes, ...]:
         """Return the reply to a platform command (the command itself) or to a request for a version."""
@@ -89,10 +85,10 @@ class PlatformService:
             if command in (ARM, RECOVER):
                 return (bytes((REPLY | command,)) + self._command(data),)
             if data == bytes((STOP,)):
-                supervisor.emergency_stop()
+                supervisor.stop_wanted = True
                 return ()
             if data == bytes((STOP_WATCHDOG,)):
-                supervisor.feed_watchdog(self._stack.kernel.now_us)
+                supervisor.feed_watchdog(self._stack.kernel.tick_count)
                 return ()
         raise WireError(f"supervisor channel {packet.channel}: {data.hex()} is unknown")
 
@@ -100,9 +96,8 @@ class PlatformService:
         """Arm, disarm or recover; return whether it succeeded and the new state."""
         check_size("a request to arm or recover", data, 1 if data[0] == COMMAND_RECOVER else 2)
         if data[0] == COMMAND_RECOVER:
-            recovered = self._supervisor.recover()
-            return bytes((recovered, recovered))
-        return bytes((self._supervisor.arm(bool(data[1])), self._supervisor.armed))
+            return bytes((self._supervisor.request_recovery(), not self._supervisor.crashed))
+        return bytes((self._supervisor.request_arming(bool(data[1])), self._supervisor.armed))
 
     def _platform_task(self) -> Task:
         while True:
@@ -126,28 +121,6 @@ def answer_link(packet: Packet) -> tuple[bytes, ...]:
     if packet.channel == LINK_ECHO:
         return (packet.data,)
     return (SOURCE_TEXT,) if packet.channel == LINK_SOURCE else ()
-
-
-def supervisor_bits(supervisor: CoreSupervisor) -> int:
-    """Return the Crazyflie's bit field: can be armed, armed, arms itself, can fly, flies, tumbled, locked."""
-    flags = (
-        not supervisor.armed and supervisor.calibrated and supervisor.can_be_armed,
-        supervisor.armed,
-        True,
-        supervisor.can_fly,
-        supervisor.state is State.FLYING,
-        False,
-        supervisor.locked,
-    )
-    return sum(1 << bit for bit, flag in enumerate(flags) if flag)
-
-
-def commander_bits(pilot: Pilot, now_us: int) -> int:
-    """Return the other bits: the high-level commander flies, has reached its path's end, is overruled by set-points."""
-    flies = pilot.planner.phase(now_us) is not Phase.IDLE
-    overruled = flies and pilot.led
-    flags = flies and not overruled, pilot.planner.finished(now_us), overruled
-    return sum(1 << bit for bit, flag in enumerate(flags, 8) if flag)
 
 
 def _version(command: int) -> bytes:

@@ -13,7 +13,7 @@ from firmware_py.wire import WireError, check_size
 from firmware_py.wire.crtp import header
 
 PORT = 8
-MAX_TRAJECTORIES = 10
+MAX_TRAJECTORIES = 31
 
 
 class PathCommand(IntEnum):
@@ -92,9 +92,21 @@ class Define(NamedTuple):
     pieces: int
 
 
-Fields = Groups | Vertical | VerticalWithVelocity | GoTo | Start | Define
-# The fields of each command, their layout, and those behind the second that older commands lack. Of a spiral, which is not
-# flown, only the groups are read.
+class SpiralFields(NamedTuple):
+    """SPIRAL."""
+
+    groups: int
+    sideways: bool
+    clockwise: bool
+    angle: float
+    first_radius: float
+    last_radius: float
+    ascent: float
+    duration: float
+
+
+Fields = Groups | Vertical | VerticalWithVelocity | GoTo | Start | Define | SpiralFields
+# The fields of each command, their layout, and those behind the second that older commands lack.
 _FORMS: dict[PathCommand, tuple[type[Fields], struct.Struct, tuple[float, ...]]] = {
     command: (kind, struct.Struct(layout), tuple(lacking))
     for command, kind, layout, *lacking in (
@@ -109,7 +121,7 @@ _FORMS: dict[PathCommand, tuple[type[Fields], struct.Struct, tuple[float, ...]]]
         (PathCommand.LAND, Vertical, "<Bff?f"),
         (PathCommand.TAKE_OFF_WITH_VELOCITY, VerticalWithVelocity, "<Bf?f?f"),
         (PathCommand.LAND_WITH_VELOCITY, VerticalWithVelocity, "<Bf?f?f"),
-        (PathCommand.SPIRAL, Groups, "<BBBfffff"),
+        (PathCommand.SPIRAL, SpiralFields, "<B??fffff"),
         (PathCommand.GO_TO, GoTo, "<B??fffff"),
         (PathCommand.START, Start, "<B???Bf"),
     )
@@ -117,7 +129,7 @@ _FORMS: dict[PathCommand, tuple[type[Fields], struct.Struct, tuple[float, ...]]]
 
 
 def decode(data: bytes) -> tuple[PathCommand, Fields]:
-    """Return the command and its fields; `WireError` for an unknown one or a number that is not finite."""
+    """Return the command and its fields; `WireError` for an unknown one or numbers that give no path."""
     try:
         command = PathCommand(data[0])
     except (IndexError, ValueError):
@@ -127,7 +139,19 @@ def decode(data: bytes) -> tuple[PathCommand, Fields]:
     fields = layout.unpack_from(data, 1)
     if not all(isfinite(value) for value in fields):
         raise WireError(f"high-level command {command.name.lower()} {fields}: must be finite")
-    return command, kind._make((*fields[:2], *lacking, *fields[2:])[: len(kind._fields)])
+    named = kind._make((*fields[:2], *lacking, *fields[2:])[: len(kind._fields)])
+    _check_time(named)
+    return command, named
+
+
+def _check_time(fields: Fields) -> None:
+    """Raise `WireError` for a time in which no path can be flown."""
+    if isinstance(fields, GoTo) and fields.linear and not fields.duration > 0.0:
+        raise WireError(f"a linear go_to of {fields.duration:g} s: must be above 0")
+    if isinstance(fields, SpiralFields) and not fields.duration > 0.0:
+        raise WireError(f"a spiral of {fields.duration:g} s: must be above 0")
+    if isinstance(fields, Start) and not fields.timescale > 0.0:
+        raise WireError(f"time scale {fields.timescale:g}: must be above 0")
 
 
 def encode(command: PathCommand, *fields: float) -> bytes:

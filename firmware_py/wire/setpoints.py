@@ -1,44 +1,48 @@
-"""Set-points on port 7 with a position: a position with a yaw, and the full state, whose motion is ignored.
+"""Set-points of clients: port 7 (crtp_commander_generic.c), and roll, pitch, yaw and thrust on port 3.
 
-Facts: crazyflie-firmware 2a18fc29 (crtp_commander_generic.c), cflib 0.1.34.
+Only a position (with a yaw) and the place in a full state are read: nothing else is flown. Facts: crazyflie-firmware
+2a18fc29, cflib 0.1.34. The firmware stops with a failed assertion when a set-point has another size; here it is refused.
 """
 
 import struct
-from math import degrees, isfinite, radians, remainder, tau
+from math import degrees, radians, remainder, tau
 
 from firmware_py.elementary import atan2
 from firmware_py.geometry import Vector
-from firmware_py.wire import WireError, check_size
-from firmware_py.wire.crtp import PORT_GENERIC_SETPOINT, check_place, header
+from firmware_py.wire import check_size
+from firmware_py.wire.crtp import PORT_GENERIC_SETPOINT, header
 from firmware_py.wire.localisation import unpack_quaternion
 
 CHANNEL_SETPOINT, CHANNEL_NOTICE = 0, 1
-STOP_SIZE, NOTICE_SIZE, ATTITUDE_SIZE = 1, 5, 14  # [bytes], the last on port 3
-STOP, FULL_STATE, POSITION = 0, 6, 7  # first byte on the channel of set-points
-NAMES = {
-    1: "velocity", 2: "height and attitude", 4: "PPM", 5: "hover", FULL_STATE: "full state", POSITION: "position",
-    8: "velocity", 9: "height and attitude", 10: "hover", 11: "manual",
-}  # fmt: skip
+NOTICE_SIZE, ATTITUDE_SIZE = 5, 14  # [bytes], the last on port 3
+STOP, PPM, FULL_STATE, POSITION = 0, 3, 6, 7  # first byte on the channel of set-points
+# Sizes with the first byte. Of STOP and of other first bytes, which mean the null set-point, any size is taken.
+SIZES = {1: 17, 2: 17, 4: 17, 5: 17, FULL_STATE: 29, POSITION: 17, 8: 17, 9: 17, 10: 17, 11: 16}
 
 _POSITION = struct.Struct("<x4f")  # [m], yaw [deg]
-_FULL_STATE = struct.Struct("<x9hI3h")  # position [mm], velocity, acceleration, quaternion, rates
+_FULL_STATE = struct.Struct("<x9hI3h")  # position [mm], velocity [mm/s], acceleration, quaternion, rates
 _MILLIMETRE = 1e-3
 
 
-def decode_place(data: bytes) -> tuple[Vector, float]:
-    """Return position [m] and yaw [rad] of a set-point that is `POSITION` or `FULL_STATE`."""
-    layout = _POSITION if data[0] == POSITION else _FULL_STATE
-    check_size(f"a {NAMES[data[0]]} set-point", data, layout.size)
-    fields = layout.unpack(data)
-    if data[0] == POSITION:
-        x, y, z, yaw = fields
-        check_place((x, y, z))
-        if not isfinite(yaw):
-            raise WireError(f"a position set-point with the yaw {yaw}: must be finite")
-        return (x, y, z), remainder(radians(yaw), tau)
-    x, y, z = (value * _MILLIMETRE for value in fields[:3])
-    qw, qx, qy, qz = unpack_quaternion(fields[9])
-    return (x, y, z), atan2(2.0 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)
+def is_null(data: bytes) -> bool:
+    """Return whether a set-point wants no motion at all."""
+    return data[0] != PPM and data[0] not in SIZES
+
+
+def decode_place(data: bytes) -> tuple[Vector, float] | None:
+    """Return position [m] and yaw [rad] of a set-point, None when it gives no position."""
+    kind = data[0]
+    if kind in SIZES:
+        check_size(f"a set-point of type {kind}", data, SIZES[kind])
+    if kind == POSITION:
+        x, y, z, yaw = _POSITION.unpack(data)
+        return (x, y, z), remainder(radians(yaw), tau) if abs(yaw) < 1e9 else yaw
+    if kind == FULL_STATE:
+        fields = _FULL_STATE.unpack(data)
+        x, y, z = (value * _MILLIMETRE for value in fields[:3])
+        qw, qx, qy, qz = unpack_quaternion(fields[9])
+        return (x, y, z), atan2(2.0 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)
+    return None
 
 
 def encode_place(p: Vector, yaw: float) -> bytes:

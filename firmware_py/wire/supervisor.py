@@ -9,7 +9,7 @@ class State(IntEnum):
     """The robot's permissions."""
 
     CALIBRATING = 0  # the gyro's zero is unknown: flaps at hover
-    WAITING = 1  # no pose yet, or no target: flaps at hover
+    WAITING = 1  # no pose yet: flaps at hover
     FLYING = 2  # loop closed
     FAILSAFE = 3  # flaps at hover, see the cause
 

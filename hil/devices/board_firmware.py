@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
+
+from numpy.typing import NDArray
 
 from firmware_py.board import Board, ImuCounts
 from firmware_py.config import FirmwareConfig
@@ -205,6 +207,14 @@ class BoardFirmware(Protocol):
     @property
     def log_numbers(self) -> Mapping[str, int]:
         """The numbers of its log variables in its table of contents, by name; empty without a log service."""
+
+    @property
+    def parameter_numbers(self) -> Mapping[str, int]:
+        """The same for its parameters."""
+
+    @property
+    def inputs(self) -> NDArray[Any] | None:
+        """A view on the flight core's input, (1,); None for a board without the core or one that does not show it."""
 
     def reports(self) -> Sequence[TaskReport]:
         """Return the timing of its tasks so far, in the order of their first run."""

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from firmware_py.board import ImuCounts
 from firmware_py.config import FirmwareConfig, parameters_of
 from firmware_py.rtos import TaskReport
-from firmware_py.signals import CONTROL, ESTIMATOR, Signals
+from firmware_py.signals import CONTROL, ESTIMATOR, INPUT, Signals
 from firmware_py.wire.supervisor import LOCKED, Cause, State
 from firmware_py.wire.telemetry import LEGACY_DEGREES
 from hil.crazyflie import syslink
@@ -240,6 +240,15 @@ class ImageFirmware:
     def signals(self) -> Signals:
         """Views on the app's core; without the app, the stock firmware's current values."""
         return self._app or stock_signals(self._table)
+
+    @property
+    def parameter_numbers(self) -> dict[str, int]:
+        return {name: parameter.number for name, parameter in self.parameters.items()}
+
+    @property
+    def inputs(self) -> NDArray[Any] | None:
+        """The input of the app's core, (1,); None without the app."""
+        return self._struct("floaty_input", INPUT) if self.image.has("floaty_input") else None
 
     def _signals_of_app(self) -> Signals:
         supervisor = ChipSupervisor(self._table if self.image.has("floaty_supervisor") else {})

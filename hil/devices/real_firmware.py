@@ -102,6 +102,8 @@ class RealFirmware:
     """The firmware of a board in the loop. Raises `LinkError` when the board does not answer."""
 
     log_numbers: ClassVar[Mapping[str, int]] = {}  # its log service is not used
+    parameter_numbers: ClassVar[Mapping[str, int]] = {}
+    inputs: ClassVar[None] = None
     scheduler: ClassVar[None] = None
     usage: ClassVar[None] = None
     clock_us: ClassVar[None] = None

@@ -327,7 +327,7 @@ def let_unaligned_trap(cpu: Any) -> None:
 
 def _memory(size: int) -> NDArray[np.uint8]:
     """Return zeroed memory, aligned to a page of this machine."""
-    return np.frombuffer(mmap.mmap(-1, size), np.uint8)
+    return np.frombuffer(mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS), np.uint8)
 
 
 def _sums_before(code: bytes, base: int, constants: frozenset[int], first_bit: int) -> NDArray[np.uint64]:

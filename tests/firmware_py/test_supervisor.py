@@ -10,8 +10,6 @@ from firmware_py.core import structs
 from firmware_py.core.sampling import RECOVERY_STEPS, STALE_STEPS
 from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL
 from firmware_py.core.supervisor import BATTERY_LOW_US, DOWN_US, EPISODE_GAP_US, EPISODE_LIMIT_US
-from firmware_py.links.platform import supervisor_bits
-from firmware_py.wire.crtp import Correction
 from firmware_py.wire.supervisor import Cause, State
 from support.crtp_client import LOC, LOG, PARAM, SUPERVISOR, CrtpClient
 from support.firmware_bench import HOVER_COUNTS
@@ -68,7 +66,7 @@ def write(client: CrtpClient, name: str, value: int) -> None:
 
 def let_watchdog_bite(client: CrtpClient) -> None:
     client.send(LOC, 1, b"\4")
-    client.run(client.now_us + 1_000_000)
+    client.run(client.now_us + 1_040_000)  # the supervisor looks every 40 ms
 
 
 STOPS = (stop, stop_on_the_supervisors_port, stop_by_parameter, let_watchdog_bite)
@@ -81,7 +79,6 @@ def test_emergency_stop_acts_within_eleven_milliseconds(flying: CrtpClient, stop
     assert flying.writes[-1][1] == HOVER_COUNTS
     assert flying.console == ["supervisor: failsafe, emergency stop"]
     assert after(flying, 3_000_000)[1] is Cause.EMERGENCY_STOP
-    assert flying.one(SUPERVISOR, 1, b"\1\1") == b"\x81\0\1"  # arming is refused
 
 
 @pytest.mark.parametrize("stop", STOPS)
@@ -99,14 +96,11 @@ def test_an_emergency_stop_of_the_crazyflie_lasts_until_a_reboot(flying: CrtpCli
     assert after(flying, 1_000_000) == (State.FLYING, Cause.NONE)
 
 
-@pytest.mark.parametrize(
-    "leave", [lambda c: write(c, "floaty.stop", 0), lambda c: c.one(SUPERVISOR, 1, b"\2")]
-)
-def test_floatys_own_stop_can_be_left(flying: CrtpClient, leave) -> None:
+def test_floatys_own_stop_can_be_left(flying: CrtpClient) -> None:
     stop_by_floatys_own_parameter(flying)
     flying.run(flying.now_us + 11_000)
     assert not flying.one(SUPERVISOR, 0, b"\x0c")[1] & 1 << 6  # not locked
-    leave(flying)
+    write(flying, "floaty.stop", 0)
     assert after(flying, 20_000) == (State.FLYING, Cause.NONE)
 
 
@@ -117,6 +111,7 @@ def test_a_disarmed_board_hovers_until_it_is_armed(flying: CrtpClient, arm) -> N
     arm(flying, False)
     assert after(flying, 11_000) == (State.FAILSAFE, Cause.DISARMED)
     assert flying.writes[-1][1] == HOVER_COUNTS
+    flying.run(flying.now_us + 200_000)  # until the Crazyflie's supervisor can be armed
     arm(flying, True)
     assert after(flying, 11_000) == (State.FLYING, Cause.NONE)
 
@@ -238,30 +233,6 @@ def test_an_episode_after_a_silent_one_restarts() -> None:
         assert bench.fly(EPISODE_LIMIT_US, bounded=True) == MODE_FLY
 
 
-CAN_BE_ARMED, CAN_FLY = 1 << 0, 1 << 3
-
-
-@EVENTS
-def test_a_board_that_can_fly_flies_at_the_next_pose(
-    happen: Callable[[SupervisorBench], object], cause: Cause, flown_by: tuple[int, int, int]
-) -> None:
-    bench = in_flight(happen)
-    bench.look()
-    told = supervisor_bits(bench.view)
-    bench.fly(3_000_000)  # after any time out of bounds
-    assert bool(told & CAN_FLY) == (bench.view.state is State.FLYING)
-
-
-@EVENTS
-def test_a_board_that_reports_can_be_armed_arms(
-    happen: Callable[[SupervisorBench], object], cause: Cause, flown_by: tuple[int, int, int]
-) -> None:
-    bench = in_flight(happen)
-    assert not supervisor_bits(bench.view) & CAN_BE_ARMED or cause is Cause.DISARMED
-    bench.view.arm(False)
-    assert bool(supervisor_bits(bench.view) & CAN_BE_ARMED) == bench.view.arm(True)
-
-
 # Instants wrap after 2^32 us, differences are ambiguous after 2^31 us: flights across both, and far from them.
 STARTS_US = pytest.mark.parametrize("start_us", [0, 2**31 - 1_000_000, 2**32 - 1_000_000, 3_600_000_000])
 
@@ -295,17 +266,6 @@ def test_timed_decisions_survive_the_clock_wrap(
     assert bench.view.cause is cause
 
 
-@STARTS_US
-def test_the_watchdog_bites_over_the_wrap_of_its_clock(start_us: int) -> None:
-    bench = in_flight(lambda bench: bench.fly(300_000), start_us)
-    bench.now_us += 4_000
-    bench.view.feed_watchdog(bench.now_us)
-    bench.fly(990_000)
-    assert (bench.look(9_999), bench.look(1)) == (MODE_FLY, MODE_HOVER)
-    assert bench.found == (State.FAILSAFE, Cause.EMERGENCY_STOP)
-    assert bench.view.locked
-
-
 def test_silence_lasts_for_hours() -> None:
     """Longer than differences of a clock of 32 bits reach."""
     bench = in_flight(fell_silent)
@@ -320,14 +280,6 @@ def test_a_board_that_is_disarmed_while_it_calibrates_is_in_failsafe() -> None:
     bench.view.arm(False)
     bench.look()
     assert bench.found == (State.FAILSAFE, Cause.DISARMED)
-
-
-def test_a_board_can_fly_only_after_gyro_calibration() -> None:
-    bench = SupervisorBench()
-    told = [supervisor_bits(bench.view) & CAN_FLY]
-    bench.calibrate()
-    bench.look()
-    assert [*told, supervisor_bits(bench.view) & CAN_FLY] == [0, CAN_FLY]
 
 
 def test_a_battery_is_low_after_exactly_five_seconds_below_the_limit_on_end() -> None:
@@ -420,30 +372,10 @@ def test_a_restarted_flight_waits_for_gyro_and_pose_and_stays_disarmed() -> None
     assert bench.view.state is State.WAITING
 
 
-def test_a_robot_without_a_goal_waits() -> None:
-    bench = in_flight(lambda bench: bench.fly(100_000))
-    bench.data.absolute = 1
-    bench.pilot.measured(Correction((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), None), bench.now_us)
-    assert bench.look() == MODE_HOVER
-    assert bench.found == (State.WAITING, Cause.NONE)
-
-
 def test_the_wire_has_the_numbers_of_the_core() -> None:
     for kind in (State, Cause):
         numbers = {one.name: getattr(structs, f"{kind.__name__.upper()}_{one.name}") for one in kind}
         assert numbers == {one.name: one.value for one in kind}
-
-
-@pytest.mark.parametrize(("port", "data"), [(LOC, b"\4"), (SUPERVISOR, b"\4")])
-def test_watchdog_bites_one_second_after_its_last_meal_and_not_before_the_first(flying, port, data) -> None:
-    assert after(flying, 2_000_000)[0] is State.FLYING
-    for _ in range(3):
-        flying.send(port, 1, data)
-        assert after(flying, 900_000)[0] is State.FLYING
-    assert after(flying, 95_000)[0] is State.FLYING
-    assert after(flying, 16_000) == (State.FAILSAFE, Cause.EMERGENCY_STOP)
-    flying.send(port, 1, data)
-    assert after(flying, 100_000)[1] is Cause.EMERGENCY_STOP
 
 
 def test_low_battery_needs_five_seconds_and_ends_by_recovery_with_a_good_voltage(flying: CrtpClient) -> None:
@@ -458,15 +390,11 @@ def test_low_battery_needs_five_seconds_and_ends_by_recovery_with_a_good_voltage
     assert flying.console == ["supervisor: failsafe, low battery"]
     flying.battery_mv = 3800
     assert after(flying, 1_000_000)[1] is Cause.LOW_BATTERY
-    flying.one(SUPERVISOR, 1, b"\2")
+    flying.one(SUPERVISOR, 1, b"\2")  # the Crazyflie's, after a crash
+    assert after(flying, 11_000)[1] is Cause.LOW_BATTERY
+    flying.write(flying.toc(PARAM), "floaty.stop", 0)
     assert after(flying, 11_000)[0] is State.FLYING
     assert after(flying, 1_000_000)[0] is State.FLYING
-
-
-def test_recovery_is_refused_while_the_battery_is_low(flying: CrtpClient) -> None:
-    flying.battery_mv = 3100
-    assert after(flying, 5_300_000)[1] is Cause.LOW_BATTERY
-    assert flying.one(SUPERVISOR, 1, b"\2") == b"\x82\0\0"
 
 
 def test_a_bounded_estimator_is_a_failsafe_until_half_a_second_after_it_returns(flying: CrtpClient) -> None:
@@ -488,16 +416,12 @@ def test_a_bounded_estimator_is_a_failsafe_until_half_a_second_after_it_returns(
 
 def test_state_and_cause_are_log_variables(flying: CrtpClient) -> None:
     table = flying.toc(LOG)
-    assert flying.log(table, "supervisor.state", "supervisor.cause", "sys.canfly", "sys.isFlying") == [
-        2,
-        0,
-        1,
-        1,
-    ]
-    stop(flying)
-    flying.run(flying.now_us + 20_000)
     names = ("supervisor.state", "supervisor.cause", "sys.canfly", "sys.isFlying", "supervisor.info")
-    assert flying.log(table, *names) == [3, 3, 0, 0, 0b10_0100_0110]
+    # With corrections the Crazyflie's supervisor sees no flight.
+    assert flying.log(table, *names) == [2, 0, 1, 0, 0b10_0000_1110]
+    stop(flying)
+    flying.run(flying.now_us + 150_000)
+    assert flying.log(table, *names) == [3, 3, 0, 0, 0b10_0100_0100]
 
 
 def test_flaps_are_written_in_every_supervisor_state(flying: CrtpClient) -> None:

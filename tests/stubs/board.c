@@ -15,6 +15,7 @@
 #include "cfassert.h"
 #include "crc32.h"
 #include "crtp.h"
+#include "crtp_commander_high_level.h"
 #include "crtp_supervisor.h"
 #include "debug.h"
 #include "estimator.h"
@@ -38,6 +39,7 @@ uint64_t stub_usec_reset_us; /* when usec.reset was written */
 TickType_t stub_first_tick;
 int32_t stub_gyro[3];
 float stub_battery = 3.9f;
+int32_t stub_armed = 1, stub_can_arm, stub_can_fly = 1, stub_planner; /* of the firmware's supervisor and commander */
 int32_t stub_locked, stub_stop_requested, stub_watchdog_fed;
 int32_t stub_gyro_known = 1;
 int32_t stub_sensors = SensorImplementation_bmi088_bmp3xx;
@@ -56,6 +58,16 @@ uint64_t usecTimestamp(void) { return stub_now_us - stub_usec_reset_us; }
 TickType_t xTaskGetTickCount(void) { return stub_first_tick + (TickType_t)(stub_now_us / 1000); }
 float pmGetBatteryVoltage(void) { return stub_battery; }
 bool supervisorIsLocked() { return stub_locked != 0; }
+bool supervisorIsArmed() { return stub_armed != 0; }
+bool supervisorCanArm() { return stub_can_arm != 0; }
+bool supervisorCanFly() { return stub_can_fly != 0; }
+bool supervisorRequestArming(const bool armed) {
+  stub_armed = armed && (stub_armed || stub_can_arm);
+  return stub_armed == armed;
+}
+enum trajectory_state crtpCommanderHighLevelGetPlannerState() { return (enum trajectory_state)stub_planner; }
+int crtpCommanderHighLevelStop() { return stub_planner = 0; }
+void vPortYield(void) {}
 void crtpSupervisorSetEmergencyStop(void) { stub_stop_requested = 1; }
 void crtpSupervisorNotifyEmergencyStopWatchdog(void) { stub_watchdog_fed += 1; }
 bool crtpSupervisorIsEmergencyStopRequested(void) { return stub_stop_requested != 0; }
@@ -208,6 +220,17 @@ static TaskFunction_t app_task;
 
 void crtpRegisterPortCB(int port, CrtpCallback cb) { callbacks[port] = cb; }
 
+/* The last packet, which waits for the task of its port unless it is taken back. */
+static CRTPPacket waiting;
+int32_t stub_waits;
+
+int crtpReceivePacket(CRTPPort port, CRTPPacket *packet) {
+  const bool there = stub_waits && waiting.port == port;
+  *packet = waiting;
+  stub_waits = stub_waits && !there;
+  return there ? pdTRUE : pdFALSE;
+}
+
 void stub_radio(int port, int channel, const uint8_t *data, int length) {
   CRTPPacket packet;
   memset(&packet, 0, sizeof packet);
@@ -215,6 +238,8 @@ void stub_radio(int port, int channel, const uint8_t *data, int length) {
   packet.port = (uint8_t)(port & 15);
   packet.channel = (uint8_t)(channel & 3);
   memcpy(packet.data, data, (size_t)length);
+  waiting = packet;
+  stub_waits = 1;
   if (callbacks[port]) {
     callbacks[port](&packet);
   }

@@ -2,7 +2,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 #define CRTP_MAX_DATA_SIZE 30
-enum { CRTP_PORT_LOCALIZATION = 0x06 };
+typedef enum { CRTP_PORT_LOCALIZATION = 0x06, CRTP_PORT_SETPOINT_HL = 0x08 } CRTPPort;
 typedef struct {
   uint8_t size; /* of data */
   union {
@@ -18,4 +18,5 @@ typedef struct {
 typedef void (*CrtpCallback)(CRTPPacket *);
 void crtpRegisterPortCB(int, CrtpCallback);
 int crtpSendPacket(CRTPPacket *);
+int crtpReceivePacket(CRTPPort, CRTPPacket *);
 bool crtpIsConnected(void);

@@ -18,6 +18,7 @@
 #include "controller.h"
 #include "crc32.h"
 #include "crtp.h"
+#include "crtp_commander_high_level.h"
 #include "crtp_supervisor.h"
 #include "debug.h"
 #include "estimator.h"
@@ -25,6 +26,7 @@
 #include "motors.h"
 #include "param.h"
 #include "param_task.h"
+#include "planner.h"
 #include "platform.h"
 #include "pm.h"
 #include "power_distribution.h"
@@ -63,6 +65,8 @@ TYPE(xQueueCreateStatic(1, 1, NULL, NULL), QueueHandle_t)
 TYPE(xQueueSend(NULL, NULL, 0), BaseType_t)
 FUNCTION(xTaskGetTickCount, TickType_t, void)
 FUNCTION(vTaskDelay, void, TickType_t)
+FUNCTION(vPortYield, void, void)
+TYPE(taskYIELD(), void)
 FUNCTION(vTaskSuspendAll, void, void)
 FUNCTION(xTaskResumeAll, BaseType_t, void)
 FUNCTION(xTaskCreateStatic, TaskHandle_t, TaskFunction_t, const char *, uint32_t, void *, UBaseType_t, StackType_t *,
@@ -87,6 +91,8 @@ VALUE(APPCHANNEL_MTU, 30)
 FUNCTION(appchannelReceiveDataPacket, size_t, void *, size_t, int)
 VALUE(CRTP_MAX_DATA_SIZE, 30)
 VALUE(CRTP_PORT_LOCALIZATION, 6)
+VALUE(CRTP_PORT_SETPOINT_HL, 8)
+FUNCTION(crtpReceivePacket, int, CRTPPort, CRTPPacket *)
 SIZE(CRTPPacket, 32)
 FIELD(CRTPPacket, size, uint8_t, 0)
 FIELD(CRTPPacket, header, uint8_t, 1)
@@ -101,6 +107,16 @@ FUNCTION(eprintf, int, int (*)(int), const char *, ...)
 TYPE(DEBUG_PRINT("%s %d\n", "", 0), int)
 FUNCTION(pmGetBatteryVoltage, float, void)
 FUNCTION(supervisorIsLocked, bool, void)
+FUNCTION(supervisorIsArmed, bool, void)
+FUNCTION(supervisorCanArm, bool, void)
+FUNCTION(supervisorCanFly, bool, void)
+FUNCTION(supervisorRequestArming, bool, const bool)
+FUNCTION(crtpCommanderHighLevelGetPlannerState, enum trajectory_state, void)
+FUNCTION(crtpCommanderHighLevelStop, int, void)
+VALUE(TRAJECTORY_STATE_IDLE, 0)
+VALUE(TRAJECTORY_STATE_FLYING, 1)
+VALUE(TRAJECTORY_STATE_LANDING, 3)
+VALUE(TRAJECTORY_STATE_DISABLED, 4)
 FUNCTION(usecTimestamp, uint64_t, void)
 
 /* autoconf.h, estimator.h, controller.h, stabilizer_types.h */

@@ -220,12 +220,12 @@ def record_plausible(seed: int, ticks: int) -> Recording:
         fields.tick, fields.now_us = tick, 1000 * tick
         fields.gyro[:] = rng.normal(0, 300, 3)
         fields.battery_mv, fields.manual_mode = rng.integers(3000, 4000), rng.choice(3, p=[0.8, 0.1, 0.1])
-        fields.idle, fields.connected, fields.by_words = rng.random(3) < 0.1
+        fields.connected, fields.by_words = rng.random(2) < 0.1
         fields.words[:] = rng.integers(65536, size=4)
         fields.poses_absolute, fields.setpoint_kind = rng.random() < 0.5, rng.integers(5)
-        fields.goal_kind = rng.integers(3)
+        fields.goal_kind = rng.integers(4)
         fields.goal[:], fields.setpoint[:] = rng.normal(0, 0.3, (2, 4))
-        fields.request = rng.integers(7)
+        fields.request = rng.integers(6)
         calls = ["begin_step", "take_sample", "estimate", "supervise", "control"]
         calls += ["admits", "follow"]
         calls += ["request"] if rng.random() < 0.02 else []

@@ -2,7 +2,6 @@
 
 from firmware_py.config import parameters_of
 from firmware_py.core_runner import CoreBlocks, PythonRunner, RunnerFactory
-from firmware_py.pilot import Pilot
 from firmware_py.supervisor import CoreSupervisor, wrapped
 from firmware_py.wire.supervisor import Cause, State
 from hil.config import load_config
@@ -19,8 +18,8 @@ class SupervisorBench:
         self.core.run.call("reset")
         for _ in range(20):  # until a pose can belong to the past
             self.core.run.call("estimate")
-        self.pilot, self.connected = Pilot(self.core), True
-        self.view = CoreSupervisor(self.core, lambda text: None, self.pilot, lambda: self.connected)
+        self.connected = True
+        self.view = CoreSupervisor(self.core, lambda text: None, lambda: self.connected)
         self.data, self.parameters = self.core.data.fields, self.core.parameters.fields
         self.now_us = now_us
         self.data.battery_mv = FULL_MV

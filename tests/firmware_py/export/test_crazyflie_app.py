@@ -894,8 +894,8 @@ def test_the_app_compiles_with_the_crazyflies_flags_and_fits(arm_build: Path) ->
         for name in ("estimatorOutOfTree", "controllerOutOfTree", "app_task", "appInit", "receive")
     }
     print(f"flash {text + data} B, RAM {data + bss} B, stack {stack} B")
-    assert text + data < 27_500
-    assert data + bss < 16_000  # a core that flies, one for the port
+    assert text + data < 29_000
+    assert data + bss < 16_500  # a core that flies, one for the port
     assert "ccm" not in sections.lower()
     assert max(stack.values()) < STABILIZER_STACK // 2
 

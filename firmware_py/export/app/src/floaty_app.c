@@ -24,11 +24,13 @@
 
 #include "controller.h"
 #include "crtp.h"
+#include "crtp_commander_high_level.h"
 #include "crtp_supervisor.h"
 #include "debug.h"
 #include "estimator.h"
 #include "log.h"
 #include "motors.h"
+#include "planner.h"
 #include "platform.h"
 #include "pm.h"
 #include "power_distribution.h"
@@ -51,7 +53,7 @@ FloatySampling floaty_sampling;
 FloatySupervisor floaty_supervisor;
 FloatyReport floaty_report;
 FloatyObserved floaty_observed;
-volatile bool floaty_requests[FLOATY_REQUEST_FEED];
+volatile bool floaty_requests[FLOATY_REQUEST_DISARM + 1];
 
 static logVarId_t gyro_raw[3];
 static bool gyro_found;
@@ -102,6 +104,33 @@ int32_t floaty_loop_us(void) {
 }
 
 /* The estimator, in the stabilizer task */
+
+/* Disarm and arm together with the firmware's supervisor, which arms itself: a client's disarming lasts until it arms. */
+static void match_arming(void) {
+  static bool held, waits; /* the firmware's supervisor is kept disarmed, and waits for the request to arm */
+  const bool armed = supervisorIsArmed();
+  if (floaty_supervisor.armed && armed) {
+    held = false;
+  } else if (floaty_supervisor.armed && held) {
+    supervisorRequestArming(true);
+  } else if (floaty_supervisor.armed && (supervisorCanFly() || supervisorCanArm())) {
+    request(FLOATY_REQUEST_DISARM);
+  } else if (armed && waits) {
+    request(FLOATY_REQUEST_ARM);
+  }
+  if (!floaty_supervisor.armed) {
+    supervisorRequestArming(false);
+    held = true;
+    waits = supervisorCanArm();
+  }
+}
+
+/* A path that gives no position silences the firmware's commander, which would lock the board: end it. */
+static void end_silent_path(void) {
+  if (crtpCommanderHighLevelGetPlannerState() == TRAJECTORY_STATE_DISABLED) {
+    crtpCommanderHighLevelStop();
+  }
+}
 
 static bool take_request(int32_t wanted) {
   const bool was = floaty_requests[wanted];
@@ -194,6 +223,8 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
   if (!gyro_found) {
     return; /* without a gyro Floaty stays calibrating, flaps at hover */
   }
+  match_arming();
+  end_silent_path();
   if (floaty_hil_switched()) {
     restart();
   }
@@ -239,6 +270,10 @@ static void read_setpoint(const setpoint_t *setpoint) {
   float yaw = mode->yaw == modeAbs ? RADIANS * setpoint->attitude.yaw : NAN;
   if (mode->quat == modeAbs) {
     yaw = atan2f(2.0f * (q->w * q->z + q->x * q->y), q->w * q->w + q->x * q->x - q->y * q->y - q->z * q->z);
+  }
+  if (place) {
+    memcpy(floaty_commanded, (float[4]){setpoint->position.x, setpoint->position.y, setpoint->position.z, yaw},
+           sizeof floaty_commanded);
   }
   floaty_input.setpoint_kind = place ? FLOATY_SETPOINT_POSITION : any ? FLOATY_SETPOINT_OTHER : FLOATY_SETPOINT_NONE;
   memcpy(floaty_input.setpoint, (float[4]){setpoint->position.x, setpoint->position.y, setpoint->position.z, yaw},

@@ -35,7 +35,7 @@ extern FloatyObserved floaty_observed;
 
 /* Requests of other tasks to the stabilizer task, the only one that calls the flying core: by FLOATY_REQUEST_... */
 #define FLOATY_RESET 0 /* restart the estimator */
-extern volatile bool floaty_requests[FLOATY_REQUEST_FEED];
+extern volatile bool floaty_requests[FLOATY_REQUEST_DISARM + 1];
 
 /* floaty_app.c: set up the core and start the servo pulses, at hover. The first call of all. */
 void floaty_begin(void);
@@ -60,6 +60,10 @@ void floaty_toc_apply(void);
 
 /* floaty_toc.c: print the parameters that differ from the profile on the console. */
 void floaty_toc_report(void);
+
+/* floaty_commands.c: refuse high-level commands that cannot be flown, from now on. */
+void floaty_commands_init(void);
+extern float floaty_commanded[4]; /* last position of the firmware's commander, x y z [m], and yaw [rad] */
 
 /* floaty_servos.c: four outputs at 400 Hz; one count is 1/21 us, a pulse 21000..42000, the period 52501. They start with these
  * pulses; new counts act from the next period on. */

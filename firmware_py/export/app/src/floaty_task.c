@@ -134,6 +134,7 @@ static void app_task(void *unused) {
 
   wait_for_self_test();
   crtpRegisterPortCB(CRTP_PORT_LOCALIZATION, receive_localisation);
+  floaty_commands_init();
   floaty_port_init();
   DEBUG_PRINT("core %s, profile %s %s\n", FLOATY_CORE_VERSION, FLOATY_PROFILE_NAME, floaty_profile_hash);
   floaty_toc_report();

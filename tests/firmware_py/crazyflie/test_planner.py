@@ -9,7 +9,19 @@ from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 from scipy.interpolate import BPoly
 
-from firmware_py.planner import Path, PathPoint, Phase, Piece, Planner, between, bezier, go_to, straight_up
+from firmware_py.crazyflie.planner import (
+    Path,
+    PathPoint,
+    Phase,
+    Piece,
+    Planner,
+    Spiral,
+    between,
+    bezier,
+    go_to,
+    spiral,
+    straight_up,
+)
 
 NUMBERS = st.floats(-2.0, 2.0)
 VECTORS = st.tuples(NUMBERS, NUMBERS, NUMBERS)
@@ -96,21 +108,52 @@ def test_a_slower_path_is_the_same_path_and_a_reversed_one_runs_back(timescale: 
 
 
 @pytest.mark.parametrize("reverse", [False, True])
-def test_a_relative_path_begins_where_the_robot_is_and_turns_with_it(reverse: bool) -> None:
+def test_a_relative_path_begins_where_the_robot_is(reverse: bool) -> None:
     path = Path(wavy().pieces, 1.0, reverse)
-    begin = path.at(0.0)
-    moved = path.begun_at((1.0, 2.0, 3.0), None)
-    turned = path.begun_at((1.0, 2.0, 3.0), begin.yaw + 0.5 * pi)
+    begin, moved = path.at(0.0), path.begun_at((1.0, 2.0, 3.0), None)
     assert moved.at(0.0).position == pytest.approx((1.0, 2.0, 3.0))
     assert moved.at(0.0).yaw == pytest.approx(begin.yaw)
-    assert turned.at(0.0).position == pytest.approx((1.0, 2.0, 3.0))
-    there, here, here_turned = path.at(0.8), moved.at(0.8), turned.at(0.8)
-    offset = np.array(there.position) - begin.position
-    assert np.array(here.position) - (1, 2, 3) == pytest.approx(offset)
-    assert np.array(here_turned.position) - (1, 2, 3) == pytest.approx([-offset[1], offset[0], offset[2]])
-    assert here_turned.yaw == pytest.approx(there.yaw + 0.5 * pi)
+    offset = np.array(path.at(0.8).position) - begin.position
+    assert np.array(moved.at(0.8).position) - (1, 2, 3) == pytest.approx(offset)
+
+
+def test_a_turned_path_turns_about_its_origin_and_a_reversed_one_does_not_turn() -> None:
+    path, here = wavy(), (1.0, 2.0, 3.0)
+    begin, there = path.at(0.0), path.at(0.8)
+    turned = path.begun_at(here, begin.yaw + 0.5 * pi).at(0.8)
+    x, y, z = there.position
+    assert turned.position == pytest.approx(np.array((-y, x, z)) + here - begin.position)
+    assert turned.yaw == pytest.approx(there.yaw + 0.5 * pi)
     x, y, z = there.velocity
-    assert here_turned.velocity == pytest.approx((-y, x, z))
+    assert turned.velocity == pytest.approx((-y, x, z))
+    back = Path(path.pieces, reverse=True)
+    assert back.begun_at(here, 2.0).at(0.8).position == pytest.approx(
+        back.begun_at(here, None).at(0.8).position
+    )
+
+
+@pytest.mark.parametrize("sideways", [False, True])
+@pytest.mark.parametrize("clockwise", [False, True])
+def test_a_spiral_s_ends_are_on_circles_about_one_centre(sideways: bool, clockwise: bool) -> None:
+    wish = Spiral(sideways, clockwise, 1.2, 0.3, 0.5, 0.4, 2.0)
+    begin = PathPoint((0.2, -0.1, 1.0), 0.7)
+    path = spiral(begin, wish)
+    first, last = path.at(0.0), path.at(2.0 - 1e-9)
+    turn = -1.2 if clockwise else 1.2
+    assert last.yaw - first.yaw == pytest.approx(turn, abs=1e-6)
+    assert last.position[2] == pytest.approx(1.4, abs=1e-6)
+    sense, aside = (1.0 if clockwise else -1.0), (0.0 if sideways else -0.5 * pi)
+    ahead = np.array([(np.cos(m.yaw + aside), np.sin(m.yaw + aside)) for m in (first, last)])
+    centres = [
+        np.array(m.position[:2]) + sense * r * a
+        for m, r, a in zip((first, last), (0.3, 0.5), ahead, strict=True)
+    ]
+    assert centres[0] == pytest.approx(centres[1], abs=1e-6)
+    for motion, radius, a in zip((first, last), (0.3, 0.5), ahead, strict=True):
+        radial = -sense * a
+        assert np.dot(motion.velocity[:2], radial) == pytest.approx(0.1, abs=1e-6)  # (0.5 - 0.3) m in 2 s
+        tangential = radius * turn / 2.0
+        assert np.dot(motion.velocity[:2], (-radial[1], radial[0])) == pytest.approx(tangential, abs=1e-6)
 
 
 def test_up_and_down_keep_the_place_and_turn_on_the_shorter_side() -> None:
@@ -152,11 +195,15 @@ def test_going_there_is_absolute_or_relative_smooth_or_straight() -> None:
 
 def test_a_landing_ends_idle_and_everything_else_goes_on() -> None:
     planner = Planner()
-    assert planner.phase(0) is Phase.IDLE
-    planner.follow(straight_up(REST, 1.0, 0.0, 2.0), 1_000_000)
-    assert planner.phase(9_000_000) is Phase.FLYING
-    assert planner.at(9_000_000).position[2] == pytest.approx(1.0)
-    assert planner.at(0).position == pytest.approx(REST.position)  # a pose from before the begin
-    planner.follow(straight_up(planner.at(9_000_000), 0.2, 0.0, 2.0), 9_000_000, landing=True)
-    assert planner.phase(10_999_999) is Phase.LANDING
-    assert planner.phase(11_000_000) is Phase.IDLE
+    assert planner.rests
+    assert planner.goal(0.0) is None
+    planner.follow(straight_up(REST, 1.0, 0.0, 2.0), 1.0)
+    goal = planner.goal(9.0)
+    assert planner.phase is Phase.FLYING
+    assert goal is not None
+    assert goal.position[2] == pytest.approx(1.0)
+    planner.follow(straight_up(goal, 0.2, 0.0, 2.0), 9.0, landing=True)
+    assert planner.goal(10.999) is not None
+    assert planner.phase is Phase.LANDING
+    assert planner.goal(11.0) is None
+    assert planner.phase is Phase.IDLE

@@ -1,16 +1,16 @@
-"""The planner behind the high-level commander: from "take off", "go to" or a stored trajectory to goals over time.
+"""The planner behind the high-level commander (planner.c, pptraj.c): from "go to" or a trajectory to goals over time.
 
 A path is a sequence of pieces, each a polynomial of 7th degree in time for x, y, z and yaw. Between two states of motion it
 is the one whose jerk is zero at both ends. Positions in the frame of the external poses [m], angles in rad, times in seconds
 from the beginning of the path. Only + - * / in a fixed order, and the functions of `elementary`: the same bits everywhere.
-Meaning of the commands: crazyflie-firmware 2a18fc29 (crtp_commander_high_level.c, planner.c).
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum, auto
-from math import comb
+from math import comb, pi, tau
 
+from firmware_py.elementary import cos, sin
 from firmware_py.geometry import Vector, rotate, wrap_angle, yaw_quaternion
 
 AXES = 4  # x, y, z, yaw
@@ -40,12 +40,15 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """Pieces one after the other, slower by `timescale`, perhaps reversed, or turned and moved to another starting point."""
+    """Pieces one after the other, slower by `timescale`, perhaps reversed, and moved.
+
+    As in the firmware, `turn` is about the pieces' origin, not about their beginning, and a reversed path is not turned.
+    """
 
     pieces: tuple[Piece, ...]
     timescale: float = 1.0
     reverse: bool = False
-    turn: float = 0.0  # about the path's starting point, then
+    turn: float = 0.0
     shift: Vector = (0.0, 0.0, 0.0)
 
     @property
@@ -75,78 +78,71 @@ class Path:
             t += piece.duration
         yield self.at(self.duration).position
 
+    def begun_at(self, position: Vector, yaw: float | None) -> "Path":
+        """Return the same path, shifted as if it were not turned, and turned if a yaw is given."""
+        begin = self.at(0.0)
+        turn = 0.0 if yaw is None else wrap_angle(yaw - begin.yaw)
+        return replace(self, turn=turn, shift=_sum(position, _scaled(begin.position, -1.0)))
+
     def _placed(self, motion: PathPoint) -> PathPoint:
-        if self.turn == 0.0:
+        if self.turn == 0.0 or self.reverse:
             return replace(motion, position=_sum(motion.position, self.shift))
-        first, q = self._first(), yaw_quaternion(self.turn)
-        offset = rotate(q, _sum(motion.position, _scaled(first, -1.0)))
+        q = yaw_quaternion(self.turn)
         return PathPoint(
-            _sum(_sum(first, offset), self.shift),
+            _sum(rotate(q, motion.position), self.shift),
             motion.yaw + self.turn,
             rotate(q, motion.velocity),
             rotate(q, motion.acceleration),
             motion.yaw_rate,
         )
 
-    def _first(self) -> Vector:
-        """Return where the pieces begin, or end when they are flown backwards."""
-        t = sum(piece.duration for piece in self.pieces) if self.reverse else 0.0
-        return _evaluate(*_find(self.pieces, t)).position
-
-    def begun_at(self, position: Vector, yaw: float | None) -> "Path":
-        """Return the same path, moved to begin at a position and, if it is given, with a yaw."""
-        begin = self.at(0.0)
-        turn = 0.0 if yaw is None else wrap_angle(yaw - begin.yaw)
-        return replace(self, turn=turn, shift=_sum(position, _scaled(begin.position, -1.0)))
-
 
 class Phase(IntEnum):
     """The planner's activity."""
 
-    IDLE = auto()
+    IDLE = auto()  # the null set-point
     FLYING = auto()
     LANDING = auto()
+    DISABLED = auto()  # no set-points, after a path that gave none
 
 
 class Planner:
-    """Holds the path in force; instants are the board's time in us."""
+    """Holds the path in force; times are in seconds."""
 
     def __init__(self) -> None:
-        self._phase = Phase.IDLE
-        self._path = Path(())
-        self._begin_us = 0
+        self.phase = Phase.IDLE
+        self._path: Path | None = None
+        self._begin = 0.0
 
-    def phase(self, now_us: int) -> Phase:
-        """Return the present phase; the end of a landing is the end of the flight."""
-        if self._phase is Phase.LANDING and self._time(now_us) >= self._path.duration:
-            self._phase = Phase.IDLE
-        return self._phase
+    @property
+    def rests(self) -> bool:
+        """Whether no path is in force."""
+        return self.phase in (Phase.IDLE, Phase.DISABLED)
 
-    def finished(self, now_us: int) -> bool:
-        """Return whether the path is over."""
-        return self.phase(now_us) is Phase.IDLE or self._time(now_us) >= self._path.duration
+    def finished(self, t: float) -> bool:
+        """Return whether the last path is over."""
+        return self._path is None or t - self._begin >= self._path.duration
 
-    def at(self, t_us: int) -> PathPoint:
-        """Return the goal at an instant; call it only while not idle."""
-        return self._path.at(self._time(t_us))
+    def goal(self, t: float) -> PathPoint | None:
+        """Return the goal at a time, None without one; the end of a landing is the end of the flight."""
+        if self.phase is Phase.LANDING and self.finished(t):
+            self.phase = Phase.IDLE
+        if self._path is None or self.rests:
+            return None
+        return self._path.at(t - self._begin)
 
     def stop(self) -> None:
-        """End the flight at the present position."""
-        self._phase = Phase.IDLE
+        """End the flight."""
+        self.phase = Phase.IDLE
 
-    def follow(self, path: Path, now_us: int, landing: bool = False) -> None:
+    def disable(self) -> None:
+        """Give no more set-points, not even the null one."""
+        self.phase = Phase.DISABLED
+
+    def follow(self, path: Path, t: float, landing: bool = False) -> None:
         """Start a path now."""
-        self._path, self._begin_us = path, now_us
-        self._phase = Phase.LANDING if landing else Phase.FLYING
-
-    def _time(self, t_us: int) -> float:
-        return (t_us - self._begin_us) * 1e-6
-
-
-def stay(position: Vector, yaw: float) -> Path:
-    """Return the endless path at a position."""
-    x, y, z = position
-    return Path((Piece(0.0, ((x,), (y,), (z,), (yaw,))),))
+        self._path, self._begin = path, t
+        self.phase = Phase.LANDING if landing else Phase.FLYING
 
 
 def straight_up(begin: PathPoint, height: float, yaw: float, duration: float) -> Path:
@@ -173,6 +169,52 @@ def go_to(
         begin = PathPoint(begin.position, begin.yaw, velocity, (0.0, 0.0, 0.0), rate)
         end = PathPoint(end.position, end.yaw, velocity, (0.0, 0.0, 0.0), rate)
     return between(begin, end, duration)
+
+
+@dataclass(frozen=True, slots=True)
+class Spiral:
+    """A turn by `angle` about a centre beside the robot or, `sideways`, before it, from a first radius to a last."""
+
+    sideways: bool
+    clockwise: bool
+    angle: float  # [rad], at most one turn either way
+    first_radius: float  # [m]
+    last_radius: float
+    ascent: float  # [m]
+    duration: float  # [s]
+
+
+def spiral(begin: PathPoint, wish: Spiral) -> Path:
+    """Return one piece that begins and ends with the motion of a spiral; `duration` is above 0."""
+    sense = 1.0 if wish.clockwise else -1.0
+    angle = min(max(wish.angle, -tau), tau)
+    r0, r1 = max(wish.first_radius, 0.0), max(wish.last_radius, 0.0)
+    turn = -sense * angle  # of the yaw
+    rate, growth = turn / wish.duration, (r1 - r0) / wish.duration
+    climb = wish.ascent / wish.duration
+    # The centre is seen from the robot along the yaw (sideways) or a quarter turn to the right of it.
+    aside = 0.0 if wish.sideways else -pi / 2
+
+    def motion(yaw: float, radius: float) -> tuple[Vector, Vector, Vector]:
+        """Return position relative to the centre, velocity and acceleration."""
+        c, s = -sense * cos(yaw + aside), -sense * sin(yaw + aside)
+        return (
+            (radius * c, radius * s, 0.0),
+            (growth * c - radius * rate * s, growth * s + radius * rate * c, climb),
+            (
+                -radius * rate * rate * c - 2.0 * growth * rate * s,
+                -radius * rate * rate * s + 2.0 * growth * rate * c,
+                0.0,
+            ),
+        )
+
+    (p0, v0, a0), (p1, v1, a1) = motion(begin.yaw, r0), motion(begin.yaw + turn, r1)
+    end = _sum(_sum(begin.position, _scaled(p0, -1.0)), (p1[0], p1[1], wish.ascent))
+    return between(
+        PathPoint(begin.position, begin.yaw, v0, a0, rate),
+        PathPoint(end, begin.yaw + turn, v1, a1, rate),
+        wish.duration,
+    )
 
 
 def between(begin: PathPoint, end: PathPoint, duration: float) -> Path:

@@ -1,0 +1,164 @@
+"""The laws of the services, each once: a client sees the same on the firmware in Python and on the flashed image.
+
+The referee is the exported app in crazyflie-firmware 2a18fc29, and that firmware alone for what is its own. Its answers are
+recorded in `tests/vectors/services` (`tools/record_services.py`); with FLOATY_CF2_ELF and FLOATY_STOCK_ELF the images
+themselves are asked.
+"""
+
+import json
+import os
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hil.deploy.service_programs import PROGRAMS, STOCK
+from hil.deploy.services import Answers, ServiceBench, differences, play, play_in_a_copy
+from hil.devices.board_firmware import PythonBoard
+from support.paths import TESTS
+
+ELF, STOCK_ELF = (os.environ.get(name, "") for name in ("FLOATY_CF2_ELF", "FLOATY_STOCK_ELF"))
+# Of each kind the programs that differ most; the others are long.
+FAST = (
+    "a command without the notice has no effect and the board locks",
+    "with the notice the command is flown",
+    "one hover set-point in a flight locks the board",
+    "a program that ends in the air",
+    "a spiral to the left",
+    "numbers that are not finite are refused and the flight goes on",
+    "goals outside the box are refused",
+    "a turned trajectory turns about its origin",
+    "there are 31 definitions",
+    "a compressed trajectory is neither scaled nor reversed",
+    "disarming in flight stops the robot until it is armed",
+    "disarming by the parameter",
+    "poses that stay away end the flight for the commander",
+    "with corrections nothing is followed",
+)
+
+
+@cache
+def recorded(name: str) -> dict[str, Answers]:
+    """The referee's answers by program; a program that has changed since has none."""
+    entries = json.loads((TESTS / "vectors" / "services" / f"{name}.json").read_text())
+    return {
+        program: Answers(
+            entry["answers"], [tuple(1e-3 * part for part in place) for place in entry["path_mm"]]
+        )
+        for program, entry in entries.items()
+        if entry["program"] == PROGRAMS.get(program)
+    }
+
+
+def booted(elf: str) -> ServiceBench:
+    pytest.importorskip("unicorn")
+    pytest.importorskip("cffi")
+    from hil.devices.image_firmware import ChipImage
+    from support.stm32_firmware import BUILD
+
+    return ServiceBench(ChipImage.load(Path(elf), None, BUILD))
+
+
+@pytest.fixture(scope="module")
+def app() -> ServiceBench:
+    if not ELF:
+        pytest.skip("FLOATY_CF2_ELF names no build of the Crazyflie firmware with the exported app")
+    return booted(ELF)
+
+
+@pytest.fixture(scope="module")
+def stock() -> ServiceBench:
+    if not STOCK_ELF:
+        pytest.skip("FLOATY_STOCK_ELF names no build of the Crazyflie firmware")
+    return booted(STOCK_ELF)
+
+
+def test_every_program_has_the_answers_of_its_referee() -> None:
+    assert set(recorded("app")) == set(PROGRAMS)
+    assert set(recorded("stock")) == STOCK
+    assert set(FAST) < set(PROGRAMS)
+
+
+@pytest.mark.parametrize("name", FAST)
+def test_the_python_board_answers_as_the_image(name: str) -> None:
+    assert list(differences(recorded("app")[name], play(PythonBoard(), PROGRAMS[name]))) == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", sorted(set(PROGRAMS) - set(FAST)))
+def test_the_python_board_answers_as_the_image_in_all_programs(name: str) -> None:
+    assert list(differences(recorded("app")[name], play(PythonBoard(), PROGRAMS[name]))) == []
+
+
+@pytest.mark.parametrize("name", sorted(STOCK))
+def test_where_the_law_is_the_firmware_s_own_the_app_changes_nothing(name: str) -> None:
+    ours = Answers(recorded("app")[name].lines)
+    ours.lines = [line.removesuffix(" flying none") for line in ours.lines]
+    assert list(differences(recorded("stock")[name], ours)) == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_the_image_answers_as_recorded(app: ServiceBench, name: str) -> None:
+    assert list(differences(recorded("app")[name], play_in_a_copy(app, PROGRAMS[name]))) == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", sorted(STOCK))
+def test_the_stock_image_answers_as_recorded(stock: ServiceBench, name: str) -> None:
+    assert list(differences(recorded("stock")[name], play_in_a_copy(stock, PROGRAMS[name]))) == []
+
+
+# Generated programs
+
+COORDINATES = st.sampled_from((-0.1, -0.05, 0.0, 0.05, 0.1))
+HEIGHTS = st.sampled_from((0.9, 1.0, 1.1, 1.2))
+# Not near the supervisor's limits of 0.5, 2 and 3 s: it looks every 40 ms.
+PAUSES = st.sampled_from((0.2, 0.3, 0.8, 1.2, 2.4))
+
+
+def line(form: str, *numbers: st.SearchStrategy[float]) -> st.SearchStrategy[str]:
+    return st.tuples(*numbers).map(lambda values: form.format(*values))
+
+
+REQUESTS = st.one_of(
+    line("takeoff {} 0.8", HEIGHTS),
+    line("goto {} {} {} 0 0.8", COORDINATES, COORDINATES, HEIGHTS),
+    line("goto {} {} 0 0 0.8 relative", COORDINATES, COORDINATES),
+    line("stream position {} {} {} 0 0.3", COORDINATES, COORDINATES, HEIGHTS),
+    line("land {} 0.8", HEIGHTS),
+    line("wait {}", PAUSES),
+    st.sampled_from(
+        ("notify", "stop", "disarm", "arm", "recover", "disconnect", "setpoint hover 0 0 0 1.1", "look")
+    ),
+)
+GENERATED = st.lists(REQUESTS, min_size=10, max_size=25).map("\n".join)
+
+
+def bits_of(answer: str) -> tuple[int, Sequence[str]]:
+    words = answer.split()
+    return int(words[words.index("bits") + 1], 16), words
+
+
+@settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
+@given(GENERATED)
+def test_bits_and_states_fit_together_whatever_a_client_does(program: str) -> None:
+    answers = play(PythonBoard(), program)
+    was_locked = False
+    for answer in (line for line in answers.lines if "bits" in line):
+        bits, words = bits_of(answer)
+        armed, can_fly, flies, locked = (bool(bits >> bit & 1) for bit in (1, 3, 4, 6))
+        assert can_fly >= flies
+        assert locked or not was_locked
+        assert ("failsafe" in words) >= (locked or not armed)
+        was_locked = locked
+
+
+@pytest.mark.long
+@settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
+@given(GENERATED)
+def test_both_boards_end_in_the_same_state_on_the_same_path(app: ServiceBench, program: str) -> None:
+    assert list(differences(play_in_a_copy(app, program), play(PythonBoard(), program))) == []

@@ -1,0 +1,4 @@
+#pragma once
+#include "planner.h"
+enum trajectory_state crtpCommanderHighLevelGetPlannerState();
+int crtpCommanderHighLevelStop();

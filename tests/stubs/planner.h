@@ -1,0 +1,7 @@
+#pragma once
+enum trajectory_state {
+  TRAJECTORY_STATE_IDLE = 0,
+  TRAJECTORY_STATE_FLYING = 1,
+  TRAJECTORY_STATE_LANDING = 3,
+  TRAJECTORY_STATE_DISABLED = 4,
+};
