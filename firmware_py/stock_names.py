@@ -83,7 +83,7 @@ SETTINGS = (
     InertGroup("velCtlPid.vxKp vxKi vxKd vxKFF", F32, (25, 1, 0, 0), True),
     InertGroup("velCtlPid.vyKp vyKi vyKd vyKFF", F32, (25, 1, 0, 0), True),
     InertGroup("velCtlPid.vzKp vzKi vzKd", F32, (25, 15, 0), True),
-    InertGroup("ring.effect", U8, (0,), True),
+    InertGroup("ring.effect", U8, (6,), True),
     InertGroup("ring.fadeColor", U32, (0,)),
     InertGroup("ring.fadeTime", F32, (0.5,), unit="s"),
     InertGroup("ring.headlightEnable", U8, (0,)),

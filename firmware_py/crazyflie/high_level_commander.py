@@ -25,7 +25,6 @@ from firmware_py.wire.high_level import (
     Define,
     Fields,
     GoTo,
-    Groups,
     PathCommand,
     SpiralFields,
     Start,
@@ -108,29 +107,44 @@ class HighLevelCommander:
         if command is PathCommand.SET_GROUP_MASK:
             self.defaults.groups = fields.groups
             return OK
+        if self.planner.rests:
+            self._last = self._board.estimate()
+        lands = command in LANDINGS
+        path = self._path(fields, lands, t)
+        # First, as in the exported app, which sees a command before the firmware does.
+        if path is not None and not self._board.admits(
+            (self._last.position, path.at(path.duration).position)
+        ):
+            return ENOEXEC
         if command is not PathCommand.STOP and self._blocked:
             return EBUSY
         if fields.groups and not fields.groups & self.defaults.groups:
             return OK  # for others
-        if command is PathCommand.STOP:
+        if isinstance(fields, Start):
+            return self._start(fields, t)
+        if path is None:
             self.planner.stop()
             return OK
-        if self.planner.rests:
-            self._last = self._board.estimate()
+        phase = self.planner.phase
+        climbs = isinstance(fields, Vertical | VerticalWithVelocity)
+        if climbs and (phase is Phase.LANDING if lands else phase is not Phase.IDLE):
+            return REFUSED
+        self.planner.follow(path, t, lands)
+        return OK
+
+    def _path(self, fields: Fields, lands: bool, t: float) -> Path | None:
+        """Return the path of a command, None of one without a path of its own."""
         match fields:
             case GoTo():
-                return self._follow(self._go_to(fields, t), t)
-            case Start():
-                return self._start(fields, t)
-            case Vertical():
-                return self._climb(fields, t, command in LANDINGS)
+                return self._go_to(fields, t)
             case VerticalWithVelocity():
-                return self._climb(self._timed(fields, command in LANDINGS), t, command in LANDINGS)
+                return self._climb(self._timed(fields, lands))
+            case Vertical():
+                return self._climb(fields)
             case SpiralFields():
-                wish = Spiral(*fields[1:3], *fields[3:])
-                return self._follow(spiral(replace(self._last), wish), t)
-            case Groups():  # of the commands above
-                return OK
+                return spiral(self._last, Spiral(*fields[1:]))
+            case _:
+                return None
 
     def _define(self, wish: Define) -> int:
         if wish.trajectory >= MAX_TRAJECTORIES:
@@ -153,12 +167,9 @@ class HighLevelCommander:
         velocity = wish.velocity if wish.velocity > 0.0 else default
         return Vertical(wish.groups, height, wish.yaw, wish.current_yaw, abs(height - z) / velocity)
 
-    def _climb(self, wish: Vertical, t: float, lands: bool) -> int:
-        phase = self.planner.phase
-        if phase is Phase.LANDING if lands else phase is not Phase.IDLE:
-            return REFUSED
+    def _climb(self, wish: Vertical) -> Path:
         yaw = self._last.yaw if wish.current_yaw else wish.yaw
-        return self._follow(straight_up(self._last, wish.height, yaw, wish.duration), t, lands)
+        return straight_up(self._last, wish.height, yaw, wish.duration)
 
     def _start(self, wish: Start, t: float) -> int:
         definition = self._definitions.get(wish.trajectory)
@@ -179,11 +190,7 @@ class HighLevelCommander:
         path = replace(path, timescale=wish.timescale, reverse=bool(wish.reverse))
         if wish.relative:
             path = path.begun_at(self._last.position, self._last.yaw if turned else None)
-        return self._follow(path, t, places=tuple(path.places()))
-
-    def _follow(self, path: Path, t: float, lands: bool = False, places: Sequence[Vector] = ()) -> int:
-        """Start a path if the board admits its places; without any, its two ends, because it is almost straight."""
-        if not self._board.admits(places or (self._last.position, path.at(path.duration).position)):
+        if not self._board.admits(tuple(path.places())):
             return ENOEXEC
-        self.planner.follow(path, t, lands)
+        self.planner.follow(path, t)
         return OK

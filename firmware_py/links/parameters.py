@@ -180,7 +180,7 @@ class ParameterService:
         # The Crazyflie firmware reads whatever its buffer holds behind a write that is too short; zeros here.
         value = data[2 : 2 + parameter.scalar.size].ljust(parameter.scalar.size, b"\0")
         self._set(parameter, parameter.scalar.unpack(value))
-        return (ident + parameter.value(),)
+        return (ident + parameter.value() + data[2 + parameter.scalar.size :],)
 
     def _set(self, parameter: Parameter, value: float) -> int:
         status = parameter.set(value)
@@ -214,7 +214,7 @@ class ParameterService:
         parameter = self._parameters[number] if known else self._parameters[0]
         persistent = known and parameter.persistent
         if command == Misc.EXTENDED_TYPE:
-            return (head + bytes((EXTENDED_PERSISTENT if persistent else 0,)),)
+            return (head + bytes((EXTENDED_PERSISTENT if persistent else ENOENT,)),)
         if command == Misc.EXTENDED_TYPE_V2:
             return (head + (bytes((OK, EXTENDED_PERSISTENT)) if persistent else bytes((ENOENT,))),)
         if command in (Misc.DEFAULT, Misc.DEFAULT_V2):
@@ -223,7 +223,7 @@ class ParameterService:
             return (head + (b"" if command == Misc.DEFAULT else bytes((OK,))) + self._defaults[number],)
         if command not in (Misc.STORE, Misc.STATE, Misc.CLEAR):
             raise WireError(f"parameter command {command} is unknown")
-        if not known:
+        if not known or (command != Misc.STATE and not persistent):
             return (head + bytes((ENOENT,)),)
         if command == Misc.STATE:
             stored = self._storage.load().get(parameter.name)

@@ -39,7 +39,7 @@ takeoff 1.1 1
 wait 1.2
 stream position 0 0.05 1.1 0 0.6
 land 0.9 1
-wait 1
+wait 0.7
 look
 wait 1.6
 look
@@ -769,8 +769,8 @@ stop
 define 31 0 0 1
 define 1 0 0 1
 ask 8 0 63000000
-ask 8 0 030000 2
-ask 8 0 000000
+ask 8 0 0300 2
+ask 8 0 0000 2
 == the supervisor at rest stock
 look
 arm
@@ -779,8 +779,6 @@ ask 9 0 03
 ask 9 0 06
 ask 9 0 07
 ask 9 0 0d
-disarm
-wait 0.5
 == identity and link stock
 ask 13 1 00
 ask 15 1 00
@@ -864,13 +862,13 @@ log 2 1
 log 6 17
 log 5 0
 == memories stock
-ask 4 0 01
+ask 4 0 01 1
 ask 4 0 0200
 ask 4 0 0201
 ask 4 0 0202
 ask 4 0 0203
 ask 4 0 0204
-ask 4 1 0200000000 18
+ask 4 1 020000000018
 ask 4 1 02f00f000010
 ask 4 2 0200000000000102
 ask 4 1 00f01f000018 6

@@ -95,9 +95,12 @@ def test_the_python_board_answers_as_the_image_in_all_programs(name: str) -> Non
 
 @pytest.mark.parametrize("name", sorted(STOCK))
 def test_where_the_law_is_the_firmware_s_own_the_app_changes_nothing(name: str) -> None:
-    ours = Answers(recorded("app")[name].lines)
-    ours.lines = [line.removesuffix(" flying none") for line in ours.lines]
-    assert list(differences(recorded("stock")[name], ours)) == []
+    """But for what the supervisor sees: Floaty flies where it is, the stock board rests."""
+    ours, theirs = (
+        [line for line in recorded(board)[name].lines if not line.startswith(("look", "end"))]
+        for board in ("app", "stock")
+    )
+    assert ours == theirs
 
 
 @pytest.mark.long

@@ -449,15 +449,6 @@ def test_stored_parameter_survives_a_reboot_and_cleared_one_does_not(client: Crt
     assert client.read(params, "extCtrl.z_P") == 3.0
 
 
-def test_a_parameter_that_is_not_persistent_is_stored_and_not_applied(client: CrtpClient, params) -> None:
-    number, kind = params["floaty.armed"]
-    assert not kind & 0x10
-    client.write(params, "floaty.armed", 0)
-    assert client.one(PARAM, 3, b"\3" + struct.pack("<H", number))[3:] == b"\0"
-    client.reboot()
-    assert client.read(params, "floaty.armed") == 1
-
-
 @given(st.binary(max_size=80), st.integers(0, 200))
 @settings(deadline=None)
 def test_a_spoilt_store_is_an_empty_one(noise: bytes, place: int) -> None:

@@ -25,6 +25,7 @@
 
 #define COMMANDS 14
 #define STATUS 3 /* byte of the answer */
+#define QUEUED 4 /* commands that may wait, one but for bursts */
 #define TURN 6.28318531f
 
 enum { TAKE_OFF_1 = 1, LAND_1, STOP, GO_TO_1, START_1, DEFINE, TAKE_OFF, LAND, TAKE_OFF_BY_SPEED, LAND_BY_SPEED, SPIRAL, GO_TO, START };
@@ -159,17 +160,22 @@ static void refuse(CRTPPacket *packet, uint8_t status) {
 }
 
 static void check_command(CRTPPacket *packet) {
-  static CRTPPacket taken;
+  static CRTPPacket taken[QUEUED];
+  int count = 0;
+  vTaskSuspendAll(); /* the commander has the same priority and would get its turn after any interruption */
   const char *why = obstacle(packet);
+  while (why != NULL && count < QUEUED && crtpReceivePacket(CRTP_PORT_SETPOINT_HL, &taken[count]) == pdTRUE) {
+    count += 1;
+  }
+  xTaskResumeAll();
   if (why == NULL) {
     taskYIELD(); /* the commander takes it before the next one comes */
     return;
   }
-  DEBUG_PRINT("command %d refused: %s\n", packet->data[0], why);
-  while (crtpReceivePacket(CRTP_PORT_SETPOINT_HL, &taken) == pdTRUE) {
-    const bool ours = memcmp(&taken, packet, sizeof taken) == 0;
-    refuse(&taken, ours ? ENOEXEC : EBUSY); /* those before it still waited */
+  for (int i = 0; i < count; i++) { /* those before the last still waited */
+    refuse(&taken[i], i == count - 1 ? ENOEXEC : EBUSY);
   }
+  DEBUG_PRINT("command %d refused: %s\n", packet->data[0], why);
 }
 
 void floaty_commands_init(void) {
