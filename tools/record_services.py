@@ -20,7 +20,6 @@ from hil.deploy.services import ServiceBench, play_in_a_copy  # noqa: E402
 from hil.devices.image_firmware import ChipImage  # noqa: E402
 
 FOLDER = ROOT / "tests" / "vectors" / "services"
-BUILD = ROOT / "runs" / "build"
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -33,7 +32,7 @@ def main(arguments: Sequence[str]) -> None:
     options = parser.parse_args(arguments)
     file = FOLDER / ("stock.json" if options.stock else "app.json")
     recorded = json.loads(file.read_text()) if file.exists() else {}
-    bench = ServiceBench(ChipImage.load(options.elf, None, BUILD))
+    bench = ServiceBench(ChipImage.load(options.elf, None))
     FOLDER.mkdir(parents=True, exist_ok=True)
     for name, program in PROGRAMS.items():
         if (options.stock and name not in STOCK) or options.only not in name:

@@ -57,9 +57,8 @@ def booted(elf: str) -> ServiceBench:
     pytest.importorskip("unicorn")
     pytest.importorskip("cffi")
     from hil.devices.image_firmware import ChipImage
-    from support.stm32_firmware import BUILD
 
-    return ServiceBench(ChipImage.load(Path(elf), None, BUILD))
+    return ServiceBench(ChipImage.load(Path(elf), None))
 
 
 @pytest.fixture(scope="module")
