@@ -15,6 +15,7 @@
 #include "cfassert.h"
 #include "crc32.h"
 #include "crtp.h"
+#include "commander.h"
 #include "crtp_commander_high_level.h"
 #include "crtp_supervisor.h"
 #include "debug.h"
@@ -67,6 +68,7 @@ bool supervisorRequestArming(const bool armed) {
 }
 enum trajectory_state crtpCommanderHighLevelGetPlannerState() { return (enum trajectory_state)stub_planner; }
 int crtpCommanderHighLevelStop() { return stub_planner = 0; }
+int commanderGetActivePriority(void) { return COMMANDER_PRIORITY_HIGHLEVEL; }
 void vPortYield(void) {}
 void crtpSupervisorSetEmergencyStop(void) { stub_stop_requested = 1; }
 void crtpSupervisorNotifyEmergencyStopWatchdog(void) { stub_watchdog_fed += 1; }

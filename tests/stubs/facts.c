@@ -15,6 +15,7 @@
 #include "app_channel.h"
 #include "autoconf.h"
 #include "cfassert.h"
+#include "commander.h"
 #include "controller.h"
 #include "crc32.h"
 #include "crtp.h"
@@ -107,6 +108,8 @@ FUNCTION(eprintf, int, int (*)(int), const char *, ...)
 TYPE(DEBUG_PRINT("%s %d\n", "", 0), int)
 FUNCTION(pmGetBatteryVoltage, float, void)
 FUNCTION(supervisorIsLocked, bool, void)
+VALUE(COMMANDER_PRIORITY_HIGHLEVEL, 1)
+FUNCTION(commanderGetActivePriority, int, void)
 FUNCTION(supervisorIsArmed, bool, void)
 FUNCTION(supervisorCanArm, bool, void)
 FUNCTION(supervisorCanFly, bool, void)

@@ -18,6 +18,7 @@
 #include "FreeRTOS.h"
 #include "task.h"
 
+#include "commander.h"
 #include "crtp.h"
 #include "crtp_commander_high_level.h"
 #include "debug.h"
@@ -123,8 +124,8 @@ static bool end_of_path(const uint8_t *data, float place[4]) {
 static bool ends_in_the_box(const uint8_t *data) {
   static FloatyInput candidate; /* without a goal the core asks for the box itself */
   float place[4];
-  if (!floaty_input.absolute) {
-    return true; /* the set-point is not followed */
+  if (!floaty_input.absolute || commanderGetActivePriority() > COMMANDER_PRIORITY_HIGHLEVEL) {
+    return true; /* the path is not followed */
   }
   begin_of_path(place);
   if (!end_of_path(data, place)) {

@@ -1,0 +1,3 @@
+#pragma once
+#define COMMANDER_PRIORITY_HIGHLEVEL 1
+int commanderGetActivePriority(void);
