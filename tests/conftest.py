@@ -44,6 +44,13 @@ GRACE_S = (
 )
 
 
+@pytest.fixture(autouse=True)
+def _own_search_path() -> Iterator[None]:
+    """Remove what `floaty` in this process sets for the programs that it starts: those of tests import `support`."""
+    yield
+    os.environ.pop("PYTHONSAFEPATH", None)
+
+
 class InconclusiveError(Exception):
     """A real-time test failed on a machine that stood still: it says nothing. `make test-all` repeats it."""
 
