@@ -13,6 +13,9 @@ from hil.servers.dongle_plugin import CONTROL, HEAD_SIZE, PORTS, READ, WRITE, fr
 from hil.servers.tcp_port import Receive, TcpClient, TcpPort, TcpProtocol
 
 HOST = "127.0.0.1"
+AHEAD = (
+    8  # cflib gives up a transfer after a time-out and sends the next: with 1, it reconnects seconds later
+)
 PROTOCOL = TcpProtocol(
     "radio", CONTROL + WRITE, 4096, send_buffer=8192
 )  # a client awaits one answer at a time
@@ -50,25 +53,25 @@ class DongleServer:
 
 
 class _UsbCable:
-    """One connection and its dongle, which does one transfer at a time, as over USB: a client that is ahead waits."""
+    """One connection and its dongle, which has at most `AHEAD` transfers in progress: a client that is ahead waits."""
 
     def __init__(self, client: TcpClient, dongle: VirtualDongle) -> None:
         self._client = client
         self._dongle = dongle
         self._received = b""
-        self._awaits = False  # an answer of the dongle
+        self._awaited = 0  # answers of the dongle
 
     def receive(self, now_us: int, data: bytes) -> None:
         """Take bytes of the client."""
         self._received += data
-        if self._awaits:
+        if self._awaited >= AHEAD:
             self._client.pause()
         else:
             self._work(now_us)
 
     def _work(self, now_us: int) -> None:
         """Execute the frames that are complete, up to one that is answered."""
-        while not self._awaits and len(self._received) >= HEAD_SIZE:
+        while self._awaited < AHEAD and len(self._received) >= HEAD_SIZE:
             size = HEAD_SIZE + self._received[2]
             if len(self._received) < size:
                 break
@@ -80,11 +83,11 @@ class _UsbCable:
         if kind == CONTROL and len(data) >= 3:
             self._dongle.control(data[0], data[1] | data[2] << 8, data[3:])
         elif kind == WRITE and data:
-            self._awaits = self._dongle.acknowledges
+            self._awaited += self._dongle.acknowledges
             self._dongle.transmit(now_us, data, lambda t_us, answer: self._answer(t_us, sequence, answer))
 
     def _answer(self, now_us: int, sequence: int, answer: bytes) -> None:
-        self._awaits = False
+        self._awaited -= 1
         self._client.send(now_us, frame(READ, sequence, answer))
         self._client.listen(self.receive)
         self._work(now_us)
