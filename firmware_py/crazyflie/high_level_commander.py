@@ -133,7 +133,7 @@ class HighLevelCommander:
         return OK
 
     def _path(self, fields: Fields, lands: bool, t: float) -> Path | None:
-        """Return the path of a command, None of one without a path of its own."""
+        """Return the path that a command asks for; None for a command that starts none."""
         match fields:
             case GoTo():
                 return self._go_to(fields, t)

@@ -267,7 +267,7 @@ def test_a_server_that_is_not_there_or_not_so_is_one_line_within_four_seconds() 
 @pytest.mark.realtime
 @pytest.mark.parametrize("multicast", [False, True], ids=["unicast", "multicast"])
 def test_packets_from_another_port_of_the_server_s_computer_change_nothing(multicast: bool) -> None:
-    """Another program there sends frames, bodies and a server of its own to every port that is open."""
+    """Another program on that computer sends frames, bodies and server descriptions to every open port."""
     with moving(multicast=multicast) as lab, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         source = OptitrackSource(CaptureConfig(port=lab.motive.port, body="floaty", axes="z-up"))
         source.open()

@@ -22,7 +22,7 @@ void set_register(struct machine *m, int number, uint32_t value)
     m->engine.reg_write(m->engine.uc, number, &value);
 }
 
-/* Writing XPSR changes the exception number; only writing its flags tells unicorn whether it is in handler mode. */
+/* Writing XPSR changes the exception number; unicorn enters or leaves handler mode only when its flags are written. */
 void set_xpsr(struct machine *m, uint32_t value)
 {
     set_register(m, R_XPSR, value);
