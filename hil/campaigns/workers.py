@@ -134,7 +134,9 @@ class Workers:
         self._bell.clear()
         done = [future for future in flying if future.done()]
         if self._client is not None:
-            self._looks = 0 if done or self._client.scheduler_info()["workers"] else self._looks + 1
+            # A scheduler that is lost in this call answers nothing, after a while.
+            present = self._client.status == "running" and self._client.scheduler_info().get("workers")
+            self._looks = 0 if done or present else self._looks + 1
             if self._client.status != "running" or self._looks * LOOK_S > LOST_S:
                 raise LabError(
                     f"--cluster {self._address}: lost; --resume continues with the flights that are kept"
