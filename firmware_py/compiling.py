@@ -35,7 +35,6 @@ FOREIGN = {"NRT_MemInfo_call_dtor": "abort", "numba_ldexp": "ldexp"} | {
 }
 METHOD = "kept_method"
 NO_ARGUMENTS = 4  # `METH_NOARGS`
-SHIPPED = ("firmware_py", "hil")
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 ctypes.pythonapi.PyCFunction_NewEx.restype = ctypes.py_object
@@ -96,11 +95,8 @@ class Compiled:
 
     @property
     def folder(self) -> Path:
-        """The folder of its kept code: one per folder of ours, or per content of a user's file, which may be anywhere."""
-        shipped = self.__wrapped__.__module__.partition(".")[0] in SHIPPED
-        return kept_folder(
-            "numba", str(Path(inspect.getfile(self.__wrapped__)).parent) if shipped else self.stamp
-        )
+        """The folder of its kept code, which the contents of its sources name: every copy of them finds it."""
+        return kept_folder("numba", self.stamp)
 
     @cached_property
     def dispatcher(self) -> Any:
@@ -119,7 +115,7 @@ class Compiled:
 
     def file(self, kinds: str) -> Path:
         """Return the file of kept code for arguments of certain kinds."""
-        name = f"{self.__wrapped__.__module__}.{self.__name__}-{kinds}-{self.stamp[:24]}{SUFFIX}"
+        name = f"{self.__wrapped__.__module__}.{self.__name__}-{kinds}{SUFFIX}"
         return self.folder / name
 
 

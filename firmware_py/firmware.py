@@ -120,16 +120,16 @@ class Firmware:
         pilot, notices = self.pilot, self._notices
         stabilizer, high_level = pilot.stabilizer, pilot.stabilizer.high_level
         CommanderService(link, stabilizer)
+        localisation = LocalisationService(
+            link, self.measurements, stabilizer.supervisor, pilot, settings.address & 0xFF
+        )
         running = Running(
             board=board,
             core=core,
             supervisor=supervisor,
             measurements=self.measurements,
             stack=link,
-            localisation=LocalisationService(
-                link, self.measurements, stabilizer.supervisor, pilot, settings.address & 0xFF
-            ),
-            platform=PlatformService(link, stabilizer.supervisor),
+            platform=PlatformService(link, stabilizer.supervisor, localisation.take_pose),
             tester=tester,
             storage=storage,
             pilot=pilot,
@@ -165,7 +165,7 @@ class Firmware:
 
         core, supervisor = self._core, self._supervisor
         setpoints = SetpointService(stack, running.pilot, config.home)
-        poses = PoseService(stack, self.measurements, running.localisation, setpoints)
+        poses = PoseService(stack, self.measurements, setpoints)
         world = PoseInWorld(core.estimator.fields, core.control.fields, setpoints)
         messages = FlightMessages(stack, supervisor, world, poses, self.variables, self._measured)
         streams = StreamService(stack, messages.streams(config.rates))

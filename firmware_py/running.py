@@ -8,7 +8,6 @@ from firmware_py.board import Board
 from firmware_py.core_runner import CoreBlocks
 from firmware_py.crazyflie.high_level_commander import Defaults
 from firmware_py.links.crtp_stack import CrtpStack
-from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.memories import Tester
 from firmware_py.links.parameters import ParameterStorage
 from firmware_py.links.platform import PlatformService
@@ -37,7 +36,6 @@ class Running:
     supervisor: CoreSupervisor
     measurements: Queue[Arrived]
     stack: CrtpStack
-    localisation: LocalisationService
     platform: PlatformService
     tester: Tester
     storage: ParameterStorage

@@ -40,6 +40,8 @@ RESTING = (  # log variables that stay zero
     Logged("mm", "range.back front left right up zrange", type="U16"),
     Logged("m", "ranging." + " ".join(f"distance{anchor}" for anchor in range(8))),
     Logged("s", "ring.fadeTime"),
+    Logged("m", "locSrv.x y z"),  # of the service that the app replaces
+    Logged("", "locSrv.qw qx qy qz"),
 )
 
 

@@ -5,13 +5,13 @@ are in degrees with the nose up positive, `gyro` and `acc` in deg/s and g. Posit
 of the poses: the goal frame for corrections, because the board knows only its error; the cameras' for absolute poses.
 """
 
+from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from functools import partial
 from math import degrees
 
 from firmware_py.core_runner import CoreBlocks
 from firmware_py.drivers.imu import acceleration, rates
-from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.log import LogVariable
 from firmware_py.rtos.statistics import ProcessorLoad
 from firmware_py.running import Running
@@ -19,7 +19,8 @@ from firmware_py.table import CORE_VARIABLES, CoreVariable
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.telemetry import LEGACY_DEGREES
 
-BATTERY_FULL_MV = 4200
+# Of a cell at rest, 0 to 90 % (LiPoTypicalChargeCurve in pm_stm32f4.c).
+CHARGE_CURVE_MV = (3000, 3780, 3830, 3870, 3890, 3920, 3960, 4000, 4040, 4100)
 # The least time over which the processor's load is averaged.
 LOAD_US = 100_000
 PM_BATTERY, PM_LOW = 0, 3  # pm.state
@@ -42,7 +43,6 @@ def log_variables(running: Running) -> tuple[LogVariable, ...]:
         LogVariable("sys.canfly", U8, "", partial(getattr, crazyflie, "can_fly")),
         LogVariable("sys.isFlying", U8, "", partial(getattr, crazyflie, "flying")),
         LogVariable("sys.isTumbled", U8, "", partial(getattr, crazyflie, "tumbled")),
-        *_localisation(running.localisation),
         *_counters(running),
     )
 
@@ -78,9 +78,7 @@ def _crazyflie(running: Running) -> Iterator[LogVariable]:
         return degrees(rates(board.read_imu(), bias.tolist())[axis])
 
     def battery_level() -> float:
-        low = int(parameters.low_battery_mv)
-        share = (board.read_battery_mv() - low) / max(1, BATTERY_FULL_MV - low)
-        return 100 * min(1.0, max(0.0, share))
+        return 10 * min(9, bisect_left(CHARGE_CURVE_MV, board.read_battery_mv()))
 
     def battery_state() -> float:
         return PM_LOW if board.read_battery_mv() < parameters.low_battery_mv else PM_BATTERY
@@ -93,12 +91,6 @@ def _crazyflie(running: Running) -> Iterator[LogVariable]:
     yield LogVariable("pm.vbatMV", U16, "mV", board.read_battery_mv)
     yield LogVariable("pm.state", I8, "", battery_state)
     yield LogVariable("pm.batteryLevel", U8, "%", battery_level)
-
-
-def _localisation(service: LocalisationService) -> Iterator[LogVariable]:
-    yield from _parts("locSrv", "x y z", "m", lambda axis: service.last.p_GB[axis])
-    yield from _parts("locSrv", "qw qx qy qz", "", lambda part: service.last.q_GB[part])
-    yield LogVariable("locSrv.positions", U32, "", partial(getattr, service, "positions"))
 
 
 def _counters(running: Running) -> Iterator[LogVariable]:

@@ -44,6 +44,10 @@ GRACE_S = (
 )
 
 
+# The sessions that `pytester` starts have another home, but the same compiled code.
+os.environ.setdefault("XDG_CACHE_HOME", str(Path.home() / ".cache"))
+
+
 @pytest.fixture(autouse=True)
 def _own_search_path() -> Iterator[None]:
     """Remove what `floaty` in this process sets for the programs that it starts: those of tests import `support`."""

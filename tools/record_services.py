@@ -3,7 +3,8 @@
     python tools/record_services.py --elf cf2.elf            (with the exported app: tests/vectors/services/app.json)
     python tools/record_services.py --elf cf2.elf --stock    (the stock firmware: tests/vectors/services/stock.json)
 
-The image boots once; each program is played in a copy of that process, so that it begins at the same instant.
+The image boots once; each program is played in a copy of that process, so that it begins at the same instant. Paths are in
+millimetres and milliradians.
 """
 
 import argparse
@@ -16,7 +17,7 @@ ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
 from hil.deploy.service_programs import PROGRAMS, STOCK  # noqa: E402 - from this tree
-from hil.deploy.services import ServiceBench, play_in_a_copy  # noqa: E402
+from hil.deploy.services import ServiceBench, play_in_copies  # noqa: E402
 from hil.devices.image_firmware import ChipImage  # noqa: E402
 
 FOLDER = ROOT / "tests" / "vectors" / "services"
@@ -34,14 +35,17 @@ def main(arguments: Sequence[str]) -> None:
     recorded = json.loads(file.read_text()) if file.exists() else {}
     bench = ServiceBench(ChipImage.load(options.elf, None))
     FOLDER.mkdir(parents=True, exist_ok=True)
-    for name, program in PROGRAMS.items():
-        if (options.stock and name not in STOCK) or options.only not in name:
-            continue
-        if recorded.get(name, {}).get("program") == program and not options.only:
-            continue  # of this run or an earlier one: remove the file for another image
-        answers = play_in_a_copy(bench, program)
+    names = [
+        name
+        for name, program in PROGRAMS.items()
+        if (name in STOCK or not options.stock)
+        and options.only in name
+        # One of this run or an earlier one stays: remove the file for another image.
+        and (options.only or recorded.get(name, {}).get("program") != program)
+    ]
+    for name, answers in zip(names, play_in_copies(bench, map(PROGRAMS.__getitem__, names)), strict=True):
         path = [[round(1000 * part) for part in place] for place in answers.path]
-        recorded[name] = {"program": program, "answers": answers.lines, "path_mm": path}
+        recorded[name] = {"program": PROGRAMS[name], "answers": answers.lines, "path": path}
         print(name, flush=True)
         rows = (f"{json.dumps(one)}: {json.dumps(recorded[one])}" for one in PROGRAMS if one in recorded)
         file.write_text("{\n" + ",\n".join(rows) + "\n}\n")

@@ -25,7 +25,8 @@ OF_CORE = {  # fields of layouts that show the core's memory
 
 def wire_header() -> str:
     constants = (
-        "CHANNEL_GENERIC", "EXT_POSE", "AGE_UNIT_US", "AGE_UNKNOWN_CODE", "EMERGENCY_STOP", "EMERGENCY_STOP_WATCHDOG",
+        "CHANNEL_GENERIC", "EXT_POSE", "EXT_POSE_PACKED", "AGE_UNIT_US", "AGE_UNKNOWN_CODE", "EMERGENCY_STOP",
+        "EMERGENCY_STOP_WATCHDOG",
         "PORT_CORE", "CHANNEL_CALLS", "CHANNEL_LOOP", "HIL_WAITING", "HIL_HOLD", "NARROW", "WIDE", "NARROW_BITS",
         "VERSION", "NAME_SIZE", "READ_MAX",
     )  # fmt: skip

@@ -14,7 +14,6 @@ again, and only the newer one counts.
 from collections import deque
 from dataclasses import dataclass
 
-from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.mavlink_setpoints import SetpointService
 from firmware_py.links.mavlink_stack import MavlinkStack, Task
 from firmware_py.pilot import Arrived
@@ -103,14 +102,12 @@ class PoseService:
         self,
         stack: MavlinkStack,
         measurements: Queue[Arrived],
-        localisation: LocalisationService,
         setpoints: SetpointService,
     ) -> None:
         self.age_us: int | None = None
         self._stack = stack
         self._setpoints = setpoints
         self._measurements = measurements
-        self._localisation = localisation
         self._partner: tuple[int, int] | None = None
         self._clock = RemoteClock()
         for name in mavlink.POSES:
@@ -125,8 +122,8 @@ class PoseService:
         now_us = self._stack.kernel.now_us
         goal = self._setpoints.note_pose()
         self.age_us = self._age_us(now_us, pose.t_us)
-        self._localisation.last = Correction(pose.p_WB, pose.q_WB, self.age_us)
-        self._measurements.send_nowait((now_us, self._localisation.last, True, goal))
+        correction = Correction(pose.p_WB, pose.q_WB, self.age_us)
+        self._measurements.send_nowait((now_us, correction, True, goal))
 
     def _age_us(self, now_us: int, t_us: int) -> int | None:
         """Return how long ago the sender's clock showed `t_us`; None when unknown."""

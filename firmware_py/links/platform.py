@@ -1,10 +1,12 @@
 """The board's identity and rights: link, platform and supervisor services, and the application channel."""
 
+from collections.abc import Callable
+
 from firmware_py.crazyflie.supervisor import Supervisor
 from firmware_py.links.crtp_stack import CrtpStack, Task
 from firmware_py.rtos import Queue
 from firmware_py.wire import WireError, check_size
-from firmware_py.wire.crtp import MAX_DATA, PORT_LINK, PORT_PLATFORM, PORT_SUPERVISOR, Packet, encode
+from firmware_py.wire.crtp import MAX_DATA, PORT_LINK, PORT_PLATFORM, PORT_SUPERVISOR, Packet
 from firmware_py.wire.supervisor import (
     ARM,
     COMMAND_ARM,
@@ -35,10 +37,13 @@ SOURCE_TEXT = b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0")  # by which clients k
 
 
 class PlatformService:
-    """Answers on the ports of link, platform and supervisor. The application echoes what it receives on its channel."""
+    """Answers on the ports of link, platform and supervisor; `application` takes the bytes of its channel."""
 
-    def __init__(self, stack: CrtpStack, supervisor: Supervisor) -> None:
+    def __init__(
+        self, stack: CrtpStack, supervisor: Supervisor, application: Callable[[bytes], Task]
+    ) -> None:
         self._stack = stack
+        self._application = application
         self._supervisor = supervisor
         kernel = stack.kernel
         self._app: Queue[bytes] = kernel.create_queue(APP_QUEUE, "app")
@@ -112,8 +117,11 @@ class PlatformService:
     def _app_task(self) -> Task:
         while True:
             data = yield from self._app.receive()
-            if data is not None:
-                yield from self._stack.deliver(encode(Packet(PORT_PLATFORM, PLATFORM_APP, data)))
+            try:
+                if data is not None:
+                    yield from self._application(data)
+            except WireError:
+                self._stack.malformed += 1
 
 
 def answer_link(packet: Packet) -> tuple[bytes, ...]:

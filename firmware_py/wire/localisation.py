@@ -1,45 +1,26 @@
 """The other messages with a position or a pose: plain position, packed positions, packed poses.
 
 Packed items carry the last byte of the receiving robot's address; positions are int16 millimetres, the
-quaternion is "smallest three": the largest component is omitted, the others take a sign and nine bits each.
+quaternion is "smallest three": the largest component is omitted, the others take a sign and nine bits each. It is unpacked
+in float32, as the exported app does.
 """
 
 import struct
 from math import sqrt
 
-from firmware_py.geometry import Vector
-from firmware_py.wire import WireError, check_size
-from firmware_py.wire.crtp import Correction, check_place, check_pose
+import numpy as np
 
-CHANNEL_POSITION = 0
-CHANNEL_PACKED = 2
+from firmware_py.wire import WireError
+from firmware_py.wire.crtp import Correction, check_pose
+
+POSITIONS = (0, 2)  # channels of positions without attitude, one and packed
 EMERGENCY_STOP = 3  # type bytes of the generic channel
 EMERGENCY_STOP_WATCHDOG = 4
 EXT_POSE_PACKED = 9
 
-_POSITION = struct.Struct("<3f")
-_PACKED_POSITION = struct.Struct("<B3h")
 _PACKED_POSE = struct.Struct("<B3hI")
 _MILLIMETRE = 1e-3
-_SHARE = 1 / (511 * sqrt(2))  # of one step in a quaternion's component
-
-
-def decode_position(data: bytes) -> Vector:
-    """Return the position [m] in the data of a channel 0 packet."""
-    check_size("a position", data, _POSITION.size)
-    x, y, z = _POSITION.unpack(data)
-    check_place((x, y, z))
-    return x, y, z
-
-
-def decode_packed_positions(data: bytes) -> list[tuple[int, Vector]]:
-    """Return pairs of address byte and position [m] in the data of a channel 2 packet."""
-    if not data or len(data) % _PACKED_POSITION.size:
-        raise WireError(f"packed positions of {len(data)} bytes: items have {_PACKED_POSITION.size}")
-    return [
-        (address, (x * _MILLIMETRE, y * _MILLIMETRE, z * _MILLIMETRE))
-        for address, x, y, z in _PACKED_POSITION.iter_unpack(data)
-    ]
+_SHARE = np.float32(1 / (511 * sqrt(2)))  # of one step in a quaternion's component
 
 
 def decode_packed_poses(data: bytes) -> list[tuple[int, Correction]]:
@@ -60,13 +41,26 @@ def unpack_quaternion(packed: int) -> tuple[float, float, float, float]:
     """Return the quaternion, w x y z, of 32 bits; not of unit length when they are not from one."""
     largest = packed >> 30
     xyzw = [0.0] * 4
-    squares = 0.0
+    squares = np.float32(0.0)
     for i in (3, 2, 1, 0):
         if i == largest:
             continue
-        value = (packed & 0x1FF) * _SHARE
-        xyzw[i] = -value if packed & 0x200 else value
+        value = np.float32(packed & 0x1FF) * _SHARE
+        xyzw[i] = float(-value if packed & 0x200 else value)
         squares += value * value
         packed >>= 10
-    xyzw[largest] = sqrt(max(0.0, 1.0 - squares))
+    xyzw[largest] = float(np.sqrt(max(np.float32(0.0), np.float32(1.0) - squares)))
     return xyzw[3], xyzw[0], xyzw[1], xyzw[2]
+
+
+def pack_quaternion(q_GB: tuple[float, float, float, float]) -> int:
+    """Return the 32 bits of a unit quaternion, w x y z."""
+    w, x, y, z = q_GB
+    xyzw = (x, y, z, w)
+    largest = max(range(4), key=lambda i: abs(xyzw[i]))
+    packed = largest
+    for i in range(4):
+        if i != largest:
+            below = (xyzw[i] < 0) != (xyzw[largest] < 0)
+            packed = packed << 10 | below << 9 | round(abs(xyzw[i]) / float(_SHARE))
+    return packed

@@ -40,7 +40,11 @@ def drill(flight: Flight) -> None:
     bounds = (0.0, 1e-4), (0.4, estimator.bound_velocity)
     plan(flight, 2.8, *((after_s, "FloatyKalm.maxVel", Scalar.F32, value) for after_s, value in bounds))
     plan(flight, 4.0, *((0.2 * mode, "extCtrl.manual", Scalar.U8, mode % 3) for mode in (1, 2, 3)))
-    plan(flight, 3.45, *((after_s, "extPose.absolute", Scalar.U8, value) for after_s, value in ((0.0, 1), (0.2, 0))))
+    plan(
+        flight,
+        3.45,
+        *((after_s, "extPose.absolute", Scalar.U8, value) for after_s, value in ((0.0, 1), (0.2, 0))),
+    )
     limits = (0.0, 20_000), (5.2, supervisor.low_battery_mv)
     plan(flight, 4.8, *((after_s, "supervisor.lowBattery", Scalar.U16, value) for after_s, value in limits))
     plan(flight, 10.2, *RECOVERY)

@@ -2,11 +2,12 @@
 
 On the bench the emulated chip is at rest, with a client on its radio and access to its memory. The parameters that a client
 can write are compared with the table that the profile exports, the servo outputs with the registers for 400 Hz. Then it
-flies beside the Python board (`hil.deploy.beside`).
+plays programs of requests (`hil.deploy.services`) and flies (`hil.deploy.beside`), each time beside the Python board.
 """
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,10 @@ from hil.bodies import make_body
 from hil.config import LabConfig, load_config
 from hil.deploy.beside import fly_beside_python
 from hil.deploy.doctor import Finding
+from hil.deploy.service_programs import PROGRAMS
+from hil.deploy.services import ServiceBench, differences, play_in_copies
 from hil.devices.board import VirtualBoard
+from hil.devices.board_firmware import PythonBoard
 from hil.devices.image_firmware import ChipImage, ImageFirmware
 from hil.devices.imu import VirtualImu
 from hil.errors import LabError
@@ -34,8 +38,7 @@ from hil.stm32f405.image import Image, MemoryUse
 FREE_LEAST = 1024  # [bytes]
 APP = "floaty_toc_apply"  # exists in images with the exported app
 UNPROVEN = (
-    "values of log variables; limits that the laboratory's own parameters do not have",
-    "absolute poses and the stock commander, manual angles, poses through the app channel",
+    "limits that the laboratory's own parameters do not have; log variables of the stock firmware alone",
     "port 10: calls for a host, hardware in the loop (`floaty deploy check --targets LINK` does on a board)",
     "restart after a crash; parameters stored in the EEPROM; decks, USB, flash wait states",
     "differences in flight below the bounds above",
@@ -230,6 +233,17 @@ class ImageBench:
         return True
 
 
+def check_services(
+    image: ServiceBench, python: ServiceBench, progress: Callable[[int], None]
+) -> Iterator[str]:
+    """Yield, for each program of requests that the boards answer differently, its first difference."""
+    answers = (play_in_copies(bench, PROGRAMS.values()) for bench in (python, image))
+    for done, (name, expected, found) in enumerate(zip(PROGRAMS, *answers, strict=True)):
+        for difference in islice(differences(expected, found), 1):
+            yield f"{name}: {difference}"
+        progress(done + 1)
+
+
 def check_memory(memory: tuple[MemoryUse, ...]) -> Finding:
     """Return the use of the memories; less than a kilobyte left is a warning."""
     short = [f"{one.name} has less than {FREE_LEAST} B left" for one in memory if one.free < FREE_LEAST]
@@ -259,6 +273,17 @@ def check_image(elf: Path, profile: str, overrides: tuple[str, ...], show: Show)
         ),
     ):
         yield from _all(list(failures), subject, good)
+
+    services = check_services(
+        ServiceBench(flashed, config),
+        ServiceBench(PythonBoard(), config),
+        lambda done: show("services", done, len(PROGRAMS)),
+    )
+    yield from _all(
+        list(services),
+        "services",
+        f"{len(PROGRAMS)} programs of requests are answered as by the Python board",
+    )
 
     def progress(name: str, now_us: int, flight: Flight) -> None:
         show(f"flight, {name}", now_us, flight.end_us)

@@ -733,6 +733,89 @@ look
 takeoff 1.2 1
 wait 1.2
 look
+== poses over the app channel fly the robot
+poses app
+wait 0.5
+takeoff 1.1 1
+wait 1.2
+goto 0.1 -0.08 1.1 30 1
+wait 1.5
+values 0.3 stateEstimate.x~0.005 stateEstimate.y~0.005 stateEstimate.z~0.005 stateEstimate.yaw~0.5
+look
+== packed poses fly the robot whose address they have
+poses packed
+wait 0.5
+takeoff 1.1 1
+wait 1.2
+goto -0.08 0.1 1.1 -30 1
+wait 1.5
+values 0.3 stateEstimate.x~0.005 stateEstimate.y~0.005 stateEstimate.z~0.005 stateEstimate.yaw~0.5
+look
+== the values of a robot that stands askew
+disarm
+place 0.03 -0.02 1.12 10 -6 25
+wait 1.5
+values 0.2 stateEstimate.x~0.002 stateEstimate.y~0.002 stateEstimate.z~0.002
+values 0.2 stateEstimate.roll~0.1 stateEstimate.pitch~0.1 stateEstimate.yaw~0.1
+values 0.2 stateEstimate.vx~0.01 stateEstimate.vy~0.01 stateEstimate.vz~0.01
+values 0.2 stateEstimate.qw~0.002 stateEstimate.qx~0.002 stateEstimate.qy~0.002 stateEstimate.qz~0.002
+values 0.2 stabilizer.roll~0.1 stabilizer.pitch~0.1 stabilizer.yaw~0.1 stabilizer.thrust~0
+values 0.2 pm.vbat~0.02 pm.vbatMV~20 pm.batteryLevel~0 pm.state~0
+values 0.2 supervisor.state~0 supervisor.cause~0 floaty.armed~0 floaty.stopped~0 floaty.calibrated~0
+values 0.2 stateEstimate.flap_1~0.002 stateEstimate.flap_2~0.002 stateEstimate.flap_3~0.002 stateEstimate.flap_4~0.002
+servos 20
+== the values of a flight with poses of a known age
+poses aged
+takeoff 1.1 1
+wait 1.2
+goto 0.1 -0.08 1.1 40 0.6
+wait 0.2
+values 0.2 controller.u1~0.03 controller.u2~0.03 controller.u3~0.03 controller.u4~0.03
+wait 2
+values 0.2 controller.u1~0.01 controller.u2~0.01 controller.u3~0.01 controller.u4~0.01
+values 0.2 floaty.m1~100 floaty.m2~100 floaty.m3~100 floaty.m4~100
+values 0.2 locSrv.age~10 delayComp.horizon~1 sys.canfly~0 sys.isFlying~0 sys.isTumbled~0 radio.isConnected~0
+poses 21
+wait 0.5
+values 1.05 locSrv.age~10 delayComp.horizon~0.15 kalman.jumps~0
+== flaps by hand need a client
+set extCtrl.m1 F32 0.3
+set extCtrl.m2 F32 -0.2
+set extCtrl.m3 F32 0.1
+set extCtrl.m4 F32 -0.3
+set extCtrl.manual U8 1
+wait 0.2
+servos 20
+radio off
+wait 2
+servos 20
+radio on
+wait 0.2
+servos 20
+set extCtrl.manual U8 2
+wait 0.2
+servos 20
+== an empty battery ends the flight
+takeoff 1.1 1
+wait 1.2
+battery 3000
+wait 5.6
+look
+values 0.2 pm.batteryLevel~0 pm.vbatMV~20
+battery 3900
+wait 0.4
+look
+set floaty.stop U8 0
+wait 0.2
+look
+== a set-point's heading turns the robot
+takeoff 1.1 1
+wait 1.2
+stream position 0.12 -0.06 1.15 50 0.8
+notify
+goto 0 0 1.1 -50 1
+wait 1.2
+look
 == with corrections nothing is followed
 set extPose.absolute U8 0
 place 0 0 0

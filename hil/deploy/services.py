@@ -3,25 +3,28 @@
 A program is a text of one request per line, in words: `LINES` names them. The same program runs on the firmware in Python
 and on an image; the answers must be equal, and the goal's path must stay within `PATH_M`. The robot is a point that sits at
 the board's goal while the board flies, and a pose comes every 20 ms. So a program costs little and needs no real time.
+
+A number in an answer may have a tolerance behind it: `12.3~0.5`.
 """
 
 import json
 import os
 import struct
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import dist, inf, nan, radians
+from math import dist, inf, nan, pi, radians, remainder
 
-from firmware_py.elementary import cos, sin
-from firmware_py.geometry import Vector
+from firmware_py.geometry import Quaternion, Vector, from_euler_zyx
 from firmware_py.wire import crtp, high_level, setpoints
 from firmware_py.wire.crtp import Packet
 from firmware_py.wire.high_level import PathCommand
+from firmware_py.wire.localisation import EXT_POSE_PACKED, pack_quaternion
 from firmware_py.wire.parameters import SetByName, encode_set_by_name
 from firmware_py.wire.scalars import Scalar
-from firmware_py.wire.supervisor import State
-from hil.config import load_config
+from firmware_py.wire.supervisor import PLATFORM_APP, State
+from hil.config import LabConfig, load_config
 from hil.devices.board import VirtualBoard
 from hil.devices.board_firmware import BoardFirmware, Executor, PowerOn
 from hil.errors import LabError
@@ -29,41 +32,48 @@ from hil.events import EventQueue
 
 HOME = (0.0, 0.0, 1.15)
 STEP_US = 1_000
-POSE_US, PATH_US, STREAM_US, ANSWER_US = 20_000, 200_000, 50_000, 30_000
+POSE_US, AGE_US, PATH_US, STREAM_US, ANSWER_US = 20_000, 25_000, 200_000, 50_000, 30_000
 SETTLED_US = 1_500_000  # after the boot: the gyro's zero is known, poses arrive
-PATH_M = 0.05
+PATH_M, PATH_RAD = 0.05, 0.05
 LATE_US = 60_000  # two boards look at a path at times that differ by no more than this
 LEVEL = (3, -2, 1, 0, 0, 1365)  # counts of the IMU; the BMI088 driver takes zeros for a defect
 
-COMMANDER, GENERIC, HIGH_LEVEL, SUPERVISOR, PARAMETERS, MEMORIES = 3, 7, 8, 9, 2, 4
+COMMANDER, GENERIC, HIGH_LEVEL, SUPERVISOR, PARAMETERS, MEMORIES, LOG = 3, 7, 8, 9, 2, 4, 5
+CREATE, DELETE, START, LOG_DATA = 6, 2, 8, 2  # commands to the log, and its channel of values
+BLOCK, AS_F32 = 200, 7  # a block of our own, and the type of its values
+ADDRESS = 0xE7  # last byte of a board's radio address
+
+Place = tuple[float, float, float, float]  # x, y, z [m] and yaw [rad]
 
 
 @dataclass(slots=True)
 class Answers:
-    """What a client saw: one text per line that is answered, and the goal's path [m], one row per `PATH_US`."""
+    """What a client saw: one text per line that is answered, and the goal's path, one row per `PATH_US`."""
 
     lines: list[str] = field(default_factory=list)
-    path: list[Vector] = field(default_factory=list)
+    path: list[Place] = field(default_factory=list)
 
 
 class ServiceBench:
     """A booted board; `floaty`: it has the flight core, so that its goal can be followed."""
 
-    def __init__(self, executor: Executor) -> None:
+    def __init__(self, executor: Executor, config: LabConfig | None = None) -> None:
         self.answers = Answers()
         self.console: list[str] = []
+        self.counts: Sequence[int] = ()  # of the servos
         self.now_us = 0
-        self.posing = True
-        self.place, self._yaw = HOME, 0.0
+        self.pose_us, self.poses_as = POSE_US, "pose"
+        self.radio = True
+        self.place, self.attitude = HOME, (0.0, 0.0, 0.0)  # roll, pitch, yaw [rad]
+        self.received: list[Packet] = []
         self._noise = 0
-        self._received: list[Packet] = []
         self._pins = VirtualBoard(
-            lambda now_us, counts: None, self._from_board, lambda now_us, text: self.console.append(text)
+            self._drive, self._from_board, lambda now_us, text: self.console.append(text)
         )
         self._pins.boot(0)
         self._pins.measure(LEVEL)
         self.firmware: BoardFirmware = executor.boot(
-            PowerOn(self._pins, load_config(), False, True, self._rest)
+            PowerOn(self._pins, config or load_config(), False, True, self._rest)
         )
         self._events = EventQueue()
         self._pins.run_on(self.firmware.kernel, self._events)
@@ -82,8 +92,15 @@ class ServiceBench:
         return (*LEVEL[:2], LEVEL[2] ^ self._noise, *LEVEL[3:])
 
     def _from_board(self, now_us: int, data: bytes) -> bool:
-        self._received.append(crtp.decode(data))
+        self.received.append(crtp.decode(data))
         return True
+
+    def _drive(self, now_us: int, counts: Sequence[int]) -> None:
+        self.counts = tuple(counts)
+
+    def supply(self, millivolts: int) -> None:
+        """Change the battery's voltage."""
+        self._pins.supply(millivolts)
 
     def run(self, duration_us: int) -> None:
         """Let time pass."""
@@ -96,29 +113,29 @@ class ServiceBench:
             self._events.run(self.now_us)
             self._pins.measure(self._rest())
             self.firmware.imu_ready()
-            self.firmware.radio_polled()
-            if self.posing and self.now_us % POSE_US == 0:
-                self._send_pose()
+            if self.radio:
+                self.firmware.radio_polled()
+                if self.pose_us and self.now_us % self.pose_us == 0:
+                    self._send_pose()
             if self._path_us is not None and (self.now_us - self._path_us) % PATH_US == 0 and self._goal:
-                self.answers.path.append(self._goal()[0])
+                self.answers.path.append(self._goal())
             kernel.run(self._boot_us + self.now_us)
 
     def _send_pose(self) -> None:
         if self._goal and self.firmware.signals.supervisor.state is State.FLYING:
-            self.place, self._yaw = self._goal()
-        w, z = cos(self._yaw / 2), sin(self._yaw / 2)
-        data = crtp.encode_ext_pose(self.place, (w, 0.0, 0.0, z), None)[:-1]
-        self.firmware.radio_received(data)
+            x, y, z, yaw = self._goal()
+            self.place, self.attitude = (x, y, z), (0.0, 0.0, yaw)
+        self.post(*POSES[self.poses_as](self.place, from_euler_zyx(*self.attitude)))
 
     def post(self, port: int, channel: int, data: bytes) -> None:
         self.firmware.radio_received(crtp.encode(Packet(port, channel, data)))
 
     def request(self, port: int, channel: int, data: bytes) -> bytes | None:
         """Send a request; return the first answer on its port and channel, None without one."""
-        self._received.clear()
+        self.received.clear()
         self.post(port, channel, data)
         self.run(ANSWER_US)
-        found = (one.data for one in self._received if (one.port, one.channel) == (port, channel))
+        found = (one.data for one in self.received if (one.port, one.channel) == (port, channel))
         return next(found, None)
 
     def bits(self) -> int:
@@ -155,17 +172,42 @@ class ServiceBench:
         self.answers.lines.append(f"{asked}: {answer}")
 
 
-def _goal_of(firmware: BoardFirmware) -> Callable[[], tuple[Vector, float]] | None:
+def _goal_of(firmware: BoardFirmware) -> Callable[[], Place] | None:
     """Return a function that reads the goal from the flight core; None for a board without it."""
     if (inputs := firmware.inputs) is None:
         return None
     goal = inputs["goal"][0]
 
-    def read() -> tuple[Vector, float]:
+    def read() -> Place:
         x, y, z, yaw = goal.tolist()
-        return (x, y, z), yaw
+        return x, y, z, yaw
 
     return read
+
+
+def _pose(place: Vector, q: Quaternion) -> tuple[int, int, bytes]:
+    return crtp.PORT_LOCALISATION, crtp.CHANNEL_GENERIC, crtp.encode_ext_pose(place, q, None)[1:-1]
+
+
+def _aged_pose(place: Vector, q: Quaternion) -> tuple[int, int, bytes]:
+    return crtp.PORT_LOCALISATION, crtp.CHANNEL_GENERIC, crtp.encode_ext_pose(place, q, AGE_US)[1:]
+
+
+def _packed_pose(place: Vector, q: Quaternion) -> tuple[int, int, bytes]:
+    """Return the packet of a swarm's sender, with another robot's pose before ours."""
+    items = (
+        struct.pack("<B3hI", address, *(round(1000 * part) + away for part in place), pack_quaternion(q))
+        for address, away in ((1, 500), (ADDRESS, 0))
+    )
+    return crtp.PORT_LOCALISATION, crtp.CHANNEL_GENERIC, bytes((EXT_POSE_PACKED,)) + b"".join(items)
+
+
+POSES: Mapping[str, Callable[[Vector, Quaternion], tuple[int, int, bytes]]] = {
+    "pose": _pose,
+    "aged": _aged_pose,
+    "packed": _packed_pose,
+    "app": lambda place, q: (crtp.PORT_PLATFORM, PLATFORM_APP, _pose(place, q)[2]),
+}
 
 
 # The lines
@@ -385,11 +427,50 @@ def _log(bench: ServiceBench, words: Sequence[str]) -> str:
     for kind, name in zip(items[::2], items[1::2], strict=True):
         number = bench.firmware.log_numbers[name] if "." in name else int(name)
         data += struct.pack("<BH", int(kind), number)
-    return _hex(bench.request(5, 1, data))
+    return _hex(bench.request(LOG, 1, data))
+
+
+def _values(bench: ServiceBench, words: Sequence[str]) -> str:
+    """`values SECONDS NAME~TOLERANCE ...`: means of up to six log variables, sampled every 10 ms."""
+    duration, *items = words
+    names, tolerances = zip(*(item.split("~") for item in items), strict=True)
+    chosen = b"".join(struct.pack("<BH", AS_F32, bench.firmware.log_numbers[name]) for name in names)
+    bench.request(LOG, 1, bytes((CREATE, BLOCK)) + chosen)
+    bench.request(LOG, 1, struct.pack("<BBH", START, BLOCK, 10))
+    bench.received.clear()
+    bench.run(round(float(duration) * 1e6))
+    rows = [
+        struct.unpack_from(f"<{len(names)}f", one.data, 4)
+        for one in bench.received
+        if (one.port, one.channel, one.data[:1]) == (LOG, LOG_DATA, bytes((BLOCK,)))
+    ]
+    bench.request(LOG, 1, bytes((DELETE, BLOCK)))
+    if not rows:
+        return "nothing"
+    means = (sum(column) / len(rows) for column in zip(*rows, strict=True))
+    return " ".join(f"{mean:.6g}~{tolerance}" for mean, tolerance in zip(means, tolerances, strict=True))
+
+
+def _servos(bench: ServiceBench, words: Sequence[str]) -> str:
+    """`servos TOLERANCE`: the counts of the four outputs."""
+    return " ".join(f"{count}~{words[0]}" for count in bench.counts)
 
 
 def _poses(bench: ServiceBench, words: Sequence[str]) -> None:
-    bench.posing = words[0] == "on"
+    """`poses on | off | PERIOD [ms] | pose | aged | packed | app`."""
+    word = words[0]
+    if word in POSES:
+        bench.poses_as = word
+    else:
+        bench.pose_us = {"on": POSE_US, "off": 0}[word] if word.isalpha() else 1000 * int(word)
+
+
+def _radio(bench: ServiceBench, words: Sequence[str]) -> None:
+    bench.radio = words[0] == "on"
+
+
+def _battery(bench: ServiceBench, words: Sequence[str]) -> None:
+    bench.supply(int(words[0]))
 
 
 def _look(bench: ServiceBench, words: Sequence[str]) -> str:
@@ -397,8 +478,9 @@ def _look(bench: ServiceBench, words: Sequence[str]) -> str:
 
 
 def _place(bench: ServiceBench, words: Sequence[str]) -> None:
-    x, y, z = _numbers(words)
+    x, y, z, roll, pitch, yaw = (*_numbers(words), 0.0, 0.0, 0.0)[:6]
     bench.place = x, y, z
+    bench.attitude = radians(roll), radians(pitch), radians(yaw)
 
 
 Line = Callable[[ServiceBench, Sequence[str]], str | None]
@@ -422,8 +504,10 @@ LINES: Mapping[str, Line] = {
     "emergency": lambda bench, words: _post(bench, SUPERVISOR, 1, b"\x03"),
     "feed": lambda bench, words: _post(bench, SUPERVISOR, 1, b"\x04"),
     "disconnect": lambda bench, words: _post(bench, COMMANDER, 0, bytes(14)),  # as cflib does
-    "poses": _poses,  # on, off
-    "place": _place,  # of a robot that does not fly
+    "poses": _poses,
+    "place": _place,  # of a robot that does not fly: x y z [roll pitch yaw]
+    "radio": _radio,  # on, off
+    "battery": _battery,  # millivolts
     "wait": _wait,
     "look": _look,
     "ask": _ask,
@@ -432,29 +516,51 @@ LINES: Mapping[str, Line] = {
     "write": _write,
     "misc": _misc,
     "log": _log,
+    "values": _values,
+    "servos": _servos,
 }
 
 
 def differences(expected: Answers, found: Answers) -> Iterator[str]:
     """Yield how the answers of two boards differ."""
     for one, other in zip(expected.lines, found.lines, strict=True):
-        if one != other:
+        if not (len(one.split()) == len(other.split()) and all(map(_near, one.split(), other.split()))):
             yield f"{other}, expected {one.rsplit(': ', 1)[1]}"
     slack = max(1, LATE_US // PATH_US)
     for row, place in enumerate(found.path):
         near = expected.path[max(0, row - slack) : row + slack + 1]
-        if near and min(dist(place, one) for one in near) > PATH_M:
+        if near and not any(_beside(place, one) for one in near):
             yield f"goal {place} after {row * PATH_US * 1e-6:.1f} s, expected {near[len(near) // 2]}"
             return
 
 
-def play(executor: Executor, program: str) -> Answers:
-    """Boot a board and play a program on it."""
-    return ServiceBench(executor).play(program)
+def _near(expected: str, found: str) -> bool:
+    (one, between, tolerance), (other, _, _) = expected.partition("~"), found.partition("~")
+    return expected == found or (bool(between) and abs(float(one) - float(other)) <= float(tolerance))
 
 
-def play_in_a_copy(bench: ServiceBench, program: str) -> Answers:
-    """Play a program on a copy of a booted board, in a copy of this process; the board stays as it is."""
+def _beside(one: Place, other: Place) -> bool:
+    turned = abs(remainder(one[3] - other[3], 2 * pi))
+    return dist(one[:3], other[:3]) <= PATH_M and turned <= PATH_RAD
+
+
+def play_in_copies(bench: ServiceBench, programs: Iterable[str]) -> Iterator[Answers]:
+    """Play programs, each on a copy of a booted board in a copy of this process; the board stays as it is.
+
+    Raises `LabError` when a copy breaks off.
+    """
+    room = len(os.sched_getaffinity(0))
+    started: deque[tuple[int, int]] = deque()
+    for program in programs:
+        if len(started) == room:
+            yield _played(*started.popleft())
+        started.append(_begin(bench, program))
+    while started:
+        yield _played(*started.popleft())
+
+
+def _begin(bench: ServiceBench, program: str) -> tuple[int, int]:
+    """Return the process that plays a program, and the pipe with its answers."""
     reading, writing = os.pipe()
     if (child := os.fork()) == 0:
         try:
@@ -466,10 +572,14 @@ def play_in_a_copy(bench: ServiceBench, program: str) -> Answers:
         finally:
             os._exit(0)
     os.close(writing)
+    return child, reading
+
+
+def _played(child: int, reading: int) -> Answers:
     with os.fdopen(reading) as pipe:
         text = pipe.read()
     os.waitpid(child, 0)
     if not text:
         raise LabError("the board broke off a program of requests")
     lines, path = json.loads(text)
-    return Answers(lines, [(x, y, z) for x, y, z in path])
+    return Answers(lines, [(x, y, z, yaw) for x, y, z, yaw in path])

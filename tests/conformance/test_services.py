@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from hil.deploy.service_programs import PROGRAMS, STOCK
-from hil.deploy.services import Answers, ServiceBench, differences, play, play_in_a_copy
+from hil.deploy.services import Answers, ServiceBench, differences, play_in_copies
 from hil.devices.board_firmware import PythonBoard
 from support.paths import TESTS
 
@@ -33,6 +33,9 @@ FAST = (
     "a turned trajectory turns about its origin",
     "there are 31 definitions",
     "a compressed trajectory is neither scaled nor reversed",
+    "poses over the app channel fly the robot",
+    "packed poses fly the robot whose address they have",
+    "the values of a robot that stands askew",
     "disarming in flight stops the robot until it is armed",
     "disarming by the parameter",
     "poses that stay away end the flight for the commander",
@@ -45,9 +48,7 @@ def recorded(name: str) -> dict[str, Answers]:
     """The referee's answers by program; a program that has changed since has none."""
     entries = json.loads((TESTS / "vectors" / "services" / f"{name}.json").read_text())
     return {
-        program: Answers(
-            entry["answers"], [tuple(1e-3 * part for part in place) for place in entry["path_mm"]]
-        )
+        program: Answers(entry["answers"], [tuple(1e-3 * part for part in place) for place in entry["path"]])
         for program, entry in entries.items()
         if entry["program"] == PROGRAMS.get(program)
     }
@@ -59,6 +60,16 @@ def booted(elf: str) -> ServiceBench:
     from hil.devices.image_firmware import ChipImage
 
     return ServiceBench(ChipImage.load(Path(elf), None))
+
+
+def played(bench: ServiceBench, program: str) -> Answers:
+    [answers] = play_in_copies(bench, [program])
+    return answers
+
+
+@pytest.fixture(scope="module")
+def python() -> ServiceBench:
+    return ServiceBench(PythonBoard())
 
 
 @pytest.fixture(scope="module")
@@ -82,14 +93,14 @@ def test_every_program_has_the_answers_of_its_referee() -> None:
 
 
 @pytest.mark.parametrize("name", FAST)
-def test_the_python_board_answers_as_the_image(name: str) -> None:
-    assert list(differences(recorded("app")[name], play(PythonBoard(), PROGRAMS[name]))) == []
+def test_the_python_board_answers_as_the_image(python: ServiceBench, name: str) -> None:
+    assert list(differences(recorded("app")[name], played(python, PROGRAMS[name]))) == []
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", sorted(set(PROGRAMS) - set(FAST)))
-def test_the_python_board_answers_as_the_image_in_all_programs(name: str) -> None:
-    assert list(differences(recorded("app")[name], play(PythonBoard(), PROGRAMS[name]))) == []
+def test_the_python_board_answers_as_the_image_in_all_programs(python: ServiceBench, name: str) -> None:
+    assert list(differences(recorded("app")[name], played(python, PROGRAMS[name]))) == []
 
 
 @pytest.mark.parametrize("name", sorted(STOCK))
@@ -105,13 +116,13 @@ def test_where_the_law_is_the_firmware_s_own_the_app_changes_nothing(name: str) 
 @pytest.mark.long
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_the_image_answers_as_recorded(app: ServiceBench, name: str) -> None:
-    assert list(differences(recorded("app")[name], play_in_a_copy(app, PROGRAMS[name]))) == []
+    assert list(differences(recorded("app")[name], played(app, PROGRAMS[name]))) == []
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", sorted(STOCK))
 def test_the_stock_image_answers_as_recorded(stock: ServiceBench, name: str) -> None:
-    assert list(differences(recorded("stock")[name], play_in_a_copy(stock, PROGRAMS[name]))) == []
+    assert list(differences(recorded("stock")[name], played(stock, PROGRAMS[name]))) == []
 
 
 # Generated programs
@@ -147,8 +158,8 @@ def bits_of(answer: str) -> tuple[int, Sequence[str]]:
 
 @settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
 @given(GENERATED)
-def test_bits_and_states_fit_together_whatever_a_client_does(program: str) -> None:
-    answers = play(PythonBoard(), program)
+def test_bits_and_states_fit_together_whatever_a_client_does(python: ServiceBench, program: str) -> None:
+    answers = played(python, program)
     was_locked = False
     for answer in (line for line in answers.lines if "bits" in line):
         bits, words = bits_of(answer)
@@ -162,6 +173,8 @@ def test_bits_and_states_fit_together_whatever_a_client_does(program: str) -> No
 @pytest.mark.long
 @settings(max_examples=10, deadline=None, phases=(Phase.generate,), suppress_health_check=list(HealthCheck))
 @given(GENERATED)
-def test_both_boards_end_in_the_same_state_on_the_same_path(app: ServiceBench, program: str) -> None:
+def test_both_boards_end_in_the_same_state_on_the_same_path(
+    app: ServiceBench, python: ServiceBench, program: str
+) -> None:
     program = program.replace("look", "wait 0.1") + "\nwait 3"  # until a lock that is due has come on both
-    assert list(differences(play_in_a_copy(app, program), play(PythonBoard(), program))) == []
+    assert list(differences(played(app, program), played(python, program))) == []

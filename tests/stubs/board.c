@@ -16,6 +16,7 @@
 #include "crc32.h"
 #include "crtp.h"
 #include "commander.h"
+#include "configblock.h"
 #include "crtp_commander_high_level.h"
 #include "crtp_supervisor.h"
 #include "debug.h"
@@ -55,6 +56,7 @@ int32_t stub_suspended;
 int32_t stub_transmit_full;
 CoreDebug_Type stub_core_debug;
 
+uint64_t configblockGetRadioAddress(void) { return 0xE7E7E7E7E7; }
 uint64_t usecTimestamp(void) { return stub_now_us - stub_usec_reset_us; }
 TickType_t xTaskGetTickCount(void) { return stub_first_tick + (TickType_t)(stub_now_us / 1000); }
 float pmGetBatteryVoltage(void) { return stub_battery; }

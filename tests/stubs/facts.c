@@ -16,6 +16,7 @@
 #include "autoconf.h"
 #include "cfassert.h"
 #include "commander.h"
+#include "configblock.h"
 #include "controller.h"
 #include "crc32.h"
 #include "crtp.h"
@@ -121,6 +122,7 @@ VALUE(TRAJECTORY_STATE_FLYING, 1)
 VALUE(TRAJECTORY_STATE_LANDING, 3)
 VALUE(TRAJECTORY_STATE_DISABLED, 4)
 FUNCTION(usecTimestamp, uint64_t, void)
+FUNCTION(configblockGetRadioAddress, uint64_t, void)
 
 /* autoconf.h, estimator.h, controller.h, stabilizer_types.h */
 VALUE(CONFIG_APP_ENABLE, 1)

@@ -13,8 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cflib.utils.encoding import compress_quaternion
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from firmware_py import supervisor as reference
 from firmware_py.core.structs import MANUAL_ANGLES, Estimator
@@ -24,6 +26,7 @@ from firmware_py.export.profile_c import profile_hash
 from firmware_py.firmware import Firmware
 from firmware_py.geometry import Quaternion, Vector, from_euler_zyx, in_goal_frame, yaw_quaternion
 from firmware_py.wire import crtp, telemetry
+from firmware_py.wire.localisation import EXT_POSE_PACKED
 from hil.config import LabConfig, load_config
 from hil.devices.board import VirtualBoard
 from support.crazyflie_app import LOCALISATION, STUBS, App, Setpoint, build_app
@@ -97,6 +100,18 @@ def write(name: str, value: float) -> Event:
     return act
 
 
+def packed_poses(header: bytes, p: NDArray[np.float64], q: Quaternion) -> bytes:
+    """Return a packet with the pose of another robot and ours."""
+    w, *xyz = q
+    items = (
+        struct.pack(
+            "<B3hI", address, *(round(1000 * part) + away for part in p), compress_quaternion((*xyz, w))
+        )
+        for address, away in ((0x01, 500), (0xE7, 0))
+    )
+    return header + bytes((EXT_POSE_PACKED,)) + b"".join(items)
+
+
 def scenario(rng: np.random.Generator, steps: int) -> dict[int, list[Event]]:
     """Poses at 50 Hz along a walk: with ages, without, too old, garbage, jumps, out of bounds; silence and stops."""
     events: dict[int, list[Event]] = defaultdict(list)
@@ -110,6 +125,8 @@ def scenario(rng: np.random.Generator, steps: int) -> dict[int, list[Event]]:
         q = (math.sqrt(1 - 0.25 * (roll**2 + yaw**2)), roll / 2, 0.0, yaw / 2)
         age_us = int(rng.choice([25_000, 40_000, 41_500, 60_000, 126_000]))
         data = crtp.encode_ext_pose(tuple(p), q, None if rng.random() < 0.1 else age_us)
+        if step % 260 == 0:
+            data = packed_poses(data[:1], p, q)
         if rng.random() < 0.03:
             data = data[:1] + bytes(30)
         just_before_control = step in (600, 3800)  # the first one, and the one that ends the silence

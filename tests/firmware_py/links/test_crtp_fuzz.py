@@ -96,8 +96,6 @@ def test_the_board_survives_random_and_mutated_packets(packets: int) -> None:
 @settings(max_examples=300)
 def test_decoders_raise_nothing_but_their_own_error(data: bytes) -> None:
     for decode in (
-        localisation.decode_position,
-        localisation.decode_packed_positions,
         localisation.decode_packed_poses,
         memories.decode_config,
         parameters.decode_set_by_name,

@@ -85,18 +85,18 @@ def test_malformed_and_unserved_packets_are_counted(
     assert (client.firmware.link.malformed, client.firmware.link.unserved) == (malformed, unserved)
 
 
-def test_application_channel_echoes_and_counts_what_it_loses(client: CrtpClient) -> None:
-    assert client.one(PLATFORM, 2, bytes(range(30))) == bytes(range(30))
-    client.radio_open = False
-    for number in range(200):  # 120 wait for the radio, 10 for the application
-        client.send(PLATFORM, 2, bytes((number,)))
-        client.run(client.now_us + 2000)
-    client.radio_open = True
-    client.run(client.now_us + 200_000)
-    echoed = [data[0] for data in client.packets(PLATFORM, 2)][1:]
-    assert echoed == list(range(len(echoed)))
-    assert 130 <= len(echoed) < 200
-    assert client.log(client.toc(LOG), "app.overflows") == [200 - len(echoed)]
+def test_the_application_channel_takes_poses_as_the_exported_app_does(client: CrtpClient) -> None:
+    client.run(610_000)
+    data = crtp.encode_ext_pose((0.02, -0.03, 0.04), (1.0, 0.0, 0.0, 0.0), None)[1:]
+    for at_us in range(620_000, 900_000, 20_000):
+        client.run(at_us)
+        client.send(PLATFORM, 2, data)
+    client.run(905_000)
+    assert client.firmware.signals.supervisor.state.name == "FLYING"
+    client.send(PLATFORM, 2, b"no pose")
+    client.run(910_000)
+    assert client.firmware.link.malformed == 1
+    assert client.packets(PLATFORM, 2) == []
 
 
 # Tables of contents
@@ -130,7 +130,7 @@ def test_the_two_tables_have_different_checksums(client: CrtpClient) -> None:
 
 
 def test_floatys_own_names_are_there_beside_those_of_the_stock_firmware(logs, params) -> None:
-    own = "controller.m1 motors_ctrp.m1 locSrv.x Error.int_z_err acc.z stateEstimate.roll_rate stateEstimate.flap_1"
+    own = "controller.m1 motors_ctrp.m1 locSrv.age Error.int_z_err acc.z stateEstimate.roll_rate stateEstimate.flap_1"
     assert set(own.split()) <= logs.keys()
     own = "extCtrl.manual extCtrl.target_yaw extCtrl.x_P extCtrl.yaw_rate_P extCtrl.m1 delayComp.activate setpoint.X "
     own += "motorShifts.m1 motorPowerSet.enable kalman.maxPos RandConsts.flapHoverAng FloatyKalm.resetKalman "
@@ -593,17 +593,13 @@ def test_packed_pose_with_our_address_is_flown_and_others_are_not(client: CrtpCl
     )
 
 
-def test_position_without_attitude_is_logged_and_not_flown(client: CrtpClient, logs) -> None:
+def test_position_without_attitude_is_not_flown(client: CrtpClient) -> None:
     client.run(610_000)
-    client.send(LOC, 0, struct.pack("<3f", 1, 2, 3))
-    client.run(620_000)
-    assert client.log(logs, "locSrv.x", "locSrv.y", "locSrv.z") == [1, 2, 3]
-    client.send(LOC, 2, struct.pack("<Bhhh", 0xE7, 100, 200, 300) + struct.pack("<Bhhh", 3, 1, 1, 1))
-    client.run(client.now_us + 5000)
-    assert client.log(logs, "locSrv.x", "locSrv.y", "locSrv.z", "locSrv.positions") == pytest.approx(
-        [0.1, 0.2, 0.3, 2]
-    )
+    for channel, data in ((0, struct.pack("<3f", 0, 0, 0)), (2, struct.pack("<Bhhh", 0xE7, 0, 0, 0))):
+        client.send(LOC, channel, data)
+    client.run(700_000)
     assert client.firmware.signals.supervisor.state.name == "WAITING"
+    assert (client.firmware.link.malformed, client.firmware.link.unserved) == (0, 0)
 
 
 # Flaps from outside

@@ -11,7 +11,7 @@ from cflib.crtp.crtpstack import CRTPPacket
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_py.wire import WireError, crtp, localisation, log, telemetry
+from firmware_py.wire import WireError, crtp, log, telemetry
 from firmware_py.wire.scalars import Scalar
 
 metres = st.floats(-100.0, 100.0, width=32)
@@ -88,13 +88,6 @@ def test_a_position_outside_of_any_tunnel_is_invalid():
     for x in (1000.5, -1001.0, 3e38):
         with pytest.raises(WireError, match="within 1000 m"):
             crtp.decode_ext_pose(crtp.encode_ext_pose((x, 0, 0), Q, 0)[1:])
-
-
-@pytest.mark.parametrize("z", [nan, inf, 1000.5, -3e38])
-def test_a_position_without_attitude_follows_the_same_rule(z):
-    assert localisation.decode_position(struct.pack("<3f", 1, 2, 1000)) == (1, 2, 1000)
-    with pytest.raises(WireError, match="within 1000 m"):
-        localisation.decode_position(struct.pack("<3f", 1, 2, z))
 
 
 @given(st.binary(max_size=40))

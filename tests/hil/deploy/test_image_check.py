@@ -3,6 +3,7 @@
 import ctypes
 import json
 import os
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +16,13 @@ from firmware_py.core.structs import Input, Parameters
 from firmware_py.export.app_toc import AppParameter, app_parameters
 from firmware_py.wire.scalars import PARAMETER_SCALARS, Scalar
 from hil.config import load_config
+from hil.deploy import image_check
 from hil.deploy.beside import compare_flights, compare_states
-from hil.deploy.image_check import TARGET, check_image, check_memory, check_parameters
+from hil.deploy.image_check import TARGET, check_image, check_memory, check_parameters, check_services
+from hil.deploy.service_programs import PROGRAMS
+from hil.deploy.services import Answers, ServiceBench, differences, play_in_copies
+from hil.devices.board_firmware import PythonBoard
+from hil.errors import LabError
 from hil.experiments import find_experiment
 from hil.laboratory.faults import parse
 from hil.laboratory.recorder import EVENTS
@@ -106,6 +112,35 @@ def test_a_parameter_that_is_missing_is_found(board: AppBoard) -> None:
     assert list(check_parameters((missing,), board)) == ["extCtrl.none: the image has no such parameter"]
 
 
+def test_programs_that_the_boards_answer_differently_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("goals outside the box are refused", "the values of a robot that stands askew")
+    monkeypatch.setattr(image_check, "PROGRAMS", {name: PROGRAMS[name] for name in names})
+    default, narrow = (
+        ServiceBench(PythonBoard(), load_config(overrides=overrides))
+        for overrides in ((), ("box.radius=0.05",))
+    )
+    done: list[int] = []
+    assert list(check_services(default, default, done.append)) == []
+    assert done == [1, 2]
+    [difference] = check_services(narrow, default, done.append)
+    assert re.match(f"{names[0]}: goto .*: status 8, expected status 0$", difference)
+
+
+def test_numbers_of_two_boards_may_be_apart_by_their_tolerance() -> None:
+    for found, apart in (("1.95~0.1 7", False), ("2.11~0.1 7", True), ("2~0.1 8", True), ("2~0.1", True)):
+        answers = [Answers([f"values: {text}"]) for text in ("2~0.1 7", found)]
+        assert bool(list(differences(*answers))) == apart
+    place = (0.0, 0.0, 1.0, 3.13)
+    for found, apart in (((0.04, 0, 1, -3.13), False), ((0.06, 0, 1, 3.13), True), ((0, 0, 1, 3.0), True)):
+        assert bool(list(differences(Answers([], [place]), Answers([], [found])))) == apart
+
+
+def test_a_program_that_breaks_off_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(LabError, match="the board broke off a program of requests"):
+        list(play_in_copies(ServiceBench(PythonBoard()), ["no-such-word"]))
+    assert "no-such-word" in capfd.readouterr().err
+
+
 @pytest.mark.parametrize(("used", "good"), [(64_512, True), (64_513, False)])
 def test_less_than_a_kilobyte_left_of_a_memory_is_a_warning(used: int, good: bool) -> None:
     finding = check_memory((MemoryUse("flash", 300_000, 1_032_192), MemoryUse("CCM", used, 65_536)))
@@ -163,10 +198,13 @@ def test_an_image_of_the_profile_passes_and_one_of_another_does_not() -> None:
     shown: list[str] = []
     findings = list(check_image(Path(ELF), "floaty", (), lambda what, done, total: shown.append(what)))
     assert [one for one in findings if not one.good] == []
-    assert {"params", "switches", "watch", "servos", "flight", "states"} <= {one.subject for one in findings}
+    assert {"params", "switches", "watch", "servos", "services", "flight", "states"} <= {
+        one.subject for one in findings
+    }
     expected = {
         "boot",
         "parameters",
+        "services",
         *(f"flight, {name}" for name in ("hover, python", "hover, image", "supervisor, image")),
     }
     assert expected <= set(shown)

@@ -4,12 +4,13 @@
  * self-test: from then on the servos get pulses, and the self-test no longer sees the cause of a restart.
  *
  * Poses: packets of port 6 come here instead of to the firmware's own localisation service, because that ignores
- * the age behind an external pose. The app channel takes the same bytes.
+ * the age behind an external pose. The app channel takes the bytes of one pose.
  */
 #define DEBUG_MODULE "FLOATY"
 
 #include "floaty_calls.h"
 
+#include <math.h>
 #include <string.h>
 
 #include "FreeRTOS.h"
@@ -19,6 +20,7 @@
 #include "app_channel.h"
 #include "autoconf.h"
 #include "cfassert.h"
+#include "configblock.h"
 #include "crtp.h"
 #include "crtp_supervisor.h"
 #include "debug.h"
@@ -30,6 +32,8 @@
 #include "floaty_settings.h"
 
 #define POSE_SIZE (1 + 7 * sizeof(float))
+#define PACKED_SIZE 11 /* last byte of the receiver's address, x y z [mm] as int16, quaternion in 32 bits */
+#define PACKED_SHARE 1.3837706e-3f /* of one step in a component: 1 / (511 * sqrt(2)) */
 #define LOOK_MS 20 /* between two checks that the controller runs */
 #define POSE_LINE_MS 10000 /* between lines about refused poses */
 #define SELF_TEST_MS 100
@@ -55,6 +59,44 @@ static void receive_pose(const uint8_t *data, uint32_t length) {
   floaty_queue_pose(&pose);
 }
 
+/* "Smallest three", in the arithmetic of firmware_py/wire/localisation.py. */
+static void unpack_quaternion(uint32_t packed, float wxyz[4]) {
+  const int largest = (int)(packed >> 30); /* of x y z w */
+  float squares = 0.0f;
+  for (int i = 3; i >= 0; i--) {
+    if (i != largest) {
+      const float value = (float)(packed & 0x1FF) * PACKED_SHARE;
+      wxyz[(i + 1) % 4] = (packed & 0x200) != 0 ? -value : value;
+      squares += value * value;
+      packed >>= 10;
+    }
+  }
+  wxyz[(largest + 1) % 4] = sqrtf(fmaxf(0.0f, 1.0f - squares));
+}
+
+static void receive_packed_poses(const uint8_t *data, uint32_t length) {
+  const uint8_t address = (uint8_t)configblockGetRadioAddress();
+  if (length == 1 || (length - 1) % PACKED_SIZE != 0) {
+    floaty_observed.malformed += 1;
+    return;
+  }
+  for (const uint8_t *item = data + 1; item < data + length; item += PACKED_SIZE) {
+    FloatyPose pose = {.arrival_us = floaty_pose_clock_us(), .age_us = -1}; /* unknown */
+    int16_t millimetres[3];
+    uint32_t packed;
+    if (item[0] != address) {
+      continue;
+    }
+    memcpy(millimetres, item + 1, sizeof millimetres);
+    memcpy(&packed, item + 1 + sizeof millimetres, sizeof packed);
+    for (int axis = 0; axis < 3; axis++) {
+      pose.position[axis] = (float)millimetres[axis] / 1000.0f;
+    }
+    unpack_quaternion(packed, pose.quaternion);
+    floaty_queue_pose(&pose);
+  }
+}
+
 static void receive_localisation(CRTPPacket *packet) {
   if (packet->channel != FLOATY_CHANNEL_GENERIC || packet->size < 1) {
     return; /* a position without attitude is no pose */
@@ -63,6 +105,8 @@ static void receive_localisation(CRTPPacket *packet) {
     crtpSupervisorSetEmergencyStop(); /* as port 9 */
   } else if (packet->data[0] == FLOATY_EMERGENCY_STOP_WATCHDOG && packet->size == 1) {
     crtpSupervisorNotifyEmergencyStopWatchdog();
+  } else if (packet->data[0] == FLOATY_EXT_POSE_PACKED) {
+    receive_packed_poses(packet->data, packet->size);
   } else {
     receive_pose(packet->data, packet->size);
   }
