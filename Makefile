@@ -16,7 +16,7 @@ test: .venv/test.stamp
 
 # Real-time tests run one at a time and beside nothing else; one that fails is repeated and listed as RERUN: repair what appears there.
 test-all: .venv/test.stamp
-	$(BIN)/python -m pytest -n auto -m 'not realtime' --durations 20
+	$(BIN)/python -m pytest -n auto --dist loadgroup -m 'not realtime' --durations 20
 	$(BIN)/python -m pytest -m realtime --reruns 2 -rfER --durations 20
 
 check: .venv/test.stamp

@@ -5,7 +5,7 @@ is the one whose jerk is zero at both ends. Positions in the frame of the extern
 from the beginning of the path. Only + - * / in a fixed order, and the functions of `elementary`: the same bits everywhere.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum, auto
 from math import comb, pi, tau
@@ -15,7 +15,6 @@ from firmware_py.geometry import Vector, rotate, wrap_angle, yaw_quaternion
 
 AXES = 4  # x, y, z, yaw
 SHORTEST_S = 1e-3  # a path that takes less time jumps to its end
-SAMPLES = 16  # positions of a piece that are compared with the box
 Coefficients = tuple[float, ...]  # ascending powers of the time in a piece
 
 
@@ -68,15 +67,6 @@ class Path:
         rate = (-1.0 if self.reverse else 1.0) / self.timescale
         velocity, acceleration = _scaled(motion.velocity, rate), _scaled(motion.acceleration, rate * rate)
         return PathPoint(motion.position, motion.yaw, velocity, acceleration, motion.yaw_rate * rate)
-
-    def places(self) -> Iterator[Vector]:
-        """Yield positions along the path, `SAMPLES` per piece and the end."""
-        t = 0.0
-        for piece in reversed(self.pieces) if self.reverse else self.pieces:
-            for step in range(SAMPLES):
-                yield self.at((t + piece.duration * step / SAMPLES) * self.timescale).position
-            t += piece.duration
-        yield self.at(self.duration).position
 
     def begun_at(self, position: Vector, yaw: float | None) -> "Path":
         """Return the same path, shifted as if it were not turned, and turned if a yaw is given."""

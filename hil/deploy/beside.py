@@ -3,10 +3,11 @@
 A second flight takes the supervisor through its states, which must be the same in the same order.
 
 The two are never equal bit for bit: boot time, gyro zero, the estimator's phase and the board's microsecond differ
-(`hil.studies.two_boards`). The bounds are about four times the differences of a correct image, in a hover of 4 s with a
-push and a cut link; there the position differs by 0.4 mm, the servo counts by 330 (rms). The first pose after the cut is
-about as old as the filter's horizon, and the phase decides whether it is fused: if one board fuses it and the other waits
-for the next one, the estimate differs by 5 cm in one row of 400, which is 2.7 mm rms.
+(`hil.studies.two_boards`). The bounds are about twice the largest difference of ten correct flights: seeds 1 to 5, the app
+compiled by gcc 12.2 and by clang 22. Each is a hover of 4 s with a push and a cut link; the largest differences are 0.96 mm
+of position and 370 servo counts (rms). The first pose after the cut is about as old as the filter's horizon, and the phase
+decides whether it is fused: if one board fuses it and the other waits for the next one, the estimate differs by 5 cm in one
+row of 400, which is 2.7 mm rms.
 """
 
 from collections.abc import Callable, Iterator
@@ -56,15 +57,15 @@ SIZES: dict[str, Callable[[NDArray[np.float64]], float]] = {
 }
 BOUNDS = (
     Bound("position", ("truth.x", "truth.y", "truth.z"), "rms", 2.0, "mm", 1e3),
-    Bound("body rates", ("truth.p", "truth.q", "truth.r"), "rms", 0.15, "rad/s"),
-    Bound("estimated position", ("estimate.x", "estimate.y", "estimate.z"), "rms", 4.0, "mm", 1e3),
+    Bound("body rates", ("truth.p", "truth.q", "truth.r"), "rms", 0.25, "rad/s"),
+    Bound("estimated position", ("estimate.x", "estimate.y", "estimate.z"), "rms", 7.0, "mm", 1e3),
     Bound("estimated rates", ("estimate.p", "estimate.q", "estimate.r"), "mean", 0.004, "rad/s"),
-    Bound("servo counts", tuple(f"motor.m{servo}" for servo in range(1, 5)), "rms", 1300.0),
-    Bound("servo counts", tuple(f"motor.m{servo}" for servo in range(1, 5)), "mean", 60.0),
-    Bound("age of poses", ("estimator.pose_age_us",), "mean", 1.5, "ms", 1e-3),
+    Bound("servo counts", tuple(f"motor.m{servo}" for servo in range(1, 5)), "rms", 750.0),
+    Bound("servo counts", tuple(f"motor.m{servo}" for servo in range(1, 5)), "mean", 17.0),
+    Bound("age of poses", ("estimator.pose_age_us",), "mean", 1.0, "ms", 1e-3),
     Bound("poses fused", ("estimator.fused",), "final", 2.0),
-    Bound("poses not fused", tuple(f"estimator.{one}" for one in ("refused", "jumps", "too_old", "invalid")), "final", 1.0),
-    Bound("supervisor's state", ("supervisor.state",), "share of time", 3.0, "%", 100.0),
+    Bound("poses not fused", tuple(f"estimator.{one}" for one in ("refused", "jumps", "too_old", "invalid")), "final", 4.0),
+    Bound("supervisor's state", ("supervisor.state",), "share of time", 1.0, "%", 100.0),
 )  # fmt: skip
 
 

@@ -482,6 +482,59 @@ look
 start 2 turned
 wait 2.2
 look
+== spirals that end outside the box are refused
+takeoff 1.1 1
+wait 1.2
+goto 0 0.1 1.1 0 0.8
+wait 1
+spiral 180 0.05 0.05 0 1
+wait 0.4
+goto 0 0.1 1.1 0 0.8
+wait 1
+spiral 180 0.05 0.05 0 1 clockwise
+wait 0.4
+goto 0 -0.1 1.1 0 0.8
+wait 1
+spiral 180 0.05 0.05 0 1
+wait 0.4
+goto 0 -0.1 1.1 0 0.8
+wait 1
+spiral 180 0.05 0.05 0 1 clockwise
+wait 0.4
+goto 0.1 0 1.1 0 0.8
+wait 1
+spiral 180 0.05 0.05 0 1 sideways
+wait 0.4
+goto 0.1 0 1.1 0 0.8
+wait 1
+spiral 180 0.05 0.05 0 1 sideways clockwise
+wait 0.4
+goto -0.1 0 1.1 0 0.8
+wait 1
+spiral 180 0.05 0.05 0 1 sideways
+wait 0.4
+goto -0.1 0 1.1 0 0.8
+wait 1
+spiral 180 0.05 0.05 0 1 sideways clockwise
+wait 0.4
+wait 1
+look
+== a trajectory is followed as far as the box goes
+takeoff 1.1 1
+wait 1.2
+upload swing 0
+define 1 0 0 1
+start 1
+wait 0.5
+look
+wait 0.5
+values 0.2 stateEstimate.x~0.01
+wait 1.5
+look
+values 0.2 stateEstimate.x~0.01
+goto 0 0 1.1 0 1
+wait 1.2
+look
 == there are 31 definitions
 upload straight 0
 takeoff 1.15 0.8
@@ -768,6 +821,12 @@ servos 20
 poses aged
 takeoff 1.1 1
 wait 1.2
+goto 0.1 0 1.1 0 0.6
+values 0.5 controller.u1~0.01 controller.u2~0.01 controller.u4~0.01 stateEstimate.vx~0.04 stateEstimate.vy~0.04 stateEstimate.vz~0.04
+goto 0 0.09 1.1 0 0.6
+values 0.5 controller.u1~0.01 controller.u2~0.01 controller.u4~0.01 stateEstimate.vx~0.04 stateEstimate.vy~0.04 stateEstimate.vz~0.04
+goto 0 0.09 1.18 0 0.6
+values 0.5 controller.u1~0.01 controller.u2~0.01 controller.u4~0.01 stateEstimate.vx~0.04 stateEstimate.vy~0.04 stateEstimate.vz~0.04
 goto 0.1 -0.08 1.1 40 0.6
 wait 0.2
 values 0.2 controller.u1~0.03 controller.u2~0.03 controller.u3~0.03 controller.u4~0.03
@@ -775,9 +834,9 @@ wait 2
 values 0.2 controller.u1~0.01 controller.u2~0.01 controller.u3~0.01 controller.u4~0.01
 values 0.2 floaty.m1~100 floaty.m2~100 floaty.m3~100 floaty.m4~100
 values 0.2 locSrv.age~10 delayComp.horizon~1 sys.canfly~0 sys.isFlying~0 sys.isTumbled~0 radio.isConnected~0
-poses 21
+poses 20.73
 wait 0.5
-values 1.05 locSrv.age~10 delayComp.horizon~0.15 kalman.jumps~0
+values 1.05 locSrv.age~2 delayComp.horizon~0.15 kalman.jumps~0
 == flaps by hand need a client
 set extCtrl.m1 F32 0.3
 set extCtrl.m2 F32 -0.2

@@ -107,21 +107,29 @@ class ServiceBench:
         kernel, end_us = self.firmware.kernel, self.now_us + duration_us
         while self.now_us < end_us:
             begin_us = self._boot_us + self.now_us
-            kernel.run(begin_us, begin_us + STEP_US - 1)
+            left_us = -self.now_us % self.pose_us if self.pose_us else 0
+            if 0 < left_us < STEP_US:  # the next pose comes within this step
+                kernel.run(begin_us, begin_us + left_us - 1)
+                begin_us += left_us
+                kernel.advance(begin_us)
+                self._send_pose()
             self.now_us += STEP_US
-            kernel.advance(begin_us + STEP_US)
+            kernel.run(begin_us, self._boot_us + self.now_us - 1)
+            kernel.advance(self._boot_us + self.now_us)
             self._events.run(self.now_us)
             self._pins.measure(self._rest())
             self.firmware.imu_ready()
             if self.radio:
                 self.firmware.radio_polled()
-                if self.pose_us and self.now_us % self.pose_us == 0:
-                    self._send_pose()
+            if self.pose_us and self.now_us % self.pose_us == 0:
+                self._send_pose()
             if self._path_us is not None and (self.now_us - self._path_us) % PATH_US == 0 and self._goal:
                 self.answers.path.append(self._goal())
             kernel.run(self._boot_us + self.now_us)
 
     def _send_pose(self) -> None:
+        if not self.radio:
+            return
         if self._goal and self.firmware.signals.supervisor.state is State.FLYING:
             x, y, z, yaw = self._goal()
             self.place, self.attitude = (x, y, z), (0.0, 0.0, yaw)
@@ -138,19 +146,14 @@ class ServiceBench:
         found = (one.data for one in self.received if (one.port, one.channel) == (port, channel))
         return next(found, None)
 
-    def bits(self) -> int:
-        """Return the supervisor's field of bits."""
-        answer = self.request(SUPERVISOR, 0, b"\x0c")
-        assert answer is not None
-        return int.from_bytes(answer[1:3], "little")
-
     def state(self) -> str:
         """Return what a client sees of the supervisors."""
+        answer = self.request(SUPERVISOR, 0, b"\x0c")
+        bits = "nothing" if answer is None else f"bits {int.from_bytes(answer[1:3], 'little'):#06x}"
         if not self.floaty:
-            return f"bits {self.bits():#06x}"
+            return bits
         supervisor = self.firmware.signals.supervisor
-        cause = supervisor.cause.name.lower()
-        return f"bits {self.bits():#06x} {supervisor.state.name.lower()} {cause}"
+        return f"{bits} {supervisor.state.name.lower()} {supervisor.cause.name.lower()}"
 
     def play(self, program: str) -> Answers:
         """Execute a program, and look at the end; return the answers."""
@@ -158,7 +161,8 @@ class ServiceBench:
             words = line.split("#")[0].split()
             if words:
                 self._execute(words)
-        self._note("end", self.state())
+        flashed = self.firmware.flashed
+        self._note("end", "; ".join((self.state(), *(() if flashed is None else flashed.failures))))
         return self.answers
 
     def _execute(self, words: Sequence[str]) -> None:
@@ -462,7 +466,7 @@ def _poses(bench: ServiceBench, words: Sequence[str]) -> None:
     if word in POSES:
         bench.poses_as = word
     else:
-        bench.pose_us = {"on": POSE_US, "off": 0}[word] if word.isalpha() else 1000 * int(word)
+        bench.pose_us = {"on": POSE_US, "off": 0}[word] if word.isalpha() else round(1000 * float(word))
 
 
 def _radio(bench: ServiceBench, words: Sequence[str]) -> None:

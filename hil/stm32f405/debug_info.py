@@ -209,8 +209,7 @@ def _ranges(unit: Any, lists: Any) -> list[tuple[int, int]]:
     attributes = top.attributes
     low = attributes["DW_AT_low_pc"].value if "DW_AT_low_pc" in attributes else 0
     if "DW_AT_ranges" in attributes:
-        of_unit = (unit,) if unit["version"] >= 5 else ()
-        ranges = lists.get_range_list_at_offset(attributes["DW_AT_ranges"].value, *of_unit)
+        ranges = lists.get_range_list_at_offset(attributes["DW_AT_ranges"].value, unit)
         found, base = [], low
         for entry in ranges:
             if hasattr(entry, "base_address"):

@@ -186,14 +186,6 @@ def boxed(absolute: Flyer) -> Flyer:
     return absolute
 
 
-def test_path_that_swings_out_of_the_box_in_between_is_refused(boxed: Flyer) -> None:
-    swing = Poly4D.Poly([0.0, 0.4, -0.2] + [0.0] * 5)  # x: 0, 0.2 after 1 s, 0 after 2 s
-    still, height = Poly4D.Poly([0.0] * 8), Poly4D.Poly([1.15] + [0.0] * 7)
-    boxed.upload(Poly4D(2.0, swing, still, height, still).pack())
-    assert boxed.order(boxed.commander.define_trajectory, 1, 0, 1) == 0
-    assert boxed.order(boxed.commander.start_trajectory, 1) == ENOEXEC
-
-
 def test_robot_that_was_pushed_out_of_the_box_may_return(boxed: Flyer) -> None:
     boxed.place = (0.3, 0.0, 1.15)
     boxed.wait(0.1)

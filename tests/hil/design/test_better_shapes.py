@@ -107,11 +107,16 @@ def test_the_flat_robot_falls_over_in_the_time_of_its_pole() -> None:
     )
 
 
+# Tests that share a search: pytest-xdist runs them in one process.
+SEARCHED = pytest.mark.xdist_group("small-search")
+
+
 @cache
 def small_search(figure: str, seed: int = 1) -> search.Optimum:
     return search.optimise(PAPER, figure, seed, generations=1)
 
 
+@SEARCHED
 @pytest.mark.long
 def test_searches_from_other_seeds_end_at_the_same_robot() -> None:
     one, other = (small_search("least-authority", seed).best for seed in (1, 11))
@@ -138,6 +143,7 @@ def test_a_shape_is_the_worse_the_more_it_violates_conditions() -> None:
     assert not shapes.tried
 
 
+@SEARCHED
 @pytest.mark.long
 def test_the_optimum_keeps_span_mass_speed_and_is_stable_and_steers_around_its_hover() -> None:
     found = small_search("least-authority")
@@ -154,6 +160,7 @@ def test_the_optimum_keeps_span_mass_speed_and_is_stable_and_steers_around_its_h
     assert found.best.authority == max(one.authority for one in found.tried)
 
 
+@SEARCHED
 @pytest.mark.long
 def test_the_front_is_what_nothing_beats_in_both() -> None:
     found = small_search("least-authority")
