@@ -519,6 +519,17 @@ spiral 180 0.05 0.05 0 1 sideways clockwise
 wait 0.4
 wait 1
 look
+== relative climbs and descents are judged by their ends
+takeoff 1.3 1
+wait 1.2
+sink 0.9 0.8 relative
+sink 0.75 0.8 relative
+wait 1.2
+look
+rise 1.3 0.8 relative
+rise 1.1 0.8 relative
+wait 1.6
+look
 == a trajectory is followed as far as the box goes
 takeoff 1.1 1
 wait 1.2
@@ -822,11 +833,11 @@ poses aged
 takeoff 1.1 1
 wait 1.2
 goto 0.1 0 1.1 0 0.6
-values 0.5 controller.u1~0.01 controller.u2~0.01 controller.u4~0.01 stateEstimate.vx~0.04 stateEstimate.vy~0.04 stateEstimate.vz~0.04
+values 0.5 controller.u1~0.01 controller.u2~0.01 stateEstimate.vx~0.04 stateEstimate.vy~0.04 stateEstimate.vz~0.04
 goto 0 0.09 1.1 0 0.6
-values 0.5 controller.u1~0.01 controller.u2~0.01 controller.u4~0.01 stateEstimate.vx~0.04 stateEstimate.vy~0.04 stateEstimate.vz~0.04
+values 0.5 controller.u1~0.01 controller.u2~0.01 stateEstimate.vx~0.04 stateEstimate.vy~0.04 stateEstimate.vz~0.04
 goto 0 0.09 1.18 0 0.6
-values 0.5 controller.u1~0.01 controller.u2~0.01 controller.u4~0.01 stateEstimate.vx~0.04 stateEstimate.vy~0.04 stateEstimate.vz~0.04
+values 0.5 controller.u1~0.01 controller.u2~0.01 stateEstimate.vx~0.04 stateEstimate.vy~0.04 stateEstimate.vz~0.04
 goto 0.1 -0.08 1.1 40 0.6
 wait 0.2
 values 0.2 controller.u1~0.03 controller.u2~0.03 controller.u3~0.03 controller.u4~0.03
