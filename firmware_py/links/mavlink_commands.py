@@ -6,7 +6,7 @@ gets no answer asks again and again. The end of a transaction, MISSION_ACK or LO
 """
 
 from collections.abc import Callable, Sequence
-from math import isfinite
+from math import isfinite, isnan
 
 from firmware_py.board import Board
 from firmware_py.links.mavlink_setpoints import SetpointService
@@ -59,7 +59,7 @@ class CommandService:
             Command.COMPONENT_ARM_DISARM: self._arm,
             Command.GET_HOME_POSITION: lambda command: self._once(NUMBERS["HOME_POSITION"]),
             Command.INJECT_FAILURE: self._fail,
-            Command.GET_MESSAGE_INTERVAL: self._report_interval,
+            Command.GET_MESSAGE_INTERVAL: lambda command: self._report_interval(_whole(command.param1)),
             Command.SET_MESSAGE_INTERVAL: self._set_interval,
             Command.REQUEST_MESSAGE: self._request,
             Command.REQUEST_PROTOCOL_VERSION: lambda command: self._once(NUMBERS["PROTOCOL_VERSION"]),
@@ -118,7 +118,8 @@ class CommandService:
 
     def _fail(self, command: Message) -> Outcome:
         """Make the simulated hardware fail; real hardware cannot."""
-        unit, failing, instance = map(_whole, (command.param1, command.param2, command.param3))
+        instance = 0 if isnan(command.param3) else _whole(command.param3)  # NaN: unused, all of them
+        unit, failing = _whole(command.param1), _whole(command.param2)
         return self._board.inject_failure(unit, failing, instance), ()
 
     def _terminate(self, command: Message) -> Outcome:
@@ -137,14 +138,15 @@ class CommandService:
         done = self._streams.set_interval(_whole(command.param1), _whole(command.param2))
         return DONE if done else DENIED
 
-    def _report_interval(self, command: Message) -> Outcome:
-        number = _whole(command.param1)
+    def _report_interval(self, number: int) -> Outcome:
         if not 0 <= number <= 0xFFFF:
             return DENIED
         return CommandResult.ACCEPTED, (services.message_interval(number, self._streams.interval_us(number)),)
 
     def _request(self, command: Message) -> Outcome:
         number, index = _whole(command.param1), _whole(command.param2)
+        if number == NUMBERS["MESSAGE_INTERVAL"]:
+            return self._report_interval(index)
         if number != NUMBERS["AVAILABLE_MODES"]:
             return self._once(number)
         modes = tuple(services.available_mode(mode) for mode in Mode)

@@ -21,8 +21,11 @@ HASH_NAME = "_HASH_CHECK"
 HASH_BITS = 24  # which a REAL32 carries exactly
 NO_INDEX = 0xFFFF
 NO_NUMBER = -1  # the same in messages where it has a sign
-DOES_NOT_EXIST, OUT_OF_RANGE = 1, 2  # MAV_PARAM_ERROR
-REAL32 = 9  # MAV_PARAM_TYPE
+DOES_NOT_EXIST, OUT_OF_RANGE, TYPE_UNSUPPORTED, TYPE_MISMATCH = 1, 2, 6, 7  # MAV_PARAM_ERROR
+REAL32 = 9
+# MAV_PARAM_TYPE by number; a message has no room for a value of 8 bytes.
+TYPES = "none", "UINT8", "INT8", "UINT16", "INT16", "UINT32", "INT32", "UINT64", "INT64", "REAL32", "REAL64"
+FOUR_BYTES = range(1, 7)
 
 
 class MavlinkParameters:
@@ -69,13 +72,19 @@ class MavlinkParameters:
         name, value = message.param_id, message.param_value
         number = self._find(message)
         parameter = self._parameters[number]
+        kind = message.param_type
         whole = parameter.scalar.is_float or (isfinite(value) and value == int(value))
-        done = message.param_type == REAL32 and whole and parameter.set(value) == OK
+        if kind != REAL32:
+            error = TYPE_MISMATCH if kind in FOUR_BYTES else TYPE_UNSUPPORTED
+            why = f"type {TYPES[kind] if kind < len(TYPES) else kind} refused, REAL32 is needed"
+        elif not whole or parameter.set(value) != OK:
+            error, why = OUT_OF_RANGE, f"{value:g} refused, {parameter.minimum:g}..{parameter.maximum:g}"
+        else:
+            error, why = None, ""
         self._stack.reply(self._value(number))
-        if not done:
-            self._stack.reply(services.parameter_error(message, name, NO_NUMBER, OUT_OF_RANGE))
-            limits = f"{parameter.minimum:g}..{parameter.maximum:g}"
-            raise WireError(f"{name} = {value:g}: refused, {limits}")
+        if error is not None:
+            self._stack.reply(services.parameter_error(message, name, NO_NUMBER, error))
+            raise WireError(f"{name}: {why}")
 
     def _find(self, request: Message) -> int:
         name = request.param_id

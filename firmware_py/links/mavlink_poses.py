@@ -147,7 +147,7 @@ class PoseService:
         """Answer a request; use an answer of the partner."""
         now_us = self._stack.kernel.now_us
         if message.tc1 == 0:
-            self._stack.reply(services.timesync(now_us * 1000, message.ts1))
+            self._stack.reply(services.timesync_answer(now_us * 1000, message))
         elif (message.get_srcSystem(), message.get_srcComponent()) == self._partner:
             self._clock.answer(now_us, message.ts1 // 1000, message.tc1 // 1000)
 

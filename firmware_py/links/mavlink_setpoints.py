@@ -9,6 +9,7 @@ goal; its origin is home while they are corrections.
 """
 
 from collections.abc import Sequence
+from math import isnan
 
 from firmware_py.crazyflie.planner import PathPoint
 from firmware_py.geometry import Vector
@@ -49,7 +50,7 @@ class SetpointService:
 
         A mode that the board lacks is a wrong parameter of a known command.
         """
-        main, sub = command.param2, command.param3
+        main, sub = command.param2, 0.0 if isnan(command.param3) else command.param3
         for mode in Mode:
             if main == mode or (main, sub) == (mode >> 16 & 0xFF, mode >> 24):
                 return CommandResult.ACCEPTED, self._enter(mode, _source(command))

@@ -14,6 +14,7 @@ from firmware_py.wire.mavlink_dialect import NUMBERS, Message
 
 DEFAULT, OFF = 0, -1  # intervals in SET_MESSAGE_INTERVAL
 NONE_SUCH = 0  # interval in MESSAGE_INTERVAL
+HEARTBEAT = NUMBERS["HEARTBEAT"]
 LONGEST_TICKS = 1_000_000
 
 _STATUS = ("SYS_STATUS", "BATTERY_STATUS", "ESTIMATOR_STATUS")
@@ -68,9 +69,12 @@ class StreamService:
         stack.kernel.create_task("MAV-STREAM", 1, self._task)
 
     def set_interval(self, number: int, interval_us: int) -> bool:
-        """Change how often a message is sent; False when there is no such message or no such interval."""
+        """Change how often a message is sent; False when there is no such message or no such interval.
+
+        The interval of heartbeats cannot be changed: without them other clients lose the board.
+        """
         stream = self._streams.get(number)
-        if stream is None or interval_us < OFF:
+        if stream is None or interval_us < OFF or (number == HEARTBEAT and interval_us != DEFAULT):
             return False
         if interval_us == DEFAULT:
             ticks = stream.default_ticks

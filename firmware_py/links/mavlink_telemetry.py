@@ -27,7 +27,7 @@ from firmware_py.links.mavlink_stack import MavlinkStack
 from firmware_py.links.mavlink_streams import Stream, interval_of
 from firmware_py.rtos.statistics import ProcessorLoad
 from firmware_py.supervisor import CoreSupervisor
-from firmware_py.wire import mavlink, telemetry
+from firmware_py.wire import WireError, mavlink, telemetry
 from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_dialect import Message
 
@@ -68,6 +68,8 @@ UNKNOWN_AGE = -1.0
 VERSION = (26, 11, 0)
 REVISION = bytes.fromhex("0f10a717")  # the parameters firmware.revision0
 SERIAL_NUMBER = 0x00F10A71  # the parameter cpu.id0
+
+LATEST_US = 7_258_118_400_000_000  # 2200-01-01
 
 Messages = Sequence[Message]
 ReadImu = Callable[[], tuple[Vector, Vector]]  # rates [rad/s, B] and acceleration [g, B]
@@ -176,6 +178,8 @@ class FlightMessages:
 
     def _see_time(self, message: Message) -> None:
         """Take the time of day from a station that knows it."""
+        if message.time_unix_usec > LATEST_US:
+            raise WireError(f"time of day {message.time_unix_usec} us: after the year 2200")
         if message.time_unix_usec:
             self._unix_ahead_us = message.time_unix_usec - self._stack.kernel.now_us
 

@@ -14,7 +14,7 @@ from math import degrees, hypot, isfinite, isnan, nan
 
 import pymavlink.dialects.v20.development as dialect
 
-from firmware_py.geometry import Quaternion, Vector, from_euler_zyx
+from firmware_py.geometry import Quaternion, Vector, from_euler_zyx, wrap_angle
 from firmware_py.wire import WireError
 from firmware_py.wire.crtp import check_place, check_pose
 from firmware_py.wire.mavlink_dialect import Message
@@ -230,7 +230,7 @@ def local_position(t_ms: int, p_WB: Vector, v_W: Vector) -> Message:
 def position_target(t_ms: int, p_WG: Vector, yaw: float) -> Message:
     """Return the goal in force."""
     return dialect.MAVLink_position_target_local_ned_message(
-        u32(t_ms), _FRAME_LOCAL_NED, _IGNORE_REST, *turn(p_WG), 0, 0, 0, 0, 0, 0, -yaw, 0
+        u32(t_ms), _FRAME_LOCAL_NED, _IGNORE_REST, *turn(p_WG), 0, 0, 0, 0, 0, 0, wrap_angle(-yaw), 0
     )
 
 

@@ -1,4 +1,4 @@
-"""MAVLink's messages: pymavlink's dialect `development`, which is `common` and newer ones, and one that it lacks."""
+"""MAVLink's messages: pymavlink's dialect `development`, which is `common` and newer ones, and what it lacks."""
 
 import struct
 from typing import Any, TypeAlias
@@ -23,6 +23,25 @@ class ProtocolVersion(dialect.MAVLink_message):  # type: ignore[misc]
     def pack(self, codec: Any) -> bytes:
         frame: bytes = self._pack(codec, self.crc_extra, self._payload)
         return frame
+
+
+class Timesync(dialect.MAVLink_timesync_message):  # type: ignore[misc]
+    """TIMESYNC with its addressee; 0: all."""
+
+    def __init__(self, tc1: int, ts1: int, system: int, component: int) -> None:
+        super().__init__(tc1, ts1)
+        self._target = system, component
+
+    def pack(self, codec: Any) -> bytes:
+        payload = struct.pack("<qqBB", self.tc1, self.ts1, *self._target)
+        frame: bytes = self._pack(codec, self.crc_extra, payload)
+        return frame
+
+
+def address(message: Message, payload: bytes) -> None:
+    """Give a received TIMESYNC its addressee."""
+    if message.get_type() == "TIMESYNC":
+        message.target_system, message.target_component = payload.ljust(18, b"\0")[16:18]
 
 
 KINDS: dict[int, Any] = dialect.mavlink_map  # pymavlink's class of each message

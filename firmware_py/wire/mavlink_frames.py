@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import pymavlink.dialects.v20.development as dialect
 
 from firmware_py.wire import WireError
-from firmware_py.wire.mavlink_dialect import KINDS, Message
+from firmware_py.wire.mavlink_dialect import KINDS, Message, address
 
 KEY_SIZE = 32
 SIGNATURE_SIZE = 13  # link id, 6 bytes of time stamp, 6 bytes of digest
@@ -235,6 +235,7 @@ class FrameReceiver:
             if refused:
                 return refused
         self._note(head)
+        address(message, frame[head_size : head_size + head.length])
         messages.append(message)
         return end - start
 

@@ -5,7 +5,7 @@ Nothing here has an axis; flight data is in `mavlink`.
 
 import pymavlink.dialects.v20.development as dialect
 
-from firmware_py.wire.mavlink_dialect import Message, ProtocolVersion
+from firmware_py.wire.mavlink_dialect import Message, ProtocolVersion, Timesync
 from firmware_py.wire.mavlink_numbers import Mode
 
 BOARD_COMPONENT = 1  # autopilot
@@ -39,6 +39,7 @@ _U16_MAX, _U32_MAX, _I32_MAX = 0xFFFF, 0xFFFFFFFF, 0x7FFFFFFF
 _CAPABILITIES = (
     dialect.MAV_PROTOCOL_CAPABILITY_MISSION_INT
     | dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+    | dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST  # every value is sent as REAL32
     | dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
     | dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
     | dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
@@ -90,8 +91,13 @@ def command(system: int, number: int, *params: float) -> Message:
 
 
 def timesync(tc1_ns: int, ts1_ns: int) -> Message:
-    """Return a request (`tc1_ns` = 0) with the sender's clock, or the answer: own clock, and that of the request."""
+    """Return a request (`tc1_ns` = 0) with the sender's clock."""
     return dialect.MAVLink_timesync_message(tc1_ns, ts1_ns)
+
+
+def timesync_answer(tc1_ns: int, request: Message) -> Message:
+    """Return the answer to a request: own clock, and what its sender recognises it by."""
+    return Timesync(tc1_ns, request.ts1, request.get_srcSystem(), request.get_srcComponent())
 
 
 def ping_answer(request: Message) -> Message:
@@ -235,7 +241,7 @@ def message_interval(number: int, interval_us: int) -> Message:
 
 
 def parameter_error(request: Message, name: str, index: int, error: int) -> Message:
-    """Return why a parameter request fails: MAV_PARAM_ERROR 1 does not exist, 2 value out of range."""
+    """Return why a parameter request fails: a MAV_PARAM_ERROR."""
     return dialect.MAVLink_param_error_message(
         request.get_srcSystem(), request.get_srcComponent(), _text(name, NAME_SIZE), index, error
     )

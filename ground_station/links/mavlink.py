@@ -160,7 +160,7 @@ class MavlinkLink:
             # The board takes our answer's time for the middle between its request and its receipt. So it gets the middle
             # between arrival and answer, as in NTP: a late answer is less precise, but not wrong.
             middle_us = (now_us + self._read_us) // 2
-            self._send(self._read_us, services.timesync(middle_us * 1000, message.ts1))
+            self._send(self._read_us, services.timesync_answer(middle_us * 1000, message))
         elif message.ts1 == self._time_request_ns:
             self.round_trip_us = now_us - message.ts1 // 1000
             self.latency = LinkLatency("serial", self.round_trip_us // 2, measured=True)

@@ -200,10 +200,14 @@ def test_after_boot_every_stream_keeps_its_rate() -> None:
 
 def test_an_interval_is_set_read_switched_off_and_reset(client: MavlinkClient) -> None:
     def interval() -> int:
-        ack, answer = [a for a in client.command(510, 30) if a.get_type() != "ATTITUDE"]
-        assert (ack.command, ack.result) == (510, 0)
-        assert answer.message_id == 30
-        return int(answer.interval_us)
+        answers = []
+        for request in ((510, 30), (512, 244, 30)):  # the older way and the present one
+            ack, answer = [a for a in client.command(*request) if a.get_type() != "ATTITUDE"]
+            assert (ack.command, ack.result) == (request[0], 0)
+            assert answer.message_id == 30
+            answers.append(int(answer.interval_us))
+        assert answers[0] == answers[1]
+        return answers[0]
 
     def attitudes() -> int:
         client.messages.clear()
@@ -223,10 +227,84 @@ def test_an_interval_is_set_read_switched_off_and_reset(client: MavlinkClient) -
 
 
 @pytest.mark.parametrize(
-    "params", [(30, math.nan), (30, -2), (30, 0.5), (math.nan, 1000), (1e30, 1000), (3, 1000)]
+    "params",
+    [
+        (30, math.nan),
+        (30, -2),
+        (30, 0.5),
+        (math.nan, 1000),
+        (1e30, 1000),
+        (3, 1000),
+        (0, -1),
+        (0, 60_000_000),
+    ],
 )
 def test_an_impossible_interval_is_denied(client: MavlinkClient, params: tuple[float, float]) -> None:
+    """Without heartbeats other clients would lose the board."""
     assert client.command(511, *params)[0].result == DENIED
+    client.messages.clear()
+    client.run(client.now_us + 2_000_000)
+    assert len(client.of("HEARTBEAT")) == 2
+
+
+def test_the_default_interval_of_heartbeats_may_be_asked_for(client: MavlinkClient) -> None:
+    assert client.command(511, 0, 0)[0].result == 0
+
+
+def test_a_parameter_of_another_type_is_refused_for_its_type(client: MavlinkClient) -> None:
+    for kind, error, name in (
+        (6, 7, "INT32"),
+        (1, 7, "UINT8"),
+        (10, 6, "REAL64"),
+        (8, 6, ""),  # its text differs from that of INT32 by a number only: once is enough
+        (99, 6, "99"),
+    ):
+        answers = {a.get_type(): a for a in client.ask("param_set", 1, 1, b"EXT_X_P", 2.0, kind)}
+        assert answers["PARAM_ERROR"].error == error
+        assert not name or f"EXT_X_P: type {name} refused, REAL32 is needed" in client.texts()
+
+
+def test_unused_fields_may_be_nan(client: MavlinkClient) -> None:
+    assert client.command(176, 1, 6, math.nan)[0].result == 0
+    assert any("mode: offboard" in text for text in client.texts())
+    unused = client.command(420, 0, 1, math.nan)[0].result
+    assert unused == client.command(420, 0, 1, 0)[0].result
+
+
+def test_a_time_of_day_that_cannot_be_is_refused(client: MavlinkClient) -> None:
+    client.send("system_time", 2**64 - 1, 5)
+    client.run(client.now_us + 3000)
+    assert any("after the year 2200" in text for text in client.texts())
+    client.command(512, 2)
+    assert client.of("SYSTEM_TIME")[-1].time_unix_usec == 0
+
+
+def test_the_goals_heading_is_reported_within_half_a_turn(client: MavlinkClient) -> None:
+    target(client, (0.0, 0.0, -1.2), math.radians(530))
+    client.messages.clear()
+    client.command(512, 85)
+    assert client.of("POSITION_TARGET_LOCAL_NED")[-1].yaw == pytest.approx(math.radians(170))
+
+
+@pytest.mark.parametrize(
+    ("addressee", "answered"),
+    [((0, 0), True), ((1, 1), True), ((1, 0), True), ((7, 1), False), ((1, 99), False)],
+)
+def test_a_timesync_is_answered_to_its_sender_alone(
+    client: MavlinkClient, addressee: tuple[int, int], answered: bool
+) -> None:
+    """In bytes, because pymavlink's message has no addressee."""
+    request = bytearray(client.codec.timesync_encode(0, 2**40 + 77).pack(client.codec))
+    request[1] = 18
+    request[10:-2] = struct.pack("<qqBB", 0, 2**40 + 77, *addressee)
+    request[-2:] = dialect.x25crc(bytes(request[1:-2]) + bytes((34,))).crc.to_bytes(2, "little")
+    client.messages.clear()
+    client.receive(bytes(request))
+    client.run(client.now_us + 3000)
+    found = [
+        bytes(answer.get_msgbuf())[10:-2] for answer in client.of("TIMESYNC") if answer.ts1 == 2**40 + 77
+    ]
+    assert [payload[16:18] for payload in found] == ([bytes((255, 190))] if answered else [])
 
 
 def test_streams_go_on_after_the_processor_was_taken_from_them(client: MavlinkClient) -> None:
@@ -586,8 +664,7 @@ def test_in_flight_only_a_forced_reset_is_obeyed(kind: str) -> None:
 
 
 def test_the_heartbeat_is_armed_only_while_the_flaps_are_controlled() -> None:
-    client = MavlinkClient()
-    client.command(511, 0, 50_000)
+    client = MavlinkClient("mavlink.rates.heartbeat=20")
 
     def armed_at(end_us: int) -> bool:
         client.run(end_us)
@@ -632,6 +709,7 @@ def test_the_version_is_reported(client: MavlinkClient, params: tuple[float, ...
     version = answers["AUTOPILOT_VERSION"]
     assert version.flight_sw_version.to_bytes(4, "big")[:2] == bytes((26, 11))
     assert version.uid == 0x00F10A71
+    assert version.capabilities & dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
 
 
 @pytest.mark.parametrize("params", [(519, 1), (512, 300)])
