@@ -10,7 +10,9 @@ TOLERANCE = 0.1
 class FrameRate:
     """Measures the usual period between exposures, once; sans I/O."""
 
-    def __init__(self, period_us: int, corrections_hz: float) -> None:
+    def __init__(self, period_us: int, corrections_hz: float, longest_us: int) -> None:
+        """`longest_us`: frames that are further apart make no track."""
+        self._longest_us = longest_us
         self._period_us = period_us
         self._corrections_hz = corrections_hz
         self._exposures_us: list[int] = []
@@ -35,7 +37,7 @@ class FrameRate:
             "" if as_configured else f", not every {self._period_us * 1e-3:.1f} ms as set by mocap.period_us"
         )
         leaving = f"{rate_hz:.0f}, not {self._corrections_hz:g}" if slow else f"{self._corrections_hz:g}"
-        return (
-            f"motion capture: a frame every {period_us * 1e-3:.1f} ms{expected}: "
-            f"{leaving} corrections leave per second"
-        )
+        effect = f"{leaving} corrections leave per second"
+        if period_us >= self._longest_us:
+            effect = f"no corrections leave, see tracker.reacquire_us = {self._longest_us}"
+        return f"motion capture: a frame every {period_us * 1e-3:.1f} ms{expected}: {effect}"

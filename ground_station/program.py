@@ -17,7 +17,7 @@ from ground_station.clock import clock_us, epoch_us, wait
 from ground_station.config import CaptureConfig, GroundConfig
 from ground_station.controls import Answer, ControlRequest
 from ground_station.errors import LinkError, MocapError
-from ground_station.frame_rate import FrameRate
+from ground_station.frame_rate import WINDOW_US, FrameRate
 from ground_station.links.frame_log import FrameLog
 from ground_station.links.live_link import LiveLink
 from ground_station.links.schemes import SCHEMES, find_link
@@ -216,7 +216,8 @@ def fly(
             for hand in hands:
                 hand(cockpit, now_us)
 
-        rate = FrameRate(settings.frame_period_us, settings.station.corrections_hz)
+        longest_us = settings.tracker.reacquire_us if settings.tracker.enabled else WINDOW_US
+        rate = FrameRate(settings.frame_period_us, settings.station.corrections_hz, longest_us)
         LiveStation(link, ground, source, rate, say, over, turn, records).run()
 
 

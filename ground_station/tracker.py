@@ -5,6 +5,7 @@ further from the prediction than noise and pushes explain. Without a good pose f
 restarts when three poses fit one another, which wrong ones rarely do. The first track starts the same way.
 """
 
+from collections import deque
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from math import degrees, nan, sqrt
@@ -70,7 +71,7 @@ class TrackNotices:
 
 
 POSES = 3  # that begin a track
-FIT_US = 50_000  # between them; a later one does not confirm the others
+FIT_US = 50_000  # between them, or two and a half frames if that is longer; a later one does not confirm the others
 WIDEN_US = 60_000  # refused poses widen the gate only until then, else it would accept them
 UNKNOWN: Vector = (nan, nan, nan)
 
@@ -118,8 +119,10 @@ class Tracker:
         self._notices = TrackNotices()
         self._poses = 0  # that fit one another, up to `POSES`
         self._tracking = False  # there are `POSES` of them
-        self._patience_us = FIT_US  # how old the last good frame may be
         self._t_us = 0  # of the newest frame
+        self._gaps_us: deque[int] = deque(
+            maxlen=2
+        )  # between the newest frames; the first one's is meaningless
         self._good_us = 0  # of the newest frame accepted by the filter
         self._lost_us: int | None = None  # of the last good frame before a track was lost
         self._refused_in_a_row = 0
@@ -140,8 +143,17 @@ class Tracker:
         counters = self.counters
         return f"{self.quality.name.lower()} ({counters.refused} refused, {counters.restarts} restarts)"
 
+    @property
+    def _patience_us(self) -> int:
+        """How old the last good frame may be: the cameras may be slower than the profile has it."""
+        if self._tracking:
+            return self._config.reacquire_us
+        return max(FIT_US, 5 * min(self._gaps_us, default=0) // 2)
+
     def _take(self, frame: MocapFrame) -> Track:
         t_us = frame.t_us
+        if t_us > self._t_us:
+            self._gaps_us.append(t_us - self._t_us)
         if self._poses and abs(t_us - self._good_us) >= self._patience_us:
             self._lose()
         if not self._poses:
@@ -189,7 +201,7 @@ class Tracker:
         self._poses += 1
         if self._poses < POSES:
             return
-        self._tracking, self._patience_us = True, self._config.reacquire_us
+        self._tracking = True
         if self._lost_us is not None:
             self.counters.restarts += 1
             self._notices.restarted(t_us, t_us - self._lost_us)
@@ -199,7 +211,7 @@ class Tracker:
             self._lost_us = self._good_us
             self._notices.lost(self._t_us)
         self._poses = 0
-        self._tracking, self._patience_us = False, FIT_US
+        self._tracking = False
 
     def _without_pose(self, frame: MocapFrame, quality: Quality) -> Track:
         """Predict the velocity without a pose: it is missing or wrong, and none is sent."""

@@ -128,6 +128,19 @@ class LabConfig(FirmwareConfig):
             signing_key=self.mavlink.signing_key,
         )
 
+    def check_cameras(self) -> None:
+        """Raise `LabError` for cameras that are too slow for a track or for the board."""
+        limits = {
+            "tracker.reacquire_us": self.tracker.enabled and self.tracker.reacquire_us,
+            "supervisor.pose_timeout_us": not self.pilot.enabled and self.supervisor.pose_timeout_us,
+        }
+        for key, limit_us in limits.items():
+            if limit_us and self.mocap.period_us >= limit_us:
+                raise LabError(
+                    f"mocap.period_us = {self.mocap.period_us}: no pose would be flown, expected less than "
+                    f"{key} = {limit_us}"
+                )
+
     def check_decks(self, is_image: bool) -> None:
         """Raise `LabError` for decks without the firmware that has drivers for them."""
         if self.robot.decks and not (is_image and self.pilot.enabled):
@@ -181,6 +194,7 @@ def read_config(profile: str = DEFAULT_PROFILE, overrides: Iterable[str] = ()) -
         config = LabConfig.model_validate(tree)
         check(config.geometry)
         check_hover(config.geometry, config.plant)
+        config.check_cameras()
     except ValidationError as error:
         raise LabError("; ".join(_explain(tree, detail) for detail in error.errors()[:3])) from None
     except FirmwareError as error:

@@ -126,7 +126,7 @@ def test_a_port_may_be_named_where_the_client_takes_one(text: str) -> None:
 
 def test_a_stream_of_another_rate_is_reported_once() -> None:
     def told(*periods_us: int, expected_us: int = 5000) -> list[str]:
-        rate, t_us, lines = FrameRate(expected_us, 50.0), 7, []
+        rate, t_us, lines = FrameRate(expected_us, 50.0, 400_000), 7, []
         for period_us in periods_us:
             t_us += period_us
             lines.append(rate.on_frame(t_us))
@@ -143,6 +143,9 @@ def test_a_stream_of_another_rate_is_reported_once() -> None:
     assert told(*[10_000] * 1000, expected_us=10_000) == []
     assert told(*[40_000] * 1000, expected_us=40_000) == [
         "motion capture: a frame every 40.0 ms: 25, not 50 corrections leave per second"
+    ]
+    assert told(*[400_000] * 20, expected_us=400_000) == [
+        "motion capture: a frame every 400.0 ms: no corrections leave, see tracker.reacquire_us = 400000"
     ]
 
 

@@ -329,6 +329,13 @@ def test_between_the_first_poses_frames_may_be_missing_but_not_for_long() -> Non
     assert qualities(frame(0), frame(1), frame(1 + late), frame(2 + late)) == [NOT_YET] * 4
 
 
+@pytest.mark.parametrize("every", [10, 12, 20, 40])  # frames of the profile's period: 20 to 5 Hz
+def test_a_track_begins_with_cameras_that_are_slower_than_the_profile_has_it(every: int) -> None:
+    numbers = [every * k for k in range(5)]
+    assert qualities(*map(frame, numbers)) == [NOT_YET] * 2 + [YES] * 3
+    assert qualities(*map(frame, (*numbers[:2], *(every * k for k in (5, 6, 7))))) == [NOT_YET] * 4 + [YES]
+
+
 def test_a_robot_that_falls_is_tracked_from_the_third_pose_on() -> None:
     falls = [frame(n, (0.0, 0.0, 1.0 - 6.0 * 0.005 * n)) for n in range(3)]
     assert qualities(*falls) == [NOT_YET, NOT_YET, YES]

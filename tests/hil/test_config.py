@@ -77,6 +77,16 @@ def test_an_override_reaches_its_value(override: str, value: object) -> None:
         ("floaty", "tunnel.speed=-1", r"tunnel\.speed = -1: .*greater than 0"),
         ("floaty", "servo.trim[1]=99999", r"servo\.trim\[1\] = 99999: .*12000"),
         ("floaty", "servo.trim[7]=0", r"no element \[7\]"),
+        (
+            "floaty",
+            "mocap.period_us=400000",
+            r"mocap\.period_us = 400000: no pose .* than tracker\.reacquire_us = 400000",
+        ),
+        (
+            "crazyflie",
+            "mocap.period_us=500000",
+            r"mocap\.period_us = 500000: no pose .* tracker\.reacquire_us",
+        ),
         ("floaty", "controller.gain_y", r"expected section\.key=value"),
         ("floaty", "gain_y=1", r"expected section\.key=value"),
         ("floaty", "controller.gain_y.deeper=1", r"gain_y is a value, not a section"),

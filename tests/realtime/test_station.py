@@ -73,7 +73,7 @@ def test_while_the_board_connects_the_cameras_are_served() -> None:
             link,
             ground,
             source,
-            FrameRate(5000, 50.0),
+            FrameRate(5000, 50.0, 400_000),
             said.append,
             lambda: time.monotonic() > end,
             lambda now_us: None,
