@@ -13,7 +13,7 @@ from firmware_py.firmware import DEADLINES_US
 from firmware_py.logic.plugs import GROUP
 from firmware_py.signals import COUNTERS, Signals
 from firmware_py.table import whole_names
-from firmware_py.wire.telemetry import BLOCKS, SLOW_BLOCKS
+from firmware_py.wire.telemetry import ATTITUDE, BLOCKS, SLOW_BLOCKS, TIMESTAMP_MASK
 from ground_station.latency import STAGES
 from ground_station.program import Cockpit
 from ground_station.tracker import Tracker
@@ -285,15 +285,21 @@ def _scheduler_channels(firmware: BoardFirmware) -> tuple[Channel, ...]:
 
 
 class Unwrapped:
-    """A 16-bit counter, unwrapped and relative to its first value; NaN before that."""
+    """A 16-bit counter of the board, relative to its first value, on a clock in ms that wraps as well.
+
+    A clock that went back was reset, and the counter with it: it counts from 0 again.
+    """
 
     def __init__(self) -> None:
-        self._last = self._total = nan
+        self._last: tuple[float, int] | None = None
+        self._total = 0.0
 
-    def __call__(self, value: float) -> float:
-        step = (value - self._last) % WRAP
-        self._total = 0.0 if self._total != self._total else self._total + step
-        self._last = value
+    def __call__(self, value: float, clock_ms: int) -> float:
+        if self._last is not None:
+            before, before_ms = self._last
+            reset = clock_ms - before_ms & TIMESTAMP_MASK > TIMESTAMP_MASK // 2
+            self._total += value if reset else (value - before) % WRAP
+        self._last = value, clock_ms
         return self._total
 
 
@@ -328,7 +334,9 @@ class StationView:
             for variable, value in zip(block.variables, newest[block.id].values, strict=True)
         }
         *measured, age, poses, rejected = (reported[name] for name in REPORTED)
-        return (*measured, AGE_UNIT_US * age, self._poses(poses), self._rejected(rejected))
+        clock_ms = newest[ATTITUDE.id].timestamp_ms
+        counts = self._poses(poses, clock_ms), self._rejected(rejected, clock_ms)
+        return (*measured, AGE_UNIT_US * age, *counts)
 
     def slow(self) -> tuple[float, ...]:
         """Battery and load."""

@@ -475,9 +475,15 @@ def test_battery_and_load_are_logged_and_shown_where_the_board_tells_them(tmp_pa
     assert [panel.label for panel in figures.station(log).panels] == ["not used [so far]", "battery [V]"]
 
 
-def test_a_counter_of_sixteen_bits_goes_on_where_it_wraps() -> None:
-    count = Unwrapped()
-    assert [count(value) for value in (65_530.0, 65_535.0, 4.0, 4.0, 10.0)] == [0, 5, 10, 10, 16]
+def test_a_counter_goes_on_where_it_wraps_and_after_a_reset_of_the_board() -> None:
+    def counted(*samples: tuple[float, int]) -> list[float]:
+        count = Unwrapped()
+        return [count(*sample) for sample in samples]
+
+    assert counted((65_530, 20), (65_535, 40), (4, 60), (4, 60), (10, 80)) == [0, 5, 10, 10, 16]
+    assert counted((0, 2**24 - 10), (3, 10)) == [0, 3], "the clock wraps"
+    assert counted((0, 5000), (6, 5020), (0, 20), (2, 40)) == [0, 6, 6, 8]
+    assert counted((60_000, 600_000), (7, 9_000)) == [0, 7], "a reset while the link was cut"
 
 
 def test_an_experiment_that_needs_the_laboratory_is_refused(tmp_path: Path) -> None:
