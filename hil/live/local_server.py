@@ -8,11 +8,11 @@ import os
 import threading
 from collections.abc import Callable
 from hmac import compare_digest
+from socket import create_server
 from typing import Any
 
 from tornado.httpserver import HTTPServer
 from tornado.ioloop import IOLoop
-from tornado.netutil import bind_sockets
 from tornado.web import Application, HTTPError, RequestHandler
 
 from hil.live.window import LOOPBACK
@@ -32,10 +32,11 @@ class LocalServer:
         self.token = os.urandom(16).hex()
         self._loop: IOLoop | None = None
         try:
-            sockets = bind_sockets(wanted, LOOPBACK)
+            listener = create_server((LOOPBACK, wanted))
         except OSError:
-            sockets = bind_sockets(0, LOOPBACK)
-        self.host = f"{LOOPBACK}:{sockets[0].getsockname()[1]}"
+            listener = create_server((LOOPBACK, 0))
+        listener.setblocking(False)
+        self.host = f"{LOOPBACK}:{listener.getsockname()[1]}"
         arguments = {"server": self, "owner": owner}
         application = Application(
             [(path, handler, arguments) for path, handler in handlers.items()],
@@ -48,7 +49,7 @@ class LocalServer:
             server = HTTPServer(
                 application, max_body_size=BODY_MAX, idle_connection_timeout=IDLE_S, body_timeout=IDLE_S
             )
-            server.add_sockets(sockets)
+            server.add_socket(listener)
             opened.set()
             self._loop.start()
             server.stop()

@@ -1,5 +1,7 @@
 """What `--view` can mean, each as the process that it is; a viewer that is not there is one line before the flight."""
 
+import gc
+import socket
 import sys
 from pathlib import Path
 
@@ -8,6 +10,7 @@ import pytest
 from hil.errors import LabError
 from hil.live import window
 from hil.live.feed import open_view
+from hil.live.local_server import LocalServer
 from hil.live.rerun_screen import RerunScreen
 from hil.live.window import DISPLAYS, LOOPBACK, free_port, open_window, show
 
@@ -45,3 +48,12 @@ def test_a_port_that_is_taken_gives_way_to_one_that_is_free() -> None:
     assert free_port(wanted) == wanted
     with window.socket.create_server((LOOPBACK, wanted)):
         assert free_port(wanted) != wanted
+
+
+def test_a_server_takes_another_port_when_its_own_is_in_use_and_leaves_no_socket() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        server = LocalServer(other.getsockname()[1], None, {})
+    host, port = server.host.split(":")
+    socket.create_connection((host, int(port)), timeout=10.0).close()
+    server.close()
+    gc.collect()  # a socket that nobody closed warns, and a warning fails the test
