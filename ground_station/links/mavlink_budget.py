@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from firmware_py.wire import mavlink
 from firmware_py.wire import mavlink_services as services
-from firmware_py.wire.mavlink_dialect import Message
+from firmware_py.wire.mavlink_dialect import Message, Timesync
 from firmware_py.wire.mavlink_frames import SIGNATURE_SIZE, FrameSender
 from firmware_py.wire.mavlink_numbers import Mode
 from ground_station.errors import LinkError
@@ -77,7 +77,7 @@ def _bytes(messages: Iterable[Message], signed: bool) -> int:
 _POSE = (mavlink.pose(10**12, _U, _Q),)
 _GOAL = (mavlink.target(10**9, _U, 0.1),)
 _HOUSEKEEPING = (services.station_heartbeat(),)
-_TIME = (services.timesync(10**15, 10**15),)
+_TIME = (Timesync(10**15, 10**15, 1, 1),)  # an answer, which is longer than a request
 _SAMPLE = (mavlink.flight_array(10**12, (0.5,) * mavlink.FLIGHT_ARRAY_SIZE),)
 # What the board sends unasked: rate [Hz] and message.
 _BOARD = (
