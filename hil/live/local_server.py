@@ -8,14 +8,13 @@ import os
 import threading
 from collections.abc import Callable
 from hmac import compare_digest
-from socket import create_server
 from typing import Any
 
 from tornado.httpserver import HTTPServer
 from tornado.ioloop import IOLoop
 from tornado.web import Application, HTTPError, RequestHandler
 
-from hil.live.window import LOOPBACK
+from hil.live.window import LOOPBACK, listen
 
 BODY_MAX = 65_536  # bytes of a request: none has a body
 MESSAGE_MAX = 1 << 20  # bytes of a WebSocket message
@@ -31,11 +30,7 @@ class LocalServer:
     def __init__(self, wanted: int, owner: Any, handlers: dict[str, type["Guarded"]]) -> None:
         self.token = os.urandom(16).hex()
         self._loop: IOLoop | None = None
-        try:
-            listener = create_server((LOOPBACK, wanted))
-        except OSError:
-            listener = create_server((LOOPBACK, 0))
-        listener.setblocking(False)
+        listener = listen(wanted)
         self.host = f"{LOOPBACK}:{listener.getsockname()[1]}"
         arguments = {"server": self, "owner": owner}
         application = Application(

@@ -95,15 +95,22 @@ def is_open(host: str, port: int) -> bool:
     return True
 
 
-def free_port(wanted: int) -> int:
-    """Return a free TCP port of this computer, the wanted one if it is free."""
+def listen(wanted: int) -> socket.socket:
+    """Return a listening socket of this computer that does not block, at the wanted port if it is free."""
     for port in (wanted, 0):
         try:
-            with socket.create_server((LOOPBACK, port)) as server:
-                return int(server.getsockname()[1])
+            listener = socket.create_server((LOOPBACK, port))
         except OSError:
             continue
+        listener.setblocking(False)
+        return listener
     raise LabError("this computer has no free TCP port")
+
+
+def free_port(wanted: int) -> int:
+    """Return a free TCP port of this computer, the wanted one if it is free."""
+    with listen(wanted) as listener:
+        return int(listener.getsockname()[1])
 
 
 def _start(arguments: Sequence[str], port: int) -> "subprocess.Popen[bytes]":

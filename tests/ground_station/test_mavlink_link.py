@@ -345,7 +345,7 @@ def test_at_57600_baud_the_loads_are_those_of_frames_counted_by_hand():
     # Frame sizes as measured with pymavlink: pose 48, goal 65, heartbeat 21, time 28, of which the
     # last is zero for two years; below: array 144, attitude 40, position 40.
     budget = link_budget(57_600, 50.0)
-    assert budget.up_load * 5760 == 50 * 48 + 2 * 65 + 21 + 3 * 27
+    assert budget.up_load * 5760 == 50 * 48 + 2 * 65 + 21 + 3 * 30
     assert budget.telemetry_hz == 25
     signed = link_budget(57_600, 50.0, signed=True)
     assert (signed.up_load - budget.up_load) * 5760 == pytest.approx(56 * 13)
@@ -377,12 +377,12 @@ def test_the_budget_allows_exactly_what_fits(baud, pose_hz, signed):
         (
             9600,
             50.0,
-            "9600 baud: 50 poses/s need 2.63 kB/s, 90 % of the line are 0.86: lower station.corrections_hz",
+            "9600 baud: 50 poses/s need 2.64 kB/s, 90 % of the line are 0.86: lower station.corrections_hz",
         ),
         (
             9600,
             5.0,
-            "9600 baud: 4 Hz of telemetry need 1.55 kB/s, 80 % of the line are 0.77: raise serial.baud",
+            "9600 baud: 4 Hz of telemetry need 1.56 kB/s, 80 % of the line are 0.77: raise serial.baud",
         ),
     ],
 )

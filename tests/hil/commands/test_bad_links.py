@@ -37,7 +37,7 @@ def without_a_dongle(monkeypatch: pytest.MonkeyPatch, empty_folder: Path) -> Non
         ("mavlink:/dev/null,fast", "baud rate 'fast': expected 9600..3000000"),
         (f"mavlink:/dev/null,{'9' * 5000}", "9': expected 9600..3000000"),
         ("mavlink:/dev/null,300", "baud rate '300': expected 9600..3000000"),
-        ("mavlink:/dev/null,9600", "9600 baud: 50 poses/s need 2.63 kB/s"),
+        ("mavlink:/dev/null,9600", "9600 baud: 50 poses/s need 2.64 kB/s"),
         ("mavlink:", f"mavlink:: {EXPECTED}"),
         ("mavlink", f"mavlink: {EXPECTED}"),
         ("mavlink:carrier-pigeon://coop", EXPECTED),

@@ -77,7 +77,7 @@ def test_one_flap_of_four_fails(lab: MavlinkLab) -> None:
 
 
 @pytest.mark.parametrize(
-    ("unit", "instance"), [(SERVO, 5), (SERVO, -1), (SERVO, 1.5), (GYRO, 2), (BATTERY, math.nan)]
+    ("unit", "instance"), [(SERVO, 5), (SERVO, -1), (SERVO, 1.5), (GYRO, 2), (BATTERY, math.inf)]
 )
 def test_an_instance_that_is_not_there_is_denied(lab: MavlinkLab, unit: int, instance: float) -> None:
     failing = OFF if unit == BATTERY else STUCK
