@@ -342,14 +342,14 @@ def test_the_budget_of_the_downlink_is_what_the_board_sends(baud):
 
 
 def test_at_57600_baud_the_loads_are_those_of_frames_counted_by_hand():
-    # Frame sizes as measured with pymavlink: pose 48, goal 65, heartbeat 21, time 28, of which the
-    # last is zero for two years; below: array 144, attitude 40, position 40.
+    # Frame sizes as measured with pymavlink: pose 48, goal 65, heartbeat 21, answer with the time
+    # 30; below: array 144, attitude 40, position 40.
     budget = link_budget(57_600, 50.0)
     assert budget.up_load * 5760 == 50 * 48 + 2 * 65 + 21 + 3 * 30
     assert budget.telemetry_hz == 25
     signed = link_budget(57_600, 50.0, signed=True)
     assert (signed.up_load - budget.up_load) * 5760 == pytest.approx(56 * 13)
-    assert budget.text == "57600 baud: uplink 2.6 kB/s, 46 %; telemetry 25 Hz, 4.6 kB/s, 79 %"
+    assert budget.text == "57600 baud: uplink 2.6 kB/s, 46 %; telemetry 25 Hz, 4.6 kB/s, 80 %"
     more = link_budget(115_200, 50.0)
     assert more.down_load * 11_520 - budget.down_load * 5760 == pytest.approx((50 - 25) * 144)
 
