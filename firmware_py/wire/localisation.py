@@ -6,10 +6,12 @@ in float32, as the exported app does.
 """
 
 import struct
+from collections.abc import Iterable
 from math import sqrt
 
 import numpy as np
 
+from firmware_py.geometry import Quaternion, Vector
 from firmware_py.wire import WireError
 from firmware_py.wire.crtp import Correction, check_pose
 
@@ -35,6 +37,15 @@ def decode_packed_poses(data: bytes) -> list[tuple[int, Correction]]:
         check_pose(p_GB, q_GB)
         poses.append((address, Correction(p_GB, q_GB, None)))
     return poses
+
+
+def encode_packed_poses(poses: Iterable[tuple[int, Vector, Quaternion]]) -> bytes:
+    """Return the data of a generic packet of type 9 with address byte, position [m] and attitude of each robot."""
+    items = (
+        _PACKED_POSE.pack(address, *(round(part / _MILLIMETRE) for part in p_GB), pack_quaternion(q_GB))
+        for address, p_GB, q_GB in poses
+    )
+    return bytes((EXT_POSE_PACKED,)) + b"".join(items)
 
 
 def unpack_quaternion(packed: int) -> tuple[float, float, float, float]:

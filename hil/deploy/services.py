@@ -17,10 +17,11 @@ from dataclasses import dataclass, field
 from math import dist, inf, nan, pi, radians, remainder
 
 from firmware_py.geometry import Quaternion, Vector, from_euler_zyx
-from firmware_py.wire import crtp, high_level, setpoints
+from firmware_py.wire import crtp, high_level, log, setpoints
 from firmware_py.wire.crtp import Packet
 from firmware_py.wire.high_level import PathCommand
-from firmware_py.wire.localisation import EXT_POSE_PACKED, pack_quaternion
+from firmware_py.wire.localisation import encode_packed_poses
+from firmware_py.wire.log import LogCommand
 from firmware_py.wire.parameters import SetByName, encode_set_by_name
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.supervisor import PLATFORM_APP, State
@@ -38,9 +39,8 @@ PATH_M, PATH_RAD = 0.05, 0.05
 LATE_US = 60_000  # two boards look at a path at times that differ by no more than this
 LEVEL = (3, -2, 1, 0, 0, 1365)  # counts of the IMU; the BMI088 driver takes zeros for a defect
 
-COMMANDER, GENERIC, HIGH_LEVEL, SUPERVISOR, PARAMETERS, MEMORIES, LOG = 3, 7, 8, 9, 2, 4, 5
-CREATE, DELETE, START, LOG_DATA = 6, 2, 8, 2  # commands to the log, and its channel of values
-BLOCK, AS_F32 = 200, 7  # a block of our own, and the type of its values
+COMMANDER, GENERIC, HIGH_LEVEL, SUPERVISOR, PARAMETERS, MEMORIES = 3, 7, 8, 9, 2, 4
+BLOCK = 200  # of the log, for `values`
 ADDRESS = 0xE7  # last byte of a board's radio address
 
 Place = tuple[float, float, float, float]  # x, y, z [m] and yaw [rad]
@@ -199,11 +199,9 @@ def _aged_pose(place: Vector, q: Quaternion) -> tuple[int, int, bytes]:
 
 def _packed_pose(place: Vector, q: Quaternion) -> tuple[int, int, bytes]:
     """Return the packet of a swarm's sender, with another robot's pose before ours."""
-    items = (
-        struct.pack("<B3hI", address, *(round(1000 * part) + away for part in place), pack_quaternion(q))
-        for address, away in ((1, 500), (ADDRESS, 0))
-    )
-    return crtp.PORT_LOCALISATION, crtp.CHANNEL_GENERIC, bytes((EXT_POSE_PACKED,)) + b"".join(items)
+    x, y, z = place
+    data = encode_packed_poses([(1, (x + 0.5, y + 0.5, z + 0.5), q), (ADDRESS, place, q)])
+    return crtp.PORT_LOCALISATION, crtp.CHANNEL_GENERIC, data
 
 
 POSES: Mapping[str, Callable[[Vector, Quaternion], tuple[int, int, bytes]]] = {
@@ -431,24 +429,26 @@ def _log(bench: ServiceBench, words: Sequence[str]) -> str:
     for kind, name in zip(items[::2], items[1::2], strict=True):
         number = bench.firmware.log_numbers[name] if "." in name else int(name)
         data += struct.pack("<BH", int(kind), number)
-    return _hex(bench.request(LOG, 1, data))
+    return _hex(bench.request(crtp.PORT_LOG, log.CHANNEL_CONTROL, data))
 
 
 def _values(bench: ServiceBench, words: Sequence[str]) -> str:
     """`values SECONDS NAME~TOLERANCE ...`: means of up to six log variables, sampled every 10 ms."""
-    duration, *items = words
-    names, tolerances = zip(*(item.split("~") for item in items), strict=True)
-    chosen = b"".join(struct.pack("<BH", AS_F32, bench.firmware.log_numbers[name]) for name in names)
-    bench.request(LOG, 1, bytes((CREATE, BLOCK)) + chosen)
-    bench.request(LOG, 1, struct.pack("<BBH", START, BLOCK, 10))
+    duration, *asked = words
+    names, tolerances = zip(*(item.split("~") for item in asked), strict=True)
+    items = [(Scalar.F32, bench.firmware.log_numbers[name]) for name in names]
+    for packet in (*log.creation(BLOCK, items), log.request(LogCommand.START_MS, BLOCK, 10, 0)):
+        bench.request(packet.port, packet.channel, packet.data)
     bench.received.clear()
     bench.run(round(float(duration) * 1e6))
-    rows = [
-        struct.unpack_from(f"<{len(names)}f", one.data, 4)
+    data = (
+        log.decode_data(one.data)
         for one in bench.received
-        if (one.port, one.channel, one.data[:1]) == (LOG, LOG_DATA, bytes((BLOCK,)))
-    ]
-    bench.request(LOG, 1, bytes((DELETE, BLOCK)))
+        if (one.port, one.channel) == (crtp.PORT_LOG, log.CHANNEL_DATA)
+    )
+    rows = [struct.unpack(f"<{len(names)}f", values) for block, _, values in data if block == BLOCK]
+    packet = log.request(LogCommand.DELETE, BLOCK)
+    bench.request(packet.port, packet.channel, packet.data)
     if not rows:
         return "nothing"
     means = (sum(column) / len(rows) for column in zip(*rows, strict=True))
