@@ -123,6 +123,14 @@ def release(control: Control) -> None:
 
 
 @kernel
+def average_inputs(control: Control) -> None:
+    """Write the mean of the inputs of this tick and of the one before, for telemetry."""
+    for i in range(4):
+        control.u_mean[i] = HALF * (control.u_last[i] + control.u[i])
+        control.u_last[i] = control.u[i]
+
+
+@kernel
 def manual_angle(parameters: Parameters, data: Input, flap: Integer) -> f32:
     """Return the flap angle from outside [rad]; for a servo word, an angle that the truncating mapping turns into it."""
     if data.by_words == 0:

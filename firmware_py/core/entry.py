@@ -31,6 +31,7 @@ _clear_samples = sampling.clear_samples
 _report_state = goal.report_state
 _control_flaps = controller.control_flaps
 _drive_servos = servo.drive_servos
+_average_inputs = controller.average_inputs
 _forget_zero = sampling.forget_zero
 _forget_flight = supervisor.forget_flight
 
@@ -67,9 +68,10 @@ def estimate(
 
 @kernel
 def control(parameters: Parameters, data: Input, estimator: Estimator, control: Control) -> None:
-    """Run one tick of the controller, down to the timer counts."""
+    """Run one tick of the controller, down to the timer counts and the mean inputs."""
     _control_flaps(parameters, data, estimator, control)
     _drive_servos(parameters, control)
+    _average_inputs(control)
 
 
 @kernel

@@ -283,7 +283,10 @@ class Control(Struct):
     """The controller's memory and its last output."""
 
     # u1 roll, u2 pitch, u3 yaw, u4 height
-    u: Annotated[F32s, 4, Logged("rad", "controller.u1 u2 u3 u4")]
+    u: Annotated[F32s, 4]
+    u_last: Annotated[F32s, 4]  # of the tick before
+    # the mean of both, over one period of telemetry: one tick alone would show u at the same phase of the poses in all rows
+    u_mean: Annotated[F32s, 4, Logged("rad", "controller.u1 u2 u3 u4")]
     integral_z: Annotated[f32, Logged("m s", "Error.int_z_err")]
     # commanded flap angles, and the same as deviations from hover
     flap: Annotated[F32s, 4, Logged("rad", "motors_ctrp.m1 m2 m3 m4")]

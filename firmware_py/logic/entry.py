@@ -36,7 +36,7 @@ _spoil_estimate = budget.spoil_estimate
 """
 TEXT = Path(entry.__file__).read_text(encoding="utf-8")
 PARTS = {node.name: node for node in ast.parse(TEXT).body if isinstance(node, ast.FunctionDef)}
-DRIVE = "    _drive_servos(parameters, control)\n"
+DRIVE = "    _drive_servos(parameters, control)\n    _average_inputs(control)\n"
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,8 @@
 Names and types are the Crazyflie's log variables and log types. On the wire the attitude is in the Crazyflie's degrees; a
 `Sample` has SI units and Floaty's signs only, converted here.
 
-Over CRTP each block is sampled and sent separately. Identification compares inputs and their effects, which are therefore in
+`controller.u1` to `.u4` are the means of two ticks, which are one row's period. Over CRTP each block is sampled and sent
+separately. Identification compares inputs and their effects, which are therefore in
 one block, as half floats: their steps, 2^-11 of the value, are below the noise of the gyro and of the flaps.
 """
 

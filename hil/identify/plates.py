@@ -48,8 +48,8 @@ def straightened(record: Record) -> Straightened:
         return Straightened(record.u, np.zeros((len(record.t), 2)))
     step, config = record.period_s, record.config
     share = 1.0 - np.exp(-step * config.model.flap_rate)
-    t = np.arange(record.u_t[0], record.u_t[-1] + step, step)
-    u = np.stack([np.interp(t, record.u_t, column) for column in record.u.T], axis=1)
+    t = np.arange(record.mean_t[0], record.mean_t[-1] + step, step)
+    u = np.stack([np.interp(t, record.mean_t, column) for column in record.u.T], axis=1)
     mean = u.mean(axis=0)
     moved = lfilter([share], [1.0, share - 1.0], u - mean, axis=0)
     roll, y = (np.interp(t, record.pose_t, record.pose[:, column]) for column in (3, SIDEWAYS))
@@ -78,7 +78,7 @@ def straightened(record: Record) -> Straightened:
     for number, about in BENT.items():
         more = level[:, 3 + about] / slopes[number][3 + about] - moved[:, number]
         commanded = lfilter([1.0 / share, (share - 1.0) / share], [1.0], more - more.mean())
-        straight[:, number] += np.interp(record.u_t, t, commanded)
+        straight[:, number] += np.interp(record.mean_t, t, commanded)
     linear = slopes[0][SIDEWAYS] * moved[:, 0] + tilting * (roll - middle) + damping * speed
     bent = scale * np.column_stack([every[:, SIDEWAYS] - linear, every[:, 2] - level[:, 2]])
     bent -= bent.mean(axis=0)

@@ -38,7 +38,7 @@ class Record:
     name: str
     t: Array  # (N,) [s] board's clock, of the tick for which the rates were estimated
     u_t: Array  # (N,) [s] board's clock, of the tick that commanded the inputs
-    u: Array  # (N, 4) [rad] the commanded inputs, after the flaps' limits
+    u: Array  # (N, 4) [rad] the commanded inputs, mean of that tick and of the one before, after the flaps' limits
     excitation: Array  # (N, 4) [rad] NaN-free; zero where none was reported
     rates: Array  # (N, 3) [rad/s] gyro, B
     pose_t: Array  # (M,) [s] board's clock, when the cameras exposed
@@ -52,6 +52,11 @@ class Record:
     def flap_angle(self) -> float:
         """The mean opening of all flaps [rad], where the constants hold."""
         return float(self.config.allocation.hover_angle + np.mean(self.u.mean(axis=0) @ SHARES))
+
+    @property
+    def mean_t(self) -> Array:
+        """The times (N,) [s] of the ticks whose inputs are like `u`: midway between both ticks of the mean."""
+        return self.u_t - 0.5e-3 * TICK_MS
 
     @property
     def period_s(self) -> float:

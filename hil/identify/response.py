@@ -29,8 +29,13 @@ def outputs(axis: Axis) -> tuple[int, ...]:
 
 
 def flap_response(w: Array, lag: float, delay: float) -> Complex:
-    """Return the frequency response of a flap to its input, held over ticks."""
-    response: Complex = np.sinc(w * STEP_S / (2 * np.pi)) * np.exp(-1j * w * delay) / (1 + 1j * w * lag)
+    """Return the frequency response of a flap to its reported input, the mean of a tick and the one before.
+
+    The inputs themselves are held over ticks; `delay` counts from the tick.
+    """
+    reported = np.cos(0.5 * w * STEP_S) * np.exp(-0.5j * w * STEP_S)
+    held = np.sinc(w * STEP_S / (2 * np.pi)) * np.exp(-1j * w * delay)
+    response: Complex = held / reported / (1 + 1j * w * lag)
     return response
 
 
@@ -68,7 +73,7 @@ def one_step(
     turn = [np.interp(t, record.t, record.rates[:, input])] if RATE in axis.states else []
     measured = np.stack([*turn, *shown], axis=1)
     # The mean effect until the next step; `delay` includes the half tick of a held input.
-    u = np.interp(t - values[DELAY] + step / 2, record.u_t, record.u[:, input])
+    u = np.interp(t - values[DELAY] + step / 2, record.mean_t, record.u[:, input])
     measured -= measured.mean(axis=0)
     u -= u.mean()
     A, B = Phi @ (np.eye(len(Phi)) - K @ C), np.hstack([Phi @ K, G])

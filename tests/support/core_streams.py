@@ -183,6 +183,7 @@ def record_plausible(seed: int, ticks: int) -> Recording:
     rng = np.random.default_rng(seed)
     core = CoreBlocks(parameters_of(CONFIG), PythonRunner)
     parameters, data = core.parameters, core.data
+    parameters.fields.gain_pitch, parameters.fields.gain_q = 0.1, 0.02  # the profile's are zero
     sane = parameters.memory.view(np.uint32).copy()
     floats = FLOATS[Parameters.dtype]
     recording = Recording([block.bytes() for block in blocks_of(core)])

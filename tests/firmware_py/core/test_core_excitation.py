@@ -98,6 +98,19 @@ def test_what_is_excited_comes_on_top_of_the_inputs_and_out_at_the_flaps() -> No
         assert board.control.fields.command == pytest.approx(part[0] * np.array([1, 1, -1, -1]), abs=1e-6)
 
 
+def test_reported_inputs_are_the_mean_of_a_tick_and_the_one_before() -> None:
+    board = Board(EXCITE_MULTISINE, **RMS)
+    u, reported = np.array([
+        (board.control.fields.u.astype(float), board.control.fields.u_mean.astype(float))
+        for _ in range(50)
+        if len(board.tick())
+    ]).swapaxes(0, 1)  # fmt: skip
+    assert reported == pytest.approx(0.5 * (u + np.concatenate([np.zeros((1, 4)), u[:-1]])), abs=1e-7)
+    board.data.fields.mode = MODE_HOVER
+    board.fly(2)
+    assert not board.control.fields.u_mean.any()
+
+
 def test_excitation_stops_when_off_or_open_loop_and_restarts_its_period() -> None:
     board = Board(EXCITE_OFF, **RMS)
     assert not board.fly(20).any()

@@ -27,6 +27,9 @@ Array = NDArray[np.float64]
 MS = 1e-3
 BEGIN_MS, REALISATION_TICKS = 3000, 2200
 ACTUATION_MS = 4
+JUMP = (
+    0.2  # of the inputs from tick to tick: a pose arrives in every second one, and rows show always the same
+)
 Change = Callable[[dict[str, Array]], dict[str, Array]]
 
 
@@ -58,7 +61,8 @@ def flight(
     r = np.cos(2 * np.pi * np.outer(t, lines) + phase[realisation]).sum(axis=1)
     r = np.where(tick >= BEGIN_MS // 10, r, 0.0)
     r *= rms * np.sqrt(2 / len(lines))
-    held = np.repeat(r, 10)
+    u = r * (1.0 + JUMP * (-1.0) ** tick)
+    held = np.repeat(u, 10)
     late = np.concatenate([np.zeros(ACTUATION_MS), held[:-ACTUATION_MS]])
     states = simulated(late, matrix, np.array([[1 / k["lag"]], [0], [0], [0], [0]]))
     gust = lfilter([1 - np.exp(-1 / 30)], [1, -np.exp(-1 / 30)], rng.normal(0, 60 * disturbance, len(held)))
@@ -75,7 +79,7 @@ def flight(
     }
     columns |= dict.fromkeys((*INPUTS, *EXCITATIONS, *RATES), zero)
     columns |= {
-        INPUTS[1]: r[rows // 10],
+        INPUTS[1]: 0.5 * (u[rows // 10] + u[rows // 10 - 1]),
         EXCITATIONS[1]: r[rows // 10],
         RATES[1]: rate[rows] + rng.normal(0, 0.02, len(rows)),
     }

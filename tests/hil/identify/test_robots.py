@@ -85,7 +85,7 @@ def hover(seconds: float) -> tuple[Record, float]:
     averaged = np.convolve(x[:, 3], np.ones(10) / 10)[: len(x)]
     pose = np.stack([x[poses, 0], zero, zero, zero, x[poses, 2], zero], axis=1)
     rates = np.stack([zero, averaged[rows], zero], axis=1)
-    inputs = np.stack([zero, u[rows], zero, zero], axis=1)
+    inputs = np.stack([zero, 0.5 * (u[rows] + u[rows - 10]), zero, zero], axis=1)
     return Record(
         "hover", t, t, inputs, 0 * inputs, rates, MS * poses + 0.008, pose, 0.0, 0.0, CONFIG, True
     ), per_hz  # fmt: skip
