@@ -2,10 +2,10 @@
 
 Flies identify-u1 to identify-u4 on ROBOTS (default 20) whose constants and servo lags are drawn within 20 % and masses
 within 3 %, in each of six conditions: undisturbed, at corners of that box, with three short dropouts of the cameras, with
-two long ones, with 40 ms more latency, in 1 m/s of side wind along y (along x the robot is lost). For each condition it prints how many of the joint fit's 95 % intervals
-contain the truth at the flown point, the mean error of each constant over its mean half interval, and how many constants
-are called identified although their error exceeds twice their interval. Flights already in FOLDER are not repeated. A
-robot takes one to two minutes of one core per condition.
+two long ones, with 40 ms more latency, in 1 m/s of side wind along y (along x the robot is lost). For each condition it
+prints how many of the joint fit's 95 % intervals contain the truth at the flown point, the mean error of each constant
+over its mean half interval, and how many constants are called identified although their error exceeds twice their
+interval. Flights already in FOLDER are not repeated. A robot takes one to two minutes of one core per condition.
 """
 
 import argparse

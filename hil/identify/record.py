@@ -7,6 +7,7 @@ the telemetry's latency, is a few milliseconds and is estimated from the data (`
 
 import csv
 from dataclasses import dataclass
+from math import nan
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,8 @@ RATES = tuple(f"stateEstimate.{name}_rate [rad/s]" for name in ("roll", "pitch",
 FACING = np.radians(30.0)  # a choice: largest median turn of the robot
 WRAP_MS = 1 << 24  # of the board's time stamps
 SHARES = (SIGNS[:, None] * MIX).T  # (4, 4) opening of each flap per input; u4 closes
+EXCHANGED_MS = 1000.0  # largest step back of rows that a link exchanged; a board that boots goes back further
+UNLIKE = 100.0  # ratio of two clocks that do not count in their units
 TICK_MS = 10.0  # the controller runs in every tenth millisecond, on the previous millisecond's rates
 
 
@@ -39,7 +42,7 @@ class Record:
     t: Array  # (N,) [s] board's clock, of the tick for which the rates were estimated
     u_t: Array  # (N,) [s] board's clock, of the tick that commanded the inputs
     u: Array  # (N, 4) [rad] the commanded inputs, mean of that tick and of the one before, after the flaps' limits
-    excitation: Array  # (N, 4) [rad] NaN-free; zero where none was reported
+    excitation: Array  # (N, 4) [rad] zero where none was reported
     rates: Array  # (N, 3) [rad/s] gyro, B
     pose_t: Array  # (M,) [s] board's clock, when the cameras exposed
     pose: Array  # (M, 6) x y z [m], roll pitch yaw [rad], W
@@ -77,12 +80,12 @@ def load_record(path: Path, profile: str) -> Record:
     config, simulated, release_s = (
         _flown_with(folder) if path.is_dir() else (read_config(profile), False, 0.0)
     )
-    columns = _read(file)
+    columns = _in_order(_read(file), path)
     state = columns["supervisor.state []"]
     flown = (state == State.FLYING) & np.all(
-        np.isfinite([columns[name] for name in (*INPUTS, *RATES)]), axis=0
+        np.isfinite([columns[name] for name in (*INPUTS, *EXCITATIONS, *RATES)]), axis=0
     )
-    board_s = 1e-3 * np.unwrap(columns[BOARD_COLUMN], period=WRAP_MS)
+    board_s = 1e-3 * columns[BOARD_COLUMN]
     flown &= board_s > release_s
     if np.count_nonzero(flown) < 100:
         raise LabError(
@@ -90,21 +93,20 @@ def load_record(path: Path, profile: str) -> Record:
         )
     ahead_s = float(np.median(columns[TIME_COLUMN] - board_s))
     u_t, t = _ticks(board_s[flown])
-    order = np.concatenate([[True], np.diff(t) > 0])
-    if not np.all(order):
-        raise LabError(f"{path}: the board's time runs backwards; one flight, in its order, is expected")
     u = np.stack([columns[name][flown] for name in INPUTS], axis=1)
     limited, saturated = _limited(u, config)
     steps = np.diff(t)
     usual = float(np.median(steps))
     pose_t, pose = _poses(columns, flown, ahead_s)
-    facing = float(np.median(pose[:, 5])) if len(pose) else 0.0
+    if not len(pose):
+        raise LabError(f"{path}: no pose in {POSE_COLUMNS[0]!r} to {POSE_COLUMNS[-1]!r}")
+    facing = float(np.median(pose[:, 5]))
     if np.cos(facing) < np.cos(FACING):
         raise LabError(
             f"{path}: it looks along {np.degrees(facing):.0f} deg; expected within {np.degrees(FACING):.0f} deg of 0, "
             "because x and y of the world count as those of the body"
         )
-    excitation = np.nan_to_num(np.stack([columns[name][flown] for name in EXCITATIONS], axis=1))
+    excitation = np.stack([columns[name][flown] for name in EXCITATIONS], axis=1)
     rates = np.stack([columns[name][flown] for name in RATES], axis=1)
     return Record(
         str(path), t, u_t, limited, excitation, rates, pose_t, pose, saturated,
@@ -123,26 +125,52 @@ def _ticks(sampled_s: Array) -> tuple[Array, Array]:
 
 
 def _read(file: Path) -> dict[str, Array]:
-    """Return the columns by their titles; a missing excitation is zero."""
+    """Return the columns by their titles; a missing excitation is zero, an empty cell NaN."""
     try:
-        with file.open(encoding="utf-8", newline="") as lines:
+        with file.open(encoding="utf-8-sig", newline="") as lines:
             rows = list(csv.reader(lines))
     except (UnicodeDecodeError, csv.Error):
         raise LabError(f"{file}: not a CSV file; identify takes run folders and {TELEMETRY}") from None
     titles = rows[0] if rows else []
+    if len(titles) == 1 and titles[0].count(";") > 1:
+        raise LabError(f"{file}: its columns are separated by ';'; ',' is expected")
     # A killed process may leave half a row.
     whole = [row for row in rows[1:] if len(row) == len(titles)]
     try:
-        table = np.array(whole, float).reshape(len(whole), len(titles))
+        table = np.array([[cell.strip() or "nan" for cell in row] for row in whole], float).reshape(
+            len(whole), len(titles)
+        )
     except ValueError as error:
         raise LabError(f"{file}: {error}") from None
     columns = dict(zip(titles, table.T, strict=True))
     for name in EXCITATIONS:
-        columns.setdefault(name, np.zeros(len(whole)))
+        if not np.isfinite(columns.get(name, nan)).any():
+            columns[name] = np.zeros(len(whole))
     for name in (BOARD_COLUMN, TIME_COLUMN, *POSE_COLUMNS, *INPUTS, *RATES, "supervisor.state []"):
         if name not in columns:
             raise LabError(f"{file}: no column {name!r}")
     return columns
+
+
+def _in_order(columns: dict[str, Array], path: Path) -> dict[str, Array]:
+    """Return each row once, in the order of the board's time, which no longer wraps; rows without a time are left out.
+
+    Links may exchange rows that follow each other. Raises `LabError` for a clock that is not one of milliseconds.
+    """
+    known = np.isfinite(columns[BOARD_COLUMN]) & np.isfinite(columns[TIME_COLUMN])
+    columns = {name: values[known] for name, values in columns.items()}
+    board_ms = columns[BOARD_COLUMN] = np.unwrap(columns[BOARD_COLUMN], period=WRAP_MS)
+    if np.min(np.diff(board_ms), initial=0.0) < -EXCHANGED_MS:
+        raise LabError(f"{path}: the board's time runs backwards; one flight, in its order, is expected")
+    steps = np.abs(np.diff(board_ms)), np.abs(np.diff(columns[TIME_COLUMN]))
+    board, ground = (float(np.median(step[step > 0])) if step.any() else 1.0 for step in steps)
+    if not 1 / UNLIKE < 1e-3 * board / ground < UNLIKE:
+        raise LabError(
+            f"{path}: from row to row {BOARD_COLUMN!r} advances by {board:g} and {TIME_COLUMN!r} by {ground:g}: is one of "
+            "them in another unit, such as microseconds?"
+        )
+    _, once = np.unique(board_ms, return_index=True)
+    return {name: values[once] for name, values in columns.items()}
 
 
 def _flown_with(folder: Path) -> tuple[LabConfig, bool, float]:
@@ -169,9 +197,10 @@ def _limited(u: Array, config: LabConfig) -> tuple[Array, float]:
 
 
 def _poses(columns: dict[str, Array], flown: NDArray[np.bool_], ahead_s: float) -> tuple[Array, Array]:
-    """Return every pose once, with yaw unwrapped."""
-    t, *parts = (columns[name][flown] for name in POSE_COLUMNS)
-    new = np.isfinite(t) & np.concatenate([[True], np.diff(t) > 0])
-    pose = np.stack(parts, axis=1)[new]
+    """Return every complete pose once, in its order, with yaw unwrapped."""
+    rows = np.stack([columns[name][flown] for name in POSE_COLUMNS], axis=1)
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    t, once = np.unique(rows[:, 0], return_index=True)
+    pose = rows[once, 1:]
     pose[:, 5] = np.unwrap(pose[:, 5])
-    return t[new] - ahead_s, pose
+    return t - ahead_s, pose

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import interp1d
 
 from hil.errors import LabError
 from hil.identify.plates import HEIGHT, SIDEWAYS, straightened
@@ -22,6 +23,13 @@ Complex = NDArray[np.complexfloating[Any, Any]]
 PERIOD_S, REALISATION_S, SPACING_HZ = 20.0, 22.0, 0.05
 SETTLING_S = 1.8  # omitted in each realisation; the rest of its 2 s allows for a missing first row
 LEAST_PERIODS = 4
+HOLE_S = 0.3  # without rows or poses in a period that counts
+BREAK_ROWS = 2.5  # after which the excitation may have begun anew
+ALIKE_S, ALIKE_ROWS, ALIKE = (
+    2.0,
+    20,
+    0.1,
+)  # length and least rows of a compared beginning, and its share of squares off
 LINE = 0.1  # of the strongest line: weaker ones are ignored
 NEIGHBOURS = 4  # lines to either side, excited or not, that give the scatter at a line
 LEAST_SAMPLES = 1.5  # per unknown of the fit
@@ -47,21 +55,64 @@ class Spectra:
 
 
 def windows(record: Record) -> list[float]:
-    """Return the start of each whole period of the excitation, board's clock. Raises `LabError` for too few."""
-    excited = np.any(record.excitation != 0.0, axis=1)
-    if not excited.any():
+    """Return the start of each whole period of the excitation, board's clock. Raises `LabError` for too few.
+
+    Periods in which rows or poses are missing for long are left out. After a failsafe the board begins the excitation anew.
+    """
+    excited = np.flatnonzero(np.any(record.excitation != 0.0, axis=1))
+    if not len(excited):
         raise LabError(
             f"{record.name}: no excitation in it: from the flow's disturbance alone no constant can be identified; "
             "fly `identify`"
         )
-    start, end = record.u_t[excited][0] + SETTLING_S, record.u_t[excited][-1]
-    count = max(0, int((end - start + record.period_s - PERIOD_S + 1e-6) // REALISATION_S + 1))
-    if count < LEAST_PERIODS:
-        raise LabError(
-            f"{record.name}: {max(end - start, 0.0):.1f} s of settled excitation: {count} realisations of "
-            f"{REALISATION_S:g} s; at least {LEAST_PERIODS} are needed"
+    t = record.u_t[excited]
+    begun = _begun(t, record.excitation[excited])
+    last = [float(t[t < following][-1]) for following in (*begun[1:], np.inf)]
+    starts = [
+        float(start)
+        for begin, end in zip(begun, last, strict=True)
+        for start in np.arange(begin + SETTLING_S, end + record.period_s + 1e-6 - PERIOD_S, REALISATION_S)
+    ]
+    whole = [
+        start for start in starts if not (_has_hole(record.u_t, start) or _has_hole(record.pose_t, start))
+    ]
+    if len(whole) < LEAST_PERIODS:
+        settled = max(t[-1] - t[0] - SETTLING_S, 0.0)
+        holes = (
+            f", {len(starts) - len(whole)} more with holes of over {HOLE_S:g} s"
+            if len(starts) > len(whole)
+            else ""
         )
-    return [float(start + REALISATION_S * index) for index in range(count)]
+        again = f", which began {len(begun)} times" if len(begun) > 1 else ""
+        raise LabError(
+            f"{record.name}: {settled:.1f} s of settled excitation{again}: {len(whole)} realisations of "
+            f"{REALISATION_S:g} s{holes}; at least {LEAST_PERIODS} are needed"
+        )
+    return whole
+
+
+def _has_hole(t: Array, start: float) -> bool:
+    """Return whether samples are missing for long in the period from `start` on."""
+    inside = t[(t > start) & (t < start + PERIOD_S)]
+    return bool(np.diff(inside, prepend=start, append=start + PERIOD_S).max() > HOLE_S)
+
+
+def _begun(t: Array, r: Array) -> list[float]:
+    """Return when an excitation r (N, 4) began: first, and anew after holes. It always begins with the same phases."""
+    begun, step = [float(t[0])], float(np.median(np.diff(t)))
+    first = t < t[0] + ALIKE_S
+    at_first = interp1d(t[first] - t[0], r[first], "cubic", axis=0, bounds_error=False, fill_value=np.nan)
+    for place in np.flatnonzero(np.diff(t) > BREAK_ROWS * step):
+        after = slice(place + 1, place + 1 + int(np.count_nonzero(first)))
+        since = t[after] - t[place + 1]
+        for more in np.arange(0.0, t[place + 1] - t[place], 0.01):
+            expected = at_first(since + more)
+            known = np.isfinite(expected).all(axis=1)
+            error = np.sum((expected[known] - r[after][known]) ** 2)
+            if np.count_nonzero(known) > ALIKE_ROWS and error < ALIKE * np.sum(r[after][known] ** 2):
+                begun.append(float(t[place + 1] - more))
+                break
+    return begun
 
 
 def excited_lines(record: Record, starts: Sequence[float]) -> list[NDArray[np.int_]]:

@@ -1,6 +1,8 @@
 """The edges of a record for identification, and the arithmetic of its spectra, flow and verdicts."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -34,10 +36,12 @@ def columns(rows: int = 100, begin_ms: int = 1000, **changes: Array) -> dict[str
     return found | {POSE_COLUMNS[0]: 1e-3 * ms + AHEAD_S - 0.04} | changes
 
 
-def loaded(folder: Path, table: Mapping[str, Array]) -> Record:
-    path = folder / "telemetry.csv"
+def loaded(folder: Path, table: Mapping[str, Array], change: Callable[[str], str] = str) -> Record:
+    """The record of a table, whose text is changed before it is read."""
+    path, text = folder / "telemetry.csv", StringIO()
     header, values = ",".join(table), np.stack(list(table.values()), axis=1)
-    np.savetxt(path, values, "%.9g", ",", header=header, comments="", encoding="utf-8")
+    np.savetxt(text, values, "%.9g", ",", header=header, comments="")
+    path.write_text(change(text.getvalue()), encoding="utf-8")
     return load_record(path, "floaty")
 
 
@@ -81,6 +85,113 @@ def test_inputs_within_the_flaps_limits_are_what_was_commanded(tmp_path: Path) -
     record = loaded(tmp_path, columns(150, **dict.fromkeys(INPUTS, u)))
     assert record.u == pytest.approx(np.stack([u] * 4, axis=1), abs=1e-6)
     assert record.saturated == 0.0
+
+
+def rows_changed(change: Callable[[list[str]], list[str]]) -> Callable[[str], str]:
+    def changed(text: str) -> str:
+        header, *rows = text.splitlines()
+        return "\n".join([header, *change(rows)]) + "\n"
+
+    return changed
+
+
+def cell(title: str, value: str) -> Callable[[str], str]:
+    """A change of one cell in row 40."""
+    place = list(columns()).index(title)
+
+    def change(rows: list[str]) -> list[str]:
+        cells = rows[40].split(",")
+        cells[place] = value
+        return [*rows[:40], ",".join(cells), *rows[41:]]
+
+    return rows_changed(change)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: "\ufeff" + text,
+        rows_changed(lambda rows: [*rows[:40], rows[40], *rows[40:]]),
+        rows_changed(lambda rows: [*rows[:40], "", *rows[40:]]),
+        rows_changed(lambda rows: [*rows[:40], rows[41], rows[40], *rows[42:]]),
+        *(cell(title, value) for title in (POSE_COLUMNS[0], POSE_COLUMNS[3]) for value in ("nan", "", "inf")),
+    ],
+    ids=["bom", "twice", "blank", "exchanged", *(f"{part}-{value}" for part in ("t", "z") for value in ("nan", "", "inf"))],
+)  # fmt: skip
+def test_rows_count_once_and_in_their_order_whatever_wrote_the_file(
+    tmp_path: Path, change: Callable[[str], str]
+) -> None:
+    record = loaded(tmp_path, columns(150), change)
+    assert record.t == pytest.approx(1.0 + 0.02 * np.arange(150))
+    assert np.diff(record.pose_t) == pytest.approx(0.02, abs=0.021)
+    assert len(record.pose_t) >= 149
+    assert np.isfinite(record.pose).all()
+
+
+@pytest.mark.parametrize("title", [BOARD_COLUMN, TIME_COLUMN, INPUTS[1], EXCITATIONS[1], RATES[1]])
+@pytest.mark.parametrize("value", ["nan", "", "-inf"])
+def test_rows_with_an_unknown_value_are_left_out(tmp_path: Path, title: str, value: str) -> None:
+    record = loaded(tmp_path, columns(150), cell(title, value))
+    assert record.t == pytest.approx(np.delete(1.0 + 0.02 * np.arange(150), 40))
+    assert np.isfinite(np.column_stack([record.u, record.excitation, record.rates])).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda text: text.replace(",", ";"), r"separated by ';'; ',' is expected"),
+        (rows_changed(lambda rows: [*rows[60:], *rows[:60]]), "runs backwards"),
+        (rows_changed(lambda rows: [row.replace(",", "000,", 1) for row in rows]), "another unit, such as microseconds"),
+        (cell(INPUTS[0], "soon"), "could not convert string to float: 'soon'"),
+    ],
+    ids=["semicolons", "parts exchanged", "microseconds", "word"],
+)  # fmt: skip
+def test_the_real_reason_is_given_for_an_unreadable_file(
+    tmp_path: Path, change: Callable[[str], str], reason: str
+) -> None:
+    with pytest.raises(LabError, match=reason):
+        loaded(tmp_path, columns(150), change)
+
+
+def holed(begin: float, end: float, afresh: float | None) -> Record:
+    """A record without rows from `begin` to `end`; the excitation may begin again, at `afresh`."""
+    rng, t = np.random.default_rng(4), 0.02 * np.arange(6751)
+    phases, lines = 2 * np.pi * rng.random((16, 20)), 0.4 * np.arange(1, 21)
+    since = t if afresh is None else np.where(t < begin, t, t - afresh)
+    turns = 2 * np.pi * np.outer(since, lines) + phases[(since // spectra.REALISATION_S).astype(int)]
+    r = np.zeros((len(t), 4))
+    r[:, 2] = np.cos(turns).sum(axis=1)
+    kept = (t < begin) | (t >= end)
+    t, r = t[kept], r[kept]
+    return Record("r", t, t, r, r, r[:, :3], t, np.zeros((len(t), 6)), 0.0, 0.0, CONFIG, False)
+
+
+@pytest.mark.parametrize(
+    ("afresh", "expected"),
+    [
+        (None, [1.8, 45.8, 67.8, 89.8, 111.8]),
+        (40.5, [1.8, 42.3, 64.3, 86.3, 108.3]),
+        (40.3, [1.8, 42.1, 64.1, 86.1, 108.1]),
+    ],
+)
+def test_periods_with_a_hole_are_left_out_and_an_excitation_that_begins_again_is_noticed(
+    afresh: float | None, expected: list[float]
+) -> None:
+    assert spectra.windows(holed(40.0, 40.5, afresh)) == pytest.approx(expected, abs=0.011)
+
+
+def test_a_short_hole_is_no_reason_to_leave_a_period_out() -> None:
+    assert spectra.windows(holed(40.0, 40.2, None)) == pytest.approx(1.8 + 22.0 * np.arange(6))
+
+
+def test_holes_in_most_periods_are_the_reason_that_is_given() -> None:
+    record = holed(40.0, 40.5, None)
+    kept = np.min(np.abs(record.t[:, None] - [10.0, 60.0, 80.0]), axis=1) > 0.25
+    poor = replace(record, pose_t=record.pose_t[kept], pose=record.pose[kept])
+    with pytest.raises(
+        LabError, match=r"2 realisations of 22 s, 4 more with holes of over 0\.3 s; at least 4 are"
+    ):
+        spectra.windows(poor)
 
 
 def excited(seconds: float, period_s: float = 0.02, begin_s: float = 3.0) -> Record:
