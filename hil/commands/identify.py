@@ -70,13 +70,14 @@ def identify(
 
 
 def _print_constants(found: "Identification") -> None:
-    rows = [one.cells for one in found.constants]
-    shown = [heading for heading in rows[0] if any(row[heading] for row in rows)]
+    from hil.identify.identify import rows_of
+
     table = Table(title="constants, with the half width of their 95 % interval")
-    for heading in shown:
+    rows = rows_of(found.constants)
+    for heading in rows[0]:
         table.add_column(heading, no_wrap=heading != "verdict")
     for row in rows:
-        table.add_row(*(row[heading] for heading in shown))
+        table.add_row(*row.values())
     common.wide_console().print(table)
     if found.excited:
         periods = ", ".join(

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import combinations
-from math import hypot, isnan, nan
+from math import floor, hypot, inf, isnan, log10, nan
 
 import numpy as np
 
@@ -56,7 +56,7 @@ class IdentifiedConstant:
     def cells(self) -> dict[str, str]:
         """The texts of a table's row, by heading."""
         return {
-            "constant": self.name, "paper": interval_text(*self.paper), "truth": interval_text(self.truth),
+            "constant": self.name, "paper": _printed(*self.paper), "truth": interval_text(self.truth),
             "paper's method": interval_text(*self.two_controllers),
             "instruments": interval_text(*self.instrumental), "joint fit": interval_text(*self.joint),
             "unit": self.unit, "verdict": f"{self.verdict}: {self.why}",
@@ -85,11 +85,28 @@ class Identification:
         return next(constant for constant in self.constants if constant.name == name)
 
 
+def rows_of(constants: Sequence[IdentifiedConstant]) -> list[dict[str, str]]:
+    """Return the rows of a table of constants, without columns that are empty in every row."""
+    rows = [constant.cells for constant in constants]
+    return [{name: row[name] for name in row if any(one[name] for one in rows)} for row in rows]
+
+
+def _printed(value: float, half: float) -> str:
+    """Return a value of the paper as it is printed there; empty without one."""
+    return "" if isnan(value) else f"{value:g}" + ("" if isnan(half) else f" ± {half:g}")
+
+
 def interval_text(value: float, half: float = nan, digits: int = 4) -> str:
-    """Return a value with the half width of its interval; empty without a value."""
+    """Return a value with the half width of its interval, both to the half width's second digit; empty without a value.
+
+    A value alone has `digits` digits.
+    """
     if isnan(value):
         return ""
-    return f"{value:.{digits}g}" + ("" if isnan(half) else f" ± {half:.2g}")
+    if not 0.0 < half < inf:
+        return np.format_float_positional(value, digits, fractional=False, trim="-")
+    places = 1 - floor(log10(half))
+    return " ± ".join(f"{round(number, places):.{max(places, 0)}f}" for number in (value, half))
 
 
 def identify(records: Sequence[Record]) -> Identification:

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from hil.design.axes import ROLL
-from hil.identify.identify import Identification
+from hil.identify.identify import IDENTIFIED, Identification, rows_of
 from hil.identify.joint import Estimate, Excited, excited_axes, whitened
 from hil.identify.record import Record
 from hil.identify.response import one_step, response
@@ -44,9 +44,12 @@ def write_pages(out: Path, found: Identification, held_out: Record | None) -> Pa
     if found.free:
         title = "why the paper's equations contain no information about the robot"
         figures.append(saved(out, "identify_paper", title, "", partial(_identity, found.free)))
-    rows = [one.cells for one in found.constants]
+    known = rows_of([one for one in found.constants if one.verdict == IDENTIFIED])
+    others = rows_of([one for one in found.constants if one.verdict != IDENTIFIED])
     names = ", ".join(record.name for record in (*found.records, *found.free))
-    return write_page(out / "identify.html", "identify.html.j2", rows=rows, figures=figures, names=names)
+    return write_page(
+        out / "identify.html", "identify.html.j2", known=known, others=others, figures=figures, names=names
+    )
 
 
 def _axis(

@@ -1,5 +1,6 @@
 """The edges of a record for identification, and the arithmetic of its spectra, flow and verdicts."""
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from io import StringIO
@@ -16,8 +17,18 @@ from hil.design.loop import FREQUENCIES
 from hil.errors import LabError
 from hil.identify import spectra
 from hil.identify.flow import flow_of
-from hil.identify.identify import IDENTIFIED, UNKNOWN, WEAK, Evidence, IdentifiedConstant, _verdict
+from hil.identify.identify import (
+    IDENTIFIED,
+    UNKNOWN,
+    WEAK,
+    Evidence,
+    Identification,
+    IdentifiedConstant,
+    _verdict,
+    interval_text,
+)
 from hil.identify.joint import LATE_S, Estimate
+from hil.identify.pages import write_pages
 from hil.identify.plates import straightened
 from hil.identify.record import BOARD_COLUMN, EXCITATIONS, INPUTS, RATES, WRAP_MS, Record, load_record
 from hil.identify.response import TICK_DELAYS_S, flap_response
@@ -362,3 +373,32 @@ def test_roll_lifts_a_robot_that_leans_and_no_other() -> None:
     assert lifted(0.1) < -9.81 * np.sin(0.1), (
         "the vertical share of its force, and less of the flow from below"
     )
+
+
+@pytest.mark.parametrize(
+    ("value", "half", "text"),
+    [
+        (1100.4, 172.0, "1100 ± 170"),
+        (-27.46, 3.43, "-27.5 ± 3.4"),
+        (0.04984, 0.0067, "0.0498 ± 0.0067"),
+        (-99_950.0, 12_300.0, "-100000 ± 12000"),
+        (123_456.0, np.nan, "123500"),
+        (0.05, np.nan, "0.05"),
+        (0.00001234, np.nan, "0.00001234"),
+        (np.nan, np.nan, ""),
+    ],
+)
+def test_a_value_ends_at_the_second_digit_of_its_interval(value: float, half: float, text: str) -> None:
+    assert interval_text(value, half) == text
+
+
+def test_the_page_shows_identified_constants_first_and_no_empty_column(tmp_path: Path) -> None:
+    weak = replace(constant((64.0, 30.0)), name="weak_one", verdict=WEAK)
+    known = replace(constant((64.0, 1.0)), name="known_one", verdict=IDENTIFIED)
+    page = write_pages(tmp_path, Identification((weak, known), (), Estimate({}, {}, 1.0), (), ()), None)
+    before, folded = page.read_text(encoding="utf-8").split("<details>")
+    assert ("known_one" in before, "weak_one" in before) == (True, False)
+    assert ("known_one" in folded, "weak_one" in folded) == (False, True)
+    for part in (before, folded):
+        rows = [re.findall("<td>(.*?)</td>", row) for row in re.findall("<tr>(.*?)</tr>", part, re.DOTALL)]
+        assert all(any(cells) for cells in zip(*filter(None, rows), strict=True))
