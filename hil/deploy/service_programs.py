@@ -878,6 +878,24 @@ look
 set floaty.stop U8 0
 wait 0.2
 look
+== a battery just above the limit flies on, one just below does not
+takeoff 1.1 1
+wait 1.2
+battery 3230
+wait 5.6
+look
+battery 3170
+wait 5.6
+look
+== poses that are cut short are not used
+takeoff 1.1 1
+wait 1.2
+poses cut
+wait 0.7
+look
+poses pose
+wait 0.4
+look
 == a set-point's heading turns the robot
 takeoff 1.1 1
 wait 1.2

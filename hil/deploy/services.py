@@ -39,7 +39,6 @@ PATH_M, PATH_RAD = 0.05, 0.05
 LATE_US = 60_000  # two boards look at a path at times that differ by no more than this
 LEVEL = (3, -2, 1, 0, 0, 1365)  # counts of the IMU; the BMI088 driver takes zeros for a defect
 
-COMMANDER, GENERIC, HIGH_LEVEL, SUPERVISOR, PARAMETERS, MEMORIES = 3, 7, 8, 9, 2, 4
 BLOCK = 200  # of the log, for `values`
 ADDRESS = 0xE7  # last byte of a board's radio address
 
@@ -83,7 +82,9 @@ class ServiceBench:
         self._path_us: int | None = None
         self.run(300_000)
         if self.floaty:
-            self.request(PARAMETERS, 3, encode_set_by_name(SetByName("extPose.absolute", Scalar.U8, 1.0))[1:])
+            self.request(
+                crtp.PORT_PARAMETERS, 3, encode_set_by_name(SetByName("extPose.absolute", Scalar.U8, 1.0))[1:]
+            )
         self.run(SETTLED_US)
         self._path_us = self.now_us
 
@@ -148,7 +149,7 @@ class ServiceBench:
 
     def state(self) -> str:
         """Return what a client sees of the supervisors."""
-        answer = self.request(SUPERVISOR, 0, b"\x0c")
+        answer = self.request(crtp.PORT_SUPERVISOR, 0, b"\x0c")
         bits = "nothing" if answer is None else f"bits {int.from_bytes(answer[1:3], 'little'):#06x}"
         if not self.floaty:
             return bits
@@ -204,10 +205,17 @@ def _packed_pose(place: Vector, q: Quaternion) -> tuple[int, int, bytes]:
     return crtp.PORT_LOCALISATION, crtp.CHANNEL_GENERIC, data
 
 
+def _cut_pose(place: Vector, q: Quaternion) -> tuple[int, int, bytes]:
+    """Return the packet of a sender that forgets the last byte: no board uses it."""
+    port, channel, data = _pose(place, q)
+    return port, channel, data[:-1]
+
+
 POSES: Mapping[str, Callable[[Vector, Quaternion], tuple[int, int, bytes]]] = {
     "pose": _pose,
     "aged": _aged_pose,
     "packed": _packed_pose,
+    "cut": _cut_pose,
     "app": lambda place, q: (crtp.PORT_PLATFORM, PLATFORM_APP, _pose(place, q)[2]),
 }
 
@@ -234,7 +242,7 @@ def _hex(answer: bytes | None, known: int = 99) -> str:
 
 def _command(bench: ServiceBench, command: PathCommand, *fields: float) -> str:
     data = high_level.encode(command, *fields)[1:]
-    answer = bench.request(HIGH_LEVEL, 0, data)
+    answer = bench.request(high_level.PORT, 0, data)
     return "nothing" if answer is None else f"status {answer[3]}"
 
 
@@ -314,17 +322,17 @@ def _upload(bench: ServiceBench, words: Sequence[str]) -> str:
     number = trajectory_memory(bench)
     for begin in range(0, len(data), 24):
         head = struct.pack("<BI", number, offset + begin)
-        answer = bench.request(MEMORIES, 2, head + data[begin : begin + 24])
+        answer = bench.request(crtp.PORT_MEMORIES, 2, head + data[begin : begin + 24])
         statuses.add(_hex(answer)[10:])
     return " ".join(sorted(statuses))
 
 
 def trajectory_memory(bench: ServiceBench) -> int:
     """Return the number of the trajectories' memory."""
-    count = bench.request(MEMORIES, 0, b"\x01")
+    count = bench.request(crtp.PORT_MEMORIES, 0, b"\x01")
     assert count is not None
     for number in range(count[1]):
-        answer = bench.request(MEMORIES, 0, bytes((2, number)))
+        answer = bench.request(crtp.PORT_MEMORIES, 0, bytes((2, number)))
         if answer is not None and answer[2] == 0x12:
             return number
     raise AssertionError("no memory of trajectories")
@@ -345,30 +353,30 @@ def _setpoint(words: Sequence[str]) -> bytes:
 
 def _post_setpoint(bench: ServiceBench, words: Sequence[str]) -> None:
     if words[0] == "manual":
-        bench.post(GENERIC, 0, struct.pack("<BfffHB", 11, 0.0, 0.0, 0.0, 20_000, 0))
+        bench.post(crtp.PORT_GENERIC_SETPOINT, 0, struct.pack("<BfffHB", 11, 0.0, 0.0, 0.0, 20_000, 0))
     elif words[0] == "attitude":
-        bench.post(COMMANDER, 0, struct.pack("<fffH", 0.0, 0.0, 0.0, int(words[1])))
+        bench.post(crtp.PORT_COMMANDER, 0, struct.pack("<fffH", 0.0, 0.0, 0.0, int(words[1])))
     elif words[0] == "stop":
-        bench.post(GENERIC, 0, b"\0")
+        bench.post(crtp.PORT_GENERIC_SETPOINT, 0, b"\0")
     else:
-        bench.post(GENERIC, 0, _setpoint(words))
+        bench.post(crtp.PORT_GENERIC_SETPOINT, 0, _setpoint(words))
     bench.run(ANSWER_US)
 
 
 def _stream(bench: ServiceBench, words: Sequence[str]) -> None:
     *words, duration = words
     for _ in range(round(float(duration) * 1e6) // STREAM_US):
-        bench.post(GENERIC, 0, _setpoint(words))
+        bench.post(crtp.PORT_GENERIC_SETPOINT, 0, _setpoint(words))
         bench.run(STREAM_US)
 
 
 def _notify(bench: ServiceBench, words: Sequence[str]) -> None:
-    bench.post(GENERIC, 1, bytes(5))
+    bench.post(crtp.PORT_GENERIC_SETPOINT, 1, bytes(5))
     bench.run(ANSWER_US)
 
 
 def _arm(bench: ServiceBench, armed: int) -> str:
-    return _hex(bench.request(SUPERVISOR, 1, bytes((1, armed))))
+    return _hex(bench.request(crtp.PORT_SUPERVISOR, 1, bytes((1, armed))))
 
 
 def _stop(bench: ServiceBench, words: Sequence[str]) -> str:
@@ -393,27 +401,27 @@ def _ask(bench: ServiceBench, words: Sequence[str]) -> str:
 def _set(bench: ServiceBench, words: Sequence[str]) -> str:
     name, kind, value = words
     data = encode_set_by_name(SetByName(name, Scalar[kind], float(value)))[1:]
-    answer = bench.request(PARAMETERS, 3, data)
+    answer = bench.request(crtp.PORT_PARAMETERS, 3, data)
     return "nothing" if answer is None else f"status {answer[-1]}"
 
 
 def _read(bench: ServiceBench, words: Sequence[str]) -> str:
     """`read NAME`: the value of a parameter."""
-    answer = bench.request(PARAMETERS, 1, struct.pack("<H", parameter_number(bench, words[0])))
+    answer = bench.request(crtp.PORT_PARAMETERS, 1, struct.pack("<H", parameter_number(bench, words[0])))
     return _hex(answer)[4:]
 
 
 def _write(bench: ServiceBench, words: Sequence[str]) -> str:
     """`write NAME HEX`: bytes to a parameter."""
     number = struct.pack("<H", parameter_number(bench, words[0]))
-    answer = bench.request(PARAMETERS, 2, number + bytes.fromhex(words[1]))
+    answer = bench.request(crtp.PORT_PARAMETERS, 2, number + bytes.fromhex(words[1]))
     return "nothing" if answer is None else answer[2:].hex()
 
 
 def _misc(bench: ServiceBench, words: Sequence[str]) -> str:
     """`misc COMMAND NAME`: a request about a parameter's state, without its number in the answer."""
     number = struct.pack("<H", parameter_number(bench, words[1]))
-    answer = bench.request(PARAMETERS, 3, bytes((int(words[0]),)) + number)
+    answer = bench.request(crtp.PORT_PARAMETERS, 3, bytes((int(words[0]),)) + number)
     return "nothing" if answer is None else answer[3:].hex()
 
 
@@ -461,7 +469,7 @@ def _servos(bench: ServiceBench, words: Sequence[str]) -> str:
 
 
 def _poses(bench: ServiceBench, words: Sequence[str]) -> None:
-    """`poses on | off | PERIOD [ms] | pose | aged | packed | app`."""
+    """`poses on | off | PERIOD [ms] | pose | aged | packed | cut | app`."""
     word = words[0]
     if word in POSES:
         bench.poses_as = word
@@ -504,10 +512,10 @@ LINES: Mapping[str, Line] = {
     "notify": _notify,
     "arm": lambda bench, words: _arm(bench, 1),
     "disarm": lambda bench, words: _arm(bench, 0),
-    "recover": lambda bench, words: _hex(bench.request(SUPERVISOR, 1, b"\x02")),
-    "emergency": lambda bench, words: _post(bench, SUPERVISOR, 1, b"\x03"),
-    "feed": lambda bench, words: _post(bench, SUPERVISOR, 1, b"\x04"),
-    "disconnect": lambda bench, words: _post(bench, COMMANDER, 0, bytes(14)),  # as cflib does
+    "recover": lambda bench, words: _hex(bench.request(crtp.PORT_SUPERVISOR, 1, b"\x02")),
+    "emergency": lambda bench, words: _post(bench, crtp.PORT_SUPERVISOR, 1, b"\x03"),
+    "feed": lambda bench, words: _post(bench, crtp.PORT_SUPERVISOR, 1, b"\x04"),
+    "disconnect": lambda bench, words: _post(bench, crtp.PORT_COMMANDER, 0, bytes(14)),  # as cflib does
     "poses": _poses,
     "place": _place,  # of a robot that does not fly: x y z [roll pitch yaw]
     "radio": _radio,  # on, off
