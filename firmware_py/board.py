@@ -10,14 +10,12 @@ from firmware_py.wire.mavlink_numbers import CommandResult
 ImuCounts = tuple[int, ...]
 
 EEPROM_SIZE = 8192
-DECK_MEMORY_SIZE = 112
 
 
 class Board(Protocol):
     """The hardware below the drivers."""
 
     eeprom: bytearray  # (8192,) survives power cycles; all 0xFF when new
-    deck_memory: bytearray  # (112,) the one-wire memory of the deck that carries the servo connectors
 
     def read_imu(self) -> ImuCounts:
         """Return the registers of the BMI088 as they are now."""

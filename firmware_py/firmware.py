@@ -36,13 +36,7 @@ from firmware_py.tasks import estimator_task, power_task, sensors_task, stabiliz
 from firmware_py.variables import log_variables
 from firmware_py.wire import WireError
 from firmware_py.wire.crtp import Correction
-from firmware_py.wire.memories import (
-    CONFIG_SIZE,
-    RadioSettings,
-    decode_config,
-    encode_config,
-    encode_one_wire,
-)
+from firmware_py.wire.memories import CONFIG_SIZE, RadioSettings, decode_config, encode_config
 
 if TYPE_CHECKING:
     from firmware_py.links.mavlink_stack import MavlinkStack
@@ -51,7 +45,6 @@ MEASUREMENT_QUEUE = 20  # original firmware
 # Of each activation: a tick's work of the flight path ends before the next tick.
 DEADLINES_US = {"SENSORS": 1000, "STABILIZER": 1000, "KALMAN": 1000}
 WATCHDOG_US = 353_000  # the longest that the Crazyflie's independent watchdog may take
-DECK = (0xBC, 0xF1, "bcFloaty", "A")  # vendor, product, name, revision of the deck with the servo connectors
 
 
 class Firmware:
@@ -114,8 +107,6 @@ class Firmware:
         """Create the services of the links."""
         board, core, link, supervisor = self._board, self._core, self.link, self._supervisor
         settings = _radio_settings(board)
-        if board.deck_memory == b"\xff" * len(board.deck_memory):
-            board.deck_memory[:] = encode_one_wire(*DECK)
         tester, storage = Tester(), ParameterStorage(board.eeprom)
         pilot, notices = self.pilot, self._notices
         stabilizer, high_level = pilot.stabilizer, pilot.stabilizer.high_level
@@ -143,7 +134,7 @@ class Firmware:
         self.parameters = (*own, *stock_parameters(running))
         LogService(link, self.variables)
         ParameterService(link, self.parameters, storage, notices)
-        MemoryService(link, memories(board.eeprom, board.deck_memory, tester, high_level.memory))
+        MemoryService(link, memories(board.eeprom, tester, high_level.memory))
         if self.mavlink is not None:
             self._start_mavlink_services(self.mavlink, config.mavlink, running, own)
 

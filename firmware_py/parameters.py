@@ -87,7 +87,7 @@ def _supervision(running: Running) -> Iterator[Parameter]:
 
 
 # cfclient's flight and lighthouse tabs and Bitcraze's QA suite read these without asking whether they exist: without them
-# they end in KeyError. Other absent decks have no entry.
+# they end in KeyError. Other decks have no entry.
 ABSENT_DECKS = (
     "bcAI", "bcDWM1000", "bcFlow", "bcFlow2", "bcLighthouse4", "bcLoco", "bcMultiranger", "bcUSD", "bcZRanger",
     "bcZRanger2",
@@ -98,7 +98,6 @@ def _identity() -> Iterator[Parameter]:
     """Yield the board's identity; read only."""
     for name, scalar, value in (
         ("system.selftestPassed", I8, 1),
-        ("deck.bcFloaty", U8, 1),
         *((f"deck.{name}", U8, 0) for name in ABSENT_DECKS),
         ("imu_sensors.BMI088", U8, 1),
         ("imu_sensors.BMP3XX", U8, 0),

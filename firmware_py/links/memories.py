@@ -1,5 +1,5 @@
 """Memories on port 4, in the order of the Crazyflie firmware: the EEPROM, the commander's trajectories, the memory tester,
-the memories of decks and of their bootloaders, which no deck here has, and the deck's one-wire memory.
+the memories of decks and of their bootloaders, which are empty: as on the flashed board there is no deck.
 
 Channel 0 lists them, 1 reads, 2 writes. The tester's byte at any address is the address modulo 256: reading
 returns it, writing compares with it and counts differences.
@@ -15,7 +15,6 @@ from firmware_py.wire.memories import (
     TYPE_DECK_BOOTLOADERS,
     TYPE_DECKS,
     TYPE_EEPROM,
-    TYPE_ONE_WIRE,
     TYPE_TESTER,
     TYPE_TRAJECTORIES,
 )
@@ -31,19 +30,15 @@ OK, EIO = 0, 5
 
 _INFO = struct.Struct("<BBBI8s")
 _ADDRESS = struct.Struct("<BI")
-_NO_SERIAL = bytes(8)
-_DECK_SERIAL = bytes((0x0D, 0xF1, 0x0A, 0x7B, 0, 0, 0, 1))  # of the one-wire chip
+_NO_SERIAL = bytes(8)  # only one-wire memories have one
 
 
 class ClientMemory:
     """A memory of real bytes as clients see it; the service checks addresses."""
 
-    def __init__(
-        self, type: int, content: bytearray, serial: bytes = _NO_SERIAL, size: int | None = None
-    ) -> None:
+    def __init__(self, type: int, content: bytearray, size: int | None = None) -> None:
         self.type = type
         self.size = len(content) if size is None else size
-        self.serial = serial
         self._content = content
 
     def read(self, address: int, length: int) -> bytes:
@@ -115,15 +110,13 @@ class MemoryService:
         if data[1] >= len(self._memories):
             return data[:2]
         memory = self._memories[data[1]]
-        return _INFO.pack(GET_INFO, data[1], memory.type, memory.size, memory.serial)
+        return _INFO.pack(GET_INFO, data[1], memory.type, memory.size, _NO_SERIAL)
 
     def _covers(self, number: int, address: int, length: int) -> bool:
         return number < len(self._memories) and address + length <= self._memories[number].size
 
 
-def memories(
-    eeprom: bytearray, deck_memory: bytearray, tester: Tester, trajectories: bytearray
-) -> tuple[ClientMemory, ...]:
+def memories(eeprom: bytearray, tester: Tester, trajectories: bytearray) -> tuple[ClientMemory, ...]:
     """Return the memories of a Floaty board."""
     return (
         ClientMemory(TYPE_EEPROM, eeprom, size=EEPROM_SIZE),
@@ -131,5 +124,4 @@ def memories(
         tester,
         NoDecks(TYPE_DECKS, DECKS_VERSION, DECKS_SIZE),
         NoDecks(TYPE_DECK_BOOTLOADERS, BOOTLOADERS_VERSION, BOOTLOADERS_SIZE),
-        ClientMemory(TYPE_ONE_WIRE, deck_memory, _DECK_SERIAL),
     )

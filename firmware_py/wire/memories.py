@@ -7,7 +7,6 @@ from zlib import crc32
 from firmware_py.wire import WireError
 
 TYPE_EEPROM = 0x00
-TYPE_ONE_WIRE = 0x01
 TYPE_TRAJECTORIES = 0x12
 TYPE_TESTER = 0x15
 TYPE_DECKS = 0x19

@@ -1033,7 +1033,7 @@ log 2 1
 log 6 17
 log 5 0
 == memories stock
-ask 4 0 01 1
+ask 4 0 01
 ask 4 0 0200
 ask 4 0 0201
 ask 4 0 0202

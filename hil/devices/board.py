@@ -1,10 +1,10 @@
 """The board's pins, connected to the virtual world: IMU registers, servo timers, radio chip, UART, debug console."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
-from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
+from firmware_py.board import EEPROM_SIZE, ImuCounts
 from firmware_py.rtos import TICK_US
 from firmware_py.wire.mavlink_numbers import CommandResult
 from hil.devices.board_firmware import Processor
@@ -29,12 +29,9 @@ class Uart(Protocol):
         """Send bytes; False when they do not fit into the transmit buffer."""
 
 
-@dataclass(frozen=True, slots=True)
-class KeptMemory:
-    """A board's memory without power."""
-
-    eeprom: bytearray = field(default_factory=lambda: bytearray(b"\xff" * EEPROM_SIZE))
-    deck: bytearray = field(default_factory=lambda: bytearray(b"\xff" * DECK_MEMORY_SIZE))
+def new_eeprom() -> bytearray:
+    """Return the contents of an EEPROM that nobody has written."""
+    return bytearray(b"\xff" * EEPROM_SIZE)
 
 
 def unsupported(now_us: int, unit: int, failing: int, instance: int) -> CommandResult:
@@ -68,12 +65,11 @@ class VirtualBoard:
         console: Callable[[int, str], None],
         uart: Uart | None = None,
         requests: Requests = NO_REQUESTS,
-        memory: KeptMemory | None = None,
+        eeprom: bytearray | None = None,
     ) -> None:
         self.imu: ImuCounts = STILL
         self.battery_mv = 3900
-        memory = memory or KeptMemory()
-        self.eeprom, self.deck_memory = memory.eeprom, memory.deck
+        self.eeprom = new_eeprom() if eeprom is None else eeprom
         self._servo, self._radio, self._console, self._uart = servo, radio, console, uart
         self._requests = requests
         self._kernel: Processor | None = None

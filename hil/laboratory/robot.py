@@ -21,7 +21,7 @@ from hil.bodies import make_body
 from hil.config import LabConfig, load_config
 from hil.crazyflie import syslink
 from hil.crazyflie.shockburst import Air
-from hil.devices.board import InjectFailure, KeptMemory, Requests, Thief, VirtualBoard, unsupported
+from hil.devices.board import InjectFailure, Requests, Thief, VirtualBoard, new_eeprom, unsupported
 from hil.devices.board_firmware import Executor, PowerOn, PythonBoard
 from hil.devices.cameras import VirtualMocap
 from hil.devices.imu import GYRO_COUNTS, VirtualImu
@@ -79,7 +79,7 @@ class Ports:
 
     `polled`: a real host polls its radio, so empty polls need no model. `restart` boots the robot after a reset of its
     processor; by default it does so itself. `radio_command` takes what the processor commands its radio chip; by default
-    only its power switch works. `fail` makes a part of it fail. `memory` may have contents.
+    only its power switch works. `fail` makes a part of it fail. `eeprom` may have contents.
     """
 
     send_packet: SendPacket
@@ -89,7 +89,7 @@ class Ports:
     restart: Callable[[int], None] | None = None
     radio_command: Callable[[int, int, bytes], None] | None = None
     fail: InjectFailure = unsupported
-    memory: KeptMemory = field(default_factory=KeptMemory)
+    eeprom: bytearray = field(default_factory=new_eeprom)
 
 
 class Robot:
@@ -130,13 +130,13 @@ class Robot:
             lambda now_us, text: self.say("board", text),
             self.uart,
             Requests(self._reset, ports.radio_command or self._radio_command, ports.fail),
-            ports.memory,
+            ports.eeprom,
         )
         self.board.supply(self.battery.millivolts)
         self.boot(0)
 
     def boot(self, now_us: int) -> None:
-        """Start the firmware; its clock begins here. EEPROM and deck memory keep their content."""
+        """Start the firmware; its clock begins here. The EEPROM keeps its content."""
         self.booted_us = now_us
         self.powered = True
         if now_us:

@@ -1,6 +1,6 @@
 """A robot for clients outside: its radio chip with the power switch, dongles, its UDP port, the far end of its serial line.
 
-Its EEPROM and deck memory survive a restart of the server, in two files of a folder.
+Its EEPROM survives a restart of the server, in a file of a folder.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ from hil.config import LabConfig
 from hil.crazyflie.nrf51 import RATES, AirSettings, Band, Nrf51, ToPeers
 from hil.crazyflie.radio_line import POLL_PERIOD_US
 from hil.crazyflie.shockburst import Air
-from hil.devices.board import InjectFailure, KeptMemory, unsupported
+from hil.devices.board import InjectFailure, new_eeprom, unsupported
 from hil.devices.board_firmware import BoardFirmware
 from hil.devices.dongle import VirtualDongle
 from hil.devices.image_settings import APP_PARAMETER, NO_APP, stock_contents
@@ -33,47 +33,41 @@ from hil.laboratory.robot import Ports, Robot, Site
 from hil.servers.dongle_server import DongleServer
 from hil.servers.serial_server import Address, Endpoint
 from hil.servers.udp_server import UdpServer
+from hil.whole_files import replacing
 
 
-class BoardFiles:
-    """`board-N.eeprom` and `board-N.deck` are the bare bytes; `load` before the board boots, `keep` now and then."""
+class BoardFile:
+    """`board-N.eeprom` is the bare bytes; `load` before the board boots, `keep` now and then."""
 
-    def __init__(self, folder: Path, number: int, memory: KeptMemory) -> None:
-        self._memories = {
-            folder / f"board-{number}.eeprom": memory.eeprom,
-            folder / f"board-{number}.deck": memory.deck,
-        }
-        self._kept: dict[Path, bytes] = {}
+    def __init__(self, folder: Path, number: int, eeprom: bytearray) -> None:
+        self._path, self._eeprom, self._kept = folder / f"board-{number}.eeprom", eeprom, b""
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise LabError(f"--state {folder}: {error.strerror}") from None
 
     def load(self) -> None:
-        """Load the stored memories. Raises `LabError` for a file that is not such a memory."""
-        for path, memory in self._memories.items():
-            try:
-                content = path.read_bytes()
-            except FileNotFoundError:
-                continue
-            except OSError as error:
-                raise LabError(f"{path}: {error.strerror}") from None
-            if len(content) != len(memory):
-                raise LabError(f"{path}: {len(content)} bytes; this memory has {len(memory)}")
-            memory[:] = self._kept[path] = content
+        """Load the stored EEPROM. Raises `LabError` for a file that is none."""
+        try:
+            content = self._path.read_bytes()
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise LabError(f"{self._path}: {error.strerror}") from None
+        if len(content) != len(self._eeprom):
+            raise LabError(f"{self._path}: {len(content)} bytes; this memory has {len(self._eeprom)}")
+        self._eeprom[:] = self._kept = content
 
     def keep(self) -> None:
-        """Write changed memories; a file is never half written."""
-        for path, memory in self._memories.items():
-            if memory == self._kept.get(path, b""):
-                continue
-            self._kept[path] = bytes(memory)
-            new = path.with_suffix(path.suffix + ".new")
-            try:
-                new.write_bytes(self._kept[path])
-                new.replace(path)
-            except OSError as error:
-                raise LabError(f"{path}: {error.strerror}") from None
+        """Write a changed EEPROM; the file is never half written."""
+        if self._eeprom == self._kept:
+            return
+        self._kept = bytes(self._eeprom)
+        try:
+            with replacing(self._path) as partial:
+                partial.write_bytes(self._kept)
+        except OSError as error:
+            raise LabError(f"{self._path}: {error.strerror}") from None
 
 
 CHANNEL = 80
@@ -136,7 +130,7 @@ class ServedRobot:
     ) -> None:
         config, events, rng = site.config, site.events, site.streams.radio
         self._rng = rng
-        memory = self._memory = KeptMemory()
+        eeprom = self._eeprom = new_eeprom()
         air, wire_us = Air.of(config.radio), site.executor.wire_us
         uart = VirtualSerial(config.serial, events, site.streams.serial) if mavlink else None
         self.number = number
@@ -151,13 +145,13 @@ class ServedRobot:
         chip = bytes((number, 0x10, 0xA7, 0xF1, 0x0A, 0xC0))
         band = Band(events, rng.random, to_peers)
         self.nrf51 = Nrf51(settings, chip, config.radio.downlink_queue, band, self, air, wire_us)
-        memory.eeprom[:CONFIG_SIZE] = _factory_config(number, config)
-        self._files = BoardFiles(state, number, memory) if state is not None else None
-        if self._files is not None:
-            self._files.load()
+        eeprom[:CONFIG_SIZE] = _factory_config(number, config)
+        self._file = BoardFile(state, number, eeprom) if state is not None else None
+        if self._file is not None:
+            self._file.load()
         self.nrf51.tune(self._settings_at_boot())
         self.robot = Robot(
-            site, Ports(self._send, air, uart, True, self.start, self.nrf51.command, fail, memory)
+            site, Ports(self._send, air, uart, True, self.start, self.nrf51.command, fail, eeprom)
         )
         self.udp_radio.connect(self.robot.packet_received, self._to_udp)
         if uart is not None:
@@ -214,8 +208,8 @@ class ServedRobot:
 
     def keep(self) -> None:
         """Write the memories that survive a restart of the server."""
-        if self._files is not None:
-            self._files.keep()
+        if self._file is not None:
+            self._file.keep()
 
     def close(self) -> None:
         """Close the connections to clients."""
@@ -322,7 +316,7 @@ class ServedRobot:
     def _settings_at_boot(self) -> AirSettings:
         """Return the radio setting at boot, from the configuration block; unchanged without a valid one."""
         try:
-            block = decode_config(bytes(self._memory.eeprom[:CONFIG_SIZE]))
+            block = decode_config(bytes(self._eeprom[:CONFIG_SIZE]))
             return AirSettings(block.channel, RATES[block.data_rate], block.address.to_bytes(5))
         except (WireError, IndexError):
             return self.nrf51.settings

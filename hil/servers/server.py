@@ -112,7 +112,7 @@ class Service:
     """What to serve: robot `number` of a swarm of a profile's robots, and its faults.
 
     Each robot has its own place, radio address, seed and MAVLink system. `faults` act from its first release on. The
-    folder `state` stores EEPROM and deck memories; `executor` executes the firmware.
+    folder `state` stores the EEPROMs; `executor` executes the firmware.
     """
 
     config: LabConfig

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from cflib.crazyflie.log import LogTocElement
 from cflib.crazyflie.mem.i2c_element import I2CElement
-from cflib.crazyflie.mem.ow_element import OWElement
 from cflib.crazyflie.param import ParamTocElement
 from cflib.utils.encoding import compress_quaternion
 from hypothesis import given, settings
@@ -134,7 +133,7 @@ def test_floatys_own_names_are_there_beside_those_of_the_stock_firmware(logs, pa
     assert set(own.split()) <= logs.keys()
     own = "extCtrl.manual extCtrl.target_yaw extCtrl.x_P extCtrl.yaw_rate_P extCtrl.m1 delayComp.activate setpoint.X "
     own += "motorShifts.m1 motorPowerSet.enable kalman.maxPos RandConsts.flapHoverAng FloatyKalm.resetKalman "
-    own += "deck.bcFloaty firmware.revision0 imu_sensors.BMP3XX"
+    own += "firmware.revision0 imu_sensors.BMP3XX"
     assert set(own.split()) <= params.keys()
 
 
@@ -357,7 +356,7 @@ def test_sensors_and_decks_reported_present_are_the_board_s(client: CrtpClient, 
     present = {
         name for name in params if name.startswith(("imu_sensors.", "deck.")) and client.read(params, name)
     }
-    assert present == {"imu_sensors.BMI088", "deck.bcFloaty"}
+    assert present == {"imu_sensors.BMI088"}
 
 
 def test_of_absent_decks_the_table_names_those_alone_that_cfclient_and_bitcrazes_suite_read(params) -> None:
@@ -366,9 +365,7 @@ def test_of_absent_decks_the_table_names_those_alone_that_cfclient_and_bitcrazes
         *("bcZRanger", "bcZRanger2"),
         *("bcLighthouse4", "bcFlow2", "bcMultiranger", "bcUSD", "bcAI", "bcLoco"),  # ALL_DECKS of the suite
     }
-    assert {name for name in params if name.startswith("deck.")} == {
-        f"deck.{name}" for name in ("bcFloaty", *read)
-    }
+    assert {name for name in params if name.startswith("deck.")} == {f"deck.{name}" for name in read}
 
 
 def test_the_authors_gains_by_their_own_names_are_the_profile_as_flown(client: CrtpClient, params) -> None:
@@ -528,19 +525,6 @@ def test_cflib_reads_and_writes_the_configuration_block(client: CrtpClient) -> N
     again.update(done.append)
     assert again.valid
     assert again.elements["radio_address"] == 0xE7E7E7E701
-
-
-def test_cflib_reads_the_decks_one_wire_memory_and_rewrites_it(client: CrtpClient) -> None:
-    element, done = OWElement(5, 1, 112, bytes(8), Handler(client)), []
-    element.update(done.append)
-    assert element.valid
-    assert (element.vid, element.elements["Board name"]) == (0xBC, "bcFloaty")
-    element.elements["Board revision"] = "B7"
-    element.write_data(lambda *arguments: done.append(arguments))
-    again = OWElement(5, 1, 112, bytes(8), Handler(client))
-    again.update(done.append)
-    assert again.valid
-    assert again.elements == {"Board name": "bcFloaty", "Board revision": "B7"}
 
 
 def test_memory_tester_gives_the_address_and_counts_wrong_bytes(client: CrtpClient, logs, params) -> None:

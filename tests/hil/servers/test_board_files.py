@@ -14,12 +14,11 @@ def serve(state: Path | None, number: int = 1) -> Server:
     return Server(Service(load_config(), number, state=state), lambda line: None)
 
 
-def test_eeprom_and_deck_memory_of_each_board_are_kept_over_a_restart(tmp_path: Path) -> None:
+def test_the_eeprom_of_each_board_is_kept_over_a_restart(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "boards"
     servers = [serve(folder, number) for number in (1, 2)]
     one, two = (server.robot.board for server in servers)
     ParameterStorage(one.eeprom).store("supervisor.poseTimeout", (321).to_bytes(2, "little"))
-    one.deck_memory[100:103] = b"abc"
     two.eeprom[8000:8003] = b"two"
     for server in servers:
         server.close()
@@ -27,7 +26,6 @@ def test_eeprom_and_deck_memory_of_each_board_are_kept_over_a_restart(tmp_path: 
     again = [serve(folder, number).robot for number in (1, 2)]
     for robot, before in zip(again, (one, two), strict=True):
         assert robot.board.eeprom == before.eeprom
-        assert robot.board.deck_memory == before.deck_memory
     values = {parameter.name: parameter.read() for parameter in again[0].firmware.parameters}
     assert values["supervisor.poseTimeout"] == 321
 
@@ -38,7 +36,7 @@ def test_changes_are_written_at_once(tmp_path: Path) -> None:
     server.lab.end_at(30_000)
     server.lab.run()
     assert (tmp_path / "board-1.eeprom").read_bytes()[8000:8003] == b"new"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["board-1.deck", "board-1.eeprom"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["board-1.eeprom"]
 
 
 def test_without_a_folder_every_server_begins_with_new_boards() -> None:

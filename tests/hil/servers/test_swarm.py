@@ -134,7 +134,7 @@ def test_a_typed_line_goes_to_the_robot_whose_number_it_has(served: Served, line
     served.wait_for(answer, PATIENCE_S)
 
 
-def test_ctrl_c_ends_all_processes_in_order_and_keeps_every_robots_memories(tmp_path: Path) -> None:
+def test_ctrl_c_ends_all_processes_in_order_and_keeps_every_robots_eeprom(tmp_path: Path) -> None:
     with serve("--boards", "2", "--udp", "0", "--state", str(tmp_path)) as served:
         pids = others(served)
         assert len(pids) == 1
@@ -142,7 +142,7 @@ def test_ctrl_c_ends_all_processes_in_order_and_keeps_every_robots_memories(tmp_
         assert served.lines[-1].startswith("stopped; time stood still for")
         assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
     assert sorted(path.name for path in tmp_path.iterdir()) == [
-        f"board-{number}.{memory}" for number in (1, 2) for memory in ("deck", "eeprom")
+        f"board-{number}.eeprom" for number in (1, 2)
     ]
 
 
