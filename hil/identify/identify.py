@@ -29,7 +29,9 @@ from hil.identify.two_controllers import two_controllers
 IDENTIFIED, WEAK, UNKNOWN = "identified", "weak", "not identifiable"
 NARROW, KNOWN = 0.25, 0.7  # half width of the interval over the value
 EXPLAINED = 10.0  # largest misfit at which the linear model explains the log
-SATURATED, LOST = 0.05, 0.30  # shares of the rows
+# Shares of the rows. With u2 of 0.16 rad rms flaps are at their limits in 16 %, and x_pitch is wrong; in the flights of the
+# experiments in less than 4 %.
+SATURATED, LOST = 0.15, 0.30
 COHERENT = 0.35  # smallest mean coherence of an axis with its excitation; pure noise has 1 over the realisations plus 1
 PLAUSIBLE = 10.0  # times the profile's value
 

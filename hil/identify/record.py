@@ -27,6 +27,7 @@ INPUTS = tuple(f"controller.u{i} [rad]" for i in range(1, 5))
 EXCITATIONS = tuple(f"excite.u{i} [rad]" for i in range(1, 5))
 RATES = tuple(f"stateEstimate.{name}_rate [rad/s]" for name in ("roll", "pitch", "yaw"))
 FACING = np.radians(30.0)  # a choice: largest median turn of the robot
+AT_LIMIT = 0.003  # [rad] from a limit: the steps of four half floats, and one tick of two a little inside
 WRAP_MS = 1 << 24  # of the board's time stamps
 SHARES = (SIGNS[:, None] * MIX).T  # (4, 4) opening of each flap per input; u4 closes
 EXCHANGED_MS = 1000.0  # largest step back of rows that a link exchanged; a board that boots goes back further
@@ -188,11 +189,12 @@ def _flown_with(folder: Path) -> tuple[LabConfig, bool, float]:
 
 
 def _limited(u: Array, config: LabConfig) -> tuple[Array, float]:
-    """Return the inputs produced by the limited flaps, and how often a flap was limited, like `allocate` on board."""
+    """Return the inputs produced by the limited flaps, like `allocate` on board, and how often a flap is at its limit."""
     allocation = config.allocation
     opening = allocation.hover_angle + u @ SHARES
     inside = np.clip(opening, allocation.opening_min, allocation.opening_max)
-    saturated = float(np.mean(np.any(np.abs(inside - opening) > 1e-4, axis=1)))
+    room = np.minimum(inside - allocation.opening_min, allocation.opening_max - inside)
+    saturated = float(np.mean(np.any(room < AT_LIMIT, axis=1)))
     return (inside - allocation.hover_angle) @ SHARES.T / 4.0, saturated
 
 

@@ -98,6 +98,20 @@ def test_inputs_within_the_flaps_limits_are_what_was_commanded(tmp_path: Path) -
     assert record.saturated == 0.0
 
 
+@pytest.mark.parametrize("limit", ["opening_min", "opening_max"])
+@pytest.mark.parametrize("beyond", [0.0, 0.05])
+def test_flaps_at_their_limit_count_like_those_that_would_exceed_it(
+    tmp_path: Path, limit: str, beyond: float
+) -> None:
+    room = CONFIG.allocation.hover_angle - getattr(CONFIG.allocation, limit)
+    u4 = np.where(
+        np.arange(150) % 3 == 0, room + np.copysign(beyond, room), 0.0
+    )  # on board u4 gives way at a limit
+    record = loaded(tmp_path, columns(150, **{INPUTS[3]: np.float16(u4).astype(float)}))
+    assert record.saturated == pytest.approx(1 / 3)
+    assert np.abs(record.u[::3, 3]) == pytest.approx(abs(room), abs=1e-3)
+
+
 def rows_changed(change: Callable[[list[str]], list[str]]) -> Callable[[str], str]:
     def changed(text: str) -> str:
         header, *rows = text.splitlines()
@@ -304,7 +318,7 @@ def constant(
     ("found", "evidence", "reason"),
     [
         (constant((64.0, 1.0)), Evidence(10.1, 0.0, 1.0), "misses the log by 3.2 times"),
-        (constant((64.0, 1.0)), Evidence(1.0, 0.06, 1.0), "at their limits in 6%"),
+        (constant((64.0, 1.0)), Evidence(1.0, 0.16, 1.0), "at their limits in 16%"),
         (constant((64.0, 1.0)), Evidence(1.0, 0.0, 0.34), "coherence 0.34"),
         (constant((64.0, 1.0), (50.0, 12.0)), Evidence(1.0, 0.0, 1.0), "exclude each other"),
     ],
