@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from firmware_py.wire.crtp import FAR
+from ground_station.unused import Reason, Unused, flaw
 
 
 @dataclass(slots=True)
@@ -20,17 +20,14 @@ class MocapFrame:
     received_us: int | None = None  # arrival of the images at the motion capture computer
     transmitted_us: int | None = None  # departure of the pose from it
     arrived_us: int | None = None  # arrival at the ground station
+    unused: Unused = (Reason.NOT_TRACKED, ())  # why it is not valid; without meaning for a valid one
 
 
 def judged(frame: MocapFrame) -> MocapFrame:
-    """Return a frame from any source, valid only if its numbers are a position and a rotation.
-
-    The comparisons are false for NaN and infinity, too.
-    """
-    x, y, z = frame.p_WB
-    a, b, c, d = frame.q_WB
-    is_pose = abs(x) + abs(y) + abs(z) < FAR and abs(a * a + b * b + c * c + d * d - 1.0) < 0.02
-    return frame if is_pose or not frame.valid else replace(frame, valid=False)
+    """Return a frame from any source, valid only if its numbers are a position and a rotation."""
+    if not frame.valid or (unused := flaw(frame.p_WB, frame.q_WB)) is None:
+        return frame
+    return replace(frame, valid=False, unused=unused)
 
 
 class MocapSource(Protocol):

@@ -153,7 +153,7 @@ class LiveStation:
         counters, tracker = self.station.counters, self.station.tracker
         track = f"track {tracker.summary()}  " if tracker is not None else ""
         self.say(
-            f"poses {counters.frames} ({counters.invalid} unusable)  {self.source.summary()}  {track}"
+            f"poses {counters.frames} ({self.station.unused.summary()})  {self.source.summary()}  {track}"
             f"{self.link.summary()}  telemetry {counters.samples}"
         )
         self.say(str(self.station.budget))

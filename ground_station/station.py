@@ -16,6 +16,7 @@ from ground_station.latency import LatencyBudget, LinkLatency
 from ground_station.mocap import MocapFrame, judged
 from ground_station.tracker import Track, Tracker
 from ground_station.trajectory import Goal, Trajectory
+from ground_station.unused import Event, UnusedPoses
 
 TELEMETRY_TIMEOUT_US = 500_000  # of silence, after which the board is asked again
 
@@ -43,7 +44,7 @@ class Link(Protocol):
 @dataclass(slots=True)
 class StationCounters:
     frames: int = 0  # from motion capture
-    invalid: int = 0  # of these, not tracked, refused or not a pose
+    invalid: int = 0  # of these, not used; `GroundStation.unused` has the reasons
     sent: int = 0  # handed to the link
     received: int = 0  # packets, or pieces of a stream, from the board
     samples: int = 0  # of telemetry in these
@@ -87,6 +88,7 @@ class GroundStation:
         tracker: Tracker | None = None,
     ) -> None:
         self.counters = StationCounters()
+        self.unused = UnusedPoses()
         self.tracker = tracker
         self.budget = LatencyBudget()
         self._link = link
@@ -107,9 +109,11 @@ class GroundStation:
             self._ask_for_telemetry_us = now_us + TELEMETRY_TIMEOUT_US
         frame = judged(frame)
         due = self._slots.due(frame.t_us)
+        event = Event.NONE
         if self.tracker is not None:
             self.track = self.tracker.take(frame)
-            frame = self.track.frame
+            frame, event = self.track.frame, self.track.event
+        self.unused.note(now_us, frame.t_us, None if frame.valid else frame.unused, event)
         if not frame.valid:
             counters.invalid += 1
             return
@@ -123,7 +127,7 @@ class GroundStation:
 
     def notices(self) -> list[str]:
         """Return lines for the user since the last call."""
-        return self.tracker.notices() if self.tracker is not None else []
+        return self.unused.due()
 
     def on_packet(self, now_us: int, data: bytes) -> None:
         """Take bytes from the board: telemetry is logged, unreadable bytes are counted."""

@@ -11,68 +11,18 @@ from enum import IntEnum
 from math import degrees, nan, sqrt
 
 from firmware_py.elementary import atan2
-from firmware_py.geometry import Vector
+from firmware_py.geometry import Quaternion, Vector
 from ground_station.config import TrackerConfig
 from ground_station.mocap import MocapFrame
 from ground_station.pose_filter import PoseFilter
-
-GATHER_US = 500_000
-
-
-@dataclass(slots=True)
-class TrackNotices:
-    """Collects events until a line is due; times are from frames."""
-
-    _refused: int = 0
-    _distance: float = 0.0  # the largest [m]
-    _angle: float = 0.0  # [rad]
-    _lost: bool = False
-    _gap_us: int | None = None  # before a track that began again
-    _due_us: int | None = None
-
-    def refused(self, t_us: int, distance: float, angle: float) -> None:
-        """Note a pose refused at this distance from the prediction [m, rad]."""
-        self._refused += 1
-        self._distance = max(self._distance, distance)
-        self._angle = max(self._angle, angle)
-        self._happened(t_us)
-
-    def lost(self, t_us: int) -> None:
-        """Note a lost track."""
-        self._lost = True
-        self._happened(t_us)
-
-    def restarted(self, t_us: int, gap_us: int) -> None:
-        """Note a new track, `gap_us` after the last good pose."""
-        self._gap_us = gap_us
-        self._happened(t_us)
-
-    def due(self, t_us: int) -> list[str]:
-        """Return at most one line, by a clock that may jump."""
-        if self._due_us is None or 0 < self._due_us - t_us <= GATHER_US:
-            return []
-        notices = []
-        if self._refused:
-            poses = "1 pose" if self._refused == 1 else f"{self._refused} poses"
-            notices.append(
-                f"{poses} refused, up to {self._distance:.2f} m and {degrees(self._angle):.0f} deg from the prediction"
-            )
-        if self._gap_us is not None:
-            notices.append(f"track restarted after {self._gap_us * 1e-6:.1f} s")
-        elif self._lost:
-            notices.append("track lost")
-        self._refused, self._distance, self._angle = 0, 0.0, 0.0
-        self._lost, self._gap_us, self._due_us = False, None, None
-        return [f"motion capture: {'; '.join(notices)}"]
-
-    def _happened(self, t_us: int) -> None:
-        if self._due_us is None:
-            self._due_us = t_us + GATHER_US
-
+from ground_station.unused import Event, Reason, Unused
 
 POSES = 3  # that begin a track
 FIT_US = 50_000  # between them, or two and a half frames if that is longer; a later one does not confirm the others
 WIDEN_US = 60_000  # refused poses widen the gate only until then, else it would accept them
+PLACE = 0.05  # [m] beyond which a pose counts as one of another place, within as one of another orientation
+RETURNS = 3  # after which poses alternate
+BEGINS: Unused = (Reason.TRACK_BEGINS, ())
 UNKNOWN: Vector = (nan, nan, nan)
 
 
@@ -92,6 +42,7 @@ class Track:
     v_WB: Vector  # [m/s]
     w_B: Vector  # [rad/s]
     quality: Quality
+    event: Event = Event.NONE
 
 
 @dataclass(slots=True)
@@ -116,7 +67,9 @@ class Tracker:
             config.acceleration,
             config.angular_acceleration,
         )
-        self._notices = TrackNotices()
+        self._event = Event.NONE  # with the last frame
+        self._stray: tuple[Vector, Quaternion] | None = None  # the last pose that did not fit
+        self._returns = 0  # of strays to the place of the one before, in sequence
         self._poses = 0  # that fit one another, up to `POSES`
         self._tracking = False  # there are `POSES` of them
         self._t_us = 0  # of the newest frame
@@ -124,19 +77,17 @@ class Tracker:
             maxlen=2
         )  # between the newest frames; the first one's is meaningless
         self._good_us = 0  # of the newest frame accepted by the filter
-        self._lost_us: int | None = None  # of the last good frame before a track was lost
+        self._was_lost = False  # a track, before
         self._refused_in_a_row = 0
         self._widening = max(1, WIDEN_US // period_us)
 
     def take(self, frame: MocapFrame) -> Track:
         """Return the frame to be used in place of `frame`."""
+        self._event = Event.NONE
         track = self._take(frame)
+        track.event = self._event
         self.quality = track.quality
         return track
-
-    def notices(self) -> list[str]:
-        """Return lines for the user since the last call, half a second late so that one line has all of them."""
-        return self._notices.due(self._t_us)
 
     def summary(self) -> str:
         """Return a few words on the state."""
@@ -148,7 +99,7 @@ class Tracker:
         """How old the last good frame may be: the cameras may be slower than the profile has it."""
         if self._tracking:
             return self._config.reacquire_us
-        return max(FIT_US, 5 * min(self._gaps_us, default=0) // 2)
+        return max(FIT_US, min(5 * min(self._gaps_us, default=0) // 2, self._config.reacquire_us))
 
     def _take(self, frame: MocapFrame) -> Track:
         t_us = frame.t_us
@@ -160,34 +111,50 @@ class Tracker:
             self._t_us = t_us
             if frame.valid:
                 self._begin(frame)
-            return _without(frame, Quality.NONE)
+            return _without(frame, Quality.NONE, BEGINS if frame.valid else frame.unused)
         elapsed_us = t_us - self._t_us
-        if elapsed_us <= 0:  # late, or a repetition
+        if elapsed_us <= 0:
             self.counters.refused += 1
-            return _without(frame, Quality.REFUSED)
+            unused = frame.unused
+            if frame.valid:
+                late_ms, at_s = -elapsed_us * 1e-3, t_us * 1e-6
+                unused = (Reason.LATE, (late_ms,)) if elapsed_us else (Reason.REPEATED, (at_s,))
+            return _without(frame, Quality.REFUSED, unused)
         self._t_us = t_us
         steps = 1 if elapsed_us <= self._period_us else round(elapsed_us / self._period_us)
         self._filter.predict(steps, self._refused_in_a_row < self._widening)
         if not frame.valid:
-            return self._without_pose(frame, Quality.NONE)
+            return self._without_pose(frame, Quality.NONE, frame.unused)
         distance2, angle2, theta = self._filter.deviation(frame.p_WB, frame.q_WB)
         position2, rotation2 = self._filter.variances
         if distance2 > self._gate2 * position2 or angle2 > self._gate2 * rotation2:
-            if not self._tracking:  # one of them is wrong: start again with the newest
-                self._begin(frame)
-                return _without(frame, Quality.NONE)
-            self.counters.refused += 1
-            self._refused_in_a_row += 1
-            self._notices.refused(t_us, sqrt(distance2), 2.0 * atan2(sqrt(angle2), 2.0))
-            return self._without_pose(frame, Quality.REFUSED)
+            return self._refuse(frame, sqrt(distance2), 2.0 * atan2(sqrt(angle2), 2.0))
         v_WB, w_B = self._filter.update(frame.p_WB, theta)
         self._good_us = t_us
         self._refused_in_a_row = 0
         if not self._tracking:
-            self._fit(t_us)
+            self._fit()
             if not self._tracking:
-                return _without(frame, Quality.NONE)
+                return _without(frame, Quality.NONE, BEGINS)
         return Track(frame, v_WB, w_B, Quality.TRACKED)
+
+    def _refuse(self, frame: MocapFrame, distance: float, angle: float) -> Track:
+        """Return the track without a pose that is this far from the prediction [m, rad]; without a track it begins one."""
+        returns = self._refused_in_a_row == 0 and _is_return(frame, self._stray, distance, angle)
+        self._returns = self._returns + 1 if returns else 0
+        if self._returns < RETURNS:
+            reason = Reason.DEVIATES if self._tracking else Reason.SCATTERED
+        else:
+            reason = Reason.PLACES if distance > PLACE else Reason.ORIENTATIONS
+        unused = reason, (distance, degrees(angle))
+        if not self._tracking:  # one of them is wrong: start again with the newest
+            self._stray = self._filter.pose
+            self._begin(frame)
+            return _without(frame, Quality.NONE, unused)
+        self._stray = frame.p_WB, frame.q_WB
+        self.counters.refused += 1
+        self._refused_in_a_row += 1
+        return self._without_pose(frame, Quality.REFUSED, unused)
 
     def _begin(self, frame: MocapFrame) -> None:
         """Take the first pose of a track."""
@@ -196,29 +163,29 @@ class Tracker:
         self._good_us = frame.t_us
         self._refused_in_a_row = 0
 
-    def _fit(self, t_us: int) -> None:
+    def _fit(self) -> None:
         """Count one more pose that fits those before it."""
         self._poses += 1
         if self._poses < POSES:
             return
         self._tracking = True
-        if self._lost_us is not None:
+        if self._was_lost:
             self.counters.restarts += 1
-            self._notices.restarted(t_us, t_us - self._lost_us)
+            self._event = Event.RESTARTED
 
     def _lose(self) -> None:
         if self._tracking:
-            self._lost_us = self._good_us
-            self._notices.lost(self._t_us)
+            self._was_lost = True
+            self._event = Event.LOST
         self._poses = 0
         self._tracking = False
 
-    def _without_pose(self, frame: MocapFrame, quality: Quality) -> Track:
+    def _without_pose(self, frame: MocapFrame, quality: Quality, unused: Unused) -> Track:
         """Predict the velocity without a pose: it is missing or wrong, and none is sent."""
         v_WB, w_B = self._filter.leave_out()
         if not self._tracking:
-            return _without(frame, quality)
-        return Track(replace(frame, valid=False), v_WB, w_B, quality)
+            return _without(frame, quality, unused)
+        return Track(replace(frame, valid=False, unused=unused), v_WB, w_B, quality)
 
 
 def tracker_of(config: TrackerConfig, period_us: int) -> Tracker | None:
@@ -226,6 +193,19 @@ def tracker_of(config: TrackerConfig, period_us: int) -> Tracker | None:
     return Tracker(config, period_us) if config.enabled else None
 
 
-def _without(frame: MocapFrame, quality: Quality) -> Track:
+def _without(frame: MocapFrame, quality: Quality, unused: Unused) -> Track:
     """Return a track without pose and motion."""
-    return Track(replace(frame, valid=False), UNKNOWN, UNKNOWN, quality)
+    return Track(replace(frame, valid=False, unused=unused), UNKNOWN, UNKNOWN, quality)
+
+
+def _is_return(
+    frame: MocapFrame, stray: tuple[Vector, Quaternion] | None, distance: float, angle: float
+) -> bool:
+    """Return whether a pose that does not fit is much nearer to the one before that did not fit."""
+    if stray is None:
+        return False
+    p, q = stray
+    if distance > PLACE:
+        return sqrt(sum((a - b) * (a - b) for a, b in zip(frame.p_WB, p, strict=True))) < 0.5 * distance
+    cosine = min(1.0, abs(sum(a * b for a, b in zip(frame.q_WB, q, strict=True))))
+    return 2.0 * atan2(sqrt(1.0 - cosine * cosine), cosine) < 0.5 * angle

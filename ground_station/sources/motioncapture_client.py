@@ -17,6 +17,7 @@ from ground_station.mocap import MocapFrame
 from ground_station.sources.alignment import Alignment, choose_body
 from ground_station.sources.motioncapture_process import Arrival, Body, decode_line
 from ground_station.sources.silence import Silence
+from ground_station.unused import Reason, Unused
 
 CONNECT_TIMEOUT_US = 5_500_000  # the process gives up after 5 s without a frame
 SETTLE_US = 1_000_000  # after the first frame, in which all bodies should have been seen
@@ -118,25 +119,32 @@ class MotioncaptureSource:
         self._buffer, self._lines = b"", []
 
     def _on_arrival(self, arrival: Arrival, now_us: int) -> MocapFrame | None:
-        """Return the frame, None if it does not contain the body."""
+        """Return the frame, None if it is VRPN's of another body."""
         body = arrival.bodies.get(self._body)
-        if (body is None and self._system == "vrpn") or now_us - arrival.t_us > OLDEST_US:
+        if body is None and self._system == "vrpn":
             return None  # VRPN reports each body separately
         self._silence.on_frame(now_us)
         arrived_us = min(arrival.t_us, now_us)
         t_us = arrived_us - self._capture.latency_us
-        if body is None or not self._usable(body):
+        unused = self._unused(body, now_us - arrived_us)
+        if unused is not None or body is None:
             self._lost += 1
-            return MocapFrame(t_us, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), valid=False)
+            return MocapFrame(
+                t_us, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), valid=False, unused=unused or (Reason.ABSENT, ())
+            )
         self._age_us = now_us - t_us
         x, y, z, qw, qx, qy, qz = body
         p_WB, q_WB = self._alignment.to_world((x, y, z), (qw, qx, qy, qz))
         return MocapFrame(t_us, p_WB, q_WB, valid=True, arrived_us=arrived_us)
 
-    def _usable(self, body: Body) -> bool:
-        """Return whether a body differs from its last pose, as every measured pose does."""
+    def _unused(self, body: Body | None, waited_us: int) -> Unused | None:
+        """Return why a body is not used: every measured pose differs from the last."""
+        if waited_us > OLDEST_US:
+            return Reason.MISTIMED, (waited_us * 1e-6,)
+        if body is None:
+            return Reason.ABSENT, ()
         last, self._pose = self._pose, body
-        return body != last
+        return (Reason.FROZEN, ()) if body == last else None
 
     def _start(self) -> None:
         # In a separate session, because Ctrl-C is for the station.

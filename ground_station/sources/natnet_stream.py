@@ -17,6 +17,7 @@ from ground_station.sources import natnet
 from ground_station.sources.alignment import Alignment, choose_body
 from ground_station.sources.natnet_reader import Version
 from ground_station.sources.silence import Silence
+from ground_station.unused import Reason, Unused
 
 DRIFT = 50e-6  # between two computers, at most; quartz
 
@@ -191,39 +192,47 @@ class NatnetStream:
         if frame.parameters & MODELS_CHANGED:
             self.outgoing.append(natnet.packet(natnet.MessageId.REQUEST_MODELDEF, b"\0"))
         counters.frames += 1
-        t_us = self._exposed_us(frame, now_us)
+        t_us, unused = self._exposed_us(frame, now_us)
+        if unused is not None:
+            counters.lost += 1
+            return MocapFrame(now_us, *NOWHERE, valid=False, unused=unused)
         pose = next((body for body in frame.bodies if body.id == self._id), None)
-        usable = t_us is not None and pose is not None and self._usable(pose)
-        counters.lost += not usable
-        if t_us is None:
-            return MocapFrame(now_us, *NOWHERE, valid=False)
+        unused = self._unused(pose)
+        if unused is not None or pose is None:
+            counters.lost += 1
+            (p, q), valid = NOWHERE, False
+        else:
+            (p, q), valid = self._alignment.to_world(pose.p, pose.q), True
         received_us, sent_us = map(self._clock.to_station_us, (frame.received, frame.transmitted))
-        p, q = self._alignment.to_world(pose.p, pose.q) if usable and pose is not None else NOWHERE
         received_us = max(t_us, min(received_us, now_us))  # the clocks' offset is less certain
         sent_us = max(received_us, min(sent_us, now_us))
-        return MocapFrame(t_us, p, q, usable, received_us, sent_us, now_us)
+        return MocapFrame(t_us, p, q, valid, received_us, sent_us, now_us, unused or (Reason.NOT_TRACKED, ()))
 
-    def _exposed_us(self, frame: natnet.Frame, now_us: int) -> int | None:
-        """Return the exposure on our clock, None if the server's time stamps make no sense."""
+    def _exposed_us(self, frame: natnet.Frame, now_us: int) -> tuple[int, Unused | None]:
+        """Return the exposure on our clock; with a reason where the server's time stamps make no sense."""
         self._clock.sent(frame.transmitted, now_us)
         # Cameras without a clock have no exposure, only an arrival.
         t_us = min(now_us, self._clock.to_station_us(frame.mid_exposure or frame.received))
         if now_us - t_us <= OLDEST_US:
             self._mistimed = 0
-            return t_us
+            return t_us, None
         self.counters.mistimed += 1
         self._mistimed += 1
         if self._mistimed == MISTIMED_FRAMES and self.server is not None:
             self._mistimed = 0
             self._clock = ServerClock(self.server.clock_hz)
-        return None
+        return t_us, (Reason.MISTIMED, ((now_us - t_us) * 1e-6,))
 
-    def _usable(self, pose: natnet.BodyPose) -> bool:
-        """Return whether a pose is tracked, and no repetition of the last."""
+    def _unused(self, pose: natnet.BodyPose | None) -> Unused | None:
+        """Return why a pose is not used: it is missing, not tracked, or a repetition of the last."""
+        if pose is None:
+            return Reason.ABSENT, ()
         last, self._pose = self._pose, pose
         same = last is not None and (last.p, last.q) == (pose.p, pose.q)
         self._repeated = self._repeated + 1 if same else 0
-        return pose.valid and self._repeated < FROZEN_FRAMES
+        if not pose.valid:
+            return Reason.NOT_TRACKED, ()
+        return (Reason.FROZEN, ()) if self._repeated >= FROZEN_FRAMES else None
 
 
 def _unreadable(server: natnet.ServerInfo) -> MocapError:

@@ -1,6 +1,7 @@
 """Frames in, corrections out, telemetry into the log."""
 
 import csv
+from dataclasses import replace
 from math import isnan, pi
 
 import numpy as np
@@ -139,6 +140,71 @@ def test_refused_frames_are_not_sent_and_the_next_good_one_takes_their_place():
     assert bench.station.notices() == [
         "motion capture: 3 poses refused, up to 0.50 m and 0 deg from the prediction"
     ]
+
+
+TURNED = (0.0, 0.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (lambda n: {"q_WB": TURNED if n % 2 else UPRIGHT}, "orientations alternate, 180 deg apart: two bodies?"),
+        (lambda n: {"p_WB": (0.5 * (n % 2), 0.0, 1.15)}, "places alternate, 0.50 m and 0 deg apart: two bodies?"),
+        (lambda n: {"p_WB": (100.0, -200.0, 1150.0 + n / 10)}, "at 100.00 -200.00 1152.00 m, outside 50 m: millimetres"),
+        (lambda n: {"p_WB": (1.0, 0.0, 49.5)}, "at 1.00 0.00 49.50 m, outside 50 m: millimetres"),
+        (lambda n: {"p_WB": (0.0, 70_000.0, 0.0)}, "at 0.00 70000.00 0.00 m, out of the volume of 50 m"),
+        (lambda n: {"q_WB": (0.0, 2.0, 0.0, 0.0)}, "a quaternion of length 2.00, not 1"),
+        (lambda n: {"p_WB": (0.0, float("nan"), 0.0)}, "a coordinate is not a number"),
+        (lambda n: {"t_us": 12_345_000}, "exposed at 12.345 s like the one before: does the frames' clock stand?"),
+        (lambda n: {"t_us": 400_000 - 5000 * n}, "ms behind a newer one"),
+        (lambda n: {"p_WB": (0.24 * n, 0.0, 1.15)}, "up to 0.24 m and 0 deg from one to the next, too far for a track"),
+        (lambda n: {"valid": False}, "missing: the body is not tracked"),
+    ],
+)  # fmt: skip
+def test_the_line_on_unused_poses_has_the_reason_and_the_value(change, line):
+    """Frames every 25 ms; all but the first two are unused for this reason."""
+    bench = StationWithPackets(tracker=Tracker(TrackerConfig(), 25_000))
+    lines = []
+    for number in range(200):
+        moved = {"t_us": 25_000 * number} | change(number)
+        frame = replace(MocapFrame(0, (0.0, 0.0, 1.15), UPRIGHT, True), **moved)
+        bench.station.on_frame(frame, 25_000 * number + 38_000)
+        lines += bench.station.notices()
+    assert len(bench.sent) == 0
+    assert 1 <= len(lines) <= 2  # in 5 s
+    assert all(line in one for one in lines), lines
+    assert bench.station.unused.counts.total() == bench.station.counters.invalid == 200
+
+
+@pytest.mark.parametrize(
+    ("stray", "word"),
+    [
+        (lambda rng: (0.5, 0.0, 1.15), "places alternate"),
+        (lambda rng: tuple(rng.uniform(-1, 1, 3).tolist()), "refused"),
+    ],
+)
+def test_poses_that_alternate_in_flight_are_two_bodies_and_single_outliers_are_not(stray, word):
+    rng, bench = np.random.default_rng(2), StationWithPackets(tracker=Tracker(TrackerConfig(), 5000))
+    bench.frames(400, p=lambda n: HOME.p_WG if n < 100 or n % 2 else stray(rng))
+    assert word in bench.station.notices()[0]
+
+
+@pytest.mark.parametrize(("jump_s", "way"), [(-3600, "back by 3600.0"), (3600, "forward by 3600.0")])
+def test_a_frame_clock_that_jumps_is_named_and_the_gap_is_the_true_one(jump_s, way):
+    bench = StationWithPackets(tracker=Tracker(TrackerConfig(), 5000))
+    lines = []
+    for number in range(1000):
+        t_us = 10_000_000_000 + 5000 * number + 1_000_000 * jump_s * (number >= 500)
+        bench.station.on_frame(MocapFrame(t_us, HOME.p_WG, UPRIGHT, True), 5000 * number)
+        lines += bench.station.notices()
+    assert lines == [f"motion capture: track restarted after 0.0 s: the frames' clock jumped {way} s"]
+
+
+def test_frames_of_unknown_bodies_that_are_seen_now_and_then_are_counted_without_a_line():
+    bench = StationWithPackets(tracker=Tracker(TrackerConfig(), 5000))
+    bench.frames(1000, valid=lambda number: number % 3 > 0)
+    assert bench.station.notices() == []
+    assert bench.station.unused.summary() == "336 unusable: 334 not tracked, 2 track begins"
 
 
 def test_the_goal_of_the_moment_counts_not_that_of_the_exposure():

@@ -14,6 +14,7 @@ from ground_station.sources.natnet import MULTICAST_GROUP
 from ground_station.sources.natnet_stream import MISTIMED_FRAMES, NatnetStream, ServerClock
 from ground_station.sources.optitrack import OptitrackSource
 from ground_station.sources.silence import SILENCE_US, Silence
+from ground_station.unused import Reason
 from support import natnet_packets as packets
 from support.motive_bench import moving
 
@@ -126,17 +127,20 @@ def test_a_server_whose_clock_was_set_is_followed_again() -> None:
     assert bench.pose().valid
     bench.ahead_us -= 5_000_000
     for _ in range(MISTIMED_FRAMES):
-        assert not bench.pose().valid
+        pose = bench.pose()
+        assert (pose.valid, pose.unused) == (False, (Reason.MISTIMED, pytest.approx((5.0,), rel=0.1)))
     assert bench.pose().valid  # without an echo
 
 
 def test_lost_tracking_is_never_a_pose() -> None:
     bench = ServedStream()
     assert bench.pose().valid
-    assert not bench.pose(tracked=False).valid
-    assert not bench.pose(number_of_body=8).valid
-    frozen = [bench.pose(pose=packets.POSE).valid for _ in range(6)]
-    assert frozen == [True, True, True, False, False, False]
+    for reason, options in ((Reason.NOT_TRACKED, {"tracked": False}), (Reason.ABSENT, {"number_of_body": 8})):
+        pose = bench.pose(**options)
+        assert (pose.valid, pose.unused) == (False, (reason, ()))
+    frozen = [bench.pose(pose=packets.POSE) for _ in range(6)]
+    assert [pose.valid for pose in frozen] == [True, True, True, False, False, False]
+    assert frozen[-1].unused[0] is Reason.FROZEN
     assert bench.pose().valid
     assert bench.stream.counters.lost == 5
 

@@ -18,6 +18,7 @@ from ground_station.config import TrackerConfig
 from ground_station.mocap import MocapFrame, judged
 from ground_station.pose_filter import PoseFilter
 from ground_station.tracker import FIT_US, Quality, Tracker, tracker_of
+from ground_station.unused import UnusedPoses
 
 PERIOD_US = 5000
 CONFIG = TrackerConfig()
@@ -246,9 +247,8 @@ def test_the_exact_opposite_attitude_is_refused(w: float) -> None:
     for number in range(3):
         tracker.take(frame(number))
     assert tracker._filter.pose[1] == UPRIGHT
-    assert tracker.take(frame(3, q=(w, 1.0, 0.0, 0.0))).quality is Quality.REFUSED
-    after = [frame(number) for number in range(4, 110)]
-    assert [line for _, line in told(tracker, after)] == [
+    wrong, after = frame(3, q=(w, 1.0, 0.0, 0.0)), [frame(number) for number in range(4, 110)]
+    assert [line for _, line in told(tracker, [wrong, *after])] == [
         "motion capture: 1 pose refused, up to 0.00 m and 180 deg from the prediction"
     ]
 
@@ -359,6 +359,11 @@ def test_a_clock_that_jumps_costs_two_frames(jump_us: int) -> None:
     assert [tracker.take(seen).quality for seen in jumped] == [NOT_YET, NOT_YET, YES, YES]
 
 
+def test_a_clock_that_jumps_before_the_track_begins_costs_two_frames() -> None:
+    far = [frame(n) for n in (10**9, 3 * 10**9, 5 * 10**9)]
+    assert qualities(*far, *(frame(n) for n in range(1000, 1004)))[-4:] == [NOT_YET, NOT_YET, YES, YES]
+
+
 def test_late_and_repeated_frames_are_refused_and_change_nothing() -> None:
     first, second, rng = tracking(), tracking(), np.random.default_rng(2)
     for number in range(100, 130):
@@ -376,10 +381,12 @@ def test_late_and_repeated_frames_are_refused_and_change_nothing() -> None:
 
 def told(tracker: Tracker, frames: list[MocapFrame]) -> list[tuple[int, str]]:
     """Frame times and lines."""
-    lines = []
+    unused, lines = UnusedPoses(), []
+    unused.note(frames[0].t_us - PERIOD_US, frames[0].t_us - PERIOD_US, None)
     for seen in frames:
-        tracker.take(seen)
-        lines += [(seen.t_us, line) for line in tracker.notices()]
+        track = tracker.take(seen)
+        unused.note(seen.t_us, seen.t_us, None if track.frame.valid else track.frame.unused, track.event)
+        lines += [(seen.t_us, line) for line in unused.due()]
     return lines
 
 
@@ -410,7 +417,7 @@ def test_a_track_that_is_lost_and_restarted_is_reported() -> None:
     back = [noisy(rng, n) for n in range(400, 600)]
     lines = told(tracking(), blind + back)
     assert [line for _, line in lines] == [
-        "motion capture: track lost",
+        "motion capture: 101 poses missing: the body is not tracked; track lost",
         "motion capture: track restarted after 1.5 s",
     ]
 
@@ -450,7 +457,6 @@ def test_anything_may_come_and_the_tracker_recovers(frames: list[MocapFrame]) ->
     tracker = Tracker(CONFIG, PERIOD_US)
     for seen in frames:
         track = tracker.take(seen)
-        tracker.notices()
         assert track.frame.valid is (track.quality is Quality.TRACKED)
         assert track.frame is seen or not track.frame.valid
     after = [tracker.take(frame(1000 + n)).quality for n in range(100)]
