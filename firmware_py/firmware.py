@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from firmware_py.board import Board
 from firmware_py.config import FirmwareConfig, MavlinkConfig, parameters_of
+from firmware_py.core.structs import HORIZON_LIMIT, POSE_NO_CORRECTION, POSE_TOO_OLD, TICK_US
 from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks, CoreCosts, PythonRunner, RunnerFactory, costs_of
 from firmware_py.drivers.imu import acceleration, rates
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from firmware_py.links.mavlink_stack import MavlinkStack
 
 MEASUREMENT_QUEUE = 20  # original firmware
+OLDEST_POSE_US = HORIZON_LIMIT * TICK_US  # at the estimator's tick
 # Of each activation: a tick's work of the flight path ends before the next tick.
 DEADLINES_US = {"SENSORS": 1000, "STABILIZER": 1000, "KALMAN": 1000}
 WATCHDOG_US = 353_000  # the longest that the Crazyflie's independent watchdog may take
@@ -231,11 +233,17 @@ class Firmware:
     def _client_is_there(self) -> bool:
         return self.link.connected or (self.mavlink is not None and self.mavlink.connected)
 
-    def _pose_refused(self, pose: Correction) -> None:
-        place = "{:.2f} {:.2f} {:.2f}".format(*pose.p_GB)
-        self._notices.refuse(
-            "pose", f"pose refused: {place} m is no correction; for absolute poses set extPose.absolute 1"
-        )
+    def _pose_refused(self, answer: int, pose: Correction) -> None:
+        """Report a refused pose; one that is late only for the present horizon is not worth a line."""
+        if answer == POSE_NO_CORRECTION:
+            place = "{:.2f} {:.2f} {:.2f}".format(*pose.p_GB)
+            self._notices.refuse(
+                "pose", f"pose refused: {place} m is no correction; for absolute poses set extPose.absolute 1"
+            )
+        elif answer == POSE_TOO_OLD and (age_us := self._core.data.fields.pose_age_us) > OLDEST_POSE_US:
+            self._notices.refuse(
+                "age", f"poses {age_us / 1000:.0f} ms old: at most {OLDEST_POSE_US / 1000:.0f} ms"
+            )
 
     def _zero_found(self) -> None:
         bias = self._core.data.fields.gyro_bias.tolist()

@@ -9,7 +9,7 @@ from collections.abc import Callable, Generator
 
 from firmware_py.board import Board
 from firmware_py.config import CpuConfig
-from firmware_py.core.structs import POSE_NO_CORRECTION
+from firmware_py.core.structs import POSE_ON_TIME
 from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks, CoreCosts
 from firmware_py.crazyflie.planner import PathPoint
@@ -83,7 +83,7 @@ def estimator_task(
     measurements: Queue[Arrived],
     core: CoreBlocks,
     costs: CoreCosts,
-    pose_refused: Callable[[Correction], None],
+    pose_refused: Callable[[int, Correction], None],
 ) -> Task:
     """Take poses at 1 kHz, estimate at 100 Hz."""
     cost_us, estimate_due = cost.kalman_us, core.sampling.cell("estimate_due")
@@ -92,8 +92,8 @@ def estimator_task(
         if cost_us:
             yield from kernel.work(cost_us)
         while (arrived := measurements.receive_nowait()) is not None:
-            if hand_pose_to_core(kernel, core, *arrived) == POSE_NO_CORRECTION:
-                pose_refused(arrived[1])
+            if (answer := hand_pose_to_core(kernel, core, *arrived)) != POSE_ON_TIME:
+                pose_refused(answer, arrived[1])
                 yield from kernel.yield_if_pending()
         if estimate_due[0]:
             yield from kernel.work(costs.estimate_us())

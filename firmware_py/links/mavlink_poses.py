@@ -92,6 +92,7 @@ EARLIEST_US = -5_000  # the clocks' offset is no more certain than this
 SYNC_PERIOD = 487
 FIRST_SYNC_PERIOD = 97
 FIRST_SYNCS = 5
+TURNS_US = 1_000_000  # within which two senders of poses are seen
 PATIENCE = 50  # requests after which it gives up, because some partners never answer
 
 
@@ -110,6 +111,7 @@ class PoseService:
         self._measurements = measurements
         self._partner: tuple[int, int] | None = None
         self._clock = RemoteClock()
+        self._posed_us: dict[tuple[int, int], int] = {}  # the last poses of senders
         for name in mavlink.POSES:
             stack.handle(name, self._take_pose)
         stack.handle("HEARTBEAT", self._see_heartbeat)
@@ -118,12 +120,23 @@ class PoseService:
 
     def _take_pose(self, message: Message) -> None:
         pose = mavlink.read_pose(message)
-        self._make_partner(message)
         now_us = self._stack.kernel.now_us
+        self._note_sender(message, now_us)
+        self._make_partner(message)
         goal = self._setpoints.note_pose()
         self.age_us = self._age_us(now_us, pose.t_us)
         correction = Correction(pose.p_WB, pose.q_WB, self.age_us)
         self._measurements.send_nowait((now_us, correction, True, goal))
+
+    def _note_sender(self, message: Message, now_us: int) -> None:
+        """Report poses of two senders in turn: the partner changes with each, and no clock becomes known."""
+        source = _source(message)
+        recent = {one: t_us for one, t_us in self._posed_us.items() if now_us - t_us < TURNS_US}
+        turns = source != self._partner and self._partner in recent and source in recent
+        if turns and source == min(recent):  # one line for all of them
+            senders = " and ".join(f"{system}/{component}" for system, component in sorted(recent))
+            self._stack.notice(message, f"poses of {senders} in turn: their age stays unknown")
+        self._posed_us = {**recent, source: now_us}
 
     def _age_us(self, now_us: int, t_us: int) -> int | None:
         """Return how long ago the sender's clock showed `t_us`; None when unknown."""
@@ -139,7 +152,7 @@ class PoseService:
 
     def _make_partner(self, message: Message) -> None:
         """Make the sender of the message the partner."""
-        source = (message.get_srcSystem(), message.get_srcComponent())
+        source = _source(message)
         if source != self._partner:
             self._partner, self._clock = source, RemoteClock()
 
@@ -148,7 +161,7 @@ class PoseService:
         now_us = self._stack.kernel.now_us
         if message.tc1 == 0:
             self._stack.reply(services.timesync_answer(now_us * 1000, message))
-        elif (message.get_srcSystem(), message.get_srcComponent()) == self._partner:
+        elif _source(message) == self._partner:
             self._clock.answer(now_us, message.ts1 // 1000, message.tc1 // 1000)
 
     def _sync_task(self) -> Task:
@@ -162,3 +175,7 @@ class PoseService:
             if self._partner is not None:
                 self._clock.request(kernel.now_us)
                 yield from self._stack.offer(services.timesync(0, kernel.now_us * 1000))
+
+
+def _source(message: Message) -> tuple[int, int]:
+    return message.get_srcSystem(), message.get_srcComponent()

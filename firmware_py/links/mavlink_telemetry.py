@@ -164,12 +164,12 @@ class FlightMessages:
         return (mavlink.battery(self._supervisor.battery_mv),)
 
     def _named_values(self, tick: int) -> Messages:
-        age_us = self._poses.age_us
+        age_us, estimator = self._poses.age_us, self._world.estimator
         return tuple(
             services.named_value(tick, name, value)
             for name, value in (
                 ("age_ms", UNKNOWN_AGE if age_us is None else age_us * 1e-3),
-                ("refused", int(self._world.estimator.refused)),
+                ("refused", int(estimator.refused + estimator.too_old + estimator.invalid)),
                 ("up_lost", self._stack.counters.lost),
                 ("tx_dropped", self._stack.dropped),
                 ("overruns", self._stack.overruns),

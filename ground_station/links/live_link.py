@@ -19,6 +19,7 @@ from ground_station.errors import LinkError
 from ground_station.latency import LinkLatency
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
+from ground_station.unused import REPEAT_US
 
 ANSWER_TIMEOUT_US = 4_000_000  # without any answer while connecting
 CONNECT_TIMEOUT_US = 60_000_000  # in total; tables of contents are long and slow with losses
@@ -73,6 +74,8 @@ class LiveLink(ABC):
         self._notices: list[str] = []
         self._received: queue.Queue[tuple[int, bytes]] = queue.Queue(PIECES)
         self._mailbox: tuple[MocapFrame, Goal] | None = None
+        self._too_old_us: int | None = None  # age of the last pose that was, since the last notices
+        self._too_old_due_us = 0  # of the next line about it
         self._muted = True
         self._lock = threading.Lock()  # around mailbox, mute and counters
         self._sender: Sender | None = None
@@ -197,11 +200,13 @@ class LiveLink(ABC):
         if mail is None:
             return
         now_us = clock_us()
-        late = now_us + self.latency.us - mail[0].t_us > MAX_AGE_US
+        age_us = now_us + self.latency.us - mail[0].t_us
+        late = age_us > MAX_AGE_US
         if not late:
             self._send(now_us, *mail)
         with self._lock:
             self.late += late
+            self._too_old_us = age_us if late else self._too_old_us
             self.sent += not late
 
     def _do(self, job: Job) -> None:
@@ -227,6 +232,13 @@ class LiveLink(ABC):
     def notices(self) -> list[str]:
         """Return lines for the user since the last call."""
         notices, self._notices = self._notices, []
+        with self._lock:
+            age_us, self._too_old_us = self._too_old_us, None
+        if age_us is not None and (now_us := clock_us()) >= self._too_old_due_us:
+            self._too_old_due_us = now_us + REPEAT_US
+            notices.append(
+                f"poses {age_us / 1000:.0f} ms old on their arrival on board: at most {MAX_AGE_US // 1000} ms"
+            )
         return notices
 
 

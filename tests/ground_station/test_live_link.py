@@ -1,5 +1,6 @@
 """What links to real boards have in common, on a back end that sends when the test lets it."""
 
+import re
 import threading
 from types import SimpleNamespace
 
@@ -103,6 +104,11 @@ def test_a_pose_that_would_be_too_old_on_board_stays_here(latency_us, age_us):
     board.put(2)
     wait_for(board, 2)
     assert (board.numbers, board.late) == ([2], 1)
+    (line,) = board.notices()
+    assert re.fullmatch(r"poses (\d+) ms old on their arrival on board: at most 120 ms", line)
+    board.put(3, age_us)
+    wait_for(board, 3)
+    assert board.notices() == []  # not again at once
     board.close()
 
 

@@ -1,6 +1,7 @@
 """The board's MAVLink services, asked by pymavlink's own codec."""
 
 import math
+import re
 import struct
 from itertools import pairwise
 from typing import Any
@@ -160,6 +161,37 @@ def test_an_impossible_age_is_unknown(lag_us: int) -> None:
     client.run(2_100_000)
     assert [m.value for m in client.of("NAMED_VALUE_FLOAT") if m.name == "age_ms"][-1] == -1.0
     assert client.firmware.signals.supervisor.state is State.FLYING
+
+
+def test_poses_that_are_too_old_are_counted_and_named() -> None:
+    client = MavlinkClient()
+    client.clock_ahead_us = 5_000_000
+    client.poses(1_000_000, 2_000_000, lag_us=222_000)
+    client.run(2_600_000)
+    (line,) = [text for text in client.texts() if text.startswith("poses")]
+    age_ms, limit = re.fullmatch(r"poses (\d+) ms old: at most (\d+) ms", line).groups()  # type: ignore[union-attr]
+    assert (int(age_ms), limit) == (pytest.approx(228, abs=8), "120")  # at the estimator's tick
+    assert [m.value for m in client.of("NAMED_VALUE_FLOAT") if m.name == "refused"][-1] >= 45
+
+
+@pytest.mark.parametrize(
+    ("start_us", "said"),
+    [(500_000, ["poses of 7/8 and 255/190 in turn: their age stays unknown"]), (1_000_000, [])],
+)
+def test_two_senders_of_poses_in_turn_are_named_and_one_that_takes_over_is_not(
+    start_us: int, said: list[str]
+) -> None:
+    client, other = MavlinkClient(), codec(7, 8)
+
+    def pose(now_us: int) -> None:
+        message = other.att_pos_mocap_encode(now_us, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, -1.15)
+        client.receive(message.pack(other))
+
+    client.poses(100_000, 1_000_000)
+    for at_us in range(start_us, start_us + 500_000, 20_000):
+        client.events.at(at_us, pose)
+    client.run(1_600_000)
+    assert [text for text in client.texts() if "in turn" in text] == said
 
 
 def test_only_the_clock_of_the_sender_of_poses_counts() -> None:
