@@ -21,9 +21,11 @@ VERSIONS: tuple[Version, ...] = ((3, 0), (3, 1), (4, 0), (4, 1))
 TRACKED = 1  # bit of a body's parameters
 HEADER_SIZE = 4
 END_TAG_SIZE = 4  # zeros behind a frame
+PRECISION_SIZE = 8  # of the time of a precision time protocol
 
 # Layouts, which the virtual Motive shares.
 SERVER_INFO = struct.Struct("<256s4B4BQHB4B")  # name, app, NatNet, clock, data port, multicast, group
+OLD_SERVER_INFO = struct.Struct("<256s4B4B")
 BODY = struct.Struct("<I3f4ffH")  # id, position, rotation x y z w, error, parameters
 LABELLED = struct.Struct("<I3ffHf")  # id, position, size, parameters, residual
 SUFFIX = struct.Struct("<8xd3Q")  # no timecode, timestamp; exposure, arrival and departure
@@ -56,7 +58,7 @@ class ServerInfo:
     name: str
     app_version: tuple[int, int, int, int]
     natnet_version: tuple[int, int, int, int]
-    clock_hz: int  # ticks per second of all time stamps
+    clock_hz: int  # ticks per second of all time stamps; 0, like the rest, before 3.0
     data_port: int
     multicast: bool
     group: str  # of multicast, dotted
@@ -184,12 +186,21 @@ def _response(reader: Reader) -> Response:
 
 
 def _server_info(reader: Reader) -> ServerInfo:
+    if reader.left < SERVER_INFO.size:  # 2.x and older end with the versions
+        raw, a, b, c, d, e, f, g, h = reader.unpack(OLD_SERVER_INFO)
+        if e < VERSIONS[0][0]:
+            return ServerInfo(_name(raw), (a, b, c, d), (e, f, g, h), 0, 0, False, "")
+        raise MocapError(f"NatNet {e}.{f} server {_name(raw)!r}: its answer lacks clock and data port")
     raw, a, b, c, d, e, f, g, h, clock_hz, port, multicast, *address = reader.unpack(SERVER_INFO)
-    name = raw.partition(b"\0")[0].decode("utf-8", "replace")
+    name = _name(raw)
     if clock_hz == 0 or port == 0:
         raise MocapError(f"NatNet server {name!r}: clock {clock_hz} Hz, data port {port}: neither may be 0")
     group = ".".join(map(str, address))
     return ServerInfo(name, (a, b, c, d), (e, f, g, h), clock_hz, port, bool(multicast), group)
+
+
+def _name(raw: bytes) -> str:
+    return raw.partition(b"\0")[0].decode("utf-8", "replace")
 
 
 def _frame(reader: Reader) -> Frame:
@@ -214,8 +225,8 @@ def _frame(reader: Reader) -> Frame:
             for _ in range(reader.count(4)):  # channels
                 reader.take(4 * reader.count(4))
     timestamp_s, exposed, received, sent = reader.unpack(SUFFIX)
-    if reader.version >= (4, 0):
-        reader.take(8)  # time of a precision time protocol
+    if reader.version >= (4, 1) or (reader.version == (4, 0) and reader.left >= PRECISION_SIZE + 2):
+        reader.take(PRECISION_SIZE)  # public readers disagree whether 4.0 has it
     parameters = int.from_bytes(reader.take(2), "little")
     if reader.left not in (0, END_TAG_SIZE):
         raise MocapError(f"NatNet frame {number}: {reader.left} bytes too many")

@@ -17,7 +17,7 @@ from ground_station.sources import natnet
 from ground_station.sources.alignment import Alignment, choose_body
 from ground_station.sources.natnet_reader import Version
 from ground_station.sources.silence import Silence
-from ground_station.unused import Reason, Unused
+from ground_station.unused import REPEAT_US, Reason, Unused
 
 DRIFT = 50e-6  # between two computers, at most; quartz
 
@@ -98,6 +98,7 @@ class NatnetStream:
         self._mistimed = 0  # frames in sequence
         self._silence = Silence(self.notices)
         self._call_us = 0
+        self._unreadable_us: int | None = None  # when that was last reported
 
     def on_packet(self, data: bytes, now_us: int) -> MocapFrame | None:
         """Take a packet; return the pose if it is a new frame.
@@ -106,8 +107,9 @@ class NatnetStream:
         """
         try:
             message = natnet.decode(data, self.version)
-        except MocapError:
+        except MocapError as error:
             self.counters.malformed += 1
+            self._report_unreadable(error, now_us)
             return None
         if isinstance(message, natnet.Frame):
             return self._on_frame(message, now_us) if self.models is not None else None
@@ -123,6 +125,14 @@ class NatnetStream:
                     raise
                 self.notices.append(f"motion capture: {error}")
         return None
+
+    def _report_unreadable(self, error: MocapError, now_us: int) -> None:
+        """Report the reason now and then, so that no packets look like silence."""
+        if self._unreadable_us is None or now_us - self._unreadable_us >= REPEAT_US:
+            self._unreadable_us = now_us
+            count = self.counters.malformed
+            packets = "1 packet" if count == 1 else f"{count} packets"
+            self.notices.append(f"motion capture: {packets} cannot be read: {error}")
 
     def call(self, now_us: int, packets_wait: bool) -> None:
         """Keep the connection alive; call it often. A silent server is asked to identify itself.

@@ -205,10 +205,27 @@ def test_a_newer_server_that_refuses_is_one_line(answer: bytes) -> None:
 
 
 def test_a_newer_server_with_multicast_and_an_older_one_are_refused_at_once() -> None:
-    for version, multicast in (((4, 2), True), ((2, 10), False)):
+    for info in (
+        packets.server_info((4, 2), True),
+        packets.server_info((2, 10)),
+        packets.old_server_info((2, 10)),
+        packets.old_server_info((1, 9)),
+    ):
         stream = NatnetStream("floaty", AS_STREAMED)
-        with pytest.raises(MocapError, match=f"NatNet {version[0]}"):
-            stream.on_packet(packets.server_info(version, multicast), 0)
+        with pytest.raises(MocapError, match=r"NatNet \d\.\d+ of Motive: 3.0, 3.1, 4.0 or 4.1 is needed"):
+            stream.on_packet(info, 0)
+
+
+def test_unreadable_packets_have_their_reason_now_and_then() -> None:
+    bench = ServedStream()
+    whole = packets.frame(1, V, (1, 2, 3))
+    cut = packets.packet(7, whole[4:60])
+    for number in range(1000):
+        assert bench.stream.on_packet(cut, bench.now_us + 6000 * number) is None
+    first, second = bench.stream.notices
+    assert first.startswith("motion capture: 1 packet cannot be read: NatNet packet of 60 bytes")
+    assert second.startswith("motion capture: 835 packets cannot be read: NatNet packet of 60 bytes")
+    assert bench.stream.counters.malformed == 1000
 
 
 def test_changed_models_are_asked_for() -> None:

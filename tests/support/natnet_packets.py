@@ -11,6 +11,11 @@ def packet(message: int, payload: bytes) -> bytes:
     return struct.pack("<HH", message, len(payload)) + payload
 
 
+def old_server_info(version: tuple[int, int]) -> bytes:
+    """The answer of a server before 3.0: nothing after the versions."""
+    return packet(1, b"Motive".ljust(256, b"\0") + bytes((1, 10, 3, 0, *version, 0, 0)))
+
+
 def server_info(
     version: tuple[int, int], multicast: bool = False, port: int = 1511, hz: int = CLOCK_HZ
 ) -> bytes:
@@ -54,7 +59,7 @@ def model_definition(bodies: dict[str, int], version: tuple[int, int]) -> bytes:
 
 def frame(
     number: int, version: tuple[int, int], ticks: tuple[int, int, int], number_of_body: int = 7, tracked: bool = True,
-    pose: tuple[tuple[float, ...], tuple[float, ...]] = POSE, parameters: int = 0,
+    pose: tuple[tuple[float, ...], tuple[float, ...]] = POSE, parameters: int = 0, precision: bool = True,
 ) -> bytes:  # fmt: skip
     """One body, one of everything else; ticks: exposure, received, transmitted."""
     body = struct.pack("<I3f4ffH", number_of_body, *pose[0], *pose[1], 0.001, tracked)
@@ -70,7 +75,9 @@ def frame(
     for count, section in sections:
         size = struct.pack("<I", len(section)) if version >= (4, 1) else b""
         payload += struct.pack("<I", count) + size + section
-    payload += struct.pack("<IId3Q", 0, 0, 12.5, *ticks) + (bytes(8) if version >= (4, 0) else b"")
+    payload += struct.pack("<IId3Q", 0, 0, 12.5, *ticks) + (
+        bytes(8) if version >= (4, 0) and precision else b""
+    )
     return packet(7, payload + struct.pack("<H", parameters) + bytes(4))
 
 
