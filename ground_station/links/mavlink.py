@@ -9,7 +9,7 @@ Telemetry that arrives at less than half of the requested rate is requested agai
 forgotten it.
 """
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 
 from firmware_py.wire import WireError, mavlink
@@ -57,6 +57,7 @@ class MavlinkLink:
         self._receiver = FrameReceiver(signing)
         self.counters = self._receiver.counters  # of the downlink
         self.round_trip_us: int | None = None  # of the last time request
+        self.senders: Counter[tuple[int, int]] = Counter()  # of the frames, by system and component
         self._goal: Goal | None = None  # as last sent
         self._goal_us = 0
         self._asked = False
@@ -137,6 +138,7 @@ class MavlinkLink:
         for message in self._receiver.feed(now_us, data):
             if self._note_frame is not None:
                 self._note_frame(now_us, bytes(message.get_msgbuf()))
+            self.senders[message.get_srcSystem(), message.get_srcComponent()] += 1
             handler = self._handlers.get(message.get_type())
             if handler is None or not self._is_of_board(message):
                 continue

@@ -7,6 +7,7 @@ import os
 import queue
 import re
 import threading
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -29,6 +30,7 @@ BAUD_MIN, BAUD_MAX = 9600, 3_000_000
 READ_SIZE = 4096
 GATHER_S = 0.005  # how long bytes are collected where a port cannot be polled
 WRITE_TIMEOUT_S = 1.0
+SENDERS = 3  # named where no autopilot is heard
 _DEVICE = re.compile(r"(?:socket|rfc2217)://[^,]+:(\d{1,5})(?:[/?][^,]*)?|(?!.*://)[^,]+")
 
 
@@ -145,7 +147,7 @@ class MavlinkSerialLink(LiveLink):
             return f"no heartbeat {within}: {refused} frames not signed with mavlink.signing_key"
         if not seen.frames:
             return f"no heartbeat {within}: {count} bytes, not one frame: wrong baud rate?"
-        return f"no heartbeat of an autopilot {within}: {seen.frames} frames of others"
+        return f"no heartbeat of an autopilot {within}: {named(self._link.senders)}"
 
     def _failure(self) -> str:
         return self._port.failure if self._port is not None else "closed"
@@ -201,6 +203,14 @@ class MavlinkSerialLink(LiveLink):
             f"{self.sent} sent, {self.late} late  frames {frames.frames}, {frames.lost} lost, {frames.bad} bad  "
             f"round trip {round_trip} ms"
         )
+
+
+def named(senders: Counter[tuple[int, int]]) -> str:
+    """Return how many frames came from whom, those that sent most first."""
+    most = senders.most_common(SENDERS)
+    texts = [f"{count} frames of system {one[0]} component {one[1]}" for one, count in most]
+    others = senders.total() - sum(count for _, count in most)
+    return ", ".join(texts) + (f", {others} of {len(senders) - SENDERS} others" if others else "")
 
 
 def reason(error: Exception) -> str:

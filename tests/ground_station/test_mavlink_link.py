@@ -21,6 +21,7 @@ from ground_station.errors import LinkError
 from ground_station.links.mavlink import MavlinkLink
 from ground_station.links.mavlink_budget import TELEMETRY_HZ, link_budget
 from ground_station.links.mavlink_controls import REASON_US
+from ground_station.links.mavlink_serial import named
 from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation
 from ground_station.telemetry_log import TelemetryLog
@@ -227,6 +228,18 @@ def test_other_systems_are_ignored():
         assert bench.link.receive(20_000, data) == []
     assert bench.link.supervisor_state == 2
     assert bench.link.board == 1
+
+
+def test_the_senders_of_frames_are_named_those_that_sent_most_first():
+    bench = LinkWithCodec()
+    for system, count in ((255, 5), (1, 3), (7, 2), (8, 1), (9, 1)):
+        other = dialect.MAVLink(io.BytesIO(), srcSystem=system, srcComponent=190)
+        for _ in range(count):
+            bench.link.receive(1000, dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(other))
+    assert named(bench.link.senders) == (
+        "5 frames of system 255 component 190, 3 frames of system 1 component 190, 2 frames of system 7 component 190, "
+        "2 of 2 others"
+    )
 
 
 def test_texts_and_refusals_are_collected():
