@@ -1,5 +1,6 @@
 """The documentation is true: its commands run, its links lead somewhere, its pictures are made, its words are explained."""
 
+import ast
 import importlib.util
 import re
 import subprocess
@@ -9,6 +10,7 @@ from types import ModuleType
 
 import pytest
 
+from ground_station.unused import Reason
 from support.documentation import (
     NOT_RUN,
     commands_in_blocks,
@@ -19,6 +21,7 @@ from support.documentation import (
     why_not_run,
 )
 from support.examples import blocks, commands_of, matches, run_examples
+from support.firmware_bench import FirmwareBench
 from support.paths import ROOT
 
 DOCS = ROOT / "docs"
@@ -336,3 +339,34 @@ def test_the_glossary_explains_frames_and_states_of_the_code() -> None:
     from firmware_py.wire.supervisor import State
 
     assert {state.name.lower() for state in State if state.name.lower() not in explained} == set()
+
+
+# Why poses are not used
+
+
+def lines_on_board() -> set[str]:
+    """The lines about poses in the code of the board, with … for values."""
+    found = set()
+    for file in ("firmware_py/firmware.py", "firmware_py/wire/mavlink.py", "firmware_py/wire/crtp.py"):
+        for node in ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                parts = [one.value if isinstance(one, ast.Constant) else "…" for one in node.values]
+                found.add("".join(map(str, parts)))
+            elif isinstance(node, ast.Constant):
+                found.add(str(node.value))
+    found = {line for line in found if not line.endswith(" ")}  # the pieces between values are constants, too
+    return {line for line in found if re.match(r"poses? |quaternion …|position … m|odometry (in|of)", line)}
+
+
+def test_the_table_of_unused_poses_is_that_of_the_code() -> None:
+    text = (DOCS / "reference" / "poses.md").read_text(encoding="utf-8")
+    station, board = text.split("## At the station")[1].split("## On board")
+    station, _ = station.split("Some poses")
+    row = re.compile(r"^\| ([^|]+?) \| [^|]+ \| ([^|]+?) \|$", re.MULTILINE)
+    reasons = [(one.word, re.sub(r"\{[^}]*\}", "…", one.line) or "none") for one in Reason]
+    assert row.findall(station) == [("counter", "line"), *reasons]
+    on_board = row.findall(board)[1:]
+    assert {line for _, line in on_board} - {"none"} == lines_on_board()
+    firmware = FirmwareBench().firmware
+    counters = {variable.name for variable in firmware.variables} | {"mavlink.refused"}
+    assert {counter for counter, _ in on_board} <= counters
