@@ -141,9 +141,7 @@ def test_ctrl_c_ends_all_processes_in_order_and_keeps_every_robots_eeprom(tmp_pa
         assert served.interrupt() == 0
         assert served.lines[-1].startswith("stopped; time stood still for")
         assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        f"board-{number}.eeprom" for number in (1, 2)
-    ]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"board-{number}.eeprom" for number in (1, 2)]
 
 
 def test_a_robot_whose_process_dies_is_named_and_the_others_continue() -> None:
