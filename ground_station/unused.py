@@ -8,8 +8,6 @@ from collections import Counter
 from enum import Enum
 from math import sqrt
 
-from firmware_py.geometry import Quaternion, Vector
-
 GATHER_US = 500_000
 REPEAT_US = 5_000_000
 MINOR = 0.1  # a reason of a smaller share of the unused poses has no part in the line
@@ -65,7 +63,7 @@ class Event(Enum):
     RESTARTED = 2
 
 
-def flaw(p_WB: Vector, q_WB: Quaternion) -> Unused | None:
+def flaw(p_WB: tuple[float, float, float], q_WB: tuple[float, float, float, float]) -> Unused | None:
     """Return what makes these numbers no pose of the robot, None if they are one."""
     x, y, z = p_WB
     a, b, c, d = q_WB

@@ -505,13 +505,6 @@ class Handler:
         element.write_done(element, address)
 
 
-def test_the_deck_s_memory_is_the_last_of_six(client: CrtpClient) -> None:
-    """The first five are the firmware's: tests/conformance/test_services.py."""
-    assert client.one(MEM, 0, b"\1") == b"\1\6"
-    assert struct.unpack_from("<BBBI", client.one(MEM, 0, b"\2\5")) == (2, 5, 0x01, 112)
-    assert client.one(MEM, 0, b"\2\6") == b"\2\6"
-
-
 def test_cflib_reads_and_writes_the_configuration_block(client: CrtpClient) -> None:
     element, done = I2CElement(0, 0, 8191, Handler(client)), []
     element.update(done.append)

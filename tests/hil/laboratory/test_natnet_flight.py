@@ -105,7 +105,8 @@ def test_hover_holds_its_limits_among_packets_out_of_order_twice_or_broken(tmp_p
     assert counters.dropped >= done["twice"] > 50
     assert counters.mistimed == counters.lost == 0
     assert np.diff(lab.exposed_us).min() > 4_000  # what was overtaken or comes twice is not flown on
-    assert lab.stream.notices == []
+    [notice] = lab.stream.notices  # of the first one; it is repeated after 5 s
+    assert notice.startswith("motion capture: 1 packet cannot be read: ")
 
 
 def test_a_stream_that_stops_is_failsafe_and_one_line_and_flies_again_when_it_is_back(tmp_path: Path) -> None:
