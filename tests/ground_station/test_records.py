@@ -63,6 +63,19 @@ def test_an_output_that_fails_ends_no_other(tmp_path: Path) -> None:
     assert (tmp_path / "kept").stat().st_size == 5 * 28
 
 
+def test_frames_are_in_the_order_of_their_times_though_received_ones_are_noted_later(tmp_path: Path) -> None:
+    frames = FrameLog(tmp_path / "frames", epoch_us=7)
+    times = [number * 300_000 for number in range(20)]
+    for t_us in times:  # sent, and received before the one that was sent last
+        frames.note(t_us, b"sent")
+        frames.note(max(0, t_us - 200_000), b"came")
+    frames.close()
+    frames.note(0, b"late")
+    data = (tmp_path / "frames").read_bytes()
+    found = [int.from_bytes(data[at : at + 8], "big") for at in range(0, len(data), 12)]
+    assert found == sorted(7 + time for t_us in times for time in (t_us, max(0, t_us - 200_000)))
+
+
 def test_all_is_complete_where_all_could_be_written(tmp_path: Path) -> None:
     records = Records()
     write_all(records, tmp_path, 100)
