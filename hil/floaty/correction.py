@@ -93,11 +93,15 @@ def calm(s: State, speed: float) -> State:
 
 @dataclass(frozen=True, slots=True)
 class OperatingPoint:
-    """A robot's mean state in flight: inputs u1..u4 [rad], attitude roll, pitch, yaw [rad], side wind [m/s, W]."""
+    """A robot's mean state in flight: inputs u1..u4 [rad], attitude roll, pitch, yaw [rad], side wind [m/s, W].
+
+    `speed` is the mean flow [m/s]; None: the design's.
+    """
 
     inputs: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     attitude: tuple[float, float, float] = (0.0, 0.0, 0.0)
     side_wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    speed: float | None = None
 
 
 LEVEL = OperatingPoint()

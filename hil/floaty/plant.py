@@ -152,8 +152,8 @@ class Plant(InTunnel):
         )
 
     def linearise(self, point: OperatingPoint = LEVEL) -> Constants:
-        """Return the linearised dynamics about a point, by default the level hover, in the uniform flow of the design."""
-        return linearise(self._s, self._airspeed, point)
+        """Return the linearised dynamics about a point of a uniform flow, by default the level hover of the design."""
+        return linearise(self._s, self._airspeed if point.speed is None else point.speed, point)
 
     def mounted_wrench(self, flaps: Vector) -> tuple[View, View]:
         """Return force [N] and torque [N m], (3,) each in B, on the robot fixed level in the design's uniform flow."""

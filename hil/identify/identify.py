@@ -189,7 +189,8 @@ def _truths(record: Record, rich: Sequence[Record], excited: Sequence[Excited]) 
 
 def operating_point(record: Record) -> OperatingPoint:
     u, attitude = record.u.mean(axis=0).tolist(), record.pose[:, 3:].mean(axis=0).tolist()
-    return OperatingPoint((*u,), (*attitude,), record.config.tunnel.side_wind)
+    tunnel = record.config.tunnel
+    return OperatingPoint((*u,), (*attitude,), tunnel.side_wind, tunnel.fan_factor * tunnel.speed)
 
 
 def truth_of(record: Record) -> dict[str, float]:

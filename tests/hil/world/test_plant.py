@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from hil.errors import LabError
+from hil.floaty.correction import OperatingPoint
 from hil.floaty.plant import Plant
 from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 from support.paths import VECTORS
@@ -284,6 +285,18 @@ def test_the_dynamics_at_hover_are_the_designs_however_the_tunnel_is_set(setting
     plant = make(TunnelConfig.model_validate({"turbulence": "none"} | setting))
     plant.advance(20_000)
     assert plant.linearise() == make().linearise()
+
+
+def test_forces_grow_with_the_square_of_the_flow_s_speed_and_dampings_with_the_speed() -> None:
+    design, faster = make().linearise(), make().linearise(OperatingPoint(speed=11.0))
+    for name, factor in {
+        "pitch_u2": 1.21,
+        "yaw_u3": 1.21,
+        "z_u4": 1.21,
+        "roll_rate": 1.1,
+        "z_vz": 1.1,
+    }.items():
+        assert getattr(faster, name) == pytest.approx(factor * getattr(design, name), rel=1e-6), name
 
 
 def test_factors_are_true_over_design() -> None:
