@@ -135,7 +135,7 @@ ROWS: Mapping[str, PaperRow] = {
         why="Between 0 and 52° the flaps that lean the robot into the wind are missing for lift: about half are lost.",
     ),
     "side-wind-4-open": _side_wind(
-        4, ", flaps -11..52°", note="Opened through zero, with a hover angle of 15°, the flaps have more lift in reserve."
+        4, ", flaps -17..52°", note="Opened through zero, with a hover angle of 10°, the flaps have more lift in reserve."
     ),
     "side-wind-x-0.25": PaperRow(
         "Side wind of 0.25 m/s along x", "not shown; the paper's fan blows along y", ROBUST,
