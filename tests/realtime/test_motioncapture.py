@@ -273,8 +273,8 @@ def test_of_several_bodies_one_must_be_named(stand_in: Callable[..., Motioncaptu
 def test_invalid_poses_are_never_valid(stand_in: Callable[..., MotioncaptureSource]) -> None:
     """Twenty frames each: good, lost, the same over and over, not a number, not a rotation, good."""
     cases = """
-        return [{"one": self.body(float(number))}, {"two": self.body(1.0)}, {"one": self.body(5.0)},
-                {"one": self.body(float("nan"))}, {"one": self.body(float(number), 2.0)}][number // 20 % 5]
+        return [{"one": self.body(number / 100)}, {"two": self.body(1.0)}, {"one": self.body(5.0)},
+                {"one": self.body(float("nan"))}, {"one": self.body(number / 100, 2.0)}][number // 20 % 5]
 """
     with opened(stand_in(CAMERAS.replace(GOOD_BODIES, cases), "one")) as source:  # takes the first one
         frames = received(source, 118)
