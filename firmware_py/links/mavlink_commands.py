@@ -16,7 +16,7 @@ from firmware_py.links.parameters import Parameter, ParameterStorage
 from firmware_py.supervisor import CoreSupervisor
 from firmware_py.wire import mavlink
 from firmware_py.wire import mavlink_services as services
-from firmware_py.wire.mavlink_dialect import NUMBERS, Message
+from firmware_py.wire.mavlink_dialect import NUMBERS, Message, sender_of
 from firmware_py.wire.mavlink_numbers import WRITE_ALL, Command, CommandResult, Mode
 
 FORCE = 21196  # MAVLink's magic number for disarming in flight
@@ -74,8 +74,7 @@ class CommandService:
         execute = self._commands.get(command.command)
         result, answers = (CommandResult.UNSUPPORTED, ()) if execute is None else execute(command)
         self._stack.refused += result is not CommandResult.ACCEPTED
-        source = command.get_srcSystem(), command.get_srcComponent()
-        self._stack.reply(services.command_ack(command.command, result, *source))
+        self._stack.reply(services.command_ack(command.command, result, *sender_of(command)))
         for answer in answers:
             self._stack.reply(answer)
 

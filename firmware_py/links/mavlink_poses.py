@@ -21,7 +21,7 @@ from firmware_py.rtos import Queue
 from firmware_py.wire import mavlink
 from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.crtp import Correction
-from firmware_py.wire.mavlink_dialect import Message
+from firmware_py.wire.mavlink_dialect import Message, sender_of
 
 WINDOW = 16  # exchanges
 DRIFT_PPM = 100  # of both clocks together: two crystals of 50 ppm
@@ -130,13 +130,13 @@ class PoseService:
 
     def _note_sender(self, message: Message, now_us: int) -> None:
         """Report poses of two senders in turn: the partner changes with each, and no clock becomes known."""
-        source = _source(message)
+        sender = sender_of(message)
         recent = {one: t_us for one, t_us in self._posed_us.items() if now_us - t_us < TURNS_US}
-        turns = source != self._partner and self._partner in recent and source in recent
-        if turns and source == min(recent):  # one line for all of them
+        turns = sender != self._partner and self._partner in recent and sender in recent
+        if turns and sender == min(recent):  # one line for all of them
             senders = " and ".join(f"{system}/{component}" for system, component in sorted(recent))
             self._stack.notice(message, f"poses of {senders} in turn: their age stays unknown")
-        self._posed_us = {**recent, source: now_us}
+        self._posed_us = {**recent, sender: now_us}
 
     def _age_us(self, now_us: int, t_us: int) -> int | None:
         """Return how long ago the sender's clock showed `t_us`; None when unknown."""
@@ -152,16 +152,15 @@ class PoseService:
 
     def _make_partner(self, message: Message) -> None:
         """Make the sender of the message the partner."""
-        source = _source(message)
-        if source != self._partner:
-            self._partner, self._clock = source, RemoteClock()
+        if (sender := sender_of(message)) != self._partner:
+            self._partner, self._clock = sender, RemoteClock()
 
     def _take_timesync(self, message: Message) -> None:
         """Answer a request; use an answer of the partner."""
         now_us = self._stack.kernel.now_us
         if message.tc1 == 0:
             self._stack.reply(services.timesync_answer(now_us * 1000, message))
-        elif _source(message) == self._partner:
+        elif sender_of(message) == self._partner:
             self._clock.answer(now_us, message.ts1 // 1000, message.tc1 // 1000)
 
     def _sync_task(self) -> Task:
@@ -175,7 +174,3 @@ class PoseService:
             if self._partner is not None:
                 self._clock.request(kernel.now_us)
                 yield from self._stack.offer(services.timesync(0, kernel.now_us * 1000))
-
-
-def _source(message: Message) -> tuple[int, int]:
-    return message.get_srcSystem(), message.get_srcComponent()

@@ -18,7 +18,7 @@ from firmware_py.pilot import Pilot
 from firmware_py.rtos import FOREVER, TICK_US
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire import mavlink_services as services
-from firmware_py.wire.mavlink_dialect import Message
+from firmware_py.wire.mavlink_dialect import Message, sender_of
 from firmware_py.wire.mavlink_numbers import Command, CommandResult, Mode
 
 SILENCE_US = 500_000  # of set-points, which ends offboard; PX4: COM_OF_LOSS_T is 1 s
@@ -53,7 +53,7 @@ class SetpointService:
         main, sub = command.param2, 0.0 if isnan(command.param3) else command.param3
         for mode in Mode:
             if main == mode or (main, sub) == (mode >> 16 & 0xFF, mode >> 24):
-                return CommandResult.ACCEPTED, self._enter(mode, _source(command))
+                return CommandResult.ACCEPTED, self._enter(mode, sender_of(command))
         return CommandResult.DENIED, ()
 
     def note_pose(self) -> PathPoint:
@@ -84,7 +84,7 @@ class SetpointService:
         return self._pilot.seen_us > self._seen_us
 
     def _take_target(self, message: Message) -> None:
-        target, source, now_us = mavlink.read_target(message), _source(message), self._stack.kernel.now_us
+        target, source, now_us = mavlink.read_target(message), sender_of(message), self._stack.kernel.now_us
         if self._leader not in (None, source):
             raise WireError("target refused: another client is in offboard")
         p_WG, yaw = self._goal
@@ -110,7 +110,7 @@ class SetpointService:
 
     def _take_mode(self, message: Message) -> None:
         """Take SET_MODE, which MAV_CMD_DO_SET_MODE has replaced."""
-        number, source = message.custom_mode, _source(message)
+        number, source = message.custom_mode, sender_of(message)
         known = number in tuple(Mode)
         result = CommandResult.ACCEPTED if known else CommandResult.DENIED
         self._stack.reply(services.command_ack(Command.DO_SET_MODE, result, *source))
@@ -147,7 +147,3 @@ class SetpointService:
                     Mode.HOLD, WARNING, "offboard left: no set-points for 0.5 s, holding"
                 ):
                     yield from self._stack.offer(news)
-
-
-def _source(message: Message) -> Source:
-    return message.get_srcSystem(), message.get_srcComponent()

@@ -17,7 +17,7 @@ from firmware_py.rtos import Kernel, Queue
 from firmware_py.rtos.scheduler import GO_ON
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire import mavlink_services as services
-from firmware_py.wire.mavlink_dialect import NUMBERS, Message
+from firmware_py.wire.mavlink_dialect import NUMBERS, Message, sender_of
 from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Signing
 
 Task = Generator[int, None, None]
@@ -103,7 +103,7 @@ class MavlinkStack:
 
     def notice(self, message: Message, text: str) -> None:
         """Report why a message was refused: once per kind and sender, then now and then with a count."""
-        source = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
+        source = "{}/{}".format(*sender_of(message))
         kind = f"{source} {''.join(filter(str.isalpha, text))}"  # without its numbers
         if kind not in self._noticed:
             if len(self._noticed) == NOTICES:
@@ -142,7 +142,7 @@ class MavlinkStack:
                 yield from kernel.yield_if_pending()
 
     def _dispatch(self, message: Message) -> None:
-        if (message.get_srcSystem(), message.get_srcComponent()) == (self.system, self.component):
+        if sender_of(message) == (self.system, self.component):
             return  # an echo of our own
         self._heard_us = self.kernel.now_us
         handler = self._handlers.get(message.get_msgId())

@@ -44,5 +44,10 @@ def address(message: Message, payload: bytes) -> None:
         message.target_system, message.target_component = payload.ljust(18, b"\0")[16:18]
 
 
+def sender_of(message: Message) -> tuple[int, int]:
+    """Return the sender of a message: system and component."""
+    return message.get_srcSystem(), message.get_srcComponent()
+
+
 KINDS: dict[int, Any] = dialect.mavlink_map  # pymavlink's class of each message
 NUMBERS: dict[str, int] = {kind.msgname: kind.id for kind in (*KINDS.values(), ProtocolVersion)}

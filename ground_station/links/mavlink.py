@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire import mavlink_services as services
-from firmware_py.wire.mavlink_dialect import NUMBERS, Message
+from firmware_py.wire.mavlink_dialect import NUMBERS, Message, sender_of
 from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Signing
 from firmware_py.wire.telemetry import Sample, state_in
 from ground_station.config import LinkSettings
@@ -138,7 +138,7 @@ class MavlinkLink:
         for message in self._receiver.feed(now_us, data):
             if self._note_frame is not None:
                 self._note_frame(now_us, bytes(message.get_msgbuf()))
-            self.senders[message.get_srcSystem(), message.get_srcComponent()] += 1
+            self.senders[sender_of(message)] += 1
             handler = self._handlers.get(message.get_type())
             if handler is None or not self._is_of_board(message):
                 continue
