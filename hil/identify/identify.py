@@ -90,7 +90,8 @@ class Identification:
 def rows_of(constants: Sequence[IdentifiedConstant]) -> list[dict[str, str]]:
     """Return the rows of a table of constants, without columns that are empty in every row."""
     rows = [constant.cells for constant in constants]
-    return [{name: row[name] for name in row if any(one[name] for one in rows)} for row in rows]
+    filled = [name for name in rows[0] if any(row[name] for row in rows)] if rows else []
+    return [{name: row[name] for name in filled} for row in rows]
 
 
 def _printed(value: float, half: float) -> str:

@@ -25,11 +25,8 @@ SETTLING_S = 1.8  # omitted in each realisation; the rest of its 2 s allows for 
 LEAST_PERIODS = 4
 HOLE_S = 0.3  # without rows or poses in a period that counts
 BREAK_ROWS = 2.5  # after which the excitation may have begun anew
-ALIKE_S, ALIKE_ROWS, ALIKE = (
-    2.0,
-    20,
-    0.1,
-)  # length and least rows of a compared beginning, and its share of squares off
+ALIKE_S, ALIKE_ROWS = 2.0, 20  # length and least rows of a beginning that is compared with the first
+ALIKE = 0.1  # share of its squares that may be off
 LINE = 0.1  # of the strongest line: weaker ones are ignored
 NEIGHBOURS = 4  # lines to either side, excited or not, that give the scatter at a line
 LEAST_SAMPLES = 1.5  # per unknown of the fit
