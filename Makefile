@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 unexport PYTHONDONTWRITEBYTECODE  # the tests start many programs: each would compile all sources anew
 
-.PHONY: fly test test-all check bench docs pictures fast dist wheel clients clean
+.PHONY: fly test test-all check bench mutants docs pictures fast dist wheel clients clean
 
 fly: .venv/fly.stamp
 	$(BIN)/floaty fly hover
@@ -14,10 +14,10 @@ test test-all: export FLOATY_PURE = 1
 test: .venv/test.stamp
 	$(BIN)/python -m pytest -n auto
 
-# Real-time tests run one at a time and beside nothing else; one that fails is repeated and listed as RERUN: repair what appears there.
+# Real-time tests mostly wait: three run side by side. One that fails is repeated alone and listed as RERUN: repair what appears there.
 test-all: .venv/test.stamp
 	$(BIN)/python -m pytest -n auto --dist loadgroup -m 'not realtime' --durations 20
-	$(BIN)/python -m pytest -m realtime --reruns 2 -rfER --durations 20
+	$(BIN)/python -m pytest -n 3 --dist loadfile -m realtime --reruns 2 -rsREf --durations 20
 
 check: .venv/test.stamp
 	$(BIN)/floaty deploy check
@@ -34,6 +34,10 @@ docs: .venv/docs.stamp
 # The documentation's pictures anew, with chromium; one alone: make pictures ONLY=report.png
 pictures: .venv/docs.stamp
 	$(BIN)/python tools/pictures.py $(ONLY)
+
+# Small mistakes, planted one at a time, that no test catches: make mutants ROOM=hil/world [SAMPLE=20]. It takes hours.
+mutants: .venv/test.stamp
+	$(BIN)/python tools/mutants.py $(ROOM) --sample $(or $(SAMPLE),0)
 
 bench: .venv/test.stamp
 	$(BIN)/python tools/bench.py

@@ -1,16 +1,19 @@
 """The tiers of the tests, and what holds in each.
 
-A test in `tests/realtime/` or marked `realtime` needs the wall clock: it runs alone (`make test-all`), and one that
-fails while this machine stood still is inconclusive and repeated. All other tests pass however busy the machine is.
+A test in `tests/realtime/` or marked `realtime` needs the wall clock and a part of a core: such tests run side by side
+(`make test-all`), but alone where marked `alone`, and whenever they are repeated. One that fails while this machine
+stood still is inconclusive. All other tests pass however busy the machine is.
 A test that exceeds its tier's time limit fails (pytest-timeout); one that does not even return from C takes its process
 with it, and pytest-xdist names it and goes on. Property tests try the same examples on every machine, and
 look for new ones with FLOATY_FUZZ set.
 """
 
 import faulthandler
+import fcntl
 import gc
 import os
 import signal
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -101,18 +104,48 @@ class SteadyMachine:
 MACHINE = SteadyMachine()
 
 
+GATE, ROOM = 0, 1  # bytes of the file that are locked
+
+
+class Turns:
+    """Lets real-time tests of all workers run side by side, or one alone: who waits to be alone lets nobody in before."""
+
+    def __init__(self, session: str) -> None:
+        self._path = Path(tempfile.gettempdir()) / f"floaty-turns-{session}"
+        self._file = os.open(self._path, os.O_CREAT | os.O_RDWR)
+
+    def take(self, alone: bool) -> None:
+        """Wait for a turn."""
+        self.leave()
+        fcntl.lockf(self._file, fcntl.LOCK_EX, 1, GATE)
+        fcntl.lockf(self._file, fcntl.LOCK_EX if alone else fcntl.LOCK_SH, 1, ROOM)
+        fcntl.lockf(self._file, fcntl.LOCK_UN, 1, GATE)
+
+    def leave(self) -> None:
+        """Let others run alone."""
+        fcntl.lockf(self._file, fcntl.LOCK_UN, 1, ROOM)
+
+    def close(self) -> None:
+        """Close what the constructor opened."""
+        os.close(self._file)
+        self._path.unlink(missing_ok=True)  # those who have it open keep it
+
+
 STDERR = pytest.StashKey[int]()  # where a test that has to be ended is reported: nothing captures it
+TURNS = pytest.StashKey[Turns]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Let Ctrl-C reach the programs under test when these tests run in the background of a shell, which ignores it."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     config.stash[STDERR] = os.dup(2)
+    config.stash[TURNS] = Turns(os.environ.get("PYTEST_XDIST_TESTRUNUID", str(os.getpid())))
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
     """Close what `pytest_configure` opened."""
     os.close(config.stash[STDERR])
+    config.stash[TURNS].close()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -137,6 +170,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[Any]:
         return (yield)
     finally:
         faulthandler.cancel_dump_traceback_later()
+        item.config.stash[TURNS].leave()
 
 
 def pytest_collection_finish() -> None:
@@ -152,7 +186,10 @@ def pytest_xdist_auto_num_workers() -> int:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_setup(item: pytest.Item) -> Iterator[Any]:
-    """Judge a fixture that fails."""
+    """Judge a fixture that fails, once it is a real-time test's turn."""
+    if "realtime" in item.keywords:
+        repeated = getattr(item, "execution_count", 1) > 1
+        item.config.stash[TURNS].take(alone=repeated or "alone" in item.keywords)
     MACHINE.wait()
     return (yield from judged(item))
 

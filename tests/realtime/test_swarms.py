@@ -65,6 +65,7 @@ def watched(served: Served) -> Iterator[list[Watcher]]:
             watcher.join()
 
 
+@pytest.mark.alone  # three boards, their station and three watchers
 def test_three_robots_fly_side_by_side_and_a_push_moves_the_one_it_is_typed_for(tmp_path: Path) -> None:
     arguments = ("--boards", "3", "--radio", "--radio-port", "0", "--station")
     with serve(*arguments, motive=True) as served:

@@ -119,7 +119,7 @@ HEALTHY = (
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "faults"), HEALTHY)
 def test_the_tracker_refuses_no_healthy_pose(tmp_path: Path, name: str, faults: tuple[str, ...]) -> None:
-    duration_s = 4.0 if faults else None
+    duration_s = 4.0 if faults else min(12.0, EXPERIMENTS[name].duration_s)
     flown(tmp_path / "run", name, duration_s=duration_s, faults=faults)
     log = load_log(tmp_path / "run")
     assert column(log, "tracker.refused")[-1] == column(log, "tracker.restarts")[-1] == 0

@@ -109,11 +109,11 @@ def test_tuning_from_the_authors_gains_hovers_like_the_default_profile(cli: Cli,
         "--runs",
         tmp_path / "runs",
         "--robots",
-        "30",
+        "10",
     )
     assert cli("tune", *arguments) == 0
     shown = cli.out
-    assert "least of 31" in shown
+    assert "least of 11" in shown
     assert "round 1" in shown
     for name, folder in (("floaty", "usual"), (str(out), "tuned")):
         cli("fly", "hover", "--profile", name, "--seed", "7", "--out", tmp_path / folder)
