@@ -99,7 +99,11 @@ METRICS: Mapping[str, Metric] = {
     "wind_offset": Metric("m", "max", "mean error along the wind in its last 5 s"),
     "height_off": Metric("m", "max", "mean error in height over the second half of the flight"),
     "as_computed": Metric("", "min", "1 when the height is held exactly if the lift of the flaps allows it"),
-    "age_mean": Metric("s", "max", "mean age of the pose when the estimator takes it"),
+    "age_mean": Metric(
+        "s",
+        "max",
+        "mean age of the pose at the estimator's tick that uses it: on arrival, and the wait for the tick",
+    ),
     "poses_refused": Metric("", "max", "poses that the estimator did not fuse"),
     "frames_refused": Metric("", "max", "frames that the ground station's tracker refused"),
     "failsafe": Metric("s", "max", "time in failsafe: flaps at hover, loop open"),
