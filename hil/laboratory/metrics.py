@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, PlainSerializer
 
 from firmware_py.geometry import euler_zyx_of
+from firmware_py.signals import REFUSED
 from firmware_py.wire.supervisor import State
 from hil.arguments import checked, shown
 from hil.errors import LabError, hint
@@ -318,7 +319,7 @@ def measure(table: pa.Table, lost: bool, resets: int | None = None) -> dict[str,
     if is_real(table):
         values["poses_refused"] = float(column(flight, "estimator.rejected")[-1])
     elif "estimator.refused" in table.schema.names:
-        refused = column(flight, "estimator.refused", "estimator.too_old", "estimator.invalid").sum(axis=1)
+        refused = column(flight, *(f"estimator.{name}" for name in REFUSED)).sum(axis=1)
         values["poses_refused"] = float(refused[-1])
     if "tracker.refused" in table.schema.names:
         values["frames_refused"] = float(column(flight, "tracker.refused")[-1])
