@@ -23,7 +23,7 @@ from hil.design.authority import QUANTITIES, authorities, least
 from hil.design.axes import PITCH, ROLL
 from hil.design.linear import Linear, Point, places
 from hil.design.sweeps import RESERVE
-from hil.design.trim import balanced, changed, opening_at, speed_at
+from hil.design.trim import balanced, opening_at, speed_at
 from hil.errors import LabError
 from hil.floaty.geometry import weigh
 
@@ -143,8 +143,9 @@ class Shapes:
         geometry, span = self._reference.geometry, self._reference.geometry.footprint
         kink, height, base, strip = np.clip(x, LOW, HIGH).tolist()
         try:
-            shape = changed(geometry, kink_angle=kink, base_side=base * span, strip_width=strip * span)
-            shape = balanced(shape, height * span)
+            shape = balanced(
+                geometry, height * span, kink_angle=kink, base_side=base * span, strip_width=strip * span
+            )
             opening = opening_at(shape, self._reference.coefficient, self._speed)
         except LabError:
             return None

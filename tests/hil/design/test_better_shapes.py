@@ -174,6 +174,27 @@ def test_the_front_is_what_nothing_beats_in_both() -> None:
         assert not ((places[:, 0] > stable) & (places[:, 1] > figure)).any()
 
 
+@pytest.mark.parametrize("base", [0.15, 0.30, 0.45])
+def test_a_smaller_base_plate_turns_more_easily_as_its_flaps_reach_further_inwards(base: float) -> None:
+    """The flaps are a square with a square hole, of inertia M (S^2 + b^2) / 6; Floaty's own shape has its own inertia."""
+    geometry = PAPER.geometry
+    flaps, span, (box, *_) = 4 * geometry.flap_mass, geometry.footprint, geometry.masses
+
+    def budget(base_side: float) -> float:
+        return (
+            flaps * (span**2 + base_side**2) / 6.0 + box.mass * (box.size[0] ** 2 + box.size[1] ** 2) / 12.0
+        )
+
+    shapes = search.Shapes(PAPER, "least-authority")
+    own = shapes.build(shapes.first)
+    found = shapes.build(np.array([*shapes.first[:2], base, shapes.first[3]]))
+    assert own is not None
+    assert weigh(own.geometry).inertia == pytest.approx(weigh(geometry).inertia, rel=1e-9)
+    assert found is not None
+    expected = weigh(geometry).inertia[2] * budget(base * span) / budget(geometry.base_side)
+    assert weigh(found.geometry).inertia[2] == pytest.approx(expected, rel=1e-6)
+
+
 def test_lighter_or_wider_robots_hold_slower_air_in_the_same_proportion() -> None:
     low, high = search.held(PAPER)
     lines = search.exercise(
