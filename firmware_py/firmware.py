@@ -96,7 +96,7 @@ class Firmware:
         )  # fmt: skip
         kernel.create_task(
             "KALMAN", 2, estimator_task,
-            kernel, cost, estimator_run, self.measurements, core, costs, self._pose_refused,
+            kernel, cost, estimator_run, self.measurements, core, costs, self._pose_refused, self._pose_gated,
         )  # fmt: skip
         kernel.create_task("PWRMGNT", 0, power_task, kernel, board, core)
         self.mavlink = self._mavlink_stack(config) if mavlink else None
@@ -244,6 +244,10 @@ class Firmware:
             self._notices.refuse(
                 "age", f"poses {age_us / 1000:.0f} ms old: at most {OLDEST_POSE_US / 1000:.0f} ms"
             )
+
+    def _pose_gated(self) -> None:
+        """Report a pose that the innovation gate has refused."""
+        self._notices.refuse("gate", "pose refused: it is too far from the estimate")
 
     def _zero_found(self) -> None:
         bias = self._core.data.fields.gyro_bias.tolist()

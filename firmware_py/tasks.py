@@ -76,7 +76,7 @@ def stabilizer_task(  # noqa: PLR0913 - what a task uses is wired once
             board.write_compare(core.control.fields.count.tolist())
 
 
-def estimator_task(
+def estimator_task(  # noqa: PLR0913 - what a task uses is wired once
     kernel: Kernel,
     cost: CpuConfig,
     estimator_run: Semaphore,
@@ -84,9 +84,11 @@ def estimator_task(
     core: CoreBlocks,
     costs: CoreCosts,
     pose_refused: Callable[[int, Correction], None],
+    pose_gated: Callable[[], None],
 ) -> Task:
     """Take poses at 1 kHz, estimate at 100 Hz."""
     cost_us, estimate_due = cost.kalman_us, core.sampling.cell("estimate_due")
+    gated = core.estimator.cell("refused")
     while True:
         yield from estimator_run.take()
         if cost_us:
@@ -97,7 +99,11 @@ def estimator_task(
                 yield from kernel.yield_if_pending()
         if estimate_due[0]:
             yield from kernel.work(costs.estimate_us())
+            before = gated[0]
             core.run.call("estimate")
+            if gated[0] != before:
+                pose_gated()
+                yield from kernel.yield_if_pending()
 
 
 def power_task(kernel: Kernel, board: Board, core: CoreBlocks) -> Task:

@@ -78,7 +78,7 @@ def budget_line(budget: Sequence[Stage]) -> str:
         return "no pose sent"
     pose, *parts = budget
     shares = " + ".join(f"{part.name} {part.mean_us / 1000:.1f}" for part in parts)
-    return f"pose {pose.mean_us / 1000:.1f} ms old on board (99 %: {pose.p99_us / 1000:.1f}): {shares}"
+    return f"pose {pose.mean_us / 1000:.1f} ms old on arrival (99 %: {pose.p99_us / 1000:.1f}): {shares}"
 
 
 class LatencyBudget:

@@ -1,15 +1,16 @@
 """Why a pose is not used at the station: the reasons, their counters, and their lines for the user.
 
-Lines are gathered for half a second, so that one has all of them, and a reason is repeated after five seconds at the
-earliest. The reasons are also in the documentation: `docs/reference/poses.md`.
+Lines are gathered for half a second, so that one has all of them, and a reason is repeated as a `Throttle` admits. The
+reasons are also in the documentation: `docs/reference/poses.md`.
 """
 
 from collections import Counter
 from enum import Enum
 from math import sqrt
 
+from ground_station.throttle import Throttle
+
 GATHER_US = 500_000
-REPEAT_US = 5_000_000
 MINOR = 0.1  # a reason of a smaller share of the unused poses has no part in the line
 VOLUME = 50.0  # [m] sum of the coordinates: no cameras follow a robot further from the tunnel's centre
 MILLI = 1000.0
@@ -84,7 +85,7 @@ class UnusedPoses:
         self.counts: Counter[Reason] = Counter()  # in total
         self._gathered: Counter[Reason] = Counter()
         self._values: dict[Reason, Values] = {}
-        self._reported_us: dict[Reason, int] = {}
+        self._throttle = Throttle()
         self._now_us = 0
         self._due_us: int | None = None
         self._some_used = False  # since the first of those gathered
@@ -146,11 +147,10 @@ class UnusedPoses:
         parts = []
         for reason, count in self._gathered.most_common():
             ordinary = reason is Reason.NOT_TRACKED and self._some_used
-            reported_us = self._reported_us.get(reason)
-            again = reported_us is not None and self._now_us - reported_us < REPEAT_US
-            if not reason.line or count < least or ordinary or (again and reason is not Reason.DEVIATES):
+            if not reason.line or count < least or ordinary:
                 continue
-            self._reported_us[reason] = self._now_us
+            if reason is not Reason.DEVIATES and not self._throttle.admits(reason, self._now_us):
+                continue
             poses = "1 pose" if count == 1 else f"{count} poses"
             parts.append(f"{poses} {reason.line.format(*self._values[reason])}")
         return parts

@@ -28,6 +28,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "ground_station": (
         "ground_station", "firmware_py.wire", "firmware_py.geometry", "firmware_py.elementary", "firmware_py.extras",
         "firmware_py.fast", "firmware_py.section", "firmware_py.table",
+        "firmware_py.core.structs",  # the oldest pose that the board can use
     ),
     "hil.stm32f405": ("hil", "firmware_py.export", "firmware_py.extras"),
     "hil.crazyflie": (

@@ -26,6 +26,7 @@ from firmware_py.links.mavlink_setpoints import SetpointService
 from firmware_py.links.mavlink_stack import MavlinkStack
 from firmware_py.links.mavlink_streams import Stream, interval_of
 from firmware_py.rtos.statistics import ProcessorLoad
+from firmware_py.signals import REFUSED
 from firmware_py.supervisor import CoreSupervisor
 from firmware_py.wire import WireError, mavlink, telemetry
 from firmware_py.wire import mavlink_services as services
@@ -169,7 +170,7 @@ class FlightMessages:
             services.named_value(tick, name, value)
             for name, value in (
                 ("age_ms", UNKNOWN_AGE if age_us is None else age_us * 1e-3),
-                ("refused", int(estimator.refused + estimator.too_old + estimator.invalid)),
+                ("refused", sum(int(getattr(estimator, name)) for name in REFUSED)),
                 ("up_lost", self._stack.counters.lost),
                 ("tx_dropped", self._stack.dropped),
                 ("overruns", self._stack.overruns),

@@ -12,19 +12,20 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from math import nan
 
+from firmware_py.core.structs import HORIZON_LIMIT, TICK_US
 from firmware_py.wire.telemetry import Sample
 from ground_station.clock import clock_us
 from ground_station.controls import Answer, ControlRequest
 from ground_station.errors import LinkError
 from ground_station.latency import LinkLatency
 from ground_station.mocap import MocapFrame
+from ground_station.throttle import Throttle
 from ground_station.trajectory import Goal
-from ground_station.unused import REPEAT_US
 
 ANSWER_TIMEOUT_US = 4_000_000  # without any answer while connecting
 CONNECT_TIMEOUT_US = 60_000_000  # in total; tables of contents are long and slow with losses
 SILENCE_TIMEOUT_US = 2_000_000  # connected: the slowest board is received once per second
-MAX_AGE_US = 120_000  # of a pose on board, which cannot use an older one
+MAX_AGE_US = HORIZON_LIMIT * TICK_US  # of a pose on board, which cannot use an older one
 POLL_S = 0.05  # between two checks of a board that connects
 CLOSE_TIMEOUT_S = 1.5
 PIECES = 2000  # read and waiting in `received`
@@ -75,7 +76,7 @@ class LiveLink(ABC):
         self._received: queue.Queue[tuple[int, bytes]] = queue.Queue(PIECES)
         self._mailbox: tuple[MocapFrame, Goal] | None = None
         self._too_old_us: int | None = None  # age of the last pose that was, since the last notices
-        self._too_old_due_us = 0  # of the next line about it
+        self._throttle = Throttle()
         self._muted = True
         self._lock = threading.Lock()  # around mailbox, mute and counters
         self._sender: Sender | None = None
@@ -234,8 +235,7 @@ class LiveLink(ABC):
         notices, self._notices = self._notices, []
         with self._lock:
             age_us, self._too_old_us = self._too_old_us, None
-        if age_us is not None and (now_us := clock_us()) >= self._too_old_due_us:
-            self._too_old_due_us = now_us + REPEAT_US
+        if age_us is not None and self._throttle.admits("too old", clock_us()):
             notices.append(
                 f"poses {age_us / 1000:.0f} ms old on their arrival on board: at most {MAX_AGE_US // 1000} ms"
             )

@@ -126,25 +126,22 @@ class MotioncaptureSource:
         self._silence.on_frame(now_us)
         arrived_us = min(arrival.t_us, now_us)
         t_us = arrived_us - self._capture.latency_us
-        unused = self._unused(body, now_us - arrived_us)
-        if unused is not None or body is None:
-            self._lost += 1
-            return MocapFrame(
-                t_us, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), valid=False, unused=unused or (Reason.ABSENT, ())
-            )
+        waited_us = now_us - arrived_us
+        if waited_us > OLDEST_US:
+            return self._without_pose(t_us, (Reason.MISTIMED, (waited_us * 1e-6,)))
+        if body is None:
+            return self._without_pose(t_us, (Reason.ABSENT, ()))
+        repeated, self._pose = body == self._pose, body
+        if repeated:  # every measured pose differs from the last
+            return self._without_pose(t_us, (Reason.FROZEN, ()))
         self._age_us = now_us - t_us
         x, y, z, qw, qx, qy, qz = body
         p_WB, q_WB = self._alignment.to_world((x, y, z), (qw, qx, qy, qz))
         return MocapFrame(t_us, p_WB, q_WB, valid=True, arrived_us=arrived_us)
 
-    def _unused(self, body: Body | None, waited_us: int) -> Unused | None:
-        """Return why a body is not used: every measured pose differs from the last."""
-        if waited_us > OLDEST_US:
-            return Reason.MISTIMED, (waited_us * 1e-6,)
-        if body is None:
-            return Reason.ABSENT, ()
-        last, self._pose = self._pose, body
-        return (Reason.FROZEN, ()) if body == last else None
+    def _without_pose(self, t_us: int, unused: Unused) -> MocapFrame:
+        self._lost += 1
+        return MocapFrame(t_us, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), valid=False, unused=unused)
 
     def _start(self) -> None:
         # In a separate session, because Ctrl-C is for the station.

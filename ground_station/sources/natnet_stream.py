@@ -17,7 +17,8 @@ from ground_station.sources import natnet
 from ground_station.sources.alignment import Alignment, choose_body
 from ground_station.sources.natnet_reader import Version
 from ground_station.sources.silence import Silence
-from ground_station.unused import REPEAT_US, Reason, Unused
+from ground_station.throttle import Throttle
+from ground_station.unused import Reason, Unused
 
 DRIFT = 50e-6  # between two computers, at most; quartz
 
@@ -98,7 +99,7 @@ class NatnetStream:
         self._mistimed = 0  # frames in sequence
         self._silence = Silence(self.notices)
         self._call_us = 0
-        self._unreadable_us: int | None = None  # when that was last reported
+        self._throttle = Throttle()
 
     def on_packet(self, data: bytes, now_us: int) -> MocapFrame | None:
         """Take a packet; return the pose if it is a new frame.
@@ -128,8 +129,7 @@ class NatnetStream:
 
     def _report_unreadable(self, error: MocapError, now_us: int) -> None:
         """Report the reason now and then, so that no packets look like silence."""
-        if self._unreadable_us is None or now_us - self._unreadable_us >= REPEAT_US:
-            self._unreadable_us = now_us
+        if self._throttle.admits("unreadable", now_us):
             count = self.counters.malformed
             packets = "1 packet" if count == 1 else f"{count} packets"
             self.notices.append(f"motion capture: {packets} cannot be read: {error}")
@@ -207,16 +207,13 @@ class NatnetStream:
             counters.lost += 1
             return MocapFrame(now_us, *NOWHERE, valid=False, unused=unused)
         pose = next((body for body in frame.bodies if body.id == self._id), None)
-        unused = self._unused(pose)
-        if unused is not None or pose is None:
-            counters.lost += 1
-            (p, q), valid = NOWHERE, False
-        else:
-            (p, q), valid = self._alignment.to_world(pose.p, pose.q), True
+        (p, q), unused = self._placed(pose)
+        counters.lost += unused is not None
         received_us, sent_us = map(self._clock.to_station_us, (frame.received, frame.transmitted))
         received_us = max(t_us, min(received_us, now_us))  # the clocks' offset is less certain
         sent_us = max(received_us, min(sent_us, now_us))
-        return MocapFrame(t_us, p, q, valid, received_us, sent_us, now_us, unused or (Reason.NOT_TRACKED, ()))
+        reason = unused or (Reason.NOT_TRACKED, ())
+        return MocapFrame(t_us, p, q, unused is None, received_us, sent_us, now_us, reason)
 
     def _exposed_us(self, frame: natnet.Frame, now_us: int) -> tuple[int, Unused | None]:
         """Return the exposure on our clock; with a reason where the server's time stamps make no sense."""
@@ -233,16 +230,18 @@ class NatnetStream:
             self._clock = ServerClock(self.server.clock_hz)
         return t_us, (Reason.MISTIMED, ((now_us - t_us) * 1e-6,))
 
-    def _unused(self, pose: natnet.BodyPose | None) -> Unused | None:
-        """Return why a pose is not used: it is missing, not tracked, or a repetition of the last."""
+    def _placed(self, pose: natnet.BodyPose | None) -> tuple[tuple[Vector, Quaternion], Unused | None]:
+        """Return the pose in the world; with a reason where it is missing, not tracked or a repetition of the last."""
         if pose is None:
-            return Reason.ABSENT, ()
+            return NOWHERE, (Reason.ABSENT, ())
         last, self._pose = self._pose, pose
         same = last is not None and (last.p, last.q) == (pose.p, pose.q)
         self._repeated = self._repeated + 1 if same else 0
         if not pose.valid:
-            return Reason.NOT_TRACKED, ()
-        return (Reason.FROZEN, ()) if self._repeated >= FROZEN_FRAMES else None
+            return NOWHERE, (Reason.NOT_TRACKED, ())
+        if self._repeated >= FROZEN_FRAMES:
+            return NOWHERE, (Reason.FROZEN, ())
+        return self._alignment.to_world(pose.p, pose.q), None
 
 
 def _unreadable(server: natnet.ServerInfo) -> MocapError:

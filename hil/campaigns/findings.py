@@ -11,9 +11,8 @@ The samplings that each measure of influence needs:
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from itertools import product
 
 import numpy as np
 import pyarrow as pa
@@ -49,8 +48,10 @@ class Limited:
     name: str
     metric: Metric
     bound: float
-    rate: Rate
-    values: Array  # of the flights with the metric
+    rate: (
+        Rate  # of the judged flights: all that ended, without lost ones unless a limit on `lost` admits them
+    )
+    values: Array  # of the judged flights with the metric
 
     def quantile(self, share: float) -> str:
         """Return a quantile as text, counted from good to bad."""
@@ -126,9 +127,23 @@ class Worst:
 
 @dataclass(frozen=True, slots=True)
 class ProfileCell:
+    """An experiment on a profile: how often it fails, and how often the robot is lost."""
+
     experiment: str
     profile: str
     rate: Rate
+    lost: Rate
+    loss_allowed: bool  # by a limit on `lost`
+    limits: tuple[Limited, ...]
+
+    @property
+    def loss_text(self) -> str:
+        """How often the robot is lost, and whether that is a failure."""
+        return f"{self.lost}{', allowed by a limit' if self.loss_allowed else ''}"
+
+    def rate_text(self, limit: Limited) -> str:
+        """How often a limit fails, and of which flights."""
+        return limit.rate.text(" that were not lost" if self.lost.failed and not self.loss_allowed else "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,16 +153,23 @@ class Findings:
     rate: Rate
     cells: tuple[ProfileCell, ...]
     errors: tuple[str, ...]  # of flights that did not end, each text once with its count
-    limits: tuple[Limited, ...]
     influences: tuple[Influence, ...]
     failure_map: FailureMap | None
     worst: tuple[Worst, ...]
+
+    @property
+    def limits(self) -> tuple[Limited, ...]:
+        """The limits of all cells."""
+        return tuple(one for cell in self.cells for one in cell.limits)
 
 
 def find(spec: Spec, flights: pa.Table) -> Findings:
     """Return the findings from a campaign's flights."""
     passed = flights["passed"].to_numpy(zero_copy_only=False).astype(bool)
-    limits = _limits(spec, flights)
+    cells = tuple(
+        _cell(spec, flights, number) for number in range(len(spec.experiments) * len(spec.profiles))
+    )
+    limits = tuple(one for cell in cells for one in cell.limits)
     points = sampling.points_of(spec)
     which = flights["index"].to_numpy() // spec.cells
     mapped = _failure_map(spec, flights["index"].to_numpy(), sampling.as_flown(spec, points)[which], ~passed)
@@ -156,8 +178,8 @@ def find(spec: Spec, flights: pa.Table) -> Findings:
         influences.insert(0, mapped.influence)
     size = sampling.cluster_of(spec)
     return Findings(
-        _rate(flights, "passed", size, size), tuple(_cells(spec, flights)), _errors(flights), limits,
-        tuple(influences), mapped, _worst(spec, flights, limits),
+        _rate(flights, "passed", size, size), cells, _errors(flights), tuple(influences), mapped,
+        _worst(spec, flights, limits),
     )  # fmt: skip
 
 
@@ -170,12 +192,31 @@ def _rate(flights: pa.Table, column: str, size: int, cluster: int) -> Rate:
     return tally.rate
 
 
-def _cells(spec: Spec, flights: pa.Table) -> Iterator[ProfileCell]:
-    size = sampling.cluster_of(spec)
-    own = size // len(spec.experiments) // len(spec.profiles)
-    for experiment, profile in product(spec.experiments, spec.profiles):
-        rows = _of_cell(flights, experiment, profile)
-        yield ProfileCell(experiment, profile, _rate(rows, "passed", own, size))
+def _cell(spec: Spec, flights: pa.Table, number: int) -> ProfileCell:
+    cluster = sampling.cluster_of(spec)
+    size = cluster // (len(spec.experiments) * len(spec.profiles))
+    drawn = sampling.draw(spec, number)
+    profile = drawn.options["profile"]
+    plain = Options(**{**drawn.options, "overrides": spec.settings, "faults": ()})
+    request = replace(drawn, options=plain).request()
+    rows = _of_cell(flights, drawn.experiment, profile)
+    ended = rows.filter(pc.not_equal(rows["outcome"], "error"))
+    stays = pc.not_equal(ended["outcome"], "lost")
+    allowed = request.limits.get("lost", 0.0) >= 1.0
+    judged, found = ended if allowed else ended.filter(stays), []
+    for name, bound in request.limits.items():
+        if name == "lost":
+            continue
+        values = judged[f"metric.{name}"].to_numpy()
+        metric = request.experiment.metrics.get(name) or METRICS[name]
+        rate = _rate(judged, f"holds.{name}", size, cluster)
+        found.append(
+            Limited(drawn.experiment, profile, name, metric, bound, rate, values[np.isfinite(values)])
+        )
+    lost = _rate(ended.append_column("stays", stays), "stays", size, cluster)
+    return ProfileCell(
+        drawn.experiment, profile, _rate(rows, "passed", size, cluster), lost, allowed, tuple(found)
+    )
 
 
 def _of_cell(flights: pa.Table, experiment: str, profile: str) -> pa.Table:
@@ -190,24 +231,6 @@ def _errors(flights: pa.Table) -> tuple[str, ...]:
     texts = failed["error"].to_pylist()
     first = dict(reversed(list(zip(texts, failed["index"].to_pylist(), strict=True))))
     return tuple(f"{texts.count(text)}×, first flight {first[text]}: {text}" for text in dict.fromkeys(texts))
-
-
-def _limits(spec: Spec, flights: pa.Table) -> tuple[Limited, ...]:
-    found, cells, size = [], len(spec.experiments) * len(spec.profiles), sampling.cluster_of(spec)
-    for cell in range(cells):
-        drawn = sampling.draw(spec, cell)
-        profile = drawn.options["profile"]
-        plain = Options(**{**drawn.options, "overrides": spec.settings, "faults": ()})
-        request = replace(drawn, options=plain).request()
-        rows = _of_cell(flights, drawn.experiment, profile)
-        for name, bound in request.limits.items():
-            values = rows[f"metric.{name}"].to_numpy()
-            metric = request.experiment.metrics.get(name) or METRICS[name]
-            rate = _rate(rows, f"holds.{name}", size // cells, size)
-            found.append(
-                Limited(drawn.experiment, profile, name, metric, bound, rate, values[np.isfinite(values)])
-            )
-    return tuple(found)
 
 
 def _failure_map(
@@ -234,10 +257,11 @@ def _influences(
     spec: Spec, points: Array, which: NDArray[np.int64], flights: pa.Table, limits: tuple[Limited, ...],
     failed: NDArray[np.bool_],
 ) -> list[Influence]:  # fmt: skip
-    """Return the influence of the axes on failing, and on the metric of every limit."""
+    """Return the influence of the axes on failing, on losses, and on the metric of every limit."""
     names = [axis.name for axis in sampling.axes(spec)]
     figures = {"failing": failed.astype(float)} | {
-        name: flights[f"metric.{name}"].to_numpy() for name in dict.fromkeys(one.name for one in limits)
+        name: flights[f"metric.{name}"].to_numpy()
+        for name in dict.fromkeys(("lost", *(one.name for one in limits)))
     }
     found = []
     for figure, values in figures.items():

@@ -68,7 +68,7 @@ class Row:
     passed: bool
     hash: str  # empty: it did not end
     metrics: Mapping[str, float]  # empty: it was not flown
-    holds: Mapping[str, bool]  # by limit
+    holds: Mapping[str, bool]  # by limit that applies
 
     @property
     def seed(self) -> int:
@@ -205,7 +205,7 @@ def row_of(job: Job, result: Result) -> Row:
     cause = result.cause or ""
     if result.outcome == "error" and any(os.strerror(number) in cause for number in FULL):
         raise LabError(f"flight {job.index}: {tempfile.gettempdir()}: {cause}")
-    holds = {verdict.metric: verdict.holds for verdict in result.verdicts}
+    holds = {verdict.metric: verdict.holds for verdict in result.verdicts if verdict.applies}
     digest = result.hash if result.outcome != "error" else ""
     return Row(job, result.outcome, cause, result.passed, digest, dict(result.metrics), holds)
 

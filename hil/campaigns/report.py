@@ -60,7 +60,12 @@ def _content(spec: Spec, found: Findings, complete: bool) -> dict[str, Any]:
         "spec": spec_text(spec),
         "complete": complete,
         **_counts(found.rate),
-        "cells": [_fields(one, "experiment", "profile") | _counts(one.rate) for one in found.cells],
+        "cells": [
+            _fields(one, "experiment", "profile", "loss_allowed")
+            | _counts(one.rate)
+            | {"lost": _counts(one.lost)}
+            for one in found.cells
+        ],
         "errors": found.errors,
         "limits": [
             _fields(one, "experiment", "profile")

@@ -50,9 +50,15 @@ class Rate:
         return interval(self.failed / self.flown if self.flown else 0.0, self.flown / self.design)
 
     def __str__(self) -> str:
+        return self.text()
+
+    def text(self, which: str = "") -> str:
+        """Return the rate and its interval; `which` flights follows their number."""
+        if not self.flown:
+            return f"0 of 0{which}"
         low, high = self.interval
-        share = self.failed / self.flown if self.flown else 0.0
-        return f"{self.failed} of {self.flown}: {100 * share:.2f} % ({100 * low:.2f} to {100 * high:.2f} %)"
+        share = self.failed / self.flown
+        return f"{self.failed} of {self.flown}{which}: {100 * share:.2f} % ({100 * low:.2f} to {100 * high:.2f} %)"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -51,12 +51,14 @@ def campaign(
         dataset, standing = runner.campaign(plan_of(read), out or Path("runs") / f"campaign-{file.stem}")
     page, findings = write_report(spec, read, dataset, standing.complete)
     say(f"failed: {findings.rate}")
-    if len(findings.cells) > 1:
-        for cell in findings.cells:
-            say(f"  {cell.experiment}, {cell.profile}: {cell.rate}")
-    for one in findings.limits:
-        where = f"{one.experiment}, {one.profile}" if len(findings.cells) > 1 else one.profile
-        say(f"  {where}, {one.name}: {one.rate}")
+    several = len(findings.cells) > 1
+    for cell in findings.cells:
+        where = f"{cell.experiment}, {cell.profile}" if several else cell.profile
+        if several:
+            say(f"  {where}: {cell.rate}")
+        say(f"  {where}, lost: {cell.loss_text}")
+        for one in cell.limits:
+            say(f"  {where}, {one.name}: {cell.rate_text(one)}")
     for text in findings.errors:
         say(f"  did not end: {text}")
     for worst in findings.worst[:3]:

@@ -109,6 +109,7 @@ def optimise(asked: Search) -> None:
     """Find the kink, centre of mass, base plate and strip with the largest figure, at the profile's span, mass and speed."""
     from hil.design import figures
     from hil.design import optimise as search
+    from hil.design.bounds import at_bounds
     from hil.design.claims import robot_lines
     from hil.pictures.drawing import png
 
@@ -134,7 +135,7 @@ def optimise(asked: Search) -> None:
         say(f"{name:38} {value}")
     own = f"{marks[profile][1]:.3f}" if found.reference_flies else "not stable and steering around its hover"
     say(f"{figure}: {marks['best'][1]:.3f}; {profile}: {own}; {len(found.tried)} robots flew")
-    for line in search.exercise(found, *updrafts):
+    for line in (*at_bounds(best.point.geometry), *search.exercise(found, *updrafts)):
         say(line)
     say(f"picture  {picture}")
 

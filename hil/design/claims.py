@@ -14,7 +14,7 @@ from hil.design import sweeps
 from hil.design.authority import wrenches
 from hil.design.axes import AXES, PITCH, ROLL
 from hil.design.linear import Point, places
-from hil.design.trim import balanced, changed
+from hil.design.trim import balanced
 from hil.floaty.correction import PAPER_TABLE
 from hil.floaty.geometry import weigh
 
@@ -89,7 +89,7 @@ def claims(
 def _flat_high(point: Point) -> Iterator[Claim]:
     """Yield the claims about flat flaps with the centre of mass in their plane."""
     high = sweeps.flat_high(point).linear
-    lowered = balanced(changed(point.geometry, kink_angle=0.0), 0.0)
+    lowered = balanced(point.geometry, 0.0, kink_angle=0.0)
     moved = replace(point, geometry=lowered).linear.constants.roll_roll
     unstable, growth = high.constants.roll_roll, high.growth(ROLL)
     yield Claim(

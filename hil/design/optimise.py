@@ -21,15 +21,13 @@ from scipy.stats import qmc
 
 from hil.design.authority import QUANTITIES, authorities, least
 from hil.design.axes import PITCH, ROLL
+from hil.design.bounds import HIGH, LOW, SEARCHED, shape_of
 from hil.design.linear import Linear, Point, places
 from hil.design.sweeps import RESERVE
-from hil.design.trim import balanced, changed, opening_at, speed_at
+from hil.design.trim import balanced, opening_at, speed_at
 from hil.errors import LabError
 from hil.floaty.geometry import weigh
 
-# Shares of the footprint, except the kink.
-BOUNDS = {"kink": (0.0, math.radians(80.0)), "height": (0.0, 0.5), "base": (0.15, 0.5), "strip": (0.02, 0.2)}
-LOW, HIGH = np.array(list(BOUNDS.values())).T
 POPULATION, GENERATIONS = 40, 25
 NEAR = 0.1  # of the bounds, standard deviation of the reference's neighbours
 AGAIN, GAIN = 5, 1e-4  # repetitions of a climb, as long as each gains that much
@@ -127,24 +125,22 @@ FIGURES: Mapping[str, Callable[[Point, Mapping[str, float]], float]] = {
 
 
 class Shapes:
-    """The shapes of a search, as shares of the footprint (4,) in the order of BOUNDS, and those already tried."""
+    """The shapes of a search, (4,) in the order of SEARCHED, and those already tried."""
 
     def __init__(self, reference: Point, figure: str) -> None:
         self._reference, self._of, self._speed = reference, FIGURES[figure], reference.speed
         self.share = authorities(reference)
         self.tried: list[Tried] = []
-        geometry, span = reference.geometry, reference.geometry.footprint
-        height = weigh(geometry).axis_height
-        own = [geometry.kink_angle, height / span, geometry.base_side / span, geometry.strip_width / span]
-        self.first = np.clip(own, LOW, HIGH)
+        self.first = np.clip(shape_of(reference.geometry), LOW, HIGH)
 
     def build(self, x: NDArray[np.float64]) -> Point | None:
         """Return the robot of a shape; None if it cannot hover at the reference's speed within the flaps' range."""
         geometry, span = self._reference.geometry, self._reference.geometry.footprint
         kink, height, base, strip = np.clip(x, LOW, HIGH).tolist()
         try:
-            shape = changed(geometry, kink_angle=kink, base_side=base * span, strip_width=strip * span)
-            shape = balanced(shape, height * span)
+            shape = balanced(
+                geometry, height * span, kink_angle=kink, base_side=base * span, strip_width=strip * span
+            )
             opening = opening_at(shape, self._reference.coefficient, self._speed)
         except LabError:
             return None
@@ -197,7 +193,7 @@ class Shapes:
 def optimise(reference: Point, figure: str, seed: int, generations: int = GENERATIONS) -> Optimum:
     """Return the robot with the largest figure at the reference's span, mass, drag coefficient and speed."""
     shapes = Shapes(reference, figure)
-    bounds, first = list(BOUNDS.values()), shapes.begin(seed)
+    bounds, first = [(one.low, one.high) for one in SEARCHED], shapes.begin(seed)
     found = differential_evolution(
         shapes.loss, bounds, init=first, maxiter=generations, seed=seed, polish=False, tol=1e-4
     )

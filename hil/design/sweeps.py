@@ -152,4 +152,4 @@ def updrafts(point: Point) -> tuple[float, float]:
 
 def flat_high(point: Point) -> Point:
     """Return the paper's first idea: flat flaps, the centre of mass in their plane, the same inertia."""
-    return replace(point, geometry=balanced(changed(point.geometry, kink_angle=0.0), 0.0, keep_inertia=True))
+    return replace(point, geometry=balanced(point.geometry, 0.0, keep_inertia=True, kink_angle=0.0))

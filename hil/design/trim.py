@@ -66,19 +66,23 @@ def scaled(geometry: GeometryConfig, length: float, mass: float) -> GeometryConf
     return changed(geometry, **changes, flap_mass=mass * geometry.flap_mass, masses=masses)
 
 
-def balanced(geometry: GeometryConfig, height: float, keep_inertia: bool = False) -> GeometryConfig:
-    """Return the robot with the centre of mass `height` [m] below the flap axes, by moving `masses` up or down.
+def balanced(
+    geometry: GeometryConfig, height: float, keep_inertia: bool = False, **shape: float
+) -> GeometryConfig:
+    """Return the robot of another `shape` with the centre of mass `height` [m] below the flap axes.
 
-    A fitted inertia changes like that of the masses, unless it is kept.
+    `masses` move up or down. A fitted inertia changes like the computed one of flaps and masses, unless it is kept: a
+    smaller base plate has flaps that reach further inwards.
     """
-    before = weigh(geometry)
+    shaped = changed(geometry, **shape)
+    before = weigh(shaped)
     hung = sum(one.mass * (4 if one.mirrored else 1) for one in geometry.masses)
     down = (height - before.axis_height) * before.mass / hung
     masses = [
         one.model_dump() | {"place": (one.place[0], one.place[1], one.place[2] - down)}
         for one in geometry.masses
     ]
-    moved = changed(geometry, masses=masses)
+    moved = changed(shaped, masses=masses)
     if keep_inertia or geometry.inertia == "masses":
         return moved
     old, new = (weigh(changed(one, inertia="masses")).inertia for one in (geometry, moved))

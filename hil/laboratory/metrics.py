@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, PlainSerializer
 
 from firmware_py.geometry import euler_zyx_of
+from firmware_py.signals import REFUSED
 from firmware_py.wire.supervisor import State
 from hil.arguments import checked, shown
 from hil.errors import LabError, hint
@@ -99,7 +100,11 @@ METRICS: Mapping[str, Metric] = {
     "wind_offset": Metric("m", "max", "mean error along the wind in its last 5 s"),
     "height_off": Metric("m", "max", "mean error in height over the second half of the flight"),
     "as_computed": Metric("", "min", "1 when the height is held exactly if the lift of the flaps allows it"),
-    "age_mean": Metric("s", "max", "mean age of the pose when the estimator takes it"),
+    "age_mean": Metric(
+        "s",
+        "max",
+        "mean age of the pose at the estimator's tick that uses it: on arrival, and the wait for the tick",
+    ),
     "poses_refused": Metric("", "max", "poses that the estimator did not fuse"),
     "frames_refused": Metric("", "max", "frames that the ground station's tracker refused"),
     "failsafe": Metric("s", "max", "time in failsafe: flaps at hover, loop open"),
@@ -314,7 +319,7 @@ def measure(table: pa.Table, lost: bool, resets: int | None = None) -> dict[str,
     if is_real(table):
         values["poses_refused"] = float(column(flight, "estimator.rejected")[-1])
     elif "estimator.refused" in table.schema.names:
-        refused = column(flight, "estimator.refused", "estimator.too_old", "estimator.invalid").sum(axis=1)
+        refused = column(flight, *(f"estimator.{name}" for name in REFUSED)).sum(axis=1)
         values["poses_refused"] = float(refused[-1])
     if "tracker.refused" in table.schema.names:
         values["frames_refused"] = float(column(flight, "tracker.refused")[-1])

@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from firmware_py.signals import REFUSED
 from ground_station.latency import STAGES
 from hil.laboratory.faults import switched_on
 from hil.laboratory.metrics import attitude_error, column, position_error
@@ -197,7 +198,7 @@ AIR = logged(("link quality [%]", "RSSI [-dBm]"), (BLUE, ORANGE), "", "link.qual
 # The colour of a mark, and the counters of a refusal, of which the log may lack some.
 MARK_KINDS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "pose refused on board": (
-        RED, ("estimator.refused", "estimator.too_old", "estimator.invalid", "estimator.rejected"),
+        RED, (*(f"estimator.{name}" for name in REFUSED), "estimator.rejected"),
     ),
     "pose refused by the tracker": (ORANGE, ("tracker.refused",)),
     "pose too late for the link": (SKY, ("link.late",)),

@@ -1,24 +1,14 @@
 """`python -m ground_station`: without the laboratory, and one line for what cannot be flown."""
 
-import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from ground_station import __main__ as alone
-from ground_station.stops import STOPS
 
-
-@pytest.fixture(autouse=True)
-def handlers() -> Iterator[None]:
-    """Keep the test runner's own way to be interrupted."""
-    kept = {number: signal.getsignal(number) for number in STOPS}
-    yield
-    for number, handler in kept.items():
-        signal.signal(number, handler)
+pytestmark = pytest.mark.usefixtures("own_signal_handlers")
 
 
 def test_it_loads_nothing_of_the_laboratory() -> None:

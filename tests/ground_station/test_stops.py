@@ -1,20 +1,12 @@
 """The signals that end a flight: all in order, and a terminal that hangs up only where the user has not ruled that out."""
 
 import signal
-from collections.abc import Iterator
 
 import pytest
 
 from ground_station.stops import STOPS, heeded, stop_signals, stopped_like_ctrl_c
 
-
-@pytest.fixture(autouse=True)
-def handlers() -> Iterator[None]:
-    """Keep the test runner's own handlers."""
-    kept = {number: signal.getsignal(number) for number in STOPS}
-    yield
-    for number, handler in kept.items():
-        signal.signal(number, handler)
+pytestmark = pytest.mark.usefixtures("own_signal_handlers")
 
 
 @pytest.mark.parametrize("number", STOPS)

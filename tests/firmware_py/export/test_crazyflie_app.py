@@ -113,7 +113,7 @@ def packed_poses(header: bytes, p: NDArray[np.float64], q: Quaternion) -> bytes:
 
 
 def scenario(rng: np.random.Generator, steps: int) -> dict[int, list[Event]]:
-    """Poses at 50 Hz along a walk: with ages, without, too old, garbage, jumps, out of bounds; silence and stops."""
+    """Poses at 50 Hz along a walk: with ages, without, too old, garbage, jumps, too far, out of bounds; silence, stops."""
     events: dict[int, list[Event]] = defaultdict(list)
     p = np.zeros(3)
     for step in range(600, steps, 20):
@@ -137,6 +137,7 @@ def scenario(rng: np.random.Generator, steps: int) -> dict[int, list[Event]]:
         (7301, "floaty.stop", 0),  # this one leaves the empty battery
     ):  # fmt: skip
         events[step].append(write(name, value))
+    events[8205].append(pose(crtp.encode_ext_pose((12.346, -2.3, 0.0), (1.0, 0.0, 0.0, 0.0), 40_000)))
     return events
 
 
@@ -184,8 +185,11 @@ def test_app_and_laboratory_turn_the_same_samples_into_the_same_bits(app: App) -
     assert compared > 890
     assert len(counts) > 300
     assert states == {(0, 0), (1, 0), (2, 0), (3, 1), (3, 2), (3, 3), (3, 4), (3, 5), (3, 9)}
-    announced = re.findall(r"^(?:FLOATY: )?(supervisor: .*)$", app.console(), re.MULTILINE)
-    assert announced == [line for line in laboratory.console if line.startswith("supervisor: ")]
+    announced = re.findall(r"^(?:FLOATY: )?((?:supervisor: |poses? ).*)$", app.console(), re.MULTILINE)
+    assert announced == [line for line in laboratory.console if line.startswith(("supervisor: ", "pose"))]
+    assert "pose refused: it is too far from the estimate" in announced
+    assert any(re.fullmatch(r"poses 1[2-4]\d ms old: at most 120 ms", line) for line in announced)
+    assert any("12.35 -2.30 0.00 m is no correction" in line for line in announced)
     assert "restarted" not in app.console()
     assert "EEPROM" not in app.console()
     for name in ("fused", "refused", "jumps", "too_old", "bounded"):

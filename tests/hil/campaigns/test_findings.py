@@ -1,5 +1,6 @@
-"""Edges of a campaign: when it ends, which flights have a fault, what counts as worst, how a figure is ranked."""
+"""Edges of a campaign: its end, the flights with a fault, the worst and lost flights, how a figure is ranked."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,10 +16,12 @@ from hil.campaigns.config import Distribution
 from hil.campaigns.dataset import Dataset, schema_of, table_of
 from hil.campaigns.findings import Influence, Limited, Rate, find, pawn, slices
 from hil.campaigns.jobs import Row
+from hil.campaigns.report import write_report
 from hil.campaigns.run import STOP_FROM, Progress, Tally, interval
 from hil.campaigns.sampling import as_flown, axes, draw, plan_of, points_of, problem, shuffled, value_at
 from hil.laboratory.metrics import METRICS
 from support.campaigns import BAD_PUSH, planted, spec_of
+from support.html_page import Page
 
 
 def half(failed: int, flown: int) -> float:
@@ -119,6 +122,37 @@ def test_the_worst_flights_are_those_lost_first_then_those_far_beyond_a_limit() 
     found = find(spec, table)
     assert [one.index for one in found.worst] == [3, 1, 2, 0, 4]
     assert (found.rate.failed, found.rate.flown) == (5, 5)
+
+
+@pytest.mark.parametrize("allowed", [False, True])
+def test_a_lost_flight_is_counted_apart_and_no_limit_is_counted_over_it(
+    allowed: bool, tmp_path: Path
+) -> None:
+    """Of six flights two are lost and one ends with an error; an allowed loss is judged on the part before it."""
+    lost = {"outcome": "lost", "error": "tumbled", "holds": {"in_box": False, "resets": False}}
+    rows = rows_of(
+        {**lost}, {**lost}, {"outcome": "error", "error": "planted", "holds": {}},
+        {"holds": {"in_box": False, "resets": True}}, *({"holds": {"in_box": True, "resets": True}} for _ in range(2)),
+    )  # fmt: skip
+    spec = spec_of(flights=6, settings=["limits.hover.lost=1", "limits.hover.in_box=0.9"] if allowed else [])
+    dataset = Dataset(tmp_path, plan_of(spec), False)
+    for row in rows:
+        dataset.add(row)
+    dataset.close()
+    page, found = write_report("spec.toml", spec, dataset, complete=True)
+    (cell,) = found.cells
+    assert (cell.lost.failed, cell.lost.flown, cell.loss_allowed) == (2, 5, allowed)
+    rates = {one.name: (one.rate.failed, one.rate.flown) for one in found.limits}
+    assert (rates["in_box"], rates["resets"]) == (((3, 5), (2, 5)) if allowed else ((1, 3), (0, 3)))
+    assert "lost" not in rates
+    tables = Page(page.read_text()).tables
+    assert tables["cells"][1][3].startswith("2 of 5: ")
+    texts = {row[1].split()[0]: row[2] for row in tables["limits"][1:]}
+    assert texts["resets"].startswith("2 of 5: " if allowed else "0 of 3 that were not lost: ")
+    told = json.loads((tmp_path / "result.json").read_text())
+    assert told["cells"][0]["lost"]["failed"] == 2
+    resets = next(one for one in told["limits"] if one["metric"] == "resets")
+    assert (resets["failed"], resets["flown"]) == rates["resets"]
 
 
 def test_rows_beyond_the_end_are_dropped_and_a_row_that_came_twice_counts_once(tmp_path: Path) -> None:

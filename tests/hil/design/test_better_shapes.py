@@ -13,10 +13,11 @@ from hil.config import load_config
 from hil.design import optimise as search
 from hil.design.authority import authorities
 from hil.design.axes import AXES, PITCH, ROLL, Axis
+from hil.design.bounds import HIGH, LOW, SEARCHED, at_bounds, shape_of
 from hil.design.gains import gains_of, profile_text
 from hil.design.linear import Linear, Point
 from hil.design.sweeps import flat_high
-from hil.design.trim import coefficient_of, scaled
+from hil.design.trim import balanced, coefficient_of, scaled
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
 from hil.floaty.geometry import weigh
@@ -108,7 +109,7 @@ def test_the_flat_robot_falls_over_in_the_time_of_its_pole() -> None:
 
 
 # Tests that share a search: pytest-xdist runs them in one process.
-SEARCHED = pytest.mark.xdist_group("small-search")
+SHARED_SEARCH = pytest.mark.xdist_group("small-search")
 
 
 @cache
@@ -116,7 +117,7 @@ def small_search(figure: str, seed: int) -> search.Optimum:
     return search.optimise(PAPER, figure, seed, generations=1)
 
 
-@SEARCHED
+@SHARED_SEARCH
 @pytest.mark.long
 def test_a_short_search_ends_at_the_robot_that_a_long_one_with_another_seed_found() -> None:
     found = small_search("least-authority", 1).best
@@ -139,11 +140,11 @@ def test_a_shape_is_the_worse_the_more_it_violates_conditions() -> None:
     shapes = search.Shapes(paper, "least-authority")
     slightly, more = (shapes.loss(shapes.first + np.array([0.0, down, 0.0, 0.0])) for down in (0.0, 0.1))
     assert 0.0 < slightly < more < search.NO_HOVER
-    assert shapes.loss(np.where([True, False, True, True], search.HIGH, search.LOW)) == search.NO_HOVER
+    assert shapes.loss(np.where([True, False, True, True], HIGH, LOW)) == search.NO_HOVER
     assert not shapes.tried
 
 
-@SEARCHED
+@SHARED_SEARCH
 @pytest.mark.long
 def test_the_optimum_keeps_span_mass_speed_and_is_stable_and_steers_around_its_hover() -> None:
     found = small_search("least-authority", 1)
@@ -160,7 +161,7 @@ def test_the_optimum_keeps_span_mass_speed_and_is_stable_and_steers_around_its_h
     assert found.best.authority == max(one.authority for one in found.tried)
 
 
-@SEARCHED
+@SHARED_SEARCH
 @pytest.mark.long
 def test_the_front_is_what_nothing_beats_in_both() -> None:
     found = small_search("least-authority", 1)
@@ -172,6 +173,43 @@ def test_the_front_is_what_nothing_beats_in_both() -> None:
         assert ((front[:, 0] >= stable) & (front[:, 1] >= figure)).any()
     for stable, figure in front:
         assert not ((places[:, 0] > stable) & (places[:, 1] > figure)).any()
+
+
+@pytest.mark.parametrize("base", [0.15, 0.30, 0.45])
+def test_a_smaller_base_plate_turns_more_easily_as_its_flaps_reach_further_inwards(base: float) -> None:
+    """The flaps are a square with a square hole, of inertia M (S^2 + b^2) / 6; Floaty's own shape has its own inertia."""
+    geometry = PAPER.geometry
+    flaps, span, (box, *_) = 4 * geometry.flap_mass, geometry.footprint, geometry.masses
+
+    def budget(base_side: float) -> float:
+        return (
+            flaps * (span**2 + base_side**2) / 6.0 + box.mass * (box.size[0] ** 2 + box.size[1] ** 2) / 12.0
+        )
+
+    shapes = search.Shapes(PAPER, "least-authority")
+    own = shapes.build(shapes.first)
+    found = shapes.build(np.array([*shapes.first[:2], base, shapes.first[3]]))
+    assert own is not None
+    assert weigh(own.geometry).inertia == pytest.approx(weigh(geometry).inertia, rel=1e-9)
+    assert found is not None
+    expected = weigh(geometry).inertia[2] * budget(base * span) / budget(geometry.base_side)
+    assert weigh(found.geometry).inertia[2] == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("number", range(len(SEARCHED)), ids=[one.name for one in SEARCHED])
+def test_every_number_of_a_shape_at_a_bound_of_the_search_is_named(number: int) -> None:
+    """With the reason; a shape inside of all bounds has no line."""
+    geometry = PAPER.geometry
+    assert at_bounds(geometry) == []
+    span = geometry.footprint
+    for x, end in ((LOW[number], "lower"), (HIGH[number], "upper")):
+        kink, height, base, strip = np.where(np.arange(4) == number, x, shape_of(geometry)).tolist()
+        shape = balanced(
+            geometry, height * span, kink_angle=kink, base_side=base * span, strip_width=strip * span
+        )
+        (line,) = at_bounds(shape)
+        assert line.startswith(f"{SEARCHED[number].name} = ")
+        assert f"at the {end} bound of the search (" in line
 
 
 def test_lighter_or_wider_robots_hold_slower_air_in_the_same_proportion() -> None:
@@ -205,6 +243,7 @@ def test_command_writes_the_pareto_picture_and_a_profile_that_flies(cli: Cli, tm
     assert cli("design", *arguments, "--write", str(profile)) == 0
     assert (tmp_path / "pareto-least-authority.png").read_bytes().startswith(b"\x89PNG")
     assert "1.375 are needed" in cli.out
+    assert "base = 0.15 of the footprint: at the lower bound of the search (it carries" in cli.out
     request = Request.of(EXPERIMENTS["hover"], profile=str(profile), duration_s=4.0)
     result = fly(request, tmp_path / "flight")
     assert result.metrics["lost"] == 0.0

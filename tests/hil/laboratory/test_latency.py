@@ -59,12 +59,12 @@ def test_the_line_marks_assumptions_and_omits_unknown_stages() -> None:
     assert all(map(math.isnan, budget.last()))
     budget.add(MocapFrame(0, HOME, UPRIGHT, True), 38_200, ASSUMED)
     assert str(budget) == (
-        "pose 39.6 ms old on board (99 %: 39.6): mocap 38.2 + station 0.0 + radio (assumed) 1.4"
+        "pose 39.6 ms old on arrival (99 %: 39.6): mocap 38.2 + station 0.0 + radio (assumed) 1.4"
     )
     budget = LatencyBudget()
     budget.add(frame(0, 20_000, 18_000, 300), 38_500, LinkLatency("serial", 2100, measured=True))
     assert str(budget) == (
-        "pose 40.6 ms old on board (99 %: 40.6): camera 20.0 + processing 18.0 + network 0.3 + station 0.2 + serial 2.1"
+        "pose 40.6 ms old on arrival (99 %: 40.6): camera 20.0 + processing 18.0 + network 0.3 + station 0.2 + serial 2.1"
     )
 
 

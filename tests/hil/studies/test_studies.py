@@ -84,6 +84,7 @@ def test_a_model_error_scales_the_constants_of_its_part_and_no_other() -> None:
 def test_outcomes_are_distinguished(settings: tuple[str, ...], fault: str, outcome: str) -> None:
     result = flight(settings, fault, 2.0)
     assert outcome_of(result) == outcome, result.metrics
+    assert outcome != "lost" or result.failed == ["lost"], "a loss leaves the other limits unjudged"
 
 
 def test_an_error_is_not_an_outcome_of_the_robot() -> None:

@@ -144,7 +144,13 @@ static void hand_pose_to_core(const FloatyPose *pose) {
   floaty_input.pose_age_us = pose->age_us;
   floaty_input.pose_waited_us = (int32_t)((uint32_t)floaty_pose_clock_us() - (uint32_t)pose->arrival_us);
   floaty_input.now_us = floaty_loop_us();
-  call_file_pose();
+  const int32_t answer = call_file_pose();
+  if (answer == FLOATY_POSE_NO_CORRECTION) {
+    memcpy(floaty_observed.no_correction, pose->position, sizeof floaty_observed.no_correction);
+  } else if (answer == FLOATY_POSE_TOO_OLD && floaty_input.pose_age_us > FLOATY_HORIZON_LIMIT * FLOATY_TICK_US) {
+    floaty_observed.too_old_us = floaty_input.pose_age_us;
+    floaty_observed.too_old += 1;
+  }
 }
 
 void floaty_gyro(int32_t counts[3]) {

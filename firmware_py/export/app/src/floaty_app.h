@@ -22,6 +22,9 @@ typedef struct {
   uint32_t malformed;        /* malformed packets on the pose channels */
   uint32_t overflows;        /* poses dropped from a full queue for a newer one */
   uint32_t stale_hovers;     /* times without control, after which the servos were set to hover */
+  int32_t too_old;           /* poses older than every horizon */
+  int32_t too_old_us;        /* age of the last of them */
+  float no_correction[3];    /* [m] place of the last pose that was too far from the goal for a correction */
 } FloatyObserved;
 
 extern FloatyParameters floaty_parameters;

@@ -137,16 +137,41 @@ static void announce_setpoint(void) {
   refused = why;
 }
 
-static void announce_poses(void) {
-  static TickType_t announced;
-  static int32_t refused;
+typedef struct {
+  TickType_t announced;
+  int32_t refused;
+} PoseLine;
+
+static bool line_is_due(PoseLine *line, int32_t refused) {
   const TickType_t now = xTaskGetTickCount();
-  const int32_t count = floaty_estimator.no_corrections;
-  if (count != refused && (announced == 0 || now - announced >= M2T(POSE_LINE_MS))) {
-    DEBUG_PRINT("pose refused: no correction is that large; for absolute poses set extPose.absolute 1\n");
-    announced = now;
+  const bool due = refused != line->refused && (line->announced == 0 || now - line->announced >= M2T(POSE_LINE_MS));
+  line->refused = refused;
+  if (due) {
+    line->announced = now;
   }
-  refused = count;
+  return due;
+}
+
+/* Return a length [m] to print with two digits, a little away from zero: DEBUG_PRINT cuts further digits off. */
+static double to_centimetre(float length) {
+  return (double)((roundf(100.0f * length) + copysignf(0.1f, length)) / 100.0f);
+}
+
+/* The lines are those of the firmware in Python: firmware_py/firmware.py. */
+static void announce_poses(void) {
+  static PoseLine no_corrections, too_old, gated;
+  const float *p = floaty_observed.no_correction;
+  if (line_is_due(&no_corrections, floaty_estimator.no_corrections)) {
+    DEBUG_PRINT("pose refused: %.2f %.2f %.2f m is no correction; for absolute poses set extPose.absolute 1\n",
+                to_centimetre(p[0]), to_centimetre(p[1]), to_centimetre(p[2]));
+  }
+  if (line_is_due(&too_old, floaty_observed.too_old)) {
+    DEBUG_PRINT("poses %d ms old: at most %d ms\n", (int)((floaty_observed.too_old_us + 500) / 1000),
+                FLOATY_HORIZON_LIMIT * FLOATY_TICK_US / 1000);
+  }
+  if (line_is_due(&gated, floaty_estimator.refused)) {
+    DEBUG_PRINT("pose refused: it is too far from the estimate\n");
+  }
 }
 
 /* Detect a stopped loop, or a controller that is not Floaty's, which no other task would. */

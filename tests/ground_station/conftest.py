@@ -1,0 +1,17 @@
+"""Fixtures of the ground station's tests."""
+
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from ground_station.stops import STOPS
+
+
+@pytest.fixture
+def own_signal_handlers() -> Iterator[None]:
+    """Keep the test runner's own signal handlers."""
+    kept = {number: signal.getsignal(number) for number in STOPS}
+    yield
+    for number, handler in kept.items():
+        signal.signal(number, handler)
