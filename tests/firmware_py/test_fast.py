@@ -115,7 +115,9 @@ def test_compiled_flights_have_the_same_hashes_until_a_source_changes(tmp_path: 
         )
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     tool = tmp_path / "tools" / "fast.py"
-    tool.write_text(tool.read_text().replace('opt_level="2"', 'opt_level="0"'))  # three times as fast to compile
+    tool.write_text(
+        tool.read_text().replace('opt_level="2"', 'opt_level="0"')
+    )  # three times as fast to compile
 
     def run(*arguments: str, **environment: str) -> tuple[str, str]:
         variables = {name: value for name, value in os.environ.items() if name != SWITCH}

@@ -119,11 +119,11 @@ def small_search(figure: str, seed: int) -> search.Optimum:
 
 @SHARED_SEARCH
 @pytest.mark.long
-def test_a_short_search_ends_at_the_robot_that_a_long_one_with_another_seed_found() -> None:
-    found = small_search("least-authority", 1).best
-    assert found.authority == pytest.approx(1.012, rel=0.002)
-    shipped = point_of("design-best").geometry.kink_angle
-    assert math.degrees(found.point.geometry.kink_angle) == pytest.approx(math.degrees(shipped), abs=0.5)
+def test_searches_from_other_seeds_end_at_the_same_robot() -> None:
+    one, other = (small_search("least-authority", seed).best for seed in (1, 11))
+    assert other.authority == pytest.approx(one.authority, rel=0.002)
+    kinks = [math.degrees(found.point.geometry.kink_angle) for found in (one, other)]
+    assert kinks[0] == pytest.approx(kinks[1], abs=0.5)
 
 
 @pytest.mark.parametrize("name", DESIGNS)
