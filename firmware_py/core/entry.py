@@ -61,6 +61,7 @@ def estimate(
     report: Report,
 ) -> None:
     """Run one tick of the estimator."""
+        data.pose_relocated = i32(0)
     _estimate(parameters, data, estimator, control)
     _clear_samples(data, sampling)
     _report_state(data, estimator, control, report)
