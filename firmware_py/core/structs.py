@@ -278,6 +278,7 @@ class Estimator(Struct):
     horizon: Annotated[i32, Logged("10 ms", "delayComp.horizon", type="U8")]
     pose_age_us: i32  # of the last pose that was accepted for fusion, at its tick
     no_corrections: i32  # of the invalid poses, those too far from the goal
+    frozen: Annotated[i32, Logged("", "kalman.frozen", type="U32")]  # likewise, those that repeat the last one
     # work space, no meaning between ticks
     work_1: Annotated[F32s, 16]
     work_2: Annotated[F32s, 16]
@@ -304,7 +305,7 @@ class Control(Struct):
 
 
 class Sampling(Struct):
-    """The state of the 1 kHz step: its number, the gyro's monitoring, and the search for its zero."""
+    """The state of the 1 kHz step: its number, the gyro's monitoring, the search for its zero, and repeated poses."""
 
     tick: i32  # [ms] of the last step
     phase: i32  # its number, modulo the steps of a tick
@@ -320,6 +321,10 @@ class Sampling(Struct):
     variance: Annotated[F32s, 3, Logged("counts^2", stock="gyro.xVariance yVariance zVariance")]
     windows_refused: i32  # because the robot moved
     calibrated: Annotated[i32, Logged("", "floaty.calibrated", type="U8")]  # the zero is known
+    last_position: Annotated[F32s, 3]  # of the last valid pose, as it arrived
+    last_quaternion: Annotated[F32s, 4]
+    turn: Annotated[F32s, 3]  # [rad] that the gyro has measured since that pose first arrived, sensor frame
+    turned_ticks: i32  # since that turn was too large for the same pose; 0: it is not
 
 
 class Supervisor(Struct):

@@ -137,16 +137,29 @@ static void announce_setpoint(void) {
   refused = why;
 }
 
-static void announce_poses(void) {
-  static TickType_t announced;
-  static int32_t refused;
+typedef struct {
+  TickType_t announced;
+  int32_t refused;
+} PoseLine;
+
+static bool line_is_due(PoseLine *line, int32_t refused) {
   const TickType_t now = xTaskGetTickCount();
-  const int32_t count = floaty_estimator.no_corrections;
-  if (count != refused && (announced == 0 || now - announced >= M2T(POSE_LINE_MS))) {
-    DEBUG_PRINT("pose refused: no correction is that large; for absolute poses set extPose.absolute 1\n");
-    announced = now;
+  const bool due = refused != line->refused && (line->announced == 0 || now - line->announced >= M2T(POSE_LINE_MS));
+  line->refused = refused;
+  if (due) {
+    line->announced = now;
   }
-  refused = count;
+  return due;
+}
+
+static void announce_poses(void) {
+  static PoseLine no_corrections, frozen;
+  if (line_is_due(&no_corrections, floaty_estimator.no_corrections)) {
+    DEBUG_PRINT("pose refused: no correction is that large; for absolute poses set extPose.absolute 1\n");
+  }
+  if (line_is_due(&frozen, floaty_estimator.frozen)) {
+    DEBUG_PRINT("poses frozen: they stay the same although the robot turns\n");
+  }
 }
 
 /* Detect a stopped loop, or a controller that is not Floaty's, which no other task would. */
