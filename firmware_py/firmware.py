@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from firmware_py.board import Board
 from firmware_py.config import FirmwareConfig, MavlinkConfig, parameters_of
-from firmware_py.core.structs import HORIZON_LIMIT, POSE_NO_CORRECTION, POSE_TOO_OLD, TICK_US
+from firmware_py.core.structs import HORIZON_LIMIT, POSE_FROZEN, POSE_NO_CORRECTION, POSE_TOO_OLD, TICK_US
 from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks, CoreCosts, PythonRunner, RunnerFactory, costs_of
 from firmware_py.drivers.imu import acceleration, rates
@@ -236,10 +236,13 @@ class Firmware:
     def _pose_refused(self, answer: int, pose: Correction) -> None:
         """Report a refused pose; one that is late only for the present horizon is not worth a line."""
         if answer == POSE_NO_CORRECTION:
-            place = "{:.2f} {:.2f} {:.2f}".format(*pose.p_GB)
+            place = " ".join(str(round(100.0 * x)) for x in pose.p_GB)
             self._notices.refuse(
-                "pose", f"pose refused: {place} m is no correction; for absolute poses set extPose.absolute 1"
+                "pose",
+                f"pose refused: {place} cm is no correction; for absolute poses set extPose.absolute 1",
             )
+        elif answer == POSE_FROZEN:
+            self._notices.refuse("frozen", "poses frozen: they stay the same although the robot turns")
         elif answer == POSE_TOO_OLD and (age_us := self._core.data.fields.pose_age_us) > OLDEST_POSE_US:
             self._notices.refuse(
                 "age", f"poses {age_us / 1000:.0f} ms old: at most {OLDEST_POSE_US / 1000:.0f} ms"

@@ -5,6 +5,8 @@ from typing import Protocol
 
 from ground_station.unused import Reason, Unused, flaw
 
+FROZEN_FRAMES = 3  # with exactly the same pose: the system repeats the last one
+
 
 @dataclass(slots=True)
 class MocapFrame:

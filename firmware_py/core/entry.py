@@ -1,7 +1,9 @@
 """The firmware's calls into the core: the public names. What they are made of has names that begin with `_`."""
 
-from firmware_py.core import controller, goal, poses, predictor, sampling, servo, supervisor
+from firmware_py.core import controller, goal, poses, predictor, repetition, sampling, servo, supervisor
 from firmware_py.core.structs import (
+    POSE_FROZEN,
+    POSE_INVALID,
     POSE_ON_TIME,
     Control,
     Estimator,
@@ -22,8 +24,12 @@ admits = goal.admits
 follow = goal.follow
 watch_control = supervisor.watch_control
 
+_valid_pose = goal.valid_pose
 _see_from_goal = goal.see_from_goal
 _age_at_tick = poses.age_at_tick
+_compare = repetition.compare
+_frozen = repetition.frozen
+_add_turn = repetition.add_turn
 _file_pose = predictor.pose_into_history
 _note_pose = supervisor.note_pose
 _estimate = predictor.estimate
@@ -41,12 +47,21 @@ def file_pose(
     parameters: Parameters, data: Input, estimator: Estimator, sampling: Sampling, supervisor: Supervisor
 ) -> i32:
     """Turn the input's pose into the goal frame and file it under the instant when it was measured."""
+    if not _valid_pose(data):
+        estimator.invalid = i32(estimator.invalid + 1)
+        return i32(POSE_INVALID)
+    _age_at_tick(data, sampling)
+    _compare(data, sampling)
+    if _frozen(data, sampling):
+        estimator.invalid = i32(estimator.invalid + 1)
+        estimator.frozen = i32(estimator.frozen + 1)
+        return i32(POSE_FROZEN)
     seen = _see_from_goal(data, estimator)
     if seen != POSE_ON_TIME:
         return seen
-    _age_at_tick(data, sampling)
     answer = _file_pose(parameters, data, estimator)
     if answer == POSE_ON_TIME:
+        data.pose_relocated = i32(0)
         _note_pose(data, supervisor)
     return answer
 
@@ -62,6 +77,7 @@ def estimate(
 ) -> None:
     """Run one tick of the estimator."""
     _estimate(parameters, data, estimator, control)
+    _add_turn(parameters, data, sampling)
     _clear_samples(data, sampling)
     _report_state(data, estimator, control, report)
 

@@ -12,7 +12,6 @@ from firmware_py.core.structs import (
     GOAL_ABSOLUTE,
     GOAL_NONE,
     GOAL_OF_CORRECTIONS,
-    POSE_INVALID,
     POSE_NO_CORRECTION,
     POSE_ON_TIME,
     POSITION,
@@ -160,10 +159,7 @@ def turn_into_goal_frame(data: Input) -> None:
 
 @kernel
 def see_from_goal(data: Input, estimator: Estimator) -> i32:
-    """Turn the pose into the error to the goal; return POSE_ON_TIME, or why it is refused."""
-    if not valid_pose(data):
-        estimator.invalid = i32(estimator.invalid + 1)
-        return i32(POSE_INVALID)
+    """Turn a valid pose into the error to the goal; return POSE_ON_TIME, or why it is refused."""
     if data.poses_absolute == 0:
         if not is_correction(data):
             estimator.invalid = i32(estimator.invalid + 1)

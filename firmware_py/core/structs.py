@@ -57,6 +57,11 @@ POSE_ON_TIME = 0
 POSE_TOO_OLD = 1
 POSE_INVALID = 2
 POSE_NO_CORRECTION = 3  # too far from the goal
+POSE_FROZEN = 4  # repeats the last one, although the robot has turned
+
+WAITING_NONE = 0
+WAITING_TO_FUSE = 1
+WAITING_TO_JUMP = 2  # the state becomes that pose, without the gate
 
 GOAL_NONE = 0
 GOAL_OF_CORRECTIONS = 1  # in the frame of the corrections
@@ -207,6 +212,7 @@ class Input(Struct):
     pose_position: Annotated[F32s, 3]  # [m] of B; in G once it is filed
     pose_quaternion: Annotated[F32s, 4]  # likewise, w x y z
     pose_age_us: i32  # at its arrival, then at the next tick; negative: unknown
+    pose_relocated: i32  # 1 until a pose is filed: its sender has moved the frame, so the state jumps to the pose
     battery_mv: i32
     connected: i32  # a client is connected
     goal_kind: i32  # GOAL_...
@@ -255,7 +261,7 @@ class Estimator(Struct):
     command: Annotated[F32s, 32, 4]  # [rad] commanded deviation from hover that held from this tick on
     pose: Annotated[F32s, 32, 6]  # position [m] and attitude [rad] in G
     pose_lag: Annotated[F32s, 32]  # [s] the pose was measured this long before its tick
-    pose_waiting: Annotated[I32s, 32]
+    pose_waiting: Annotated[I32s, 32]  # WAITING_...
     # a refused pose, kept to distinguish a jump of the goal from an outlier
     suspect: Annotated[F32s, 6]
     suspect_tick: i32
@@ -272,6 +278,7 @@ class Estimator(Struct):
     horizon: Annotated[i32, Logged("10 ms", "delayComp.horizon", type="U8")]
     pose_age_us: i32  # of the last pose that was accepted for fusion, at its tick
     no_corrections: i32  # of the invalid poses, those too far from the goal
+    frozen: Annotated[i32, Logged("", "kalman.frozen", type="U32")]  # likewise, those that repeat the last one
     # work space, no meaning between ticks
     work_1: Annotated[F32s, 16]
     work_2: Annotated[F32s, 16]
@@ -298,7 +305,7 @@ class Control(Struct):
 
 
 class Sampling(Struct):
-    """The state of the 1 kHz step: its number, the gyro's monitoring, and the search for its zero."""
+    """The state of the 1 kHz step: its number, the gyro's monitoring, the search for its zero, and repeated poses."""
 
     tick: i32  # [ms] of the last step
     phase: i32  # its number, modulo the steps of a tick
@@ -314,6 +321,10 @@ class Sampling(Struct):
     variance: Annotated[F32s, 3, Logged("counts^2", stock="gyro.xVariance yVariance zVariance")]
     windows_refused: i32  # because the robot moved
     calibrated: Annotated[i32, Logged("", "floaty.calibrated", type="U8")]  # the zero is known
+    last_position: Annotated[F32s, 3]  # of the last valid pose, as it arrived
+    last_quaternion: Annotated[F32s, 4]
+    turn: Annotated[F32s, 3]  # [rad] that the gyro has measured since that pose first arrived, sensor frame
+    turned_ticks: i32  # since that turn was too large for the same pose; 0: it is not
 
 
 class Supervisor(Struct):

@@ -111,6 +111,7 @@ class PoseService:
         self._measurements = measurements
         self._partner: tuple[int, int] | None = None
         self._clock = RemoteClock()
+        self._frames: dict[str, int] = {}  # of the partner, by the kind of its poses
         self._posed_us: dict[tuple[int, int], int] = {}  # the last poses of senders
         for name in mavlink.POSES:
             stack.handle(name, self._take_pose)
@@ -126,7 +127,7 @@ class PoseService:
         goal = self._setpoints.note_pose()
         self.age_us = self._age_us(now_us, pose.t_us)
         correction = Correction(pose.p_WB, pose.q_WB, self.age_us)
-        self._measurements.send_nowait((now_us, correction, True, goal))
+        self._measurements.send_nowait((now_us, correction, True, goal, self._is_relocated(message, pose)))
 
     def _note_sender(self, message: Message, now_us: int) -> None:
         """Report poses of two senders in turn: the partner changes with each, and no clock becomes known."""
@@ -137,6 +138,13 @@ class PoseService:
             senders = " and ".join(f"{system}/{component}" for system, component in sorted(recent))
             self._stack.notice(message, f"poses of {senders} in turn: their age stays unknown")
         self._posed_us = {**recent, sender: now_us}
+
+    def _is_relocated(self, message: Message, pose: mavlink.Pose) -> bool:
+        """Return whether the partner has moved the frame of its poses since its last one of this kind."""
+        kind = message.get_type()
+        last = self._frames.get(kind, pose.frame)
+        self._frames[kind] = pose.frame
+        return pose.frame != last
 
     def _age_us(self, now_us: int, t_us: int) -> int | None:
         """Return how long ago the sender's clock showed `t_us`; None when unknown."""
@@ -153,7 +161,7 @@ class PoseService:
     def _make_partner(self, message: Message) -> None:
         """Make the sender of the message the partner."""
         if (sender := sender_of(message)) != self._partner:
-            self._partner, self._clock = sender, RemoteClock()
+            self._partner, self._clock, self._frames = sender, RemoteClock(), {}
 
     def _take_timesync(self, message: Message) -> None:
         """Answer a request; use an answer of the partner."""

@@ -86,6 +86,7 @@ class Pose:
     t_us: int
     p_WB: Vector  # [m]
     q_WB: Quaternion  # w x y z, length 0.9..1.1
+    frame: int = 0  # another number: the sender has moved the frame, as after a relocalisation
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +131,7 @@ def read_pose(message: Message) -> Pose:
     _check_covariance(covariance)
     p_WB, q_WB = turn((message.x, message.y, message.z)), turn_quaternion(q)
     check_pose(p_WB, q_WB)
-    return Pose(t_us, p_WB, q_WB)
+    return Pose(t_us, p_WB, q_WB, getattr(message, "reset_counter", 0))
 
 
 def _check_odometry(message: Message) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from firmware_py.geometry import Quaternion, Vector
 from ground_station.errors import MocapError
-from ground_station.mocap import MocapFrame
+from ground_station.mocap import FROZEN_FRAMES, MocapFrame
 from ground_station.sources import natnet
 from ground_station.sources.alignment import Alignment, choose_body
 from ground_station.sources.natnet_reader import Version
@@ -58,7 +58,6 @@ class ServerClock:
 
 
 LATE_FRAMES = 100  # an older number is from a server that has restarted
-FROZEN_FRAMES = 3  # with exactly the same pose: the server repeats the last one
 # So many in sequence mean that the server's clock was set; a socket's backlog is shorter.
 MISTIMED_FRAMES = 1000
 OLDEST_US = 1_000_000  # an older exposure is useless, or its time stamp is wrong

@@ -10,11 +10,14 @@ from dataclasses import replace
 import numpy as np
 
 from firmware_py.geometry import IDENTITY, Quaternion, Vector, multiply, rotate
-from ground_station.mocap import MocapFrame
+from ground_station.mocap import FROZEN_FRAMES, MocapFrame
+from ground_station.unused import Reason
 from hil.devices.config import MocapConfig
 from hil.devices.markers import Sighting, VirtualMarkers
 from hil.world.body import Motion
 from hil.world.fixed_order import normal
+
+Pose = tuple[Vector, Quaternion]
 
 NOISE_ROWS = 512  # frames of noise drawn at once
 
@@ -28,7 +31,8 @@ class VirtualMocap:
 
     `dropout`, `outlier` (0..1) share of frames; `wrong_by` [m] error of every position, in random directions;
     `swapped_by` [m] swapped markers turn poses by 180 degrees about z of B and shift them along its x; 0: none;
-    `more_latency_us` is added to the configured one. `sighting` is the last exposure's view of the markers, None without
+    `more_latency_us` is added to the configured one; `frozen`: every frame has the last pose, which counts as frozen
+    when it has been repeated as often as from OptiTrack. `sighting` is the last exposure's view of the markers, None without
     markers.
     """
 
@@ -47,6 +51,9 @@ class VirtualMocap:
         self.wrong_by = 0.0
         self.swapped_by = 0.0
         self.more_latency_us = 0.0
+        self.frozen = 0.0
+        self._repeated = 0  # frames
+        self._kept: tuple[Pose | None, Sighting | None] = None, None  # of the last frame
         self.markers = markers
         self.sighting: Sighting | None = None
         self._arrival_us = 0  # of the last frame
@@ -59,15 +66,23 @@ class VirtualMocap:
         latency_us = self._config.latency_us + round(self.more_latency_us)
         self._arrival_us = arrival_us = max(self._arrival_us, now_us + latency_us)
         pose = self._pose(body)
+        if self.frozen > 0.0:
+            self._repeated += 1
+            pose, self.sighting = self._kept
+        else:
+            self._repeated = 0
+            self._kept = pose, self.sighting
         p_WB, q_WB = pose or (NOWHERE, IDENTITY)
         received_us = now_us + self._camera_us
         frame = MocapFrame(now_us, p_WB, q_WB, pose is not None, received_us, arrival_us)
+        if pose is not None and self._repeated >= FROZEN_FRAMES:
+            frame.valid, frame.unused = False, (Reason.FROZEN, ())
         return frame, arrival_us
 
-    def _pose(self, body: Motion) -> tuple[Vector, Quaternion] | None:
+    def _pose(self, body: Motion) -> Pose | None:
         """Return the pose with its errors, None when the body is not tracked."""
         if self.markers is None:
-            pose: tuple[Vector, Quaternion] | None = self._noisy_pose(body)
+            pose: Pose | None = self._noisy_pose(body)
         else:
             self.sighting = self.markers.look(body.p_WB, body.q_WB)
             pose = self.sighting.pose
@@ -88,7 +103,7 @@ class VirtualMocap:
             q_WB = multiply(q_WB, HALF_TURN)
         return p_WB, q_WB
 
-    def _noisy_pose(self, body: Motion) -> tuple[Vector, Quaternion]:
+    def _noisy_pose(self, body: Motion) -> Pose:
         if not self._draws:
             self._draws = normal(self._rng, (NOISE_ROWS, 6)).tolist()
         x, y, z, a, b, c = self._draws.pop()

@@ -232,6 +232,10 @@ KINDS: dict[str, Kind] = {
         "markers swapped: every pose is turned by 180 deg about z and shifted by this along x of B", "m", 0.1, 0.001, 1.0,
         (_mocap("swapped_by", max),), "holds", duration_s=GLIMPSE_S,
     ),
+    "mocap.freeze": Kind(
+        "every frame repeats the last pose, with a new time stamp", "", 1.0, 1.0, 1.0,
+        (_mocap("frozen", max),), "holds", duration_s=GLIMPSE_S,
+    ),
     "mocap.latency": Kind(
         "the cameras' computer needs this much longer", "ms", 40.0, 0.0, 500.0,
         (_mocap("more_latency_us", add),), "holds", MS,

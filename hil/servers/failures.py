@@ -36,6 +36,7 @@ TABLE: dict[Unit, KindsByFailing] = {
     Unit.ACCELEROMETER: _IMU,
     Unit.POSES: {
         Failing.OFF: ("mocap.dropout",),
+        Failing.STUCK: ("mocap.freeze",),
         Failing.GARBAGE: ("mocap.outlier",),
         Failing.WRONG: ("mocap.swap",),
         Failing.DELAYED: ("mocap.latency",),

@@ -33,6 +33,7 @@ from ground_station.sources.natnet import (
     packet,
 )
 from ground_station.sources.natnet_reader import Version
+from ground_station.unused import Reason
 from hil.clock import Readers
 from hil.devices.markers import DIAMETER, NO_POINTS, Sighting
 from hil.errors import LabError
@@ -217,10 +218,11 @@ class VirtualMotive:
         )
         p, q = in_axes(self._up, frame.p_WB, frame.q_WB)
         error = 0.0 if sighting is None else sighting.error
-        self._seen[body] = BodyPose(body, p, q, error, frame.valid)
+        tracked = frame.valid or frame.unused[0] is Reason.FROZEN  # clients find out by themselves
+        self._seen[body] = BodyPose(body, p, q, error, tracked)
         if sighting is not None:
             self._unlabelled += self._all_turned(sighting.unlabelled)
-            self._labelled += self._labels(body, sighting) if frame.valid else ()
+            self._labelled += self._labels(body, sighting) if tracked else ()
         if self._awaited <= self._seen.keys():
             self._stream(sent)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from ground_station.mocap import MocapFrame
+from ground_station.unused import Reason
 from hil.devices.markers import NO_POINTS, Sighting
 from hil.floaty.drawing import marker_places
 from hil.servers.dongle_server import Readers
@@ -54,10 +55,10 @@ class MotiveBench:
         self.number = 0
         self.markers = markers
 
-    def expose(self, valid: bool = True) -> None:
+    def expose(self, valid: bool = True, reason: Reason = Reason.NOT_TRACKED) -> None:
         self.number += 1
         frame = seen(self.number)
-        shown = MocapFrame(7_000_000, frame.p_WB, frame.q_WB, valid)
+        shown = MocapFrame(7_000_000, frame.p_WB, frame.q_WB, valid, unused=(reason, ()))
         sighting = sighted(self.number, valid) if self.markers else None
         self.motive.take(1, shown, 7_000_000 + LATENCY_US, sighting)
 

@@ -202,8 +202,8 @@ def test_an_impossible_correction_only_reports(relative: Flyer, place: tuple[flo
     assert relative.estimate() == pytest.approx(before, abs=1e-3)
     lines = [line for line in relative.console if "extPose.absolute" in line]
     assert lines == [
-        "pose refused: {:.2f} {:.2f} {:.2f} m is no correction; for absolute poses set extPose.absolute 1".format(
-            *place
+        "pose refused: {} {} {} cm is no correction; for absolute poses set extPose.absolute 1".format(
+            *(round(100 * x) for x in place)
         )
     ]
     assert relative.firmware.signals.counters[COUNTERS.index("invalid")] >= 14

@@ -11,6 +11,7 @@ import pymavlink.dialects.v20.development as dialect
 import pytest
 from scipy.spatial.transform import Rotation
 
+from firmware_py.signals import COUNTERS
 from firmware_py.wire import telemetry
 from firmware_py.wire.mavlink import POSES
 from firmware_py.wire.mavlink_dialect import NUMBERS
@@ -192,6 +193,47 @@ def test_two_senders_of_poses_in_turn_are_named_and_one_that_takes_over_is_not(
         client.events.at(at_us, pose)
     client.run(1_600_000)
     assert [text for text in client.texts() if "in turn" in text] == said
+
+
+VISION = "vision_position_estimate", "global_vision_position_estimate"
+
+
+@pytest.mark.parametrize("kind", [*VISION, "odometry"])
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_counted_reset_of_the_sender_moves_the_estimate_at_once(kind: str, moved: bool) -> None:
+    client, unknown = MavlinkClient(), [math.nan] + [0.0] * 20
+
+    def pose(now_us: int) -> None:
+        late = now_us >= 1_500_000
+        x, resets = (0.3, 255 if late and moved else 0) if late else (0.0, 0)
+        if kind in VISION:
+            client.send(kind, now_us, x, 0.0, -1.15, 0.0, 0.0, 0.0, unknown, 7 if not late else resets or 7)
+            return
+        frames = dialect.MAV_FRAME_LOCAL_NED, dialect.MAV_FRAME_BODY_FRD
+        client.send(kind, now_us, *frames, x, 0.0, -1.15, LEVEL, *(0.0,) * 6, unknown, unknown, resets)
+
+    for at_us in range(GYRO_ZERO_US, 2_000_000, 20_000):
+        client.events.at(at_us, pose)
+    client.run(2_000_000)
+    counters = dict(zip(COUNTERS, client.firmware.signals.counters.tolist(), strict=True))
+    assert (counters["refused"], counters["jumps"]) == ((0, 1) if moved else (1, 1))
+    assert client.firmware.signals.estimate[0] == pytest.approx(0.3, abs=0.02)
+
+
+def test_another_sender_is_no_relocalisation() -> None:
+    client, other = MavlinkClient(), codec(7, 8)
+
+    def pose(now_us: int) -> None:
+        sender, resets = (client.codec, 3) if now_us < 1_000_000 else (other, 4)
+        message = sender.vision_position_estimate_encode(
+            now_us, 0.0, 0.0, -1.15, 0.0, 0.0, 0.0, [math.nan] + [0.0] * 20, resets
+        )
+        client.receive(message.pack(sender))
+
+    for at_us in range(GYRO_ZERO_US, 1_500_000, 20_000):
+        client.events.at(at_us, pose)
+    client.run(1_600_000)
+    assert dict(zip(COUNTERS, client.firmware.signals.counters.tolist(), strict=True))["jumps"] == 0
 
 
 def test_only_the_clock_of_the_sender_of_poses_counts() -> None:

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ground_station.mocap import MocapFrame
+from ground_station.unused import Reason
 from hil.devices.cameras import VirtualMocap
 from hil.devices.config import MocapConfig
 from hil.floaty.plant import Plant
@@ -85,6 +86,31 @@ def test_swapped_markers_turn_the_pose_about_its_own_z_and_shift_it_along_its_x(
     between = (q_WB.inv() * q_WS).as_rotvec()
     assert np.abs(between) == pytest.approx([0, 0, math.pi], abs=1e-7)
     assert q_WB.inv().apply(np.subtract(wrong.p_WB, right.p_WB)) == pytest.approx([0.1, 0, 0], abs=1e-9)
+
+
+def test_frozen_frames_repeat_the_last_pose_with_new_stamps_until_it_thaws_to_the_frames_of_always() -> None:
+    plant = make_plant()
+    plain, mocap = (VirtualMocap(MocapConfig(), np.random.default_rng(1)) for _ in range(2))
+    expected = [plain.expose(5000 * i, plant)[0] for i in range(20)]
+    seen = []
+    for i in range(20):
+        mocap.frozen = float(5 <= i < 15)
+        seen.append(mocap.expose(5000 * i, plant)[0])
+    assert seen[:5] + seen[15:] == expected[:5] + expected[15:]
+    assert {(frame.p_WB, frame.q_WB) for frame in seen[4:15]} == {(seen[4].p_WB, seen[4].q_WB)}
+    assert [frame.t_us for frame in seen] == [5000 * i for i in range(20)]
+    # As a station judges OptiTrack's.
+    assert [frame.valid for frame in seen[5:15]] == [True] * 2 + [False] * 8
+    assert {frame.unused[0] for frame in seen[7:15]} == {Reason.FROZEN}
+
+
+def test_a_system_that_freezes_without_the_body_does_not_see_it() -> None:
+    plant, mocap = make_plant(), VirtualMocap(MocapConfig(dropout=1.0), np.random.default_rng(1))
+    mocap.expose(0, plant)
+    mocap.dropout, mocap.frozen = 0.0, 1.0
+    for i in range(1, 6):
+        frame, _ = mocap.expose(5000 * i, plant)
+        assert (frame.valid, frame.unused[0]) == (False, Reason.NOT_TRACKED)
 
 
 def test_frames_arrive_later_and_never_out_of_order() -> None:

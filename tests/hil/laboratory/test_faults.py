@@ -246,6 +246,7 @@ SIGNS = [
     Sign("mocap.dropout", _grown("link.up_sent"), (0, 0), (38, 41)),
     Sign("mocap.outlier", _grown("tracker.refused"), (28, 28), (0, 0), (0.1, 0.25)),
     Sign("mocap.swap", _grown("tracker.refused"), (28, 28), (0, 0), (0.15, 0.3)),
+    Sign("mocap.freeze", _grown("link.up_sent"), (0, 0), (38, 41)),
     Sign("mocap.latency=20", _mean_of("estimator.pose_age_us", 1e-3), (19.5, 20.5), (-1.5, 1.5)),
     Sign("marker.hidden", _markers_seen, (4, 4), (8, 8)),
     Sign("marker.swap", _mean("markers.error", 1e3), (97, 100), (1.4, 1.7), (0.1, 0.25)),
@@ -323,6 +324,12 @@ def test_a_fault_acts_from_its_begin_to_its_end(sign: Sign) -> None:
         window = (start_s + sign.window[0], start_s + sign.window[1])
         figure = sign.seen(rows_between(log, *window), rows_between(without, *window))
         assert low <= figure <= high, f"{figure}, from {start_s} s on"
+
+
+def test_the_station_names_frozen_frames(tmp_path: Path) -> None:
+    go(tmp_path / "run", "mocap.freeze@0.2:0.3", duration_s=1.2)
+    lines = [event["text"] for event in load_events(tmp_path / "run") if event["source"] == "station"]
+    assert lines == ["motion capture: 58 poses unusable: the system repeats one pose"]  # 60 frames less two
 
 
 def test_every_kind_has_a_sign() -> None:

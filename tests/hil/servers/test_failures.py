@@ -23,6 +23,7 @@ EXPECTED: dict[tuple[int, int], list[str]] = {
     **{(unit, GARBAGE): ["imu.noise"] for unit in (GYRO, ACCEL)},
     (GYRO, WRONG): ["imu.bias.p", "imu.bias.q", "imu.bias.r"],
     (VIO, OFF): ["mocap.dropout"],
+    (VIO, STUCK): ["mocap.freeze"],
     (VIO, GARBAGE): ["mocap.outlier"],
     (VIO, WRONG): ["mocap.swap"],
     (VIO, DELAYED): ["mocap.latency"],

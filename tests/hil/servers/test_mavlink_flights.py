@@ -14,6 +14,7 @@ from support.mavlink_lab import MavlinkLab
 NED = Rotation.from_euler("x", np.pi)  # W to NED, B to FRD
 UNKNOWN = [np.nan] + [0.0] * 20  # covariance
 HOME = (0.0, 0.0, 1.15)
+STUCK = 2  # FAILURE_TYPE
 HOLD, OFFBOARD = 0x03040000, 0x00060000
 Pose = Callable[[int, Any, Any], tuple[Any, ...]]
 
@@ -71,6 +72,27 @@ def test_poses_of_every_kind_fly_the_robot_to_its_goals(kind: str) -> None:
         assert max(rms_cm(lab.repeat(goal, 2.0), goal)) < 6.0
     ages_ms = [m.value for m in lab.of("NAMED_VALUE_FLOAT") if m.name == "age_ms"]
     assert ages_ms[-1] == pytest.approx(40.5, abs=2.0)  # camera 20, processing 18, line 1.5 to 4
+
+
+@pytest.mark.parametrize(
+    "kind", ["odometry", *(pytest.param(kind, marks=pytest.mark.long) for kind in (*POSES,)[:2])]
+)
+def test_frozen_poses_of_every_kind_are_named_and_end_in_the_failsafe_until_they_move(kind: str) -> None:
+    lab = MavlinkLab()
+    fly_on(kind, lab)
+    lab.run(4.0)
+    assert lab.robot.free
+    assert lab.command(dialect.MAV_CMD_INJECT_FAILURE, dialect.FAILURE_UNIT_SENSOR_VIO, STUCK) == 0
+    lab.run(0.85)
+    frozen, failsafe = lab.texts()
+    assert frozen == "poses frozen: they stay the same although the robot turns"
+    assert failsafe == "supervisor: failsafe, silence"
+    counted = {variable.name: variable.read for variable in lab.robot.firmware.variables}
+    assert counted["kalman.frozen"]() == pytest.approx(40, abs=5)  # 0.1 s after the first one
+    assert lab.command(dialect.MAV_CMD_INJECT_FAILURE, dialect.FAILURE_UNIT_SENSOR_VIO, 0) == 0
+    lab.run(1.0)
+    assert lab.texts() == ["supervisor: flying"]
+    assert lab.place == pytest.approx(HOME, abs=0.3)
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,7 @@ from ground_station.sources.natnet import (
     packet,
 )
 from ground_station.sources.natnet_stream import NatnetStream
+from ground_station.unused import Reason
 from hil.errors import LabError
 from hil.servers.dongle_server import HOST
 from hil.servers.motive import MAX_CLIENTS, Streaming, Up, VirtualMotive, in_axes
@@ -217,10 +218,13 @@ def test_a_frame_is_stamped_with_its_exposure(lab: MotiveBench, client: NatNetSo
     assert frames[-1].transmitted <= echo.server < frames[-1].transmitted + hz
 
 
-def test_a_body_that_is_not_tracked_is_marked(lab: MotiveBench, client: NatNetSocket) -> None:
+@pytest.mark.parametrize(("reason", "tracked"), [(Reason.NOT_TRACKED, False), (Reason.FROZEN, True)])
+def test_a_body_that_is_not_tracked_is_marked_and_one_that_is_frozen_is_not(
+    lab: MotiveBench, client: NatNetSocket, reason: Reason, tracked: bool
+) -> None:
     client.connect()
-    lab.expose(valid=False)
-    assert not decode(client.hear(), (4, 1)).bodies[0].valid
+    lab.expose(valid=False, reason=reason)
+    assert decode(client.hear(), (4, 1)).bodies[0].valid == tracked
 
 
 def test_markers_of_a_body_that_is_not_tracked_have_no_label(start) -> None:

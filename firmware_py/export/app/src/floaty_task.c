@@ -152,22 +152,24 @@ static bool line_is_due(PoseLine *line, int32_t refused) {
   return due;
 }
 
-/* Return a length [m] to print with two digits, a little away from zero: DEBUG_PRINT cuts further digits off. */
-static double to_centimetre(float length) {
-  return (double)((roundf(100.0f * length) + copysignf(0.1f, length)) / 100.0f);
+static int centimetres(float length) {
+  return (int)lrintf(100.0f * length);
 }
 
 /* The lines are those of the firmware in Python: firmware_py/firmware.py. */
 static void announce_poses(void) {
-  static PoseLine no_corrections, too_old, gated;
+  static PoseLine no_corrections, too_old, frozen, gated;
   const float *p = floaty_observed.no_correction;
   if (line_is_due(&no_corrections, floaty_estimator.no_corrections)) {
-    DEBUG_PRINT("pose refused: %.2f %.2f %.2f m is no correction; for absolute poses set extPose.absolute 1\n",
-                to_centimetre(p[0]), to_centimetre(p[1]), to_centimetre(p[2]));
+    DEBUG_PRINT("pose refused: %d %d %d cm is no correction; for absolute poses set extPose.absolute 1\n",
+                centimetres(p[0]), centimetres(p[1]), centimetres(p[2]));
   }
   if (line_is_due(&too_old, floaty_observed.too_old)) {
     DEBUG_PRINT("poses %d ms old: at most %d ms\n", (int)((floaty_observed.too_old_us + 500) / 1000),
                 FLOATY_HORIZON_LIMIT * FLOATY_TICK_US / 1000);
+  }
+  if (line_is_due(&frozen, floaty_estimator.frozen)) {
+    DEBUG_PRINT("poses frozen: they stay the same although the robot turns\n");
   }
   if (line_is_due(&gated, floaty_estimator.refused)) {
     DEBUG_PRINT("pose refused: it is too far from the estimate\n");
