@@ -9,7 +9,13 @@ import pytest
 from firmware_py.core import structs
 from firmware_py.core.sampling import RECOVERY_STEPS, STALE_STEPS
 from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL
-from firmware_py.core.supervisor import BATTERY_LOW_US, DOWN_US, EPISODE_GAP_US, EPISODE_LIMIT_US
+from firmware_py.core.supervisor import (
+    BATTERY_LOW_US,
+    BOUNDS_RECOVERY_US,
+    DOWN_US,
+    EPISODE_GAP_US,
+    EPISODE_LIMIT_US,
+)
 from firmware_py.wire.supervisor import Cause, State
 from support.crtp_client import LOC, LOG, PARAM, SUPERVISOR, CrtpClient
 from support.firmware_bench import HOVER_COUNTS
@@ -224,6 +230,57 @@ def test_bounded_steps_50_ms_apart_are_one_episode_that_counts_at_200_ms(gap_us:
         expected = Cause.OUT_OF_BOUNDS if outside and now_us >= EPISODE_LIMIT_US else Cause.NONE
         assert bench.view.cause is expected
         bench.fly(gap_us - 10_000)
+
+
+def test_a_bounded_step_within_the_half_second_begins_it_anew_and_one_after_it_a_new_episode() -> None:
+    bench = in_flight(was_held_at_its_bounds)
+    for inside_us in (10_000, BOUNDS_RECOVERY_US - 20_000):
+        bench.fly(inside_us)
+        bench.fly(10_000, bounded=True)
+    bench.fly(BOUNDS_RECOVERY_US - 10_000)
+    assert bench.view.cause is Cause.OUT_OF_BOUNDS
+    for bounded in (False, True):
+        bench.fly(10_000, bounded)
+        assert bench.view.cause is Cause.NONE
+
+
+ENDS = {
+    Cause.IMU_STALE: {"counts"}, Cause.SILENCE: {"pose", "inside", "volts"}, Cause.OUT_OF_BOUNDS: {"inside"},
+    Cause.EMERGENCY_STOP: set(), Cause.LOW_BATTERY: {"recover"}, Cause.DISARMED: {"arm"},
+    Cause.CONTROLLER_NOT_FINITE: {"recover"}, Cause.ESTIMATOR_NOT_FINITE: {"recover"},
+}  # fmt: skip
+
+
+@EVENTS
+def test_every_cause_ends_as_documented_each_time_and_by_nothing_else(
+    happen: Callable[[SupervisorBench], object], cause: Cause, flown_by: tuple[int, int, int]
+) -> None:
+    def volts(bench: SupervisorBench) -> None:
+        bench.data.battery_mv = bench.parameters.low_battery_mv
+        bench.fly(10_000)
+
+    def recover(bench: SupervisorBench) -> None:
+        assert bench.view.recover() == (cause is not Cause.LOW_BATTERY)
+        bench.data.battery_mv = bench.parameters.low_battery_mv
+        assert bench.view.recover()
+
+    actions: dict[str, Callable[[SupervisorBench], object]] = {
+        "pose": lambda bench: bench.fly(10_000),
+        "inside": lambda bench: bench.fly(BOUNDS_RECOVERY_US + 10_000),
+        "counts": lambda bench: bench.steps(RECOVERY_STEPS, moving=True),
+        "arm": lambda bench: bench.view.arm(True),
+        "volts": volts,
+        "recover": recover,
+    }
+    for name, act in actions.items():
+        bench = in_flight(lambda bench: None)
+        for _ in range(2):
+            happen(bench)
+            bench.look()
+            assert bench.view.cause is cause
+            act(bench)
+            bench.look()
+            assert (bench.view.cause is Cause.NONE) == (name in ENDS.get(cause, actions)), name
 
 
 def test_an_episode_after_a_silent_one_restarts() -> None:
