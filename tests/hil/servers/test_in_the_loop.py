@@ -207,15 +207,30 @@ def test_without_a_sample_the_flight_pauses_and_is_counted(host: Host) -> None:
     assert (host.looped[-1].state, host.looped[-1].late, host.looped[-1].fresh) == (State.FLYING, 0, 1)
 
 
-def test_counters_restart_with_the_loop(host: Host) -> None:
-    host.run(100)
-    host.run(200, sending=False)
-    assert host.looped[-1].held > 100
+def test_a_loop_that_begins_again_is_like_the_first(host: Host) -> None:
+    def played() -> list[Loop]:
+        begun = host.count
+        host.looped.clear()
+        host.client.execute([loop(Hil.STILL)])
+        host.run(100)
+        host.run(HIL_HOLD + 100, sending=False)
+        host.run(50)
+        missing = host.count
+        host.count += 4
+        host.run(60)
+        host.send(number=missing - 2, count=6)
+        host.count = missing + 4
+        host.run(60)
+        host.client.execute([loop(Hil.OFF)])
+        host.run(20 + -host.step % 10, sending=False)
+        return [told._replace(used=told.used - begun, state=0, cause=0) for told in host.looped]
+
     host.client.execute([loop(Hil.OFF)])
     host.run(10, sending=False)
-    host.client.execute([loop(Hil.STILL)])
-    host.run(100)
-    assert host.looped[-1].held == HIL_WAITING
+    first = played()
+    last = first[-1]
+    assert min(last.used, last.held, last.late, last.lost, last.doubled) > 0
+    assert played() == first
 
 
 def test_poses_do_not_age_in_a_pause(host: Host) -> None:
