@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 
 from firmware_py.core import structs
-from firmware_py.core.sampling import RECOVERY_STEPS, STALE_STEPS
+from firmware_py.core.sampling import RECOVERY_STEPS, STALE_STEPS, WINDOW
 from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL
 from firmware_py.core.supervisor import (
     BATTERY_LOW_US,
@@ -419,9 +419,13 @@ def test_a_controller_that_has_not_begun_is_not_lost() -> None:
 def test_a_restarted_flight_waits_for_gyro_and_pose_and_stays_disarmed() -> None:
     bench = in_flight(lambda bench: bench.fly(100_000))
     bench.view.arm(False)
-    bench.core.run.call("restart")
-    bench.look()
-    assert (bench.view.calibrated, bench.view.armed) == (False, False)
+    for _ in range(2):  # in the middle of a search, too
+        bench.core.run.call("restart")
+        bench.look()
+        assert (bench.view.calibrated, bench.view.armed) == (False, False)
+        assert not any((*bench.data.gyro_bias, *bench.data.gyro_sum, bench.data.gyro_samples))
+        found = [bench.core.run.call("take_sample") for _ in range(WINDOW - 1)]
+        assert not any(found)
     assert not bench.core.supervisor.fields.aloft
     bench.view.arm(True)
     bench.calibrate()

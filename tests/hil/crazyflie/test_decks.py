@@ -144,6 +144,24 @@ def test_a_ranger_reports_out_of_reach_and_a_stopped_one_nothing() -> None:
     assert not ready(bench, ADDRESS)
 
 
+@pytest.mark.parametrize("stop", ["off", "abort", "again"])
+def test_a_measurement_that_was_stopped_never_ends(stop: str) -> None:
+    bench = DeckBench("multiranger")
+    bench.write(EXPANDER_ADDRESS, bytes((3, 0xFF & ~1)))
+    bench.write(EXPANDER_ADDRESS, b"\1\1")
+    start(bench, ADDRESS, 0x40)
+    bench.wait(15_000)
+    if stop == "off":
+        bench.write(EXPANDER_ADDRESS, b"\1\0")
+        bench.write(EXPANDER_ADDRESS, b"\1\1")
+    else:
+        start(bench, ADDRESS, 0x80 if stop == "abort" else 0x10)
+    bench.wait(15_000)  # of 25 ms
+    assert not ready(bench, ADDRESS)
+    bench.wait(15_000)
+    assert ready(bench, ADDRESS) == (stop == "again")
+
+
 def test_timed_ranger_measures_again_and_again_and_counts() -> None:
     bench = DeckBench("flow2")
     bench.place((0.0, 0.0, 1.0))
@@ -250,6 +268,15 @@ def test_flow_is_the_way_over_the_height_and_the_turn(to, q_at, wanted) -> None:
     assert total == pytest.approx(0.5 * np.array(wanted), abs=0.04)
 
 
+@pytest.mark.parametrize(("axis", "wanted"), [(1, (0.0, 1.0)), (0, (-1.0, 0.0))])
+def test_flow_is_seen_from_the_sensors_place(axis: int, wanted: tuple[float, float]) -> None:
+    """With the body's middle 9 cm above the floor the floor turns by a tenth more: the sensor is 8 mm nearer."""
+    bench = DeckBench("flow2")
+    way = [((0.0, 0.0, 0.09), about(axis, angle)) for angle in np.linspace(-0.3, 0.3, 20)]
+    seen = [0.6 * 0.0915 / (0.0915 - SENSOR_BELOW) * sign for sign in wanted]  # 9.0 to 9.4 cm along its view
+    assert moved(bench, way) / FLOW_COUNTS == pytest.approx(np.array(seen), abs=0.025)
+
+
 def test_flow_is_limited_by_the_rate_that_it_can_follow() -> None:
     bench = DeckBench("flow2")
     bench.place((0.0, 0.0, 0.1))
@@ -258,6 +285,16 @@ def test_flow_is_limited_by_the_rate_that_it_can_follow() -> None:
     bench.place((0.5, 0.0, 0.1))
     bench.wait(8_264)
     assert burst(bench)[2] == pytest.approx(-7.4 * 8.264e-3 * FLOW_COUNTS, abs=4)
+
+
+def test_motion_is_forgotten_once_it_was_read_and_by_a_reset() -> None:
+    bench = DeckBench("flow2")
+    for forget in (lambda: burst(bench), lambda: bench.transfer(b"\xba\x5a")):
+        for x in (0.0, 0.1):
+            bench.place((x, x, 1.0))
+            bench.wait(8_264)
+        forget()
+        assert burst(bench)[:3] == (0x30, 0, 0)
 
 
 def test_near_the_floor_fewer_features_are_counted() -> None:
