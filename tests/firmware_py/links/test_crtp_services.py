@@ -344,12 +344,16 @@ def test_writing_a_parameter_changes_the_running_core(client: CrtpClient, params
     assert client.writes[-1][1] != HOVER_COUNTS
 
 
-def test_each_parameter_of_the_set_point_sets_its_own_element(client: CrtpClient, params) -> None:
+def test_each_parameter_of_set_point_and_commander_sets_its_own_number(client: CrtpClient, params) -> None:
     for number, name in enumerate(("X", "Y", "Z", "Yaw"), 1):
         client.write(params, f"setpoint.{name}", number / 8)
     assert list(client.firmware._core.parameters.fields.target) == [1 / 8, 2 / 8, 3 / 8, 4 / 8]
     client.write(params, "extCtrl.target_yaw", 0.0)
     assert client.read(params, "setpoint.Yaw") == 0.0
+    for name, value in (("vtoff", 0.25), ("vland", 2.0), ("groupmask", 3)):
+        client.write(params, f"hlCommander.{name}", value)
+    defaults = client.firmware.pilot.stabilizer.high_level.defaults
+    assert (defaults.take_off_velocity, defaults.landing_velocity, defaults.groups) == (0.25, 2.0, 3)
 
 
 def test_sensors_and_decks_reported_present_are_the_board_s(client: CrtpClient, params) -> None:
@@ -658,6 +662,13 @@ def test_a_burst_of_requests_is_cut_to_the_queues_and_counted(client: CrtpClient
     answered = len(client.packets(PARAM, 1))
     assert 0 < answered <= PORT_QUEUE
     assert client.firmware.link.dropped == 100 - answered
+
+
+def test_queues_have_the_originals_names_and_lengths(client: CrtpClient) -> None:
+    queues = {queue.name: queue.length for queue in client.firmware.kernel.queues}
+    assert {name: length for name, length in queues.items() if not name.startswith("port")} == {
+        "measurements": 20, "syslink": 8, "crtpPacketDelivery": 5, "crtpTx": 120, "console": 40, "app": 10,
+    }  # fmt: skip
 
 
 def test_poses_come_in_while_nothing_goes_out(client: CrtpClient) -> None:

@@ -108,6 +108,19 @@ def test_curves_and_states_are_in_seconds_from_the_release() -> None:
     ]
 
 
+def test_the_directions_of_a_link_have_each_their_own_line() -> None:
+    count, zeros = np.arange(301.0), np.zeros(301)
+    lost = ("up_dropped", "down_dropped", "retried", "overrun", "no_room", "up_bad", "down_bad")
+    columns = {f"{group}.{name}": zeros for group in ("link", "serial") for name in lost}
+    for name, value in (("up", 1.0), ("down", 3.0)):
+        columns[f"link.{name}_delivered"] = count
+        columns[f"link.{name}_latency_sum"] = 1000 * value * count
+        columns[f"serial.{name}_busy"] = 100 * value * count
+    rows = log([0] * 301, **columns)  # type: ignore[arg-type]
+    for panel in (*figures.radio(rows).panels[:1], *figures.serial_line(rows).panels[:2]):
+        assert {line.name: set(line.values.round(6)) for line in panel.series} == {"up": {1.0}, "down": {3.0}}
+
+
 def overloaded(shares: list[float], error: list[float], late: list[int]) -> pa.Table:
     """A flight with 50 rows per step of the thief's share."""
     rows = 50 * len(shares)
