@@ -7,10 +7,13 @@ from itertools import combinations
 import numpy as np
 import pyarrow as pa
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
 from hil.experiments.overload import loads_that_hurt
+from hil.laboratory.schedule import runs
 from hil.pictures import curves, figures
 
 RELEASE_US = 1_000_000
@@ -77,6 +80,25 @@ def test_a_task_has_one_colour_in_every_figure_whatever_tasks_are_there() -> Non
     drawn = [(bar.lane, round(1e6 * (bar.end_s - bar.begin_s)), bar.colour) for bar in processor.bars]
     kalman, sensors = map(curves.task_colour, ("KALMAN", "SENSORS"))
     assert drawn == [("SENSORS", 200, sensors), ("KALMAN", 100, kalman), ("KALMAN", 100, kalman)]
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 2), st.sampled_from("ABC"), st.sampled_from(["IN", "READY"])), max_size=20
+    )
+)
+def test_turns_are_never_empty_and_cover_the_time_of_each_task(steps: list[tuple[int, str, str]]) -> None:
+    us = np.cumsum([0, *(step for step, _, _ in steps), 2]).tolist()
+    events = [("IN", "A"), *((event, who) for _, who, event in steps), ("END", "-")]
+    had: list[str] = []  # the task of each microsecond
+    task = ""
+    for (event, who), begin, end in zip(events, us, [*us[1:], us[-1]], strict=True):
+        task = who if event == "IN" else task
+        had += [task] * (end - begin)
+    table = pa.table({"us": us, "event": [event for event, _ in events], "who": [who for _, who in events]})
+    turns = list(runs(table))
+    assert all(turn.start_us < turn.end_us for turn in turns)
+    assert [turn.task for turn in turns for _ in range(turn.start_us, turn.end_us)] == had
 
 
 @pytest.mark.parametrize("cut", [1, 3, 5, 30])
