@@ -187,8 +187,10 @@ def test_rows_end_a_second_after_silence_and_the_next_gets_none(client: CrtpClie
     if kind == "telemetry":
         client.stream(client.now_us)
     else:
-        assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
-        assert client.one(LOG, 1, bytes((3, 1, 1))) == bytes((3, 1, 0))
+        for number in (1, 2):  # the second one is stopped
+            assert client.create(number, logs["pm.vbatMV"][::-1]) == 0
+            assert client.one(LOG, 1, bytes((3, number, 1))) == bytes((3, number, 0))
+        assert client.one(LOG, 1, bytes((4, 2))) == bytes((4, 2, 0))
     client.run(client.now_us + 3_000_000)  # the radio chip is polled, that is enough
     client.sent.clear()
     client.polling = False
@@ -201,7 +203,8 @@ def test_rows_end_a_second_after_silence_and_the_next_gets_none(client: CrtpClie
     rows = client.packets(LOG, 2)
     last_ms = max(int.from_bytes(row[1:4], "little") for row in rows)
     assert last_ms <= silent_us // 1000 + 510  # one was already on its way to the chip
-    assert client.one(LOG, 1, bytes((3, 1, 1))) == bytes((3, 1, errno.ENOENT))
+    for number in (1, 2):
+        assert client.one(LOG, 1, bytes((3, number, 1))) == bytes((3, number, errno.ENOENT))
     client.stream(client.now_us)
     client.run(client.now_us + 100_000)
     assert client.packets(LOG, 2)
@@ -537,14 +540,22 @@ def test_memory_tester_gives_the_address_and_counts_wrong_bytes(client: CrtpClie
 
 
 @pytest.mark.parametrize(
-    ("number", "address", "length"), [(0, 8191, 1), (0, 8189, 3), (5, 100, 13), (9, 0, 1), (0, 2**32 - 1, 2)]
+    ("number", "address", "length"),
+    [(0, 8191, 1), (0, 8189, 3), (5, 100, 13), (9, 0, 1), (0, 2**32 - 1, 2), (0, 100, 25)],
 )
 def test_memory_access_outside_fails(client: CrtpClient, number: int, address: int, length: int) -> None:
     head = struct.pack("<BI", number, address)
     assert client.one(MEM, 1, head + bytes((length,))) == head + bytes((errno.EIO,))
     before = bytes(client.eeprom)
-    assert client.one(MEM, 2, head + bytes(length)) == head + bytes((errno.EIO,))
+    if length < 25:  # more is none of a write's
+        assert client.one(MEM, 2, head + bytes(length)) == head + bytes((errno.EIO,))
     assert client.eeprom == before
+
+
+def test_24_bytes_are_read_at_once_up_to_the_last_one(client: CrtpClient) -> None:
+    client.eeprom[8167:8191] = bytes(range(24))
+    head = struct.pack("<BI", 0, 8191 - 24)
+    assert client.one(MEM, 1, head + b"\x18") == head + b"\0" + bytes(range(24))
 
 
 # Localisation
