@@ -682,6 +682,15 @@ def test_queues_have_the_originals_names_and_lengths(client: CrtpClient) -> None
     }  # fmt: skip
 
 
+def test_packets_to_the_board_are_counted_beyond_a_byte(client: CrtpClient, logs) -> None:
+    (before,) = client.log(logs, "radio.numRxUc")
+    for _ in range(300):
+        client.send(15, 3, b"")
+        client.run(client.now_us + 1_000)
+    (after,) = client.log(logs, "radio.numRxUc")
+    assert 300 <= after - before < 310
+
+
 def test_poses_come_in_while_nothing_goes_out(client: CrtpClient) -> None:
     client.poses(605_000, 2_000_000)
     client.radio_open = False

@@ -144,6 +144,13 @@ def test_less_than_a_kilobyte_left_of_a_memory_is_a_warning(used: int, good: boo
     assert ("CCM has less than 1024 B left" in finding.text) != good
 
 
+MEMBERS = {
+    "servo counts": 4,
+    "poses not fused": 4,
+    "age of poses": 1,
+    "poses fused": 1,
+    "supervisor's state": 1,
+}
 SIZE_OF = {"rms": 14**0.5 / 2, "mean": 1.0, "final": 2.0}  # of the differences 0, -1, 3, 2
 
 
@@ -160,6 +167,7 @@ def test_each_bound_is_that_of_its_size_in_every_one_of_its_columns(bound: Bound
         ]
         return {one.bound: one for one in compare_flights(*runs)}[bound]  # type: ignore[arg-type]
 
+    assert len(bound.columns) == MEMBERS.get(bound.name, 3), "x, y, z and others"
     for name in bound.columns:
         for share, held in ((0.999, True), (1.001, False)):
             if bound.size == "share of time":

@@ -110,6 +110,11 @@ def test_a_fault_that_begins_twice_acts_twice_and_ends_twice() -> None:
             board.act(fault, now_us)
         seen.append((len(board.active), round(math.degrees(robot.imu.rate_bias[0]))))
     assert seen == [(1, 5)] * 2 + [(2, 10)] * 3 + [(1, 5)] * 2 + [(0, 0)] * 2
+    robot.imu.set_rate_bias(0.01, 0.0, 0.0)  # what a later fault begins from
+    board.act(fault, 1_600_000)
+    assert robot.imu.rate_bias[0] == pytest.approx(0.01 + math.radians(5.0))
+    board.end(fault, 1_600_000)
+    assert robot.imu.rate_bias[0] == pytest.approx(0.01)
 
 
 def test_a_command_that_comes_twice_acts_once_and_another_takes_its_place(lab: MavlinkLab) -> None:
