@@ -149,6 +149,7 @@ def test_a_measurement_that_was_stopped_never_ends(stop: str) -> None:
     if stop == "off":
         bench.write(EXPANDER_ADDRESS, b"\1\0")
         bench.write(EXPANDER_ADDRESS, b"\1\1")
+        assert bench.read(ADDRESS, b"\0\x5e", 6) == bytes(6)
     else:
         start(bench, ADDRESS, 0x80 if stop == "abort" else 0x10)
     bench.wait(15_000)  # of 25 ms

@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("unicorn")
 
 from hil.errors import LabError
-from hil.stm32f405.chip import CYCLES_PER_US, FLASH, Why
+from hil.stm32f405.chip import CYCLES_PER_US, FLASH, RAM, Why
 from support.stm32_bench import Bench
 
 TIM3, I2C1, IWDG = 0x4000_0400, 0x4000_5400, 0x4000_3000
@@ -170,13 +170,18 @@ def test_a_reset_chip_is_like_a_fresh_one(bench: Bench, seed: int) -> None:
                 bench[base + 4 * word] = int(rng.integers(1, 1 << 32) & rng.integers(1, 1 << 32))
     for name in CORE[:13]:
         bench.chip.set_register(name, 0x1234)
-    for name in ("basepri", "faultmask"):
-        bench.chip.set_register(name, 0x10)
+    for name, value in (("basepri", 0x10), ("faultmask", 1), ("primask", 1), ("control", 2)):
+        bench.chip.set_register(name, value)
     bench.chip.run(5 * CYCLES_PER_US)
     assert seen(bench) != seen(fresh)
     fresh.chip.run(bench.chip.state.now)
     for one in (bench, fresh):
         one.chip.reset(0x0C00_0000)
+    # The manuals' values: VTOR, CCR, status of USART2 and SPI1, reload of TIM2 and TIM3, cause.
+    places = (0xE000_ED08, 0xE000_ED14, 0x4000_4400, 0x4001_3008, 0x4000_002C, 0x4000_042C, 0x4002_3874)
+    values = (FLASH, 0x200, 0xC0, 2, 0xFFFF_FFFF, 0xFFFF, 0x0C00_0000)
+    assert [bench[place] for place in places] == list(values)
+    assert [bench.chip.register(name) for name in CORE] == [*13 * [0], RAM + 0x1000, FLASH + 8, 0, 0, 0, 0]
     for _ in range(3):
         assert set(seen(bench).items()) == set(seen(fresh).items())
         for one in (bench, fresh):
