@@ -230,6 +230,15 @@ def test_other_systems_are_ignored():
     assert bench.link.board == 1
 
 
+def test_a_board_that_is_forgotten_has_no_state_until_its_next_heartbeat():
+    bench = LinkWithCodec()
+    for bench.codec.seq in range(2):
+        bench.hear(0, heartbeat())
+        assert bench.link.supervisor_state == 2
+        bench.link.forget()
+        assert bench.link.supervisor_state is None
+
+
 def test_the_senders_of_frames_are_named_those_that_sent_most_first():
     bench = LinkWithCodec()
     for system, count in ((255, 5), (1, 3), (7, 2), (8, 1), (9, 1)):

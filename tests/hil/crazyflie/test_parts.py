@@ -1,16 +1,20 @@
 """The parts around the chip by the registers of their data sheets."""
 
 import struct
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("unicorn")
 
+from hil.crazyflie import syslink
 from hil.crazyflie.parts import Parts
+from hil.crazyflie.radio_line import RadioLine
+from support.deck_bench import DeckBench
 from support.stm32_bench import Bench
 
-SYSCFG, EXTI, PORT_C = 0x4001_3800, 0x4001_3C00, 2
+SYSCFG, EXTI, PORT_C, USART6 = 0x4001_3800, 0x4001_3C00, 2, 0x4001_1400
 
 
 def test_a_sample_is_in_the_bmi088s_registers_when_its_interrupt_comes() -> None:
@@ -29,3 +33,21 @@ def test_a_sample_is_in_the_bmi088s_registers_when_its_interrupt_comes() -> None
         1,
     )  # identities, ready
     assert not parts.accel[0x18:].any()
+
+
+def test_a_frame_that_a_reset_cut_off_costs_no_later_one() -> None:
+    bench, lines = DeckBench(), []
+    outside = SimpleNamespace(
+        debug_write=lines.append, radio_send=lambda data: True, radio_command=lambda kind, data: None
+    )
+    radio = RadioLine(bench.chip, bench.processor, bench.decks, outside, polls=False)  # type: ignore[arg-type]
+    frame = syslink.encode(syslink.RAW, b"\0hello\n")
+    for data in (frame[:-3], frame):
+        bench[USART6 + 8], bench[USART6 + 0xC] = 84, 1 << 13 | 1 << 3  # BRR, UE and TE
+        for byte in data:
+            bench[USART6 + 4] = byte
+            bench.wait(20)
+        radio.sent()
+        bench.chip.reset(0x1400_0000)
+        radio.reset(bench.chip.now_us)
+    assert lines == ["hello"]

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from firmware_py.geometry import yaw_quaternion
+from firmware_py.geometry import from_euler_zyx, yaw_quaternion
 from hil.errors import LabError
 from hil.pictures import compare, curves
 from hil.pictures.panels import TOGETHER_S, marks_of_flight, saturated
@@ -49,6 +49,16 @@ def test_the_attitude_error_goes_the_short_way_round(yaw: float, error: float) -
     assert curves.ATTITUDE.read(flight([yaw]))[0] == pytest.approx([0.0, 0.0, error], abs=1e-9)
 
 
+def test_angles_have_their_own_names() -> None:
+    rows = flight(
+        [180.0],
+        **{f"truth.q{part}": [q] for part, q in zip("wxyz", from_euler_zyx(0.1, -0.2, 3.0), strict=True)},
+    )
+    shown = dict(zip(curves.ATTITUDE.names, curves.ATTITUDE.read(rows)[0].tolist(), strict=True))
+    expected = {"roll": 0.1, "pitch": -0.2, "yaw": 3.0 - np.pi}
+    assert shown == pytest.approx({name: np.degrees(angle) for name, angle in expected.items()})
+
+
 def test_an_estimate_across_half_a_turn_misses_by_the_difference() -> None:
     rows = flight([1.0, -1.0], **{"estimate.yaw": np.radians([179.0, -178.0])})
     missed = curves.ATTITUDE_MISS.read(rows)[:, 2]
@@ -57,7 +67,8 @@ def test_an_estimate_across_half_a_turn_misses_by_the_difference() -> None:
 
 def probed(columns: set[str], grown: str = "") -> pa.Table:
     """Three rows of a log with these columns, of which one grows."""
-    always = {"t", "link.up_delivered", "link.down_delivered", grown}
+    packets = {"link.up_delivered", "link.down_delivered"} if "link.up_latency_sum" in columns else set()
+    always = {"t", grown, *packets}
     rows = {one: np.arange(3.0) if one in always else np.full(3, float(one == "truth.qw")) for one in columns}
     return pa.table(rows).replace_schema_metadata(RELEASE)
 
