@@ -41,8 +41,8 @@ def test_a_frame_that_a_reset_cut_off_costs_no_later_one() -> None:
         debug_write=lines.append, radio_send=lambda data: True, radio_command=lambda kind, data: None
     )
     radio = RadioLine(bench.chip, bench.processor, bench.decks, outside, polls=False)  # type: ignore[arg-type]
-    frame = syslink.encode(syslink.RAW, b"\0hello\n")
-    for data in (frame[:-3], frame):
+    long, frame = syslink.encode(syslink.RAW, bytes(26)), syslink.encode(syslink.RAW, b"\0hello\n")
+    for data in (long[:8], frame):
         bench[USART6 + 8], bench[USART6 + 0xC] = 84, 1 << 13 | 1 << 3  # BRR, UE and TE
         for byte in data:
             bench[USART6 + 4] = byte
