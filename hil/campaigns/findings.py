@@ -274,11 +274,12 @@ def _influences(
             continue
         if spec.sampling in ("saltelli", "morris") and not there.all():
             continue  # an incomplete design gives no indices
-        found.append(_influence(spec, figure, points[there], means))
+        found.append(influence_of(spec, figure, points[there], means))
     return found
 
 
-def _influence(spec: Spec, figure: str, points: Array, means: Array) -> Influence:
+def influence_of(spec: Spec, figure: str, points: Array, means: Array) -> Influence:
+    """Return the influence of the axes on a figure, of which each point (N, D) has its mean."""
     names = [axis.name for axis in sampling.axes(spec)]
     cube = sampling.problem(points.shape[1])
 

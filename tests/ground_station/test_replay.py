@@ -97,17 +97,17 @@ def test_a_replay_hands_on_each_frame_when_it_is_due_by_its_own_clock(timeout_s:
         rows = [f"{100_000 + 20_000 * n},{93_000 + 20_000 * n},1,2,3,1,0,0,0,1\n" for n in range(10)]
         path.write_text(path.read_text() + "".join(rows))
         source = ReplaySource(path)
-        source.open()
-        arrivals = []
-        while not source.over:
-            if (frame := source.receive(timeout_s)) is not None:
-                arrivals.append((now_us[0] - 7_000_000, frame.t_us - 7_000_000))
-        assert source.receive(timeout_s) is None
-        assert source.notices()[-1] == "the recording is over: 10 frames"
-    assert [t_us for _, t_us in arrivals] == [20_000 * n - 7_000 for n in range(10)]
-    assert [arrival_us for arrival_us, _ in arrivals] == pytest.approx(
-        [20_000 * n for n in range(10)], abs=20
-    )
+        for _ in range(2):
+            source.open()
+            arrivals, begun_us = [], now_us[0]
+            while not source.over:
+                if (frame := source.receive(timeout_s)) is not None:
+                    arrivals.append((now_us[0] - begun_us, frame.t_us - begun_us))
+            assert source.receive(timeout_s) is None
+            assert source.notices()[-1] == "the recording is over: 10 frames"
+            assert [t_us for _, t_us in arrivals] == [20_000 * n - 7_000 for n in range(10)]
+            due = [20_000 * n for n in range(10)]
+            assert [arrival_us for arrival_us, _ in arrivals] == pytest.approx(due, abs=20)
 
 
 def test_telemetry_is_replayed_each_frame_once(tmp_path: Path) -> None:

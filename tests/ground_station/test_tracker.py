@@ -18,7 +18,7 @@ from ground_station.config import TrackerConfig
 from ground_station.mocap import MocapFrame, judged
 from ground_station.pose_filter import PoseFilter
 from ground_station.tracker import FIT_US, Quality, Tracker, tracker_of
-from ground_station.unused import UnusedPoses
+from ground_station.unused import Event, Reason, UnusedPoses
 
 PERIOD_US = 5000
 CONFIG = TrackerConfig()
@@ -473,3 +473,16 @@ def test_a_profile_may_do_without() -> None:
 def test_bad_configuration_is_refused(change: dict[str, float]) -> None:
     with pytest.raises(ValidationError):
         TrackerConfig(**change)
+
+
+def test_a_reason_is_reported_again_after_five_seconds_each_time_and_a_lost_track_each_time():
+    unused, lines = UnusedPoses(), []
+    for now_us in range(0, 18_000_000, 100_000):
+        event = Event.LOST if now_us in (2_000_000, 3_000_000) else Event.NONE
+        unused.note(now_us, now_us, (Reason.FROZEN, ()), event)
+        lines += [(now_us, line) for line in unused.due()]
+    frozen = [now_us for now_us, line in lines if "repeats one pose" in line]
+    assert frozen[0] == 500_000
+    assert all(5_000_000 <= gap <= 5_600_000 for gap in np.diff(frozen))
+    assert len(frozen) == 4
+    assert [line for _, line in lines if "pose" not in line] == ["motion capture: track lost"] * 2

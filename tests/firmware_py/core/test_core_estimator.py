@@ -17,7 +17,7 @@ from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation
 
 from firmware_py.core import entry
-from firmware_py.core.structs import HISTORY, POSE_INVALID, POSE_ON_TIME, POSE_TOO_OLD, Parameters
+from firmware_py.core.structs import POSE_INVALID, POSE_ON_TIME, POSE_TOO_OLD, Estimator, Parameters
 from ground_station.trajectory import Goal, Offsets, Sine, Square, Trajectory
 from hil.experiments import Experiment
 from hil.laboratory.lockstep import lockstep_flight
@@ -636,22 +636,29 @@ def test_the_report_has_attitude_poses_and_flaps() -> None:
     assert np.abs(core.now[12:]).max() > 0.01
 
 
+COUNTERS = {"fused", "refused", "jumps", "too_old", "invalid", "no_corrections", "bounded", "resets"}
+# Of the last pose; work space; and what counts only while a pose or a suspect waits.
+LEFT = {"pose_age_us", "work_1", "work_2", "work_3", "work_P", "pose", "pose_lag", "suspect", "suspect_tick"}
+
+
 def test_reset_forgets_everything_but_the_counters() -> None:
-    used, fresh = feed(Core(), 99, (0.1, 0.2, 0.3), quaternion(yaw=1.0)), Core()
-    for age_us in (0, 10_000, 20_000, 30_000):
-        used.pose((0.1, 0.2, 0.3), LEVEL, age_us)
-    for _ in range(HISTORY):
-        used.tick(counts((1, 2, 3)), command=(0.1, 0.2, 0.3, 0.4))
+    rng = np.random.default_rng(1)
+    used, fresh = Core(age_measured=1), Core(age_measured=1)
+    for name, (kind, *_) in Estimator.dtype.fields.items():
+        garbage = rng.uniform(-2, 2, kind.shape) if kind.base.kind == "f" else rng.integers(1, 9, kind.shape)
+        used.estimator.memory[name] = garbage
+    before = dict(used.counters)
     entry.reset(used.parameters.arg, used.estimator.arg)
-    for tick in range(50):
+    for tick in range(180):  # the goal jumps there and back; then poses are young for more than a second
         for core in (used, fresh):
-            if tick > 10:
-                core.pose((0, 0.1, 0))
+            if tick in (10, 11) or 40 < tick < 170:
+                core.pose((0.9 * (40 < tick < 60), 0.1, 0), LEVEL, 40_000 * (tick < 60))
             core.tick(samples=10 if tick > 5 else 0)  # at first the last rates are all that is known
-        assert (used.x == fresh.x).all()
-        assert (used.P == fresh.P).all()
-        assert (used.now == fresh.now).all()
-    assert used.fields.fused > fresh.fields.fused
+        for name in set(Estimator.dtype.names) - COUNTERS - LEFT:
+            assert np.array_equal(used.estimator.memory[name], fresh.estimator.memory[name]), (name, tick)
+    assert fresh.fields.jumps > 0
+    assert fresh.fields.horizon < 4
+    assert {name: used.counters[name] - before[name] for name in fresh.counters} == fresh.counters
 
 
 FLOATS = [name for name, kind in Parameters.dtype.fields.items() if kind[0].kind == "f"]

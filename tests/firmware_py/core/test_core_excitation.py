@@ -120,6 +120,10 @@ def test_excitation_stops_when_off_or_open_loop_and_restarts_its_period() -> Non
     assert not board.fly(5).any()
     board.data.fields.mode = MODE_FLY
     assert np.array_equal(board.fly(20), first)
+    board.parameters.fields.excite_kind = EXCITE_OFF
+    assert not board.fly(1).any()
+    board.parameters.fields.excite_kind = EXCITE_MULTISINE
+    assert np.array_equal(board.fly(20), first)
 
 
 def test_the_signals_have_the_numbers_of_the_parameter() -> None:

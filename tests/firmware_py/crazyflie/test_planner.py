@@ -1,6 +1,8 @@
 """The planner's polynomials against numpy's linear algebra and scipy's Bezier curves; its paths by their laws."""
 
+import struct
 from math import pi
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
 from scipy.interpolate import BPoly
 
+from firmware_py.crazyflie.high_level_commander import FINISHED, HighLevelCommander
 from firmware_py.crazyflie.planner import (
     Path,
     PathPoint,
@@ -207,3 +210,22 @@ def test_a_landing_ends_idle_and_everything_else_goes_on() -> None:
     assert planner.phase is Phase.LANDING
     assert planner.goal(11.0) is None
     assert planner.phase is Phase.IDLE
+
+
+@pytest.mark.parametrize("relative", [False, True])
+def test_without_a_velocity_a_take_off_and_a_landing_have_each_their_own(relative: bool) -> None:
+    board = SimpleNamespace(estimate=lambda: PathPoint((0.1, 0.2, 0.0), 0.0), admits=lambda places: True)
+    commander = HighLevelCommander(board, lambda kind, text: None)
+    commander.block(False)
+    commander.defaults.take_off_velocity, commander.defaults.landing_velocity = 0.25, 2.0
+    t = 0.0
+    for command, height, by, duration in ((9, 1.0, 1.0, 4.0), (10, 0.4, 0.6, 0.3)):
+        data = struct.pack("<BBf?f?f", command, 0, by if relative else height, relative, 0.0, True, 0.0)
+        assert commander.execute(data, t) == 0
+        goal = commander.planner.goal(t + 0.99 * duration)
+        assert goal is not None
+        assert goal.position[2] == pytest.approx(height, abs=1e-4)
+        finished = [bool(commander.bits(t + duration * share) & FINISHED) for share in (0.99, 1.01)]
+        assert finished == [False, True]
+        t += duration + 1.0
+        commander.setpoint(t)

@@ -187,8 +187,10 @@ def test_rows_end_a_second_after_silence_and_the_next_gets_none(client: CrtpClie
     if kind == "telemetry":
         client.stream(client.now_us)
     else:
-        assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
-        assert client.one(LOG, 1, bytes((3, 1, 1))) == bytes((3, 1, 0))
+        for number in (1, 2):  # the second one is stopped
+            assert client.create(number, logs["pm.vbatMV"][::-1]) == 0
+            assert client.one(LOG, 1, bytes((3, number, 1))) == bytes((3, number, 0))
+        assert client.one(LOG, 1, bytes((4, 2))) == bytes((4, 2, 0))
     client.run(client.now_us + 3_000_000)  # the radio chip is polled, that is enough
     client.sent.clear()
     client.polling = False
@@ -201,7 +203,8 @@ def test_rows_end_a_second_after_silence_and_the_next_gets_none(client: CrtpClie
     rows = client.packets(LOG, 2)
     last_ms = max(int.from_bytes(row[1:4], "little") for row in rows)
     assert last_ms <= silent_us // 1000 + 510  # one was already on its way to the chip
-    assert client.one(LOG, 1, bytes((3, 1, 1))) == bytes((3, 1, errno.ENOENT))
+    for number in (1, 2):
+        assert client.one(LOG, 1, bytes((3, number, 1))) == bytes((3, number, errno.ENOENT))
     client.stream(client.now_us)
     client.run(client.now_us + 100_000)
     assert client.packets(LOG, 2)
@@ -344,12 +347,16 @@ def test_writing_a_parameter_changes_the_running_core(client: CrtpClient, params
     assert client.writes[-1][1] != HOVER_COUNTS
 
 
-def test_each_parameter_of_the_set_point_sets_its_own_element(client: CrtpClient, params) -> None:
+def test_each_parameter_of_set_point_and_commander_sets_its_own_number(client: CrtpClient, params) -> None:
     for number, name in enumerate(("X", "Y", "Z", "Yaw"), 1):
         client.write(params, f"setpoint.{name}", number / 8)
     assert list(client.firmware._core.parameters.fields.target) == [1 / 8, 2 / 8, 3 / 8, 4 / 8]
     client.write(params, "extCtrl.target_yaw", 0.0)
     assert client.read(params, "setpoint.Yaw") == 0.0
+    for name, value in (("vtoff", 0.25), ("vland", 2.0), ("groupmask", 3)):
+        client.write(params, f"hlCommander.{name}", value)
+    defaults = client.firmware.pilot.stabilizer.high_level.defaults
+    assert (defaults.take_off_velocity, defaults.landing_velocity, defaults.groups) == (0.25, 2.0, 3)
 
 
 def test_sensors_and_decks_reported_present_are_the_board_s(client: CrtpClient, params) -> None:
@@ -533,14 +540,22 @@ def test_memory_tester_gives_the_address_and_counts_wrong_bytes(client: CrtpClie
 
 
 @pytest.mark.parametrize(
-    ("number", "address", "length"), [(0, 8191, 1), (0, 8189, 3), (5, 100, 13), (9, 0, 1), (0, 2**32 - 1, 2)]
+    ("number", "address", "length"),
+    [(0, 8191, 1), (0, 8189, 3), (5, 100, 13), (9, 0, 1), (0, 2**32 - 1, 2), (0, 100, 25)],
 )
 def test_memory_access_outside_fails(client: CrtpClient, number: int, address: int, length: int) -> None:
     head = struct.pack("<BI", number, address)
     assert client.one(MEM, 1, head + bytes((length,))) == head + bytes((errno.EIO,))
     before = bytes(client.eeprom)
-    assert client.one(MEM, 2, head + bytes(length)) == head + bytes((errno.EIO,))
+    if length < 25:  # more is none of a write's
+        assert client.one(MEM, 2, head + bytes(length)) == head + bytes((errno.EIO,))
     assert client.eeprom == before
+
+
+def test_24_bytes_are_read_at_once_up_to_the_last_one(client: CrtpClient) -> None:
+    client.eeprom[8167:8191] = bytes(range(24))
+    head = struct.pack("<BI", 0, 8191 - 24)
+    assert client.one(MEM, 1, head + b"\x18") == head + b"\0" + bytes(range(24))
 
 
 # Localisation
@@ -658,6 +673,22 @@ def test_a_burst_of_requests_is_cut_to_the_queues_and_counted(client: CrtpClient
     answered = len(client.packets(PARAM, 1))
     assert 0 < answered <= PORT_QUEUE
     assert client.firmware.link.dropped == 100 - answered
+
+
+def test_queues_have_the_originals_names_and_lengths(client: CrtpClient) -> None:
+    queues = {queue.name: queue.length for queue in client.firmware.kernel.queues}
+    assert {name: length for name, length in queues.items() if not name.startswith("port")} == {
+        "measurements": 20, "syslink": 8, "crtpPacketDelivery": 5, "crtpTx": 120, "console": 40, "app": 10,
+    }  # fmt: skip
+
+
+def test_packets_to_the_board_are_counted_beyond_a_byte(client: CrtpClient, logs) -> None:
+    (before,) = client.log(logs, "radio.numRxUc")
+    for _ in range(300):
+        client.send(15, 3, b"")
+        client.run(client.now_us + 1_000)
+    (after,) = client.log(logs, "radio.numRxUc")
+    assert 300 <= after - before < 310
 
 
 def test_poses_come_in_while_nothing_goes_out(client: CrtpClient) -> None:

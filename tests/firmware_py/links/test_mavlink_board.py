@@ -887,6 +887,27 @@ def test_counters_are_log_variables(client: MavlinkClient) -> None:
     assert (values["mavlink.frames"], values["mavlink.bad"], values["mavlink.overruns"]) == (1, 1, 3)
 
 
+def test_each_counter_and_deviation_has_its_own_place_in_the_messages(client: MavlinkClient) -> None:
+    counters, estimator = client.stack.counters, client.firmware._core.estimator.fields
+    counters.frames, counters.lost, counters.bad_crc = 995, 5, 7
+    client.stack.refused, client.stack._transmit.dropped, client.uart_overruns = 20, 40, 3
+    estimator.refused, estimator.too_old, estimator.invalid = 100, 200, 400
+    for deviations in ((0.2, 0.3, 0.4), (0.3, 0.2, 0.1)):
+        estimator.P[range(3), range(3)] = np.square(deviations)
+        client.messages.clear()
+        for number in ("NAMED_VALUE_FLOAT", "SYS_STATUS", "ESTIMATOR_STATUS"):
+            client.command(512, NUMBERS[number])
+            found = client.of(number)
+            if number == "NAMED_VALUE_FLOAT":
+                named = {one.name: one.value for one in found if one.name != "age_ms"}
+                assert named == {"refused": 700, "up_lost": 5, "tx_dropped": 40, "overruns": 3}
+            elif number == "SYS_STATUS":
+                assert (found[-1].errors_comm, found[-1].drop_rate_comm) == (7 + 20 + 3, 50)
+            else:
+                seen = found[-1].pos_horiz_accuracy, found[-1].pos_vert_accuracy
+                assert seen == pytest.approx((0.3, deviations[2]), abs=0.02)
+
+
 def test_without_mavlink_there_is_no_task_and_no_variable_of_it() -> None:
     firmware = FirmwareBench().firmware
     assert firmware.mavlink is None

@@ -1,5 +1,6 @@
 """The budget of a call of own logic: loops that exceed it are refused, or stopped alike on every target."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -91,6 +92,25 @@ def test_a_known_loop_beyond_the_budget_is_refused(tmp_path: Path, body: str, be
         own_config(tmp_path, text)
     assert str(error.value).startswith(f"{tmp_path / 'controller.py'}:{line_of(text, at)}: for ")
     assert str(error.value).endswith("cycles: a call has 672000 (4 ms of a Cortex-M4)")
+
+
+def test_a_call_of_exactly_the_budget_is_admitted_and_one_more_cycle_is_not(tmp_path: Path) -> None:
+    longest, one = (
+        CALL_CYCLES // 5,
+        "memory.hidden = memory.hidden + DT\n",
+    )  # 5 cycles of a round, 1 of it alone
+    with pytest.raises(LabError, match=r": for i in range"):
+        own_config(tmp_path, law(SUM.format(longest + 1)))
+    with pytest.raises(LabError, match=r": control_law takes at least (\d+) cycles") as beyond:
+        own_config(tmp_path, law(SUM.format(longest)))
+    found = re.search(r"at least (\d+)", str(beyond.value))
+    assert found
+    rest = int(found[1]) - CALL_CYCLES
+    rounds = longest - -(-rest // 5)
+    body = one * (5 * (longest - rounds) - rest) + SUM.format(rounds)
+    own_config(tmp_path, law(body))
+    with pytest.raises(LabError, match=f"control_law takes at least {CALL_CYCLES + 1} cycles"):
+        own_config(tmp_path, law(one + body))
 
 
 def test_loops_that_fit_alone_but_not_together_are_refused_where_the_function_begins(tmp_path: Path) -> None:

@@ -102,6 +102,21 @@ def test_a_task_of_priority_0_runs_at_the_interrupt_that_wakes_it():
     assert woke_us == instants_us
 
 
+@pytest.mark.parametrize("before_us", [2_999, 3_000, 3_001])
+def test_a_run_that_is_stopped_before_an_instant_does_what_is_due_before_it_and_no_more(before_us):
+    kernel, ran = Kernel(), []
+
+    def task():
+        while True:
+            yield from kernel.delay(1)
+            ran.append(kernel.now_us)
+            kernel.stop_before(before_us)
+
+    start(kernel, task=(1, task))
+    kernel.run(0, 10_000)
+    assert (ran, kernel.now_us) == ([us for us in (1_000, 2_000, 3_000) if us < before_us], before_us - 1)
+
+
 def test_an_interrupt_at_the_instant_at_which_work_ends_comes_first():
     kernel = Kernel()
     semaphore = kernel.create_binary_semaphore("semaphore")

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from firmware_py.wire import WireError, crtp, log, telemetry
 from firmware_py.wire.scalars import Scalar
+from firmware_py.wire.toc import Toc
 
 metres = st.floats(-100.0, 100.0, width=32)
 Q = (0.5, -0.5, 0.5, 0.5)
@@ -151,3 +152,15 @@ def test_variables_have_one_home():
     names = [variable.name for block in telemetry.ALL_BLOCKS for variable in block.variables]
     assert len(names) == len(set(names))
     assert len({block.id for block in telemetry.ALL_BLOCKS}) == len(telemetry.ALL_BLOCKS)
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "good"), [(1, 23, True), (23, 1, True), (12, 13, False), (25, 0, False), (0, 24, False)]
+)
+def test_a_name_in_a_table_of_contents_has_24_letters_at_most(group: int, name: int, good: bool) -> None:
+    listed = [(8, f"{'g' * group}.{'n' * name}")]
+    if good:
+        assert len(Toc.of(2, listed).entries[0]) == 1 + group + 1 + name + 1
+        return
+    with pytest.raises(WireError, match="at most 24 letters"):
+        Toc.of(2, listed)

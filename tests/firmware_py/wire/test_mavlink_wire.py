@@ -261,6 +261,17 @@ def test_position_is_the_standards() -> None:
     assert message.time_boot_ms == 77
 
 
+@given(st.floats(-7.0, 7.0) | st.sampled_from([0.0, 1e-5, -1e-5, np.pi, -np.pi, 2 * np.pi]))
+def test_a_heading_is_the_yaw_clockwise_from_north_and_less_than_a_full_turn(yaw: float) -> None:
+    north = np.degrees(-yaw)
+    for message, name, unit in (
+        (mavlink.hud(V, U, yaw), "heading", 1.0), (mavlink.global_position(1, V, U, yaw, 0.0), "hdg", 0.01),
+    ):  # fmt: skip
+        found = unit * getattr(over_the_wire(message), name)
+        assert 0.0 <= found < 360.0 - unit / 2
+        assert abs((found - north + 180.0) % 360.0 - 180.0) <= 0.5001 * unit
+
+
 def test_home_is_the_standards() -> None:
     message = over_the_wire(mavlink.home_position(88, V))
     assert vector(message, "x y z") == near(D @ V)

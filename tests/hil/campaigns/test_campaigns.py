@@ -9,7 +9,9 @@ import random
 import re
 import signal
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -336,8 +338,24 @@ def test_flights_without_an_end_are_distinct_failures(tmp_path: Path) -> None:
     assert found.errors == ("3×, first flight 0: limit on 'unsee': no such metric; did you mean unseen?",)
 
 
-@pytest.mark.parametrize(("limit", "value"), [("simulated_s", 1.2), ("wall_s", 1e-6)])
-def test_a_flight_beyond_its_time_limit_is_a_row_that_names_it(limit: str, value: float) -> None:
+@pytest.mark.parametrize(
+    ("limit", "value", "ended"),
+    [
+        ("simulated_s", 1.27, False),
+        ("simulated_s", 1.271, True),
+        ("wall_s", 2.4, False),
+        ("wall_s", 2.6, True),
+    ],
+)
+def test_a_flight_beyond_its_time_limit_is_a_row_that_names_it(
+    limit: str, value: float, ended: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is asked at 0.02, 0.27, 0.52 ... 1.27 s, and a clock of the wall shows half a second more each time."""
+    clock = SimpleNamespace(monotonic=(0.5 * number for number in count(1000)).__next__)
+    monkeypatch.setattr("hil.campaigns.jobs.time", clock)
     row = fly_job(draw(spec_of(limits={limit: value}), 0))
+    if ended:
+        assert (row.outcome, row.error) == ("completed", "")
+        return
     assert (row.outcome, row.passed, row.hash) == ("error", False, "")
     assert row.error == f"TooLongError: limits.{limit} = {value:g}: the flight had not ended"

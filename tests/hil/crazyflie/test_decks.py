@@ -130,18 +130,32 @@ def test_ranger_returns_the_distance_of_the_floor_with_little_noise() -> None:
     assert np.mean(seen) == pytest.approx(0.0, abs=0.002)
 
 
-def test_a_ranger_reports_out_of_reach_and_a_stopped_one_nothing() -> None:
+def test_a_ranger_reports_out_of_reach() -> None:
     bench = DeckBench("flow2")
     bench.place((0.0, 0.0, 3.2))  # "medium" reaches 2.9 m
     start(bench, ADDRESS)
     bench.wait(30_000)
     status, distance = ranged(bench, ADDRESS)
     assert (status, distance > 8.0) == (4, True)
-    start(bench, ADDRESS)
+
+
+@pytest.mark.parametrize("stop", ["off", "abort", "again"])
+def test_a_measurement_that_was_stopped_never_ends(stop: str) -> None:
+    bench = DeckBench("multiranger")
+    bench.write(EXPANDER_ADDRESS, bytes((3, 0xFF & ~1)))
+    bench.write(EXPANDER_ADDRESS, b"\1\1")
+    start(bench, ADDRESS, 0x40)
+    bench.wait(15_000)
+    if stop == "off":
+        bench.write(EXPANDER_ADDRESS, b"\1\0")
+        bench.write(EXPANDER_ADDRESS, b"\1\1")
+        assert bench.read(ADDRESS, b"\0\x5e", 6) == bytes(6)
+    else:
+        start(bench, ADDRESS, 0x80 if stop == "abort" else 0x10)
+    bench.wait(15_000)  # of 25 ms
     assert not ready(bench, ADDRESS)
-    bench.write(ADDRESS, struct.pack(">HBB", START - 1, 1, 0x80))
-    bench.wait(60_000)
-    assert not ready(bench, ADDRESS)
+    bench.wait(15_000)
+    assert ready(bench, ADDRESS) == (stop == "again")
 
 
 def test_timed_ranger_measures_again_and_again_and_counts() -> None:
@@ -154,6 +168,10 @@ def test_timed_ranger_measures_again_and_again_and_counts() -> None:
         bench.wait(50_000)
         counts.append(bench.read(ADDRESS, b"\0\x8b", 1)[0])
     assert np.diff(counts).tolist() == [1, 1, 1]
+    bench.write(ADDRESS, b"\0\x8b\xfe")
+    for count in (255, 128, 129):  # as on the chip
+        bench.wait(50_000)
+        assert bench.read(ADDRESS, b"\0\x8b", 1)[0] == count
 
 
 def test_ranger_has_sts_identity_and_moves_to_the_address_that_it_is_given() -> None:
@@ -232,22 +250,22 @@ def about(axis: int, angle: float) -> tuple[float, ...]:
 
 
 @pytest.mark.parametrize(
-    ("to", "q_at", "wanted"),
-    [
-        ((0.5, 0.0, 0.0), lambda s: LEVEL, (0.0, -1.0)),  # forward: the firmware takes -delta y as x
-        ((0.0, 0.5, 0.0), lambda s: LEVEL, (-1.0, 0.0)),
-        ((0.0, 0.0, 0.0), lambda s: about(1, 0.3 * s), (0.0, 0.6)),  # nose down: the floor moves forward
-        ((0.0, 0.0, 0.0), lambda s: about(0, 0.3 * s), (-0.6, 0.0)),
-        ((0.0, 0.0, 0.0), lambda s: LEVEL, (0.0, 0.0)),
-    ],
+    ("to", "wanted"), [((0.5, 0.0), (0.0, -1.0)), ((0.0, 0.5), (-1.0, 0.0)), ((0.0, 0.0), (0.0, 0.0))]
 )
-def test_flow_is_the_way_over_the_height_and_the_turn(to, q_at, wanted) -> None:  # type: ignore[no-untyped-def]
-    """Half a metre at 1 m is 0.5 rad; the sensor turns about the body's middle, 8 mm above it."""
+def test_flow_is_the_way_over_the_height(to: tuple[float, float], wanted: tuple[float, float]) -> None:
+    """Half a metre at 1 m is 0.5 rad; the firmware takes -delta y as x."""
     bench = DeckBench("flow2")
-    height = 1.0 + SENSOR_BELOW
-    way = [((to[0] * s, to[1] * s, height), q_at(s)) for s in STEPS]
-    total = moved(bench, way) / FLOW_COUNTS
-    assert total == pytest.approx(0.5 * np.array(wanted), abs=0.04)
+    way = [((to[0] * s, to[1] * s, 1.0 + SENSOR_BELOW), LEVEL) for s in STEPS]
+    assert moved(bench, way) / FLOW_COUNTS == pytest.approx(0.5 * np.array(wanted), abs=0.04)
+
+
+@pytest.mark.parametrize(("axis", "wanted"), [(1, (0.0, 1.0)), (0, (-1.0, 0.0))])
+def test_flow_is_seen_from_the_sensors_place(axis: int, wanted: tuple[float, float]) -> None:
+    """Nose down, the floor moves forward; with the middle 9 cm above it by a tenth more: the sensor is 8 mm nearer."""
+    bench = DeckBench("flow2")
+    way = [((0.0, 0.0, 0.09), about(axis, angle)) for angle in np.linspace(-0.3, 0.3, 20)]
+    seen = [0.6 * 0.0915 / (0.0915 - SENSOR_BELOW) * sign for sign in wanted]  # 9.0 to 9.4 cm along its view
+    assert moved(bench, way) / FLOW_COUNTS == pytest.approx(np.array(seen), abs=0.025)
 
 
 def test_flow_is_limited_by_the_rate_that_it_can_follow() -> None:
@@ -258,6 +276,16 @@ def test_flow_is_limited_by_the_rate_that_it_can_follow() -> None:
     bench.place((0.5, 0.0, 0.1))
     bench.wait(8_264)
     assert burst(bench)[2] == pytest.approx(-7.4 * 8.264e-3 * FLOW_COUNTS, abs=4)
+
+
+def test_motion_is_forgotten_once_it_was_read_and_by_a_reset() -> None:
+    bench = DeckBench("flow2")
+    for forget in (lambda: burst(bench), lambda: bench.transfer(b"\xba\x5a")):
+        for x in (0.0, 0.1):
+            bench.place((x, x, 1.0))
+            bench.wait(8_264)
+        forget()
+        assert burst(bench)[:3] == (0x30, 0, 0)
 
 
 def test_near_the_floor_fewer_features_are_counted() -> None:

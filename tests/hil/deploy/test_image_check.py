@@ -4,9 +4,9 @@ import ctypes
 import json
 import os
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -17,18 +17,13 @@ from firmware_py.export.app_toc import AppParameter, app_parameters
 from firmware_py.wire.scalars import PARAMETER_SCALARS, Scalar
 from hil.config import load_config
 from hil.deploy import image_check
-from hil.deploy.beside import compare_flights, compare_states
+from hil.deploy.beside import BOUNDS, Bound, Compared, compare_flights, compare_states
 from hil.deploy.image_check import TARGET, check_image, check_memory, check_parameters, check_services
 from hil.deploy.service_programs import PROGRAMS
 from hil.deploy.services import Answers, ServiceBench, differences, play_in_copies
 from hil.devices.board_firmware import PythonBoard
 from hil.errors import LabError
-from hil.experiments import find_experiment
-from hil.laboratory.faults import parse
 from hil.laboratory.recorder import EVENTS
-from hil.laboratory.request import Request
-from hil.laboratory.run import fly
-from hil.pictures.compare import FlownRun, load_flown
 from hil.stm32f405.image import MemoryUse
 from support.crazyflie_app import App
 
@@ -149,36 +144,41 @@ def test_less_than_a_kilobyte_left_of_a_memory_is_a_warning(used: int, good: boo
     assert ("CCM has less than 1024 B left" in finding.text) != good
 
 
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., FlownRun]:
-    """Fly half a second of hover."""
-
-    def fly_hover(*faults: str) -> FlownRun:
-        folder = tmp_path_factory.mktemp("run") / "run"
-        chosen = [parse(text) for text in faults]
-        fly(Request.of(find_experiment("hover"), duration_s=0.5, faults=chosen), folder)
-        return load_flown(folder)
-
-    return fly_hover
+MEMBERS = {
+    "servo counts": 4,
+    "poses not fused": 4,
+    "age of poses": 1,
+    "poses fused": 1,
+    "supervisor's state": 1,
+}
+SIZE_OF = {"rms": 14**0.5 / 2, "mean": 1.0, "final": 2.0}  # of the differences 0, -1, 3, 2
 
 
-def test_flights_are_compared_by_their_bounds(flown: Callable[..., FlownRun]) -> None:
-    right = flown()
-    assert [one.found for one in compare_flights(right, right)] == [0.0] * 10
-    late = {one.bound.name: one for one in compare_flights(right, flown("mocap.latency@0.1:0.4=43"))}
-    age = late["age of poses"]
-    assert 1.5 < age.found < 43
-    assert not age.held
-    assert str(age).endswith("ms apart (estimator.pose_age_us), at most 1 ms")
-    place = right.log.column_names.index("motor.m3")
-    counts = pa.array(right.log.column("motor.m3").to_numpy() + np.int32(18))
-    moved = replace(right, log=right.log.set_column(place, "motor.m3", counts))
-    broken = [one for one in compare_flights(right, moved) if not one.held]
-    assert [(one.bound.name, one.bound.size, one.column, one.found) for one in broken] == [
-        ("servo counts", "mean", "motor.m3", 18.0)
-    ]
-    empty = replace(right, log=right.log.slice(0, 0))
-    assert not any(one.held for one in compare_flights(right, empty))
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("bound", BOUNDS, ids=lambda bound: f"{bound.name} {bound.size}")
+def test_each_bound_is_that_of_its_size_in_every_one_of_its_columns(bound: Bound, sign: int) -> None:
+    columns = {"t", "flight.free", *(name for one in BOUNDS for name in one.columns)}
+
+    def found(name: str, difference: list[float]) -> Compared:
+        rows = {one: np.zeros(len(difference)) for one in columns} | {"flight.free": np.ones(len(difference))}
+        runs = [
+            SimpleNamespace(log=pa.table(rows | {name: values}))
+            for values in (rows[name], sign * np.array(difference))
+        ]
+        return {one.bound: one for one in compare_flights(*runs)}[bound]  # type: ignore[arg-type]
+
+    assert len(bound.columns) == MEMBERS.get(bound.name, 3), "x, y, z and others"
+    for name in bound.columns:
+        for share, held in ((0.999, True), (1.001, False)):
+            if bound.size == "share of time":
+                assert found(name, [0.0] * 99 + [1.0] * (2 - held)).held == held
+                continue
+            scale = share * bound.limit / SIZE_OF[bound.size] / bound.factor
+            one = found(name, [0.0, -scale, 3 * scale, 2 * scale])
+            assert (one.held, one.column) == (held, name)
+            if bound.unit == "ms":
+                assert str(one).endswith("ms apart (estimator.pose_age_us), at most 1 ms")
+        assert not found(name, []).held
 
 
 def test_the_first_state_that_one_board_does_not_reach_is_found(tmp_path: Path) -> None:

@@ -8,8 +8,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter, ss2tf
 
+from firmware_py.config import parameters_of
+from firmware_py.core.controller import allocate
+from firmware_py.core.servo import drive_servos
+from firmware_py.core.structs import Control
 from ground_station.telemetry_log import POSE_COLUMNS, TIME_COLUMN
-from hil.config import load_config
+from hil.config import LabConfig, load_config
 from hil.design.axes import PITCH as PITCH_AXIS
 from hil.errors import LabError
 from hil.identify.identify import IDENTIFIED, UNKNOWN, Identification, check_held_out, identify
@@ -223,15 +227,31 @@ def test_the_intervals_hold_the_truth_of_most_constants(tmp_path: Path) -> None:
     assert np.mean(hits) >= 0.85
 
 
-@pytest.mark.long
-def test_a_profile_of_what_was_identified_loads_and_keeps_what_was_not(tmp_path: Path) -> None:
-    path = tmp_path / "mine.toml"
-    write_profile(path, "floaty", identified(tmp_path, flight(1)))
-    model = load_config(str(path)).model
-    assert model.pitch_u2 == pytest.approx(-900, rel=0.1)
-    assert model.flap_rate == pytest.approx(1 / 0.045, rel=0.1)
-    assert model.roll_u1 == load_config().model.roll_u1
+def test_a_written_profile_has_what_was_identified_and_holds_the_mean_inputs_by_its_trim(
+    tmp_path: Path,
+) -> None:
+    path, base, mean = tmp_path / "mine.toml", tmp_path / "base.toml", (0.02, -0.03, 0.05, 0.04)
+    base.write_text('base = "floaty"\n[servo]\ndirection = [1, -1, -1, 1]\n')
+    columns = flight(1)
+    columns |= {name: columns[name] + value for name, value in zip(INPUTS, mean, strict=True)}
+    found = identify([load_record(written(tmp_path, columns), str(base))])
+    notice = write_profile(path, str(base), found)
+    assert notice == "servo trim changed: the flights needed u1..u4 of 20, -30, 50, 40 mrad on the mean"
+    before, after = load_config(str(base)), load_config(str(path))
+    assert after.model.pitch_u2 == pytest.approx(-900, rel=0.1)
+    assert after.model.flap_rate == pytest.approx(1 / 0.045, rel=0.1)
+    assert after.model.roll_u1 == before.model.roll_u1
     assert "± " in path.read_text()
+    assert servo_words(after, (0.0, 0.0, 0.0, 0.0)) == pytest.approx(servo_words(before, mean), abs=20)
+
+
+def servo_words(config: LabConfig, u: tuple[float, ...]) -> list[int]:
+    """Return the words that the core sends to the servos for four inputs."""
+    parameters, control = parameters_of(config), Control.allocate()
+    control.fields.u[:] = u
+    allocate(parameters.arg, control.arg)
+    drive_servos(parameters.arg, control.arg)
+    return control.fields.word.tolist()
 
 
 def test_the_papers_equations_find_no_damping_whatever_the_robot_has(tmp_path: Path) -> None:

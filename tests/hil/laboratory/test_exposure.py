@@ -62,6 +62,15 @@ def test_unseen_instants_have_no_pose():
     assert np.isfinite(x[(times < 1_750_000) | ((times > 2_500_000) & (times < 3_900_000))]).all()
 
 
+@pytest.mark.parametrize(("gap_us", "known"), [(100_000, True), (110_000, False)])
+def test_instants_between_two_exposures_are_known_up_to_a_tenth_of_a_second(gap_us, known):
+    times, exposed = rows(300)
+    begin = exposed[100]
+    exposed[(exposed > begin) & (exposed < begin + gap_us)] = begin
+    x = at_exposure(log_of(exposed, times)).column("cameras.x").to_numpy()
+    assert (np.isfinite(x[(times > begin) & (times < begin + gap_us)]) == known).all()
+
+
 def test_before_the_first_pose_there_is_none():
     times, exposed = rows(100)
     exposed[:50] = np.nan

@@ -10,6 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import hil.learn
+from hil.config import load_config
 from hil.errors import LabError
 from hil.learn.envs import FastEnv, FirmwareEnv, make_env
 from hil.learn.tasks import TASKS
@@ -142,10 +143,13 @@ def test_an_episode_is_truncated_after_its_duration(fidelity: str) -> None:
 def test_an_age_of_the_pose_delays_the_observation_of_the_cameras_alone() -> None:
     quiet: Any = {"overrides": STILL, "errors": hil.learn.EstimateErrors(0.0, 0.0, 0.0, 0.0)}
     now, late = make_env("Hover", **quiet), make_env("Hover", pose_delay_us=50_000, **quiet)
+    assert isinstance(now, FastEnv)
+    home = load_config().flight.home
     seen = {env: [env.reset(seed=2)[0]] for env in (now, late)}
     for action in actions(40, 0.3):
         for env, rows in seen.items():
             rows.append(env.step(action)[0])
+        assert seen[now][-1][2] == pytest.approx(home[2] - now.truth[at.P + 2], abs=1e-6)
     fresh, old = np.array(seen[now]), np.array(seen[late])
     np.testing.assert_array_equal(old[5:, :9], fresh[:-5, :9])
     np.testing.assert_array_equal(old[:, 9:], fresh[:, 9:])

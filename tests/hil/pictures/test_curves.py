@@ -1,6 +1,7 @@
 """The arithmetic of curves, spells and pictures: half turns, gaps, states, ends of ranges."""
 
 import json
+import re
 from collections.abc import Sequence
 from math import nan
 
@@ -8,12 +9,15 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from firmware_py.geometry import yaw_quaternion
+from firmware_py.geometry import from_euler_zyx, yaw_quaternion
+from hil.errors import LabError
 from hil.pictures import compare, curves
 from hil.pictures.panels import TOGETHER_S, marks_of_flight, saturated
 from hil.pictures.trials import openings
+from hil.pictures.viewer.plots import RATES
 
 RELEASE = {b"release_us": b"0"}
+MEMBERS = (("up", "down"), ("x", "y", "z"), ("roll", "pitch", "yaw"), ("1", "2", "3", "4"))
 
 
 def flight(yaw: Sequence[float], period_us: int = 10_000, **columns: Sequence[float]) -> pa.Table:
@@ -45,10 +49,67 @@ def test_the_attitude_error_goes_the_short_way_round(yaw: float, error: float) -
     assert curves.ATTITUDE.read(flight([yaw]))[0] == pytest.approx([0.0, 0.0, error], abs=1e-9)
 
 
+def test_angles_have_their_own_names() -> None:
+    rows = flight(
+        [180.0],
+        **{f"truth.q{part}": [q] for part, q in zip("wxyz", from_euler_zyx(0.1, -0.2, 3.0), strict=True)},
+    )
+    shown = dict(zip(curves.ATTITUDE.names, curves.ATTITUDE.read(rows)[0].tolist(), strict=True))
+    expected = {"roll": 0.1, "pitch": -0.2, "yaw": 3.0 - np.pi}
+    assert shown == pytest.approx({name: np.degrees(angle) for name, angle in expected.items()})
+
+
 def test_an_estimate_across_half_a_turn_misses_by_the_difference() -> None:
     rows = flight([1.0, -1.0], **{"estimate.yaw": np.radians([179.0, -178.0])})
     missed = curves.ATTITUDE_MISS.read(rows)[:, 2]
     assert missed == pytest.approx([-2.0, 3.0], abs=1e-9)
+
+
+def probed(columns: set[str], grown: str = "") -> pa.Table:
+    """Three rows of a log with these columns, of which one grows."""
+    packets = {"link.up_delivered", "link.down_delivered"} if "link.up_latency_sum" in columns else set()
+    always = {"t", grown, *packets}
+    rows = {one: np.arange(3.0) if one in always else np.full(3, float(one == "truth.qw")) for one in columns}
+    return pa.table(rows).replace_schema_metadata(RELEASE)
+
+
+def columns_of(plot: curves.Curves) -> set[str]:
+    columns: set[str] = {"t"}
+    while True:
+        try:
+            plot.read(probed(columns))
+            return columns
+        except LabError as missing:
+            columns.add(str(missing).split("'")[1])
+
+
+def words(text: str) -> set[str]:
+    return set(re.findall(r"[a-z]+|[0-9]", text.replace("rotor", "")))
+
+
+PLOTTED = {name: one for name, one in vars(curves).items() if isinstance(one, curves.Curves)} | dict(RATES)
+PLOTTED |= {
+    one.__name__: curves.Curves(("up", "down"), ("", ""), "", one)
+    for one in (curves.latency, curves.line_load)
+}
+
+
+@pytest.mark.parametrize("name", PLOTTED)
+def test_a_curve_shows_the_member_of_a_group_that_its_name_says(name: str) -> None:
+    plot = PLOTTED[name]
+    read = columns_of(plot)
+    moved: list[set[str]] = [set() for _ in plot.names]
+    for grown in read - {"t"}:
+        with np.errstate(all="ignore"):
+            changed = (plot.read(probed(read, grown)) != plot.read(probed(read))).reshape(-1, len(moved))
+        for index in np.flatnonzero(changed.any(axis=0)):
+            moved[index].add(grown.partition(".")[2])
+    for label, columns in zip(plot.names, moved, strict=True):
+        for members in MEMBERS:
+            named, shown = (
+                set(members) & found for found in (words(label), set().union(*map(words, columns)))
+            )
+            assert not named or not shown or shown == named, (label, columns)
 
 
 def test_the_time_since_the_last_fused_pose_grows_until_the_next_one() -> None:

@@ -7,10 +7,13 @@ from itertools import combinations
 import numpy as np
 import pyarrow as pa
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
 from hil.experiments.overload import loads_that_hurt
+from hil.laboratory.schedule import runs
 from hil.pictures import curves, figures
 
 RELEASE_US = 1_000_000
@@ -79,6 +82,25 @@ def test_a_task_has_one_colour_in_every_figure_whatever_tasks_are_there() -> Non
     assert drawn == [("SENSORS", 200, sensors), ("KALMAN", 100, kalman), ("KALMAN", 100, kalman)]
 
 
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 2), st.sampled_from("ABC"), st.sampled_from(["IN", "READY"])), max_size=20
+    )
+)
+def test_turns_are_never_empty_and_cover_the_time_of_each_task(steps: list[tuple[int, str, str]]) -> None:
+    us = np.cumsum([0, *(step for step, _, _ in steps), 2]).tolist()
+    events = [("IN", "A"), *((event, who) for _, who, event in steps), ("END", "-")]
+    had: list[str] = []  # the task of each microsecond
+    task = ""
+    for (event, who), begin, end in zip(events, us, [*us[1:], us[-1]], strict=True):
+        task = who if event == "IN" else task
+        had += [task] * (end - begin)
+    table = pa.table({"us": us, "event": [event for event, _ in events], "who": [who for _, who in events]})
+    turns = list(runs(table))
+    assert all(turn.start_us < turn.end_us for turn in turns)
+    assert [turn.task for turn in turns for _ in range(turn.start_us, turn.end_us)] == had
+
+
 @pytest.mark.parametrize("cut", [1, 3, 5, 30])
 def test_the_time_since_the_last_fused_pose_goes_on_over_batches(cut: int) -> None:
     rows = log([0, 0, 1, 1, 2, *60 * [2], 3])
@@ -106,6 +128,19 @@ def test_curves_and_states_are_in_seconds_from_the_release() -> None:
         ("supervisor", "flying", second(0.0), second(0.02)),
         ("supervisor", "failsafe", second(0.02), second(0.03)),
     ]
+
+
+def test_the_directions_of_a_link_have_each_their_own_line() -> None:
+    count, zeros = np.arange(301.0), np.zeros(301)
+    lost = ("up_dropped", "down_dropped", "retried", "overrun", "no_room", "up_bad", "down_bad")
+    columns = {f"{group}.{name}": zeros for group in ("link", "serial") for name in lost}
+    for name, value in (("up", 1.0), ("down", 3.0)):
+        columns[f"link.{name}_delivered"] = count
+        columns[f"link.{name}_latency_sum"] = 1000 * value * count
+        columns[f"serial.{name}_busy"] = 100 * value * count
+    rows = log([0] * 301, **columns)  # type: ignore[arg-type]
+    for panel in (*figures.radio(rows).panels[:1], *figures.serial_line(rows).panels[:2]):
+        assert {line.name: set(line.values.round(6)) for line in panel.series} == {"up": {1.0}, "down": {3.0}}
 
 
 def overloaded(shares: list[float], error: list[float], late: list[int]) -> pa.Table:

@@ -291,13 +291,6 @@ def test_the_latency_is_that_of_the_packets_that_arrived() -> None:
     np.testing.assert_array_equal(curves.latency(rows), [[2.0, 2.0], [np.nan, np.nan]])
 
 
-def test_the_load_of_the_line_is_its_busy_time_in_percent() -> None:
-    rows = pa.table(
-        {"t": [0, 10_000, 30_000], "serial.up_busy": [0, 1_000, 11_000], "serial.down_busy": [0, 0, 20_000]}
-    )
-    np.testing.assert_allclose(curves.line_load(rows), [[10.0, 0.0], [50.0, 100.0]])
-
-
 def test_states_have_the_supervisors_names() -> None:
     assert curves.SUPERVISOR.names == (*(state.name.lower() for state in State), "unknown")
 

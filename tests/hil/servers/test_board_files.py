@@ -30,13 +30,18 @@ def test_the_eeprom_of_each_board_is_kept_over_a_restart(tmp_path: Path) -> None
     assert values["supervisor.poseTimeout"] == 321
 
 
-def test_changes_are_written_at_once(tmp_path: Path) -> None:
+def test_every_change_is_written_at_once(tmp_path: Path) -> None:
     server = serve(tmp_path)
-    server.robot.board.eeprom[8000:8003] = b"new"
-    server.lab.end_at(30_000)
-    server.lab.run()
-    assert (tmp_path / "board-1.eeprom").read_bytes()[8000:8003] == b"new"
+    for end_us, data in ((30_000, b"new"), (60_000, b"two"), (90_000, b"new")):
+        server.robot.board.eeprom[8000:8003] = data
+        server.lab.end_at(end_us)
+        server.lab.run()
+        assert (tmp_path / "board-1.eeprom").read_bytes()[8000:8003] == data
     assert sorted(path.name for path in tmp_path.iterdir()) == ["board-1.eeprom"]
+    again = serve(tmp_path)
+    again.robot.board.eeprom[8000:8003] = b"aga"  # a change after a load
+    again.close()
+    assert (tmp_path / "board-1.eeprom").read_bytes()[8000:8003] == b"aga"
 
 
 def test_without_a_folder_every_server_begins_with_new_boards() -> None:

@@ -8,7 +8,7 @@ from firmware_py.wire.memories import CONFIG_SIZE, RadioSettings, encode_config
 from hil.config import load_config
 from hil.events import EventQueue
 from hil.laboratory.fault_kinds import KINDS
-from hil.laboratory.faults import Switchboard
+from hil.laboratory.faults import Switchboard, parse
 from hil.laboratory.robot import Ports, Robot, Site, Streams, nobody_listens
 from hil.servers.failures import Failures
 from support.mavlink_lab import MavlinkLab
@@ -98,6 +98,24 @@ def test_another_bodys_motors_fail_instead() -> None:
     events.run(0)
     assert [fault.kind for fault in board.active] == ["motor.stop.2"]
     assert robot.body.settings["motor.current.2"].read() == 0.0
+
+
+def test_a_fault_that_begins_twice_acts_twice_and_ends_twice() -> None:
+    events = EventQueue()
+    robot = Robot(Site(load_config(), events, Streams.of_seed(1), lambda *_: None), Ports(nobody_listens))
+    board, fault = Switchboard(robot), parse("imu.bias.p:1=5", live=True)
+    seen = []
+    for now_us in range(0, 1_600_001, 200_000):
+        events.run(now_us)
+        if now_us in (0, 400_000):
+            board.act(fault, now_us)
+        seen.append((len(board.active), round(math.degrees(robot.imu.rate_bias[0]))))
+    assert seen == [(1, 5)] * 2 + [(2, 10)] * 3 + [(1, 5)] * 2 + [(0, 0)] * 2
+    robot.imu.set_rate_bias(0.01, 0.0, 0.0)  # what a later fault begins from
+    board.act(fault, 1_600_000)
+    assert robot.imu.rate_bias[0] == pytest.approx(0.01 + math.radians(5.0))
+    board.end(fault, 1_600_000)
+    assert robot.imu.rate_bias[0] == pytest.approx(0.01)
 
 
 def test_a_command_that_comes_twice_acts_once_and_another_takes_its_place(lab: MavlinkLab) -> None:

@@ -361,6 +361,19 @@ def test_a_watchpoint_stops_after_the_access(kind: bytes, name: str) -> None:
         assert said[4] == b"01000000"
 
 
+def test_a_debugger_that_has_left_stops_nothing_any_more() -> None:
+    machine, server = FirmwareOnChip(), GdbServer(0)
+    place = machine.image.symbol("xTickCount").address
+    with socket.create_connection(("127.0.0.1", server.port)) as line:
+        line.sendall(b"".join(map(framed, (b"QStartNoAckMode", b"Z2,%x,4" % place, b"D"))))
+        chip = DebuggedChip(machine.chip, server)
+        assert chip.run(CYCLES_PER_US) == Why.TIME
+    for end_us in (2_000, 4_000):  # the chip itself, without its debugger
+        while machine.chip.now_us < end_us:
+            assert machine.chip.run(end_us * CYCLES_PER_US) & Why.WATCHPOINT == 0
+    server.close()
+
+
 def test_the_chip_waits_for_its_debugger_at_its_first_instruction() -> None:
     machine, answers = on_chip(lambda _: [b"QStartNoAckMode", b"pf", b"me000ed28,4", b"D"], 2_000)
     reset = framed(pack("<I", machine.image.reset).hex().encode())

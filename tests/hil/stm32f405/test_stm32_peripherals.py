@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("unicorn")
 
 from hil.errors import LabError
-from hil.stm32f405.chip import FLASH, Why
+from hil.stm32f405.chip import CYCLES_PER_US, FLASH, RAM, Why
 from support.stm32_bench import Bench
 
 TIM3, I2C1, IWDG = 0x4000_0400, 0x4000_5400, 0x4000_3000
@@ -142,10 +142,47 @@ def test_where_nothing_is_nothing_can_be_read(bench: Bench) -> None:
         bench.chip.read(0x6000_0000, 4)
 
 
-def test_a_register_that_changes_stays_until_reset(bench: Bench) -> None:
-    bench.chip.set_register("r7", 0x1234)
-    bench.wait(10)
-    assert bench.chip.register("r7") == 0x1234
-    bench.chip.reset(0x0C00_0000)
-    assert bench.chip.register("r7") == 0
-    assert bench.chip.register("pc") == FLASH + 8
+# TIM2 to TIM5, USART2, I2C1, TIM1, USART6, SPI1, SYSCFG, EXTI, GPIOA to GPIOD, RCC, DMA1, DMA2; SysTick, NVIC, SCB.
+PERIPHERALS = (
+    0x4000_0000, 0x4000_0400, 0x4000_0800, 0x4000_0C00, 0x4000_4400, 0x4000_5400, 0x4001_0000, 0x4001_1400, 0x4001_3000,
+    0x4001_3800, 0x4001_3C00, 0x4002_0000, 0x4002_0400, 0x4002_0800, 0x4002_0C00, 0x4002_3800, 0x4002_6000, 0x4002_6400,
+)  # fmt: skip
+SYSTEM = (0xE000_E010, 0xE000_E100, 0xE000_E200, 0xE000_E400, 0xE000_ED04)
+CORE = (*(f"r{number}" for number in range(13)), "sp", "pc", "primask", "basepri", "faultmask", "control")
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_reset_chip_is_like_a_fresh_one(bench: Bench, seed: int) -> None:
+    """Whatever was written to its registers, and while it runs on."""
+
+    def seen(one: Bench) -> dict[int | str, int]:
+        registers: dict[int | str, int] = {name: one.chip.register(name) for name in CORE}
+        places = [
+            base + 4 * word for base in PERIPHERALS + SYSTEM for word in range(24 if base < SYSTEM[0] else 4)
+        ]
+        return registers | {place: one[place] for place in places}
+
+    rng = np.random.default_rng(seed)
+    fresh = Bench()
+    for base in rng.permutation(PERIPHERALS + SYSTEM[:4]).tolist():
+        for word in rng.integers(0, 24 if base < SYSTEM[0] else 4, 12).tolist():
+            if base + 4 * word != 0x4002_3C00:
+                bench[base + 4 * word] = int(rng.integers(1, 1 << 32) & rng.integers(1, 1 << 32))
+    for name in CORE[:13]:
+        bench.chip.set_register(name, 0x1234)
+    for name, value in (("basepri", 0x10), ("faultmask", 1), ("primask", 1), ("control", 2)):
+        bench.chip.set_register(name, value)
+    bench.chip.run(5 * CYCLES_PER_US)
+    assert seen(bench) != seen(fresh)
+    fresh.chip.run(bench.chip.state.now)
+    for one in (bench, fresh):
+        one.chip.reset(0x0C00_0000)
+    # The manuals' values: VTOR, CCR, status of USART2 and SPI1, reload of TIM2 and TIM3, cause.
+    places = (0xE000_ED08, 0xE000_ED14, 0x4000_4400, 0x4001_3008, 0x4000_002C, 0x4000_042C, 0x4002_3874)
+    values = (FLASH, 0x200, 0xC0, 2, 0xFFFF_FFFF, 0xFFFF, 0x0C00_0000)
+    assert [bench[place] for place in places] == list(values)
+    assert [bench.chip.register(name) for name in CORE] == [*13 * [0], RAM + 0x1000, FLASH + 8, 0, 0, 0, 0]
+    for _ in range(3):
+        assert set(seen(bench).items()) == set(seen(fresh).items())
+        for one in (bench, fresh):
+            one.chip.run(fresh.chip.state.now + 100 * CYCLES_PER_US)
