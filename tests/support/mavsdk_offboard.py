@@ -20,10 +20,10 @@ from mavsdk.plugins.mission import MissionItem, MissionPlan
 from mavsdk.plugins.mission_raw import MissionItem as RawItem
 
 GOALS = (  # north, east, down [m], yaw [deg], and for how long [s]
-    (0.0, 0.0, -1.3, 0.0, 8.0),
-    (0.1, 0.0, -1.3, 90.0, 8.0),
-    (0.1, 0.1, -1.3, 90.0, 8.0),
-    (0.0, 0.1, -1.15, 180.0, 8.0),
+    (0.0, 0.0, -1.3, 0.0, 4.5),
+    (0.1, 0.0, -1.3, 90.0, 4.5),
+    (0.1, 0.1, -1.3, 90.0, 4.5),
+    (0.0, 0.1, -1.15, 180.0, 4.5),
 )
 STREAMS = (
     "odometry", "position_velocity_ned", "actuator_output_status", "home", "fixedwing_metrics", "unix_epoch_time",
@@ -78,8 +78,7 @@ async def main(url):
                 seen["places"].append((time.monotonic(), p.north_m, p.east_m, p.down_m))
 
         tasks = [asyncio.create_task(listen()), asyncio.create_task(watch())]
-        found = await asyncio.gather(*(first(getattr(telemetry, f"subscribe_{name}")()) for name in STREAMS))
-        seen["streams"] = dict(zip(STREAMS, found, strict=True))
+        found = asyncio.gather(*(first(getattr(telemetry, f"subscribe_{name}")()) for name in STREAMS))
         await telemetry.set_rate_position_velocity_ned(20.0)
 
         seen["arm"] = await outcome(action.arm())
@@ -106,6 +105,7 @@ async def main(url):
         )  # fmt: skip
         seen["mission"] = await outcome(MissionAsync(drone).upload_mission(MissionPlan([point])))
         seen["start mission"] = await outcome(MissionAsync(drone).start_mission())
+        seen["streams"] = dict(zip(STREAMS, await found, strict=True))
         for task in tasks:
             task.cancel()
     print(json.dumps(seen))

@@ -386,6 +386,7 @@ def test_after_a_relocalisation_the_state_jumps_to_the_first_pose_in_time(
     assert core.pose(p, q, age_us=500_000) == POSE_TOO_OLD
     assert core.pose(p, q) == POSE_ON_TIME
     core.pose(p, q)  # another one of the same tick
+    assert not core.data.fields.pose_relocated
     while not core.fields.jumps:
         core.tick()
     assert core.counters["too_old"] == before["too_old"] + 1
