@@ -275,7 +275,7 @@ def test_a_limit_on_an_unknown_metric_is_refused_where_it_is_declared() -> None:
 
 def test_a_knob_of_an_unknown_attribute_is_refused_with_those_that_exist() -> None:
     with pytest.raises(
-        LabError, match="knob 'nope_us' of VirtualMocap: there are dropout, more_latency_us, outlier"
+        LabError, match="knob 'nope_us' of VirtualMocap: there are dropout, frozen, more_latency_us, outlier"
     ):
         knob(lambda robot: robot.mocap, "nope_us", add)
     with pytest.raises(LabError, match="knob 'more_latency' of VirtualMocap: did you mean more_latency_us"):
