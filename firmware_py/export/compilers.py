@@ -16,6 +16,8 @@ from firmware_py.export.errors import ExportError
 from firmware_py.extras import install_command
 from firmware_py.kept_code import kept_folder, may_load
 
+ATTEMPTS = 3  # clang itself crashed once (SIGBUS) in a run of all tests
+
 SYSTEM_COMPILERS = ("gcc", "clang", "cc")
 HOST_FLAGS = (
     "-O2", "-shared", "-fPIC", "-std=c99", "-fno-sanitize=all",
@@ -79,7 +81,10 @@ def compile_texts(
     except OSError as error:
         raise ExportError(f"{place}: cannot be written ({error.strerror or error})") from None
     caches = {name: str(kept_folder("zig")) for name in ("ZIG_LOCAL_CACHE_DIR", "ZIG_GLOBAL_CACHE_DIR")}
-    done = _run((*command, "-o", partial, *inputs), cwd=place, env=os.environ | caches)
+    for _ in range(ATTEMPTS):
+        done = _run((*command, "-o", partial, *inputs), cwd=place, env=os.environ | caches)
+        if "frontend command failed" not in done.stderr:
+            break
     if done.returncode:
         complaints = [line for line in done.stderr.splitlines() if "error" in line]
         raise ExportError(f"{compiler.name}: {(complaints or [f'exit {done.returncode}'])[0]}")
