@@ -14,11 +14,7 @@ ESTIMATOR, CONTROL, INPUT = (
     Control.dtype,
     Input.dtype,
 )  # how they lie in memory, here and in an image
-REFUSED = (
-    "refused",
-    "too_old",
-    "invalid",
-)  # counters of poses that were not fused; their sum is `Report.rejected`
+REFUSED = ("refused", "too_old", "invalid")  # counters of poses not fused; their sum is `Report.rejected`
 COUNTERS = ("fused", "refused", "jumps", "too_old", "invalid", "bounded", "resets", "horizon", "pose_age_us")
 
 

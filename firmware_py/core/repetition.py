@@ -5,6 +5,7 @@ the robot rests. So a repetition alone is no fault. It is one when the gyro has 
 """
 
 from firmware_py.core.maths import ZERO
+from firmware_py.core.model import DT
 from firmware_py.core.structs import HORIZON_LIMIT, TICK_US, Input, Parameters, Sampling
 from firmware_py.core.subset import f32, i32, kernel
 
@@ -12,7 +13,6 @@ from firmware_py.core.subset import f32, i32, kernel
 TURN = f32(0.0175)
 # A turn is forgotten with a time constant of 16 ticks: a wrong zero of 5 deg/s adds up to 0.8 deg.
 KEPT = f32(0.9375)
-TICK_S = f32(0.01)
 
 
 @kernel
@@ -55,7 +55,7 @@ def add_turn(parameters: Parameters, data: Input, sampling: Sampling) -> None:
         turn = KEPT * sampling.turn[axis]
         if data.gyro_samples > 0:
             mean = f32(data.gyro_sum[axis]) / f32(data.gyro_samples) - data.gyro_bias[axis]
-            turn = turn + mean * parameters.gyro_scale * TICK_S
+            turn = turn + mean * parameters.gyro_scale * DT
         sampling.turn[axis] = turn
         square = square + turn * turn
     if square > TURN * TURN:

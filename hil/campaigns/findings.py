@@ -41,16 +41,17 @@ PULL = 1.0  # weight of the prior that pulls the logistic map towards no influen
 
 @dataclass(frozen=True, slots=True)
 class Limited:
-    """A limit of an experiment on a profile, over the flights."""
+    """A limit of an experiment on a profile, over the judged flights.
+
+    Judged are all that ended, without lost ones unless a limit on `lost` admits them.
+    """
 
     experiment: str
     profile: str
     name: str
     metric: Metric
     bound: float
-    rate: (
-        Rate  # of the judged flights: all that ended, without lost ones unless a limit on `lost` admits them
-    )
+    rate: Rate
     values: Array  # of the judged flights with the metric
 
     def quantile(self, share: float) -> str:

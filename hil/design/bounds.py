@@ -30,11 +30,8 @@ class Bounds:
         """Return a sentence when a value lies at one of the ends, else nothing."""
         for end, at, why in (("lower", self.low, self.why_low), ("upper", self.high, self.why_high)):
             if abs(value - at) <= AT_BOUND * (self.high - self.low):
-                shown = (
-                    f"{math.degrees(value):.0f} deg"
-                    if self.name == "kink"
-                    else f"{value:.3g} of the footprint"
-                )
+                angle = self.name == "kink"
+                shown = f"{math.degrees(value):.0f} deg" if angle else f"{value:.3g} of the footprint"
                 return f"{self.name} = {shown}: at the {end} bound of the search ({why})"
         return ""
 

@@ -637,9 +637,8 @@ def test_the_report_has_attitude_poses_and_flaps() -> None:
     assert np.abs(core.now[12:]).max() > 0.01
 
 
-COUNTERS = {
-    *("fused", "refused", "jumps", "too_old", "invalid", "no_corrections", "frozen", "bounded", "resets")
-}
+COUNTERS = {"fused", "refused", "jumps", "bounded", "resets"}
+COUNTERS |= {"too_old", "invalid", "no_corrections", "frozen"}
 # Of the last pose; work space; and what counts only while a pose or a suspect waits.
 LEFT = {"pose_age_us", "work_1", "work_2", "work_3", "work_P", "pose", "pose_lag", "suspect", "suspect_tick"}
 

@@ -59,14 +59,17 @@ def rms_cm(places: list[Any], goal: tuple[float, ...]) -> Any:
     return 100 * np.sqrt(np.mean((np.array(places) - goal[:3]) ** 2, axis=0))
 
 
-@pytest.mark.parametrize(
-    "kind", ["odometry", *(pytest.param(kind, marks=pytest.mark.long) for kind in (*POSES,)[:2])]
-)
-def test_poses_of_every_kind_fly_the_robot_to_its_goals(kind: str) -> None:
+@pytest.fixture(params=["odometry", *(pytest.param(kind, marks=pytest.mark.long) for kind in (*POSES,)[:2])])
+def lab(request: pytest.FixtureRequest) -> MavlinkLab:
+    """A robot that flies on poses of a kind."""
     lab = MavlinkLab()
-    fly_on(kind, lab)
+    fly_on(request.param, lab)
     lab.run(4.0)
     assert lab.robot.free
+    return lab
+
+
+def test_poses_of_every_kind_fly_the_robot_to_its_goals(lab: MavlinkLab) -> None:
     for goal in (HOME, (0.1, -0.05, 1.3)):
         lab.repeat(goal, 2.0)
         assert max(rms_cm(lab.repeat(goal, 2.0), goal)) < 6.0
@@ -74,14 +77,9 @@ def test_poses_of_every_kind_fly_the_robot_to_its_goals(kind: str) -> None:
     assert ages_ms[-1] == pytest.approx(40.5, abs=2.0)  # camera 20, processing 18, line 1.5 to 4
 
 
-@pytest.mark.parametrize(
-    "kind", ["odometry", *(pytest.param(kind, marks=pytest.mark.long) for kind in (*POSES,)[:2])]
-)
-def test_frozen_poses_of_every_kind_are_named_and_end_in_the_failsafe_until_they_move(kind: str) -> None:
-    lab = MavlinkLab()
-    fly_on(kind, lab)
-    lab.run(4.0)
-    assert lab.robot.free
+def test_frozen_poses_of_every_kind_are_named_and_end_in_the_failsafe_until_they_move(
+    lab: MavlinkLab,
+) -> None:
     assert lab.command(dialect.MAV_CMD_INJECT_FAILURE, dialect.FAILURE_UNIT_SENSOR_VIO, STUCK) == 0
     lab.run(0.85)
     frozen, failsafe = lab.texts()
