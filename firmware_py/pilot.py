@@ -28,9 +28,8 @@ from firmware_py.geometry import Vector
 from firmware_py.supervisor import CoreSupervisor
 from firmware_py.wire.crtp import Correction
 
-# Arrival of a pose on board [us], the pose, whether it is absolute, its own goal (of MAVLink; None: that in force), and
-# whether its sender has moved the frame since its last pose.
-Arrived = tuple[int, Correction, bool, PathPoint | None, bool]
+# Arrival of a pose on board [us], the pose, whether it is absolute, and its own goal (of MAVLink); None: that in force.
+Arrived = tuple[int, Correction, bool, PathPoint | None]
 
 BOX = "it leaves the box, see box.radius, box.below and box.above"
 REASONS = {
@@ -128,7 +127,7 @@ class Pilot:
     def measured(self, pose: Correction, now_us: int) -> Arrived:
         """Return a pose that has just arrived over CRTP."""
         self.seen_us = now_us
-        return now_us, pose, self.absolute, None, False
+        return now_us, pose, self.absolute, None
 
     def _follow(self, setpoint: Setpoint) -> None:
         """Hand the core a set-point; report one that is not followed."""

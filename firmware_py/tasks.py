@@ -122,7 +122,6 @@ def hand_pose_to_core(
     pose: Correction,
     absolute: bool,
     goal: PathPoint | None,
-    relocated: bool,
 ) -> int:
     """Hand a pose to the core; return the result, `POSE_...`."""
     data = core.data.fields
@@ -134,8 +133,6 @@ def hand_pose_to_core(
     data.pose_position[:] = pose.p_GB
     data.pose_quaternion[:] = pose.q_GB
     data.pose_age_us = i32(-1 if pose.age_us is None else pose.age_us)
-    if relocated:
-        data.pose_relocated = i32(1)  # the core clears it: a pose that it does not use leaves it
     answer = core.run.call("file_pose")
     if goal is not None:
         put_goal(data, None)  # it was that of this pose only: the estimate is reported from the goal

@@ -61,7 +61,6 @@ def file_pose(
         return seen
     answer = _file_pose(parameters, data, estimator)
     if answer == POSE_ON_TIME:
-        data.pose_relocated = i32(0)
         _note_pose(data, supervisor)
     return answer
 

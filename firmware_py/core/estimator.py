@@ -13,8 +13,6 @@ from firmware_py.core.structs import (
     RATE,
     STATES,
     VELOCITY,
-    WAITING_NONE,
-    WAITING_TO_JUMP,
     Estimator,
     Parameters,
 )
@@ -189,7 +187,7 @@ def jump(parameters: Parameters, estimator: Estimator, pose: F32s) -> None:
 
 @kernel
 def update_pose(parameters: Parameters, estimator: Estimator, row: Integer) -> None:
-    """Fuse the pose in that row of the history, unless the gate refuses it; jump to it where the frame has moved."""
+    """Fuse the pose in that row of the history, unless the gate refuses it."""
     pose = estimator.work_2
     pose_at_tick(estimator, row, pose)
     if estimator.started == 0:
@@ -197,9 +195,8 @@ def update_pose(parameters: Parameters, estimator: Estimator, row: Integer) -> N
         jump(parameters, estimator, pose)
         estimator.fused = i32(estimator.fused + 1)
         return
-    relocated = estimator.pose_waiting[row] == WAITING_TO_JUMP
-    if relocated or surprising(parameters, estimator, pose):
-        if relocated or confirms_suspect(parameters, estimator, pose):
+    if surprising(parameters, estimator, pose):
+        if confirms_suspect(parameters, estimator, pose):
             jump(parameters, estimator, pose)
             estimator.jumps = i32(estimator.jumps + 1)
             estimator.suspect_waiting = i32(0)
@@ -269,7 +266,7 @@ def filter_tick(parameters: Parameters, estimator: Estimator) -> None:
     estimator.filtered_tick = i32(estimator.filtered_tick + 1)
     row = estimator.filtered_tick % HISTORY
     update_gyro(parameters, estimator, row)
-    if estimator.pose_waiting[row] != WAITING_NONE:
+    if estimator.pose_waiting[row] != 0:
+        estimator.pose_waiting[row] = i32(0)
         update_pose(parameters, estimator, row)
-        estimator.pose_waiting[row] = i32(WAITING_NONE)
     keep_sane(parameters, estimator)

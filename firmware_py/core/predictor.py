@@ -19,9 +19,6 @@ from firmware_py.core.structs import (
     RATE,
     STATES,
     TICK_US,
-    WAITING_NONE,
-    WAITING_TO_FUSE,
-    WAITING_TO_JUMP,
     Control,
     Estimator,
     Input,
@@ -53,7 +50,7 @@ def reset(parameters: Parameters, estimator: Estimator) -> None:
         estimator.x[i] = ZERO
         estimator.now[i] = ZERO
     for row in range(HISTORY):
-        estimator.pose_waiting[row] = i32(WAITING_NONE)
+        estimator.pose_waiting[row] = i32(0)
         for i in range(3):
             estimator.gyro[row, i] = ZERO
         for i in range(4):
@@ -104,10 +101,7 @@ def pose_into_history(parameters: Parameters, data: Input, estimator: Estimator)
     for axis in range(3):
         estimator.pose[row, 3 + axis] = estimator.work_1[axis]
     estimator.pose_lag[row] = f32(age_us - ticks * TICK_US) * SECONDS_PER_US
-    if data.pose_relocated != 0:
-        estimator.pose_waiting[row] = i32(WAITING_TO_JUMP)
-    elif estimator.pose_waiting[row] == WAITING_NONE:
-        estimator.pose_waiting[row] = i32(WAITING_TO_FUSE)
+    estimator.pose_waiting[row] = i32(1)
     estimator.pose_age_us = reported_us
     return i32(POSE_ON_TIME)
 

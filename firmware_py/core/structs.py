@@ -59,10 +59,6 @@ POSE_INVALID = 2
 POSE_NO_CORRECTION = 3  # too far from the goal
 POSE_FROZEN = 4  # repeats the last one, although the robot has turned
 
-WAITING_NONE = 0
-WAITING_TO_FUSE = 1
-WAITING_TO_JUMP = 2  # the state becomes that pose, without the gate
-
 GOAL_NONE = 0
 GOAL_OF_CORRECTIONS = 1  # in the frame of the corrections
 GOAL_ABSOLUTE = 2  # in W
@@ -212,7 +208,6 @@ class Input(Struct):
     pose_position: Annotated[F32s, 3]  # [m] of B; in G once it is filed
     pose_quaternion: Annotated[F32s, 4]  # likewise, w x y z
     pose_age_us: i32  # at its arrival, then at the next tick; negative: unknown
-    pose_relocated: i32  # 1 until a pose is filed: its sender has moved the frame, so the state jumps to the pose
     battery_mv: i32
     connected: i32  # a client is connected
     goal_kind: i32  # GOAL_...
@@ -261,7 +256,7 @@ class Estimator(Struct):
     command: Annotated[F32s, 32, 4]  # [rad] commanded deviation from hover that held from this tick on
     pose: Annotated[F32s, 32, 6]  # position [m] and attitude [rad] in G
     pose_lag: Annotated[F32s, 32]  # [s] the pose was measured this long before its tick
-    pose_waiting: Annotated[I32s, 32]  # WAITING_...
+    pose_waiting: Annotated[I32s, 32]
     # a refused pose, kept to distinguish a jump of the goal from an outlier
     suspect: Annotated[F32s, 6]
     suspect_tick: i32

@@ -13,6 +13,7 @@ again, and only the newer one counts.
 
 from collections import deque
 from dataclasses import dataclass
+from math import dist
 
 from firmware_py.links.mavlink_setpoints import SetpointService
 from firmware_py.links.mavlink_stack import MavlinkStack, Task
@@ -111,7 +112,7 @@ class PoseService:
         self._measurements = measurements
         self._partner: tuple[int, int] | None = None
         self._clock = RemoteClock()
-        self._frames: dict[str, int] = {}  # of the partner, by the kind of its poses
+        self._last: dict[str, mavlink.Pose] = {}  # of the partner, by their kind
         self._posed_us: dict[tuple[int, int], int] = {}  # the last poses of senders
         for name in mavlink.POSES:
             stack.handle(name, self._take_pose)
@@ -124,10 +125,11 @@ class PoseService:
         now_us = self._stack.kernel.now_us
         self._note_sender(message, now_us)
         self._make_partner(message)
+        self._follow_frame(message, pose)
         goal = self._setpoints.note_pose()
         self.age_us = self._age_us(now_us, pose.t_us)
         correction = Correction(pose.p_WB, pose.q_WB, self.age_us)
-        self._measurements.send_nowait((now_us, correction, True, goal, self._is_relocated(message, pose)))
+        self._measurements.send_nowait((now_us, correction, True, goal))
 
     def _note_sender(self, message: Message, now_us: int) -> None:
         """Report poses of two senders in turn: the partner changes with each, and no clock becomes known."""
@@ -139,12 +141,17 @@ class PoseService:
             self._stack.notice(message, f"poses of {senders} in turn: their age stays unknown")
         self._posed_us = {**recent, sender: now_us}
 
-    def _is_relocated(self, message: Message, pose: mavlink.Pose) -> bool:
-        """Return whether the partner has moved the frame of its poses since its last one of this kind."""
+    def _follow_frame(self, message: Message, pose: mavlink.Pose) -> None:
+        """Move the goal with the frame of the poses, where the partner has moved that since its last one of this kind."""
         kind = message.get_type()
-        last = self._frames.get(kind, pose.frame)
-        self._frames[kind] = pose.frame
-        return pose.frame != last
+        last = self._last.get(kind, pose)
+        self._last[kind] = pose
+        if pose.frame != last.frame:
+            self._setpoints.follow_frame(last, pose)
+            moved = dist(last.p_WB, pose.p_WB)
+            self._stack.notice(
+                message, f"poses: their frame has moved by {moved:.2f} m, and the goal with it"
+            )
 
     def _age_us(self, now_us: int, t_us: int) -> int | None:
         """Return how long ago the sender's clock showed `t_us`; None when unknown."""
@@ -161,7 +168,7 @@ class PoseService:
     def _make_partner(self, message: Message) -> None:
         """Make the sender of the message the partner."""
         if (sender := sender_of(message)) != self._partner:
-            self._partner, self._clock, self._frames = sender, RemoteClock(), {}
+            self._partner, self._clock, self._last = sender, RemoteClock(), {}
 
     def _take_timesync(self, message: Message) -> None:
         """Answer a request; use an answer of the partner."""

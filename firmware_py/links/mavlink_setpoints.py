@@ -4,15 +4,16 @@ Hold: the robot flies at the last goal; a target of any client moves it.
 Offboard: started by a client, whose targets alone are then accepted. When none has arrived for 0.5 s, the board returns to
 Hold and stays at the last goal.
 
-Goals are in W. Poses from MAVLink are compared with `goal` itself. Poses from CRTP pass the pilot, which then gets the
-goal; its origin is home while they are corrections.
+Goals are in W. Poses from MAVLink are compared with `goal` itself, which moves with their frame: a robot that
+holds stays where it is. Poses from CRTP pass the pilot, which then gets the goal; its origin is home while they are
+corrections.
 """
 
 from collections.abc import Sequence
 from math import isnan
 
 from firmware_py.crazyflie.planner import PathPoint
-from firmware_py.geometry import Vector
+from firmware_py.geometry import Vector, in_goal_frame, rotate, to_euler_zyx, wrap_angle, yaw_quaternion
 from firmware_py.links.mavlink_stack import INFO, WARNING, MavlinkStack, Task
 from firmware_py.pilot import Pilot
 from firmware_py.rtos import FOREVER, TICK_US
@@ -60,6 +61,15 @@ class SetpointService:
         """Return the goal for a pose from MAVLink that has just arrived."""
         self._seen_from, self._seen_us = self._goal, self._stack.kernel.now_us
         return PathPoint(*self._goal)
+
+    def follow_frame(self, before: mavlink.Pose, after: mavlink.Pose) -> None:
+        """Keep the goal where it is to the robot, whose pose in two frames this is."""
+        p_WG, yaw = self._goal
+        (*_, yaw_before), (*_, yaw_after) = to_euler_zyx(before.q_WB), to_euler_zyx(after.q_WB)
+        p_BG, _ = in_goal_frame(p_WG, yaw_quaternion(yaw), before.p_WB, yaw_before)
+        x, y, z = rotate(yaw_quaternion(yaw_after), p_BG)
+        px, py, pz = after.p_WB
+        self._goal = (x + px, y + py, z + pz), wrap_angle(yaw + yaw_after - yaw_before)
 
     @property
     def goal(self) -> Goal:

@@ -17,7 +17,7 @@ from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation
 
 from firmware_py.core import entry
-from firmware_py.core.structs import POSE_INVALID, POSE_ON_TIME, POSE_TOO_OLD, Estimator, Parameters
+from firmware_py.core.structs import POSE_INVALID, POSE_ON_TIME, Estimator, Parameters
 from ground_station.trajectory import Goal, Offsets, Sine, Square, Trajectory
 from hil.experiments import Experiment
 from hil.laboratory.lockstep import lockstep_flight
@@ -374,28 +374,6 @@ def test_two_outliers_that_agree_are_a_jump_of_the_goal(p: tuple[float, ...], q:
     assert np.allclose(core.P[[0, 1, 2, 6, 7, 8]], expected, rtol=1e-6, atol=0)
     feed(core, 2, p, q)
     assert core.counters["refused"] == 1
-
-
-@pytest.mark.parametrize(("p", "q"), [*OUTLIERS[:3], OUTLIERS[4], ((0.01, 0, 0), LEVEL)])
-def test_after_a_relocalisation_the_state_jumps_to_the_first_pose_in_time(
-    p: tuple[float, ...], q: object
-) -> None:
-    core = settled()
-    before = core.counters
-    core.data.fields.pose_relocated = 1
-    assert core.pose(p, q, age_us=500_000) == POSE_TOO_OLD
-    assert core.pose(p, q) == POSE_ON_TIME
-    core.pose(p, q)  # another one of the same tick
-    assert not core.data.fields.pose_relocated
-    while not core.fields.jumps:
-        core.tick()
-    assert core.counters["too_old"] == before["too_old"] + 1
-    got = Rotation.from_euler("ZYX", core.x[[8, 7, 6]])
-    assert core.x[:3] == pytest.approx(p, abs=1e-6)
-    assert (got.inv() * Rotation.from_quat(q, scalar_first=True)).magnitude() < 1e-3
-    feed(core, 2, p, q)
-    assert core.counters["jumps"] == 1
-    assert "refused" not in core.counters
 
 
 @pytest.mark.parametrize("axis", range(6))

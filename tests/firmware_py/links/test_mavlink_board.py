@@ -199,25 +199,33 @@ VISION = "vision_position_estimate", "global_vision_position_estimate"
 
 
 @pytest.mark.parametrize("kind", [*VISION, "odometry"])
-@pytest.mark.parametrize("moved", [False, True])
-def test_a_counted_reset_of_the_sender_moves_the_estimate_at_once(kind: str, moved: bool) -> None:
+@pytest.mark.parametrize("counted", [False, True])
+def test_the_goal_moves_with_the_frame_of_the_poses_so_the_robot_does_not(kind: str, counted: bool) -> None:
     client, unknown = MavlinkClient(), [math.nan] + [0.0] * 20
 
     def pose(now_us: int) -> None:
         late = now_us >= 1_500_000
-        x, resets = (0.3, 255 if late and moved else 0) if late else (0.0, 0)
+        x, y, z, yaw = (0.3, -0.2, -1.3, -1.0) if late else (0.05, 0.02, -1.2, 0.1)  # NED
+        resets = 255 if late and counted else 7
         if kind in VISION:
-            client.send(kind, now_us, x, 0.0, -1.15, 0.0, 0.0, 0.0, unknown, 7 if not late else resets or 7)
+            client.send(kind, now_us, x, y, z, 0.0, 0.0, yaw, unknown, resets)
             return
         frames = dialect.MAV_FRAME_LOCAL_NED, dialect.MAV_FRAME_BODY_FRD
-        client.send(kind, now_us, *frames, x, 0.0, -1.15, LEVEL, *(0.0,) * 6, unknown, unknown, resets)
+        turned = math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)
+        client.send(kind, now_us, *frames, x, y, z, turned, *(0.0,) * 6, unknown, unknown, resets)
 
     for at_us in range(GYRO_ZERO_US, 2_000_000, 20_000):
         client.events.at(at_us, pose)
+    client.run(1_490_000)
+    before = client.firmware.signals.estimate[:9].copy()
     client.run(2_000_000)
     counters = dict(zip(COUNTERS, client.firmware.signals.counters.tolist(), strict=True))
-    assert (counters["refused"], counters["jumps"]) == ((0, 1) if moved else (1, 1))
-    assert client.firmware.signals.estimate[0] == pytest.approx(0.3, abs=0.02)
+    assert (counters["refused"], counters["jumps"]) == ((0, 0) if counted else (1, 1))
+    assert (client.firmware.signals.estimate[:9] == pytest.approx(before, abs=0.02)) == counted
+    report = client.of("LOCAL_POSITION_NED")[-1]
+    assert (report.x, report.y, report.z) == pytest.approx((0.3, -0.2, -1.3), abs=0.03)
+    said = ["poses: their frame has moved by 0.35 m, and the goal with it"] if counted else []
+    assert [text for text in client.texts() if "frame" in text] == said
 
 
 def test_another_sender_is_no_relocalisation() -> None:
@@ -234,6 +242,7 @@ def test_another_sender_is_no_relocalisation() -> None:
         client.events.at(at_us, pose)
     client.run(1_600_000)
     assert dict(zip(COUNTERS, client.firmware.signals.counters.tolist(), strict=True))["jumps"] == 0
+    assert not any("frame" in text for text in client.texts())
 
 
 def test_only_the_clock_of_the_sender_of_poses_counts() -> None:
