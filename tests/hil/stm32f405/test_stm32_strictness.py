@@ -219,6 +219,15 @@ def test_a_step_over_an_unaligned_load_ends_after_it() -> None:
     assert bench.chip.state.instructions == instructions  # counted at the begin of their block
 
 
+def test_a_step_behind_wfi_wakes_the_processor() -> None:
+    bench = Strict("30bf 4ff0 0500 0137")  # wfi; mov.w r0, #5; adds r7, #1
+    for place in (2, 6):
+        bench.chip.step()
+        assert bench.chip.register("pc") == START + place
+    assert bench.run() == 0
+    assert bench.chip.register("r7") == 1
+
+
 @pytest.mark.parametrize(("code", "kind"), [("2068", 3), ("2060", 2)], ids=["read", "written"])
 def test_a_watchpoint_sees_an_unaligned_access(code: str, kind: int) -> None:
     bench = Strict(code, {"r4": DATA + 5})
