@@ -21,28 +21,9 @@ from hil.devices.board_firmware import PythonBoard
 from support.paths import TESTS
 
 ELF, STOCK_ELF = (os.environ.get(name, "") for name in ("FLOATY_CF2_ELF", "FLOATY_STOCK_ELF"))
+
+
 # Of each kind the programs that differ most; the others are long.
-FAST = (
-    "a command without the notice has no effect and the board locks",
-    "with the notice the command is flown",
-    "one hover set-point in a flight locks the board",
-    "a program that ends in the air",
-    "a spiral to the left",
-    "numbers that are not finite are refused and the flight goes on",
-    "goals outside the box are refused",
-    "a turned trajectory turns about its origin",
-    "there are 31 definitions",
-    "a compressed trajectory is neither scaled nor reversed",
-    "poses over the app channel fly the robot",
-    "packed poses fly the robot whose address they have",
-    "the values of a robot that stands askew",
-    "disarming in flight stops the robot until it is armed",
-    "disarming by the parameter",
-    "poses that stay away end the flight for the commander",
-    "with corrections nothing is followed",
-)
-
-
 @cache
 def recorded(name: str) -> dict[str, Answers]:
     """The referee's answers by program; a program that has changed since has none."""
@@ -89,17 +70,10 @@ def stock() -> ServiceBench:
 def test_every_program_has_the_answers_of_its_referee() -> None:
     assert set(recorded("app")) == set(PROGRAMS)
     assert set(recorded("stock")) == STOCK
-    assert set(FAST) < set(PROGRAMS)
 
 
-@pytest.mark.parametrize("name", FAST)
+@pytest.mark.parametrize("name", PROGRAMS)
 def test_the_python_board_answers_as_the_image(python: ServiceBench, name: str) -> None:
-    assert list(differences(recorded("app")[name], played(python, PROGRAMS[name]))) == []
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", sorted(set(PROGRAMS) - set(FAST)))
-def test_the_python_board_answers_as_the_image_in_all_programs(python: ServiceBench, name: str) -> None:
     assert list(differences(recorded("app")[name], played(python, PROGRAMS[name]))) == []
 
 

@@ -169,6 +169,7 @@ def test_an_own_metric_has_its_unit_and_a_value_also_where_it_was_not_measured()
     assert load_run(run.folder).experiment is None
 
 
+@pytest.mark.long
 def test_the_notebook_flies_sweeps_and_plots() -> None:
     cells = json.loads((PAGE.parents[1] / "tutorials" / "fly-sweep-plot.ipynb").read_text(encoding="utf-8"))[
         "cells"

@@ -71,6 +71,7 @@ def test_a_request_by_another_name_of_this_computer_is_refused(links: Links, run
     assert answer(links, "/report.html", Host=f"localhost:{links.server_port}")[0] == 200
 
 
+@pytest.mark.long
 def test_idle_connections_delay_nobody(links: Links) -> None:
     idle = [socket.create_connection((HOST, links.server_port)) for _ in range(20)]
     assert answer(links, "/")[0] == 404

@@ -171,6 +171,7 @@ def test_two_robots_are_compared_by_position_and_attitude(runs: dict[str, Path],
         assert labels == ["x [cm]", "y [cm]", "z [cm]", "roll [deg]", "pitch [deg]", "yaw [deg]"]
 
 
+@pytest.mark.long
 def test_the_caption_names_the_colours_of_the_lines(runs: dict[str, Path], tmp_path: Path) -> None:
     a, b = load_flown(runs["one"]), load_flown(runs["two"])
     figure = pair((a.log, b.log), ("a", "b"))

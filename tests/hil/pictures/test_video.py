@@ -29,6 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_video_and_gif_last_as_long_as_the_flight_at_30_frames_per_second(folder: Path, cli: Cli) -> None:
     assert cli("export", folder, "--video", "--gif") == 0
     with av.open(str(folder / "flight.mp4")) as file:
@@ -54,6 +55,7 @@ def test_each_frame_shows_the_robot_of_its_instant_and_the_curves_up_to_it(folde
     assert ink[0] < ink[15] < ink[-1]
 
 
+@pytest.mark.long
 def test_a_gif_has_the_colours_of_the_curves(folder: Path) -> None:
     video.write_gif(folder)
     with Image.open(folder / "flight.gif") as picture:

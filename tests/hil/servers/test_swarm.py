@@ -76,6 +76,7 @@ def test_a_robot_that_a_client_moves_is_found_on_its_new_channel(served: Served)
         assert other.send(0x02) == ACKNOWLEDGED
 
 
+@pytest.mark.long
 def test_a_packet_to_all_reaches_all_and_none_answers(served: Served) -> None:
     with closing(Dongle(served)) as dongle:
         dongle.request(SET_CHANNEL, 80)
@@ -93,6 +94,7 @@ def test_a_packet_to_all_reaches_all_and_none_answers(served: Served) -> None:
     served.forget()
 
 
+@pytest.mark.long
 def test_a_client_that_writes_and_never_reads_is_closed_in_one_line(served: Served) -> None:
     served.forget()
     host, port = served.environment[VARIABLE].split(":")
@@ -144,6 +146,7 @@ def test_ctrl_c_ends_all_processes_in_order_and_keeps_every_robots_eeprom(tmp_pa
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"board-{number}.eeprom" for number in (1, 2)]
 
 
+@pytest.mark.long
 def test_a_robot_whose_process_dies_is_named_and_the_others_continue() -> None:
     with serve("--boards", "3", "--radio", "--radio-port", "0") as served, closing(Dongle(served)) as dongle:
         assert [dongle.send(last) for last in (0xE7, 0x02, 0x03)] == [1, 1, 1]
