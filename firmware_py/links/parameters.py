@@ -148,7 +148,6 @@ class ParameterService:
         self, stack: CrtpStack, parameters: Sequence[Parameter], storage: ParameterStorage, notices: Notices
     ) -> None:
         self.toc = toc.Toc.of(PORT_PARAMETERS, ((item.type_byte, item.name) for item in parameters))
-        self.refused = 0  # writes of values that are not allowed
         self._parameters = parameters
         self._numbers = {parameter.name: number for number, parameter in enumerate(parameters)}
         self._defaults = [parameter.value() for parameter in parameters]
@@ -187,7 +186,6 @@ class ParameterService:
         if status == EINVAL:
             allowed = f"{parameter.minimum:g}..{parameter.maximum:g} {parameter.unit}".rstrip()
             self._notices.refuse(parameter.name, f"{parameter.name} = {value:g} refused: allowed {allowed}")
-        self.refused += status != OK
         return status
 
     def _set_by_name(self, data: bytes) -> tuple[bytes, ...]:

@@ -371,6 +371,17 @@ def test_flaps_that_are_moved_by_hand_are_not_at_rest() -> None:
     assert bench.core.supervisor.fields.aloft
 
 
+@pytest.mark.parametrize("stops", [True, False])
+def test_a_robot_that_was_stopped_or_disarmed_stays_where_it_is_when_it_may_fly_again(stops: bool) -> None:
+    bench = in_flight(lambda bench: bench.fly(100_000))
+    bench.data.goal_kind = structs.GOAL_ABSOLUTE
+    bench.view.recover() if stops else bench.view.arm(True)
+    assert bench.data.goal_kind == structs.GOAL_ABSOLUTE, "it flies: its goal stays"
+    bench.view.stop() if stops else bench.view.arm(False)
+    bench.view.recover() if stops else bench.view.arm(True)
+    assert bench.data.goal_kind == structs.GOAL_STALE
+
+
 def test_a_commander_leads_a_flight_with_absolute_poses_and_no_other() -> None:
     bench = in_flight(lambda bench: bench.fly(100_000))
     led = []

@@ -277,6 +277,9 @@ def test_newer_start_counts_in_milliseconds_and_period_zero_sends_once(client: C
 
 def test_at_most_128_variables_are_in_blocks(client: CrtpClient, logs) -> None:
     number = logs["supervisor.state"][0]
+    assert client.create(16, (1, len(logs) - 1)) == 0
+    assert client.create(17, (1, len(logs))) == errno.ENOENT
+    assert client.one(LOG, 1, b"\5\0") == b"\5\0\0"
     for block in range(16):
         assert client.create(block, *[(1, number)] * 8) == 0
     assert client.one(LOG, 1, bytes((7, 3)) + struct.pack("<BH", 1, number)) == bytes((7, 3, errno.ENOMEM))
@@ -421,7 +424,9 @@ def test_set_by_name_acts_answers_and_tells_the_new_value(client: CrtpClient, pa
     assert update == b"\1" + struct.pack("<Hf", number, 2.5)
     assert client.read(params, "extCtrl.z_P") == 2.5
     assert client.one(PARAM, 3, b"\0extCtrl\0nix\0\x06" + bytes(4)) == b"\0extCtrl\0nix\0\2"
-    assert client.one(PARAM, 3, b"\0extCtrl\0z_P\0\x08\1") == b"\0extCtrl\0z_P\0" + bytes((errno.EINVAL,))
+    for other in (b"\x08\1", b"\2\1\0\0\0"):  # another type, also one of the same size
+        reply = client.one(PARAM, 3, b"\0extCtrl\0z_P\0" + other)
+        assert reply == b"\0extCtrl\0z_P\0" + bytes((errno.EINVAL,))
     nan_request = b"\0extCtrl\0z_P\0\x06" + struct.pack("<f", nan)
     assert client.one(PARAM, 3, nan_request) == b"\0extCtrl\0z_P\0" + bytes((errno.EINVAL,))
     read_only = b"\0cpu\0flash\0\x09\0\0"
@@ -476,6 +481,23 @@ def test_a_store_with_foreign_names_can_be_written() -> None:
     assert storage.store("a.b", b"\1")
     assert storage.load()["a.b"] == b"\1"
     assert len(storage.load()) == 2
+
+
+def test_of_a_store_only_persistent_parameters_of_the_right_size_count(client: CrtpClient, params) -> None:
+    storage = ParameterStorage(client.eeprom)
+    assert not params["setpoint.X"][1] & 0x10
+    two = struct.pack("<f", 2.0)
+    foreign = {
+        "setpoint.X": struct.pack("<f", 0.25),
+        "extCtrl.y_P": two[:3],
+        "extCtrl.z_P": two + b"\0",
+        "gone.x": two,
+    }
+    assert storage.store_all(foreign | {"extCtrl.yaw_P": struct.pack("<f", 0.5)})
+    before = {name: client.read(params, name) for name in foreign if name in params}
+    client.reboot()
+    assert {name: client.read(params, name) for name in before} == before
+    assert client.read(params, "extCtrl.yaw_P") == 0.5
 
 
 def test_a_full_store_refuses_and_keeps_what_it_has(client: CrtpClient) -> None:
