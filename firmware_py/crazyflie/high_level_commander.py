@@ -35,7 +35,7 @@ from firmware_py.wire.high_level import (
 
 OK, REFUSED, ENOEXEC, EBUSY = 0, 1, 8, 16
 LANDINGS = (PathCommand.LAND, PathCommand.LAND_1, PathCommand.LAND_WITH_VELOCITY)
-ACTIVE, FINISHED, SILENT = 1 << 8, 1 << 9, 1 << 10  # bits of the supervisor's field
+ACTIVE, FINISHED = 1 << 8, 1 << 9  # bits of the supervisor's field
 
 
 @dataclass(slots=True)
@@ -76,21 +76,18 @@ class HighLevelCommander:
             self.planner.stop()
         self._blocked = blocked
 
-    def setpoint(self, t: float) -> Setpoint | None:
-        """Return the set-point of this instant, None while there is none."""
+    def setpoint(self, t: float) -> Setpoint:
+        """Return the set-point of this instant, the null one while no path is in force."""
         goal = self.planner.goal(t)
-        if self.planner.rests:
-            return NULL if self.planner.phase is Phase.IDLE else None
-        assert goal is not None
+        if goal is None:
+            return NULL
         self._last = goal
         return Setpoint(goal.position, goal.yaw, goal.velocity)
 
     def bits(self, t: float) -> int:
         """Return its bits of the supervisor's field."""
-        phase = self.planner.phase
-        active = ACTIVE if phase in (Phase.FLYING, Phase.LANDING) else 0
-        finished = FINISHED if self.planner.finished(t) else 0
-        return active | finished | (SILENT if phase is Phase.DISABLED else 0)
+        active = 0 if self.planner.rests else ACTIVE
+        return active | (FINISHED if self.planner.finished(t) else 0)
 
     def execute(self, data: bytes, t: float) -> int:
         """Execute a command; return its status."""

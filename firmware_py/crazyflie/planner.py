@@ -93,7 +93,6 @@ class Phase(IntEnum):
     IDLE = auto()  # the null set-point
     FLYING = auto()
     LANDING = auto()
-    DISABLED = auto()  # no set-points, after a path that gave none
 
 
 class Planner:
@@ -107,7 +106,7 @@ class Planner:
     @property
     def rests(self) -> bool:
         """Whether no path is in force."""
-        return self.phase in (Phase.IDLE, Phase.DISABLED)
+        return self.phase is Phase.IDLE
 
     def finished(self, t: float) -> bool:
         """Return whether the last path is over."""
@@ -124,10 +123,6 @@ class Planner:
     def stop(self) -> None:
         """End the flight."""
         self.phase = Phase.IDLE
-
-    def disable(self) -> None:
-        """Give no more set-points, not even the null one."""
-        self.phase = Phase.DISABLED
 
     def follow(self, path: Path, t: float, landing: bool = False) -> None:
         """Start a path now."""

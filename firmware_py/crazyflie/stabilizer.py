@@ -40,8 +40,8 @@ class Stabilizer:
         tick, t = now_us // TICK_US, now_us * SECONDS_PER_US
         can_fly = self.supervisor.can_fly
         self.high_level.block(not can_fly)
-        if can_fly and (path := self.high_level.setpoint(t)) is not None:
-            self.commander.set(path, HIGH_LEVEL, tick)
+        if can_fly:
+            self.commander.set(self.high_level.setpoint(t), HIGH_LEVEL, tick)
         setpoint = self.commander.setpoint if can_fly else STOPPED
         self._steps += 1
         if self._steps % STEPS == 0:

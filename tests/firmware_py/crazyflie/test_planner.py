@@ -213,14 +213,17 @@ def test_a_landing_ends_idle_and_everything_else_goes_on() -> None:
 
 
 @pytest.mark.parametrize("relative", [False, True])
-def test_without_a_velocity_a_take_off_and_a_landing_have_each_their_own(relative: bool) -> None:
+@pytest.mark.parametrize("velocity", [0.0, -1.0])
+def test_without_a_velocity_a_take_off_and_a_landing_have_each_their_own(
+    relative: bool, velocity: float
+) -> None:
     board = SimpleNamespace(estimate=lambda: PathPoint((0.1, 0.2, 0.0), 0.0), admits=lambda places: True)
     commander = HighLevelCommander(board, lambda kind, text: None)
     commander.block(False)
     commander.defaults.take_off_velocity, commander.defaults.landing_velocity = 0.25, 2.0
     t = 0.0
     for command, height, by, duration in ((9, 1.0, 1.0, 4.0), (10, 0.4, 0.6, 0.3)):
-        data = struct.pack("<BBf?f?f", command, 0, by if relative else height, relative, 0.0, True, 0.0)
+        data = struct.pack("<BBf?f?f", command, 0, by if relative else height, relative, 0.0, True, velocity)
         assert commander.execute(data, t) == 0
         goal = commander.planner.goal(t + 0.99 * duration)
         assert goal is not None

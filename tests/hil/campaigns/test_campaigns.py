@@ -321,10 +321,13 @@ def test_a_report_of_nothing_and_of_nothing_that_failed_can_be_written(tmp_path:
 def test_a_design_has_its_own_indices(tmp_path: Path, sampling: str, flights: int, method: str) -> None:
     spec = spec_of(sampling=sampling, flights=flights)
     flown_into(tmp_path, spec, workers(2))
-    found = find(spec, Dataset(tmp_path, plan_of(spec), resume=True).table())
-    (failing,) = (one for one in found.influences if one.figure == "failing" and one.method == method)
+    table = Dataset(tmp_path, plan_of(spec), resume=True).table()
+    (failing,) = (
+        one for one in find(spec, table).influences if (one.figure, one.method) == ("failing", method)
+    )
     assert failing.by_axis["actuators.tau"] == pytest.approx(0.0, abs=1e-9)
     assert failing.by_axis["fault 1 push.y size"] > 0.1
+    assert method not in {one.method for one in find(spec, table.slice(1)).influences}, "one point is missing"
 
 
 def test_flights_without_an_end_are_distinct_failures(tmp_path: Path) -> None:
