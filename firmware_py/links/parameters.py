@@ -60,7 +60,7 @@ class ParameterStorage:
         magic, length, checksum = _HEAD.unpack_from(self._eeprom, START)
         begin = START + _HEAD.size
         records = bytes(self._eeprom[begin : begin + length])
-        if magic != _MAGIC or len(records) != length or crc32(records) != checksum:
+        if magic != _MAGIC or crc32(records) != checksum:
             return {}
         values: dict[str, bytes] = {}
         while records:

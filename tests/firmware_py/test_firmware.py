@@ -111,15 +111,16 @@ def test_gyro_zero_is_the_mean_of_a_still_window() -> None:
 
 
 @pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize(("noise", "still"), [(99, True), (101, False), (32767, False)])
+@pytest.mark.parametrize(("noise", "still"), [(100, True), (101, False), (32767, False)])
 def test_gyro_zero_waits_until_the_robot_is_still(axis: int, noise: int, still: bool) -> None:
     gyro = Gyro()
-    for k in range(WINDOW):
-        sample = [0, 0, 0]
-        sample[axis] = noise if k % 4 < 2 else -noise
-        found = gyro.add(*sample)
-    assert found == still
-    assert gyro.sampling.fields.windows_refused == (not still)
+    for _ in range(1 if still else 2):
+        for k in range(WINDOW):
+            sample = [0, 0, 0]
+            sample[axis] = noise if k % 4 < 2 else -noise
+            found = gyro.add(*sample)
+        assert found == still
+    assert gyro.sampling.fields.windows_refused == (0 if still else 2)
     assert gyro.bias == [0.0, 0.0, 0.0]
     if not still:
         assert [gyro.add(1, 2, 3) for _ in range(WINDOW)][-1]

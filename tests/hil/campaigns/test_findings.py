@@ -312,6 +312,8 @@ def test_inert_axes_exceed_the_threshold_of_chance_in_one_of_twenty_campaigns() 
 
 
 def test_an_index_whose_interval_is_too_wide_is_not_ranked() -> None:
-    found = Influence("x", "total Sobol index", {"a": 13.5, "b": 0.4}, None, {"a": 1.1, "b": 0.1}, 1.0)
-    assert (found.ranked, found.unknown) == ([("b", 0.4)], ["a"])
+    found = Influence(
+        "x", "total Sobol index", {"a": 13.5, "b": 0.4, "c": -0.9}, None, {"a": 1.1, "b": 0.1}, 1.0
+    )
+    assert (found.ranked, found.unknown) == ([("c", -0.9), ("b", 0.4)], ["a"])
     assert found.text("b") == "b 0.4 ± 0.1"

@@ -334,6 +334,7 @@ def test_a_narrow_interval_is_not_enough(found: IdentifiedConstant, evidence: Ev
 def test_a_value_far_from_the_profile_s_is_weak_however_narrow_its_interval() -> None:
     verdict, why = _verdict(constant((64.0, 1.0)), Evidence(1.0, 0.0, 1.0), -6.3)
     assert (verdict, why) == (WEAK, "± 2%, but more than 10 times the profile's -6.3")
+    assert _verdict(constant((64.0, 46.0)), Evidence(1.0, 0.0, 1.0), -6.3)[0] == UNKNOWN
 
 
 def test_the_worst_record_counts_and_of_several_the_clearest_response() -> None:
