@@ -100,6 +100,19 @@ def test_an_absolute_pose_is_filed_as_it_looks_from_the_goal() -> None:
         assert (R_GB.inv() * R_WG.inv() * R_WB).magnitude() == pytest.approx(0.0, abs=2e-5)
 
 
+def test_the_report_has_place_velocity_and_heading_in_w() -> None:
+    """p_WB = p_WG + R_WG p_GB, and v_WB = v_WG + R_WG v_GB of a goal that moves."""
+    rng, core = np.random.default_rng(4), Core()
+    data = core.data.fields
+    data.goal[:], data.goal_velocity[:] = (1.0, 2.0, 3.0, 0.6), (0.5, -0.4, 0.3)
+    core.fields.x[:] = rng.uniform(-0.1, 0.1, 16)
+    core.tick()
+    R_WG, now, report = Rotation.from_euler("z", 0.6), core.now, core.report.fields
+    assert report.position == pytest.approx(data.goal[:3] + R_WG.apply(now[:3]), abs=1e-5)
+    assert report.velocity == pytest.approx(data.goal_velocity + R_WG.apply(now[3:6]), abs=1e-5)
+    assert report.attitude == pytest.approx(now[6:9] + np.array((0.0, 0.0, 0.6)), abs=1e-5)
+
+
 def test_a_correction_is_refused_that_is_larger_than_the_laboratory() -> None:
     """No further from the goal than 0.9 m sideways, 2 m below and 1 m above it."""
     near = [(0.89, 0.0, 0.0), (-0.6, 0.6, 0.0), (0.0, 0.0, -1.99), (0.0, 0.0, 0.99)]

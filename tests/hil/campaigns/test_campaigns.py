@@ -188,6 +188,11 @@ def test_a_folder_is_not_mistaken_for_another_campaign(tmp_path: Path) -> None:
         flown_into(tmp_path / "out", spec, workers(1))
     with pytest.raises(LabError, match=r"--resume: spec\.seed was 1 and is 9: choose another --out"):
         flown_into(tmp_path / "out", spec_of(seed=9), workers(1), resume=True)
+    path = tmp_path / "out" / "campaign.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content | {"versions": content["versions"] | {"gone": "1.0"}}))
+    with pytest.raises(LabError, match=r"--resume: versions\.gone was '1.0' and is None"):
+        flown_into(tmp_path / "out", spec, workers(1), resume=True)
     (tmp_path / "begun").mkdir()
     (tmp_path / "begun" / "campaign.json.partial").write_text("{")  # of a process that was killed
     assert flown_into(tmp_path / "begun", spec, workers(1)).complete

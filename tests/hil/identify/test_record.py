@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from ground_station.telemetry_log import POSE_COLUMNS, TIME_COLUMN
 from hil.config import load_config
-from hil.design.axes import DELAY, ROLL, dynamics, robot_of
+from hil.design.axes import DELAY, PITCH, ROLL, Axis, dynamics, robot_of
 from hil.design.loop import FREQUENCIES
 from hil.errors import LabError
 from hil.identify import spectra
@@ -296,6 +297,13 @@ def test_fifteen_seconds_of_flight_after_the_first_two_show_the_flow_and_less_do
         flow_of(swinging(robot, seconds=16.9), ROLL, robot)
 
 
+@pytest.mark.parametrize(("axis", "column"), [(ROLL, 3), (PITCH, 4)])
+def test_a_robot_that_leans_has_its_mean_angle(axis: Axis, column: int) -> None:
+    record = swinging(robot_of(CONFIG))
+    record.pose[:, column] += 0.2
+    assert flow_of(record, axis, robot_of(CONFIG)).angle == pytest.approx(0.2, abs=0.01)
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(
     ("share", "verdict"), [(0.25, IDENTIFIED), (0.26, WEAK), (0.7, WEAK), (0.71, UNKNOWN), (np.inf, UNKNOWN)]
@@ -342,6 +350,12 @@ def test_the_worst_record_counts_and_of_several_the_clearest_response() -> None:
     object.__setattr__(limited, "saturated", 0.06)
     assert Evidence.of(Estimate({}, {}, 1.0), [calm, limited], []).saturated == 0.06
     assert Evidence.of(Estimate({}, {}, 1.0), [calm], []).coherence == 1.0
+    # lines by input and outputs: of each axis the best output counts, of both the better one
+    own = [
+        SimpleNamespace(spectra=SimpleNamespace(coherence=np.array([[1.0, 0.2, high], [1.0, high, 0.2]])))
+        for high in (0.6, 0.4)
+    ]
+    assert Evidence.of(Estimate({}, {}, 1.0), [calm], own).coherence == pytest.approx(0.6)
 
 
 def test_rates_sampled_before_the_inputs_belong_to_the_next_tick(tmp_path: Path) -> None:
