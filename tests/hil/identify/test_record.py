@@ -30,7 +30,7 @@ from hil.identify.identify import (
 )
 from hil.identify.joint import LATE_S, Estimate
 from hil.identify.pages import write_pages
-from hil.identify.plates import straightened
+from hil.identify.plates import plant_of, straightened, turns_of
 from hil.identify.record import BOARD_COLUMN, EXCITATIONS, INPUTS, RATES, WRAP_MS, Record, load_record
 from hil.identify.response import TICK_DELAYS_S, flap_response
 
@@ -385,6 +385,26 @@ def test_u3_is_straightened_by_the_law_of_flat_plates_sin_phi_cos_phi_squared() 
     assert expected < 0.97 * 0.2
     assert straight.u[:, [1, 3]] == pytest.approx(u[:, [1, 3]])
     assert straight.bent == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("side_wind", [(0.0, 0.0, 0.0), (0.5, 1.0, 0.0)])
+def test_turning_alone_pushes_a_robot_of_plates_whatever_wind_blows(side_wind: tuple[float, ...]) -> None:
+    t, zero = 0.02 * np.arange(100), np.zeros((100, 3))
+    windy = CONFIG.model_copy(update={"tunnel": CONFIG.tunnel.model_copy(update={"side_wind": side_wind})})
+    record = Record(
+        "r", t, t, np.zeros((100, 4)), np.zeros((100, 4)), zero, t, np.zeros((100, 6)), 0.0, 0.0, windy, False
+    )
+    bare = CONFIG.plant.model_copy(update={"variant": "plate"})
+    plates, pushes = plant_of(CONFIG.model_copy(update={"plant": bare})), {}
+    for name, about, along in (("y_rate", 0, 1), ("x_rate", 1, 0)):
+        ends = []
+        for turn in (0.01, -0.01):
+            omega = np.where(np.arange(3) == about, turn, 0.0)
+            plates.place((0.0, 0.0, CONFIG.tunnel.hover_height), (1.0, 0.0, 0.0, 0.0), omega_B=omega.tolist())
+            ends.append(plates.acceleration_W[along])
+        pushes[name] = (ends[0] - ends[1]) / 0.02
+    assert turns_of(record) == pytest.approx(pushes, rel=0.01)
+    assert min(map(abs, pushes.values())) > 0.005
 
 
 def test_roll_lifts_a_robot_that_leans_and_no_other() -> None:
