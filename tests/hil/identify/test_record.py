@@ -328,7 +328,7 @@ def constant(
         (constant((64.0, 1.0)), Evidence(10.1, 0.0, 1.0), "misses the log by 3.2 times"),
         (constant((64.0, 1.0)), Evidence(1.0, 0.16, 1.0), "at their limits in 16%"),
         (constant((64.0, 1.0)), Evidence(1.0, 0.0, 0.34), "coherence 0.34"),
-        (constant((64.0, 1.0), (50.0, 12.0)), Evidence(1.0, 0.0, 1.0), "exclude each other"),
+        (constant((64.0, 1.0), (51.5, 12.0)), Evidence(1.0, 0.0, 1.0), "exclude each other"),
     ],
     ids=["misfit", "saturated", "incoherent", "contradicted"],
 )  # fmt: skip

@@ -36,7 +36,10 @@ def test_metrics_count_from_the_release_to_the_end() -> None:
         "t": [1_000_000 * second for second in range(15)],
         "flight.free": free,
         "truth.x": [*4 * [5.0], *10 * [0.05], 0.3],
-        "truth.y": [0.01] * 15,
+        "truth.y": [*7 * [0.01], 0.2, *7 * [0.01]],
+        "truth.z": [*9 * [0.0], -0.11, *5 * [0.0]],
+        "truth.qw": [*14 * [1.0], np.cos(0.1)],
+        "truth.qy": [*14 * [0.0], -np.sin(0.1)],
         "supervisor.state": [*4 * [3], 3, 3, *9 * [2]],
         "serial.up_busy": [9 * 10**5 * second for second in range(4)]
         + [3_600_000 + 10**5 * n for n in range(11)],
@@ -48,9 +51,8 @@ def test_metrics_count_from_the_release_to_the_end() -> None:
         "tracker.refused": range(0, 30, 2),
         "estimator.pose_age_us": [*4 * [0], *11 * [40_000]],
     }
-    still = dict.fromkeys(("truth.z", "truth.qx", "truth.qy", "truth.qz"), [0.0] * 15) | {
-        "truth.qw": [1.0] * 15
-    }
+    still = dict.fromkeys(("truth.qx", "truth.qz"), [0.0] * 15)
+    rms_x, rms_y = (np.sqrt((10 * rest**2 + most**2) / 11) for rest, most in ((0.05, 0.3), (0.01, 0.2)))
     goal = {f"goal.{name}": [0.0] * 15 for name in ("x", "y", "z", "yaw")}
     estimate = {f"estimate.{name}": [*range(10), *3 * [10], 13, 14] for name in "xyzpqr"}
     values = measure(pa.table(log | still | goal | estimate), lost=False)
@@ -59,18 +61,18 @@ def test_metrics_count_from_the_release_to_the_end() -> None:
         {
             "lost": 0.0,
             "flown": 10.0,
-            "rms_x": np.sqrt((10 * 0.05**2 + 0.3**2) / 11),
-            "rms_y": 0.01,
-            "rms_z": 0.0,
+            "rms_x": rms_x,
+            "rms_y": rms_y,
+            "rms_z": 0.11 / np.sqrt(11),
             "max_x": 0.3,
-            "max_y": 0.01,
-            "max_z": 0.0,
+            "max_y": 0.2,
+            "max_z": 0.11,
             "within_6cm_x": 10 / 11,
-            "within_6cm_y": 1.0,
-            "within_6cm_z": 1.0,
-            "in_box": 10 / 11,
-            "attitude_max": 0.0,
-            "y_over_x": 0.01 / np.sqrt((10 * 0.05**2 + 0.3**2) / 11),
+            "within_6cm_y": 10 / 11,
+            "within_6cm_z": 10 / 11,
+            "in_box": 8 / 11,
+            "attitude_max": 0.2,
+            "y_over_x": rms_y / rms_x,
             "age_mean": 0.04,
             "failsafe": 10.0 * 2 / 11,
             "resets": 0.0,
