@@ -172,6 +172,7 @@ def test_a_new_session_ends_the_old_one(app: App) -> None:
 def test_requests_outside_are_refused_and_take_no_number(app: App, request_: tuple[Message, bytes]) -> None:
     begun(app)
     assert ask(app, BEGUN, request_).refusal() == Refusal.OUTSIDE
+    assert ask(app, 0, hello()).about().done == BEGUN
     assert ticks(app, BEGUN) == 0
 
 
