@@ -249,6 +249,14 @@ def test_with_hardware_in_the_loop_no_call_stops_the_scheduler(app: App) -> None
     assert ticks(app, BEGUN + 1) == 0
 
 
+def test_health_has_the_gyro_s_counts_by_axis(app: App) -> None:
+    begun(app)
+    app.gyro[:], app.gyro_noise = (11, -22, 33), 0
+    app.step(1)
+    report = ask(app, BEGUN, health()).health()
+    assert (report.gyro_x, report.gyro_y, report.gyro_z) == (11, -22, 33)
+
+
 def test_a_packet_without_a_head_or_on_another_channel_is_not_answered(app: App) -> None:
     app.radio(b"\0\7\0", PORT_CORE, 0)
     app.radio(encode_request(*hello(), 7, 0), PORT_CORE, 1)

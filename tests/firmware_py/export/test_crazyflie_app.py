@@ -323,14 +323,16 @@ def hover_of(app: App) -> list[int]:
 def test_a_stopped_loop_moves_the_servos_to_hover(app: App) -> None:
     flying(app)
     hover = hover_of(app)
-    assert app.counts() != hover
-    app.now.value += 30_000
-    app.c.stub_run_app(1)
-    assert app.counts() != hover
-    app.now.value += 30_000
-    app.c.stub_run_app(3)
-    assert app.counts() == hover
-    assert app.log("floaty.staleHovers") == 1
+    for stop in (1, 2):
+        assert app.counts() != hover
+        app.now.value += 30_000
+        app.c.stub_run_app(1)
+        assert app.counts() != hover
+        app.now.value += 30_000
+        app.c.stub_run_app(3)
+        assert app.counts() == hover
+        assert app.log("floaty.staleHovers") == stop
+        fly_on(app, 1200 + 100 * stop, 100)
 
 
 def test_the_firmwares_own_emergency_stop_stops_floaty(app: App) -> None:
@@ -341,6 +343,19 @@ def test_the_firmwares_own_emergency_stop_stops_floaty(app: App) -> None:
     for step in range(1200, 1211):
         app.step(step)
     assert app.counts() == hover
+    app.c.stub_run_app(1)
+    assert app.console().endswith("supervisor: failsafe, emergency stop\n")
+
+
+def test_another_cause_of_failsafe_is_another_line(app: App) -> None:
+    flying(app)
+    for step in range(1200, 1800):
+        app.step(step)
+    app.c.stub_run_app(1)
+    assert app.console().endswith("supervisor: failsafe, silence\n")
+    app.locked.value = 1
+    for step in range(1800, 1811):
+        app.step(step)
     app.c.stub_run_app(1)
     assert app.console().endswith("supervisor: failsafe, emergency stop\n")
 
@@ -711,6 +726,23 @@ def test_impossible_corrections_are_counted_and_reported_every_ten_seconds(
             assert estimate(app) == pytest.approx(before, abs=0.02)
             assert app.log("kalman.invalid") - invalid == 3
     assert np.diff(reported).tolist() == [10_000, 10_000]
+
+
+def test_a_pose_refused_soon_after_a_line_is_in_no_later_line(app: App) -> None:
+    flying(app)
+    for first, length in ((1200, 1000), (2200, 1000), (3200, 10_000)):
+        if first < 3000:
+            app.radio(crtp.encode_ext_pose((0.0, 0.0, 1.1), yaw_quaternion(0.0), 40_000)[1:])
+        fly_on(app, first, length)
+        app.c.stub_run_app(1)
+    assert app.console().count("for absolute poses set extPose.absolute 1") == 1
+
+
+def test_a_packet_of_packed_poses_without_any_is_malformed(app: App) -> None:
+    app.boot()
+    before = app.log("floaty.malformed")
+    app.radio(b"\x09")
+    assert app.log("floaty.malformed") == before + 1
 
 
 @pytest.mark.parametrize("data", [b"\x03\x00", b"\x04\x00"])
