@@ -33,7 +33,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "hil.stm32f405": ("hil", "firmware_py.export", "firmware_py.extras"),
     "hil.crazyflie": (
         "hil", "firmware_py.wire.scalars", "firmware_py.wire.memories", "firmware_py.elementary", "firmware_py.section",
-        "firmware_py.compiling",
+        "firmware_py.compiling", "firmware_py.core.subset",
     ),
     "hil.learn": ("hil", "ground_station", "firmware_py"),
     "hil.demonstrations": ("hil", "firmware_py"),
@@ -44,6 +44,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "firmware_py.wire", "firmware_py.geometry", "firmware_py.elementary", "firmware_py.compiling",
         "firmware_py.errors", "firmware_py.extras", "firmware_py.fast", "firmware_py.logic", "firmware_py.policy",
         "firmware_py.section", "firmware_py.table", "firmware_py.kept_code",
+        "firmware_py.core.subset",  # the language of the world's kernels
     ),
 }  # fmt: skip
 

@@ -4,7 +4,8 @@ Subset: module constants `f32(..)`, `i32(..)`, plain ints and arrays `constant(.
 with `f32`, `i32` or `Annotated[F32s, ...]` annotations); functions marked `@kernel` with annotated scalars and structs;
 `for` over `range`, `if`/`elif`/`else`; `+ - * /` on float32, `+ - * // %` on small non-negative int32; comparisons,
 `and`/`or`/`not`; calls of other kernels; `abs`, `sqrt`, `elapsed`. Floats never meet ints without `f32(..)`, and every
-constant is explicitly float32: numba would otherwise compute in double where CPython and C do not.
+constant is explicitly float32: numba would otherwise compute in double where CPython and C do not. `f64` and `F64s` are for
+the structs and kernels of the laboratory's world alone: the core's translator refuses them.
 
 A struct is one block of memory with the layout of the C struct (naturally aligned), so that plain Python, numba and the
 microcontroller can be compared byte by byte. Kernels are compiled by numba (`firmware_py.compiling`); with
@@ -14,7 +15,7 @@ NUMBA_DISABLE_JIT=1 they stay plain Python that a debugger can step through.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Self, TypeAlias, TypeVar, cast
+from typing import Any, ClassVar, Generic, Self, TypeAlias, TypeVar, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from firmware_py import compiling
 
 f32 = np.float32
 i32 = np.int32
+f64 = float
 sqrt = np.sqrt  # correctly rounded on every target: sqrtss on x86, VSQRT.F32 on the Cortex-M4
 
 Integer: TypeAlias = int | np.int32
@@ -39,6 +41,7 @@ def elapsed(later: Integer, earlier: Integer) -> i32:
 
 F32s: TypeAlias = NDArray[np.float32]
 I32s: TypeAlias = NDArray[np.int32]
+F64s: TypeAlias = NDArray[np.float64]
 
 
 def constant(*rows: float | Sequence[float]) -> F32s:
@@ -119,6 +122,17 @@ class Block(Generic[S_co]):
         """Return the memory of a number: `cell[0]` reads it in a fifth of the time of `fields`."""
         return self.memory[name].data
 
+    def copy(self) -> Self:
+        """Return a block with the same content and memory of its own."""
+        other = type(self)(self.kind)
+        other.memory[:] = self.memory
+        return other
+
+    def piece(self, first: str, count: int) -> F64s:
+        """Return `count` numbers from a field of f64 on, over the following ones of that type."""
+        assert self.kind.dtype.fields is not None
+        return np.ndarray(count, f64, self.memory, self.kind.dtype.fields[first][1])
+
     def bytes(self) -> bytes:
         """Return the struct's bytes in memory."""
         return self.memory.tobytes()
@@ -151,7 +165,7 @@ class Struct:
             shape = tuple(size for size in getattr(kind, "__metadata__", ()) if isinstance(size, int))
             element = getattr(kind, "__origin__", kind)
             if shape:
-                element = f32 if element == F32s else i32
+                element = get_args(get_args(element)[1])[0]  # of the dtype
             columns.append((name, element, shape) if shape else (name, element))
         cls.dtype = np.dtype(columns, align=True)
         scalars = tuple(column[0] for column in columns if len(column) == 2)
@@ -172,3 +186,8 @@ class Struct:
     def allocate(cls) -> Block[Self]:
         """Return a zeroed instance."""
         return Block(cls)
+
+    @classmethod
+    def rows(cls, memory: NDArray[Any]) -> Any:
+        """Return what a kernel takes from outside the core for a structured array of instances."""
+        return [cls._view(memory[n : n + 1]) for n in range(len(memory))] if compiling.PLAIN else memory

@@ -15,21 +15,20 @@ from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from firmware_py.compiling import bound
+from firmware_py.core.subset import F64s, Struct, f64, i32
 from firmware_py.elementary import cos
 from firmware_py.section import Section, number
 from hil.scene import CENTRE, PALE, Look, Markers, box, eight_markers
-from hil.world import layout as at
 from hil.world.body import Channel, Quantity, Setting, Vector, View
 from hil.world.config import BatteryConfig, PlantConfig, TunnelConfig
 from hil.world.fixed_order import atan2, compiled, exp, normal
-from hil.world.in_tunnel import UPRIGHT, InTunnel
-from hil.world.motion import GRAVITY, accelerate, gust, move, surround
-from hil.world.plates import State
+from hil.world.in_tunnel import UPRIGHT, InTunnel, seen, settings_of
+from hil.world.motion import GRAVITY, accelerate, begin, lose, move, surround
 from hil.world.room import Room
+from hil.world.structs import NOISE_ROWS, Air, Rigid
 from hil.world.tunnel import Tunnel
 
 ORANGE = "#e69f00"
@@ -43,37 +42,7 @@ RADIANS_PER_RPM = 2.0 * math.pi / 60.0
 FRONT, LEFT = (1.0, -1.0, -1.0, 1.0), (-1.0, -1.0, 1.0, 1.0)  # where the motors are
 TURN = (1.0, -1.0, 1.0, -1.0)  # of the propellers about z of B
 
-# Places of the array behind those that bodies share
-DUTY = at.SIZE  # (4,) share of the supply voltage that a motor gets
-RPM = DUTY + 4  # (4,) of the propellers
-SPIN_UP = RPM + 4  # (4,) [rpm/s]
-SUPPLY = SPIN_UP + 4  # [V] at the motors' drivers
-STRENGTH = SUPPLY + 1  # (4,) thrust and torque over the nominal
-CURRENT = STRENGTH + 4  # (4,) 0: the motor's wire is broken
-OBEYS = CURRENT + 4  # (4,) 0: the duty stays
-THRUST = OBEYS + 4  # (4,) [N]
-LAG = THRUST + 4  # [s]
-ARM_XY = LAG + 1  # [m]
-MOTOR_POWER = ARM_XY + 1  # [W/N]
-ENERGY = MOTOR_POWER + 1  # [J] taken by the motors since the start
-ROTOR_INERTIA = ENERGY + 1
-ROTOR_DRAG = ROTOR_INERTIA + 1  # (2,) sideways, along z
-GROUND_GAIN = ROTOR_DRAG + 2
-ROTOR_RADIUS = GROUND_GAIN + 1
-ROTOR_ABOVE = ROTOR_RADIUS + 1
-IMPACT_MAX = ROTOR_ABOVE + 1
-TOUCHED = IMPACT_MAX + 1  # 1: the feet were on the floor a step before
-SINKING = TOUCHED + 1  # [m/s] when the step began
-SHAKING = SINKING + 1  # (2,) [rad/s, m/s2] per rms of the rotors' squared speeds [rpm2]
-VOLTS_TO_THRUST = SHAKING + 2  # (4,) from the constant to the cubic
-RPM_TO_THRUST = VOLTS_TO_THRUST + 4  # (2,) linear, quadratic
-RPM_TO_TORQUE = RPM_TO_THRUST + 2  # (2,)
-CURVE_BEGIN = RPM_TO_TORQUE + 2  # [V]
-DEAD_VOLTS = CURVE_BEGIN + 1  # [V] up to here a motor stands
-SLOW_RPM = DEAD_VOLTS + 1  # [rpm/V] between the two
-SIZE = SLOW_RPM + 1
-
-LEFT_ROOM, TOO_HIGH, HIT_FLOOR, TUMBLED = 1, 2, 3, 4  # causes in LOST
+LEFT_ROOM, TOO_HIGH, HIT_FLOOR, TUMBLED = 1, 2, 3, 4  # causes of a loss
 LOSS_TEXTS = {
     LEFT_ROOM: "left the room: {:.2f} m from its middle",
     TOO_HIGH: "hit the ceiling at {:.2f} m",
@@ -159,149 +128,181 @@ class QuadrotorConfig(Section):
     tilt: float = number(math.pi / 2, f"(0, {math.pi})", "and tilted so far [rad]; chosen")
 
 
+class Rotors(Struct):
+    """The motors and propellers, and how hard the feet meet the floor."""
+
+    command: Annotated[F64s, 4]  # share of the supply voltage
+    wanted: Annotated[F64s, 4]  # [N] at which the thrusts would settle if nothing had failed
+    duty: Annotated[F64s, 4]  # share of the supply voltage that a motor gets
+    rpm: Annotated[F64s, 4]  # of the propellers
+    spin_up: Annotated[F64s, 4]  # [rpm/s]
+    thrust: Annotated[F64s, 4]  # [N]
+    energy: f64  # [J] taken by the motors since the start
+    touched: i32  # 1: the feet were on the floor a step before
+    sinking: f64  # [m/s] when the step began
+    # Inputs from outside
+    supply: f64  # [V] at the motors' drivers
+    strength: Annotated[F64s, 4]  # thrust and torque over the nominal
+    current: Annotated[F64s, 4]  # 0: the motor's wire is broken
+    obeys: Annotated[F64s, 4]  # 0: the duty stays
+    # Constants
+    x: Annotated[F64s, 4]  # [m] of the motors, in B
+    y: Annotated[F64s, 4]
+    turn: Annotated[F64s, 4]  # 1, -1: of the propellers about z of B
+    lag: f64  # [s]
+    inertia: f64
+    drag: Annotated[F64s, 3]  # [kg] in B
+    ground_gain: f64
+    radius: f64  # [m]
+    above: f64  # [m] the centre of mass
+    shaking: Annotated[F64s, 2]  # [rad/s, m/s2] per rms of the rotors' squared speeds [rpm2]
+    power: f64  # [W/N] of the motors
+    volts_to_thrust: Annotated[F64s, 4]  # from the constant to the cubic
+    rpm_to_thrust: Annotated[F64s, 2]  # linear, quadratic
+    rpm_to_torque: Annotated[F64s, 2]
+    curve_begin: f64  # [V]
+    dead_volts: f64  # [V] up to here a motor stands
+    slow_rpm: f64  # [rpm/V] between the two
+    impact_max: f64  # [m/s]
+
+
 @compiled
-def thrust_at(s: State, rpm: float) -> float:
+def thrust_at(rotors: Rotors, rpm: float) -> float:
     """Return the nominal thrust [N] of a propeller at a speed."""
-    return max(rpm * (float(s[RPM_TO_THRUST]) + rpm * float(s[RPM_TO_THRUST + 1])), 0.0)
+    return max(f64(rpm * (rotors.rpm_to_thrust[0] + rpm * rotors.rpm_to_thrust[1])), 0.0)
 
 
 @compiled
-def rpm_for(s: State, thrust: float) -> float:
+def rpm_for(rotors: Rotors, thrust: float) -> float:
     """Return the speed [rpm] at which a propeller has a thrust [N]."""
-    a, b = float(s[RPM_TO_THRUST]), float(s[RPM_TO_THRUST + 1])
-    return (-a + math.sqrt(a * a + 4.0 * b * thrust)) / (2.0 * b)
+    a, b = rotors.rpm_to_thrust[0], rotors.rpm_to_thrust[1]
+    return f64((-a + math.sqrt(a * a + 4.0 * b * thrust)) / (2.0 * b))
 
 
 @compiled
-def curve_rpm(s: State, volts: float) -> float:
+def curve_rpm(rotors: Rotors, volts: float) -> float:
     """Return the speed [rpm] that the curve of thrust over voltage has at a voltage."""
-    c = VOLTS_TO_THRUST
-    return rpm_for(s, max(float(s[c] + volts * (s[c + 1] + volts * (s[c + 2] + volts * s[c + 3]))), 0.0))
+    c = rotors.volts_to_thrust
+    return rpm_for(rotors, max(c[0] + volts * (c[1] + volts * (c[2] + volts * c[3])), 0.0))
 
 
 @compiled
-def steady_rpm(s: State, volts: float) -> float:
+def steady_rpm(rotors: Rotors, volts: float) -> float:
     """Return the speed [rpm] at which a propeller turns with a voltage at its motor."""
-    if volts <= s[CURVE_BEGIN]:
-        return max(volts - float(s[DEAD_VOLTS]), 0.0) * float(s[SLOW_RPM])
-    return curve_rpm(s, volts)
+    if volts <= rotors.curve_begin:
+        return max(volts - rotors.dead_volts, 0.0) * rotors.slow_rpm
+    return curve_rpm(rotors, volts)
 
 
 @compiled
-def spin(s: State, duration: float) -> None:
+def spin(rotors: Rotors, duration: float) -> None:
     """Bring the propellers towards the speeds of their voltages, for `duration` [s]."""
     for i in range(4):
-        wanted = steady_rpm(s, s[DUTY + i] * s[SUPPLY] * s[CURRENT + i])
-        n = s[RPM + i]
-        s[RPM + i] = wanted + (n - wanted) * exp(-duration / s[LAG])
-        s[SPIN_UP + i] = (s[RPM + i] - n) / duration
+        wanted = steady_rpm(rotors, rotors.duty[i] * rotors.supply * rotors.current[i])
+        n = rotors.rpm[i]
+        rotors.rpm[i] = wanted + (n - wanted) * exp(-duration / rotors.lag)
+        rotors.spin_up[i] = (rotors.rpm[i] - n) / duration
 
 
 @compiled
-def near_ground(s: State) -> float:
+def settle(rotors: Rotors) -> None:
+    """Write the thrusts that the commands lead to."""
+    for i in range(4):
+        rotors.wanted[i] = thrust_at(rotors, steady_rpm(rotors, rotors.command[i] * rotors.supply))
+
+
+@compiled
+def near_ground(body: Rigid, rotors: Rotors) -> float:
     """Return by what factor the floor raises the thrust."""
-    height = max(s[at.P + 2] - s[at.NET_HEIGHT] + s[ROTOR_ABOVE], s[ROTOR_RADIUS])
-    share: float = s[ROTOR_RADIUS] / (4.0 * height)
-    return 1.0 + float(s[GROUND_GAIN]) * share * share
+    height = max(f64(body.p_WB[2] - body.net_height + rotors.above), rotors.radius)
+    share = rotors.radius / (4.0 * height)
+    return 1.0 + rotors.ground_gain * share * share
 
 
 @compiled
-def evaluate(s: State) -> None:
+def evaluate(body: Rigid, air: Air, rotors: Rotors) -> None:
     """Compute forces and accelerations from state, inputs and constants."""
-    surround(s)
-    lift, mx, my, mz, turning, momentum = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    gain = near_ground(s)
+    surround(body, air)
+    lift, mx, my, mz, turning, momentum, squares = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    gain = near_ground(body, rotors)
     for i in range(4):
-        n = s[RPM + i]
-        thrust = gain * s[STRENGTH + i] * thrust_at(s, n)
-        torque = s[STRENGTH + i] * max(n * (s[RPM_TO_TORQUE] + n * s[RPM_TO_TORQUE + 1]), 0.0)
-        torque += s[ROTOR_INERTIA] * RADIANS_PER_RPM * s[SPIN_UP + i]
-        s[THRUST + i] = thrust
-        lift += thrust
-        mx += LEFT[i] * s[ARM_XY] * thrust
-        my -= FRONT[i] * s[ARM_XY] * thrust
-        mz -= TURN[i] * torque
-        turning += RADIANS_PER_RPM * n
-        momentum += s[ROTOR_INERTIA] * RADIANS_PER_RPM * TURN[i] * n
-    squares = 0.0
-    for i in range(4):
-        square = s[RPM + i] * s[RPM + i]
-        squares += square * square
-    s[at.VIBRATION] = s[SHAKING] * math.sqrt(squares)
-    s[at.VIBRATION + 1] = s[SHAKING + 1] * math.sqrt(squares)
-    f = at.DRAG
+        n = rotors.rpm[i]
+        thrust = gain * rotors.strength[i] * thrust_at(rotors, n)
+        drag = rotors.strength[i] * max(n * (rotors.rpm_to_torque[0] + n * rotors.rpm_to_torque[1]), 0.0)
+        torque = drag + rotors.inertia * RADIANS_PER_RPM * rotors.spin_up[i]
+        rotors.thrust[i] = thrust
+        lift = lift + thrust
+        mx = mx + rotors.y[i] * thrust
+        my = my - rotors.x[i] * thrust
+        mz = mz - rotors.turn[i] * torque
+        turning = turning + RADIANS_PER_RPM * n
+        momentum = momentum + rotors.inertia * RADIANS_PER_RPM * rotors.turn[i] * n
+        squares = squares + (n * n) * (n * n)
+    body.vibration[0] = rotors.shaking[0] * math.sqrt(squares)
+    body.vibration[1] = rotors.shaking[1] * math.sqrt(squares)
+    f = body.wrench_B
     for i in range(3):
-        s[f + i] = s[ROTOR_DRAG + i // 2] * turning * s[at.WIND + i]
-    s[f + 2] += lift
-    s[f + 3] = mx - s[at.OMEGA + 1] * momentum  # omega x h of the propellers
-    s[f + 4] = my + s[at.OMEGA] * momentum
-    s[f + 5] = mz
-    accelerate(s)
+        f[i] = rotors.drag[i] * turning * air.wind_B[i]
+    f[2] = f[2] + lift
+    f[3] = mx - body.omega_B[1] * momentum  # omega x h of the propellers
+    f[4] = my + body.omega_B[0] * momentum
+    f[5] = mz
+    accelerate(body)
 
 
 @compiled
-def watch(s: State) -> None:
-    """Note the first reason why the flight is over."""
-    radius = max(abs(s[at.P]), abs(s[at.P + 1]))
-    height, down = s[at.P + 2] - s[at.NET_HEIGHT], s[SINKING]
-    touches = s[at.GROUND + 2] > 0.0
-    cos_tilt = s[at.R + 8]
-    cause, value = 0, 0.0
-    if radius > s[at.LIMIT_RADIUS]:
-        cause, value = LEFT_ROOM, radius
-    elif height > s[at.LIMIT_ABOVE]:
-        cause, value = TOO_HIGH, height
-    elif touches and s[TOUCHED] == 0.0 and down > s[IMPACT_MAX]:
-        cause, value = HIT_FLOOR, down
-    elif cos_tilt < s[at.LIMIT_COS_TILT]:
-        cause, value = TUMBLED, atan2(math.sqrt(1.0 - cos_tilt * cos_tilt), cos_tilt)
-    s[TOUCHED] = 1.0 if touches else 0.0
-    if cause != 0:
-        s[at.LOST], s[at.LOST_VALUE] = cause, value
+def watch(body: Rigid, rotors: Rotors) -> None:
+    """Record the first reason why the flight is over."""
+    radius = max(abs(body.p_WB[0]), abs(body.p_WB[1]))
+    height = body.p_WB[2] - body.net_height
+    cos_tilt = body.R_WB[2, 2]
+    touches = body.ground[2] > 0.0
+    if radius > body.limit_radius:
+        lose(body, LEFT_ROOM, radius)
+    elif height > body.limit_above:
+        lose(body, TOO_HIGH, height)
+    elif touches and rotors.touched == 0 and rotors.sinking > rotors.impact_max:
+        lose(body, HIT_FLOOR, rotors.sinking)
+    elif cos_tilt < body.limit_cos_tilt:
+        lose(body, TUMBLED, atan2(math.sqrt(1.0 - cos_tilt * cos_tilt), cos_tilt))
+    rotors.touched = i32(touches)
 
 
 @compiled
-def step(s: State, draws: View, step_us: float) -> None:
-    """Advance by one step: the midpoint rule; ACC and ALPHA hold for the start."""
-    gust(s, draws)
-    duration = step_us * 1e-6  # [s]
-    s[at.TIME_US] += step_us
-    s[ENERGY] += s[MOTOR_POWER] * (s[THRUST] + s[THRUST + 1] + s[THRUST + 2] + s[THRUST + 3]) * duration
-    if s[at.HELD] != 0.0:
-        spin(s, duration)
-        evaluate(s)
+def step(body: Rigid, air: Air, rotors: Rotors, draws: F64s) -> None:
+    """Advance by one step: the midpoint rule; its accelerations hold for the start."""
+    begin(body, air, draws)
+    duration = body.step_us * 1e-6  # [s]
+    thrust = rotors.thrust[0] + rotors.thrust[1] + rotors.thrust[2] + rotors.thrust[3]
+    rotors.energy = rotors.energy + rotors.power * thrust * duration
+    if body.held != 0:
+        spin(rotors, duration)
+        evaluate(body, air, rotors)
         return
-    for i in range(13):
-        s[at.BEFORE + i] = s[at.P + i]
-    s[SINKING] = -s[at.V + 2]
+    rotors.sinking = -body.v_WB[2]
     for part in range(2):
-        s[at.DURATION] = 0.5 * duration if part == 0 else duration
-        move(s)
-        spin(s, 0.5 * duration)
-        evaluate(s)
-    if s[at.LOST] == 0.0:
-        watch(s)
+        body.duration = 0.5 * f64(1 + part) * duration
+        move(body)
+        spin(rotors, 0.5 * duration)
+        evaluate(body, air, rotors)
+    if body.lost == 0:
+        watch(body, rotors)
 
 
 @compiled
-def advance(s: State, draws: View, now_us: NDArray[np.int64]) -> bool:
-    """Do every step that ends at or before `now_us[0]`; return True when the draws ran out before that."""
-    row = int(s[at.NOISE_ROW])
-    while s[at.TIME_US] + at.STEP_US <= now_us[0]:
-        if row == draws.shape[0]:
-            s[at.NOISE_ROW] = 0.0
-            return True
-        step(s, draws[row], at.STEP_US)
-        row += 1
-    s[at.NOISE_ROW] = row
-    return False
+def advance(body: Rigid, air: Air, rotors: Rotors, draws: F64s) -> None:
+    """Do every step that is due, as long as there are draws."""
+    for _ in range(air.noise_row, NOISE_ROWS):
+        if body.time_us + body.step_us > body.until_us:
+            return
+        step(body, air, rotors, draws)
 
 
 class Quadrotor(InTunnel):
     """The robot, its motors and the room, in the air of a tunnel whose fans may stand still.
 
-    Beside the views of every body: truth (SIZE,) everything; acceleration_W, alpha_B (3,); rpm, thrust (4,) of the rotors
-    [rpm, N]; escs those speeds for the ESCs of brushless motors, None with brushed ones.
+    Beside the views of every body: rpm, thrust (4,) of the rotors [rpm, N]; escs those speeds for the ESCs of brushless
+    motors, None with brushed ones. `rotors` is the memory of the kernels.
     """
 
     loss_texts = LOSS_TEXTS
@@ -315,43 +316,44 @@ class Quadrotor(InTunnel):
         p_WB: Vector | None = None,
     ) -> None:
         """Start at rest, motors off, on the floor in the middle of the room unless `p_WB` [m] says otherwise."""
-        s = np.zeros(SIZE)
-        super().__init__(s, Tunnel(tunnel, s), PlantConfig(), rng)
-        s[at.TETHER_LENGTH], s[at.NET_HEIGHT] = math.inf, 0.0
-        s[at.MASS], s[at.INERTIA : at.INERTIA + 3] = config.mass, config.inertia
-        s[ARM_XY] = config.arm * math.sqrt(0.5)
-        s[LAG], s[ROTOR_INERTIA], s[MOTOR_POWER] = config.rotor_lag, config.rotor_inertia, config.motor_power
-        s[ROTOR_DRAG : ROTOR_DRAG + 2] = config.rotor_drag
-        s[VOLTS_TO_THRUST : VOLTS_TO_THRUST + 4] = config.volts_to_thrust
-        s[RPM_TO_THRUST : RPM_TO_THRUST + 2] = config.rpm_to_thrust
-        s[RPM_TO_TORQUE : RPM_TO_TORQUE + 2] = config.rpm_to_torque
-        begin, dead = config.curve_begin, config.curve_begin * config.dead_share
-        s[CURVE_BEGIN], s[DEAD_VOLTS], s[SLOW_RPM] = begin, dead, curve_rpm(s, begin) / (begin - dead)
-        hover_rpm = rpm_for(s, 0.25 * config.mass * GRAVITY)
-        s[SHAKING : SHAKING + 2] = np.array(config.vibration) / (2.0 * hover_rpm**2)
-        s[GROUND_GAIN], s[ROTOR_RADIUS] = config.ground_effect, config.rotor_radius
-        s[ROTOR_ABOVE] = config.rotor_above
-        s[at.FOOT_SPREAD], s[at.FOOT_BELOW] = s[ARM_XY], config.foot_below
-        s[at.FOOT_REACH] = math.sqrt(config.arm * config.arm + config.foot_below * config.foot_below)
-        s[at.NET_STIFFNESS], s[at.NET_DAMPING] = config.floor_stiffness, config.floor_damping
-        s[at.FRICTION] = config.floor_friction
-        s[at.LIMIT_RADIUS], s[at.LIMIT_ABOVE], s[IMPACT_MAX] = config.room, config.ceiling, config.impact
-        s[at.LIMIT_COS_TILT] = cos(config.tilt)
-        s[CURRENT : CURRENT + 4] = s[OBEYS : OBEYS + 4] = 1.0
-        s[STRENGTH : STRENGTH + 4] = 1.0 + config.motor_spread * normal(rng, 4)
+        body, self.rotors = Rigid.allocate(), Rotors.allocate()
+        super().__init__(body, Tunnel(tunnel), PlantConfig(), rng)
+        b, r = body.fields, self.rotors.fields
+        b.tether_length, b.net_height = math.inf, 0.0
+        b.mass, b.inertia[:] = config.mass, config.inertia
+        arm_xy = config.arm * math.sqrt(0.5)
+        r.x[:], r.y[:], r.turn[:] = np.multiply(FRONT, arm_xy), np.multiply(LEFT, arm_xy), TURN
+        r.lag, r.inertia, r.power = config.rotor_lag, config.rotor_inertia, config.motor_power
+        sideways, along = config.rotor_drag
+        r.drag[:] = sideways, sideways, along
+        r.volts_to_thrust[:] = config.volts_to_thrust
+        r.rpm_to_thrust[:], r.rpm_to_torque[:] = config.rpm_to_thrust, config.rpm_to_torque
+        r.curve_begin, r.dead_volts = config.curve_begin, config.curve_begin * config.dead_share
+        r.slow_rpm = curve_rpm(self.rotors.arg, r.curve_begin) / (r.curve_begin - r.dead_volts)
+        hover_rpm = rpm_for(self.rotors.arg, 0.25 * config.mass * GRAVITY)
+        r.shaking[:] = np.array(config.vibration) / (2.0 * hover_rpm**2)
+        r.ground_gain, r.radius, r.above = config.ground_effect, config.rotor_radius, config.rotor_above
+        b.foot_spread, b.foot_below = arm_xy, config.foot_below
+        b.foot_reach = math.sqrt(config.arm * config.arm + config.foot_below * config.foot_below)
+        b.net_stiffness, b.net_damping = config.floor_stiffness, config.floor_damping
+        b.friction = config.floor_friction
+        b.limit_radius, b.limit_above, r.impact_max = config.room, config.ceiling, config.impact
+        b.limit_cos_tilt = cos(config.tilt)
+        r.current[:] = r.obeys[:] = 1.0
+        r.strength[:] = 1.0 + config.motor_spread * normal(rng, 4)
         self._config = config
         self.room = Room(0.0, config.room, config.ceiling)
-        self._evaluate, self._advance = bound(evaluate, s), bound(advance, s, self._draws, self._now_us)
-        self.truth = self._view(0, SIZE)
-        self.acceleration_W, self.alpha_B = self._view(at.ACC, 3), self._view(at.ALPHA, 3)
-        self.rpm, self.thrust = self._view(RPM, 4), self._view(THRUST, 4)
+        self._settle = bound(settle, self.rotors.arg)
+        memory = body.arg, self.tunnel.air.arg, self.rotors.arg
+        self._evaluate, self._advance = bound(evaluate, *memory), bound(advance, *memory, self._draws)
+        self.rpm, self.thrust = seen(r.rpm), seen(r.thrust)
         self.outputs: Sequence[tuple[int, int]] = OUTPUTS[config.motors]
         self.escs = self.rpm if config.motors == "brushless" else None
         self._electronics = self._power = battery.electronics_power
         self._drawn_us, self._drawn_J = 0, 0.0
-        self._commanded = np.zeros(4)  # share of the supply voltage
-        self.settings: Mapping[str, Setting] = self._settings(
-            {"motor.strength": STRENGTH, "motor.current": CURRENT, "motor.obeys": OBEYS}
+        self._energy = self.rotors.cell("energy")
+        self.settings: Mapping[str, Setting] = settings_of(
+            {"motor.strength": r.strength, "motor.current": r.current, "motor.obeys": r.obeys}
         )
         sunk = config.mass * GRAVITY / (4.0 * config.floor_stiffness)
         self.place((0.0, 0.0, config.foot_below - sunk) if p_WB is None else p_WB, UPRIGHT)
@@ -359,16 +361,16 @@ class Quadrotor(InTunnel):
     def set_counts(self, now_us: int, counts: Sequence[int]) -> None:
         """Take the compare counts of M1 to M4, or their throttles; a PWM period of 3 us is no delay."""
         self.advance(now_us)
-        steps = STEPS[self._config.motors]
+        steps, r = STEPS[self._config.motors], self.rotors.fields
         for i, count in enumerate(counts):
-            self._commanded[i] = duty = min(max(count, 0), steps) / steps
-            if self._s[OBEYS + i] != 0.0:
-                self._s[DUTY + i] = duty
+            r.command[i] = duty = min(max(count, 0), steps) / steps
+            if r.obeys[i] != 0.0:
+                r.duty[i] = duty
 
     def draw(self, now_us: int, cell_V: float) -> float:
         """Return the mean power [W] of electronics and motors since the last call; the motors run on `cell_V` [V]."""
-        self._s[SUPPLY] = cell_V
-        duration, taken_J = 1e-6 * (now_us - self._drawn_us), float(self._s[ENERGY])
+        self.rotors.fields.supply = cell_V
+        duration, taken_J = 1e-6 * (now_us - self._drawn_us), self._energy[0]
         if duration > 0.0:
             self._power = self._electronics + (taken_J - self._drawn_J) / duration
             self._drawn_us, self._drawn_J = now_us, taken_J
@@ -385,15 +387,15 @@ class Quadrotor(InTunnel):
             )
         )
 
-    def _commanded_thrust(self) -> NDArray[np.float64]:
-        volts = self._commanded * self._s[SUPPLY]
-        return np.array([thrust_at(self._s, steady_rpm(self._s, one)) for one in volts.tolist()])
+    def _commanded_thrust(self) -> View:
+        self._settle()
+        return self.rotors.fields.wanted
 
     @property
     def look(self) -> Look:
         """Two beams with a rotor at each end, the front ones orange, and the board between them."""
-        xy, above = float(self._s[ARM_XY]), self._config.rotor_above
-        ends = [(x * xy, y * xy, 0.0) for x, y in zip(FRONT, LEFT, strict=True)]
+        r, above = self.rotors.fields, self._config.rotor_above
+        ends = [(x, y, 0.0) for x, y in zip(r.x.tolist(), r.y.tolist(), strict=True)]
         beams = tuple(np.array((ends[i], ends[i + 2])) for i in (0, 1))
         size = 2.0 * self._config.rotor_radius
         rotors = [

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from firmware_py.compiling import bound
 from hil.design import figures
 from hil.design.authority import QUANTITIES, attainable, authorities, pressure_at, single, wrenches
 from hil.design.claims import Claim, claims, robot_lines
@@ -16,7 +17,6 @@ from hil.design.sweeps import hover_angles, scaling, stability
 from hil.floaty.shape import SIGNS
 from hil.pictures.pages import saved, write_page
 from hil.whole_files import write_whole
-from hil.world import layout as at
 from hil.world.motion import evaluate
 
 CHECKED = 200  # openings at which plant and plate equations are compared
@@ -33,16 +33,17 @@ class Analysis:
 
 def model_error(point: Point) -> float:
     """Return the largest difference between the flown plant and the Supplement's plates, [N] or [N m], over openings."""
-    c = calm_plates(point.geometry, point.speed, point.opening)
+    plates = calm_plates(point.geometry, point.speed, point.opening)
+    press = bound(evaluate, *plates.args)
     places = np.stack(
         [np.linspace(point.low, point.high, CHECKED) * f % point.high for f in (1.0, 1.7, 2.3, 3.1)], axis=1
     )
     expected = wrenches(point.geometry, places, pressure_at(point.geometry, point.opening))
     worst = 0.0
     for openings, wanted in zip(places, expected, strict=True):
-        c[at.FLAPS : at.FLAPS + 4] = SIGNS * openings
-        evaluate(c)
-        worst = max(worst, float(np.abs(c[at.DRAG : at.DRAG + 6] - wanted).max()))
+        plates.flaps.fields.angle[:] = SIGNS * openings
+        press()
+        worst = max(worst, float(np.abs(plates.body.fields.wrench_B - wanted).max()))
     return worst
 
 

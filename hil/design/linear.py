@@ -11,10 +11,10 @@ import numpy as np
 from hil.config import LabConfig
 from hil.design.axes import ANGLE, AXES, FLAP, NUISANCES, PITCH, RATE, ROLL, VELOCITY, Axis, Matrix
 from hil.design.trim import coefficient_of, speed_at
-from hil.floaty.correction import DIFFERENCE, Constants, accelerations, calm, slope
+from hil.floaty.correction import DIFFERENCE, Constants, Probe, calm
 from hil.floaty.plant import assemble
 from hil.world.config import GeometryConfig, PlantConfig, TunnelConfig
-from hil.world.plates import State
+from hil.world.structs import FloatyBlocks
 
 CAUSES = ("vx", "vy", "vz", "qx", "qy", "qz", "ox", "oy", "oz", "u1", "u2", "u3", "u4")
 STATES = 9
@@ -73,17 +73,17 @@ def _place(axis: Axis, state: str) -> int:
     return {ANGLE: 3, RATE: 6, FLAP: STATES}[state] + axis.input
 
 
-def calm_plates(geometry: GeometryConfig, speed: float, opening: float) -> State:
+def calm_plates(geometry: GeometryConfig, speed: float, opening: float) -> FloatyBlocks:
     """Return the plate model, level and at rest at a hover, at a speed [m/s] and opening [rad]."""
     plant = PlantConfig(variant="plate", airspeed=speed, hover_angle=opening)
-    s, _ = assemble(geometry, plant, TunnelConfig(turbulence="none"))
-    return calm(s, speed)
+    blocks, _ = assemble(geometry, plant, TunnelConfig(turbulence="none"))
+    return calm(blocks, speed)
 
 
 def linear(geometry: GeometryConfig, speed: float, opening: float) -> Linear:
     """Return the dynamics of the plates in a hover at a speed [m/s] and opening [rad]."""
-    c = calm_plates(geometry, speed, opening)
-    slopes = np.array([slope(c, cause) for cause in CAUSES]).T  # (6, 13)
+    probe = Probe(calm_plates(geometry, speed, opening))
+    slopes = np.array([probe.slope(cause) for cause in CAUSES]).T  # (6, 13)
     A, B = np.zeros((STATES, STATES)), np.zeros((STATES, 4))
     A[:3], A[6:] = slopes[:3, :STATES], slopes[3:, :STATES]
     A[3:6, 6:] = np.eye(3)
@@ -93,8 +93,8 @@ def linear(geometry: GeometryConfig, speed: float, opening: float) -> Linear:
 
 def stiffness(geometry: GeometryConfig, speed: float, opening: float) -> float:
     """Return f_αα alone: roll acceleration per roll angle [1/s2]."""
-    c = calm_plates(geometry, speed, opening)
-    change = accelerations(c, "qx", DIFFERENCE) - accelerations(c, "qx", -DIFFERENCE)
+    probe = Probe(calm_plates(geometry, speed, opening))
+    change = probe.accelerations("qx", DIFFERENCE) - probe.accelerations("qx", -DIFFERENCE)
     return float(change[3]) / (2 * DIFFERENCE)
 
 

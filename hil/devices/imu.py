@@ -7,12 +7,14 @@ in S.
 
 import math
 from collections.abc import Callable
+from copy import copy, deepcopy
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.board import ImuCounts
 from firmware_py.compiling import bound
+from firmware_py.core.subset import F64s, I32s, Integer, Struct, f64, i32
 from firmware_py.elementary import cos, sin, tan
 from hil.devices.config import S_AZIMUTH, ImuConfig
 from hil.errors import LabError
@@ -20,52 +22,65 @@ from hil.world.body import Motion
 from hil.world.fixed_order import compiled, normal
 from hil.world.motion import GRAVITY
 
-View = NDArray[np.float64]
-Counts = NDArray[np.int64]  # (7,) of a sample, then the number of noise rows left
-LEFT = 6
 SAMPLE_RATE = 1000.0  # [Hz]
 GYRO_COUNTS = 32768 / math.radians(2000)  # per rad/s; data sheet, range +-2000 deg/s
 ACCEL_COUNTS = 32768 / (24 * GRAVITY)  # per m/s2; data sheet, range +-24 g
 COUNTS = 32768.0  # of int16, one more below zero than above
 NOISE_ROWS = 2048  # samples of noise drawn at once
 COS, SIN = cos(S_AZIMUTH), sin(S_AZIMUTH)  # of the default
-# Layout of the sensor's array: for each of six channels (gyro x y z, accelerometer x y z) a row of
-NOW_1, NOW_2, B0, A1, A2, SCALE, BIAS, NOISE, FAULT_BIAS, STUCK, RANGE, COUNT, AXIS_COS, AXIS_SIN = range(14)
-FIELDS = 14
+
+
+class Imu(Struct):
+    """The sensor's memory; arrays of six have a number for each of gyro x y z, accelerometer x y z."""
+
+    first: Annotated[F64s, 6]  # memory of the filters
+    second: Annotated[F64s, 6]
+    count: Annotated[I32s, 6]  # of the last sample
+    rows_left: i32  # of noise
+    # Constants, and values that faults change
+    b0: Annotated[F64s, 6]  # of the filters
+    a1: Annotated[F64s, 6]
+    a2: Annotated[F64s, 6]
+    scale: Annotated[F64s, 6]  # [counts] per rad/s or m/s2
+    bias: Annotated[F64s, 6]
+    fault_bias: Annotated[F64s, 6]
+    noise: Annotated[F64s, 6]  # rms
+    limit: Annotated[F64s, 6]  # [counts]
+    frozen: i32  # 1: the counts stay
+    axis_cos: f64  # of the azimuth of S
+    axis_sin: f64
 
 
 @compiled
-def channel(row: View, truth: float, shaken: float, draw: float) -> int:
-    """Filter (transposed form II, b = B0 (1, 2, 1)), disturb and round one channel; returns counts.
+def channel(imu: Imu, i: Integer, truth: float, shaken: float, draw: float) -> None:
+    """Filter (transposed form II, b = b0 (1, 2, 1)), disturb and round one channel.
 
     `shaken`: vibration noise, added to the sensor's own.
     """
-    low = row[B0] * truth + row[NOW_1]
-    row[NOW_1] = 2.0 * row[B0] * truth - row[A1] * low + row[NOW_2]
-    row[NOW_2] = row[B0] * truth - row[A2] * low
-    if row[STUCK] == 0.0:
-        noise = row[NOISE] if shaken == 0.0 else math.sqrt(row[NOISE] * row[NOISE] + shaken * shaken)
-        value = row[SCALE] * (low + row[BIAS] + row[FAULT_BIAS] + noise * draw)
-        row[COUNT] = min(max(math.floor(value + 0.5), -row[RANGE]), row[RANGE] - 1.0)
-    return int(row[COUNT])
+    low = imu.b0[i] * truth + imu.first[i]
+    imu.first[i] = 2.0 * imu.b0[i] * truth - imu.a1[i] * low + imu.second[i]
+    imu.second[i] = imu.b0[i] * truth - imu.a2[i] * low
+    if imu.frozen == 0:
+        noise = imu.noise[i]
+        if shaken != 0.0:
+            noise = math.sqrt(noise * noise + shaken * shaken)
+        value = imu.scale[i] * (low + imu.bias[i] + imu.fault_bias[i] + noise * draw)
+        imu.count[i] = i32(min(max(math.floor(value + 0.5), -imu.limit[i]), imu.limit[i] - 1.0))
 
 
 @compiled
-def channels(
-    rows: View, omega_B: View, specific_force_B: View, vibration: View, draws: View, counts: Counts
-) -> None:
+def channels(imu: Imu, omega_B: F64s, specific_force_B: F64s, vibration: F64s, draws: F64s) -> None:
     """Turn rates and specific force into S and then into counts, with the next row of noise."""
     ox, oy, fx, fy = omega_B[0], omega_B[1], specific_force_B[0], specific_force_B[1]
-    c, s = rows[0, AXIS_COS], rows[0, AXIS_SIN]
-    turned, pushed = vibration[0], vibration[1]
-    counts[LEFT] -= 1
-    noise = draws[counts[LEFT]]
-    counts[0] = channel(rows[0], c * ox + s * oy, turned, noise[0])
-    counts[1] = channel(rows[1], c * oy - s * ox, turned, noise[1])
-    counts[2] = channel(rows[2], omega_B[2], turned, noise[2])
-    counts[3] = channel(rows[3], c * fx + s * fy, pushed, noise[3])
-    counts[4] = channel(rows[4], c * fy - s * fx, pushed, noise[4])
-    counts[5] = channel(rows[5], specific_force_B[2], pushed, noise[5])
+    c, s, turned, pushed = imu.axis_cos, imu.axis_sin, vibration[0], vibration[1]
+    imu.rows_left = i32(imu.rows_left - 1)
+    row = imu.rows_left
+    channel(imu, 0, c * ox + s * oy, turned, draws[row, 0])
+    channel(imu, 1, c * oy - s * ox, turned, draws[row, 1])
+    channel(imu, 2, omega_B[2], turned, draws[row, 2])
+    channel(imu, 3, c * fx + s * fy, pushed, draws[row, 3])
+    channel(imu, 4, c * fy - s * fx, pushed, draws[row, 4])
+    channel(imu, 5, specific_force_B[2], pushed, draws[row, 5])
 
 
 def low_pass(bandwidth: float) -> tuple[float, float, float]:
@@ -83,19 +98,19 @@ class VirtualImu:
 
     def __init__(self, config: ImuConfig, rng: np.random.Generator) -> None:
         self._rng = rng
-        self._rows = rows = np.zeros((6, FIELDS))
+        self._memory = Imu.allocate()
+        imu = self._memory.fields
         self._noise = np.repeat([config.gyro_noise, config.accel_noise], 3)
-        rows[:, SCALE] = np.repeat([GYRO_COUNTS, ACCEL_COUNTS], 3)
-        rows[:, BIAS] = normal(rng, 6) * np.repeat([config.gyro_bias, config.accel_bias], 3)
-        rows[:3, [B0, A1, A2]] = low_pass(config.gyro_bandwidth)
-        rows[3:, [B0, A1, A2]] = low_pass(config.accel_bandwidth)
-        self._draws: View = np.zeros((NOISE_ROWS, 6))
-        self._counts: Counts = np.zeros(7, np.int64)
-        self._left = 0  # rows of noise
+        imu.scale[:3], imu.scale[3:] = GYRO_COUNTS, ACCEL_COUNTS
+        imu.bias[:] = normal(rng, 6) * np.repeat([config.gyro_bias, config.accel_bias], 3)
+        for part, bandwidth in ((slice(3), config.gyro_bandwidth), (slice(3, 6), config.accel_bandwidth)):
+            imu.b0[part], imu.a1[part], imu.a2[part] = low_pass(bandwidth)
+        self._draws = np.zeros((NOISE_ROWS, 6))
+        self._rows_left = self._memory.cell("rows_left")
         self._measure: Callable[[], object]
         self._body: Motion | None = None  # sampled last
-        rows[:, RANGE] = COUNTS
-        rows[:, AXIS_COS], rows[:, AXIS_SIN] = cos(config.azimuth), sin(config.azimuth)
+        imu.limit[:] = COUNTS
+        imu.axis_cos, imu.axis_sin = cos(config.azimuth), sin(config.azimuth)
         self.rate_range: float = COUNTS / GYRO_COUNTS
         self.frozen: bool = False
         self.silent: bool = False
@@ -107,41 +122,48 @@ class VirtualImu:
         if self._body is not body:
             self._body = body
             felt = body.omega_B, body.specific_force_B, body.vibration
-            self._measure = bound(channels, self._rows, *felt, self._draws, self._counts)
-        if self._left == 0:
+            self._measure = bound(channels, self._memory.arg, *felt, self._draws)
+        if self._rows_left[0] == 0:
             self._draws[:] = normal(self._rng, (NOISE_ROWS, 6))
-            self._counts[LEFT] = NOISE_ROWS
+            self._rows_left[0] = NOISE_ROWS
         self._measure()
-        *counts, self._left = self._counts.tolist()
-        return tuple(counts)
+        return tuple(self._memory.fields.count.tolist())
+
+    def twin(self) -> "VirtualImu":
+        """Return the same specimen, with filters, noise and faults of its own from now on."""
+        twin = copy(self)
+        twin._memory, twin._rng, twin._draws = self._memory.copy(), deepcopy(self._rng), self._draws.copy()
+        twin._rows_left, twin._body = twin._memory.cell("rows_left"), None
+        return twin
 
     def continue_from(self, earlier: "VirtualImu") -> None:
         """Take over the memory of the filters of the same specimen, which was sampled before."""
-        memory = [NOW_1, NOW_2]
-        self._rows[:, memory] = earlier._rows[:, memory]
+        ours, theirs = self._memory.fields, earlier._memory.fields
+        ours.first[:], ours.second[:] = theirs.first, theirs.second
 
     def set_noise_scale(self, scale: float) -> None:
         """Scale the white noise of all channels; 1 as configured."""
         if not 0.0 <= scale <= 1000.0:
             raise LabError(f"IMU noise scale = {scale}: outside 0..1000")
         self.noise_scale: float = scale
-        self._rows[:, NOISE] = scale * self._noise
+        self._memory.fields.noise[:] = scale * self._noise
 
     def set_rate_bias(self, p: float, q: float, r: float) -> None:
         """Move the gyro's zero, on top of the specimen's own bias [rad/s, B]."""
         self.rate_bias = (p, q, r)
-        c, s = self._rows[0, [AXIS_COS, AXIS_SIN]].tolist()
-        self._rows[:3, FAULT_BIAS] = c * p + s * q, c * q - s * p, r
+        imu = self._memory.fields
+        c, s = imu.axis_cos, imu.axis_sin
+        imu.fault_bias[:3] = c * p + s * q, c * q - s * p, r
 
     def set_rate_range(self, rate: float) -> None:
         """Make the gyro saturate at +-`rate` [rad/s, about the axes of S] or, if that is less, at its full scale."""
         self.rate_range = rate
-        self._rows[:3, RANGE] = min(max(round(rate * GYRO_COUNTS), 1), COUNTS)
+        self._memory.fields.limit[:3] = min(max(round(rate * GYRO_COUNTS), 1), COUNTS)
 
     def freeze(self, frozen: bool) -> None:
         """Start or stop repeating the last sample."""
         self.frozen = frozen
-        self._rows[:, STUCK] = float(frozen)
+        self._memory.fields.frozen = i32(frozen)
 
     def silence(self, silent: bool) -> None:
         """Suppress the data-ready interrupt, or raise it again."""

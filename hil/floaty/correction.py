@@ -12,15 +12,16 @@ from typing import Any
 import numpy as np
 
 from firmware_py.compiling import bound
+from firmware_py.core.subset import i32
 from firmware_py.elementary import cos, sin
 from firmware_py.geometry import from_euler_zyx, multiply
 from hil.floaty.geometry import Weight
 from hil.floaty.shape import MIX
-from hil.world import layout as at
 from hil.world.config import PlantConfig
-from hil.world.fixed_order import fit_polynomial
+from hil.world.fixed_order import Matrix, fit_polynomial
 from hil.world.motion import GRAVITY, evaluate
-from hil.world.plates import LIFT_U4_MAX, State
+from hil.world.plates import LIFT_U4_MAX
+from hil.world.structs import FloatyBlocks
 
 # The paper's Table "Empirical estimation of dynamics constants": value and uncertainty, by the names of `Constants`.
 PAPER_TABLE: dict[str, tuple[float, float]] = {
@@ -76,19 +77,17 @@ AFFECTED = ("x", "y", "z", "roll", "pitch", "yaw")  # by the rows of `accelerati
 DIFFERENCE = 1e-3  # [rad, rad/s, m/s] step of the five-point difference
 
 
-def calm(s: State, speed: float) -> State:
+def calm(plant: FloatyBlocks, speed: float) -> FloatyBlocks:
     """Return a copy of the plant, level and at rest at the hover point, in a uniform flow of `speed` [m/s]."""
-    c = s.copy()
-    c[at.P : at.P + 3] = 0.0, 0.0, s[at.HOVER_HEIGHT]
-    c[at.Q : at.Q + 4] = 1.0, 0.0, 0.0, 0.0
-    c[at.V : at.V + 3] = c[at.OMEGA : at.OMEGA + 3] = c[at.SIDE_WIND : at.SIDE_WIND + 3] = 0.0
-    c[at.PUSH : at.PUSH + 3] = c[at.PUSH_TORQUE : at.PUSH_TORQUE + 3] = 0.0
-    c[at.FLAPS : at.FLAPS + 4] = s[at.HOVER_FLAPS : at.HOVER_FLAPS + 4]
-    c[at.SPEED], c[at.PROFILE_RADIUS], c[at.FAN] = speed, math.inf, 1.0
-    c[at.HEIGHT_SLOPE] = c[at.GUST_SCALE] = c[at.OCCLUSION + 3] = c[at.HELD] = 0.0
-    c[at.TETHER_LENGTH] = math.inf
-    c[at.NET_HEIGHT] = -math.inf
-    return c
+    copy = plant.copy()
+    body, air, flaps = copy.body.fields, copy.air.fields, copy.flaps.fields
+    body.p_WB[:], body.q_WB[:] = (0.0, 0.0, air.hover_height), (1.0, 0.0, 0.0, 0.0)
+    body.v_WB[:] = body.omega_B[:] = body.push[:] = air.side_wind_W[:] = 0.0
+    body.tether_length, body.net_height, body.held = math.inf, -math.inf, i32(0)
+    flaps.angle[:] = flaps.hover
+    air.speed, air.profile_radius, air.fan = speed, math.inf, 1.0
+    air.height_slope = air.gust_scale = air.occlusion_depth = 0.0
+    return copy
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,38 +106,44 @@ class OperatingPoint:
 LEVEL = OperatingPoint()
 
 
-def accelerations(c: State, cause: str, amount: float) -> State:
-    """Return ACC (W) and ALPHA (B), (6,), of a calm plant with one cause changed by `amount`."""
-    s = c.copy()
-    if cause[0] == "u":
-        s[at.FLAPS : at.FLAPS + 4] += amount * MIX[:, int(cause[1]) - 1]
-    elif cause[0] == "v":
-        s[at.V + "xyz".index(cause[1])] = amount
-    elif cause[0] == "q":
-        w, x, y, z = c[at.Q : at.Q + 4].tolist()
-        about = [sin(amount / 2) * (axis == cause[1]) for axis in "xyz"]
-        s[at.Q : at.Q + 4] = multiply((w, x, y, z), (cos(amount / 2), about[0], about[1], about[2]))
-    else:
-        s[at.OMEGA + "xyz".index(cause[1])] = amount
-    bound(evaluate, s)()
-    return np.concatenate([s[at.ACC : at.ACC + 3], s[at.ALPHA : at.ALPHA + 3]])
+class Probe:
+    """A calm plant of which one cause is changed."""
+
+    def __init__(self, calm_plant: FloatyBlocks) -> None:
+        self._calm, self._plant = calm_plant, calm_plant.copy()
+        self._evaluate = bound(evaluate, *self._plant.args)
+
+    def accelerations(self, cause: str, amount: float) -> Matrix:
+        """Return linear (W) and angular accelerations (B), (6,), with a cause changed by `amount`."""
+        for changed, block in zip(self._plant, self._calm, strict=True):
+            changed.memory[:] = block.memory
+        body, flaps = self._plant.body.fields, self._plant.flaps.fields
+        if cause[0] == "u":
+            flaps.angle[:] += amount * MIX[:, int(cause[1]) - 1]
+        elif cause[0] == "v":
+            body.v_WB["xyz".index(cause[1])] = amount
+        elif cause[0] == "q":
+            w, x, y, z = body.q_WB.tolist()
+            about = [sin(amount / 2) * (axis == cause[1]) for axis in "xyz"]
+            body.q_WB[:] = multiply((w, x, y, z), (cos(amount / 2), about[0], about[1], about[2]))
+        else:
+            body.omega_B["xyz".index(cause[1])] = amount
+        self._evaluate()
+        return np.concatenate([body.acceleration_W, body.alpha_B])
+
+    def slope(self, cause: str) -> Matrix:
+        """Return the change of the accelerations per unit of a cause."""
+        h, of = DIFFERENCE, partial(self.accelerations, cause)
+        return (8 * (of(h) - of(-h)) - (of(2 * h) - of(-2 * h))) / (12 * h)
 
 
-def slope(c: State, cause: str) -> State:
-    """Return the change of ACC (W) and ALPHA (B), (6,), of a calm plant per unit of a cause."""
-    h = DIFFERENCE
-    near = accelerations(c, cause, h) - accelerations(c, cause, -h)
-    far = accelerations(c, cause, 2 * h) - accelerations(c, cause, -2 * h)
-    return (8 * near - far) / (12 * h)
-
-
-def linearise(s: State, speed: float, point: OperatingPoint = LEVEL) -> Constants:
-    """Return the constants of the plant in `s` about a point of a uniform flow of `speed` [m/s]: the level hover."""
-    c = calm(s, speed)
-    c[at.FLAPS : at.FLAPS + 4] += sum(column * u for column, u in zip(MIX.T, point.inputs, strict=True))
-    c[at.SIDE_WIND : at.SIDE_WIND + 3] = point.side_wind
-    c[at.Q : at.Q + 4] = from_euler_zyx(*point.attitude)
-    slope_of = cache(partial(slope, c))
+def linearise(plant: FloatyBlocks, speed: float, point: OperatingPoint = LEVEL) -> Constants:
+    """Return the constants of the plant about a point of a uniform flow of `speed` [m/s]: the level hover."""
+    c = calm(plant, speed)
+    c.flaps.fields.angle[:] += sum(column * u for column, u in zip(MIX.T, point.inputs, strict=True))
+    c.air.fields.side_wind_W[:] = point.side_wind
+    c.body.fields.q_WB[:] = from_euler_zyx(*point.attitude)
+    slope_of = cache(Probe(c).slope)
     found = {}
     for name in (field.name for field in fields(Constants)):
         affected, cause = name.split("_")
@@ -160,29 +165,28 @@ def target_constants(config: PlantConfig, plate: Constants) -> Constants:
     return replace(target, **{name: factors[name] * getattr(target, name) for name in factors})
 
 
-def trim_and_correct(s: State, config: PlantConfig, weight: Weight) -> None:
-    """Write the trimmed drag, then the correction of the configured variant; needs the plates and the true mass in `s`."""
-    design = calm(s, config.airspeed)
-    design[at.MASS], design[at.DRAG_FACTOR], design[at.CORRECTED] = weight.mass, 1.0, 0.0
-    design[at.INERTIA : at.INERTIA + 3] = weight.inertia
-    design[at.PRESSURE] = 1.0
-    bound(evaluate, design)()
-    s[at.PRESSURE] = design[at.PRESSURE] = weight.mass * GRAVITY / design[at.DRAG + 2]
-    s[at.AIRSPEED] = config.airspeed
-    s[at.CORRECTED] = float(config.variant != "plate")
+def trim_and_correct(plant: FloatyBlocks, config: PlantConfig, weight: Weight) -> None:
+    """Write the trimmed drag, then the correction of the configured variant; needs the plates and the true mass."""
+    design, flaps = calm(plant, config.airspeed), plant.flaps.fields
+    body, trimmed = design.body.fields, design.flaps.fields
+    body.mass, body.inertia[:] = weight.mass, weight.inertia
+    trimmed.drag_factor, trimmed.corrected, trimmed.pressure = 1.0, i32(0), 1.0
+    bound(evaluate, *design.args)()
+    flaps.pressure = trimmed.pressure = weight.mass * GRAVITY / body.wrench_B[2]
+    flaps.airspeed = config.airspeed
+    flaps.corrected = i32(config.variant != "plate")
     if config.variant == "plate":
         return
 
-    lift = [accelerations(design, "u4", u4)[2] / GRAVITY + 1.0 for u4 in LIFT_SAMPLES.tolist()]
-    s[at.LIFT_FIT : at.LIFT_FIT + LIFT_ORDER + 1] = fit_polynomial(LIFT_SAMPLES, np.array(lift), LIFT_ORDER)
+    probe = Probe(design)
+    lift = [probe.accelerations("u4", u4)[2] / GRAVITY + 1.0 for u4 in LIFT_SAMPLES.tolist()]
+    flaps.lift_fit[:] = fit_polynomial(LIFT_SAMPLES, np.array(lift), LIFT_ORDER)
     L = linearise(design, config.airspeed)
     T = target_constants(config, L)
-    m, (ix, iy, iz) = weight.mass, weight.inertia
-    s[at.X_INPUT], s[at.X_TILT] = T.x_u2 / L.x_u2, m * (T.x_pitch - L.x_pitch)
-    s[at.Y_INPUT], s[at.Y_TILT] = T.y_u1 / L.y_u1, m * (T.y_roll - L.y_roll)
-    s[at.Z_INPUT] = T.z_u4 / GRAVITY
-    s[at.ROLL_INPUT], s[at.ROLL_TILT] = T.roll_u1 / L.roll_u1, ix * (T.roll_roll - L.roll_roll)
-    s[at.ROLL_RATE] = ix * (T.roll_rate - L.roll_rate)
-    s[at.PITCH_INPUT], s[at.PITCH_TILT] = iy * T.pitch_u2, iy * (T.pitch_pitch - L.pitch_pitch)
-    s[at.PITCH_RATE] = iy * (T.pitch_rate - L.pitch_rate)
-    s[at.YAW_INPUT], s[at.YAW_RATE] = T.yaw_u3 / L.yaw_u3, iz * (T.yaw_rate - L.yaw_rate)
+    m, (ix, iy, _) = weight.mass, weight.inertia
+    flaps.by_input[:3] = T.x_u2 / L.x_u2, T.y_u1 / L.y_u1, T.z_u4 / GRAVITY
+    flaps.by_input[3:] = T.roll_u1 / L.roll_u1, iy * T.pitch_u2, T.yaw_u3 / L.yaw_u3
+    flaps.by_tilt[:2] = m * (T.x_pitch - L.x_pitch), m * (T.y_roll - L.y_roll)
+    flaps.by_tilt[3:5] = ix * (T.roll_roll - L.roll_roll), iy * (T.pitch_pitch - L.pitch_pitch)
+    rates = (T.roll_rate - L.roll_rate, T.pitch_rate - L.pitch_rate, T.yaw_rate - L.yaw_rate)
+    flaps.by_rate[3:] = np.multiply(weight.inertia, rates)

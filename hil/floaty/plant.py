@@ -12,13 +12,12 @@ from hil.floaty.drawing import look_of, markers_of
 from hil.floaty.geometry import weigh
 from hil.floaty.shape import SIGNS, place_plates
 from hil.scene import Look, Markers
-from hil.world import layout as at
 from hil.world.body import ACTUATORS, Channel, Failure, Quantity, Vector, View, of_each_actuator
 from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
-from hil.world.in_tunnel import AT_REST, UPRIGHT, InTunnel
+from hil.world.in_tunnel import AT_REST, UPRIGHT, InTunnel, seen, settings_of
 from hil.world.motion import advance, evaluate
-from hil.world.plates import State
 from hil.world.servos import OUTPUTS, commanded_angles, next_period_us
+from hil.world.structs import Flaps, FloatyBlocks, Rigid
 from hil.world.tunnel import Tunnel
 
 DEG = math.radians(1.0)
@@ -35,24 +34,28 @@ SERVO_FAILURES = of_each_actuator({
 })  # fmt: skip
 
 
-def assemble(geometry: GeometryConfig, config: PlantConfig, tunnel: TunnelConfig) -> tuple[State, Tunnel]:
-    """Return the plant's array with the robot, trimmed and corrected, and the knobs of the tunnel around it."""
-    s = np.zeros(at.SIZE)
-    air, weight = Tunnel(tunnel, s), weigh(geometry)
-    place_plates(s, geometry, config.hover_angle)
-    s[at.MASS] = weight.mass * config.mass_factor
-    s[at.INERTIA : at.INERTIA + 3] = np.array(weight.inertia) * config.inertia_factor
-    s[at.DRAG_FACTOR] = config.drag_factor
-    trim_and_correct(s, config, weight)
-    return s, air
+def assemble(
+    geometry: GeometryConfig, config: PlantConfig, tunnel: TunnelConfig
+) -> tuple[FloatyBlocks, Tunnel]:
+    """Return the plant's memory with the robot, trimmed and corrected, and the knobs of the tunnel around it."""
+    knobs = Tunnel(tunnel)
+    blocks = FloatyBlocks(Rigid.allocate(), knobs.air, Flaps.allocate())
+    body, flaps, weight = blocks.body.fields, blocks.flaps.fields, weigh(geometry)
+    place_plates(flaps, geometry, config.hover_angle)
+    body.mass, body.tether_height = weight.mass * config.mass_factor, weight.axis_height
+    body.inertia[:] = np.array(weight.inertia) * config.inertia_factor
+    flaps.drag_factor = config.drag_factor
+    flaps.next_us = flaps.after_us = math.inf
+    trim_and_correct(blocks, config, weight)
+    return blocks, knobs
 
 
 class Plant(InTunnel):
     """Body, servos, tether and the air around them; these views of the truth besides those of `InTunnel`:
 
-    truth (layout.SIZE,) everything; flaps (4,) [rad] signed flap angles; wrench_B (6,) force [N] and torque [N m] of the
-    flow about the centre of mass; zero_offset (4,) [rad] of the servos' middle, for which the board was trimmed; servo_trim
-    (4,) [rad] of the mounting and servo_speed (4,) times the usual one, 0: stuck; plate_forces_W (5, 3) of base and four
+    blocks the kernels' memory; flaps (4,) [rad] signed flap angles; wrench_B (6,) force [N] and torque [N m] of the flow
+    about the centre of mass; zero_offset (4,) [rad] of the servos' middle, for which the board was trimmed; servo_trim (4,)
+    [rad] of the mounting and servo_speed (4,) times the usual one, 0: stuck; plate_forces_W (5, 3) of base and four
     flaps as isolated plates, without the identified correction, so they do not add up to the whole force.
     """
 
@@ -72,31 +75,28 @@ class Plant(InTunnel):
 
         From the battery's configuration it takes the power of servos and electronics.
         """
-        s, air = assemble(geometry, config, tunnel)
-        super().__init__(s, air, config, rng_gust)
+        self.blocks, knobs = assemble(geometry, config, tunnel)
+        super().__init__(self.blocks.body, knobs, config, rng_gust)
+        self._flaps = f = self.blocks.flaps.fields
         self._airspeed, self._geometry, self._ground = config.airspeed, geometry, config.ground
-        s[at.SERVO_TAU], s[at.SERVO_RATE], s[at.DEAD_BAND] = servos.tau, servos.rate_limit, servos.dead_band
+        f.lag, f.rate_limit, f.dead_band = servos.tau, servos.rate_limit, servos.dead_band
         self.zero_offset = servos.zero_offset
-        self.servo_trim, self.servo_speed = self._view(at.SERVO_TRIM, 4), self._view(at.SERVO_SPEED, 4)
-        s[at.SERVO_TRIM : at.SERVO_TRIM + 4], s[at.SERVO_SPEED : at.SERVO_SPEED + 4] = (
-            servos.trim_error,
-            servos.speed,
-        )
-        self.settings = self._settings({"servo.trim": at.SERVO_TRIM, "servo.pace": at.SERVO_SPEED})
+        f.trim[:], f.pace[:] = servos.trim_error, servos.speed
+        self.servo_trim, self.servo_speed = seen(f.trim), seen(f.pace)
+        self.settings = settings_of({"servo.trim": f.trim, "servo.pace": f.pace})
         self._counts: Sequence[int] = ()
         self._commanded = (SIGNS * config.hover_angle).tolist()
-        s[at.COMMAND : at.COMMAND + 4] = self._commanded
-        self._evaluate = bound(evaluate, s)
-        self._advance = bound(advance, s, self._draws, self._now_us)
-        self.truth, self.flaps = self._view(0, at.SIZE), self._view(at.FLAPS, 4)
-        self.acceleration_W, self.alpha_B = self._view(at.ACC, 3), self._view(at.ALPHA, 3)
-        self.wrench_B = self._view(at.DRAG, 6)
-        self.plate_forces_W = self._view(at.PLATE_FORCES, 15).reshape(5, 3)
+        f.command[:] = self._commanded
+        self._evaluate = bound(evaluate, *self.blocks.args)
+        self._advance = bound(advance, *self.blocks.args, self._draws)
+        self.flaps, self.plate_forces_W = seen(f.angle), seen(f.forces)
+        self.wrench_B = seen(self._body.wrench_B)
         start = (0.0, 0.0, tunnel.hover_height) if p_WB is None else p_WB
         self.place(start, UPRIGHT, flaps=self._commanded)
         self._at_rest = loads.electronics_power + len(ACTUATORS) * loads.servo_power  # [W]
         self._servo_energy, self._power = loads.servo_energy, self._at_rest
-        self._drawn_us, self._drawn_travel = 0, float(s[at.TRAVEL])
+        self._travel = self.blocks.flaps.cell("travel")
+        self._drawn_us, self._drawn_travel = 0, self._travel[0]
 
     def place(
         self,
@@ -110,7 +110,7 @@ class Plant(InTunnel):
         if flaps is not None:
             if not all(map(math.isfinite, flaps)):
                 raise LabError(f"cannot place the plant with flaps = {flaps}: not finite")
-            self._s[at.FLAPS : at.FLAPS + 4] = flaps
+            self._flaps.angle[:] = flaps
         super().place(p_WB, q_WB, v_WB, omega_B)
 
     def set_counts(self, now_us: int, counts: Sequence[int]) -> None:
@@ -121,10 +121,12 @@ class Plant(InTunnel):
         self._counts = counts
         self.advance(now_us)
         self._commanded = commanded_angles(counts, self.zero_offset, self._commanded)
-        s = self._s
+        f = self._flaps
         # An earlier change may have been latched since the last millisecond: then this one follows it.
-        at_us, angles = (at.AFTER_US, at.AFTER) if s[at.NEXT_US] <= now_us else (at.NEXT_US, at.NEXT)
-        s[at_us], s[angles : angles + 4] = next_period_us(now_us), self._commanded
+        if f.next_us <= now_us:
+            f.after_us, f.after[:] = next_period_us(now_us), self._commanded
+        else:
+            f.next_us, f.next[:] = next_period_us(now_us), self._commanded
 
     @property
     def look(self) -> Look:
@@ -138,7 +140,7 @@ class Plant(InTunnel):
         """Return the mean power [W] since the last call: electronics, servos at rest, and the flaps' travel."""
         duration = 1e-6 * (now_us - self._drawn_us)
         if duration > 0.0:
-            travel = float(self._s[at.TRAVEL])
+            travel = self._travel[0]
             turned, self._drawn_us, self._drawn_travel = travel - self._drawn_travel, now_us, travel
             self._power = self._at_rest + self._servo_energy * turned / duration
         return self._power
@@ -153,11 +155,12 @@ class Plant(InTunnel):
 
     def linearise(self, point: OperatingPoint = LEVEL) -> Constants:
         """Return the linearised dynamics about a point of a uniform flow, by default the level hover of the design."""
-        return linearise(self._s, self._airspeed if point.speed is None else point.speed, point)
+        return linearise(self.blocks, self._airspeed if point.speed is None else point.speed, point)
 
     def mounted_wrench(self, flaps: Vector) -> tuple[View, View]:
         """Return force [N] and torque [N m], (3,) each in B, on the robot fixed level in the design's uniform flow."""
-        s = calm(self._s, self._airspeed)
-        s[at.FLAPS : at.FLAPS + 4] = flaps
-        bound(evaluate, s)()
-        return s[at.DRAG : at.DRAG + 3], s[at.DRAG + 3 : at.DRAG + 6]
+        calm_plant = calm(self.blocks, self._airspeed)
+        calm_plant.flaps.fields.angle[:] = flaps
+        bound(evaluate, *calm_plant.args)()
+        force, torque = np.split(calm_plant.body.fields.wrench_B, 2)
+        return force, torque

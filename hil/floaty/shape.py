@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from firmware_py.elementary import cos, sin
 from hil.errors import LabError
 from hil.floaty.geometry import area_and_centre, axis_of, raised, surfaces, weigh
-from hil.world import layout as at
 from hil.world.config import GeometryConfig, PlantConfig
 from hil.world.motion import GRAVITY
-from hil.world.plates import State
+from hil.world.structs import Flaps
 
 MIRRORS = np.array([[1, -1, 1], [1, 1, 1], [-1, 1, 1], [-1, -1, 1]], float)  # signs of x, y, z for each flap
 SIGNS = np.array([1, -1, 1, -1], float)  # of the flap angles at hover (paper, eq. input_signals)
@@ -92,17 +91,15 @@ def check_hover(geometry: GeometryConfig, plant: PlantConfig) -> None:
         )
 
 
-def place_plates(s: State, geometry: GeometryConfig, hover_angle: float) -> None:
+def place_plates(flaps: Flaps, geometry: GeometryConfig, hover_angle: float) -> None:
     """Write the areas, normals and centres of pressure of all plates, and the hover angles."""
     height, axis = weigh(geometry).axis_height, axis_of(geometry)
-    s[at.BASE_AREA] = geometry.base_side * geometry.base_side
-    s[at.AXIS_HEIGHT] = height
-    s[at.HOVER_FLAPS : at.HOVER_FLAPS + 4] = SIGNS * hover_angle
-    s[at.HOVER_TURN : at.HOVER_TURN + 2] = cos(hover_angle), -sin(hover_angle)
-    s[at.FLOW_POINTS : at.FLOW_POINTS + 8] = (geometry.flow_point * MIRRORS[:, :2]).ravel()
+    flaps.base_area = geometry.base_side * geometry.base_side
+    flaps.hover[:] = SIGNS * hover_angle
+    flaps.hover_turn[:] = cos(hover_angle), -sin(hover_angle)
+    flaps.flow_points[:, :2], flaps.flow_points[:, 2] = geometry.flow_point * MIRRORS[:, :2], height
     lift = np.array([[0.0, 0.0, height], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     for plate, (mirror, part) in enumerate(product(MIRRORS, flap_plates(geometry))):
-        normal, centre = at.NORMAL + 9 * plate, at.CENTRE + 9 * plate
-        s[at.AREA + plate] = part.area
-        s[normal : normal + 9] = (mirror * _turning(part.normal, axis)).ravel()
-        s[centre : centre + 9] = (mirror * _turning(part.centre, axis) + lift).ravel()
+        flaps.area[plate] = part.area
+        flaps.normal[plate] = (mirror * _turning(part.normal, axis)).ravel()
+        flaps.centre[plate] = (mirror * _turning(part.centre, axis) + lift).ravel()

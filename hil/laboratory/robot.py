@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cache
 from math import isfinite
@@ -144,7 +143,7 @@ class Robot:
         if self.uart is not None:
             self.uart.read()  # a booted processor starts with an empty buffer
         self.board.boot(now_us)
-        specimen = deepcopy(self.imu)  # gives every board the same sensor noise in flight
+        specimen = self.imu.twin()  # gives every board the same sensor noise in flight
         specimen.set_noise_scale(BENCH_NOISE if self.config.imu.gyro_noise > BENCH_GYRO else 1.0)
         rest = None if now_us else lambda: specimen.sample(self.body)
         start = PowerOn(

@@ -22,21 +22,21 @@ from firmware_py.core.guard import allocate
 from firmware_py.core.observation import ACTIONS, act, observe
 from firmware_py.core.servo import drive_servos
 from firmware_py.core.structs import ATTITUDE, FLAP, RATE, Control, Estimator
+from firmware_py.core.subset import i32
 from hil.arguments import checked
 from hil.config import LabConfig
 from hil.errors import LabError
 from hil.floaty.plant import Plant
 from hil.learn.tasks import PUSH_S, PUSHES, Episode
-from hil.world import layout as at
 from hil.world.fixed_order import SOURCES, atan2, exp, normal, sine_ahead
 from hil.world.motion import evaluate, step
 from hil.world.servos import MIDDLE_COUNTS, PERIOD_COUNTS, RAD_PER_COUNT, TIMER_MHZ
+from hil.world.structs import GUSTS, STEP_US, Air, Flaps, FloatyBlocks, Rigid
 
 CONTROL_US = 10_000
 DELAY_MAX = 12  # control steps
 SEEN = 9  # position, velocity in W, and Euler angles, from the cameras
 ERRORS = SEEN + 3  # plus the rates, from the gyro
-GUSTS = 14
 Array = NDArray[np.float64]
 compiled = compiler(Path(__file__).parent, *SOURCES)
 Actions = NDArray[np.float32]
@@ -81,38 +81,40 @@ def wrapped(angle: float) -> float:
 
 
 @compiled
-def command(s: Array, counts: Array, zero_offset: Array) -> None:
+def command(body: Rigid, flaps: Flaps, counts: Array, zero_offset: Array) -> None:
     """Latch the timer counts at the next PWM period, at least 1 ms from now for the board's computation."""
-    ready_us = s[at.TIME_US] + at.STEP_US
+    ready_us = body.time_us + STEP_US
     period = math.floor(ready_us * TIMER_MHZ / PERIOD_COUNTS) + 1.0
-    s[at.NEXT_US] = math.ceil(period * PERIOD_COUNTS / TIMER_MHZ)
+    flaps.next_us = math.ceil(period * PERIOD_COUNTS / TIMER_MHZ)
     for i in range(4):
-        s[at.NEXT + i] = (counts[i] - MIDDLE_COUNTS) * RAD_PER_COUNT - zero_offset[i]
+        flaps.next[i] = (counts[i] - MIDDLE_COUNTS) * RAD_PER_COUNT - zero_offset[i]
 
 
 @compiled
-def push(s: Array, t: float, pushes: Array) -> None:
+def push(body: Rigid, t: float, pushes: Array) -> None:
     """Apply the pushes of this step: rows are times, kinds and sizes."""
     for i in range(6):
-        s[at.PUSH + i] = 0.0
+        body.push[i] = 0.0
     for i in range(PUSHES):
         if pushes[0, i] <= t < pushes[0, i] + PUSH_S:
-            s[at.PUSH + int(pushes[1, i])] = pushes[2, i]
+            body.push[int(pushes[1, i])] = pushes[2, i]
 
 
 @compiled
-def look(s: Array, row: Array) -> None:
+def look(body: Rigid, row: Array) -> None:
     """Write the cameras' measurement: position, velocity in W, and roll, pitch, yaw."""
-    for i in range(6):
-        row[i] = s[at.P + i]
-    row[6] = atan2(s[at.R + 7], s[at.R + 8])
-    row[7] = atan2(-s[at.R + 6], math.sqrt(s[at.R] * s[at.R] + s[at.R + 3] * s[at.R + 3]))
-    row[8] = atan2(s[at.R + 3], s[at.R])
+    R = body.R_WB
+    for i in range(3):
+        row[i] = body.p_WB[i]
+        row[3 + i] = body.v_WB[i]
+    row[6] = atan2(R[2, 1], R[2, 2])
+    row[7] = atan2(-R[2, 0], math.sqrt(R[0, 0] * R[0, 0] + R[1, 0] * R[1, 0]))
+    row[8] = atan2(R[1, 0], R[0, 0])
 
 
 @compiled
 def estimate(
-    s: Array, seen: Array, rates: Array, errors: Array, goal: Array, now: NDArray[np.float32]
+    flaps: Flaps, seen: Array, rates: Array, errors: Array, goal: Array, now: NDArray[np.float32]
 ) -> None:
     """Write the board's estimated state: in the goal frame, with errors."""
     c, z = sine_ahead(goal[3], 1), sine_ahead(goal[3], 0)
@@ -128,13 +130,13 @@ def estimate(
         now[RATE + i] = rates[i] + errors[SEEN + i]
     now[ATTITUDE + 2] = wrapped(now[ATTITUDE + 2] - goal[3])
     for i in range(4):
-        now[FLAP + i] = s[at.FLAPS + i] - s[at.HOVER_FLAPS + i]
+        now[FLAP + i] = flaps.angle[i] - flaps.hover[i]
 
 
 @compiled
-def find_goal(s: Array, home: Array, path: Array, goal: Array) -> None:
+def find_goal(body: Rigid, home: Array, path: Array, goal: Array) -> None:
     """Write the current goal: position in W, yaw."""
-    t = s[at.TIME_US] * 1e-6
+    t = body.time_us * 1e-6
     for axis in range(4):
         goal[axis] = home[axis] + path[0, axis] * sine_ahead(2.0 * math.pi * path[1, axis] * t, 0)
 
@@ -147,7 +149,9 @@ def tilt_of(x: float, y: float, z: float) -> float:
 
 @compiled
 def advance_all(
-    plants: Array,  # (N, layout.SIZE)
+    bodies: Sequence[Rigid],  # (N,)
+    airs: Sequence[Air],
+    all_flaps: Sequence[Flaps],
     paths: Array,  # (N, 2, 4): amplitudes and frequencies of the goal
     pushes: Array,  # (N, 3, PUSHES): instants, kinds, sizes
     rings: Array,  # (N, DELAY_MAX + 1, SEEN): the cameras' measurements, the newest at `tick`
@@ -169,8 +173,8 @@ def advance_all(
     """Advance all robots by one control step, from their actions to their next observations."""
     newest, seen_at = tick % (DELAY_MAX + 1), (tick - delay) % (DELAY_MAX + 1)
     goal, rates = np.zeros(4), np.zeros(3)
-    for n in range(plants.shape[0]):
-        s = plants[n]
+    for n in range(actions.shape[0]):
+        body, air, flaps = bodies[n], airs[n], all_flaps[n]
         change = 0.0
         act(parameters, actions[n], control)
         allocate(parameters, control)
@@ -178,41 +182,42 @@ def advance_all(
         for i in range(ACTIONS):
             change += (actions[n, i] - previous[n, i]) * (actions[n, i] - previous[n, i])
             previous[n, i] = actions[n, i]
-        command(s, control.count, zero_offsets[n])
-        push(s, s[at.TIME_US] * 1e-6, pushes[n])
+        command(body, flaps, control.count, zero_offsets[n])
+        push(body, body.time_us * 1e-6, pushes[n])
         for i in range(3):
-            rates[i] = 0.5 * s[at.OMEGA + i]
-        step(s, draws[n, :GUSTS], CONTROL_US)
+            rates[i] = 0.5 * body.omega_B[i]
+        air.noise_row = i32(n)
+        step(body, air, flaps, draws)
         for i in range(3):  # the gyro's mean over the step
-            rates[i] += 0.5 * s[at.OMEGA + i]
-        look(s, rings[n, newest])
+            rates[i] += 0.5 * body.omega_B[i]
+        look(body, rings[n, newest])
         for i in range(SEEN):
             errors[n, i] = constants[0] * errors[n, i] + constants[1] * constants[2 + i] * draws[n, GUSTS + i]
         for i in range(SEEN, ERRORS):
             errors[n, i] = constants[2 + i] * draws[n, GUSTS + i]
-        find_goal(s, home, paths[n], goal)
-        estimate(s, rings[n, seen_at], rates, errors[n], goal, estimator.now)
+        find_goal(body, home, paths[n], goal)
+        estimate(flaps, rings[n, seen_at], rates, errors[n], goal, estimator.now)
         observe(parameters, estimator, previous[n], observations[n])
-        dx, dy, dz = s[at.P] - goal[0], s[at.P + 1] - goal[1], s[at.P + 2] - goal[2]
+        dx, dy, dz = body.p_WB[0] - goal[0], body.p_WB[1] - goal[1], body.p_WB[2] - goal[2]
         turned = wrapped(rings[n, newest, 8] - goal[3])
-        distance, tilt = (
-            math.sqrt(dx * dx + dy * dy + dz * dz),
-            tilt_of(s[at.R + 6], s[at.R + 7], s[at.R + 8]),
-        )
+        distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+        tilt = tilt_of(body.R_WB[2, 0], body.R_WB[2, 1], body.R_WB[2, 2])
         rewards[n] = reward_of(distance, tilt, turned, change)
 
 
 @compiled
 def observe_start(
-    s: Array, home: Array, path: Array, ring: Array, errors: Array, parameters: Any, estimator: Any, out: Actions,
+    bodies: Sequence[Rigid], airs: Sequence[Air], all_flaps: Sequence[Flaps], n: int, home: Array, path: Array,
+    ring: Array, errors: Array, parameters: Any, estimator: Any, out: Actions,
 ) -> None:  # fmt: skip
     """Fill the cameras' memory of a robot at its start, and write its first observation."""
-    evaluate(s)
+    body, flaps = bodies[n], all_flaps[n]
+    evaluate(body, airs[n], flaps)
     goal, previous = np.zeros(4), np.zeros(4, np.float32)
     for row in range(DELAY_MAX + 1):
-        look(s, ring[row])
-    find_goal(s, home, path, goal)
-    estimate(s, ring[0], s[at.OMEGA : at.OMEGA + 3], errors, goal, estimator.now)
+        look(body, ring[row])
+    find_goal(body, home, path, goal)
+    estimate(flaps, ring[0], body.omega_B, errors, goal, estimator.now)
     observe(parameters, estimator, previous, out)
 
 
@@ -226,17 +231,23 @@ class Fleet:
     """Robots that fly at the same time, each its own episode, in the arrays of `advance_all`.
 
     `config` is the boards'; `worlds` are the robots that an episode may draw, free and at home. `delay_us` is the pose's
-    age that the estimate does not compensate. `plants`, (count, layout.SIZE), may be read.
+    age that the estimate does not compensate.
     """
 
     def __init__(
         self, config: LabConfig, worlds: Sequence[Plant], count: int, delay_us: int, errors: EstimateErrors
     ) -> None:
-        self._templates = np.array([world.truth for world in worlds])
-        self._gust_rms = _slow_gusts(self._templates)
+        self._plant = worlds[0].blocks
+        kinds = zip(*(world.blocks for world in worlds), strict=True)
+        self._templates = [np.concatenate([block.memory for block in kind]) for kind in kinds]
+        self._templates[0]["step_us"] = CONTROL_US
+        self._gust_rms = _slow_gusts(self._templates[1])
         self._offsets = np.array([world.zero_offset for world in worlds])
         self._home = np.array((*config.flight.home, 0.0))
-        self.plants, self._zero_offsets = np.zeros((count, at.SIZE)), np.zeros((count, 4))
+        self._robots = [np.zeros(count, block.kind.dtype) for block in self._plant]
+        body, air, flaps = (one.kind.rows(rows) for one, rows in zip(self._plant, self._robots, strict=True))
+        self._args = body, air, flaps
+        self._zero_offsets = np.zeros((count, 4))
         self._paths, self._pushes = np.zeros((count, 2, 4)), np.zeros((count, 3, PUSHES))
         self._rings, self._errors = np.zeros((count, DELAY_MAX + 1, SEEN)), np.zeros((count, ERRORS))
         self._previous = np.zeros((count, ACTIONS), np.float32)
@@ -249,17 +260,20 @@ class Fleet:
 
     def begin(self, n: int, episode: Episode, rng: np.random.Generator, out: Actions) -> None:
         """Put robot `n` at the start of an episode, at rest in moving air; write its observation (20,)."""
-        robot, s = int(episode.robot * len(self._templates)), self.plants[n]
-        s[:] = self._templates[robot]
-        s[at.P : at.P + 3] += episode.start
-        s[at.GUSTS : at.GUSTS + GUSTS] = self._gust_rms[robot] * normal(rng, GUSTS)
+        robot = int(episode.robot * len(self._offsets))
+        for memory, templates in zip(self._robots, self._templates, strict=True):
+            memory[n] = templates[robot]
+        bodies, airs, _ = self._robots
+        bodies["p_WB"][n] += episode.start
+        airs["gusts"][n] = self._gust_rms[robot] * normal(rng, GUSTS)
         self._zero_offsets[n] = self._offsets[robot]
         self._paths[n] = episode.amplitude, episode.frequency_hz
         self._pushes[n] = episode.push_at, episode.push_kind, episode.push_size
         self._previous[n] = 0.0
         self._errors[n] = self._sizes * normal(rng, ERRORS)
         observe_start(
-            s, self._home, self._paths[n], self._rings[n], self._errors[n], self._parameters, self._estimator, out
+            *self._args, n, self._home, self._paths[n], self._rings[n], self._errors[n], self._parameters,
+            self._estimator, out,
         )  # fmt: skip
 
     def advance(
@@ -268,7 +282,7 @@ class Fleet:
         """Advance all by 10 ms with their actions (count, 4); write observations (count, 20) and rewards (count,)."""
         self._tick += 1
         advance_all(
-            self.plants, self._paths, self._pushes, self._rings, self._errors, actions, self._previous,
+            *self._args, self._paths, self._pushes, self._rings, self._errors, actions, self._previous,
             normal(rng, (len(actions), GUSTS + ERRORS)), self._constants, self._zero_offsets, self._home, self._tick,
             self._delay, self._parameters, self._estimator, self._control, observations, rewards,
         )  # fmt: skip
@@ -276,13 +290,20 @@ class Fleet:
     @property
     def lost(self) -> NDArray[np.bool_]:
         """Which robots have left the flow, fallen or tumbled, (count,)."""
-        return np.asarray(self.plants[:, at.LOST] != 0.0)
+        return np.asarray(self._robots[0]["lost"] != 0)
+
+    def truth(self, n: int) -> FloatyBlocks:
+        """Return a copy of a robot's memory."""
+        copy = self._plant.copy()
+        for block, memory in zip(copy, self._robots, strict=True):
+            block.memory[:] = memory[n]
+        return copy
 
 
-def _slow_gusts(templates: Array) -> Array:
-    """Make plants' gusts advance by a control step instead of a millisecond; return their rms, (N, 14) [m/s]."""
-    decay, kick = (templates[:, one : one + GUSTS] for one in (at.GUST_DECAY, at.GUST_KICK))
+def _slow_gusts(airs: NDArray[Any]) -> Array:
+    """Make gusts advance by a control step instead of a millisecond; return their rms, (N, 14) [m/s]."""
+    decay, kick = airs["gust_decay"], airs["gust_kick"]
     rms = kick / np.sqrt(1.0 - decay**2)
-    decay **= CONTROL_US // at.STEP_US
+    decay **= CONTROL_US // STEP_US
     kick[:] = rms * np.sqrt(1.0 - decay**2)
     return np.asarray(rms)

@@ -38,6 +38,7 @@ from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
 from hil.learn import batch, law
 from hil.learn.tasks import AXES, PUSH_KINDS, PUSH_S, Episode, EpisodeTask, draw_episode, find_task
+from hil.world.structs import FloatyBlocks
 
 Fidelity = Literal["fast", "firmware"]
 JUST_BEFORE_US = 1  # a step ends this long before the controller runs, after the estimator
@@ -196,10 +197,9 @@ class FastEnv(gymnasium.Env[batch.Actions, batch.Actions]):
         return np.clip(self._observation[0], -REACH, REACH), float(self._reward[0]), lost, late, {}
 
     @property
-    def truth(self) -> NDArray[np.float64]:
-        """The plant's array, `hil.world.layout`."""
-        truth: NDArray[np.float64] = self._fleet.plants[0]
-        return truth
+    def truth(self) -> FloatyBlocks:
+        """A copy of the plant's memory."""
+        return self._fleet.truth(0)
 
 
 class FirmwareEnv(gymnasium.Env[batch.Actions, batch.Actions]):

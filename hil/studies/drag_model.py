@@ -31,7 +31,7 @@ from hil.pictures.drawing import WIDTH
 from hil.pictures.pages import saved, write_page
 from hil.world.body import ACTUATORS
 from hil.world.fixed_order import normal
-from hil.world.layout import STEP_US
+from hil.world.structs import STEP_US
 
 Wrench = NDArray[np.float64]  # (6,): force [N] and torque [N m] in B
 

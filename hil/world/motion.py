@@ -3,242 +3,256 @@ compiled."""
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
-from hil.world import layout as at
+from firmware_py.core.subset import F64s, Integer, f64, i32
 from hil.world.fixed_order import atan2, compiled, exp
-from hil.world.plates import State, blow, drag, orient
+from hil.world.plates import blow, drag, orient
+from hil.world.structs import GUSTS, NOISE_ROWS, Air, Flaps, Rigid
 
+LEFT_SIDEWAYS, ROSE, FELL, TETHER_TAUT, TUMBLED = 1, 2, 3, 4, 5  # causes of a loss
 GRAVITY = 9.81  # [m/s2]
 CREEP = 0.02  # [m/s] below this speed a foot's friction fades
 
 
 @compiled
-def pull(s: State) -> None:
-    """Write the force of the tether (PULL, W); the line is tied to the base plate, AXIS_HEIGHT above B."""
-    lever, r = s[at.AXIS_HEIGHT], at.R
-    dx = s[at.P] + lever * s[r + 2] - s[at.TETHER_ANCHOR]
-    dy = s[at.P + 1] + lever * s[r + 5] - s[at.TETHER_ANCHOR + 1]
-    dz = s[at.P + 2] + lever * s[r + 8] - s[at.TETHER_ANCHOR + 2]
+def pull(body: Rigid) -> None:
+    """Write the force of the tether; the line is tied to the base plate, above B."""
+    lever, R, v, anchor = body.tether_height, body.R_WB, body.v_WB, body.tether_anchor
+    dx = body.p_WB[0] + lever * R[0, 2] - anchor[0]
+    dy = body.p_WB[1] + lever * R[1, 2] - anchor[1]
+    dz = body.p_WB[2] + lever * R[2, 2] - anchor[2]
     span = math.sqrt(dx * dx + dy * dy + dz * dz)
-    stretch = span - s[at.TETHER_LENGTH]
+    stretch = span - body.tether_length
     tension = 0.0
     if stretch > 0.0:
-        ox, oy = lever * s[at.OMEGA], lever * s[at.OMEGA + 1]
-        vx = s[at.V] + s[r] * oy - s[r + 1] * ox  # of the knot
-        vy = s[at.V + 1] + s[r + 3] * oy - s[r + 4] * ox
-        vz = s[at.V + 2] + s[r + 6] * oy - s[r + 7] * ox
+        ox, oy = lever * body.omega_B[0], lever * body.omega_B[1]
+        vx = v[0] + R[0, 0] * oy - R[0, 1] * ox  # of the knot
+        vy = v[1] + R[1, 0] * oy - R[1, 1] * ox
+        vz = v[2] + R[2, 0] * oy - R[2, 1] * ox
         away = (vx * dx + vy * dy + vz * dz) / span
-        tension = max(s[at.TETHER_STIFFNESS] * stretch + s[at.TETHER_DAMPING] * away, 0.0)
+        tension = max(body.tether_stiffness * stretch + body.tether_damping * away, 0.0)
     share = -tension / span
-    s[at.PULL], s[at.PULL + 1], s[at.PULL + 2] = share * dx, share * dy, share * dz
+    body.pull_W[0], body.pull_W[1], body.pull_W[2] = share * dx, share * dy, share * dz
 
 
 @compiled
-def stand(s: State) -> None:
-    """Write force and torque of the net on the body's four feet: GROUND, force [N] in W and torque [N m] in B.
+def push_foot(body: Rigid, bx: float, by: float, bz: float) -> None:
+    """Add the net's force and torque on the foot at (bx, by, bz) [m, B]."""
+    R, v, g = body.R_WB, body.v_WB, body.ground
+    depth = body.net_height - (body.p_WB[2] + R[2, 0] * bx + R[2, 1] * by + R[2, 2] * bz)
+    if depth <= 0.0:
+        return
+    ox, oy, oz = body.omega_B[0], body.omega_B[1], body.omega_B[2]
+    wx, wy, wz = oy * bz - oz * by, oz * bx - ox * bz, ox * by - oy * bx  # omega x r, in B
+    vx = v[0] + R[0, 0] * wx + R[0, 1] * wy + R[0, 2] * wz
+    vy = v[1] + R[1, 0] * wx + R[1, 1] * wy + R[1, 2] * wz
+    vz = v[2] + R[2, 0] * wx + R[2, 1] * wy + R[2, 2] * wz
+    up = max(body.net_stiffness * depth - body.net_damping * vz, 0.0)
+    drag = body.friction * up / max(math.sqrt(vx * vx + vy * vy), CREEP)
+    fx, fy = -drag * vx, -drag * vy
+    g[0], g[1], g[2] = g[0] + fx, g[1] + fy, g[2] + up
+    px = R[0, 0] * fx + R[1, 0] * fy + R[2, 0] * up
+    py = R[0, 1] * fx + R[1, 1] * fy + R[2, 1] * up
+    pz = R[0, 2] * fx + R[1, 2] * fy + R[2, 2] * up
+    g[3] = g[3] + (by * pz - bz * py)
+    g[4] = g[4] + (bz * px - bx * pz)
+    g[5] = g[5] + (bx * py - by * px)
+
+
+@compiled
+def stand(body: Rigid) -> None:
+    """Write force and torque of the net on the body's four feet.
 
     A foot is a spring and a damper that only push, and dry friction, smooth at rest. Air blows through the net unhindered.
     """
-    g, r = at.GROUND, at.R
     for i in range(6):
-        s[g + i] = 0.0
-    if s[at.P + 2] > s[at.NET_HEIGHT] + s[at.FOOT_REACH]:
+        body.ground[i] = 0.0
+    if body.p_WB[2] > body.net_height + body.foot_reach:
         return
-    ox, oy, oz = s[at.OMEGA], s[at.OMEGA + 1], s[at.OMEGA + 2]
-    bz = -s[at.FOOT_BELOW]
-    for foot in range(4):
-        bx = s[at.FOOT_SPREAD] if foot < 2 else -s[at.FOOT_SPREAD]
-        by = s[at.FOOT_SPREAD] if foot % 2 == 0 else -s[at.FOOT_SPREAD]
-        depth = s[at.NET_HEIGHT] - (s[at.P + 2] + s[r + 6] * bx + s[r + 7] * by + s[r + 8] * bz)
-        if depth <= 0.0:
-            continue
-        wx, wy, wz = oy * bz - oz * by, oz * bx - ox * bz, ox * by - oy * bx  # omega x r, in B
-        vx = s[at.V] + s[r] * wx + s[r + 1] * wy + s[r + 2] * wz
-        vy = s[at.V + 1] + s[r + 3] * wx + s[r + 4] * wy + s[r + 5] * wz
-        vz = s[at.V + 2] + s[r + 6] * wx + s[r + 7] * wy + s[r + 8] * wz
-        up = max(s[at.NET_STIFFNESS] * depth - s[at.NET_DAMPING] * vz, 0.0)
-        drag = s[at.FRICTION] * up / max(math.sqrt(vx * vx + vy * vy), CREEP)
-        fx, fy = -drag * vx, -drag * vy
-        s[g], s[g + 1], s[g + 2] = s[g] + fx, s[g + 1] + fy, s[g + 2] + up
-        px = s[r] * fx + s[r + 3] * fy + s[r + 6] * up
-        py = s[r + 1] * fx + s[r + 4] * fy + s[r + 7] * up
-        pz = s[r + 2] * fx + s[r + 5] * fy + s[r + 8] * up
-        s[g + 3] += by * pz - bz * py
-        s[g + 4] += bz * px - bx * pz
-        s[g + 5] += bx * py - by * px
+    spread, below = body.foot_spread, -body.foot_below
+    push_foot(body, spread, spread, below)
+    push_foot(body, spread, -spread, below)
+    push_foot(body, -spread, spread, below)
+    push_foot(body, -spread, -spread, below)
 
 
 @compiled
-def evaluate(s: State) -> None:
+def evaluate(body: Rigid, air: Air, flaps: Flaps) -> None:
     """Compute forces and accelerations from state, inputs and constants."""
-    drag(s)
-    accelerate(s)
+    drag(body, air, flaps)
+    accelerate(body)
 
 
 @compiled
-def surround(s: State) -> None:
+def surround(body: Rigid, air: Air) -> None:
     """Compute attitude and air from state and inputs."""
-    orient(s)
-    blow(s)
+    orient(body)
+    blow(body, air)
 
 
 @compiled
-def accelerate(s: State) -> None:
-    """Compute tether, net and accelerations, for the force and torque in DRAG."""
-    pull(s)
-    stand(s)
-    r, f, g, m = at.R, at.DRAG, at.GROUND, s[at.MASS]
-    if s[at.HELD] != 0.0:  # the clamp supplies the missing force
-        s[at.ACC] = s[at.ACC + 1] = s[at.ACC + 2] = 0.0
+def accelerate(body: Rigid) -> None:
+    """Compute tether, net and accelerations, for the wrench of air and rotors."""
+    pull(body)
+    stand(body)
+    R, f, g, push, acceleration = body.R_WB, body.wrench_B, body.ground, body.push, body.acceleration_W
+    if body.held != 0:  # the clamp supplies the missing force
+        for i in range(3):
+            acceleration[i] = 0.0
     else:
         for i in range(3):
-            force = s[r + 3 * i] * s[f] + s[r + 3 * i + 1] * s[f + 1] + s[r + 3 * i + 2] * s[f + 2]
-            s[at.ACC + i] = (force + s[at.PUSH + i] + s[at.PULL + i] + s[g + i]) / m
-        s[at.ACC + 2] -= GRAVITY
-    ax, ay, az = s[at.ACC], s[at.ACC + 1], s[at.ACC + 2] + GRAVITY
+            force = R[i, 0] * f[0] + R[i, 1] * f[1] + R[i, 2] * f[2]
+            acceleration[i] = (force + push[i] + body.pull_W[i] + g[i]) / body.mass
+        acceleration[2] = acceleration[2] - GRAVITY
+    ax, ay, az = acceleration[0], acceleration[1], acceleration[2] + GRAVITY
     for i in range(3):
-        s[at.SPECIFIC_FORCE + i] = s[r + i] * ax + s[r + 3 + i] * ay + s[r + 6 + i] * az
+        body.specific_force_B[i] = R[0, i] * ax + R[1, i] * ay + R[2, i] * az
 
-    px, py, pz = s[at.PULL], s[at.PULL + 1], s[at.PULL + 2]
-    lever = s[at.AXIS_HEIGHT]
-    mx = s[f + 3] + s[at.PUSH_TORQUE] + s[g + 3] - lever * (s[r + 1] * px + s[r + 4] * py + s[r + 7] * pz)
-    my = s[f + 4] + s[at.PUSH_TORQUE + 1] + s[g + 4] + lever * (s[r] * px + s[r + 3] * py + s[r + 6] * pz)
-    mz = s[f + 5] + s[at.PUSH_TORQUE + 2] + s[g + 5]
-    ix, iy, iz = s[at.INERTIA], s[at.INERTIA + 1], s[at.INERTIA + 2]
-    ox, oy, oz = s[at.OMEGA], s[at.OMEGA + 1], s[at.OMEGA + 2]
-    s[at.ALPHA] = (mx - (iz - iy) * oy * oz) / ix  # I domega/dt = M - omega x I omega
-    s[at.ALPHA + 1] = (my - (ix - iz) * oz * ox) / iy
-    s[at.ALPHA + 2] = (mz - (iy - ix) * ox * oy) / iz
+    px, py, pz = body.pull_W[0], body.pull_W[1], body.pull_W[2]
+    lever = body.tether_height
+    mx = f[3] + push[3] + g[3] - lever * (R[0, 1] * px + R[1, 1] * py + R[2, 1] * pz)
+    my = f[4] + push[4] + g[4] + lever * (R[0, 0] * px + R[1, 0] * py + R[2, 0] * pz)
+    mz = f[5] + push[5] + g[5]
+    ix, iy, iz = body.inertia[0], body.inertia[1], body.inertia[2]
+    ox, oy, oz = body.omega_B[0], body.omega_B[1], body.omega_B[2]
+    body.alpha_B[0] = (mx - (iz - iy) * oy * oz) / ix  # I domega/dt = M - omega x I omega
+    body.alpha_B[1] = (my - (ix - iz) * oz * ox) / iy
+    body.alpha_B[2] = (mz - (iy - ix) * ox * oy) / iz
 
 
 @compiled
-def turn_flaps(s: State, duration: float) -> None:
+def turn_flaps(flaps: Flaps, duration: float) -> None:
     """Turn each flap towards its command for `duration` [s]: rate limit, then first order, then dead band; exact."""
-    reach = s[at.SERVO_RATE] * s[at.SERVO_TAU]  # [rad] errors beyond it run at the rate limit
+    reach = flaps.rate_limit * flaps.lag  # [rad] errors beyond it run at the rate limit
     for i in range(4):
-        left = duration * s[at.SERVO_SPEED + i]
-        target = s[at.COMMAND + i] + s[at.SERVO_TRIM + i]
-        error = abs(target - s[at.FLAPS + i])
-        if error <= s[at.DEAD_BAND]:
-            continue
-        if error > reach:
-            run = min(left, (error - reach) / s[at.SERVO_RATE])
-            error -= s[at.SERVO_RATE] * run
-            left -= run
-        if left > 0.0:
-            error = max(error * exp(-left / s[at.SERVO_TAU]), s[at.DEAD_BAND])
-        before = s[at.FLAPS + i]
-        s[at.FLAPS + i] = target - math.copysign(error, target - before)
-        s[at.TRAVEL] += abs(s[at.FLAPS + i] - before)
+        left = duration * flaps.pace[i]
+        before = flaps.angle[i]
+        target = flaps.command[i] + flaps.trim[i]
+        error = abs(target - before)
+        if error > flaps.dead_band:
+            if error > reach:
+                run = min(left, (error - reach) / flaps.rate_limit)
+                error = error - flaps.rate_limit * run
+                left = left - run
+            if left > 0.0:
+                error = max(error * exp(-left / flaps.lag), flaps.dead_band)
+            flaps.angle[i] = target - math.copysign(error, target - before)
+            flaps.travel = flaps.travel + abs(flaps.angle[i] - before)
 
 
 @compiled
-def drive_servos(s: State, start_us: float, end_us: float) -> None:
+def drive_servos(flaps: Flaps, start_us: float, end_us: float) -> None:
     """Turn the flaps from `start_us` to `end_us`, latching new counts at their times in between."""
-    if s[at.NEXT_US] < end_us:
-        latch_us = max(s[at.NEXT_US], start_us)
-        turn_flaps(s, (latch_us - start_us) * 1e-6)
+    from_us = start_us
+    if flaps.next_us < end_us:
+        from_us = max(flaps.next_us, start_us)
+        turn_flaps(flaps, (from_us - start_us) * 1e-6)
         for i in range(4):
-            s[at.COMMAND + i] = s[at.NEXT + i]
-            s[at.NEXT + i] = s[at.AFTER + i]
-        s[at.NEXT_US] = s[at.AFTER_US]
-        s[at.AFTER_US] = math.inf
-        start_us = latch_us
-    turn_flaps(s, (end_us - start_us) * 1e-6)
+            flaps.command[i] = flaps.next[i]
+            flaps.next[i] = flaps.after[i]
+        flaps.next_us = flaps.after_us
+        flaps.after_us = math.inf
+    turn_flaps(flaps, (end_us - from_us) * 1e-6)
 
 
 @compiled
-def rotate(s: State, qw: float, qx: float, qy: float, qz: float, duration: float) -> None:
-    """Set Q to q + duration/2 q (0, omega), of unit length; for the rate in OMEGA."""
-    half = 0.5 * duration
-    aw, ax, ay, az = s[at.Q], s[at.Q + 1], s[at.Q + 2], s[at.Q + 3]
-    ox, oy, oz = s[at.OMEGA], s[at.OMEGA + 1], s[at.OMEGA + 2]
-    qw += half * (-ax * ox - ay * oy - az * oz)
-    qx += half * (aw * ox + ay * oz - az * oy)
-    qy += half * (aw * oy + az * ox - ax * oz)
-    qz += half * (aw * oz + ax * oy - ay * ox)
+def rotate(body: Rigid) -> None:
+    """Set q to that before + duration/2 q (0, omega), of unit length, with the present q and omega."""
+    half, q, before = 0.5 * body.duration, body.q_WB, body.before
+    aw, ax, ay, az = q[0], q[1], q[2], q[3]
+    ox, oy, oz = body.omega_B[0], body.omega_B[1], body.omega_B[2]
+    qw = before[6] + half * (-ax * ox - ay * oy - az * oz)
+    qx = before[7] + half * (aw * ox + ay * oz - az * oy)
+    qy = before[8] + half * (aw * oy + az * ox - ax * oz)
+    qz = before[9] + half * (aw * oz + ax * oy - ay * ox)
     norm = 1.0 / math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
-    s[at.Q], s[at.Q + 1], s[at.Q + 2], s[at.Q + 3] = qw * norm, qx * norm, qy * norm, qz * norm
+    q[0], q[1], q[2], q[3] = qw * norm, qx * norm, qy * norm, qz * norm
 
 
 @compiled
-def watch(s: State) -> None:
+def lose(body: Rigid, cause: Integer, value: float) -> None:
+    """Record why the flight is over."""
+    body.lost = i32(cause)
+    body.lost_value = value
+
+
+@compiled
+def watch(body: Rigid, air: Air) -> None:
     """Record the first reason why the flight is over."""
-    x, y, z = s[at.P], s[at.P + 1], s[at.P + 2] - s[at.HOVER_HEIGHT]
+    x, y, z = body.p_WB[0], body.p_WB[1], body.p_WB[2] - air.hover_height
     radius = math.sqrt(x * x + y * y)
-    cos_tilt = s[at.R + 8]
-    cause, value = 0, 0.0
-    if radius > s[at.LIMIT_RADIUS]:
-        cause, value = at.LEFT_SIDEWAYS, radius
-    elif z > s[at.LIMIT_ABOVE]:
-        cause, value = at.ROSE, z
-    elif -z > s[at.LIMIT_BELOW]:
-        cause, value = at.FELL, -z
-    elif s[at.PULL] != 0.0 or s[at.PULL + 1] != 0.0 or s[at.PULL + 2] != 0.0:
-        cause, value = at.TETHER_TAUT, -z
-    elif cos_tilt < s[at.LIMIT_COS_TILT]:
-        cause, value = at.TUMBLED, atan2(math.sqrt(1.0 - cos_tilt * cos_tilt), cos_tilt)
-    if cause != 0:
-        s[at.LOST], s[at.LOST_VALUE] = cause, value
+    cos_tilt = body.R_WB[2, 2]
+    if radius > body.limit_radius:
+        lose(body, LEFT_SIDEWAYS, radius)
+    elif z > body.limit_above:
+        lose(body, ROSE, z)
+    elif -z > body.limit_below:
+        lose(body, FELL, -z)
+    elif body.pull_W[0] != 0.0 or body.pull_W[1] != 0.0 or body.pull_W[2] != 0.0:
+        lose(body, TETHER_TAUT, -z)
+    elif cos_tilt < body.limit_cos_tilt:
+        lose(body, TUMBLED, atan2(math.sqrt(1.0 - cos_tilt * cos_tilt), cos_tilt))
 
 
 @compiled
-def gust(s: State, draws: NDArray[np.float64]) -> None:
-    """Advance the gusts by one step with 14 unit normal `draws`."""
-    for i in range(14):
-        s[at.GUSTS + i] = s[at.GUST_DECAY + i] * s[at.GUSTS + i] + s[at.GUST_KICK + i] * draws[i]
+def gust(air: Air, draws: F64s) -> None:
+    """Advance the gusts by one step with the next row of unit normal `draws`."""
+    row = air.noise_row
+    air.noise_row = i32(row + 1)
+    for i in range(GUSTS):
+        air.gusts[i] = air.gust_decay[i] * air.gusts[i] + air.gust_kick[i] * draws[row, i]
 
 
 @compiled
-def move(s: State) -> None:
-    """Set the state to BEFORE, moved for DURATION [s] with the present velocities and accelerations."""
-    h, b = s[at.DURATION], at.BEFORE
+def begin(body: Rigid, air: Air, draws: F64s) -> None:
+    """Begin a step: advance the gusts and the time, and keep the state."""
+    gust(air, draws)
+    body.time_us = body.time_us + body.step_us
     for i in range(3):
-        s[at.P + i] = s[b + i] + h * s[at.V + i]
-        s[at.V + i] = s[b + 3 + i] + h * s[at.ACC + i]
-    rotate(s, s[b + 6], s[b + 7], s[b + 8], s[b + 9], h)
-    for i in range(3):
-        s[at.OMEGA + i] = s[b + 10 + i] + h * s[at.ALPHA + i]
+        body.before[i] = body.p_WB[i]
+        body.before[3 + i] = body.v_WB[i]
+        body.before[10 + i] = body.omega_B[i]
+    for i in range(4):
+        body.before[6 + i] = body.q_WB[i]
 
 
 @compiled
-def step(s: State, draws: NDArray[np.float64], step_us: float) -> None:
-    """Advance the plant by one step with 14 unit normal `draws`; ACC and ALPHA hold for the start."""
-    gust(s, draws)
-    start_us = s[at.TIME_US]
-    middle_us, end_us = start_us + 0.5 * step_us, start_us + step_us
-    s[at.TIME_US] = end_us
-    drive_servos(s, start_us, middle_us)
-    if s[at.HELD] != 0.0:
-        drive_servos(s, middle_us, end_us)
-        evaluate(s)
+def move(body: Rigid) -> None:
+    """Set the state to that before, moved for the duration with the present velocities and accelerations."""
+    for i in range(3):
+        body.p_WB[i] = body.before[i] + body.duration * body.v_WB[i]
+        body.v_WB[i] = body.before[3 + i] + body.duration * body.acceleration_W[i]
+    rotate(body)
+    for i in range(3):
+        body.omega_B[i] = body.before[10 + i] + body.duration * body.alpha_B[i]
+
+
+@compiled
+def step(body: Rigid, air: Air, flaps: Flaps, draws: F64s) -> None:
+    """Advance the plant by one step with unit normal `draws`; its accelerations hold for the start."""
+    start_us = body.time_us
+    middle_us, duration = start_us + 0.5 * body.step_us, body.step_us * 1e-6
+    begin(body, air, draws)
+    drive_servos(flaps, start_us, middle_us)
+    if body.held != 0:
+        drive_servos(flaps, middle_us, body.time_us)
+        evaluate(body, air, flaps)
         return
 
-    duration = step_us * 1e-6  # [s]
-    for i in range(13):
-        s[at.BEFORE + i] = s[at.P + i]
     # To the middle with the rates at the start, then to the end with those at the middle.
     for part in range(2):
-        s[at.DURATION] = 0.5 * duration if part == 0 else duration
-        move(s)
+        body.duration = 0.5 * f64(1 + part) * duration
+        move(body)
         if part == 1:
-            drive_servos(s, middle_us, end_us)
-        evaluate(s)
-    if s[at.LOST] == 0.0:
-        watch(s)
+            drive_servos(flaps, middle_us, body.time_us)
+        evaluate(body, air, flaps)
+    if body.lost == 0:
+        watch(body, air)
 
 
 @compiled
-def advance(s: State, draws: NDArray[np.float64], now_us: NDArray[np.int64]) -> bool:
-    """Do every step that ends at or before `now_us[0]`; return True when the draws ran out before that."""
-    row = int(s[at.NOISE_ROW])
-    while s[at.TIME_US] + at.STEP_US <= now_us[0]:
-        if row == draws.shape[0]:
-            s[at.NOISE_ROW] = 0.0
-            return True
-        step(s, draws[row], at.STEP_US)
-        row += 1
-    s[at.NOISE_ROW] = row
-    return False
+def advance(body: Rigid, air: Air, flaps: Flaps, draws: F64s) -> None:
+    """Do every step that is due, as long as there are draws."""
+    for _ in range(air.noise_row, NOISE_ROWS):
+        if body.time_us + body.step_us > body.until_us:
+            return
+        step(body, air, flaps, draws)

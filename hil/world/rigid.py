@@ -12,17 +12,18 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from firmware_py.compiling import bound
+from firmware_py.core.subset import i32
 from hil.errors import LabError, blame
 from hil.scene import Look, Markers, Part, ball, eight_markers
-from hil.world import layout as at
 from hil.world.body import Channel, Quantity, Setting, Vector
 from hil.world.config import BatteryConfig, PlantConfig, TunnelConfig
 from hil.world.in_tunnel import UPRIGHT, InTunnel
-from hil.world.motion import accelerate, gust, move, surround, watch
+from hil.world.motion import accelerate, begin, move, surround, watch
 from hil.world.servos import OUTPUTS
+from hil.world.structs import NOISE_ROWS, STEP_US, Rigid
 from hil.world.tunnel import Tunnel
 
-STEP_S = at.STEP_US * 1e-6
+STEP_S = STEP_US * 1e-6
 MOST = 1e6  # [N], [N m] a larger force moves the body to where no picture can be drawn
 EXPECTED = "expected force and torque, each of three numbers"
 
@@ -59,19 +60,20 @@ class RigidBody(InTunnel):
 
     def __init__(self, world: World, rng_gust: np.random.Generator, p_WB: Vector) -> None:
         """Start upright and at rest at a place [m]. Raises `LabError` for an invalid subclass."""
-        s = np.zeros(at.SIZE)
-        super().__init__(s, Tunnel(world.tunnel, s), world.plant, rng_gust)
-        s[at.MASS] = self._stated("mass", 1)[0] * world.plant.mass_factor
-        s[at.INERTIA : at.INERTIA + 3] = np.multiply(self._stated("inertia", 3), world.plant.inertia_factor)
+        body, tunnel = Rigid.allocate(), Tunnel(world.tunnel)
+        super().__init__(body, tunnel, world.plant, rng_gust)
+        self._body.mass = self._stated("mass", 1)[0] * world.plant.mass_factor
+        self._body.inertia[:] = np.multiply(self._stated("inertia", 3), world.plant.inertia_factor)
         if world.plant.constant_factors or world.plant.drag_factor != 1.0:
             raise LabError("plant.constant_factors and plant.drag_factor act on floaty only")
         self.counts: tuple[int, ...] = (0, 0, 0, 0)
         self._electronics = world.battery.electronics_power
         self._failed: str | None = None
-        self._row = 0
-        self._draw = np.zeros(14)
-        self._surround, self._accelerate = bound(surround, s), bound(accelerate, s)
-        self._gust, self._move, self._watch = bound(gust, s, self._draw), bound(move, s), bound(watch, s)
+        air = tunnel.air
+        self._air = air.fields
+        self._surround, self._accelerate = bound(surround, body.arg, air.arg), bound(accelerate, body.arg)
+        self._begin, self._move = bound(begin, body.arg, air.arg, self._draws), bound(move, body.arg)
+        self._watch = bound(watch, body.arg, air.arg)
         self.place(p_WB, UPRIGHT)
         if self._failed is not None:
             raise LabError(self._failed)
@@ -103,7 +105,7 @@ class RigidBody(InTunnel):
     @property
     def time_s(self) -> float:
         """The time of the laboratory."""
-        return 1e-6 * float(self._s[at.TIME_US])
+        return 1e-6 * float(self._body.time_us)
 
     # For the laboratory
 
@@ -168,9 +170,8 @@ class RigidBody(InTunnel):
     def _evaluate(self) -> None:
         """Compute air, wrench and accelerations; an invalid wrench ends the flight with the body clamped."""
         self._surround()
-        s = self._s
         if self._failed is None:
-            given = self._asked(self.wrench, s[at.WIND : at.WIND + 3].tolist())
+            given = self._asked(self.wrench, self._air.wind_B.tolist())
             parts = list(given) if isinstance(given, tuple | list) else []
             force, torque = (_numbers(part, 3) for part in parts) if len(parts) == 2 else ([], [])
             if not (force and torque):
@@ -178,43 +179,34 @@ class RigidBody(InTunnel):
             elif not all(abs(number) < MOST for number in force + torque):
                 self._fail(f"{type(self).__name__}.wrench returned force {force} N, torque {torque} N m")
             else:
-                s[at.DRAG : at.DRAG + 6] = force + torque
+                self._body.wrench_B[:] = force + torque
         self._accelerate()
 
     def _fail(self, why: str) -> None:
         if self._failed is None:
-            self._failed = f"{why} at {self.time_s:.2f} s" if self._s[at.TIME_US] else why
-        self._s[at.DRAG : at.DRAG + 6] = 0.0
-        self._s[at.HELD] = 1.0
+            self._failed = f"{why} at {self.time_s:.2f} s" if self._body.time_us else why
+        self._body.wrench_B[:] = 0.0
+        self._body.held = i32(1)
         self._accelerate()
 
-    def _advance(self) -> bool:
-        """Do every step that ends at or before `_now_us[0]`; return True when the draws ran out before that."""
-        s, now_us = self._s, self._now_us[0]
-        while s[at.TIME_US] + at.STEP_US <= now_us:
-            if self._row == len(self._draws):
-                self._row = 0
-                return True
-            self._draw[:] = self._draws[self._row]
-            self._row += 1
+    def _advance(self) -> None:
+        body, air = self._body, self._air
+        while air.noise_row < NOISE_ROWS and body.time_us + STEP_US <= body.until_us:
             self._step()
-        return False
 
     def _step(self) -> None:
-        s = self._s
-        self._gust()
-        s[at.TIME_US] += at.STEP_US
+        body = self._body
+        self._begin()
         if self._failed is None:
             self._asked(self.actuate, STEP_S)
-        if s[at.HELD] != 0.0:
+        if body.held:
             self._evaluate()
             return
-        s[at.BEFORE : at.BEFORE + 13] = self.state
         for duration in (0.5 * STEP_S, STEP_S):
-            s[at.DURATION] = duration
+            body.duration = duration
             self._move()
             self._evaluate()
-        if s[at.LOST] == 0.0:
+        if not body.lost:
             self._watch()
 
 

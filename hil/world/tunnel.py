@@ -5,14 +5,13 @@ up, origin in the middle of the tunnel's exit, hover point `hover_height` above 
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.elementary import exp
 from hil.errors import LabError
-from hil.world import layout as at
 from hil.world.config import TunnelConfig
+from hil.world.structs import STEP_US, Air
 
-# docs/explanation/plant.md, Tunnel. Rows as in layout.GUSTS: time constant [s]; then rms [m/s] per level.
+# docs/explanation/plant.md, Tunnel. Rows as in `Air.gusts`: time constant [s]; then rms [m/s] per level.
 GUST_TAU = (0.015, 0.015, 0.015, 0.4, 0.4, 0.4, *4 * (0.010,), *4 * (0.15,))
 GUST_RMS = {
     "none": 14 * (0.0,),
@@ -26,19 +25,19 @@ GUST_GROWTH_MAX = 6.0  # ... up to this
 class Tunnel:
     """The knobs of the tunnel during a flight; a change takes effect at the next millisecond.
 
-    `fan_factor`, `gust_scale`, `side_wind` (x, y, z) and `shadow` (the blocked share) are the last values set.
+    `fan_factor`, `gust_scale`, `side_wind` (x, y, z) and `shadow` (the blocked share) are the last values set; `air` is the
+    memory of the kernels.
     """
 
-    def __init__(self, config: TunnelConfig, state: NDArray[np.float64]) -> None:
-        self._s = s = state
-        s[at.SPEED] = config.speed
-        s[at.PROFILE_RADIUS] = config.profile_radius
-        s[at.HEIGHT_SLOPE] = config.height_slope
-        s[at.HOVER_HEIGHT] = config.hover_height
-        s[at.GUST_RADIUS], s[at.GUST_GROWTH_MAX] = GUST_RADIUS, GUST_GROWTH_MAX
-        decay = np.array([exp(-at.STEP_US * 1e-6 / tau) for tau in GUST_TAU])
-        s[at.GUST_DECAY : at.GUST_DECAY + 14] = decay  # exact discretisation of an Ornstein-Uhlenbeck process
-        s[at.GUST_KICK : at.GUST_KICK + 14] = np.array(GUST_RMS[config.turbulence]) * np.sqrt(1.0 - decay**2)
+    def __init__(self, config: TunnelConfig) -> None:
+        self.air = Air.allocate()
+        air = self.air.fields
+        air.speed, air.profile_radius = config.speed, config.profile_radius
+        air.height_slope, air.hover_height = config.height_slope, config.hover_height
+        air.gust_radius, air.gust_growth_max = GUST_RADIUS, GUST_GROWTH_MAX
+        decay = np.array([exp(-STEP_US * 1e-6 / tau) for tau in GUST_TAU])
+        air.gust_decay[:] = decay  # exact discretisation of an Ornstein-Uhlenbeck process
+        air.gust_kick[:] = np.array(GUST_RMS[config.turbulence]) * np.sqrt(1.0 - decay**2)
         self.set_gust_scale(config.gust_scale)
         self.set_side_wind(*config.side_wind)
         self.set_fan_factor(config.fan_factor)
@@ -46,23 +45,23 @@ class Tunnel:
 
     def set_fan_factor(self, factor: float) -> None:
         """Scale the mean flow and the gusts: 1 as configured, 0 fans off."""
-        self._s[at.FAN] = self.fan_factor = _inside("fan factor", factor, 0.0, 2.0)
+        self.air.fields.fan = self.fan_factor = _inside("fan factor", factor, 0.0, 2.0)
 
     def set_gust_scale(self, scale: float) -> None:
         """Scale the gusts of the configured level."""
-        self._s[at.GUST_SCALE] = self.gust_scale = _inside("gust scale", scale, 0.0, 5.0)
+        self.air.fields.gust_scale = self.gust_scale = _inside("gust scale", scale, 0.0, 5.0)
 
     def set_side_wind(self, x: float, y: float, z: float = 0.0) -> None:
         """Add a wind [m/s, W] everywhere; a fan beside the tunnel."""
         wind = tuple(_inside("side wind", component, -20.0, 20.0) for component in (x, y, z))
-        self._s[at.SIDE_WIND : at.SIDE_WIND + 3] = self.side_wind = wind
+        self.air.fields.side_wind_W[:] = self.side_wind = wind
 
     def block(self, x: float, y: float, radius: float, depth: float) -> None:
         """Remove the share `depth` of the flow around (x, y) [m, W], half of it at `radius` [m]; depth 0 clears."""
         self.shadow = _inside("occlusion depth", depth, 0.0, 1.0)
         place = [_inside(f"occlusion {name}", value, -2.0, 2.0) for name, value in (("x", x), ("y", y))]
-        size = _inside("occlusion radius", radius, 0.01, 5.0)
-        self._s[at.OCCLUSION : at.OCCLUSION + 4] = *place, size, depth
+        self.air.fields.occlusion_radius = _inside("occlusion radius", radius, 0.01, 5.0)
+        self.air.fields.occlusion_W[:], self.air.fields.occlusion_depth = place, depth
 
 
 def _inside(what: str, value: float, low: float, high: float) -> float:

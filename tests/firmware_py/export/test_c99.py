@@ -22,7 +22,7 @@ C = translate()
 
 PROBE = """\
 from firmware_py.core.structs import Control, Estimator
-from firmware_py.core.subset import F32s, I32s, Integer, f32, i32, kernel, sqrt
+from firmware_py.core.subset import F32s, F64s, I32s, Integer, f32, f64, i32, kernel, sqrt
 
 LIMIT = f32(2.0)
 COUNT = 3
@@ -88,6 +88,7 @@ REFUSED = [
     ("y = math.sin(x)", "call math.sin(..) is no plain call of a kernel"),
     ("y = sin(x)", "call of sin, which is no kernel"),
     ("y = float(x)", "call of float, which is no kernel"),
+    ("y = f64(x)", "call of f64, which is no kernel"),
     ("y = abs(n)", "abs of is i32, not f32"),
     ("y = sqrt(n)", "sqrt of is i32, not f32"),
     ("y = f32(x > y)", "f32(..) of bool"),
@@ -147,6 +148,10 @@ REFUSED_KERNELS = [
     ("HALF = f32(1e39)\n", 0, "constant HALF is none of f32(number), a 32-bit integer and constant(numbers)"),
     ("class Thing:\n    pass\n", 0, "class Thing is not a Struct"),
     ("class Thing(Struct):\n    x: float\n", 1, "field type float"),
+    ("class Thing(Struct):\n    x: f64\n", 1, "field type f64"),
+    ("class Thing(Struct):\n    x: Annotated[F64s, 3]\n", 1, "field type Annotated[F64s, 3]"),
+    ("@kernel\ndef f(x: f64) -> None:\n    '''Do.'''\n", 1, "argument x of f has no type of the subset"),
+    ("@kernel\ndef f(x: F64s) -> None:\n    '''Do.'''\n", 1, "argument x of f has no type of the subset"),
     ("class Thing(Struct):\n    x: f32 = 0\n", 1, "a struct has nothing but fields"),
     ("import math\n", 0, "import math is outside the subset, and not used: leave it out"),
     ("from math import pi\n", 0, "from math import pi is outside the subset, and not used: leave it out"),

@@ -55,6 +55,19 @@ def test_sensor_mounted_along_the_body_reads_body_rates_and_forces() -> None:
     )
 
 
+def test_a_twin_samples_what_the_sensor_would_and_leaves_it_unchanged() -> None:
+    plant, sensors = still_plant(), [VirtualImu(ImuConfig(), np.random.default_rng(1)) for _ in range(2)]
+    alone, copied = sensors
+    assert settled(alone, plant) == settled(copied, plant)
+    twin = copied.twin()
+    twin.set_rate_bias(0.1, 0.2, 0.3)
+    twin.set_rate_bias(0.0, 0.0, 0.0)
+    expected = [alone.sample(plant) for _ in range(3000)]  # beyond a block of noise
+    assert [twin.sample(plant) for _ in range(3000)] == expected
+    twin.freeze(True)
+    assert [copied.sample(plant) for _ in range(3000)] == expected
+
+
 def test_low_pass_is_second_order_butterworth_at_the_sample_instants() -> None:
     plant, imu = still_plant(), VirtualImu(SILENT, np.random.default_rng(1))
     turning = np.random.default_rng(2).uniform(-3, 3, 300)

@@ -14,7 +14,6 @@ from hil.config import load_config
 from hil.errors import LabError
 from hil.learn.envs import FastEnv, FirmwareEnv, make_env
 from hil.learn.tasks import TASKS
-from hil.world import layout as at
 
 STILL = ["tunnel.turbulence=none"]
 
@@ -51,9 +50,10 @@ def test_both_fidelities_fly_alike_in_open_loop_from_the_same_seed(task: str) ->
         mine, theirs = fast.step(action), whole.step(action)
         assert whole.flight is not None
         plant = whole.flight.robot.body
-        np.testing.assert_allclose(fast.truth[at.P : at.P + 3], plant.p_WB, atol=0.002)
-        np.testing.assert_allclose(fast.truth[at.V : at.V + 3], plant.v_WB, atol=0.02)
-        np.testing.assert_allclose(fast.truth[at.Q : at.Q + 4], plant.q_WB, atol=0.005)
+        flown = fast.truth.body.fields
+        np.testing.assert_allclose(flown.p_WB, plant.p_WB, atol=0.002)
+        np.testing.assert_allclose(flown.v_WB, plant.v_WB, atol=0.02)
+        np.testing.assert_allclose(flown.q_WB, plant.q_WB, atol=0.005)
         assert mine[1] == pytest.approx(theirs[1], abs=0.02)
         assert mine[2:4] == theirs[2:4]
     assert mine[3], "the episode is over after 100 steps"
@@ -100,9 +100,9 @@ def test_a_row_of_many_robots_flies_as_the_seed_of_its_own() -> None:
     for action in actions(30, 0.2):
         many.step(np.tile(action, (3, 1)))
         alone.step(action)
-    np.testing.assert_array_equal(
-        many.unwrapped._fleet.plants[2, at.P : at.P + 7], alone.truth[at.P : at.P + 7]
-    )  # type: ignore[attr-defined]
+    one, other = many.unwrapped._fleet.truth(2).body.fields, alone.truth.body.fields  # type: ignore[attr-defined]
+    for found, expected in ((one.p_WB, other.p_WB), (one.q_WB, other.q_WB), (one.v_WB, other.v_WB)):
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_a_lost_robot_ends_its_episode_and_begins_another_in_the_same_step() -> None:
@@ -149,7 +149,7 @@ def test_an_age_of_the_pose_delays_the_observation_of_the_cameras_alone() -> Non
     for action in actions(40, 0.3):
         for env, rows in seen.items():
             rows.append(env.step(action)[0])
-        assert seen[now][-1][2] == pytest.approx(home[2] - now.truth[at.P + 2], abs=1e-6)
+        assert seen[now][-1][2] == pytest.approx(home[2] - now.truth.body.fields.p_WB[2], abs=1e-6)
     fresh, old = np.array(seen[now]), np.array(seen[late])
     np.testing.assert_array_equal(old[5:, :9], fresh[:-5, :9])
     np.testing.assert_array_equal(old[:, 9:], fresh[:, 9:])
@@ -165,9 +165,9 @@ def test_robots_are_drawn_from_the_campaign_s_distributions_in_both_fidelities()
         fast.reset(seed=seed)
         whole.reset(seed=seed)
         assert whole.flight is not None
-        lags.add(float(fast.truth[at.SERVO_TAU]))
-        assert fast.truth[at.SERVO_TAU] == whole.flight.config.actuators.tau
-        assert 0.040 <= fast.truth[at.SERVO_TAU] <= 0.060
+        lags.add(lag := float(fast.truth.flaps.fields.lag))
+        assert lag == whole.flight.config.actuators.tau
+        assert 0.040 <= lag <= 0.060
     assert 2 < len(lags) <= 5
     whole.close()
 

@@ -44,8 +44,8 @@ from hil.pictures.viewer.recording import RerunFlight, write_rrd, write_run_rrd
 from hil.pictures.viewer.scene import HIDDEN, METRES_PER_NEWTON, PUSH_SHOWN_US, SEEN
 from hil.pictures.viewer.track import FROM_RELEASE, FROM_START, timeline_of
 from hil.scene import Look, Part, ball, box
-from hil.world import layout as at
 from hil.world.config import GeometryConfig, NetConfig
+from hil.world.structs import Flaps
 
 RELEASE_US = load_config().flight.release_us
 angles = st.floats(-1.5, 1.5)
@@ -211,8 +211,8 @@ SHAPES: tuple[dict[str, object], ...] = (
 @pytest.mark.parametrize("shape", SHAPES)
 @given(angles, st.integers(0, 3))
 def test_a_drawn_flap_lies_where_the_plant_has_it(shape: dict[str, object], angle: float, flap: int) -> None:
-    geometry, s = GeometryConfig.model_validate(shape), np.zeros(at.SIZE)
-    place_plates(s, geometry, 0.4)
+    geometry, flaps = GeometryConfig.model_validate(shape), Flaps.allocate().fields
+    place_plates(flaps, geometry, 0.4)
     part = look_of(geometry, NetConfig()).parts[1 + flap]
     turn = Rotation.from_quat(scene.turn_of(part, pa.table({part.angle: [angle]}))[0], scalar_first=True)
     turned = np.add(turn.apply(part.triangles.reshape(-1, 3)), part.place).reshape(-1, 3, 3)
@@ -220,9 +220,9 @@ def test_a_drawn_flap_lies_where_the_plant_has_it(shape: dict[str, object], angl
     phi = -angle if flap % 2 == 0 else angle  # the plant's flaps 1 and 3 are mirror images
     series = np.array([1.0, np.cos(phi), np.sin(phi)])
     for plate, which in ((2 * flap, slice(-strip)), (2 * flap + 1, slice(-strip, None))):
-        n, r = (series @ s[base + 9 * plate :][:9].reshape(3, 3) for base in (at.NORMAL, at.CENTRE))
+        n, r = (series @ parts[plate].reshape(3, 3) for parts in (flaps.normal, flaps.centre))
         np.testing.assert_allclose(scene.centre_of(turned[which]), r, atol=1e-12)
-        np.testing.assert_allclose(_area(turned[which]), s[at.AREA + plate], rtol=1e-12)
+        np.testing.assert_allclose(_area(turned[which]), flaps.area[plate], rtol=1e-12)
         normal = turn.apply(scene.normals_of(part)[which][0, 0])
         np.testing.assert_allclose(normal, n, atol=1e-12)
 

@@ -8,7 +8,6 @@ from pydantic import ValidationError
 
 from hil.errors import LabError
 from hil.floaty.plant import Plant
-from hil.world import layout as at
 from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -75,7 +74,7 @@ def test_gusts_have_the_levels_and_time_constants_of_the_specification(level: st
     series = np.empty((120_000, 14))
     for step in range(len(series)):
         plant.advance(1000 * (step + 1))
-        series[step] = plant._s[at.GUSTS : at.GUSTS + 14]
+        series[step] = plant.blocks.air.fields.gusts
     series = series[5000:]
     spread = 3.5 * np.sqrt(tau / 115) + 0.005  # an estimate of the rms over 115 s varies by sqrt(tau / 115 s)
     assert (np.abs(series.std(axis=0) / rms - 1) < spread).all()
