@@ -306,7 +306,12 @@ def test_an_interval_is_set_read_switched_off_and_reset(client: MavlinkClient) -
     assert (interval(), attitudes()) == (250_000, 4)
     assert client.command(511, 30, 1)[0].result == 0  # faster than a tick
     assert interval() == 1000
-    assert client.command(510, 3)[1].interval_us == 0  # never sent
+    assert client.command(511, 30, 4e9)[0].result == 0  # longer than the report's field can state
+    assert interval() == 1_000_000_000
+    assert (
+        client.command(510, 3)[1].interval_us == client.command(510, 65_535)[1].interval_us == 0
+    )  # never sent
+    assert client.command(510, 65_536)[0].result == DENIED
 
 
 @pytest.mark.parametrize(
@@ -595,11 +600,12 @@ def test_each_impossible_parameter_request_is_answered_with_the_reason(client: M
         assert (found.target_system, found.target_component) == (255, 190)
         return found.param_id, found.param_index, found.error
 
+    count = client.one("param_request_read", 1, 1, b"EXT_Z_P", -1).param_count
     missing, out_of_range = dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST, dialect.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
     for _ in range(2):
         assert error("param_set", b"NONE", 1.0, 9) == ("NONE", -1, missing)
         assert error("param_request_read", b"NONE", -1) == ("NONE", -1, missing)
-        assert error("param_request_read", b"", 1000) == ("", 1000, missing)
+        assert error("param_request_read", b"", count) == ("", count, missing)
         assert error("param_set", b"EXT_Z_P", 1e9, 9) == ("EXT_Z_P", -1, out_of_range)
     assert client.stack.refused == 8
 

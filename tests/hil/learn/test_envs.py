@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -12,8 +13,9 @@ from gymnasium.utils.env_checker import check_env
 import hil.learn
 from hil.config import load_config
 from hil.errors import LabError
-from hil.learn.envs import FastEnv, FirmwareEnv, make_env
-from hil.learn.tasks import TASKS
+from hil.learn.batch import EstimateErrors
+from hil.learn.envs import REACH, FastEnv, FirmwareEnv, make_env
+from hil.learn.tasks import PUSHES, TASKS, EpisodeTask, draw_episode
 
 STILL = ["tunnel.turbulence=none"]
 
@@ -138,6 +140,72 @@ def test_an_episode_is_truncated_after_its_duration(fidelity: str) -> None:
     ends = [env.step(np.zeros(4, np.float32))[2:4] for _ in range(7)]
     assert ends == [(False, False)] * 6 + [(False, True)]
     env.close()
+
+
+def test_episodes_of_many_robots_that_follow_one_another_are_of_equal_length() -> None:
+    many = gymnasium.make_vec("floaty/Hover-v0", num_envs=2, duration_s=0.07)
+    many.reset(seed=1)
+    ends = [step for step in range(1, 22) if many.step(np.zeros((2, 4), np.float32))[3].all()]
+    assert ends == [7, 14, 21]
+
+
+def test_a_loss_in_the_last_step_is_no_truncation() -> None:
+    def until_lost(duration_s: float) -> tuple[int, bool, bool]:
+        many = gymnasium.make_vec("floaty/Hover-v0", num_envs=1, duration_s=duration_s)
+        many.reset(seed=1)
+        for step in range(1, 500):
+            _, _, lost, late, _ = many.step(np.ones((1, 4), np.float32))
+            if lost.any() or late.any():
+                return step, bool(lost[0]), bool(late[0])
+        raise AssertionError("not lost")
+
+    steps, *_ = until_lost(5.0)
+    assert until_lost(0.01 * steps) == (steps, True, False)
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_observations_stay_within_their_space_however_wrong_the_estimate(many: bool) -> None:
+    errors = EstimateErrors(position=1e3, velocity=1e3, attitude=1e3, rate=1e3)
+    made = (
+        gymnasium.make_vec("floaty/Hover-v0", num_envs=2, errors=errors)
+        if many
+        else make_env("Hover", errors=errors)
+    )
+    made.reset(seed=1)
+    found = [made.step(np.zeros((2, 4) if many else 4, np.float32))[0] for _ in range(20)]
+    assert all(made.observation_space.contains(one) for one in found)
+    assert np.abs(found).max() == REACH.max(), "a bound was reached"
+
+
+def test_the_laboratory_limits_actions_and_forgets_them_at_a_reset() -> None:
+    limited, wild = (make_env("Hover", "firmware", duration_s=0.5) for _ in range(2))
+    assert isinstance(wild, FirmwareEnv)
+    for env in (limited, wild):
+        env.reset(seed=1)
+    for _ in range(3):
+        expected, reward, *_ = limited.step(np.array((1.0, -1.0, 1.0, 0.5), np.float32))
+        found, same, *_ = wild.step(np.array((5.0, -3.0, 1.01, 0.5), np.float32))
+        assert (found.tobytes(), same) == (expected.tobytes(), reward)
+    assert not wild.reset(seed=1)[0][16:].any()
+    for env in (limited, wild):
+        env.close()
+
+
+def test_every_draw_of_an_episode_is_a_number_of_its_own() -> None:
+    task = EpisodeTask("t", "", (1.0, 2.0, 3.0), (4.0, 5.0, 6.0, 7.0), (0.1, 0.3), (1.0,) * 6)
+    share: list[np.ndarray] = []
+
+    def numbers(count: int) -> np.ndarray:
+        share.append(np.linspace(0.02, 0.98, count))
+        return share[0]
+
+    one = draw_episode(task, SimpleNamespace(random=numbers), 9.0)  # type: ignore[arg-type]
+    unit = [
+        (one.start / task.start + 1.0) / 2.0, (one.amplitude / task.path + 1.0) / 2.0, (one.frequency_hz - 0.1) / 0.2,
+    ]  # fmt: skip
+    assert np.concatenate(unit) == pytest.approx(share[0][:11])
+    assert (one.push_size + 1.0) / 2.0 == pytest.approx(share[0][-1 - PUSHES : -1])
+    assert one.robot == share[0][-1]
 
 
 def test_an_age_of_the_pose_delays_the_observation_of_the_cameras_alone() -> None:
