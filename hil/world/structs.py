@@ -35,9 +35,7 @@ class Rigid(Struct):
     acceleration_W: Annotated[F64s, 3]  # [m/s2] of the centre of mass, gravity included
     alpha_B: Annotated[F64s, 3]  # [rad/s2]
     specific_force_B: Annotated[F64s, 3]  # [m/s2] as measured by an accelerometer at the centre of mass
-    vibration: Annotated[
-        F64s, 2
-    ]  # [rad/s], [m/s2] rms of rate and specific force by rotating parts, per axis
+    vibration: Annotated[F64s, 2]  # [rad/s], [m/s2] rms per axis of rate and specific force by rotating parts
     # Inputs from outside
     held: i32  # 1: the body is clamped where it is
     push: Annotated[F64s, 6]  # force [N], in W, and torque [N m], in B

@@ -695,6 +695,12 @@ def test_a_command_for_all_is_obeyed(client: MavlinkClient, target: tuple[int, i
     assert not client.firmware.signals.supervisor.armed
 
 
+def test_a_forced_start_is_no_stop(client: MavlinkClient) -> None:
+    assert client.command(400, 1, 21196)[0].result == 0
+    assert client.firmware.signals.supervisor.armed
+    assert not client.firmware.signals.supervisor.stopped
+
+
 @pytest.mark.parametrize("params", [(185, 1), (400, 0, 21196)])
 def test_a_forced_stop_is_latched(client: MavlinkClient, params: tuple[float, ...]) -> None:
     assert client.command(*params)[0].result == 0  # type: ignore[arg-type]
