@@ -15,7 +15,17 @@ from scipy.stats import bootstrap
 from hil.campaigns import report
 from hil.campaigns.config import Distribution
 from hil.campaigns.dataset import Dataset, schema_of, table_of
-from hil.campaigns.findings import FailureMap, Influence, Limited, Rate, find, influence_of, pawn, slices
+from hil.campaigns.findings import (
+    FailureMap,
+    Influence,
+    Limited,
+    Rate,
+    _beyond,
+    find,
+    influence_of,
+    pawn,
+    slices,
+)
 from hil.campaigns.jobs import Row
 from hil.campaigns.report import write_report
 from hil.campaigns.run import STOP_FROM, Progress, Tally, interval
@@ -298,6 +308,16 @@ def test_pawn_is_that_of_salib() -> None:
 def test_both_values_of_an_axis_of_two_count_for_pawn() -> None:
     points = np.repeat([[0.0], [1.0]], 50, axis=0)
     assert pawn(slices(points), points[:, 0]) == pytest.approx([0.5])
+
+
+def test_values_that_are_all_equal_depend_on_no_axis() -> None:
+    points = np.random.default_rng(1).random((100, 2))
+    assert pawn(slices(points), np.ones(100)).tolist() == [0.0, 0.0]
+
+
+def test_a_metric_that_is_no_number_is_beyond_every_limit() -> None:
+    limit = SimpleNamespace(metric=METRICS["max_y"], bound=0.1)
+    assert [_beyond(limit, value) for value in (0.2, np.nan, np.inf)] == [pytest.approx(1.0), np.inf, np.inf]
 
 
 def test_inert_axes_exceed_the_threshold_of_chance_in_one_of_twenty_campaigns() -> None:

@@ -27,6 +27,7 @@ from hil.identify.identify import (
     IdentifiedConstant,
     _verdict,
     interval_text,
+    operating_point,
 )
 from hil.identify.joint import LATE_S, Estimate
 from hil.identify.pages import write_pages
@@ -297,6 +298,17 @@ def test_fifteen_seconds_of_flight_after_the_first_two_show_the_flow_and_less_do
         flow_of(swinging(robot, seconds=16.9), ROLL, robot)
 
 
+def test_the_operating_point_is_the_mean_of_the_flight_in_the_tunnel_s_flow() -> None:
+    record = swinging(robot_of(CONFIG))
+    record.pose[:, 3:] += (0.1, 0.2, 0.3)
+    record.u[:] = (0.01, 0.02, 0.03, 0.04)
+    air = CONFIG.tunnel.model_copy(update={"fan_factor": 0.9, "side_wind": (0.5, 1.0, 0.0)})
+    point = operating_point(replace(record, config=CONFIG.model_copy(update={"tunnel": air})))
+    assert point.inputs == pytest.approx((0.01, 0.02, 0.03, 0.04))
+    assert point.attitude == pytest.approx((0.1, 0.2, 0.3), abs=1e-3)
+    assert (point.side_wind, point.speed) == ((0.5, 1.0, 0.0), 0.9 * CONFIG.tunnel.speed)
+
+
 @pytest.mark.parametrize(("axis", "column"), [(ROLL, 3), (PITCH, 4)])
 def test_a_robot_that_leans_has_its_mean_angle(axis: Axis, column: int) -> None:
     record = swinging(robot_of(CONFIG))
@@ -333,7 +345,7 @@ def constant(
     ids=["misfit", "saturated", "incoherent", "contradicted"],
 )  # fmt: skip
 def test_a_narrow_interval_is_not_enough(found: IdentifiedConstant, evidence: Evidence, reason: str) -> None:
-    assert _verdict(found, Evidence(1.0, 0.0, 1.0), 64.0)[0] == IDENTIFIED or found.differs
+    assert _verdict(found, Evidence(10.0, 0.15, 0.35), 64.0)[0] == IDENTIFIED or found.differs
     verdict, why = _verdict(found, evidence, 64.0)
     assert verdict == UNKNOWN
     assert reason in why
@@ -411,7 +423,9 @@ def test_roll_lifts_a_robot_that_leans_and_no_other() -> None:
         pose = np.zeros((len(t), 6))
         pose[:, 3] = lean + swing
         record = Record("r", t, t, still, still, zero, t, pose, 0.0, 0.0, config, False)
-        return float(swing @ straightened(record).bent[:, 1] / (swing @ swing))
+        bent = straightened(record).bent
+        assert bent.mean(axis=0) == pytest.approx(0.0, abs=1e-5)
+        return float(swing @ bent[:, 1] / (swing @ swing))
 
     assert lifted(0.0) == pytest.approx(0.0, abs=1e-3)
     assert lifted(0.1) == pytest.approx(-lifted(-0.1), rel=1e-3)

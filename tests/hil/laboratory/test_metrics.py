@@ -9,7 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_py.geometry import from_euler_zyx, in_goal_frame, to_euler_zyx
-from hil.laboratory.metrics import METRICS, attitude_error, measure, position_error
+from hil.laboratory.metrics import (
+    ALWAYS,
+    METRICS,
+    _time_seen,
+    attitude_error,
+    limits_of,
+    measure,
+    position_error,
+    show,
+)
 
 length, angle, tilt = st.floats(-3.0, 3.0), st.floats(-pi, pi), st.floats(-1.2, 1.2)
 place = st.tuples(length, length, length)
@@ -50,7 +59,10 @@ def test_metrics_count_from_the_release_to_the_end() -> None:
         "estimator.invalid": range(15),
         "tracker.refused": range(0, 30, 2),
         "estimator.pose_age_us": [*4 * [0], *11 * [40_000]],
-    }
+        "loop.delay": [*4 * [0], *11 * [2_000]],
+        "loop.added": [*4 * [0], *11 * [5_000]],
+        "loop.stood": [1_000_000 * second for second in range(15)],
+    } | {f"loop.{name}": [*14 * [0], n] for n, name in enumerate(("held", "late", "lost", "doubled"), 1)}
     still = dict.fromkeys(("truth.qx", "truth.qz"), [0.0] * 15)
     rms_x, rms_y = (np.sqrt((10 * rest**2 + most**2) / 11) for rest, most in ((0.05, 0.3), (0.01, 0.2)))
     goal = {f"goal.{name}": [0.0] * 15 for name in ("x", "y", "z", "yaw")}
@@ -83,6 +95,37 @@ def test_metrics_count_from_the_release_to_the_end() -> None:
             "line_overrun": 7.0,
             "poses_refused": 2 + 1 + 14,
             "frames_refused": 28.0,
+            "loop_delay": 0.002,
+            "loop_added": 0.005,
+            "loop_stood": 14.0,
+            "samples_held": 1.0,
+            "samples_late": 2.0,
+            "samples_lost": 3.0,
+            "samples_doubled": 4.0,
         }
     )
     assert told.keys() <= METRICS.keys()
+
+
+@pytest.mark.parametrize(
+    ("seen", "flown_s", "unseen_s"),
+    [("1111", 3, 0), ("1011", 1, 2), ("1101", 1, 2), ("1010", 0, 2), ("0111", 2, 1)],
+)
+def test_a_second_counts_as_flown_when_both_its_ends_were_seen(
+    seen: str, flown_s: float, unseen_s: float
+) -> None:
+    """A second that was not seen at the end of the log belongs to nobody, when the next pose may still be under way."""
+    places = [0.0 if one == "1" else np.nan for one in seen]
+    end_us = 3_000_000 if seen[-1] == "1" else 2_050_000
+    log = {"t": [0, 1_000_000, 2_000_000, end_us], "flight.free": [1] * 4, "cameras.x": places}
+    assert _time_seen(pa.table(log)) == (flown_s, unseen_s)
+
+
+def test_a_profile_s_limits_replace_those_of_the_experiment_and_of_every_flight() -> None:
+    assert limits_of({"rms_x": 1.0}) == {"rms_x": 1.0, **ALWAYS}
+    assert limits_of({"rms_x": 1.0, "resets": 2.0}) == {"rms_x": 1.0, **ALWAYS, "resets": 2.0}
+    assert limits_of({"rms_x": 1.0}, {"rms_y": 2.0, "unseen": 3.0}) == {"rms_y": 2.0, **ALWAYS, "unseen": 3.0}
+
+
+def test_what_never_happens_is_shown_as_never() -> None:
+    assert (show(np.inf, "s"), show(0.123, "m"), show(-np.inf, "")) == ("never", "12.3 cm", "-inf")
