@@ -1,7 +1,7 @@
 """The planner's polynomials against numpy's linear algebra and scipy's Bezier curves; its paths by their laws."""
 
 import struct
-from math import pi
+from math import pi, tau
 from types import SimpleNamespace
 
 import numpy as np
@@ -157,6 +157,16 @@ def test_a_spiral_s_ends_are_on_circles_about_one_centre(sideways: bool, clockwi
         assert np.dot(motion.velocity[:2], radial) == pytest.approx(0.1, abs=1e-6)  # (0.5 - 0.3) m in 2 s
         tangential = radius * turn / 2.0
         assert np.dot(motion.velocity[:2], (-radial[1], radial[0])) == pytest.approx(tangential, abs=1e-6)
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_a_spiral_turns_once_at_most_and_has_no_negative_radius(sense: float) -> None:
+    begin = PathPoint((0.2, -0.1, 1.0), 0.7)
+    wild, tame = (
+        Spiral(True, True, sense * 9.0, -0.1, -0.2, 0.4, 2.0),
+        Spiral(True, True, sense * tau, 0.0, 0.0, 0.4, 2.0),
+    )
+    assert spiral(begin, wild) == spiral(begin, tame)
 
 
 def test_up_and_down_keep_the_place_and_turn_on_the_shorter_side() -> None:
