@@ -155,8 +155,10 @@ def test_a_spiral_s_ends_are_on_circles_about_one_centre(sideways: bool, clockwi
     for motion, radius, a in zip((first, last), (0.3, 0.5), ahead, strict=True):
         radial = -sense * a
         assert np.dot(motion.velocity[:2], radial) == pytest.approx(0.1, abs=1e-6)  # (0.5 - 0.3) m in 2 s
-        tangential = radius * turn / 2.0
-        assert np.dot(motion.velocity[:2], (-radial[1], radial[0])) == pytest.approx(tangential, abs=1e-6)
+        rate, along = turn / 2.0, (-radial[1], radial[0])
+        assert np.dot(motion.velocity[:2], along) == pytest.approx(radius * rate, abs=1e-6)
+        assert np.dot(motion.acceleration[:2], radial) == pytest.approx(-radius * rate * rate, abs=1e-5)
+        assert np.dot(motion.acceleration[:2], along) == pytest.approx(2.0 * 0.1 * rate, abs=1e-5)
 
 
 @pytest.mark.parametrize("sense", [1.0, -1.0])
