@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from hil.campaigns.config import Distribution, Spec
-from hil.campaigns.sampling import axes, check_design, draw, points_of, value_at
+from hil.campaigns.sampling import axes, check_design, cluster_of, draw, points_of, value_at
 from hil.config import load_config
 from hil.errors import LabError
 from hil.floaty.correction import PAPER_TABLE
@@ -144,6 +144,19 @@ def test_an_impossible_number_of_flights_is_refused_with_a_possible_one(sampling
     with pytest.raises(LabError, match=r"needs (40 or 80|40 or 44)"):
         check_design(spec_of(sampling=sampling, flights=flights))
     check_design(spec_of(sampling=sampling, flights=40))
+
+
+@pytest.mark.parametrize(("sampling", "one", "two"), [("saltelli", 20, 40), ("morris", 4, 8)])
+def test_a_design_needs_two_base_rows(sampling: str, one: int, two: int) -> None:
+    with pytest.raises(LabError, match=rf"needs {two}$"):
+        check_design(spec_of(sampling=sampling, flights=one))
+    check_design(spec_of(sampling=sampling, flights=two))
+
+
+def test_where_nothing_varies_a_cluster_is_the_flights_of_a_seed() -> None:
+    both = ["floaty", "as-flown"]
+    assert cluster_of(spec_of(parameters={}, faults=[], flights=6, seeds=3, profiles=both)) == 2
+    assert cluster_of(spec_of(flights=12, seeds=3, profiles=both)) == 6
 
 
 def test_a_campaign_over_seeds_alone_has_no_axes() -> None:

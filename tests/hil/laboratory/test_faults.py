@@ -23,7 +23,7 @@ from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, Experiment
 from hil.floaty.plant import Plant
 from hil.laboratory.fault_kinds import KINDS, MARKERS_ON, Kind
-from hil.laboratory.faults import Fault, check, parse, spans_of
+from hil.laboratory.faults import SWITCHED_ON, Fault, check, parse, spans_of, switched_on
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_events, load_log
@@ -566,3 +566,16 @@ def test_the_list_tells_every_kind(cli: Cli) -> None:
     shown = cli.out
     first = [line.split()[0] for line in shown.splitlines() if line and not line.startswith(" ")]
     assert first == ["kind", *KINDS]
+
+
+def test_a_fault_that_was_switched_on_twice_has_two_spans() -> None:
+    def event(t_us: int, text: str, source: str = "lab") -> dict[str, object]:
+        return {"t_us": t_us, "source": source, "text": text}
+
+    events = [
+        event(1, "fault push.y=1 begins"), event(2, "fault push.x=1 begins"), event(3, "fault push.y=1 ends"),
+        event(4, "fault push.y=1 begins", "board"), event(5, "fault push.y=1 begins"), event(6, "fault push.y=1 ends"),
+    ]  # fmt: skip
+    assert json.loads(switched_on(events)[SWITCHED_ON]) == [
+        ["push.y=1", 1, 3], ["push.x=1", 2, math.inf], ["push.y=1", 5, 6],
+    ]  # fmt: skip
