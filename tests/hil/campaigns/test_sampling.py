@@ -146,7 +146,7 @@ def test_an_impossible_number_of_flights_is_refused_with_a_possible_one(sampling
     check_design(spec_of(sampling=sampling, flights=40))
 
 
-@pytest.mark.parametrize(("sampling", "one", "two"), [("saltelli", 20, 40), ("morris", 4, 8)])
+@pytest.mark.parametrize(("sampling", "one", "two"), [("saltelli", 5, 10), ("morris", 4, 8)])
 def test_a_design_needs_two_base_rows(sampling: str, one: int, two: int) -> None:
     with pytest.raises(LabError, match=rf"needs {two}$"):
         check_design(spec_of(sampling=sampling, flights=one))
