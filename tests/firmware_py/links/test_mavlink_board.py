@@ -143,6 +143,9 @@ def test_ages_within_the_clock_error_are_zero_else_unknown(lag_us: int, age_us: 
     assert usual is not None
     found = age_of(lag_us - (usual - 100_000))  # on its arrival, whatever the line takes
     assert found == (age_us if not age_us else pytest.approx(age_us, abs=100))
+    client.command(512, NUMBERS["NAMED_VALUE_FLOAT"])
+    (age_ms,) = [m.value for m in client.of("NAMED_VALUE_FLOAT") if m.name == "age_ms"][-1:]
+    assert age_ms == pytest.approx(-1.0 if found is None else 1e-3 * found)
 
 
 def test_the_clock_is_asked_ten_times_a_second_until_five_answers_came_then_twice() -> None:

@@ -18,7 +18,17 @@ from hil.laboratory.experiment import Source, unknown
 from hil.laboratory.metrics import Metric, Verdict
 from hil.laboratory.recorder import Recorder
 from hil.laboratory.request import REAL, Bench, Request
-from hil.laboratory.result import RESULT, Program, QueueReport, Result, metadata_of, read_result, write_result
+from hil.laboratory.result import (
+    RESULT,
+    Program,
+    QueueReport,
+    Result,
+    metadata_of,
+    read_result,
+    with_failures,
+    with_resets,
+    write_result,
+)
 from hil.scene import Look
 from hil.world.body import Channel, Quantity
 from support.command import Cli
@@ -146,3 +156,32 @@ def test_a_log_whose_schema_does_not_tell_where_it_comes_from_is_refused(result:
         killed(result.folder, {"request": json.dumps(values), "program": json.dumps(values)})
         with pytest.raises(LabError, match=f"{result.folder}.*{told}".replace("[", r"\[")):
             read_result(result.folder)
+
+
+@pytest.mark.parametrize(
+    ("ended", "resets", "expected"),
+    [
+        (("completed", None), math.nan, ("completed", None)),
+        (("completed", None), 0, ("completed", None)),
+        (("completed", None), 1, ("reset", "the board was reset 1 time")),
+        (("lost", "fell"), 2, ("lost", "fell; the board was reset 2 times")),
+    ],
+)
+def test_resets_end_a_completed_flight_otherwise_and_join_another_cause(
+    ended: tuple[Any, Any], resets: float, expected: tuple[Any, Any]
+) -> None:
+    assert with_resets(*ended, resets) == expected
+
+
+@pytest.mark.parametrize(
+    ("ended", "failures", "expected"),
+    [
+        (("completed", None), [], ("completed", None)),
+        (("completed", None), ["a"], ("error", "a")),
+        (("lost", "fell"), ["a", "b", "c"], ("lost", "a; 2 more in events.jsonl; fell")),
+    ],
+)
+def test_the_first_failure_of_a_firmware_comes_before_the_other_cause(
+    ended: tuple[Any, Any], failures: list[str], expected: tuple[Any, Any]
+) -> None:
+    assert with_failures(*ended, failures) == expected
