@@ -931,7 +931,8 @@ def test_each_counter_and_deviation_has_its_own_place_in_the_messages(client: Ma
                 named = {one.name: one.value for one in found if one.name != "age_ms"}
                 assert named == {"refused": 700, "up_lost": 20, "tx_dropped": 40, "overruns": 3}
             elif number == "SYS_STATUS":
-                assert (found[-1].errors_comm, found[-1].drop_rate_comm) == (7 + 20 + 3, 2000)
+                assert found[-1].errors_comm == 7 + 20 + 3
+                assert 1800 < found[-1].drop_rate_comm <= 2000, "20 of 100, and the requests that came since"
             else:
                 seen = found[-1].pos_horiz_accuracy, found[-1].pos_vert_accuracy
                 assert seen == pytest.approx((0.3, deviations[2]), abs=0.02)
