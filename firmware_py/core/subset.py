@@ -123,7 +123,7 @@ class Block(Generic[S_co]):
         return self.memory[name].data
 
     def copy(self) -> Self:
-        """Return a block with the same content and memory of its own."""
+        """Return an independent copy."""
         other = type(self)(self.kind)
         other.memory[:] = self.memory
         return other

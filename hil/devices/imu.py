@@ -130,7 +130,7 @@ class VirtualImu:
         return tuple(self._memory.fields.count.tolist())
 
     def twin(self) -> "VirtualImu":
-        """Return the same specimen, with filters, noise and faults of its own from now on."""
+        """Return an independent copy of this specimen, which draws the same noise."""
         twin = copy(self)
         twin._memory, twin._rng, twin._draws = self._memory.copy(), deepcopy(self._rng), self._draws.copy()
         twin._rows_left, twin._body = twin._memory.cell("rows_left"), None

@@ -144,5 +144,5 @@ class FloatyBlocks(NamedTuple):
         return self.body.arg, self.air.arg, self.flaps.arg
 
     def copy(self) -> "FloatyBlocks":
-        """Return blocks with the same content and memory of their own."""
+        """Return an independent copy."""
         return FloatyBlocks(self.body.copy(), self.air.copy(), self.flaps.copy())
