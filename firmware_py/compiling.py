@@ -1,15 +1,17 @@
-"""Compilation by numba: strict IEEE arithmetic, kept on disk, never older than its sources.
+"""Compilation by a C compiler or numba: strict IEEE arithmetic, kept on disk, never older than its sources.
 
-Without fast maths LLVM neither reorders nor fuses, so every processor computes the same bits. A call on memory that does not
+Without fast maths neither reorders nor fuses, so every processor computes the same bits. A call on memory that does not
 move (`bound`) is kept as machine code, which a later process loads without numba: loading numba takes longer than a
-short flight. Every other call goes through numba's dispatcher and its own cache. Kept code is valid for the content of all
-sources; `firmware_py/kept_code.py` has its folders. Stale code is overwritten.
+short flight. It is that of a C compiler where the function's room translates it (`Library`). Every other call goes through
+numba's dispatcher and its own cache. Kept code is valid for the content of all sources; `firmware_py/kept_code.py` has its
+folders. Stale code is overwritten.
 """
 
 import ctypes
 import hashlib
 import inspect
 import os
+import platform
 import struct
 import sys
 from collections.abc import Callable, Iterator
@@ -27,22 +29,30 @@ from numpy.typing import NDArray
 from firmware_py.kept_code import keep, kept_folder, may_load
 
 PLAIN = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
-SUFFIX = ".machine"
+SUFFIX, LIBRARY_SUFFIX = ".machine", ".so"
 WHOLE = ("None", "bool", "int", "i32", "int32")  # what a bound function may return
 # What kept code may call, by its name in C; numba never frees the memory of others.
 FOREIGN = {"NRT_MemInfo_call_dtor": "abort", "numba_ldexp": "ldexp"} | {
     name: name for name in ("sqrt", "sqrtf", "memset", "memcpy", "memmove")
 }
 METHOD = "kept_method"
+METHOD_IN_C = "floaty_method"
 NO_ARGUMENTS = 4  # `METH_NOARGS`
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+Arrays = tuple[NDArray[Any], ...]
+# Returns the library of a function on memory of this kind, whose method `METHOD_IN_C` has the addresses of the arrays in
+# its self; None where no C compiler makes it.
+Library = Callable[[Callable[..., Any], Arrays], Path | None]
 ctypes.pythonapi.PyCFunction_NewEx.restype = ctypes.py_object
 ctypes.pythonapi.PyCFunction_NewEx.argtypes = (ctypes.c_void_p, ctypes.py_object, ctypes.py_object)
 
 
-def compiler(*sources: Path) -> Callable[[Function], Function]:
-    """Return the decorator for functions that depend only on `sources`, files or folders, and on their own file."""
+def compiler(*sources: Path, library: Library | None = None) -> Callable[[Function], Function]:
+    """Return the decorator for functions that depend only on `sources`, files or folders, and on their own file.
+
+    `library` compiles them as C; without it, or where it returns None, numba does.
+    """
     shared = hashlib.sha256(f"{np.__version__} {sys.version}".encode())
     for source in (Path(__file__), *sources, *_version_of_numba()):
         for path in sorted(source.glob("*.py")) if source.is_dir() else (source,):
@@ -58,7 +68,7 @@ def compiler(*sources: Path) -> Callable[[Function], Function]:
         stamp.update(function.__module__.encode())
         source = inspect.getfile(function)
         stamp.update(_content(source, os.stat(source).st_mtime_ns))
-        return cast(Function, Compiled(function, stamp.hexdigest()))
+        return cast(Function, Compiled(function, stamp.hexdigest(), library))
 
     return compiled
 
@@ -83,13 +93,13 @@ def _version_of_numba() -> list[Path]:
 
 
 class Compiled:
-    """A function that numba compiles when it is first called, also from another one."""
+    """A function that is compiled when it is first called, also from another one."""
 
-    def __init__(self, function: Callable[..., Any], stamp: str) -> None:
+    def __init__(self, function: Callable[..., Any], stamp: str, library: Library | None = None) -> None:
         self.__wrapped__: Callable[..., Any]
         self.__name__: str
         update_wrapper(self, function)
-        self.stamp = stamp
+        self.stamp, self.library = stamp, library
         returned = function.__annotations__.get("return")
         self.whole = getattr(returned, "__name__", str(returned)) in WHOLE
 
@@ -113,9 +123,9 @@ class Compiled:
         """Call the function through numba."""
         return self.dispatcher(*arguments)
 
-    def file(self, kinds: str) -> Path:
+    def file(self, kinds: str, suffix: str = SUFFIX) -> Path:
         """Return the file of kept code for arguments of certain kinds."""
-        name = f"{self.__wrapped__.__module__}.{self.__name__}-{kinds}{SUFFIX}"
+        name = f"{self.__wrapped__.__module__}.{self.__name__}-{kinds}{suffix}"
         return self.folder / name
 
 
@@ -125,9 +135,16 @@ def bound(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
         return partial(function, *arguments)
     if not function.whole or not all(map(_stays, arguments)):
         return partial(function.dispatcher, *arguments)
-    method = _kept(function, arguments)
-    if method is None:
-        return partial(function.dispatcher, *arguments)
+    method = _kept_library(function, arguments) or _kept(function, arguments)
+    return partial(function.dispatcher, *arguments) if method is None else _on_memory(method, arguments)
+
+
+def bound_in(library: Path, *arrays: NDArray[Any]) -> Callable[[], Any]:
+    """Return the call of the method in a library on the present memory of arrays and records."""
+    return _on_memory(_method_in(library)[0], arrays)
+
+
+def _on_memory(method: "_Method", arguments: Arrays) -> Callable[[], Any]:
     places = struct.pack(f"{len(arguments)}P", *(one.__array_interface__["data"][0] for one in arguments))
     # the unused last argument keeps the memory alive as long as the call
     return cast(
@@ -139,7 +156,8 @@ def is_kept(function: Callable[..., Any]) -> bool:
     """Return whether a function has been compiled on this machine already."""
     if not isinstance(function, Compiled):
         return True
-    return any(function.folder.glob(function.file("*").name))
+    names = (function.file("*", suffix).name for suffix in (SUFFIX, LIBRARY_SUFFIX))
+    return any(path for name in names for path in function.folder.glob(name))
 
 
 def _stays(argument: Any) -> bool:
@@ -160,23 +178,59 @@ class _Method(ctypes.Structure):
 _LOADED: dict[tuple[str, str, str], tuple[_Method, Any]] = {}  # with what holds its machine code
 
 
-def _kept(function: Compiled, arguments: tuple[NDArray[Any], ...]) -> _Method | None:
-    """Return a function's machine code for arrays of these kinds; None where it needs numba."""
-    kinds = [(one.dtype.str, one.shape) for one in arguments]
-    digest = hashlib.sha256(f"{kinds} {_processor()}".encode()).hexdigest()[:16]
-    key = (function.__wrapped__.__module__, function.__name__, digest)
+def _kept_library(function: Compiled, arrays: Arrays) -> _Method | None:
+    """Return a function's code in C for arrays of these kinds; None where there is none."""
+    if function.library is None:
+        return None
+    key = _key(function, arrays, f"{sys.platform} {platform.machine()}")
     if key not in _LOADED:
-        path = function.file(digest)
+        path = function.file(key[2], LIBRARY_SUFFIX)
+        if not may_load(path):
+            made = function.library(function.__wrapped__, arrays)
+            if made is None:
+                return None
+            with suppress(OSError):
+                _replace(path, made.read_bytes())
+            path = path if path.exists() else made
+        _LOADED[key] = _method_in(path)
+    return _LOADED[key][0]
+
+
+@cache
+def _method_in(library: Path) -> tuple[_Method, Any]:
+    """Return the method in a library, and the owner of its machine code, which Python never frees."""
+    code = ctypes.CDLL(str(library))
+    address = ctypes.cast(code[METHOD_IN_C], ctypes.c_void_p).value
+    return _Method(METHOD_IN_C.encode(), address, NO_ARGUMENTS, None), code
+
+
+def _key(function: Compiled, arrays: Arrays, machine: str) -> tuple[str, str, str]:
+    """Return module and name of a function, and a hash of its arrays' kinds and the machine."""
+    kinds = [(one.dtype.str, one.shape) for one in arrays]
+    digest = hashlib.sha256(f"{kinds} {machine}".encode()).hexdigest()[:16]
+    return function.__wrapped__.__module__, function.__name__, digest
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Keep the code of a function instead of that for other kinds of arguments."""
+    keep(path, content)
+    for older in path.parent.glob(f"{path.name.rsplit('-', 1)[0]}-*{path.suffix}"):
+        if older != path:
+            older.unlink(missing_ok=True)
+
+
+def _kept(function: Compiled, arguments: Arrays) -> _Method | None:
+    """Return a function's machine code of numba for arrays of these kinds; None where it needs numba."""
+    key = _key(function, arguments, _processor())
+    if key not in _LOADED:
+        path = function.file(key[2])
         content = path.read_bytes() if may_load(path) else b""
         if not content:
             content = _machine_code(function, arguments)
             if not content:
                 return None
             with suppress(OSError):
-                keep(path, content)
-                for older in path.parent.glob(f"{path.name.rsplit('-', 1)[0]}-*{SUFFIX}"):
-                    if older != path:
-                        older.unlink(missing_ok=True)
+                _replace(path, content)
         _LOADED[key] = _load(function.__name__, content)
     return _LOADED[key][0]
 
@@ -191,7 +245,7 @@ def _processor() -> str:
     return f"{binding.get_host_cpu_name()} {features} {chosen}"
 
 
-def _machine_code(function: Compiled, arguments: tuple[NDArray[Any], ...]) -> bytes:
+def _machine_code(function: Compiled, arguments: Arrays) -> bytes:
     """Return the object file of a method without arguments, whose self has the addresses of the arrays.
 
     Empty where the code needs numba.

@@ -104,7 +104,7 @@ def _header(modules: list[Module], public: list[FunctionPrinter], version: str) 
         "#ifndef FLOATY_CORE_H\n#define FLOATY_CORE_H\n\n#include <stdint.h>\n\n",
         f'#define FLOATY_CORE_VERSION "{version}"  // hash of the Python sources\n\n',
         "".join(constant_definition(thing) + "\n" for thing in own if isinstance(thing, Constant)),
-        *(f"\n{_struct(thing)}" for thing in _structs(modules)),
+        *(f"\n{struct_definition(thing)}" for thing in _structs(modules)),
         "\n/* A profile as written by profile_c.py: a hash of its values, and the call that writes them. */\n",
         "extern const char floaty_profile_hash[];\n",
         "void floaty_core_init(FloatyParameters *parameters);\n",
@@ -120,7 +120,8 @@ def _structs(modules: list[Module]) -> list[StructType]:
     return [thing for module in modules for thing in module.defined if isinstance(thing, StructType)]
 
 
-def _struct(struct: StructType) -> str:
+def struct_definition(struct: StructType) -> str:
+    """Return the definition of a struct with its comments."""
     lines = []
     for member in struct.fields.values():
         if member.above:

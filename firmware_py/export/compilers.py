@@ -62,6 +62,11 @@ def find_compiler(name: str = "") -> Compiler:
     )
 
 
+def quick_compilers() -> Iterator[Compiler]:
+    """Yield the C compilers of this machine, the system's before ziglang, which takes several times as long."""
+    yield from sorted(compilers(), key=lambda one: one.name == "zig")
+
+
 def compile_texts(
     texts: dict[str, str], inputs: Sequence[str], flags: Sequence[str], output: str, compiler: Compiler
 ) -> Path:

@@ -50,6 +50,8 @@ class Value:
 class Expressions:
     """Prints the expressions of one kernel; `names` holds the types of what is in scope."""
 
+    FLOAT, INTEGER = F32, I32
+
     def __init__(self, kernel: Signature) -> None:
         self.kernel = kernel
         self.module: Module = kernel.scope
@@ -57,6 +59,7 @@ class Expressions:
         self.constants: list[Constant] = []  # those that the kernel uses
         self.read: set[str] = set()
         self.loops: dict[str, tuple[int, int]] = {}  # the values of loop variables, where they are known
+        self.rounds_down = self.module.own  # `//` and `%` of negative numbers are Python's
 
     def refuse(self, node: ast.AST, reason: str) -> ExportError:
         """Return the error for a construct of this kernel."""
@@ -102,7 +105,7 @@ class Expressions:
         literal = constant_literal(node)
         if literal is None:
             raise self.refuse(node, f"literal {node.value!r}")
-        return Value(literal[1], I32)
+        return Value(literal[1], self.INTEGER)
 
     def _name(self, node: ast.Name) -> Value:
         if node.id in self.names:
@@ -133,7 +136,7 @@ class Expressions:
             raise self.refuse(node, f"{ast.unparse(node)}: {len(indices)} indices on {describe(array.kind)}")
         text = array.text
         for axis, index in enumerate(indices):
-            text += f"[{self.scalar(index, I32, 'an index').text}]"
+            text += f"[{self.scalar(index, self.INTEGER, 'an index').text}]"
             reached = self._reach(index)
             size = array.kind.shape[axis] if array.kind.shape else 2**31
             if reached is None and self.module.own:
@@ -164,7 +167,9 @@ class Expressions:
                 return self.loops[name]
             case ast.Name(id=name) if name not in self.names:
                 known = self.module.names.get(name)
-                value = int(known.text) if isinstance(known, Constant) and known.kind == I32 else None
+                value = (
+                    int(known.text) if isinstance(known, Constant) and known.kind == self.INTEGER else None
+                )
                 return None if value is None else (value, value)
             case ast.BinOp(op=ast.Add() | ast.Sub() | ast.Mult()):
                 left, right = self._reach(node.left), self._reach(node.right)
@@ -183,18 +188,22 @@ class Expressions:
         return (first[0], last[1] - 1) if first and last and first[0] < last[1] else None
 
     def _binary(self, node: ast.BinOp) -> Value:
-        left, right = self.value(node.left), self.value(node.right)
+        left, right = self._alike(self.value(node.left), self.value(node.right))
         name = type(node.op).__name__
-        if left.kind != right.kind or left.kind not in (F32, I32):
+        if left.kind != right.kind or left.kind not in (self.FLOAT, self.INTEGER):
             hint = instead(CONSTRUCTS, name) or mixed(left.kind, right.kind)
             raise self.refuse(node, f"{name} of {describe(left.kind)} and {describe(right.kind)}{hint}")
-        operators = FLOAT_OPERATORS if left.kind == F32 else INTEGER_OPERATORS
+        operators = FLOAT_OPERATORS if left.kind == self.FLOAT else INTEGER_OPERATORS
         if type(node.op) not in operators:
             raise self.refuse(node, f"{name} of {describe(left.kind)}{instead(CONSTRUCTS, name)}")
-        if self.module.own and isinstance(node.op, ast.FloorDiv | ast.Mod):
+        if self.rounds_down and isinstance(node.op, ast.FloorDiv | ast.Mod):
             return self._rounded_down(node, left, right)
         sign, strength = operators[type(node.op)]
         return Value(f"{left.within(strength)} {sign} {right.within(strength + 1)}", left.kind, strength)
+
+    def _alike(self, left: Value, right: Value) -> tuple[Value, Value]:
+        """Return the operands of one operator; nothing is converted silently."""
+        return left, right
 
     def _rounded_down(self, node: ast.BinOp, left: Value, right: Value) -> Value:
         """Return `//` or `%` of any integer as Python computes it: C rounds towards zero."""
@@ -204,14 +213,14 @@ class Expressions:
             raise self.refuse(node, reason)
         over, by = left.within(PRODUCT), right.within(UNARY)
         if isinstance(node.op, ast.Mod):
-            return Value(f"({over} % {by} + {by}) % {by}", I32, PRODUCT)
-        return Value(f"{over} / {by} - ({over} % {by} < 0)", I32, SUM)
+            return Value(f"({over} % {by} + {by}) % {by}", self.INTEGER, PRODUCT)
+        return Value(f"{over} / {by} - ({over} % {by} < 0)", self.INTEGER, SUM)
 
     def _unary(self, node: ast.UnaryOp) -> Value:
         operand = self.value(node.operand)
         if isinstance(node.op, ast.Not) and operand.kind == BOOL:
             return Value(f"!{operand.within(PRIMARY)}", BOOL, UNARY)
-        if isinstance(node.op, ast.USub) and operand.kind in (F32, I32):
+        if isinstance(node.op, ast.USub) and operand.kind in (self.FLOAT, self.INTEGER):
             return Value(f"-{operand.within(PRIMARY)}", operand.kind, UNARY)
         raise self.refuse(node, f"{type(node.op).__name__} of {describe(operand.kind)}")
 
@@ -219,8 +228,8 @@ class Expressions:
         if len(node.ops) != 1 or type(node.ops[0]) not in COMPARISONS:
             hint = instead(CONSTRUCTS, type(node if len(node.ops) > 1 else node.ops[0]).__name__)
             raise self.refuse(node, f"comparison {ast.unparse(node)}{hint}")
-        left, right = self.value(node.left), self.value(node.comparators[0])
-        if left.kind != right.kind or left.kind not in (F32, I32):
+        left, right = self._alike(self.value(node.left), self.value(node.comparators[0]))
+        if left.kind != right.kind or left.kind not in (self.FLOAT, self.INTEGER):
             raise self.refuse(
                 node,
                 f"comparison of {describe(left.kind)} and {describe(right.kind)}{mixed(left.kind, right.kind)}",
@@ -251,6 +260,10 @@ class Expressions:
             later, earlier = (self.scalar(argument, I32, "an instant") for argument in node.args)
             difference = f"(uint32_t){later.within(UNARY)} - (uint32_t){earlier.within(UNARY)}"
             return Value(f"(int32_t)({difference})", I32, UNARY)
+        return self._kernel(node, name, alone)
+
+    def _kernel(self, node: ast.Call, name: str, alone: bool) -> Value:
+        """Return the call of a kernel."""
         kernel = self.module.names.get(name)
         if not isinstance(kernel, Signature):
             raise self.refuse(node, f"call of {name}, which is no kernel{instead(FUNCTIONS, name)}")

@@ -2,23 +2,30 @@
 
 import ast
 import textwrap
+from typing import ClassVar
 
 from firmware_py.export.expressions import Expressions, describe
 from firmware_py.export.hints import CONSTRUCTS, instead
 from firmware_py.export.locals import find_locals
-from firmware_py.export.syntax import BOOL, I32, VOID, Constant, Signature, ValueType
+from firmware_py.export.syntax import BOOL, I32, I64, VOID, Constant, Signature, ValueType
 
-C_TYPES = {"f32": "float", "i32": "int32_t", "bool": "bool", "void": "void"}
+C_TYPES = {
+    "f32": "float", "f64": "double", "i32": "int32_t", "i64": "int64_t", "bool": "bool", "void": "void",
+}  # fmt: skip
 WIDTH = 110
 
 
 class FunctionPrinter:
     """Prints one kernel; afterwards `constants` are those that it uses."""
 
+    EXPRESSIONS: ClassVar[type[Expressions]] = Expressions
+    LOCALS_ANYWHERE: ClassVar[bool] = False
+
     def __init__(self, kernel: Signature) -> None:
         self.kernel = kernel
-        self._print = Expressions(kernel)
-        self._locals, self._loops = find_locals(kernel)
+        self._print = self.EXPRESSIONS(kernel)
+        self._locals, self._loops = find_locals(kernel, self.LOCALS_ANYWHERE)
+        self._declared: list[str] = []  # at the top, without a value
         self._lines: list[str] = []
         self._commented = kernel.node.body[0].end_lineno or 0  # comments up to this line are printed
         self._body = kernel.node.body[1:] if ast.get_docstring(kernel.node) else kernel.node.body
@@ -39,7 +46,7 @@ class FunctionPrinter:
             if name not in self._print.read:
                 raise self._print.refuse(self.kernel.node, f"argument {name} is not used")
         comment = block_comment(ast.get_docstring(self.kernel.node) or "")
-        return f"{comment}{self.signature()} {{\n" + "\n".join(self._lines) + "\n}\n"
+        return f"{comment}{self.signature()} {{\n" + "\n".join((*self._declared, *self._lines)) + "\n}\n"
 
     def signature(self) -> str:
         """Return the declaration without its semicolon; known after the callers have been printed."""
@@ -69,12 +76,16 @@ class FunctionPrinter:
     def _write(self, node: ast.stmt, depth: int, text: str) -> None:
         """Print a line with the comment behind its statement, folded if it is long."""
         simple = not isinstance(node, ast.If | ast.For)
-        scope, indent = self.kernel.scope, "    " * depth
+        scope = self.kernel.scope
         comment = scope.comment(node) if simple else scope.trailing.get(node.lineno, "")
-        folded = textwrap.wrap(text, WIDTH - len(indent), subsequent_indent="    ", break_long_words=False)
-        self._lines += [indent + line for line in folded]
+        self._fold(depth, text)
         if comment:
             self._lines[-1] += f"  // {comment}"
+
+    def _fold(self, depth: int, text: str) -> None:
+        indent = "    " * depth
+        folded = textwrap.wrap(text, WIDTH - len(indent), subsequent_indent="    ", break_long_words=False)
+        self._lines += [indent + line for line in folded]
 
     def _statement(self, node: ast.stmt, depth: int) -> None:
         match node:
@@ -162,17 +173,22 @@ class FunctionPrinter:
                 raise self._print.refuse(node, "a loop runs over range(end) or range(start, end)")
         if name in self._print.names:
             raise self._print.refuse(node, f"loop variable {name} is in use")
-        start = self._print.scalar(limits[0], I32, "the start of a range").text if len(limits) == 2 else "0"
+        start = (
+            self._print.scalar(limits[0], self._print.INTEGER, "the start of a range").text
+            if len(limits) == 2
+            else "0"
+        )
         # Evaluated once, and last.
-        end = self._print.scalar(limits[-1], I32, "the end of a range", alone=True).text
+        end = self._print.scalar(limits[-1], self._print.INTEGER, "the end of a range", alone=True).text
         limit = ""
         if not self._fixed(limits[-1]):  # Python evaluates the end of a range once
             limit, end = f", {name}_end = {end}", f"{name}_end"
-        self._write(node, depth, f"for (int32_t {name} = {start}{limit}; {name} < {end}; {name}++) {{")
+        c_type = C_TYPES[self._print.INTEGER.base]
+        self._write(node, depth, f"for ({c_type} {name} = {start}{limit}; {name} < {end}; {name}++) {{")
         reach = self._print.loop(limits[0] if len(limits) == 2 else None, limits[-1])
         if reach:
             self._print.loops[name] = reach
-        self._print.names[name] = I32
+        self._print.names[name] = self._print.INTEGER
         self._block(node.body, depth + 1)
         del self._print.names[name]
         self._print.loops.pop(name, None)
@@ -216,10 +232,10 @@ def constant_definition(constant: Constant) -> str:
     comment = f"  // {constant.comment}" if constant.comment else ""
     if constant.shared:
         return f"#define {constant.c_name} {constant.text}{comment}"
-    if constant.kind == I32:
+    if constant.kind in (I32, I64):
         return f"enum {{ {constant.c_name} = {constant.text} }};{comment}"
     sizes = "".join(f"[{size}]" for size in constant.kind.shape)
-    text = f"static const float {constant.c_name}{sizes} = {constant.text};"
+    text = f"static const {C_TYPES[constant.kind.base]} {constant.c_name}{sizes} = {constant.text};"
     return "\n".join(textwrap.wrap(text, WIDTH, subsequent_indent="    ", break_on_hyphens=False)) + comment
 
 

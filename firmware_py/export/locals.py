@@ -24,8 +24,11 @@ class Local:
     assignments: int
 
 
-def find_locals(kernel: Signature) -> tuple[dict[str, Local], set[str]]:
-    """Return the locals by name, and the names of the loop variables."""
+def find_locals(kernel: Signature, anywhere: bool = False) -> tuple[dict[str, Local], set[str]]:
+    """Return the locals by name, and the names of the loop variables.
+
+    `anywhere`: a local may get its first value inside a block and be used outside.
+    """
     found: dict[str, Local] = {}
     targets = [node.target for node in ast.walk(kernel.node) if isinstance(node, ast.For)]
     loops = {target.id for target in targets if isinstance(target, ast.Name)}
@@ -48,7 +51,7 @@ def find_locals(kernel: Signature) -> tuple[dict[str, Local], set[str]]:
         local.assignments += assigned
         local.home = _common(local.home, block)
     for name, local in found.items():
-        if local.home != local.block:
+        if local.home != local.block and not anywhere:
             raise refusal(
                 kernel.path, local.first, f"{name} gets its first value inside a block: give it one before"
             )
@@ -62,6 +65,9 @@ def find_writes(kernel: Signature) -> None:
         match node:
             case ast.Assign(targets=[ast.Name(id=name), *_], value=ast.Attribute() | ast.Name() as source):
                 aliases[name] = _root(source)
+            case ast.Assign(targets=[ast.Tuple(elts=targets)], value=ast.Tuple(elts=sources)):
+                pairs = zip(targets, sources, strict=False)
+                aliases |= {one.id: _root(source) for one, source in pairs if isinstance(one, ast.Name)}
     roots: dict[str, ast.AST] = {}
     for node in ast.walk(kernel.node):
         if isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store):
@@ -71,8 +77,8 @@ def find_writes(kernel: Signature) -> None:
             if isinstance(callee, Signature):
                 _check_above(kernel, callee, node)
                 kernel.calls |= {callee.c_name} | callee.calls
-                pairs = zip(node.args, callee.arguments, strict=False)
-                roots |= {_root(argument): node for argument, name in pairs if name in callee.writes}
+                given = zip(node.args, callee.arguments, strict=False)
+                roots |= {_root(argument): node for argument, name in given if name in callee.writes}
     roots |= {aliases[root]: node for root, node in roots.items() if root in aliases}
     for root, node in roots.items():
         if isinstance(kernel.scope.names.get(root), Constant) and root not in kernel.arguments:

@@ -83,19 +83,24 @@ def _imported_modules(node: ast.stmt) -> list[str]:
     return []
 
 
+def read_comments(module: Module, text: str) -> None:
+    """Add the comments of a text to its module."""
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.COMMENT:
+            own_line = not token.line[: token.start[1]].strip()
+            comments = module.standing if own_line else module.trailing
+            words = token.string.lstrip("# ").split("  # ")[0]
+            if not words.startswith(("fmt:", "noqa", "type:")):
+                comments[token.start[0]] = words
+
+
 class _Reader:
     def __init__(self, module: Module, text: str, tree: ast.Module, done: dict[str, Module]) -> None:
         self.module = module
         self._tree = tree
         self._done = done
         self._numbers = 0  # in constant arrays
-        for token in tokenize.generate_tokens(io.StringIO(text).readline):
-            if token.type == tokenize.COMMENT:
-                own_line = not token.line[: token.start[1]].strip()
-                comments = self.module.standing if own_line else self.module.trailing
-                words = token.string.lstrip("# ").split("  # ")[0]
-                if not words.startswith(("fmt:", "noqa", "type:")):
-                    comments[token.start[0]] = words
+        read_comments(module, text)
         for node in tree.body:
             self._statement(node)
 

@@ -36,6 +36,7 @@ class ValueType:
 
 
 F32, I32, BOOL, VOID = ValueType("f32"), ValueType("i32"), ValueType("bool"), ValueType("void")
+F64, I64 = ValueType("f64"), ValueType("i64")  # of the laboratory alone: see `live_reading.py`
 SCALARS = {"f32": F32, "i32": I32, "Integer": I32, "bool": BOOL}
 ARRAYS = {"F32s": "f32", "I32s": "i32"}
 

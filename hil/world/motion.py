@@ -76,13 +76,6 @@ def stand(body: Rigid) -> None:
 
 
 @compiled
-def evaluate(body: Rigid, air: Air, flaps: Flaps) -> None:
-    """Compute forces and accelerations from state, inputs and constants."""
-    drag(body, air, flaps)
-    accelerate(body)
-
-
-@compiled
 def surround(body: Rigid, air: Air) -> None:
     """Compute attitude and air from state and inputs."""
     orient(body)
@@ -117,6 +110,13 @@ def accelerate(body: Rigid) -> None:
     body.alpha_B[0] = (mx - (iz - iy) * oy * oz) / ix  # I domega/dt = M - omega x I omega
     body.alpha_B[1] = (my - (ix - iz) * oz * ox) / iy
     body.alpha_B[2] = (mz - (iy - ix) * ox * oy) / iz
+
+
+@compiled
+def evaluate(body: Rigid, air: Air, flaps: Flaps) -> None:
+    """Compute forces and accelerations from state, inputs and constants."""
+    drag(body, air, flaps)
+    accelerate(body)
 
 
 @compiled

@@ -80,5 +80,11 @@ def test_every_setting_makes_the_same_flights(name: str, usual: list[str]) -> No
     assert hashes(SETTINGS[name]) == usual
 
 
+@pytest.mark.long
+def test_without_a_system_compiler_the_world_makes_the_same_flights(usual: list[str], tmp_path: Path) -> None:
+    (tmp_path / "programs").mkdir()
+    assert hashes({"PATH": str(tmp_path / "programs"), "NUMBA_CACHE_DIR": str(tmp_path)}) == usual
+
+
 if __name__ == "__main__":
     print_hashes()

@@ -1,0 +1,108 @@
+"""The laboratory's kernels as C, compiled into a library with one method of CPython.
+
+    path = library(advance, (body, air, flaps, draws))
+
+The method takes nothing and has the addresses of records and arrays in its `self`, as `firmware_py.compiling.bound` uses
+it. Every operation is rounded by itself: all compilers and numba compute the same bits.
+"""
+
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from firmware_py.compiling import METHOD_IN_C, Arrays
+from firmware_py.export.c99 import CHECK, struct_definition
+from firmware_py.export.compilers import Compiler, compile_texts, quick_compilers
+from firmware_py.export.errors import ExportError
+from firmware_py.export.functions import block_comment, constant_definition
+from firmware_py.export.live_printing import HELPERS, LivePrinter
+from firmware_py.export.live_reading import Kernels, read_kernels
+from firmware_py.export.syntax import BOOL, I64, VOID, Constant, Signature
+
+FLAGS = (
+    "-O2", "-shared", "-fPIC", "-std=c99", "-ffp-contract=off", "-fno-math-errno", "-fno-sanitize=all",
+    "-Wall", "-Wextra", "-Werror",
+)  # fmt: skip
+HEAD = """\
+#include <float.h>
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#if FLT_EVAL_METHOD != 0
+#error "the world needs arithmetic in double"
+#endif
+
+char *PyBytes_AsString(void *object);
+void *PyLong_FromLongLong(long long value);
+
+"""
+
+
+def translate(function: Callable[..., Any], arrays: Arrays) -> str:
+    """Return the C of a kernel on memory of this kind, with all that it calls. Raises `ExportError`."""
+    found = read_kernels(function, arrays)
+    kernels = found.kernels
+    reached = {kernels[-1].c_name} | kernels[-1].calls
+    printed: dict[str, str] = {}
+    used: dict[str, Constant] = {}
+    for kernel in reversed(kernels):  # callers first: they show the shapes of array arguments
+        if kernel.c_name in reached:
+            printer = LivePrinter(kernel)
+            printed[kernel.c_name] = printer.text()
+            used |= {one.c_name: one for one in printer.constants}
+    return "".join(
+        (
+            block_comment(f"{kernels[-1].c_name}, written from Python by firmware_py/export/kernels.py"),
+            HEAD,
+            *(f"{struct_definition(struct)}\n" for struct, _ in found.structs),
+            _layout(found),
+            f"\n{HELPERS}\n",
+            *(f"{constant_definition(one)}\n" for one in used.values()),
+            *(f"\n{text}" for text in reversed(printed.values())),
+            _method(kernels[-1]),
+        )
+    )
+
+
+def library(function: Callable[..., Any], arrays: Arrays) -> Path | None:
+    """Return the library of a kernel by the first compiler that works; None without any."""
+    text = translate(function, arrays)
+    for compiler in quick_compilers():
+        with suppress(ExportError):
+            return build(text, compiler)
+    return None
+
+
+def build(text: str, compiler: Compiler) -> Path:
+    """Return the library of a kernel in C; it is compiled unless it is kept. Raises `ExportError`."""
+    return compile_texts({"kernels.c": text}, ("kernels.c", "-lm"), FLAGS, "kernels.so", compiler)
+
+
+def _layout(found: Kernels) -> str:
+    """Return checks that the structs lie in memory as numpy lays them out."""
+    lines = [CHECK]
+    for struct, dtype in found.structs:
+        name = f"Floaty{struct.name}"
+        lines.append(f"LAYOUT({name}, sizeof({name}) == {dtype.itemsize});\n")
+        for field, (_, offset, *_rest) in (dtype.fields or {}).items():
+            lines.append(f"LAYOUT({name}_{field}, offsetof({name}, {field}) == {offset});\n")
+    return "".join(lines)
+
+
+def _method(kernel: Signature) -> str:
+    if kernel.result not in (VOID, BOOL, I64):
+        raise ExportError(f"{kernel.c_name} returns a float: a method of CPython returns whole numbers")
+    places = ", ".join(f"places[{index}]" for index in range(len(kernel.arguments)))
+    call = f"{kernel.c_name}({places})"
+    answer = (
+        f"    {call};\n    return PyLong_FromLongLong(0);"
+        if kernel.result == VOID
+        else (f"    return PyLong_FromLongLong({call});")
+    )
+    return (
+        f"\nvoid *{METHOD_IN_C}(void *self, void *unused);\n\n"
+        f"void *{METHOD_IN_C}(void *self, void *unused) {{\n"
+        f"    void **places = (void **)PyBytes_AsString(self);\n    (void)unused;\n{answer}\n}}\n"
+    )

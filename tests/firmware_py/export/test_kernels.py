@@ -1,0 +1,168 @@
+"""The laboratory's kernels in C do what their Python does, and what has no equal in C is refused."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from firmware_py.compiling import Arrays, bound_in, compiler
+from firmware_py.core.subset import F64s, I32s, Integer, f64, i32
+from firmware_py.elementary import atan2, exp, sine_ahead
+from firmware_py.export.compilers import Compiler, compilers
+from firmware_py.export.errors import ExportError
+from firmware_py.export.kernels import build, translate
+from support.plain_kernels import plain
+
+COMPILERS = [one for one in compilers() if one.name != "cc"]
+IDS = [one.name for one in COMPILERS]
+COEFFICIENTS = (0.5, -0.25, 1e-300)
+ROW, SHIFT = 1, -0.1
+
+kernel = compiler()
+
+
+@kernel
+def reduced(x: float, by: Integer) -> float:
+    """Return a value that gets its first value in a branch, and a choice."""
+    whole = math.floor(x) + by
+    if whole % 3 == 0:
+        value = 1.0 - x
+        value = math.copysign(value, -1.0)
+    else:
+        value = x + 2 * whole
+    return -value if whole // 4 > 0 or value < SHIFT else value
+
+
+@kernel
+def swap(numbers: F64s) -> None:
+    """Swap through a second name."""
+    same, before = numbers, numbers[0]
+    numbers[0], numbers[1] = same[1], same[0]
+    numbers[2] = before - numbers[1]
+
+
+@kernel
+def compute(numbers: F64s, table: F64s, counts: I32s) -> None:
+    """Do one of everything."""
+    a, b = numbers[0], numbers[1]
+    swap(numbers)
+    series: float = 0.0
+    for coefficient in COEFFICIENTS:
+        series = series * a + coefficient
+    numbers[3], numbers[4] = min(a, b), max(a, b)
+    numbers[5], numbers[6] = abs(series), math.sqrt(abs(b))
+    for i in range(counts[0], 3):
+        table[ROW, i] = table[ROW, i] + reduced(a, i - counts[1])
+    counts[0], counts[1] = i32(max(math.floor(a), f64(counts[1]))), i32(a > b)
+    numbers[7], numbers[8], numbers[9] = exp(a), sine_ahead(b, counts[1]), atan2(a, b)
+    numbers[10] = math.inf if a == b else math.ldexp(a, int(counts[1]) - 3) * math.pi
+
+
+def fresh(numbers: list[float], first: int, second: int) -> Arrays:
+    arrays = np.zeros(11), np.full((2, 3), 0.5), np.array([first, second], i32)
+    arrays[0][:2] = numbers
+    return arrays
+
+
+@pytest.mark.parametrize("compiler", COMPILERS, ids=IDS)
+def test_c_computes_the_bits_of_python(compiler: Compiler) -> None:
+    in_c = fresh([0.0, 0.0], 0, 0)
+    in_python_only = plain(compute)
+    call = bound_in(build(translate(compute, in_c), compiler), *in_c)
+    number = st.floats(-700.0, 700.0)  # beyond, Python's ldexp may raise
+    number |= st.sampled_from([0.0, -0.0, 1.0, -1.0])
+
+    @settings(max_examples=300, deadline=None)
+    @given(
+        numbers=st.lists(number, min_size=2, max_size=2), first=st.integers(0, 2), second=st.integers(-9, 9)
+    )
+    def holds(numbers: list[float], first: int, second: int) -> None:
+        in_python = fresh(numbers, first, second)
+        for array, content in zip(in_c, in_python, strict=True):
+            array[:] = content
+        call()
+        in_python_only(*in_python)
+        assert [array.tobytes() for array in in_c] == [array.tobytes() for array in in_python]
+
+    holds()
+
+
+@kernel
+def grow(numbers: F64s) -> None:
+    """Do."""
+    numbers[0] += 1.0
+
+
+@kernel
+def library_sine(numbers: F64s) -> None:
+    """Do."""
+    numbers[0] = math.sin(numbers[1])
+
+
+@kernel
+def listed(numbers: F64s) -> None:
+    """Do."""
+    numbers[0] = max([numbers[1], 1.0])
+
+
+@kernel
+def by_float(numbers: F64s) -> None:
+    """Do."""
+    numbers[0] = numbers[numbers[1]]
+
+
+@kernel
+def beyond(numbers: F64s) -> None:
+    """Do."""
+    numbers[11] = 0.0
+
+
+@kernel
+def retyped(numbers: F64s) -> None:
+    """Do."""
+    x = 1
+    x = 0.5
+    numbers[0] = x
+
+
+@kernel
+def untyped(numbers: Any) -> None:
+    """Do."""
+    numbers[0] = 0.0
+
+
+@kernel
+def recursive(numbers: F64s) -> None:
+    """Do."""
+    recursive(numbers)
+
+
+@pytest.mark.parametrize(
+    ("function", "reason"),
+    [
+        (grow, "AugAssign statement"),
+        (library_sine, "call of math.sin, which is no kernel"),
+        (listed, "call of max, which is no kernel"),
+        (by_float, "an index is f64, not i64"),
+        (beyond, "index 11: f64 array of 11 has 0..10"),
+        (retyped, "i64 = f64"),
+        (untyped, "typing.Any has no equal in C"),
+        (recursive, "recursive calls itself: recursion"),
+        (swap, "takes 1 arguments, not 2"),
+    ],
+)
+def test_what_has_no_equal_in_c_is_refused(function: Any, reason: str) -> None:
+    arrays = fresh([0.0, 0.0], 0, 0)[: 2 if function is swap else 1]
+    with pytest.raises(ExportError) as refused:
+        translate(function, arrays)
+    assert reason in str(refused.value)
+
+
+def test_memory_of_another_kind_is_refused() -> None:
+    """The addresses of a bound call carry no types."""
+
+    with pytest.raises(ExportError, match="int64 is not its memory"):
+        translate(swap, (np.zeros(3, np.int64),))

@@ -1,0 +1,93 @@
+"""The world compiled as C computes the bits of its Python, with every compiler."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from firmware_py.compiling import bound_in
+from firmware_py.core.subset import Block, F64s
+from firmware_py.export.compilers import Compiler, compilers
+from firmware_py.export.kernels import build, translate
+from hil.crazyflie import quadrotor
+from hil.devices import imu
+from hil.world import motion
+from hil.world.structs import GUSTS, NOISE_ROWS, Air, Flaps, Rigid
+from support.plain_kernels import plain
+
+COMPILERS = [one for one in compilers() if one.name != "cc"]
+STATES = 40
+FEW_ROWS = 8
+Memory = list[Block[Any] | F64s]
+
+
+def floaty() -> Memory:
+    return [Rigid.allocate(), Air.allocate(), Flaps.allocate(), np.zeros((NOISE_ROWS, GUSTS))]
+
+
+def crazyflie() -> Memory:
+    return [Rigid.allocate(), Air.allocate(), quadrotor.Rotors.allocate(), np.zeros((NOISE_ROWS, GUSTS))]
+
+
+def sensor() -> Memory:
+    return [imu.Imu.allocate(), np.zeros(3), np.zeros(3), np.zeros(2), np.zeros((imu.NOISE_ROWS, 6))]
+
+
+def record_of(memory: Block[Any] | F64s) -> Any:
+    return memory.memory[0] if isinstance(memory, Block) else memory
+
+
+def bytes_of(memory: Memory) -> list[bytes]:
+    return [record_of(one).tobytes() for one in memory]
+
+
+def draw(rng: np.random.Generator, memory: Memory) -> None:
+    """Fill memory with finite numbers of many sizes, and with what steps, roots and floors need."""
+    for one in memory:
+        if not isinstance(one, Block):
+            one[:FEW_ROWS] = rng.standard_normal(one[:FEW_ROWS].shape)
+            continue
+        for name in one.memory.dtype.names or ():
+            field = one.memory[name]
+            sizes = 10.0 ** rng.integers(-3, 3, field.shape)
+            numbers = rng.standard_normal(field.shape) * sizes
+            field[...] = rng.integers(0, 2, field.shape) if field.dtype == np.int32 else numbers
+        fields: Any = one.fields
+        if one.kind is Rigid:
+            fields.time_us, fields.step_us, fields.until_us = 5000.0, 1000.0, 7000.0
+            fields.q_WB[:] /= np.sqrt(np.sum(np.square(fields.q_WB)))
+        if one.kind is Air:
+            fields.noise_row = rng.integers(0, FEW_ROWS - 2)
+        if one.kind is Flaps:
+            fields.lag, fields.rate_limit = 0.03, 5.0
+        if one.kind is quadrotor.Rotors:
+            fields.volts_to_thrust[:] = np.abs(fields.volts_to_thrust)
+            fields.rpm_to_thrust[:], fields.lag = np.abs(fields.rpm_to_thrust), 0.05
+        if one.kind is imu.Imu:
+            fields.rows_left, fields.limit[:] = rng.integers(1, FEW_ROWS), 32768.0
+
+
+@pytest.mark.parametrize("compiler", COMPILERS, ids=[one.name for one in COMPILERS])
+@pytest.mark.parametrize(
+    ("kernel", "allocate"),
+    [(motion.advance, floaty), (quadrotor.advance, crazyflie), (imu.channels, sensor)],
+    ids=["floaty", "quadrotor", "imu"],
+)
+def test_steps_from_any_state_have_the_bits_of_python(
+    kernel: Callable[..., None], allocate: Callable[[], Memory], compiler: Compiler
+) -> None:
+    rng = np.random.default_rng(2026)
+    in_c, in_python = allocate(), allocate()
+    arrays = tuple(record_of(one) for one in in_c)
+    call, function = bound_in(build(translate(kernel, arrays), compiler), *arrays), plain(kernel)
+    for _ in range(STATES):
+        draw(rng, in_c)
+        before = bytes_of(in_c)
+        for ours, theirs in zip(in_python, in_c, strict=True):
+            memory = ours.memory if isinstance(ours, Block) else ours
+            memory[:] = theirs.memory if isinstance(theirs, Block) else theirs
+        call()
+        with np.errstate(all="ignore"):
+            function(*(one.fields if isinstance(one, Block) else one for one in in_python))
+        assert bytes_of(in_c) == bytes_of(in_python) != before
