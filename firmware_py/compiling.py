@@ -192,7 +192,10 @@ def _kept_library(function: Compiled, arrays: Arrays) -> _Method | None:
             with suppress(OSError):
                 _replace(path, made.read_bytes())
             path = path if path.exists() else made
-        _LOADED[key] = _method_in(path)
+        try:
+            _LOADED[key] = _method_in(path)
+        except OSError:  # in a file system from which nothing may be executed
+            return None
     return _LOADED[key][0]
 
 

@@ -6,7 +6,8 @@ beside their sources, in a project, in a run folder or in the current folder. Wh
 `floaty-UID` in the folder for temporary files serves under the same conditions, and after it a folder that is deleted
 with the process.
 
-    numba/   `.machine`, numba's `.nbi` and `.nbc`, the entry modules of own logic    firmware_py/compiling.py
+    numba/   `.so` of the world's kernels, `.machine`, numba's `.nbi` and `.nbc`,     firmware_py/compiling.py
+             the entry modules of own logic
     c/       libraries and images that a C compiler made: core, meter, emulated chip  firmware_py/export/compilers.py
     zig/     that compiler's own cache                                                firmware_py/export/compilers.py
     pages/   templates of pages as bytecode                                           hil/pictures/pages.py

@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 
 from firmware_py import compiling
-from firmware_py.compiling import bound, compiler
+from firmware_py.compiling import Arrays, bound, compiler
+from firmware_py.core.subset import F64s
+from firmware_py.export.compilers import compilers
+from firmware_py.export.kernels import library
 from firmware_py.kept_code import UNUSED_S, keep, kept_folder, may_load
 
 ABSENT_UID = 12345
@@ -121,6 +124,42 @@ def test_doubtful_machine_code_and_pickles_are_compiled_again(
             path.chmod(0o666)
     told = capsys.readouterr().err
     assert told.count("others may write it: it is not loaded") == told.count("\n") > 0
+
+
+def twice(x: F64s) -> None:
+    """Double the first number."""
+    x[0] = 2.0 * x[0]
+
+
+@pytest.mark.skipif(not list(compilers()), reason="no C compiler")
+def test_a_library_is_compiled_once_and_again_when_others_may_have_written_it(
+    cache_home: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Path | None] = []
+
+    def count_and_make(function: Callable[..., object], arrays: Arrays) -> Path | None:
+        made.append(library(function, arrays))
+        return made[-1]
+
+    def call() -> float:
+        monkeypatch.setattr(compiling, "_LOADED", {})  # as in another process
+        x = np.array([4.0])
+        bound(compiler(library=count_and_make)(twice), x)()
+        return float(x[0])
+
+    assert (call(), call(), len(made)) == (8.0, 8.0, 1)
+    (kept,) = cache_home.rglob("*twice*.so")
+    assert (kept.stat().st_mode & 0o777, list(cache_home.rglob("*.machine"))) == (0o600, [])
+    kept.chmod(0o666)
+    assert (call(), len(made)) == (8.0, 2)
+    assert capsys.readouterr().err == f"floaty: {kept}: others may write it: it is not loaded\n"
+
+
+def test_numba_compiles_what_no_c_compiler_makes(cache_home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiling, "_LOADED", {})
+    x = np.array([4.0])
+    bound(compiler(library=lambda function, arrays: None)(twice), x)()
+    assert (x[0], len(list(cache_home.rglob("*twice*.machine")))) == (8.0, 1)
 
 
 def test_folders_that_nobody_has_used_for_long_are_deleted() -> None:

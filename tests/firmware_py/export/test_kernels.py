@@ -1,6 +1,7 @@
 """The laboratory's kernels in C do what their Python does, and what has no equal in C is refused."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from firmware_py.core.subset import F64s, I32s, Integer, f64, i32
 from firmware_py.elementary import atan2, exp, sine_ahead
 from firmware_py.export.compilers import Compiler, compilers
 from firmware_py.export.errors import ExportError
-from firmware_py.export.kernels import build, translate
+from firmware_py.export.kernels import build, library, translate
 from support.plain_kernels import plain
 
 COMPILERS = [one for one in compilers() if one.name != "cc"]
@@ -123,7 +124,7 @@ def beyond(numbers: F64s) -> None:
 @kernel
 def retyped(numbers: F64s) -> None:
     """Do."""
-    x = 1
+    x: Any = 1
     x = 0.5
     numbers[0] = x
 
@@ -166,3 +167,18 @@ def test_memory_of_another_kind_is_refused() -> None:
 
     with pytest.raises(ExportError, match="int64 is not its memory"):
         translate(swap, (np.zeros(3, np.int64),))
+
+
+@pytest.mark.skipif("zig" not in IDS, reason="no ziglang")
+def test_a_system_compiler_that_does_not_work_is_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = tmp_path / "gcc"
+    broken.write_text("#!/bin/sh\nexit 1\n")
+    broken.chmod(0o700)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    numbers = np.array([1.0, 2.0, 0.0])
+    path = library(swap, (numbers,))
+    assert path is not None
+    bound_in(path, numbers)()
+    assert numbers.tolist() == [2.0, 1.0, 0.0]
