@@ -5,7 +5,9 @@ do not use them. This file suits the few small matrices of a flight. Normal nois
 """
 
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +20,17 @@ SOURCES = (
     Path(compiling.__file__).with_name("elementary.py"),
     Path(compiling.__file__).with_name("core"),
 )
-compiled = compiling.compiler(*SOURCES)
+TRANSLATOR = Path(compiling.__file__).with_name("export")
+
+
+def in_c(function: Callable[..., Any], arrays: compiling.Arrays) -> Path | None:
+    """Return a kernel's library; None where no C compiler makes it."""
+    from firmware_py.export.kernels import library  # not needed where one is kept
+
+    return library(function, arrays)
+
+
+compiled = compiling.compiler(*SOURCES, TRANSLATOR, library=in_c)
 
 Matrix = NDArray[np.float64]
 SWEEPS_MAX = 50  # of Jacobi's method; 4 to 6 are usual
