@@ -53,10 +53,7 @@ def compiler(*sources: Path, library: Library | None = None) -> Callable[[Functi
 
     `library` compiles them as C; without it, or where it returns None, numba does.
     """
-    shared = hashlib.sha256(f"{np.__version__} {sys.version}".encode())
-    for source in (Path(__file__), *sources, *_version_of_numba()):
-        for path in sorted(source.glob("*.py")) if source.is_dir() else (source,):
-            shared.update(path.read_bytes())
+    shared = hash_of(*sources, *_version_of_numba())
 
     def compiled(function: Function) -> Function:
         if PLAIN:
@@ -71,6 +68,15 @@ def compiler(*sources: Path, library: Library | None = None) -> Callable[[Functi
         return cast(Function, Compiled(function, stamp.hexdigest(), library))
 
     return compiled
+
+
+def hash_of(*sources: Path) -> "hashlib._Hash":
+    """Return a hash of this Python, numpy, this module and the content of files and folders; it may go on."""
+    found = hashlib.sha256(f"{np.__version__} {sys.version}".encode())
+    for source in (Path(__file__), *sources):
+        for path in sorted(source.glob("*.py")) if source.is_dir() else (source,):
+            found.update(path.read_bytes())
+    return found
 
 
 @cache
@@ -139,9 +145,9 @@ def bound(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
     return partial(function.dispatcher, *arguments) if method is None else _on_memory(method, arguments)
 
 
-def bound_in(library: Path, *arrays: NDArray[Any]) -> Callable[[], Any]:
-    """Return the call of the method in a library on the present memory of arrays and records."""
-    return _on_memory(_method_in(library)[0], arrays)
+def bound_in(library: Path, method: str, *arrays: NDArray[Any]) -> Callable[[], Any]:
+    """Return the call of a method in a library on the present memory of arrays and records."""
+    return _on_memory(_method_in(library, method)[0], arrays)
 
 
 def _on_memory(method: "_Method", arguments: Arrays) -> Callable[[], Any]:
@@ -184,27 +190,35 @@ def _kept_library(function: Compiled, arrays: Arrays) -> _Method | None:
         return None
     key = _key(function, arrays, f"{sys.platform} {platform.machine()}")
     if key not in _LOADED:
-        path = function.file(key[2], LIBRARY_SUFFIX)
-        if not may_load(path):
-            made = function.library(function.__wrapped__, arrays)
-            if made is None:
-                return None
-            with suppress(OSError):
-                _replace(path, made.read_bytes())
-            path = path if path.exists() else made
+        make = partial(function.library, function.__wrapped__, arrays)
+        path = kept_library(function.file(key[2], LIBRARY_SUFFIX), make)
+        if path is None:
+            return None
         try:
-            _LOADED[key] = _method_in(path)
+            _LOADED[key] = _method_in(path, METHOD_IN_C)
         except OSError:  # in a file system from which nothing may be executed
             return None
     return _LOADED[key][0]
 
 
+def kept_library(path: Path, make: Callable[[], Path | None]) -> Path | None:
+    """Return a library that is kept at `path`, made if it is missing; None where nothing makes it."""
+    if may_load(path):
+        return path
+    made = make()
+    if made is None:
+        return None
+    with suppress(OSError):
+        _replace(path, made.read_bytes())
+    return path if path.exists() else made
+
+
 @cache
-def _method_in(library: Path) -> tuple[_Method, Any]:
-    """Return the method in a library, and the owner of its machine code, which Python never frees."""
+def _method_in(library: Path, name: str) -> tuple[_Method, Any]:
+    """Return a method in a library, and the owner of its machine code, which Python never frees."""
     code = ctypes.CDLL(str(library))
-    address = ctypes.cast(code[METHOD_IN_C], ctypes.c_void_p).value
-    return _Method(METHOD_IN_C.encode(), address, NO_ARGUMENTS, None), code
+    address = ctypes.cast(code[name], ctypes.c_void_p).value
+    return _Method(name.encode(), address, NO_ARGUMENTS, None), code
 
 
 def _key(function: Compiled, arrays: Arrays, machine: str) -> tuple[str, str, str]:

@@ -1,20 +1,37 @@
 """The memory of the flight core and what executes it.
 
-The tasks call the core through a `CoreRunner` on the memory of `CoreBlocks`: Python (compiled by numba or plain), and
-under `firmware_py.export` the same core as C on this machine and as machine code of a Cortex-M4.
+The tasks call the core through a `CoreRunner` on the memory of `CoreBlocks`: the C that is flashed, compiled for this
+machine; under `firmware_py.export` also its plain Python, and machine code of a Cortex-M4.
 """
 
+import platform
+import sys
 from collections.abc import Callable
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from functools import cache, partial
+from pathlib import Path
+from typing import ClassVar, Protocol, runtime_checkable
 
-from firmware_py.compiling import bound
+import numpy as np
+
+from firmware_py import core, export
+from firmware_py.compiling import LIBRARY_SUFFIX, PLAIN, bound_in, hash_of, kept_library
 from firmware_py.config import CpuConfig
-from firmware_py.core import entry
 from firmware_py.core.structs import Control, Estimator, Input, Parameters, Report, Sampling, Supervisor
 from firmware_py.core.subset import Block, Struct
+from firmware_py.export.c99 import core_texts, translate
+from firmware_py.export.compilers import Compiler, by_first_that_works
+from firmware_py.export.errors import ExportError
+from firmware_py.export.methods import METHOD
+from firmware_py.export.native import build
+from firmware_py.export.plain import PlainModules
+from firmware_py.export.syntax import ENTRY
 from firmware_py.export.usage import Usage
+from firmware_py.kept_code import kept_folder, report
 from firmware_py.logic.loading import Logic
 from firmware_py.logic.plugs import CALLS
+
+SOURCES = tuple(Path(package.__path__[0]) for package in (core, export))
+_report = cache(report)  # once in a process
 
 
 class CoreRunner(Protocol):
@@ -77,23 +94,70 @@ class CoreBlocks:
         )
 
 
-class PythonRunner:
-    """Runs the Python sources: compiled by numba, or plain with NUMBA_DISABLE_JIT=1."""
+class NativeRunner:
+    """Runs the core as C on the blocks' memory.
 
-    def __init__(self, blocks: CoreBlocks) -> None:
-        self._blocks = blocks
-        self._calls: dict[str, Callable[[], Any]] = {}
+    `library` is one of `firmware_py.export.native.build`; None: that of all flights. Raises `ExportError` where no C
+    compiler works.
+    """
+
+    def __init__(self, blocks: CoreBlocks, library: Path | None = None) -> None:
+        library = library or core_library(blocks.logic)
+        self._calls = {
+            name: bound_in(library, METHOD + name, *(blocks.named[block].memory for block in taken))
+            for name, taken in blocks.calls.items()
+        }
 
     def call(self, name: str) -> int:
-        """Execute an entry point; its first call compiles it."""
-        call = self._calls.get(name) or self._bind(name)
-        return call() or 0
+        return self._calls[name]()  # type: ignore[no-any-return]
 
-    def _bind(self, name: str) -> Callable[[], Any]:
-        blocks = self._blocks
-        module = entry if blocks.logic is None else blocks.logic.loaded.entry
-        arguments = (blocks.named[block].arg for block in blocks.calls[name])
-        return self._calls.setdefault(name, bound(getattr(module, name), *arguments))
+
+class PlainRunner:
+    """Runs the core's Python sources."""
+
+    def __init__(self, blocks: CoreBlocks) -> None:
+        modules = PlainModules(core_texts()) if blocks.logic is None else blocks.logic.loaded.modules
+        entry = modules.load(ENTRY)
+        self._calls = {
+            name: partial(getattr(entry, name), *(blocks.named[block].fields for block in taken))
+            for name, taken in blocks.calls.items()
+        }
+
+    def call(self, name: str) -> int:
+        """Execute an entry point."""
+        with np.errstate(all="ignore"):  # the comparison deals with infinities and NaN
+            return int(self._calls[name]() or 0)
+
+
+def default_runner(blocks: CoreBlocks) -> CoreRunner:
+    """Return the runner of all flights: the C; plain Python for a debugger, and where no C compiler works."""
+    if not PLAIN:
+        try:
+            return NativeRunner(blocks)
+        except (ExportError, OSError) as error:  # or nothing may be executed from the folder of kept code
+            _report(f"the flight core flies as plain Python, far slower: {error}")
+    return PlainRunner(blocks)
+
+
+def core_library(logic: Logic | None) -> Path:
+    """Return the core's library for this machine, with own logic in it. Raises `ExportError`."""
+    sources = hash_of(*SOURCES)
+    sources.update(f"{sys.platform} {platform.machine()} {logic.loaded.digest if logic else ''}".encode())
+    path = kept_folder("c", sources.hexdigest()) / f"core{LIBRARY_SUFFIX}"
+    library = kept_library(path, partial(_compile, logic))
+    assert library is not None
+    return library
+
+
+def _compile(logic: Logic | None) -> Path:
+    text = translate() if logic is None else logic.loaded.translation
+
+    def make(compiler: Compiler) -> Path:
+        if logic is not None:
+            report(f"compiling {', '.join(Path(file).name for file in logic.loaded.files.values())}")
+        return build(text, compiler)
+
+    return by_first_that_works(make)
 
 
 class ConfiguredCosts:

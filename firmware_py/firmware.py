@@ -12,7 +12,7 @@ from firmware_py.board import Board
 from firmware_py.config import FirmwareConfig, MavlinkConfig, parameters_of
 from firmware_py.core.structs import HORIZON_LIMIT, POSE_FROZEN, POSE_NO_CORRECTION, POSE_TOO_OLD, TICK_US
 from firmware_py.core.subset import i32
-from firmware_py.core_runner import CoreBlocks, CoreCosts, PythonRunner, RunnerFactory, costs_of
+from firmware_py.core_runner import CoreBlocks, CoreCosts, RunnerFactory, costs_of, default_runner
 from firmware_py.drivers.imu import acceleration, rates
 from firmware_py.export.usage import Usage
 from firmware_py.geometry import Vector
@@ -64,7 +64,7 @@ class Firmware:
         config: FirmwareConfig,
         board: Board,
         mavlink: bool = False,
-        runner: RunnerFactory = PythonRunner,
+        runner: RunnerFactory = default_runner,
     ) -> None:
         self.kernel = self.scheduler = Kernel(preemption=True)
         self._board = board

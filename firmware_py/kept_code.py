@@ -47,7 +47,7 @@ def may_load(path: Path) -> bool:
     """Return whether a file is there that may be loaded. One that may not is reported and counts as missing."""
     why = _why_not(path)
     if why:
-        _report(f"{path}: {why}: it is not loaded")
+        report(f"{path}: {why}: it is not loaded")
     return not why and path.is_file()
 
 
@@ -79,7 +79,7 @@ def _usable(chosen: str, home: str, temporary: str) -> Path:
             why = f"cannot be used ({error.strerror or error})"
         if not why:
             return folder
-        _report(f"{folder}: {why}: compiled code is kept elsewhere")
+        report(f"{folder}: {why}: compiled code is kept elsewhere")
     return _temporary()
 
 
@@ -139,5 +139,6 @@ def _why_not_in(parent: Path) -> str:
     return "in a folder that all may write" if mode & stat.S_IWOTH and not mode & stat.S_ISVTX else ""
 
 
-def _report(line: str) -> None:
+def report(line: str) -> None:
+    """Print a line about compiled code on standard error."""
     print("floaty:", line.encode("unicode_escape").decode("ascii"), file=sys.stderr)

@@ -112,7 +112,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "onnx": ("firmware_py/policy/reading.py",),
     "safetensors": ("firmware_py/policy/reading.py",),
     "elftools": ("firmware_py/export/elf.py",),
-    "ctypes": ("firmware_py/compiling.py", "firmware_py/export/cortex_m4.py", "firmware_py/export/native.py"),
+    "ctypes": ("firmware_py/compiling.py", "firmware_py/export/cortex_m4.py"),
     "cffi": ("hil/stm32f405/chip.py",),
     "subprocess": (
         "hil/installation.py", "hil/live/", "hil/servers/linked.py",

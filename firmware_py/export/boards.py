@@ -3,10 +3,10 @@
 from functools import partial
 
 from firmware_py.config import LogicConfig
-from firmware_py.core_runner import PythonRunner, RunnerFactory
+from firmware_py.core_runner import NativeRunner, RunnerFactory, default_runner
 from firmware_py.export.arm_image import build_image, build_meter
 from firmware_py.export.cortex_m4 import CortexM4Runner, find_emulator
-from firmware_py.export.native import NativeRunner, build
+from firmware_py.export.native import build
 from firmware_py.logic.loading import translation_of
 
 PYTHON, C, CORTEX_M4 = "python", "c", "cortex-m4"
@@ -19,7 +19,7 @@ def runner_of(board: str, logic: LogicConfig) -> RunnerFactory:
     Raises `ExportError`, and `LogicError` as `load_logic` does.
     """
     if board == PYTHON:
-        return PythonRunner
+        return default_runner
     if board == CORTEX_M4:
         find_emulator()
     core = translation_of(logic)

@@ -8,6 +8,7 @@ Kernels and constants that the entry points do not reach are left out.
 """
 
 import ast
+import dataclasses
 import hashlib
 from collections import Counter
 from collections.abc import Mapping
@@ -20,7 +21,7 @@ from firmware_py.export.errors import ExportError
 from firmware_py.export.functions import C_TYPES, FunctionPrinter, block_comment, constant_definition
 from firmware_py.export.locals import find_writes
 from firmware_py.export.reading import read_modules
-from firmware_py.export.syntax import SHARED, Constant, Module, Signature, StructType
+from firmware_py.export.syntax import CORE, SHARED, VOID, Constant, Module, Signature, StructType
 
 NO_PATHS: Mapping[str, str] = {}
 WORD = 4  # bytes of every number
@@ -47,12 +48,16 @@ CHECK = "#define LAYOUT(name, holds) typedef char layout_##name[(holds) ? 1 : -1
 
 @dataclass(frozen=True, slots=True)
 class Translation:
-    """The C of the core; `functions` are the C names of all functions in their order."""
+    """The C of the core; `functions` are the C names of all functions in their order.
+
+    `entries` are the entry points: how many blocks each takes, and whether it has an answer.
+    """
 
     header: str
     source: str
     functions: tuple[str, ...]
     version: str = ""  # hash of the Python sources
+    entries: Mapping[str, tuple[int, bool]] = dataclasses.field(default_factory=dict)
 
 
 def core_texts() -> dict[str, str]:
@@ -84,7 +89,8 @@ def translate(texts: Mapping[str, str] | None = None, own: Mapping[str, str] = N
     version = hashlib.sha256("\0".join(texts[module.name] for module in modules).encode()).hexdigest()[:12]
     header = _header(modules, [printers[kernel.c_name] for kernel in public], version)
     names = tuple(kernel.c_name for kernel in kernels)
-    return Translation(header, _source(modules, printed, used), names, version)
+    entries = {one.c_name.removeprefix(CORE): (len(one.arguments), one.result != VOID) for one in public}
+    return Translation(header, _source(modules, printed, used), names, version, entries)
 
 
 def _rename_equal_constants(modules: list[Module]) -> None:

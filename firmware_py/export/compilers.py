@@ -5,7 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -57,14 +57,25 @@ def find_compiler(name: str = "") -> Compiler:
     for compiler in compilers():
         if name in ("", compiler.name):
             return compiler
-    raise ExportError(
-        f"no C compiler{' ' + name if name else ''} on this machine: {install_command('deploy')}"
-    )
+    raise _no_compiler(f" {name}" if name else "")
 
 
-def quick_compilers() -> Iterator[Compiler]:
-    """Yield the C compilers of this machine, the system's before ziglang, which takes several times as long."""
-    yield from sorted(compilers(), key=lambda one: one.name == "zig")
+def _no_compiler(name: str) -> ExportError:
+    return ExportError(f"no C compiler{name} on this machine: {install_command('deploy')}")
+
+
+def by_first_that_works(make: Callable[[Compiler], Path]) -> Path:
+    """Return what the first compiler makes that can, the system's before ziglang, which takes several times as long.
+
+    Raises `ExportError` with the first complaint.
+    """
+    first: ExportError | None = None
+    for compiler in sorted(compilers(), key=lambda one: one.name == "zig"):
+        try:
+            return make(compiler)
+        except ExportError as error:
+            first = first or error
+    raise first or _no_compiler("")
 
 
 def compile_texts(

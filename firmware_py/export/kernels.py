@@ -8,17 +8,19 @@ it. Every operation is rounded by itself: all compilers and numba compute the sa
 
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from firmware_py.compiling import METHOD_IN_C, Arrays
 from firmware_py.export.c99 import CHECK, struct_definition
-from firmware_py.export.compilers import Compiler, compile_texts, quick_compilers
+from firmware_py.export.compilers import Compiler, by_first_that_works, compile_texts
 from firmware_py.export.errors import ExportError
 from firmware_py.export.functions import block_comment, constant_definition
 from firmware_py.export.live_printing import HELPERS, LivePrinter
 from firmware_py.export.live_reading import Kernels, read_kernels
-from firmware_py.export.syntax import BOOL, I64, VOID, Constant, Signature
+from firmware_py.export.methods import PROTOTYPES, method
+from firmware_py.export.syntax import BOOL, I64, VOID, Constant
 
 FLAGS = (
     "-O2", "-shared", "-fPIC", "-std=c99", "-ffp-contract=off", "-fno-math-errno", "-fno-sanitize=all",
@@ -34,9 +36,6 @@ HEAD = """\
 #error "the world needs arithmetic in double"
 #endif
 
-char *PyBytes_AsString(void *object);
-void *PyLong_FromLongLong(long long value);
-
 """
 
 
@@ -44,6 +43,8 @@ def translate(function: Callable[..., Any], arrays: Arrays) -> str:
     """Return the C of a kernel on memory of this kind, with all that it calls. Raises `ExportError`."""
     found = read_kernels(function, arrays)
     kernels = found.kernels
+    if kernels[-1].result not in (VOID, BOOL, I64):
+        raise ExportError(f"{kernels[-1].c_name} returns a float: a method of CPython returns whole numbers")
     reached = {kernels[-1].c_name} | kernels[-1].calls
     printed: dict[str, str] = {}
     used: dict[str, Constant] = {}
@@ -55,13 +56,13 @@ def translate(function: Callable[..., Any], arrays: Arrays) -> str:
     return "".join(
         (
             block_comment(f"{kernels[-1].c_name}, written from Python by firmware_py/export/kernels.py"),
-            HEAD,
+            f"{HEAD}{PROTOTYPES}\n",
             *(f"{struct_definition(struct)}\n" for struct, _ in found.structs),
             _layout(found),
             f"\n{HELPERS}\n",
             *(f"{constant_definition(one)}\n" for one in used.values()),
             *(f"\n{text}" for text in reversed(printed.values())),
-            _method(kernels[-1]),
+            method(METHOD_IN_C, kernels[-1].c_name, len(arrays), kernels[-1].result != VOID),
         )
     )
 
@@ -69,9 +70,8 @@ def translate(function: Callable[..., Any], arrays: Arrays) -> str:
 def library(function: Callable[..., Any], arrays: Arrays) -> Path | None:
     """Return the library of a kernel by the first compiler that works; None without any."""
     text = translate(function, arrays)
-    for compiler in quick_compilers():
-        with suppress(ExportError):
-            return build(text, compiler)
+    with suppress(ExportError):
+        return by_first_that_works(partial(build, text))
     return None
 
 
@@ -89,20 +89,3 @@ def _layout(found: Kernels) -> str:
         for field, (_, offset, *_rest) in (dtype.fields or {}).items():
             lines.append(f"LAYOUT({name}_{field}, offsetof({name}, {field}) == {offset});\n")
     return "".join(lines)
-
-
-def _method(kernel: Signature) -> str:
-    if kernel.result not in (VOID, BOOL, I64):
-        raise ExportError(f"{kernel.c_name} returns a float: a method of CPython returns whole numbers")
-    places = ", ".join(f"places[{index}]" for index in range(len(kernel.arguments)))
-    call = f"{kernel.c_name}({places})"
-    answer = (
-        f"    {call};\n    return PyLong_FromLongLong(0);"
-        if kernel.result == VOID
-        else (f"    return PyLong_FromLongLong({call});")
-    )
-    return (
-        f"\nvoid *{METHOD_IN_C}(void *self, void *unused);\n\n"
-        f"void *{METHOD_IN_C}(void *self, void *unused) {{\n"
-        f"    void **places = (void **)PyBytes_AsString(self);\n    (void)unused;\n{answer}\n}}\n"
-    )

@@ -17,6 +17,7 @@ from firmware_py.export.literals import array_literal, constant_literal
 from firmware_py.export.syntax import (
     ARRAYS,
     C_KEYWORDS,
+    CORE,
     ENTRY,
     OWN,
     PACKAGE,
@@ -158,7 +159,7 @@ class _Reader:
                 thing = source.names[node.value.attr]
                 self._take(name, thing, node)
                 if isinstance(thing, Signature) and self.module.name == ENTRY and not name.startswith("_"):
-                    thing.c_name, thing.public = f"floaty_core_{name}", True
+                    thing.c_name, thing.public = f"{CORE}{name}", True
                 return
         literal = self._array(name, node.value) or constant_literal(node.value)
         if literal is None:
@@ -261,7 +262,7 @@ class _Reader:
         if outside := hints.outside_subset(node):
             raise refusal(self.module.path, outside[0], f"{outside[1]} (in {node.name})")
         public = self.module.name == ENTRY
-        c_name = f"floaty_core_{node.name}" if public else f"{self.module.name}_{node.name}"
+        c_name = f"{CORE}{node.name}" if public else f"{self.module.name}_{node.name}"
         return Signature(c_name, self.module.path, node, arguments, result, public, self.module)
 
     def _argument_kind(self, argument: ast.arg, node: ast.FunctionDef) -> ValueType:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from firmware_py.core.structs import Parameters
 from firmware_py.core.subset import Block
-from firmware_py.core_runner import CoreBlocks, PythonRunner, RunnerFactory
+from firmware_py.core_runner import CoreBlocks, RunnerFactory, default_runner
 from firmware_py.export.compare import Difference, differing_bits
 from firmware_py.export.errors import ExportError
 
@@ -47,7 +47,7 @@ class SideBySide:
 
     def __init__(self, blocks: CoreBlocks, targets: Mapping[str, RunnerFactory]) -> None:
         self.targets = [ComparedTarget(name, blocks, factory) for name, factory in targets.items()]
-        self._reference = PythonRunner(blocks)
+        self._reference = default_runner(blocks)
         self.blocks = blocks
         self._inputs = blocks.inputs
         self._tick = 0

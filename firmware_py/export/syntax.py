@@ -9,6 +9,7 @@ from firmware_py.core.subset import Logged, Settable, Tunable
 
 PACKAGE = "firmware_py.core"
 SUBSET = f"{PACKAGE}.subset"
+CORE = "floaty_core_"  # before the C names of the entry points
 OWN = "own_logic"  # the package in which the entry module finds the user's modules
 ENTRY = "entry"  # the module whose kernels are the C API, but for names that begin with `_`
 SHARED = "structs"  # the module whose constants and structs are in the header

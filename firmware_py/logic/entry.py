@@ -12,6 +12,7 @@ from pathlib import Path
 from textwrap import dedent
 
 from firmware_py.core import entry
+from firmware_py.export.syntax import OWN
 from firmware_py.logic.budget import ARGUMENT, STRUCT
 from firmware_py.logic.plugs import ANSWERING, BLOCKS, CALLS, CONTROLLER, ESTIMATOR, Plug
 
@@ -47,8 +48,8 @@ class EntryText:
     calls: Mapping[str, tuple[str, ...]]
 
 
-def compose(plugs: Sequence[Plug], package: str) -> EntryText:
-    """Return the entry module that finds the user's modules in a package: the core's, with some calls replaced."""
+def compose(plugs: Sequence[Plug]) -> EntryText:
+    """Return the entry module that calls the user's modules: the core's, with some calls replaced."""
     by_name = {plug.point.name: plug for plug in plugs}
     bodies = {"supervise": f"    _note_faults(supervisor, {GUARD})\n{_body('supervise')}"}
     if ESTIMATOR.name in by_name:
@@ -59,7 +60,7 @@ def compose(plugs: Sequence[Plug], package: str) -> EntryText:
     head = "".join(TEXT.splitlines(keepends=True)[: first - 1]).rstrip() + "\n"
     lines = [re.sub(rf"^({'|'.join(bodies)}) = ", r"_\1 = ", head, flags=re.MULTILINE)]
     modules = {plug.point.name: f"own_{plug.point.name}" for plug in plugs}
-    lines.append(HEAD.format(package=package, modules=", ".join(modules.values())))
+    lines.append(HEAD.format(package=OWN, modules=", ".join(modules.values())))
     lines += [BUDGET] if any(plug.charged for plug in plugs) else []
     types = {**BLOCKS, GUARD: "Guard"}
     for plug in plugs:

@@ -1,17 +1,11 @@
-"""From the profile's `[logic]` to code that flies: the modules are read, checked, joined with the core and loaded.
-
-Loaded modules are named by a hash of the text. So an edited module is never mistaken for its earlier version, neither in
-one process nor in numba's cache on disk.
-"""
+"""From the profile's `[logic]` to code that flies: the modules are read, checked, joined with the core and translated."""
 
 import difflib
 import hashlib
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from firmware_py.config import LogicConfig
@@ -20,9 +14,8 @@ from firmware_py.core.guard import Guard
 from firmware_py.core.subset import Block, Struct
 from firmware_py.errors import LogicError
 from firmware_py.export.c99 import Translation, core_texts, translate
+from firmware_py.export.plain import PlainModules
 from firmware_py.export.reading import read_modules
-from firmware_py.export.syntax import OWN as PACKAGE
-from firmware_py.kept_code import keep, kept_folder
 from firmware_py.logic.budget import ARGUMENT, budgeted
 from firmware_py.logic.entry import GUARD, compose
 from firmware_py.logic.plugs import GROUP, POINTS, Plug, read_plug
@@ -35,9 +28,8 @@ class Loaded:
 
     plugs: tuple[Plug, ...]
     digest: str  # of the modules' texts
-    entry: ModuleType
     calls: Mapping[str, tuple[str, ...]]
-    texts: Mapping[str, str]  # of the core's modules and these, by module name
+    modules: PlainModules  # of the core and these, as Python
     translation: Translation
     structs: Mapping[str, type[Struct]]  # of the blocks that own logic adds to the core's
     files: Mapping[str, str]  # by plug point
@@ -140,26 +132,29 @@ def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
     )
     _check_names(plugs, shown)
     digest = hashlib.sha256(repr([(name, text) for name, _, text in modules]).encode()).hexdigest()
-    translation = translate(texts | {"entry": compose(plugs, PACKAGE).text}, shown)
+    translation = translate(texts | {"entry": compose(plugs).text}, shown)
     flown = {plug.point.name: _with_budget(plug, texts, shown) for plug in plugs}
     plugs = tuple(plug for plug, _ in flown.values())
-    entry = compose(plugs, PACKAGE)
+    entry = compose(plugs)
     texts |= {f"own_{name}": text for name, (_, text) in flown.items()} | {"entry": entry.text}
     if any(plug.charged for plug in plugs):
         translation = translate(texts, shown)
     files = {name: file for name, file, _ in modules}
-    modules = tuple((name, file, flown[name][1]) for name, file, _ in modules)
-    package = f"{PACKAGE}_{digest[:16]}"  # of the text alone: equal modules share their machine code, wherever they lie
-    run = _execute(modules, compose(plugs, package).text, package)
+    run = PlainModules(texts, {f"own_{name}": file for name, file in files.items()})
     structs: dict[str, type[Struct]] = {GUARD: Guard}
     for plug in plugs:
+        try:
+            module = run.load(f"own_{plug.point.name}")
+        except Exception as error:
+            file = shown[f"own_{plug.point.name}"]
+            raise LogicError(f"{file}: {type(error).__name__}: {error}") from error
         for argument, struct in plug.structs.items():
-            module = getattr(sys.modules[package], f"own_{plug.point.name}")
-            name = struct.name.removeprefix(plug.point.name.capitalize())
-            structs[plug.block(argument)] = getattr(module, name)
+            structs[plug.block(argument)] = getattr(
+                module, struct.name.removeprefix(plug.point.name.capitalize())
+            )
         if plug.charged:
             structs[plug.block(ARGUMENT)] = LoopBudget
-    return Loaded(plugs, digest, run, entry.calls, texts, translation, structs, files)
+    return Loaded(plugs, digest, entry.calls, run, translation, structs, files)
 
 
 def _with_budget(plug: Plug, texts: Mapping[str, str], shown: Mapping[str, str]) -> tuple[Plug, str]:
@@ -186,39 +181,6 @@ def _check_names(plugs: tuple[Plug, ...], shown: Mapping[str, str]) -> None:
                 if key in seen:
                     raise LogicError(f"{path}: {name}: this name exists already: {seen[key]}")
                 seen[key] = f"{name} in {path}"
-
-
-def _execute(modules: tuple[tuple[str, str, str], ...], entry: str, package: str) -> ModuleType:
-    """Run the modules' texts and the entry module's; each in a separate Python module, below `package`."""
-    parent = sys.modules[package] = ModuleType(package)
-    for name, file, text in modules:
-        try:
-            module = _run(f"{package}.own_{name}", Path(file), text)
-        except Exception as error:
-            raise LogicError(f"{_shown(file)}: {type(error).__name__}: {error}") from error
-        setattr(parent, f"own_{name}", module)
-    stems = "_".join(Path(file).stem for _, file, _ in modules)
-    path = _written(kept_folder("numba", package) / f"floaty_entry_{stems}.py", entry)
-    return _run(f"{package}.entry", path, entry)
-
-
-def _run(name: str, path: Path, text: str) -> ModuleType:
-    module: Any = ModuleType(name)
-    module.__file__ = str(path)
-    sys.modules[name] = module
-    exec(compile(text, str(path), "exec"), module.__dict__)
-    return module  # type: ignore[no-any-return]
-
-
-def _written(path: Path, text: str) -> Path:
-    """Write the text of a module, which numba reads, if it is not there already; return its path."""
-    content = text.encode()
-    try:
-        if not path.is_file() or path.read_bytes() != content:
-            keep(path, content)
-    except OSError as error:
-        raise LogicError(f"{path}: cannot be written ({error.strerror})") from None
-    return path
 
 
 def _shown(file: str) -> str:

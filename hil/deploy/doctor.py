@@ -11,7 +11,7 @@ from statistics import median
 import numpy as np
 
 from firmware_py.config import parameters_of
-from firmware_py.core_runner import CoreBlocks, PythonRunner
+from firmware_py.core_runner import CoreBlocks, default_runner
 from firmware_py.export.profile_c import profile_hash
 from firmware_py.logic.loading import load_logic, translation_of
 from firmware_py.wire import crtp
@@ -156,7 +156,7 @@ def _health(client: CoreClient) -> Iterator[Finding]:
 def _core(client: CoreClient, about: About, config: LabConfig) -> Finding:
     """Compute some ticks on the board and here."""
     try:
-        blocks = CoreBlocks(parameters_of(config), PythonRunner, load_logic(config.logic))
+        blocks = CoreBlocks(parameters_of(config), default_runner, load_logic(config.logic))
         core = RealCore(blocks, client)
     except LinkError as error:
         return Finding("computes", str(error).removeprefix(f"{client.name}: "), good=False)

@@ -7,12 +7,11 @@ from functools import partial
 from pathlib import Path
 
 from firmware_py.config import LogicConfig
-from firmware_py.core_runner import CoreBlocks, CoreRunner, RunnerFactory
+from firmware_py.core_runner import CoreBlocks, CoreRunner, NativeRunner, PlainRunner, RunnerFactory
 from firmware_py.export.arm_image import CoreImage, build_image, build_meter, read_image
 from firmware_py.export.cortex_m4 import CortexM4Runner, find_emulator
 from firmware_py.export.errors import ExportError
-from firmware_py.export.native import NativeRunner, build
-from firmware_py.export.plain import PlainRunner
+from firmware_py.export.native import build
 from firmware_py.export.usage import EntryLoad
 from firmware_py.logic.loading import translation_of
 from hil.devices.real_core import RealCore, is_link, open_real_core
@@ -99,7 +98,7 @@ class Toolbox:
             c = c if source is None else replace(c, source=source)
             for name in names:
                 if name in OPTIMISATION:
-                    library = build(c, OPTIMISATION[name])
+                    library = build(c, optimisation=OPTIMISATION[name])
                     self._native[name] = partial(NativeRunner, library=library)
                 elif name == CORTEX_M4:
                     find_emulator()

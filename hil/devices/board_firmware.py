@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from firmware_py.board import Board, ImuCounts
 from firmware_py.config import FirmwareConfig
-from firmware_py.core_runner import PythonRunner, RunnerFactory
+from firmware_py.core_runner import RunnerFactory, default_runner
 from firmware_py.export.usage import Usage
 from firmware_py.firmware import Firmware
 from firmware_py.rtos import TaskReport
@@ -279,7 +279,7 @@ class Executor(Protocol):
 class PythonBoard:
     """Executes the firmware in Python, with its flight core in `runner`."""
 
-    runner: RunnerFactory = PythonRunner
+    runner: RunnerFactory = default_runner
     needs_polls: ClassVar[bool] = False
     wire_us = staticmethod(syslink_us)
 

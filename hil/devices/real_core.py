@@ -11,7 +11,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.core_runner import CoreBlocks, PythonRunner, RunnerFactory
+from firmware_py.core_runner import CoreBlocks, RunnerFactory, default_runner
 from firmware_py.export.usage import EntryLoad, Usage
 from firmware_py.extras import install_command
 from firmware_py.wire.core_port import WRITE_MAX, About, Call, Called, call, write
@@ -59,10 +59,10 @@ class RealCore:
         self.load = {entry.name.lower(): EntryLoad() for entry in Call if entry.name.lower() not in HERE}
         self.unexpected = 0  # calls with another result than here
         self._client = client
-        self._host = PythonRunner(blocks)
+        self._host = default_runner(blocks)
         self._here = _bytes_of(blocks)
         # computes a call without changing the flight
-        self._copy = CoreBlocks(blocks.parameters.kind.allocate(), PythonRunner, blocks.logic)
+        self._copy = CoreBlocks(blocks.parameters.kind.allocate(), default_runner, blocks.logic)
         self._expected = _bytes_of(self._copy)
         size = sum(memory.size for memory in self._here)
         self.about: About = client.begin()

@@ -21,7 +21,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from firmware_py.core.observation import ACTIONS, OBSERVATIONS
-from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner
+from firmware_py.core_runner import CoreBlocks, CoreRunner, default_runner
 from firmware_py.geometry import rotation_matrix, to_euler_zyx, wrap_angle
 from ground_station.trajectory import Goal, Offsets, Sine, Trajectory
 from hil.arguments import checked, shown
@@ -269,7 +269,7 @@ class FirmwareEnv(gymnasium.Env[batch.Actions, batch.Actions]):
 
     def _runner(self, blocks: CoreBlocks) -> CoreRunner:
         self._blocks = blocks
-        return PythonRunner(blocks)
+        return default_runner(blocks)
 
     def _request(self, episode: Episode, seed: int) -> Request:
         setup, settings = self._setup, self._robots[int(episode.robot * len(self._robots))]

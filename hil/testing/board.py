@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from firmware_py.board import ImuCounts
-from firmware_py.core_runner import PythonRunner, RunnerFactory
+from firmware_py.core_runner import RunnerFactory, default_runner
 from firmware_py.firmware import Firmware
 from firmware_py.geometry import Vector
 from firmware_py.rtos import TaskReport
@@ -51,7 +51,9 @@ class BareBoard:
     With `serial` it speaks MAVLink over its UART: `receive` and `sent` are the bytes there.
     """
 
-    def __init__(self, config: LabConfig, runner: RunnerFactory = PythonRunner, serial: bool = False) -> None:
+    def __init__(
+        self, config: LabConfig, runner: RunnerFactory = default_runner, serial: bool = False
+    ) -> None:
         self.counts: tuple[int, ...] = ()
         self.console: list[str] = []
         self.sent: list[tuple[int, bytes]] = []

@@ -5,9 +5,8 @@ import pytest
 
 from firmware_py.config import LogicConfig, parameters_of
 from firmware_py.core.structs import POSE_INVALID, POSE_ON_TIME, POSE_TOO_OLD, Input, Parameters
-from firmware_py.core_runner import CoreBlocks, PythonRunner, RunnerFactory
+from firmware_py.core_runner import CoreBlocks, PlainRunner, RunnerFactory, default_runner
 from firmware_py.export.boards import BOARDS, runner_of
-from firmware_py.export.plain import PlainRunner
 from hil.config import load_config
 from support.core_streams import Recording, blocks_of, fill, record_wild, run_step
 
@@ -44,7 +43,7 @@ def test_arbitrary_calls_give_the_bits_of_python(recording: Recording, runner: R
 def test_one_runner_continues_what_another_began(recording: Recording, runner: RunnerFactory) -> None:
     """All state lies in the blocks: runners that take turns with Python's compute what one alone does."""
     core = core_at_start(recording, runner)
-    runners = (core.run, PythonRunner(core))
+    runners = (core.run, default_runner(core))
     for number, (step, after) in enumerate(zip(recording.steps, recording.after, strict=True)):
         core.run = runners[number % 3 % 2]
         assert run_step(core, step) == after, f"call {number}, {step.call}"

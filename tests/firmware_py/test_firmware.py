@@ -8,7 +8,7 @@ from firmware_py.config import parameters_of
 from firmware_py.core import entry
 from firmware_py.core.sampling import WINDOW
 from firmware_py.core.structs import Input, Sampling
-from firmware_py.core_runner import CoreBlocks, PythonRunner
+from firmware_py.core_runner import CoreBlocks, default_runner
 from firmware_py.errors import FirmwareError
 from firmware_py.firmware import MEASUREMENT_QUEUE
 from firmware_py.supervisor import wrapped
@@ -136,7 +136,7 @@ def test_gyro_zero_is_exact_at_the_ends_of_its_range(zero: int) -> None:
 
 
 def test_samples_are_summed_from_tick_to_tick() -> None:
-    core = CoreBlocks(parameters_of(load_config()), PythonRunner)
+    core = CoreBlocks(parameters_of(load_config()), default_runner)
     core.run.call("reset")
     data = core.data.fields
     for _ in range(2):
@@ -151,7 +151,7 @@ def test_samples_are_summed_from_tick_to_tick() -> None:
 @pytest.mark.parametrize("start", [0, 2**31 - 35])
 def test_the_controller_runs_in_every_tenth_step_and_the_estimator_in_the_one_before(start: int) -> None:
     """Steps are counted over the wrap of their number; one that is missed is caught up, and does not move the next."""
-    core = CoreBlocks(parameters_of(load_config()), PythonRunner)
+    core = CoreBlocks(parameters_of(load_config()), default_runner)
     data, sampling = core.data.fields, core.sampling.fields
     sampling.tick, sampling.phase = start, 0
     controls, estimates = [], []

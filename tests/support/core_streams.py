@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from firmware_py.config import parameters_of
 from firmware_py.core.structs import Control, Estimator, Input, Parameters, Report, Sampling, Supervisor
 from firmware_py.core.subset import Block
-from firmware_py.core_runner import CoreBlocks, PythonRunner
-from firmware_py.export.native import NativeRunner
+from firmware_py.core_runner import CoreBlocks, NativeRunner, PlainRunner
 from hil.config import load_config
+from hil.devices.board_firmware import PythonBoard
 from hil.experiments.position import HOVER
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
@@ -101,7 +101,7 @@ def run_step(core: CoreBlocks, step: Step) -> bytes:
 
 def replay(recording: Recording, library: Path | None) -> Iterator[bytes]:
     """Yield result and blocks after each recorded call on a compiled library, or on Python."""
-    runner = partial(NativeRunner, library=library) if library else PythonRunner
+    runner = partial(NativeRunner, library=library) if library else PlainRunner
     core = CoreBlocks(Parameters.allocate(), runner)
     for block, content in zip(blocks_of(core), recording.start, strict=True):
         fill(block, content)
@@ -134,7 +134,8 @@ class RecordingRunner:
 def record_flight(duration_s: float) -> Recording:
     """Return the core's calls in a hover with pushes and with gaps, outliers and late poses."""
     faults = ["push.y@2=2", "push.roll@3=0.2", "mocap.dropout@4:0.4", "push.z@5=2"]
-    flight = lockstep_flight(Request.of(HOVER, duration_s=duration_s, faults=faults))
+    request = Request.of(HOVER, duration_s=duration_s, faults=faults)
+    flight = lockstep_flight(request, executor=PythonBoard(PlainRunner))
     core = flight.robot.firmware._core
     runner = RecordingRunner(core)
     core.run = runner  # type: ignore[assignment]
@@ -161,7 +162,7 @@ def wild_words(rng: np.random.Generator, block: Block) -> bytes:
 def record_wild(seed: int, count: int) -> Recording:
     """Return calls with arbitrary bits in parameters, input and the estimator's floats, run on Python."""
     rng = np.random.default_rng(seed)
-    core = CoreBlocks(parameters_of(CONFIG), PythonRunner)
+    core = CoreBlocks(parameters_of(CONFIG), PlainRunner)
     parameters, data, estimator = core.parameters, core.data, core.estimator
     data.fields.pose_quaternion[0] = 1.0
     data.fields.gyro_samples = 10
@@ -181,7 +182,7 @@ def record_wild(seed: int, count: int) -> Recording:
 def record_plausible(seed: int, ticks: int) -> Recording:
     """Return ticks with poses, outliers, ages and rates of a flight, under profiles that are varied now and then."""
     rng = np.random.default_rng(seed)
-    core = CoreBlocks(parameters_of(CONFIG), PythonRunner)
+    core = CoreBlocks(parameters_of(CONFIG), PlainRunner)
     parameters, data = core.parameters, core.data
     parameters.fields.gain_pitch, parameters.fields.gain_q = 0.1, 0.02  # the profile's are zero
     sane = parameters.memory.view(np.uint32).copy()

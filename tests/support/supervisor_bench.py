@@ -1,7 +1,7 @@
 """The core's supervisor on the bench: events of a flight go in, mode, state and cause come out."""
 
 from firmware_py.config import parameters_of
-from firmware_py.core_runner import CoreBlocks, PythonRunner, RunnerFactory
+from firmware_py.core_runner import CoreBlocks, RunnerFactory, default_runner
 from firmware_py.supervisor import CoreSupervisor, wrapped
 from firmware_py.wire.supervisor import Cause, State
 from hil.config import load_config
@@ -13,7 +13,7 @@ FULL_MV = 3900
 class SupervisorBench:
     """A board that has just booted at an instant; `view` is what the rest of the firmware sees."""
 
-    def __init__(self, now_us: int = 0, runner: RunnerFactory = PythonRunner, look: bool = True) -> None:
+    def __init__(self, now_us: int = 0, runner: RunnerFactory = default_runner, look: bool = True) -> None:
         self.core = CoreBlocks(parameters_of(load_config()), runner)
         self.core.run.call("reset")
         for _ in range(20):  # until a pose can belong to the past

@@ -198,10 +198,10 @@ def test_the_shortest_of_two_arrays_bounds_an_index(arrays: tuple[str, str]) -> 
 @pytest.mark.parametrize("standard", ["-std=c99", "-std=gnu11"])
 @pytest.mark.parametrize("compiler", COMPILERS, ids=IDS)
 def test_strict_compilers_accept_the_core_without_a_warning(compiler: Compiler, standard: str) -> None:
-    build(C, "-Os", compiler, (standard,))
+    build(C, compiler, "-Os", (standard,))
     warned = C.source + "\nstatic int32_t never(void) { return 1; }\n"
     with pytest.raises(ExportError, match="never"):
-        build(Translation(C.header, warned, ()), "-Os", compiler, (standard,))
+        build(Translation(C.header, warned, ()), compiler, "-Os", (standard,))
 
 
 def test_the_c_has_no_double_no_library_and_no_memory_of_its_own() -> None:
@@ -271,7 +271,7 @@ def test_every_float_literal_is_read_by_the_compiler_as_that_float() -> None:
     values = np.concatenate([values, np.array([0.0, -0.0, 1e-45, 3.4028235e38, 16777216.0], np.float32)])
     table = ",\n".join(map(float_literal, values))
     source = f"extern const float table[];\nconst float table[] = {{\n{table}}};\n"
-    library = ctypes.CDLL(str(build(Translation("", source, ()), "-O0")))
+    library = ctypes.CDLL(str(build(Translation("", source, ()), optimisation="-O0")))
     got = np.ctypeslib.as_array((ctypes.c_float * values.size).in_dll(library, "table"))
     assert got.tobytes() == values.tobytes()
 

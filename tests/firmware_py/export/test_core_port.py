@@ -9,7 +9,7 @@ import pytest
 
 from firmware_py.config import parameters_of
 from firmware_py.core.structs import Estimator, Input, Parameters
-from firmware_py.core_runner import CoreBlocks, PythonRunner
+from firmware_py.core_runner import CoreBlocks, default_runner
 from firmware_py.export.c99 import translate
 from firmware_py.export.profile_c import profile_hash
 from firmware_py.wire import WireError
@@ -92,13 +92,13 @@ def test_a_session_begins_with_what_is_on_board_and_memory_of_zeros(app: App) ->
     assert profile_hash(load_config()).startswith(about.profile)
     assert len(about.core) == len(about.profile) == NAME_SIZE
     assert (about.done, about.state, about.clock_mhz) == (0, State.CALIBRATING, 168)
-    blocks = CoreBlocks(parameters_of(load_config()), PythonRunner)
+    blocks = CoreBlocks(parameters_of(load_config()), default_runner)
     assert about.size == sum(len(block.bytes()) for block in blocks.named.values())
     assert ask(app, 0, read(about.size - READ_MAX, READ_MAX)).body == bytes(READ_MAX)
 
 
 def test_a_call_is_answered_with_cycles_and_the_digest_of_all_memory(app: App) -> None:
-    blocks = CoreBlocks(parameters_of(load_config()), PythonRunner)
+    blocks = CoreBlocks(parameters_of(load_config()), default_runner)
     blocks.run.call("reset")
     begun(app)
     app.cycles.value = 4321
@@ -304,7 +304,7 @@ def test_the_board_s_results_fly_even_where_they_are_wrong(tmp_path: Path) -> No
     app.boot()
     client, _ = client_of(app)
     blocks = CoreBlocks(parameters_of(load_config()), partial(RealCore, client=client))
-    right = CoreBlocks(parameters_of(load_config()), PythonRunner)
+    right = CoreBlocks(parameters_of(load_config()), default_runner)
     for core in (blocks, right):
         core.run.call("reset")
         core.run.call("control")
@@ -316,7 +316,7 @@ def test_measured_cycles_become_processor_time_whatever_is_changed_before_the_ca
     client, _ = client_of(app)
     app.cycles.value = 168 * 100 + 1
     blocks = CoreBlocks(parameters_of(load_config()), partial(RealCore, client=client))
-    right = CoreBlocks(parameters_of(load_config()), PythonRunner)
+    right = CoreBlocks(parameters_of(load_config()), default_runner)
     for core in (blocks, right):
         core.run.call("reset")
         core.run.call("estimate")

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_py.compiling import Arrays, bound_in, compiler
+from firmware_py.compiling import METHOD_IN_C, Arrays, bound_in, compiler
 from firmware_py.core.subset import F64s, I32s, Integer, f64, i32
 from firmware_py.elementary import atan2, exp, sine_ahead
 from firmware_py.export.compilers import Compiler, compilers
@@ -72,7 +72,7 @@ def fresh(numbers: list[float], first: int, second: int) -> Arrays:
 def test_c_computes_the_bits_of_python(compiler: Compiler) -> None:
     in_c = fresh([0.0, 0.0], 0, 0)
     in_python_only = plain(compute)
-    call = bound_in(build(translate(compute, in_c), compiler), *in_c)
+    call = bound_in(build(translate(compute, in_c), compiler), METHOD_IN_C, *in_c)
     number = st.floats(-700.0, 700.0)  # beyond, Python's ldexp may raise
     number |= st.sampled_from([0.0, -0.0, 1.0, -1.0])
 
@@ -180,5 +180,5 @@ def test_a_system_compiler_that_does_not_work_is_passed_over(
     numbers = np.array([1.0, 2.0, 0.0])
     path = library(swap, (numbers,))
     assert path is not None
-    bound_in(path, numbers)()
+    bound_in(path, METHOD_IN_C, numbers)()
     assert numbers.tolist() == [2.0, 1.0, 0.0]

@@ -1,12 +1,14 @@
 """What a module of the user's may hold, and what it is told when it does not: file, line, and what to write instead."""
 
+import re
 from pathlib import Path
 from textwrap import indent
 
 import pytest
 
 from firmware_py.config import LogicConfig, parameters_of
-from firmware_py.core_runner import CoreBlocks, PythonRunner
+from firmware_py.core_runner import CoreBlocks, PlainRunner, default_runner
+from firmware_py.export import compilers
 from firmware_py.export.errors import ExportError
 from firmware_py.logic.loading import load_logic
 from hil.config import load_config
@@ -310,7 +312,7 @@ def test_an_edited_module_is_never_mistaken_for_what_it_was(tmp_path: Path) -> N
     def after_one_tick(factor: str) -> float:
         law = AS_BUILT_IN + f"    control.u[0] = f32({factor})\n"
         config = own_config(tmp_path, law)
-        blocks = CoreBlocks(parameters_of(config), PythonRunner, load_logic(config.logic))
+        blocks = CoreBlocks(parameters_of(config), default_runner, load_logic(config.logic))
         blocks.data.fields.mode = 1
         blocks.run.call("control")
         return float(blocks.control.fields.u[0])
@@ -319,15 +321,37 @@ def test_an_edited_module_is_never_mistaken_for_what_it_was(tmp_path: Path) -> N
     assert {path.suffix for path in tmp_path.rglob("*")} == {".py", ".toml"}, "compiled code in a project"
 
 
-def test_a_project_gets_no_compiled_code(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    project = tmp_path / "project"
+def test_a_project_gets_no_compiled_code(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project, cache = tmp_path / "project", tmp_path / "cache"
     project.mkdir()
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
     config = own_config(project, AS_BUILT_IN)
-    logic = load_logic(config.logic)
-    assert logic is not None
-    assert Path(str(logic.loaded.entry.__file__)).is_relative_to(tmp_path / "cache" / "floaty")
+    for _ in range(2):
+        CoreBlocks(parameters_of(config), default_runner, load_logic(config.logic))
+    assert [path.stat().st_mode & 0o777 for path in cache.rglob("core.so")] == [0o600]
+    assert capsys.readouterr().err == f"floaty: compiling {Path(config.logic.controller).name}\n"
     assert {path.suffix for path in project.rglob("*")} == {".py", ".toml"}
+
+
+def test_without_a_compiler_own_logic_flies_as_python_and_one_line_names_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(compilers, "compilers", lambda: iter(()))
+    config = own_config(tmp_path, AS_BUILT_IN + "    control.u[0] = f32(0.25)\n")
+    for _ in range(2):
+        blocks = CoreBlocks(parameters_of(config), default_runner, load_logic(config.logic))
+        assert isinstance(blocks.run, PlainRunner)
+    blocks.data.fields.mode = 1
+    blocks.run.call("control")
+    assert blocks.control.fields.u[0] == 0.25
+    assert re.fullmatch(
+        r"floaty: the flight core flies as plain Python, far slower: no C compiler on this "
+        r"machine: .*pip install .*ziglang.*\n",
+        capsys.readouterr().err,
+    )
 
 
 def test_text_outside_the_subset_is_an_export_error(tmp_path: Path) -> None:

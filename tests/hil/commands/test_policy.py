@@ -8,7 +8,7 @@ import pytest
 
 from firmware_py.config import parameters_of
 from firmware_py.core.structs import MODE_FLY
-from firmware_py.core_runner import CoreBlocks, PythonRunner
+from firmware_py.core_runner import CoreBlocks, default_runner
 from firmware_py.export.boards import runner_of
 from firmware_py.logic.loading import load_logic
 from firmware_py.policy.reading import read_policy
@@ -41,7 +41,7 @@ def test_a_policy_becomes_a_law_with_the_answers_of_its_framework(cli: Cli) -> N
 
     config, answer = load_config("law/profile.toml"), read_policy(file).answer
     logic = load_logic(config.logic)
-    runners = (PythonRunner, runner_of("c", config.logic), runner_of("cortex-m4", config.logic))
+    runners = (default_runner, runner_of("c", config.logic), runner_of("cortex-m4", config.logic))
     targets = [CoreBlocks(parameters_of(config), runner, logic) for runner in runners]
     rng = np.random.default_rng(1)
     for _ in range(30):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from firmware_py.core import structs
-from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory
+from firmware_py.core_runner import CoreBlocks, CoreRunner, NativeRunner, RunnerFactory, default_runner
 from firmware_py.export.c99 import translate
 from firmware_py.extras import install_command
 from firmware_py.logic.plugs import CALLS
@@ -33,7 +33,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("built")
 
 
-class Spoilt(PythonRunner):
+class Spoilt(NativeRunner):
     """Python with one word that is wrong from one call on."""
 
     def __init__(self, blocks: CoreBlocks, call: str, tick: int, spoil: Callable[[CoreBlocks], None]) -> None:
@@ -86,7 +86,7 @@ def test_the_first_difference_is_reported_with_its_tick_call_and_word(
 
 
 def test_a_differing_target_is_found() -> None:
-    class Late(PythonRunner):
+    class Late(NativeRunner):
         def call(self, name: str) -> int:
             return super().call(name) + (name == "file_pose")
 
@@ -104,7 +104,7 @@ def test_a_target_that_has_differed_does_not_hide_the_others() -> None:
         def spoilt(blocks: CoreBlocks) -> CoreRunner:
             return Spoilt(blocks, "control", 20, spoil)
 
-        return {"spoilt": spoilt, "python": PythonRunner}
+        return {"spoilt": spoilt, "python": default_runner}
 
     [request] = plan("hover", False, seed=3, duration_s=0.5)
     checked = check_flight(request, factories, lambda now_us, flight: None)
@@ -130,7 +130,7 @@ def test_another_robot_flies_with_the_faults_that_act_on_it() -> None:
 def test_the_check_reaches_every_state_and_cause_of_the_core_and_every_entry_point() -> None:
     called: set[str] = set()
 
-    class Noting(PythonRunner):
+    class Noting(NativeRunner):
         def call(self, name: str) -> int:
             called.add(name)
             return super().call(name)
@@ -172,7 +172,7 @@ def test_ten_thousand_ticks_are_bit_identical(cli: Cli, monkeypatch: pytest.Monk
     assert "; not" not in cli.out
 
 
-class Watch(PythonRunner):
+class Watch(NativeRunner):
     """Python that notes the tick in which the counter of late poses first moves."""
 
     first: ClassVar[list[int]] = []

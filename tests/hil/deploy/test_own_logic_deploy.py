@@ -14,7 +14,7 @@ from scipy.linalg import solve_discrete_are
 from firmware_py.config import LogicConfig, parameters_of
 from firmware_py.core import model
 from firmware_py.core.structs import MODE_FLY
-from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner
+from firmware_py.core_runner import CoreBlocks, CoreRunner, default_runner
 from firmware_py.export.side_by_side import SideBySide
 from firmware_py.logic.loading import Logic, load_logic, translation_of
 from hil.config import load_config
@@ -67,7 +67,7 @@ def test_a_parameter_that_is_set_in_flight_reaches_every_target(project: Path) -
     config, made = load_config("profile.toml"), []
 
     def side_by_side(blocks: CoreBlocks) -> CoreRunner:
-        made.append(SideBySide(blocks, {"python": PythonRunner}))
+        made.append(SideBySide(blocks, {"python": default_runner}))
         return made[0]
 
     core = CoreBlocks(parameters_of(config), side_by_side, load_logic(config.logic))
@@ -102,7 +102,7 @@ def test_the_original_law_is_the_original_firmwares_with_both_integrators_and_wi
     rows = json.loads((VECTORS / "original_controller.json").read_text())["rows"]
     overrides = ("allocation.hover_angle=0.393", "controller.limit_u=0.5895", "controller.limit_u3=0.5895")
     config = load_config("original", overrides)
-    core = CoreBlocks(parameters_of(config), PythonRunner, load_logic(config.logic))
+    core = CoreBlocks(parameters_of(config), default_runner, load_logic(config.logic))
     for row in rows:
         core.data.fields.mode = 0
         core.run.call("control")
@@ -167,7 +167,7 @@ def test_the_lqr_s_gains_are_the_optimum_of_all_16_states_for_the_weights_that_i
 @pytest.mark.parametrize("roll", [0.0, 0.05])
 def test_the_lqr_feeds_all_16_states_back(roll: float) -> None:
     config = load_config("lqr")
-    core = CoreBlocks(parameters_of(config), PythonRunner, load_logic(config.logic))
+    core = CoreBlocks(parameters_of(config), default_runner, load_logic(config.logic))
     core.data.fields.mode = MODE_FLY
     K = matrix(dict(logic_of("lqr").values))
     core.parameters.fields.opening_min, core.parameters.fields.opening_max = -10.0, 10.0
