@@ -17,7 +17,7 @@ from typing import Any, Unpack
 
 import pyarrow as pa
 
-from firmware_py.export.boards import PYTHON
+from firmware_py.export.boards import C
 from ground_station import trajectory
 from hil.arguments import Known, checked
 from hil.config import DEFAULT_PROFILE, LabConfig
@@ -295,7 +295,7 @@ def command_of(request: Request) -> str | None:
     words += _options("--fault", request.faults[len(experiment.faults) :])
     bench = request.bench
     words += ["--link", bench.link] if bench.link != RADIO else []
-    words += ["--board", bench.board] if bench.board != PYTHON else []
+    words += ["--board", bench.board] if bench.board != C else []
     words += ["--elf", str(bench.elf)] if bench.elf is not None else []
     words += [f"--hil={bench.in_loop}"] if bench.in_loop else []
     return shlex.join(words)

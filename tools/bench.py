@@ -134,7 +134,7 @@ def command_s(*words: str, **environment: str) -> float:
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def start_up_s(board: str = "python", **environment: str) -> float:
+def start_up_s(board: str = "c", **environment: str) -> float:
     """Processor time of a process that flies until its first ticks."""
     code = (
         "from contextlib import ExitStack; from hil.experiments import EXPERIMENTS;"

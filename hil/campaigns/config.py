@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
 
-from firmware_py.export.boards import BOARDS, PYTHON
+from firmware_py.export.boards import BOARDS, C
 from hil.bodies import MEASURED
 from hil.config import DEFAULT_PROFILE, keys_at, read_toml
 from hil.errors import LabError, hint
@@ -102,7 +102,7 @@ class Spec(_Part):
     duration_s: float | None = Field(None, gt=0, description="free flight [s]; default: the experiment's")
     link: Literal["radio", "mavlink"] = "radio"
     board: str = Field(
-        PYTHON, description=f"{', '.join(BOARDS)}, or the image of a Crazyflie's firmware, an ELF file"
+        C, description=f"{', '.join(BOARDS)}, or the image of a Crazyflie's firmware, an ELF file"
     )
     flights: int = Field(ge=1, le=10_000_000)
     seeds: int = Field(1, ge=1, description="flights per point, profile and experiment")

@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from firmware_py.export.boards import PYTHON
+from firmware_py.export.boards import C
 from firmware_py.logic.loading import digest_of
 from hil.bodies import digest_of_body
 from hil.campaigns.jobs import Plan, Row
@@ -123,7 +123,7 @@ class Dataset:
 def about(plan: Plan) -> dict[str, Any]:
     """Return a plan's identity: plans with equal ones have equal flights of equal number."""
     sources = [find_experiment(name).source for name in plan.experiments]
-    board = Path(plan.job(0).options.get("board", PYTHON))
+    board = Path(plan.job(0).options.get("board", C))
     return {
         **plan.about,
         "experiments": [source and source.sha256 for source in sources],

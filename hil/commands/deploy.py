@@ -57,7 +57,7 @@ def deploy() -> None:
 @common.fault_option
 @click.option(
     "--targets", "target_text", metavar="NAME,...",
-    help="What to compare with numba: plain, c-O0, c-O2, cortex-m4, and real boards: radio://…, usb://0, udp://…  "
+    help="What to compare with the flying C: plain, c-O0, c-O2, cortex-m4, and real boards: radio://…, usb://0, udp://…  "
     "[default: all but boards]",
 )  # fmt: skip
 @click.option(
@@ -77,7 +77,7 @@ def check(
     firmware: Path | None,
     **options: Unpack[Options],
 ) -> int:
-    """Fly with numba, plain Python, C and Cortex-M4 machine code side by side; compare the core's memory bit for bit.
+    """Fly with C, plain Python and Cortex-M4 machine code side by side; compare the core's memory bit for bit.
 
     Without EXPERIMENT: hover, yaw step, a hover with faults, 10 000 ticks of 10 ms, and flights that take the supervisor
     through all states and causes. Exit code 0: no bit differs; 1: one does; 2: bad input; 130: interrupted. With --elf
@@ -166,7 +166,7 @@ def _print_sum(checked: list[Checked], fresh: bool) -> None:
     ticks = min(sum(target.ticks for target in every if target.name == name) for name in names)
     different = [name for name in names if any(target.divergence for target in every if target.name == name)]
     verdict = f"{', '.join(different)} DIFFERS" if different else "no bit differs"
-    say(f"{ticks} ticks, numba beside {', '.join(names)}: {verdict}")
+    say(f"{ticks} ticks, c beside {', '.join(names)}: {verdict}")
     seen, missed = reached(checked)
     say(f"supervisor: reached {seen}{f'; not {missed}' if missed else ''}")
     if not fresh and "not finite" in missed:

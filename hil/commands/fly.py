@@ -44,9 +44,9 @@ SEEDS_MAX = 10_000
     "cflib or a serial port, in real time, the ground station in a process of its own.",
 )  # fmt: skip
 @click.option(
-    "--board", metavar="BOARD", default="python", show_default=True,
-    help="What executes the flight core: python, c (its exported C) or cortex-m4 (its machine code, emulated); the image "
-    "of a Crazyflie's firmware, an ELF file, which flies whole; or a real board, which must not fly: "
+    "--board", metavar="BOARD", default="c", show_default=True,
+    help="What executes the flight core: c (the C that is flashed), python (for a debugger) or cortex-m4 (its machine code, "
+    "emulated); the image of a Crazyflie's firmware, an ELF file, which flies whole; or a real board, which must not fly: "
     "radio://0/80/2M/E7E7E7E7E7, usb://0 or udp://HOST:PORT.",
 )  # fmt: skip
 @click.option(

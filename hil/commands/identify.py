@@ -101,7 +101,7 @@ def _print_constants(found: "Identification") -> None:
     help="Number of robots drawn from the intervals of the model; all must be stable.",
 )  # fmt: skip
 @common.seed_option
-@click.option("--board", metavar="BOARD", default="python", show_default=True, help="As for `floaty fly`.")
+@click.option("--board", metavar="BOARD", default="c", show_default=True, help="As for `floaty fly`.")
 @click.option(
     "--out",
     type=PATH,

@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.export.boards import PYTHON
+from firmware_py.export.boards import C
 from hil.deploy.drill import DRILL
 from hil.experiments.position import HOVER
 from hil.laboratory.flight import Flight
@@ -121,7 +121,7 @@ def _fly_both(
 ) -> tuple[Result, Result]:
     """Fly a request on the Python board and on an image; Ctrl-C raises `KeyboardInterrupt`."""
     results = []
-    for name, board in (("python", PYTHON), ("image", str(image))):
+    for name, board in (("python", C), ("image", str(image))):
         on_board = replace(request, bench=replace(request.bench, board=board))
         show = partial(progress, f"{request.experiment.name}, {name}")
         results.append(fly(on_board, folder / name, progress=show))

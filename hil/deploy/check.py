@@ -1,7 +1,7 @@
 """Flights that run every implementation of the flight core in parallel and compare them after every call.
 
-The reference is the board of all other flights: the core's Python compiled by numba. The targets are the same source as
-plain Python, as C for this machine, and as machine code of the Cortex-M4. After its last step a flight makes the two
+The reference is the board of all other flights: the core as C for this machine. The targets are the same source as plain
+Python, as C with less optimisation, and as machine code of the Cortex-M4. After its last step a flight makes the two
 calls of a board whose controller has stopped and which then flies by another gyro.
 """
 

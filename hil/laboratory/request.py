@@ -23,7 +23,7 @@ from pydantic import (
 )
 from pydantic_core.core_schema import CoreSchema, with_info_after_validator_function
 
-from firmware_py.export.boards import BOARDS, CORTEX_M4, PYTHON
+from firmware_py.export.boards import BOARDS, CORTEX_M4, C
 from ground_station.links.crazyflie_link import FlightTimes, FromFloor
 from ground_station.links.schemes import SCHEMES
 from ground_station.trajectory import Goal, Trajectory
@@ -40,7 +40,7 @@ LOCKSTEP = (RADIO, MAVLINK)  # links that are fully simulated
 REAL = "real"  # the board of a flight recorded only by its ground station
 DURATION_MAX_S = 86_400.0
 SEED_MAX = 2**62
-USUAL = {"profile": DEFAULT_PROFILE, "link": RADIO, "board": PYTHON}  # of `Request.parts`
+USUAL = {"profile": DEFAULT_PROFILE, "link": RADIO, "board": C}  # of `Request.parts`
 
 InLoop = Literal["still", "moving"] | None
 Find = Callable[
@@ -54,7 +54,7 @@ class Bench:
     """The link and the board of a flight, and how they run."""
 
     link: str = RADIO  # radio and mavlink: in lockstep; a URI: a station in another process, paced
-    board: str = PYTHON  # a runner of the flight core, the path of a complete image, or a link
+    board: str = C  # a runner of the flight core, the path of a complete image, or a link
     elf: Path | None = None  # the symbols of an image without its own
     in_loop: InLoop = None  # a real board flies by its own tasks and clock, with its servos still or moving
     gdb: int | None = None  # port on which an image waits for a debugger; 0: any
@@ -85,9 +85,9 @@ class Bench:
             raise LabError(
                 f"--hil: --board {self.board} --link {self.link}: expected the link to a real board as --board"
             )
-        if self.board != PYTHON and not self.is_image and not self.in_lockstep:
+        if self.board != C and not self.is_image and not self.in_lockstep:
             raise LabError(
-                f"--board {self.board}: --link {self.link}: only python flies over a link, and an image"
+                f"--board {self.board}: --link {self.link}: only {C} flies over a link, and an image"
             )
         if not self.in_lockstep and self.link.partition(":")[0] not in SCHEMES:
             raise LabError(
@@ -120,7 +120,7 @@ class Options(TypedDict, total=False):
     faults: Sequence[Fault | str]  # added to the experiment's own
     trajectory: Callable[[Goal, int], Trajectory]  # instead of the experiment's, like Along(path)
     link: str  # radio and mavlink: in lockstep; a URI: in real time; default: radio
-    board: str  # runner of the flight core: python, c or cortex-m4; default: python
+    board: str  # runner of the flight core: c, python or cortex-m4; default: c
     elf: Path | None
     in_loop: InLoop
     gdb: int | None

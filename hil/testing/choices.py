@@ -10,7 +10,7 @@ from itertools import product
 from typing import Any
 
 from firmware_py.config import LogicConfig
-from firmware_py.export.boards import BOARDS, PYTHON, runner_of
+from firmware_py.export.boards import BOARDS, C, runner_of
 from firmware_py.export.errors import ExportError
 from hil.config import DEFAULT_PROFILE
 from hil.errors import LabError, hint
@@ -70,7 +70,7 @@ def choices_of(marked: Marked, wanted: Wanted) -> list[Options]:
     """
     needed = tuple(board for board in marked.needs if board in BOARDS)
     seeds = tuple(range(1, wanted.seeds + 1)) or marked.seeds or (1,)
-    boards = wanted.boards or marked.boards or needed or (PYTHON,)
+    boards = wanted.boards or marked.boards or needed or (C,)
     profiles = wanted.profiles or marked.profiles or (wanted.usual_profile,)
     return [
         {"seed": seed, "board": board, "profile": profile, "link": wanted.link}
@@ -92,8 +92,8 @@ def why_not(choice: Options, needs: Iterable[str]) -> str:
     """Return why a test cannot fly its choice here, empty when it can."""
     board, link = choice["board"], choice["link"]
     in_lockstep = link in LOCKSTEP
-    if not in_lockstep and board != PYTHON:
-        return f"board {board}: --floaty-link {link}: only python flies over a link"
+    if not in_lockstep and board != C:
+        return f"board {board}: --floaty-link {link}: only {C} flies over a link"
     for need in needs:
         if need in BOARDS and need != board:
             return f"needs {need}: this flies on {board}"

@@ -77,7 +77,7 @@ class Flights:
 
     @property
     def target(self) -> str:
-        """The runner of the flight core: python, c or cortex-m4."""
+        """The runner of the flight core: c, python or cortex-m4."""
         return self.choice["board"]
 
     @checked

@@ -30,7 +30,7 @@ FIRST = pytest.StashKey[dict[str, str]]()  # the first test failed by a user's e
 ALL = pytest.StashKey[list["Item"]]()  # of this process
 MARK = (
     "floaty(seeds=20, boards=[...], profiles=[...], needs=...): choices of the fixture `floaty`. seeds: how many, or "
-    "which; boards: of python, c, cortex-m4; needs: boards, mavlink, radio or lockstep, without which the test is skipped."
+    "which; boards: of c, python, cortex-m4; needs: boards, mavlink, radio or lockstep, without which the test is skipped."
 )
 
 
@@ -38,7 +38,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("floaty", "flights in the Floaty virtual laboratory")
     group.addoption(
         "--floaty-board", action="append", default=[], metavar="BOARD[,BOARD]",
-        help="what executes the flight core: python, c, cortex-m4; overrides the marks",
+        help="what executes the flight core: c, python, cortex-m4; overrides the marks",
     )  # fmt: skip
     group.addoption(
         "--floaty-profile", action="append", default=[], metavar="NAME|FILE[,…]",

@@ -5,12 +5,11 @@ import pytest
 
 from firmware_py.config import LogicConfig, parameters_of
 from firmware_py.core.structs import POSE_INVALID, POSE_ON_TIME, POSE_TOO_OLD, Input, Parameters
-from firmware_py.core_runner import CoreBlocks, PlainRunner, RunnerFactory, default_runner
+from firmware_py.core_runner import CoreBlocks, RunnerFactory, default_runner
 from firmware_py.export.boards import BOARDS, runner_of
 from hil.config import load_config
 from support.core_streams import Recording, blocks_of, fill, record_wild, run_step
 
-PLAIN = "plain"
 RECORDING = 25  # ticks
 
 
@@ -19,11 +18,9 @@ def recording() -> Recording:
     return record_wild(7, RECORDING)
 
 
-@pytest.fixture(scope="module", params=[*BOARDS, PLAIN])
+@pytest.fixture(scope="module", params=BOARDS)
 def runner(request: pytest.FixtureRequest) -> RunnerFactory:
     """What makes a runner of each kind."""
-    if request.param == PLAIN:
-        return PlainRunner
     return runner_of(request.param, LogicConfig())
 
 

@@ -140,7 +140,7 @@ def test_the_command_of_a_request_has_all_that_differs_from_defaults() -> None:
         "floaty fly yaw-step --seed 2 --duration 0.1 --profile as-flown --set 'servo.trim=[1, 2, 3, 4]' "
         "--fault push.y@0=1 --fault push.z@0:0.05=2 --link mavlink"
     )
-    assert command_of(request_of("hover", board="c")) == "floaty fly hover --seed 1 --board c"
+    assert command_of(request_of("hover", board="python")) == "floaty fly hover --seed 1 --board python"
 
 
 def shell_words(command: str) -> list[str]:

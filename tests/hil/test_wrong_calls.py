@@ -71,7 +71,7 @@ class Call:
 
 OPTIONS: dict[str, Any] = {
     "profile": "floaty", "overrides": ["servo.trim[0]=0"], "seed": 1, "duration_s": 0.05, "link": "radio",
-    "faults": ["push.y@0"], "board": "python", "trajectory": Along(lambda t: (0.0, 0.0, 0.0)),
+    "faults": ["push.y@0"], "board": "c", "trajectory": Along(lambda t: (0.0, 0.0, 0.0)),
 }  # fmt: skip
 CALLS = (
     Call(fly, {"flown": "hover", "folder": "here", "progress": False, "report": False, "replace": False, **OPTIONS}),

@@ -18,7 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.core import entry
 from firmware_py.core.structs import POSE_INVALID, POSE_ON_TIME, Estimator, Parameters
+from firmware_py.core_runner import CoreBlocks, NativeRunner
 from ground_station.trajectory import Goal, Offsets, Sine, Square, Trajectory
+from hil.devices.board_firmware import PythonBoard
 from hil.experiments import Experiment
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
@@ -134,34 +136,37 @@ def flight() -> list[Record]:
     """Ten seconds of a flight with pushes, as the tasks on board fed the core."""
     records: list[Record] = []
     poses: list[tuple[Vector, Vector, int]] = []
-    estimate, file_pose = entry.estimate, entry.file_pose
 
-    def listen_pose(parameters, data, *others):
-        answer = file_pose(parameters, data, *others)
-        poses.append((data["pose_position"].astype(float), data["pose_quaternion"].astype(float),
-                      int(data["pose_age_us"])))  # fmt: skip
-        return answer
+    class Listening(NativeRunner):
+        def __init__(self, blocks: CoreBlocks) -> None:
+            super().__init__(blocks)
+            self.data, self.control = blocks.data.memory[0], blocks.control.memory[0]
 
-    def listen_tick(parameters, data, estimator, control, sampling, report):
-        records.append(
-            Record(poses.copy(), data["gyro_sum"].tolist(), int(data["gyro_samples"]),
-                   data["gyro_bias"].astype(float), control["command"].astype(float))
-        )  # fmt: skip
-        poses.clear()
-        estimate(parameters, data, estimator, control, sampling, report)
+        def call(self, name: str) -> int:
+            data = self.data
+            if name == "estimate":
+                command = self.control["command"].astype(float)
+                records.append(
+                    Record(poses.copy(), data["gyro_sum"].tolist(), int(data["gyro_samples"]),
+                           data["gyro_bias"].astype(float), command)
+                )  # fmt: skip
+                poses.clear()
+            answer = super().call(name)
+            if name == "file_pose":
+                poses.append((data["pose_position"].astype(float), data["pose_quaternion"].astype(float),
+                              int(data["pose_age_us"])))  # fmt: skip
+            return answer
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(entry, "file_pose", listen_pose)
-        patch.setattr(entry, "estimate", listen_tick)
-        flight = lockstep_flight(Request.of(Experiment("tour", "", 10.0, {}, tour), seed=3))
-        for at_us, force, torque in (
-            (3_000_000, (0.3, 0.0, 0.0), (0.0, 0.0, 0.003)),
-            (5_000_000, (0.0, -0.5, 0.3), (0.002, 0.0, 0.0)),
-            (7_500_000, (0.0, 0.0, -0.5), (0.0, 0.001, -0.003)),
-        ):
-            flight.events.at(at_us, lambda _, f=force, t=torque: flight.robot.body.push(f, t))
-            flight.events.at(at_us + 100_000, lambda _: flight.robot.body.push((0.0, 0.0, 0.0)))
-        assert flight.run().lost is None
+    request = Request.of(Experiment("tour", "", 10.0, {}, tour), seed=3)
+    flight = lockstep_flight(request, executor=PythonBoard(Listening))
+    for at_us, force, torque in (
+        (3_000_000, (0.3, 0.0, 0.0), (0.0, 0.0, 0.003)),
+        (5_000_000, (0.0, -0.5, 0.3), (0.002, 0.0, 0.0)),
+        (7_500_000, (0.0, 0.0, -0.5), (0.0, 0.001, -0.003)),
+    ):
+        flight.events.at(at_us, lambda _, f=force, t=torque: flight.robot.body.push(f, t))
+        flight.events.at(at_us + 100_000, lambda _: flight.robot.body.push((0.0, 0.0, 0.0)))
+    assert flight.run().lost is None
     return records
 
 

@@ -10,7 +10,7 @@ import pytest
 from firmware_py.config import parameters_of
 from firmware_py.core.budget import CALL_CYCLES
 from firmware_py.core.structs import MODE_FLY
-from firmware_py.core_runner import CoreBlocks, PlainRunner
+from firmware_py.core_runner import CoreBlocks
 from firmware_py.export.boards import BOARDS, runner_of
 from firmware_py.export.cortex_m4 import CortexM4Runner
 from firmware_py.logic.budget import CLOCK_MHZ
@@ -41,9 +41,9 @@ Make = Callable[..., CoreBlocks]
 def blocks_of(tmp_path: Path) -> Make:
     """Return the memory of a core with own logic in flight, and what executes it on a board."""
 
-    def make(text: str, board: str = "python", estimator: str = "") -> CoreBlocks:
+    def make(text: str, board: str = "c", estimator: str = "") -> CoreBlocks:
         config = own_config(tmp_path, text, estimator)
-        runner = PlainRunner if board == "plain" else runner_of(board, config.logic)
+        runner = runner_of(board, config.logic)
         blocks = CoreBlocks(parameters_of(config), runner, load_logic(config.logic))
         blocks.data.fields.mode = MODE_FLY
         return blocks
@@ -118,8 +118,8 @@ def test_loops_that_fit_alone_but_not_together_are_refused_where_the_function_be
         own_config(tmp_path, text)
 
 
-SLOW = dict.fromkeys(("python", "cortex-m4", "plain"), pytest.mark.long)  # all but c
-EVERY = [pytest.param(board, marks=SLOW.get(board, ())) for board in (*BOARDS, "plain")]
+SLOW = dict.fromkeys(("c", "cortex-m4"), pytest.mark.long)  # all but python, which compiles nothing
+EVERY = [pytest.param(board, marks=SLOW.get(board, ())) for board in BOARDS]
 # the body of the law, the function with the loop, and a value of `after` with which it does not exceed its budget
 DATA = [
     (SUM.format("own.after"), "", 3),

@@ -7,7 +7,7 @@ import pytest
 
 from firmware_py.config import parameters_of
 from firmware_py.core.structs import MODE_FLY
-from firmware_py.core_runner import CoreBlocks, PlainRunner, default_runner
+from firmware_py.core_runner import CoreBlocks, default_runner
 from firmware_py.export.boards import BOARDS, runner_of
 from firmware_py.logic.loading import load_logic
 from hil.config import LabConfig
@@ -65,10 +65,10 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> LabConfig:
     return own_config(tmp_path_factory.mktemp("matrix"), LAW)
 
 
-@pytest.mark.parametrize("board", [*BOARDS[1:], "plain"])
+@pytest.mark.parametrize("board", BOARDS[1:])
 def test_matrix_times_vector_is_equal_everywhere(config: LabConfig, board: str) -> None:
     logic = load_logic(config.logic)
-    other = PlainRunner if board == "plain" else runner_of(board, config.logic)
+    other = runner_of(board, config.logic)
     flown, beside = (CoreBlocks(parameters_of(config), runner, logic) for runner in (default_runner, other))
     rng = np.random.default_rng(3)
     for scale in (1e-20, 1e-3, 0.1, 1.0, 10.0, 1e3):

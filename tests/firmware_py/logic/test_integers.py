@@ -4,7 +4,7 @@ import pytest
 
 from firmware_py.config import parameters_of
 from firmware_py.core.structs import MODE_FLY
-from firmware_py.core_runner import CoreBlocks, PlainRunner, default_runner
+from firmware_py.core_runner import CoreBlocks
 from firmware_py.export.boards import BOARDS, runner_of
 from firmware_py.logic.loading import load_logic
 from hil.config import LabConfig
@@ -44,11 +44,10 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> LabConfig:
     return own_config(tmp_path_factory.mktemp("integers"), LAW)
 
 
-@pytest.mark.parametrize("board", [*BOARDS, "plain"])
+@pytest.mark.parametrize("board", BOARDS)
 def test_division_and_remainder_round_down_everywhere(config: LabConfig, board: str) -> None:
     logic = load_logic(config.logic)
-    kinds = {"plain": PlainRunner, "python": default_runner}
-    runner = kinds.get(board) or runner_of(board, config.logic)
+    runner = runner_of(board, config.logic)
     blocks = CoreBlocks(parameters_of(config), runner, logic)
     ring = [0] * 5
     for number in range(-13, 14):

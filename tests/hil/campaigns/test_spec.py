@@ -68,7 +68,7 @@ PUSH = HOVER + '[[faults]]\nkind = "push.y"\n'
         ),
         (HOVER.replace("hover", "hovver"), "experiment 'hovver': unknown; did you mean hover?"),
         (HOVER + 'profiles = ["flaoty"]', "did you mean floaty?"),
-        (HOVER + 'board = "cf2.elf"', "cf2.elf: no such file; expected python, c"),
+        (HOVER + 'board = "cf2.elf"', "cf2.elf: no such file; expected c, python"),
     ],
 )
 def test_a_bad_spec_is_one_line_and_exit_code_two(

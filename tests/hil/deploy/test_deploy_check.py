@@ -304,7 +304,7 @@ def test_the_core_inside_a_linked_firmware_is_checked(
     if code:
         assert "tick 0, after control: Control.count[0]" in shown
     else:
-        assert "150 ticks, numba beside cortex-m4: no bit differs" in shown
+        assert "150 ticks, c beside cortex-m4: no bit differs" in shown
 
 
 def test_c_that_does_not_compile_is_one_line_and_exit_code_two(cli: Cli) -> None:

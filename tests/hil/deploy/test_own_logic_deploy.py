@@ -37,7 +37,7 @@ def project(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 def test_all_targets_are_equal_with_own_logic(cli: Cli, project: Path) -> None:
     assert cli("deploy", "check", *SHORT, "--set", "logic.after=60") == 0
     shown = cli.out
-    assert "130 ticks, numba beside plain, c-O0, c-O2, cortex-m4: no bit differs" in shown
+    assert "130 ticks, c beside plain, c-O0, c-O2, cortex-m4: no bit differs" in shown
 
 
 @pytest.mark.long

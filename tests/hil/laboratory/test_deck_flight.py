@@ -24,7 +24,7 @@ def test_decks_without_the_firmware_that_drives_them_are_one_clear_line(tmp_path
     image = tmp_path / "cf2.elf"
     image.write_bytes(b"")
     line = r"^robot.decks = flow2: the drivers are in the Crazyflie's own firmware; --profile crazyflie --board FILE$"
-    for board in ("python", str(image)):
+    for board in ("c", str(image)):
         with pytest.raises(LabError, match=line):
             Request.of(HOVER, overrides=['robot.decks=["flow2"]'], board=board)
     Request.of(HOVER, overrides=['robot.decks=["flow2"]'], board=str(image), profile="crazyflie")

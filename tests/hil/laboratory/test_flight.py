@@ -41,7 +41,7 @@ def test_flight_without_a_recorder_keeps_what_is_noted() -> None:
     flight.close()
 
 
-@pytest.mark.parametrize("board", ["python", "c"])
+@pytest.mark.parametrize("board", ["c", "python"])
 def test_an_estimate_that_is_not_finite_fails_the_flight_and_is_reported(tmp_path: Path, board: str) -> None:
     def made(*arguments: object) -> Flight:
         flight = in_lockstep(*arguments)  # type: ignore[arg-type]

@@ -51,7 +51,7 @@ def test_every_part_of_the_request_counts() -> None:
     fly("hover", duration_s=SHORT)
     for options in (
         {"profile": "lqr"}, {"duration_s": 0.1}, {"overrides": {"controller.gain_z": 3.1}}, {"faults": ["push.y@0=1"]},
-        {"link": "mavlink"}, {"board": "c"},
+        {"link": "mavlink"}, {"board": "python"},
     ):  # fmt: skip
         request = request_of("hover", **{"duration_s": SHORT, **options})  # type: ignore[arg-type]
         assert folder_of(request) == Path("runs/hover-1-2"), options

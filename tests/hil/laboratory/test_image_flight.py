@@ -71,7 +71,7 @@ def test_an_image_with_the_app_flies_no_crazyflie(tmp_path: Path) -> None:
 @flies
 def test_the_image_answers_a_push_as_the_python_board_does(tmp_path: Path) -> None:
     binary = flown(tmp_path / "binary", 4.0, "push.y@1=1")
-    python = flown(tmp_path / "python", 4.0, "push.y@1=1", board="python")
+    python = flown(tmp_path / "python", 4.0, "push.y@1=1", board="c")
     assert binary.metrics["max_y"] == pytest.approx(python.metrics["max_y"], abs=0.01)
     ages = [
         load_log(tmp_path / board).column("estimator.pose_age_us").to_numpy()[-100:].mean()
@@ -83,7 +83,7 @@ def test_the_image_answers_a_push_as_the_python_board_does(tmp_path: Path) -> No
 @pytest.mark.long
 @flies
 def test_the_image_s_difference_from_the_python_board_is_measured(tmp_path: Path) -> None:
-    for name, board in (("python", "python"), ("binary", ELF)):
+    for name, board in (("python", "c"), ("binary", ELF)):
         flown(tmp_path / name, 1.0, board=board)
     found = two_boards(*(load_flown(tmp_path / name) for name in ("python", "binary")))
     assert found.first is not None
@@ -135,7 +135,7 @@ def test_an_image_without_the_app_is_flown_and_recorded_with_its_tasks_and_repor
     [
         (
             "no-such-board",
-            "expected python, c, cortex-m4, an image of a Crazyflie's firmware: an ELF file, or the link",
+            "expected c, python, cortex-m4, an image of a Crazyflie's firmware: an ELF file, or the link",
         ),
         (str(Path(__file__)), "not an ELF file; a .bin needs --elf FILE, the ELF that it was made of"),
     ],
@@ -159,7 +159,7 @@ def test_an_image_is_reached_over_radio_and_udp(link: str) -> None:
 
 
 def test_an_elf_beside_another_board_is_refused() -> None:
-    with pytest.raises(LabError, match=r"--elf x\.elf: goes with an image as --board, not with python"):
+    with pytest.raises(LabError, match=r"--elf x\.elf: goes with an image as --board, not with c"):
         Request.of(HOVER, elf=Path("x.elf"))
 
 

@@ -1,9 +1,6 @@
 """Flights with a controller and an estimator of the user's own, on every board; the laws that ship."""
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 from textwrap import dedent
 
@@ -94,28 +91,13 @@ def test_own_logic_s_log_is_recorded_and_drawn(failed: Result) -> None:
     assert "Own logic" in write_report(failed.folder).read_text()
 
 
-@pytest.mark.parametrize("board", ["c", pytest.param("cortex-m4", marks=pytest.mark.long)])
+@pytest.mark.parametrize("board", ["python", pytest.param("cortex-m4", marks=pytest.mark.long)])
 def test_a_flight_on_another_board_is_bit_identical(failed: Result, tmp_path: Path, board: str) -> None:
     again = hover(
         tmp_path, *failed.request.overrides, profile=failed.request.profile, duration_s=0.5, board=board
     )
     assert again.hash == failed.hash
     assert again.cause == failed.cause
-
-
-@pytest.mark.long
-def test_without_numba_the_same_text_makes_the_same_flight(failed: Result) -> None:
-    command = ("hover", "--duration", "0.01", "--profile", failed.request.profile)
-    hashes = set()
-    for plain in ("0", "1"):
-        out = failed.folder.parent / f"plain-{plain}"
-        done = subprocess.run(
-            (sys.executable, "-m", "hil.commands", "fly", *command, "--set", "flight.release_us=700000", "--out", out),
-            env=os.environ | {"NUMBA_DISABLE_JIT": plain}, cwd=ROOT, capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        assert done.returncode in (0, 1), done.stderr
-        hashes.add(json.loads((out / "result.json").read_text())["hash"])
-    assert len(hashes) == 1
 
 
 @pytest.mark.long

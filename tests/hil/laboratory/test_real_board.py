@@ -55,7 +55,7 @@ def test_a_flight_on_a_board_has_the_hash_of_python(
 def test_experiments_are_equal_at_loss(plugged: Plug, library: Path, tmp_path: Path, experiment: str) -> None:
     plugged(library).mess = 0.1
     hashes = []
-    for board in ("python", URI):
+    for board in ("c", URI):
         hashes.append(fly(Request.of(find_experiment(experiment), board=board), tmp_path / "run").hash)
     assert hashes[0] == hashes[1]
 
@@ -101,7 +101,7 @@ def test_the_check_compares_a_board_and_prints_measurements(cli: Cli, plugged: P
     arguments = ("deploy", "check", "hover", "--duration", "0.3", "--targets", URI)
     assert cli(*arguments) == 0
     printed = " ".join(cli.out.split())
-    assert f"130 ticks, numba beside {URI}: no bit differs" in printed
+    assert f"130 ticks, c beside {URI}: no bit differs" in printed
     assert f"{URI}: cycles per call, mean and worst, as measured on the board" in printed
     assert "estimate 130 calls 1234 1234" in printed
 
@@ -138,7 +138,7 @@ def test_a_check_whose_board_falls_silent_fails_in_one_line(
         (("fly", "hover", "--board", URI), f"floaty: --board {URI}: silent for 3 s"),
         (("fly", "hover", "--board", URI, "--seeds", "2"), "--seeds 2: a real board is in one flight at a time"),
         (("fly", "hover", "--board", "udp:nonsense"), "or the link to a real board"),
-        (("fly", "hover", "--board", URI, "--link", "radio://0/80/2M"), "only python flies over a link"),
+        (("fly", "hover", "--board", URI, "--link", "radio://0/80/2M"), "only c flies over a link"),
         (("deploy", "check", "--targets", URI), f"floaty: {URI}: silent for 3 s"),
         (("deploy", "check", "--targets", "udp"), "and no link to a board"),
     ],

@@ -490,7 +490,7 @@ def test_processor_time_of_a_real_board_cannot_be_taken(app: App) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--hil",), "--hil: --board python --link radio: expected the link to a real board as --board"),
+        (("--hil",), "--hil: --board c --link radio: expected the link to a real board as --board"),
         (("--hil", "--board", URI, "--link", "mavlink"), "expected the link to a real board as --board"),
         (("--hil", "shaking", "--board", URI), "'shaking' is not one of 'still', 'moving'"),
         (("--hil", "--board", URI, "--seeds", "2"), "--seeds 2: a real board is in one flight at a time"),

@@ -40,7 +40,7 @@ def test_the_profile_cad_has_the_plate_model_on_board() -> None:
         (["--profile", "crazyflie"], "not for the Crazyflie's own firmware"),
         (["--out", "gains.txt"], "--out gains.txt: a profile's name ends in .toml"),
         (["--repeat", "0"], "--repeat"),
-        (["--board", "abacus"], "--board abacus: no such file; expected python"),
+        (["--board", "abacus"], "--board abacus: no such file; expected c, python"),
         (["--runs", "/proc/floaty"], "--runs /proc/floaty: cannot be written"),
     ],
 )

@@ -19,8 +19,8 @@ from support.choices import choice
 def test_a_name_tells_only_what_differs_between_the_choices() -> None:
     two = [choice(1), choice(2)]
     assert [name_of(one, two) for one in two] == ["seed1", "seed2"]
-    boards = [choice(1, "python"), choice(1, "c")]
-    assert [name_of(one, boards) for one in boards] == ["python", "c"]
+    boards = [choice(1, "c"), choice(1, "python")]
+    assert [name_of(one, boards) for one in boards] == ["c", "python"]
     assert name_of(choice(), [choice()]) == ""
 
 

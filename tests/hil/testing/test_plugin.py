@@ -103,7 +103,7 @@ def test_a_failure_shows_limit_value_folder_picture_and_the_command_that_flies_i
     shown = result.stdout.str().partition("floaty flights")[2]
     value = re.search(r"limit +rms_x = (\S+) cm \(limit <= 1e-07 cm\)", shown)
     assert value is not None
-    assert "hover, seed 3, board python, profile " in shown
+    assert "hover, seed 3, board c, profile " in shown
     assert "fault    push.y@0.1=0.2" in shown
     (folder,) = re.findall(r"folder +(\S+)", shown)
     (picture,) = re.findall(r"picture +(\S+)", shown)
@@ -234,7 +234,7 @@ def test_flights_take_what_the_mark_says_and_options_go_before_it(pytester: pyte
         ({}, Wanted(), [choice()]),
         ({"seeds": 2}, Wanted(), [choice(1), choice(2)]),
         ({"seeds": [5, 3]}, Wanted(), [choice(5), choice(3)]),
-        ({"seeds": 20, "boards": ["c"]}, Wanted(1, ("python", "c")), [choice(1), choice(1, "c")]),
+        ({"seeds": 20, "boards": ["c"]}, Wanted(1, ("c", "python")), [choice(1), choice(1, "python")]),
         ({"needs": "cortex-m4"}, Wanted(), [choice(1, "cortex-m4")]),
         ({"needs": ["lockstep"]}, Wanted(link="udp://x:1"), [choice(link="udp://x:1")]),
         ({}, Wanted(usual_profile="as-flown"), [choice(profile="as-flown")]),
@@ -268,25 +268,25 @@ def test_paths_start_at_the_root_folder_and_ini_names_the_profile(pytester: pyte
 
 def test_an_absent_board_is_skipped(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
     def runner_of(board: str, logic: object) -> None:
-        if board != "python":
+        if board != "c":
             raise ExportError("no C compiler on this machine")
 
     monkeypatch.setattr(choices, "runner_of", runner_of)
     pytester.makepyfile("""
         import pytest
 
-        @pytest.mark.floaty(boards=["python", "c", "cortex-m4"])
+        @pytest.mark.floaty(boards=["c", "python", "cortex-m4"])
         def test_it(floaty):
-            assert floaty.target == "python"
+            assert floaty.target == "c"
 
         def test_in_the_middle(floaty):
-            floaty.fly(board="c")
+            floaty.fly(board="python")
         """)
     result = pytester.runpytest_inprocess()
     result.assert_outcomes(passed=1, skipped=3)
     result.stdout.fnmatch_lines(
         [
-            "floaty: 2 not flown: board c is not available here: no C compiler on this machine",
+            "floaty: 2 not flown: board python is not available here: no C compiler on this machine",
             "floaty: 1 not flown: board cortex-m4 is not available here: no C compiler on this machine",
         ]
     )
@@ -297,9 +297,9 @@ def test_an_absent_board_is_skipped(pytester: pytest.Pytester, monkeypatch: pyte
     [
         (choice(), (), ""),
         (choice(), ("lockstep", "mavlink", "radio"), ""),
-        (choice(), ("cortex-m4",), "needs cortex-m4: this flies on python"),
+        (choice(), ("cortex-m4",), "needs cortex-m4: this flies on c"),
         (choice(link="udp://127.0.0.1:1"), ("lockstep",), "needs lockstep: this flies over udp://127.0.0.1:1"),
-        (choice(board="c", link="udp://127.0.0.1:1"), (), "board c: --floaty-link udp://127.0.0.1:1: only python flies"),
+        (choice(board="python", link="udp://127.0.0.1:1"), (), "board python: --floaty-link udp://127.0.0.1:1: only c"),
     ],
 )  # fmt: skip
 def test_a_test_s_needs_decide_whether_it_flies(chosen: Options, needs: tuple[str, ...], told: str) -> None:
@@ -319,8 +319,8 @@ def test_a_package_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -
         ({"sedes": 2}, "sedes: did you mean seeds?"),
         ({"colour": 2}, "colour: there are seeds, boards, profiles, needs"),
         ({"seeds": 0}, "seeds = 0: expected 1 or more"),
-        ({"boards": ["arm"]}, "boards = 'arm': expected python, c, cortex-m4"),
-        ({"needs": "wings"}, "needs = 'wings': expected python, c, cortex-m4, mavlink, radio, lockstep"),
+        ({"boards": ["arm"]}, "boards = 'arm': expected c, python, cortex-m4"),
+        ({"needs": "wings"}, "needs = 'wings': expected c, python, cortex-m4, mavlink, radio, lockstep"),
     ],
 )
 def test_a_mark_that_cannot_be_is_one_line(words: dict[str, object], told: str) -> None:
@@ -340,7 +340,7 @@ def test_a_wrong_mark_fails_the_collection_in_one_line(pytester: pytest.Pytester
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (["--floaty-board=arm"], "--floaty-board arm: expected python, c, cortex-m4"),
+        (["--floaty-board=arm"], "--floaty-board arm: expected c, python, cortex-m4"),
         (["--floaty-seeds=-1"], "--floaty-seeds -1: expected 1 or more"),
         (["--floaty-keep=some"], "invalid choice: 'some'"),
         (["--floaty-link=udp://127.0.0.1:1", "-n2"], "flights in real time fly one at a time; omit -n"),

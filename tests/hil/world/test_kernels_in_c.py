@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.compiling import bound_in
+from firmware_py.compiling import METHOD_IN_C, bound_in
 from firmware_py.core.subset import Block, F64s
 from firmware_py.export.compilers import Compiler, compilers
 from firmware_py.export.kernels import build, translate
@@ -80,7 +80,7 @@ def test_steps_from_any_state_have_the_bits_of_python(
     rng = np.random.default_rng(2026)
     in_c, in_python = allocate(), allocate()
     arrays = tuple(record_of(one) for one in in_c)
-    call, function = bound_in(build(translate(kernel, arrays), compiler), *arrays), plain(kernel)
+    call, function = bound_in(build(translate(kernel, arrays), compiler), METHOD_IN_C, *arrays), plain(kernel)
     for _ in range(STATES):
         draw(rng, in_c)
         before = bytes_of(in_c)
