@@ -3,8 +3,7 @@
 They follow `firmware_py/core/observation.py`, computed from the log by the board's own function.
 """
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,9 +11,11 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from firmware_py.compiling import bound
 from firmware_py.config import FirmwareConfig, parameters_of
 from firmware_py.core.observation import ACTIONS, OBSERVATIONS, observe
-from firmware_py.core.structs import Estimator
+from firmware_py.core.structs import Estimator, Parameters
+from firmware_py.core.subset import Block, F32s
 from firmware_py.wire.supervisor import State
 from hil.world.fixed_order import compiled
 
@@ -34,11 +35,16 @@ class Demonstrations:
 
 
 @compiled
-def observe_rows(parameters: Any, estimator: Any, states: Rows, previous: Rows, out: Rows) -> None:
-    """Write the observation of every row."""
-    for n in range(len(states)):
-        estimator.now[:] = states[n]
-        observe(parameters, estimator, previous[n], out[n])
+def observe_board(parameters: Parameters, estimator: Estimator, previous: F32s, out: F32s) -> None:
+    """Write the observation from the memory of a board's core."""
+    observe(parameters, estimator, previous, out)
+
+
+def observer(
+    parameters: Block[Parameters], estimator: Block[Estimator], previous: Rows, out: Rows
+) -> Callable[[], object]:
+    """Return what writes the observation `out` (20,) of a board after its `previous` action (4,)."""
+    return bound(observe_board, parameters.arg, estimator.arg, previous, out)
 
 
 def demonstrations_of(log: pa.Table, config: FirmwareConfig) -> Demonstrations:
@@ -50,8 +56,12 @@ def demonstrations_of(log: pa.Table, config: FirmwareConfig) -> Demonstrations:
     states = np.stack([columns[name] for name in STATE], axis=1).astype(np.float32)
     inputs = np.stack([columns[name] for name in INPUTS], axis=1)
     actions = np.clip(inputs / limits, -1.0, 1.0).astype(np.float32)
-    previous = np.concatenate([np.zeros((1, ACTIONS), np.float32), actions[:-1]])[: len(actions)]
-    observations = np.zeros((len(states), OBSERVATIONS), np.float32)
-    observe_rows(parameters.arg, Estimator.allocate().arg, states, previous, observations)
+    previous, estimator = np.zeros(ACTIONS, np.float32), Estimator.allocate()
+    observations, seen = np.zeros((len(states), OBSERVATIONS), np.float32), np.zeros(OBSERVATIONS, np.float32)
+    see = observer(parameters, estimator, previous, seen)
+    for state, action, observation in zip(states, actions, observations, strict=True):
+        estimator.fields.now[:] = state
+        see()
+        observation[:], previous[:] = seen, action
     closed = columns["supervisor.state"] == State.FLYING
     return Demonstrations(columns["t"][closed], observations[closed], actions[closed])

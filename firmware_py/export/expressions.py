@@ -8,6 +8,7 @@ calls inside an expression open.
 import ast
 import operator
 from dataclasses import dataclass
+from typing import ClassVar
 
 from firmware_py.export.errors import ExportError, refusal
 from firmware_py.export.hints import CONSTRUCTS, FUNCTIONS, instead
@@ -50,7 +51,8 @@ class Value:
 class Expressions:
     """Prints the expressions of one kernel; `names` holds the types of what is in scope."""
 
-    FLOAT, INTEGER = F32, I32
+    INTEGER = I32
+    NUMBERS: ClassVar[tuple[ValueType, ...]] = (F32, I32)
 
     def __init__(self, kernel: Signature) -> None:
         self.kernel = kernel
@@ -190,10 +192,10 @@ class Expressions:
     def _binary(self, node: ast.BinOp) -> Value:
         left, right = self._alike(self.value(node.left), self.value(node.right))
         name = type(node.op).__name__
-        if left.kind != right.kind or left.kind not in (self.FLOAT, self.INTEGER):
+        if left.kind != right.kind or left.kind not in self.NUMBERS:
             hint = instead(CONSTRUCTS, name) or mixed(left.kind, right.kind)
             raise self.refuse(node, f"{name} of {describe(left.kind)} and {describe(right.kind)}{hint}")
-        operators = FLOAT_OPERATORS if left.kind == self.FLOAT else INTEGER_OPERATORS
+        operators = INTEGER_OPERATORS if left.kind == self.INTEGER else FLOAT_OPERATORS
         if type(node.op) not in operators:
             raise self.refuse(node, f"{name} of {describe(left.kind)}{instead(CONSTRUCTS, name)}")
         if self.rounds_down and isinstance(node.op, ast.FloorDiv | ast.Mod):
@@ -220,7 +222,7 @@ class Expressions:
         operand = self.value(node.operand)
         if isinstance(node.op, ast.Not) and operand.kind == BOOL:
             return Value(f"!{operand.within(PRIMARY)}", BOOL, UNARY)
-        if isinstance(node.op, ast.USub) and operand.kind in (self.FLOAT, self.INTEGER):
+        if isinstance(node.op, ast.USub) and operand.kind in self.NUMBERS:
             return Value(f"-{operand.within(PRIMARY)}", operand.kind, UNARY)
         raise self.refuse(node, f"{type(node.op).__name__} of {describe(operand.kind)}")
 
@@ -229,7 +231,7 @@ class Expressions:
             hint = instead(CONSTRUCTS, type(node if len(node.ops) > 1 else node.ops[0]).__name__)
             raise self.refuse(node, f"comparison {ast.unparse(node)}{hint}")
         left, right = self._alike(self.value(node.left), self.value(node.comparators[0]))
-        if left.kind != right.kind or left.kind not in (self.FLOAT, self.INTEGER):
+        if left.kind != right.kind or left.kind not in self.NUMBERS:
             raise self.refuse(
                 node,
                 f"comparison of {describe(left.kind)} and {describe(right.kind)}{mixed(left.kind, right.kind)}",

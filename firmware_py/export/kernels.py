@@ -16,9 +16,9 @@ from firmware_py.compiling import METHOD_IN_C, Arrays
 from firmware_py.export.c99 import CHECK, struct_definition
 from firmware_py.export.compilers import Compiler, by_first_that_works, compile_texts
 from firmware_py.export.errors import ExportError
-from firmware_py.export.functions import block_comment, constant_definition
+from firmware_py.export.functions import FunctionPrinter, block_comment, constant_definition
 from firmware_py.export.live_printing import HELPERS, LivePrinter
-from firmware_py.export.live_reading import Kernels, read_kernels
+from firmware_py.export.live_reading import Kernels, LiveModule, read_kernels
 from firmware_py.export.methods import PROTOTYPES, method
 from firmware_py.export.syntax import BOOL, I64, VOID, Constant
 
@@ -50,7 +50,8 @@ def translate(function: Callable[..., Any], arrays: Arrays) -> str:
     used: dict[str, Constant] = {}
     for kernel in reversed(kernels):  # callers first: they show the shapes of array arguments
         if kernel.c_name in reached:
-            printer = LivePrinter(kernel)
+            assert isinstance(kernel.scope, LiveModule)
+            printer = FunctionPrinter(kernel) if kernel.scope.core else LivePrinter(kernel)
             printed[kernel.c_name] = printer.text()
             used |= {one.c_name: one for one in printer.constants}
     return "".join(

@@ -1,7 +1,8 @@
 """Prints the laboratory's kernels as C: what they may do beyond the core's subset.
 
 They compute in `double`, with integers of 64 bits, and call `math`, `min` and `max`; an integer next to a float becomes a
-float, as in Python. Locals may get their first value in any block, and a tuple on the left takes one on the right.
+float, as in Python, and `float` meets `double` through `f32(..)` and `f64(..)` only. Locals may get their first value in any
+block, and a tuple on the left takes one on the right.
 """
 
 import ast
@@ -10,11 +11,11 @@ import math
 from types import ModuleType
 from typing import Any, ClassVar
 
-from firmware_py.core.subset import f64, i32
+from firmware_py.core.subset import f32, f64, i32
 from firmware_py.export.expressions import OR, UNARY, Expressions, Value, describe
 from firmware_py.export.functions import C_TYPES, FunctionPrinter, declare
 from firmware_py.export.live_reading import LiveModule, double_literal
-from firmware_py.export.syntax import BOOL, F64, I32, I64, Signature, ValueType
+from firmware_py.export.syntax import BOOL, F32, F64, I32, I64, Signature, ValueType
 
 CHOICE = 1
 # Exact or correctly rounded: name in C, kinds of the arguments, of the result.
@@ -48,7 +49,7 @@ __attribute__((unused)) static inline double ldexp_of(double x, int64_t doubling
 class LiveExpressions(Expressions):
     """Prints the expressions of a kernel of the laboratory."""
 
-    FLOAT, INTEGER = F64, I64
+    INTEGER, NUMBERS = I64, (F64, F32, I64)
 
     def __init__(self, kernel: Signature) -> None:
         super().__init__(kernel)
@@ -119,7 +120,7 @@ class LiveExpressions(Expressions):
         meant = self._meant(node.func)
         if node.keywords or meant is None:
             raise self.refuse(node, f"call {ast.unparse(node)}")
-        if meant in (f64, int, i32, bool) and len(node.args) == 1:
+        if meant in (f64, f32, int, i32, bool) and len(node.args) == 1:
             return self._converted(node, meant)
         if meant in FUNCTIONS and len(node.args) == len(FUNCTIONS[meant][1]):
             name, kinds, result = FUNCTIONS[meant]
@@ -132,8 +133,11 @@ class LiveExpressions(Expressions):
         value = self.value(node.args[0])
         if target is f64 and value.kind in (F64, I64):
             return self.as_float(value)
-        if target is bool and value.kind == BOOL:
+        if (target, value.kind) in ((bool, BOOL), (f32, F32)):
             return value
+        if (target, value.kind) in ((f64, F32), (f32, F64)):
+            c_type, kind = ("double", F64) if target is f64 else ("float", F32)
+            return Value(f"({c_type}){value.within(UNARY)}", kind, UNARY)
         if target in (int, i32) and value.kind in (F64, I64, BOOL):
             c_type = "int32_t" if target is i32 else "int64_t"
             return Value(f"({c_type}){value.within(UNARY)}", I64, UNARY)

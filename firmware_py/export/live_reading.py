@@ -2,7 +2,8 @@
 
 The core's reader only parses text, because users' own logic goes through it. These kernels are parts of the laboratory and
 imported already: a name means what it means to Python, in the globals of the function. So a struct is its dtype, and a
-constant its value. Numbers are `f64` and integers; an integer is 64 bits wide everywhere but in memory.
+constant its value. Numbers are `f64` and integers; an integer is 64 bits wide everywhere but in memory. They may call the
+core's kernels, which keep the core's types.
 """
 
 import ast
@@ -16,14 +17,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.core.subset import F64s, I32s, Integer, Struct, f64, i32
+from firmware_py.core import subset
+from firmware_py.core.subset import F32s, F64s, I32s, Integer, Struct, f32, f64, i32
 from firmware_py.export.errors import ExportError, refusal
+from firmware_py.export.literals import literal
 from firmware_py.export.locals import find_writes
 from firmware_py.export.reading import read_comments
 from firmware_py.export.syntax import (
     BOOL,
+    F32,
     F64,
+    I32,
     I64,
+    PACKAGE,
     VOID,
     Constant,
     Module,
@@ -34,10 +40,10 @@ from firmware_py.export.syntax import (
 )
 
 ARGUMENTS: tuple[tuple[Any, ValueType], ...] = (
-    (f64, F64), (int, I64), (i32, I64), (Integer, I64), (bool, BOOL),
-    (F64s, ValueType("f64", 1)), (I32s, ValueType("i32", 1)),
+    (f64, F64), (f32, F32), (int, I64), (i32, I64), (Integer, I64), (bool, BOOL),
+    (F64s, ValueType("f64", 1)), (F32s, ValueType("f32", 1)), (I32s, ValueType("i32", 1)),
 )  # fmt: skip
-ELEMENTS = {np.dtype(f64): "f64", np.dtype(i32): "i32"}
+ELEMENTS = {np.dtype(f64): "f64", np.dtype(f32): "f32", np.dtype(i32): "i32"}
 
 
 @dataclass(slots=True)
@@ -46,6 +52,11 @@ class LiveModule(Module):
 
     live: Mapping[str, Any] = field(default_factory=dict)
     functions: Mapping[int, ast.FunctionDef] = field(default_factory=dict)
+
+    @property
+    def core(self) -> bool:
+        """Whether this is a module of the flight core."""
+        return str(self.live["__name__"]).startswith(f"{PACKAGE}.")
 
 
 @dataclass(slots=True)
@@ -118,6 +129,7 @@ class _Reader:
             name = function.__module__.replace(".", "_")
             doc = ast.get_docstring(tree) or ""
             module = LiveModule(name, path, doc, live=function.__globals__, functions=functions)
+            module.builtins = {key for key, thing in module.live.items() if vars(subset).get(key) is thing}
             read_comments(module, text)
             self._modules[path] = module
         return self._modules[path]
@@ -125,12 +137,12 @@ class _Reader:
     def _define(self, module: LiveModule, name: str) -> None:
         """Give a kernel or a constant that a name means to the module."""
         thing = module.live.get(name)
-        if name in module.names or thing is None:
+        if name in module.names or name in module.builtins or thing is None:
             return
         function = inspect.unwrap(thing) if callable(thing) else None
         if isinstance(function, FunctionType):
             module.names[name] = self.kernel(function)
-        elif constant := _constant(f"{module.name}_{name}", thing):
+        elif constant := _constant(f"{module.name}_{name}", thing, I32 if module.core else I64):
             module.names[name] = constant
             module.defined.append(constant)
 
@@ -140,7 +152,7 @@ class _Reader:
             return ValueType(struct.name, struct=struct)
         for known, kind in ARGUMENTS:
             if annotation == known:
-                return kind
+                return I32 if module.core and kind == I64 else kind
         raise refusal(module.path, node, f"{annotation!r} has no equal in C")
 
     def _struct(self, struct: type[Struct]) -> StructType:
@@ -167,12 +179,14 @@ def _names(node: ast.FunctionDef) -> Iterator[str]:
                 yield part.id
 
 
-def _constant(c_name: str, value: object) -> Constant | None:
+def _constant(c_name: str, value: object, integer: ValueType) -> Constant | None:
     """Return a number, or numbers in a row, as a constant of C; None for anything else."""
     if isinstance(value, bool):
         return None
     if isinstance(value, int):
-        return Constant(c_name, I64, str(int(value)), "", False)
+        return Constant(c_name, integer, str(int(value)), "", False)
+    if isinstance(value, np.float32):
+        return Constant(c_name, F32, literal(value), "", False)
     if isinstance(value, float):
         return Constant(c_name, F64, double_literal(value), "", False)
     if isinstance(value, tuple) and value and all(isinstance(one, float) for one in value):

@@ -7,7 +7,7 @@ ends when the robot is lost (terminated) or after `duration_s` (truncated).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -22,12 +22,14 @@ from numpy.typing import NDArray
 
 from firmware_py.core.observation import ACTIONS, OBSERVATIONS
 from firmware_py.core_runner import CoreBlocks, CoreRunner, default_runner
+from firmware_py.elementary import atan2
 from firmware_py.geometry import rotation_matrix, to_euler_zyx, wrap_angle
 from ground_station.trajectory import Goal, Offsets, Sine, Trajectory
 from hil.arguments import checked, shown
 from hil.campaigns.config import find_spec, read_spec
 from hil.campaigns.sampling import draw
 from hil.config import DEFAULT_PROFILE, Overrides, load_config, settings_of
+from hil.demonstrations import observer
 from hil.devices.board_firmware import PythonBoard
 from hil.errors import LabError
 from hil.floaty.plant import Plant
@@ -37,7 +39,8 @@ from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
 from hil.learn import batch, law
-from hil.learn.tasks import AXES, PUSH_KINDS, PUSH_S, Episode, EpisodeTask, draw_episode, find_task
+from hil.learn.agent import DELAY_MAX
+from hil.learn.tasks import AXES, PUSH_KINDS, PUSH_S, Episode, EpisodeTask, draw_episode, find_task, reward_of
 from hil.world.structs import FloatyBlocks
 
 Fidelity = Literal["fast", "firmware"]
@@ -68,9 +71,9 @@ class Setup:
     def __post_init__(self) -> None:
         if not 0.0 < self.duration_s <= 3600.0:
             raise LabError(f"duration_s = {self.duration_s!r}: expected seconds, above 0 and up to 3600")
-        if not 0 <= self.pose_delay_us <= batch.DELAY_MAX * batch.CONTROL_US:
+        if not 0 <= self.pose_delay_us <= DELAY_MAX * batch.CONTROL_US:
             raise LabError(
-                f"pose_delay_us = {self.pose_delay_us!r}: expected 0..{batch.DELAY_MAX * batch.CONTROL_US}"
+                f"pose_delay_us = {self.pose_delay_us!r}: expected 0..{DELAY_MAX * batch.CONTROL_US}"
             )
         if self.robot_count < 1:
             raise LabError(f"robot_count = {self.robot_count!r}: expected 1 or more")
@@ -132,8 +135,7 @@ class FastVectorEnv(VectorEnv[batch.Actions, batch.Actions, NDArray[Any]]):
         self.action_space = batch_space(ACTION_SPACE, num_envs)
         self._task, self._setup = task, setup
         self._fleet = fleet_of(setup, num_envs)
-        self._observations = np.zeros((num_envs, OBSERVATIONS), np.float32)
-        self._rewards, self._steps = np.zeros(num_envs), np.zeros(num_envs, np.int64)
+        self._steps = np.zeros(num_envs, np.int64)
         self._streams: list[np.random.Generator] = []
 
     def reset(
@@ -146,29 +148,30 @@ class FastVectorEnv(VectorEnv[batch.Actions, batch.Actions, NDArray[Any]]):
             self.np_random = self._streams[0].spawn(1)[0]  # for common draws
         for n in range(self.num_envs):
             self._begin(n)
-        return self._observations.copy(), {}
+        return self._fleet.observations.copy(), {}
 
     def step(
         self, actions: batch.Actions
     ) -> tuple[batch.Actions, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Info]:
         """Advance all robots by 10 ms."""
         limited = _checked(actions, self.num_envs)
-        self._fleet.advance(limited, self.np_random, self._observations, self._rewards)
-        np.clip(self._observations, -REACH, REACH, out=self._observations)
+        self._fleet.advance(limited, self.np_random)
+        observations = np.clip(self._fleet.observations, -REACH, REACH)
         self._steps += 1
         lost = self._fleet.lost
         late = (self._steps >= self._setup.steps) & ~lost
         info: Info = {}
         if (over := lost | late).any():
-            info = {"final_obs": self._observations.copy(), "_final_obs": over}
+            info = {"final_obs": observations.copy(), "_final_obs": over}
             for n in np.flatnonzero(over):
                 self._begin(int(n))
-        return self._observations.copy(), self._rewards.copy(), lost, late, info
+            observations[over] = self._fleet.observations[over]
+        return observations, self._fleet.rewards.copy(), lost, late, info
 
     def _begin(self, n: int) -> None:
         rng = self._streams[n]
         episode = draw_episode(self._task, rng, self._setup.duration_s)
-        self._fleet.begin(n, episode, rng, self._observations[n])
+        self._fleet.begin(n, episode, rng)
         self._steps[n] = 0
 
 
@@ -179,22 +182,22 @@ class FastEnv(gymnasium.Env[batch.Actions, batch.Actions]):
         self.observation_space, self.action_space = OBSERVATION_SPACE, ACTION_SPACE
         self._task, self._setup = task, setup
         self._fleet = fleet_of(setup, 1)
-        self._observation, self._reward = np.zeros((1, OBSERVATIONS), np.float32), np.zeros(1)
         self._steps = 0
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[batch.Actions, Info]:
         super().reset(seed=seed)
         episode = draw_episode(self._task, self.np_random, self._setup.duration_s)
-        self._fleet.begin(0, episode, self.np_random, self._observation[0])
+        self._fleet.begin(0, episode, self.np_random)
         self._steps = 0
-        return self._observation[0].copy(), {}
+        return self._fleet.observations[0].copy(), {}
 
     def step(self, action: batch.Actions) -> tuple[batch.Actions, float, bool, bool, Info]:
         limited = _checked(action, 1)
-        self._fleet.advance(limited, self.np_random, self._observation, self._reward)
+        self._fleet.advance(limited, self.np_random)
         self._steps += 1
         lost, late = bool(self._fleet.lost[0]), self._steps >= self._setup.steps
-        return np.clip(self._observation[0], -REACH, REACH), float(self._reward[0]), lost, late, {}
+        seen, reward = self._fleet.observations[0], float(self._fleet.rewards[0])
+        return np.clip(seen, -REACH, REACH), reward, lost, late, {}
 
     @property
     def truth(self) -> FloatyBlocks:
@@ -216,7 +219,8 @@ class FirmwareEnv(gymnasium.Env[batch.Actions, batch.Actions]):
         self.observation_space, self.action_space = OBSERVATION_SPACE, ACTION_SPACE
         self._task, self._setup = task, setup
         self._robots = setup.settings()
-        self._previous = np.zeros(ACTIONS, np.float32)
+        self._previous, self._observation = np.zeros(ACTIONS, np.float32), np.zeros(OBSERVATIONS, np.float32)
+        self._see: Callable[[], object]
         self._blocks: CoreBlocks | None = None
         self.flight: Flight | None = None
 
@@ -245,9 +249,10 @@ class FirmwareEnv(gymnasium.Env[batch.Actions, batch.Actions]):
         body, goal = flight.robot.body, flight.line.trajectory.at(flight.now_us)
         flight.robot.look(flight.now_us)
         distance = math.dist(body.p_WB.tolist(), goal.p_WG)
-        up_B = rotation_matrix(tuple(body.q_WB.tolist()))[2].tolist()
+        x, y, z = rotation_matrix(tuple(body.q_WB.tolist()))[2].tolist()
         yaw = to_euler_zyx(tuple(body.q_WB.tolist()))[2]
-        reward = batch.reward_of(distance, batch.tilt_of(*up_B), wrap_angle(yaw - goal.yaw), change)
+        tilt = atan2(math.sqrt(x * x + y * y), z)
+        reward = reward_of(distance, tilt, wrap_angle(yaw - goal.yaw), change)
         over = flight.now_us - flight.release_us >= (self._setup.steps - 0.5) * batch.CONTROL_US
         return self._observe(), reward, body.lost is not None, over, {}
 
@@ -262,13 +267,12 @@ class FirmwareEnv(gymnasium.Env[batch.Actions, batch.Actions]):
         self.flight.lab.run()
 
     def _observe(self) -> batch.Actions:
-        assert self._blocks is not None
-        out = np.zeros(OBSERVATIONS, np.float32)
-        batch.observe_board(self._blocks.parameters.arg, self._blocks.estimator.arg, self._previous, out)
-        return np.clip(out, -REACH, REACH)
+        self._see()
+        return np.clip(self._observation, -REACH, REACH)
 
     def _runner(self, blocks: CoreBlocks) -> CoreRunner:
         self._blocks = blocks
+        self._see = observer(blocks.parameters, blocks.estimator, self._previous, self._observation)
         return default_runner(blocks)
 
     def _request(self, episode: Episode, seed: int) -> Request:

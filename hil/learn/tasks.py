@@ -3,8 +3,6 @@
 A seed draws the same episodes in both fidelities. Lengths in m, angles in rad, times in s from the release.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -63,6 +61,17 @@ def find_task(name: str) -> EpisodeTask:
     if name not in TASKS:
         raise LabError(f"task {name!r}: unknown; {hint(name, list(TASKS))}")
     return TASKS[name]
+
+
+def reward_of(distance: float, tilt: float, yaw_error: float, change: float) -> float:
+    """Return the reward of a step, -0.08..1.
+
+    `distance` from the goal [m], `tilt` [rad], `yaw_error` [rad], and the sum of the squared changes of the action.
+    """
+    near = 1.0 / (1.0 + (distance / 0.03) * (distance / 0.03))
+    level = 1.0 / (1.0 + (tilt / 0.15) * (tilt / 0.15))
+    turned = 1.0 / (1.0 + (yaw_error / 0.2) * (yaw_error / 0.2))
+    return 0.6 * near + 0.2 * level + 0.2 * turned - 0.005 * change
 
 
 def draw_episode(task: EpisodeTask, rng: np.random.Generator, duration_s: float) -> Episode:

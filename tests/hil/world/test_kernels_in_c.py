@@ -1,17 +1,30 @@
-"""The world compiled as C computes the bits of its Python, with every compiler."""
+"""World, fast model and observation compiled as C compute the bits of their Python, with every compiler."""
 
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+<<<<<<< HEAD
 from firmware_py.compiling import METHOD_IN_C, bound_in
 from firmware_py.core.subset import Block, F64s
+||||||| parent of f0cbf61 (Fly the fast model of learning as C)
+from firmware_py.compiling import bound_in
+from firmware_py.core.subset import Block, F64s
+=======
+from firmware_py.compiling import bound_in
+from firmware_py.core.structs import Control, Estimator, Parameters
+from firmware_py.core.subset import Block
+>>>>>>> f0cbf61 (Fly the fast model of learning as C)
 from firmware_py.export.compilers import Compiler, compilers
 from firmware_py.export.kernels import build, translate
+from hil import demonstrations
 from hil.crazyflie import quadrotor
 from hil.devices import imu
+from hil.learn import agent
+from hil.learn.tasks import PUSH_KINDS, PUSHES
 from hil.world import motion
 from hil.world.structs import GUSTS, NOISE_ROWS, Air, Flaps, Rigid
 from support.plain_kernels import plain
@@ -19,7 +32,7 @@ from support.plain_kernels import plain
 COMPILERS = [one for one in compilers() if one.name != "cc"]
 STATES = 40
 FEW_ROWS = 8
-Memory = list[Block[Any] | F64s]
+Memory = list[Block[Any] | NDArray[Any]]
 
 
 def floaty() -> Memory:
@@ -34,7 +47,16 @@ def sensor() -> Memory:
     return [imu.Imu.allocate(), np.zeros(3), np.zeros(3), np.zeros(2), np.zeros((imu.NOISE_ROWS, 6))]
 
 
-def record_of(memory: Block[Any] | F64s) -> Any:
+def learner() -> Memory:
+    own = [agent.Agent.allocate(), agent.Sensing.allocate(), np.zeros((1, agent.DRAWS))]
+    return [*floaty()[:3], *own, Parameters.allocate(), Estimator.allocate(), Control.allocate()]
+
+
+def board() -> Memory:
+    return [Parameters.allocate(), Estimator.allocate(), np.zeros(4, np.float32), np.zeros(20, np.float32)]
+
+
+def record_of(memory: Block[Any] | NDArray[Any]) -> Any:
     return memory.memory[0] if isinstance(memory, Block) else memory
 
 
@@ -57,6 +79,8 @@ def draw(rng: np.random.Generator, memory: Memory) -> None:
         if one.kind is Rigid:
             fields.time_us, fields.step_us, fields.until_us = 5000.0, 1000.0, 7000.0
             fields.q_WB[:] /= np.sqrt(np.sum(np.square(fields.q_WB)))
+        if one.kind is agent.Agent:
+            fields.pushes[:2] = rng.uniform(-0.1, 0.01, PUSHES), rng.integers(0, len(PUSH_KINDS), PUSHES)
         if one.kind is Air:
             fields.noise_row = rng.integers(0, FEW_ROWS - 2)
         if one.kind is Flaps:
@@ -71,8 +95,14 @@ def draw(rng: np.random.Generator, memory: Memory) -> None:
 @pytest.mark.parametrize("compiler", COMPILERS, ids=[one.name for one in COMPILERS])
 @pytest.mark.parametrize(
     ("kernel", "allocate"),
-    [(motion.advance, floaty), (quadrotor.advance, crazyflie), (imu.channels, sensor)],
-    ids=["floaty", "quadrotor", "imu"],
+    [
+        (motion.advance, floaty),
+        (quadrotor.advance, crazyflie),
+        (imu.channels, sensor),
+        (agent.advance, learner),
+        (demonstrations.observe_board, board),
+    ],
+    ids=["floaty", "quadrotor", "imu", "learn", "observation"],
 )
 def test_steps_from_any_state_have_the_bits_of_python(
     kernel: Callable[..., None], allocate: Callable[[], Memory], compiler: Compiler
