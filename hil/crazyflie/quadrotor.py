@@ -195,6 +195,15 @@ def steady_rpm(rotors: Rotors, volts: float) -> float:
 
 
 @compiled
+def calibrate(body: Rigid, rotors: Rotors) -> None:
+    """Compute the slope of slow speeds, and the vibration of a speed from that in hover, which `shaking` has before."""
+    rotors.slow_rpm = curve_rpm(rotors, rotors.curve_begin) / (rotors.curve_begin - rotors.dead_volts)
+    hover_rpm = rpm_for(rotors, 0.25 * body.mass * GRAVITY)
+    for i in range(2):
+        rotors.shaking[i] = rotors.shaking[i] / (2.0 * (hover_rpm * hover_rpm))
+
+
+@compiled
 def spin(rotors: Rotors, duration: float) -> None:
     """Bring the propellers towards the speeds of their voltages, for `duration` [s]."""
     for i in range(4):
@@ -329,9 +338,8 @@ class Quadrotor(InTunnel):
         r.volts_to_thrust[:] = config.volts_to_thrust
         r.rpm_to_thrust[:], r.rpm_to_torque[:] = config.rpm_to_thrust, config.rpm_to_torque
         r.curve_begin, r.dead_volts = config.curve_begin, config.curve_begin * config.dead_share
-        r.slow_rpm = curve_rpm(self.rotors.arg, r.curve_begin) / (r.curve_begin - r.dead_volts)
-        hover_rpm = rpm_for(self.rotors.arg, 0.25 * config.mass * GRAVITY)
-        r.shaking[:] = np.array(config.vibration) / (2.0 * hover_rpm**2)
+        r.shaking[:] = config.vibration
+        bound(calibrate, body.arg, self.rotors.arg)()
         r.ground_gain, r.radius, r.above = config.ground_effect, config.rotor_radius, config.rotor_above
         b.foot_spread, b.foot_below = arm_xy, config.foot_below
         b.foot_reach = math.sqrt(config.arm * config.arm + config.foot_below * config.foot_below)

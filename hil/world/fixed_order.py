@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py import compiling, elementary
+from firmware_py.core.subset import F64s, Integer
 
 # The dependencies of the laboratory's compiled functions, besides their own files.
 SOURCES = (
@@ -33,6 +34,7 @@ def in_c(function: Callable[..., Any], arrays: compiling.Arrays) -> Path | None:
 compiled = compiling.compiler(*SOURCES, TRANSLATOR, library=in_c)
 
 Matrix = NDArray[np.float64]
+SIZE = 4  # of the largest matrix with eigenvalues, a turn's
 SWEEPS_MAX = 50  # of Jacobi's method; 4 to 6 are usual
 NEGLIGIBLE = 1e-36  # sum of squares off the diagonal, as a share of all
 
@@ -41,50 +43,61 @@ exp = compiled(elementary.exp)
 atan2 = compiled(elementary.atan2)
 
 
-@compiled
 def product(A: Matrix, B: Matrix) -> Matrix:
     """Return the product of two matrices."""
     C = np.zeros((A.shape[0], B.shape[1]))
-    for i in range(A.shape[0]):
-        for j in range(B.shape[1]):
-            for k in range(A.shape[1]):
-                C[i, j] += A[i, k] * B[k, j]
+    for k in range(A.shape[1]):
+        C += A[:, k, None] * B[k]
     return C
 
 
-@compiled
 def eigen(S: Matrix) -> tuple[Matrix, Matrix]:
-    """Return eigenvalues (N,) and vectors (N, N), one a column, of a symmetric matrix; Jacobi's method, row by row."""
-    A = S.copy()
-    n = A.shape[0]
-    V = np.eye(n)
+    """Return eigenvalues (N,) and vectors (N, N), one a column, of a symmetric matrix; N <= 4; Jacobi's method."""
+    n, A, V = len(S), np.zeros((SIZE, SIZE)), np.eye(SIZE)
+    A[:n, :n] = S
+    compiling.bound(diagonalise, A, V)()
+    return np.diag(A)[:n].copy(), V[:n, :n]
+
+
+@compiled
+def turn(A: F64s, p: Integer, q: Integer, cosine: float, sine: float) -> None:
+    """Turn two columns of a square matrix into each other."""
+    for k in range(SIZE):
+        a, b = A[k, p], A[k, q]
+        A[k, p], A[k, q] = cosine * a - sine * b, sine * a + cosine * b
+
+
+@compiled
+def annul(A: F64s, V: F64s, p: Integer, q: Integer) -> None:
+    """Turn a symmetric matrix so that its element (p, q) vanishes, and the vectors with it."""
+    ratio = (A[q, q] - A[p, p]) / (2.0 * A[p, q])
+    tangent = math.copysign(1.0, ratio) / (abs(ratio) + math.sqrt(ratio * ratio + 1.0))
+    cosine = 1.0 / math.sqrt(tangent * tangent + 1.0)
+    sine = tangent * cosine
+    turn(A, p, q, cosine, sine)
+    turn(V, p, q, cosine, sine)
+    for k in range(SIZE):  # rows
+        a, b = A[p, k], A[q, k]
+        A[p, k], A[q, k] = cosine * a - sine * b, sine * a + cosine * b
+
+
+@compiled
+def diagonalise(A: F64s, V: F64s) -> None:
+    """Turn a symmetric matrix until it is diagonal, and the vectors `V` with it."""
     for _ in range(SWEEPS_MAX):
         beside, everything = 0.0, 0.0
-        for p in range(n):
-            for q in range(n):
+        for p in range(SIZE):
+            for q in range(SIZE):
                 square = A[p, q] * A[p, q]
-                everything += square
+                everything = everything + square
                 if p != q:
-                    beside += square
+                    beside = beside + square
         if beside <= NEGLIGIBLE * everything:
-            break
-        for p in range(n - 1):
-            for q in range(p + 1, n):
-                if A[p, q] == 0.0:
-                    continue
-                ratio = (A[q, q] - A[p, p]) / (2.0 * A[p, q])
-                tangent = math.copysign(1.0, ratio) / (abs(ratio) + math.sqrt(ratio * ratio + 1.0))
-                cosine = 1.0 / math.sqrt(tangent * tangent + 1.0)
-                sine = tangent * cosine
-                for k in range(n):  # columns
-                    a, b = A[k, p], A[k, q]
-                    A[k, p], A[k, q] = cosine * a - sine * b, sine * a + cosine * b
-                    a, b = V[k, p], V[k, q]
-                    V[k, p], V[k, q] = cosine * a - sine * b, sine * a + cosine * b
-                for k in range(n):  # rows
-                    a, b = A[p, k], A[q, k]
-                    A[p, k], A[q, k] = cosine * a - sine * b, sine * a + cosine * b
-    return np.diag(A).copy(), V
+            return
+        for p in range(SIZE - 1):
+            for q in range(p + 1, SIZE):
+                if A[p, q] != 0.0:
+                    annul(A, V, p, q)
 
 
 def fit_polynomial(x: Matrix, y: Matrix, order: int) -> Matrix:

@@ -25,7 +25,7 @@ from hil.crazyflie import quadrotor
 from hil.devices import imu
 from hil.learn import agent
 from hil.learn.tasks import PUSH_KINDS, PUSHES
-from hil.world import motion
+from hil.world import fixed_order, motion
 from hil.world.structs import GUSTS, NOISE_ROWS, Air, Flaps, Rigid
 from support.plain_kernels import plain
 
@@ -54,6 +54,10 @@ def learner() -> Memory:
 
 def board() -> Memory:
     return [Parameters.allocate(), Estimator.allocate(), np.zeros(4, np.float32), np.zeros(20, np.float32)]
+
+
+def matrices() -> Memory:
+    return [np.zeros((4, 4)), np.zeros((4, 4))]
 
 
 def record_of(memory: Block[Any] | NDArray[Any]) -> Any:
@@ -101,8 +105,9 @@ def draw(rng: np.random.Generator, memory: Memory) -> None:
         (imu.channels, sensor),
         (agent.advance, learner),
         (demonstrations.observe_board, board),
+        (fixed_order.diagonalise, matrices),
     ],
-    ids=["floaty", "quadrotor", "imu", "learn", "observation"],
+    ids=["floaty", "quadrotor", "imu", "learn", "observation", "eigen"],
 )
 def test_steps_from_any_state_have_the_bits_of_python(
     kernel: Callable[..., None], allocate: Callable[[], Memory], compiler: Compiler
