@@ -100,23 +100,16 @@ def look(body: Rigid, agent: Agent, row: Integer) -> None:
 
 
 @compiled
-def find_goal(body: Rigid, agent: Agent, sensing: Sensing) -> None:
-    """Write the current goal."""
-    t = body.time_us * 1e-6
-    for i in range(4):
-        agent.goal[i] = sensing.home[i]
-        if agent.path[0, i] != 0.0:
-            along = sine_ahead(2.0 * math.pi * agent.path[1, i] * t, 0)
-            agent.goal[i] = sensing.home[i] + agent.path[0, i] * along
-
-
-@compiled
 def see(
     body: Rigid, flaps: Flaps, agent: Agent, sensing: Sensing, parameters: Parameters, estimator: Estimator
 ) -> None:
     """Write the goal, and the observation of the board's estimate: in the goal's frame, with errors."""
-    find_goal(body, agent, sensing)
     sights, errors, goal, row, now = agent.sights, agent.errors, agent.goal, sensing.oldest, estimator.now
+    for i in range(4):
+        goal[i] = sensing.home[i]
+        if agent.path[0, i] != 0.0:
+            phase = 2.0 * math.pi * agent.path[1, i] * (body.time_us * 1e-6)
+            goal[i] = goal[i] + agent.path[0, i] * sine_ahead(phase, 0)
     c, s = sine_ahead(goal[3], 1), sine_ahead(goal[3], 0)
     x, y = sights[row, 0] + errors[0] - goal[0], sights[row, 1] + errors[1] - goal[1]
     vx, vy = sights[row, 3] + errors[3], sights[row, 4] + errors[4]
@@ -134,24 +127,16 @@ def see(
 
 
 @compiled
-def start(body: Rigid, air: Air, flaps: Flaps, agent: Agent) -> None:
-    """Fill the cameras' memory at the start of an episode."""
-    agent.begins = i32(0)
-    evaluate(body, air, flaps)
-    for row in range(SIGHTS):
-        look(body, agent, row)
-    for i in range(3):
-        agent.rates[i] = body.omega_B[i]
-
-
-@compiled
 def advance(
-    body: Rigid, air: Air, flaps: Flaps, agent: Agent, sensing: Sensing, draws: F64s,
-    parameters: Parameters, estimator: Estimator, control: Control,
+    body: Rigid, air: Air, flaps: Flaps, agent: Agent, draws: F64s,
+    parameters: Parameters, estimator: Estimator, control: Control, sensing: Sensing,
 ) -> None:  # fmt: skip
     """Begin an episode, or advance by one control step with a row of unit normal `draws`; write the observation."""
     if agent.begins != 0:
-        start(body, air, flaps, agent)
+        agent.begins = i32(0)
+        evaluate(body, air, flaps)
+        for row in range(SIGHTS):
+            look(body, agent, row)
         see(body, flaps, agent, sensing, parameters, estimator)
         return
     act(parameters, agent.action, control)

@@ -2,8 +2,9 @@
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +52,7 @@ class Fleet:
     """Robots that fly at the same time, each its own episode.
 
     `config` is the boards'; `worlds` are the robots that an episode may draw, free and at home. `delay_us` is the pose's
-    age that the estimate does not compensate. `observations` (N, 20) and `rewards` (N,) are views of the last step.
+    age that the estimate does not compensate.
     """
 
     def __init__(
@@ -63,61 +64,78 @@ class Fleet:
         self._templates[0]["step_us"] = CONTROL_US
         self._gust_rms = _slow_gusts(self._templates[1])
         self._offsets = np.array([world.zero_offset for world in worlds])
-        structs = (*(block.kind for block in self._plant), Agent)
-        *self._robots, self._agents = memory = [np.zeros(count, kind.dtype) for kind in structs]
-        self.observations, self.rewards = self._agents["observation"], self._agents["reward"]
-        sensing, self._draws = Sensing.allocate(), np.zeros((count, DRAWS))
-        self._sensing = sensing.fields
-        self._sensing.lasting = decay = exp(-CONTROL_US * 1e-6 / errors.tau_s)
-        self._sensing.fresh = math.sqrt(1.0 - decay * decay)
-        rms = errors.position, errors.velocity, errors.attitude, errors.rate
-        self._sensing.sizes[:] = np.repeat(rms, 3)
-        self._sensing.home[:3] = config.flight.home
+        self._kinds = (*(block.kind for block in self._plant), Agent)
+        self._memory, self._draws = (
+            [np.zeros(count, kind.dtype) for kind in self._kinds],
+            np.zeros((count, DRAWS)),
+        )
+        self._sensing, self._parameters = Sensing.allocate(), parameters_of(config)
+        sensing, decay = self._sensing.fields, exp(-CONTROL_US * 1e-6 / errors.tau_s)
+        sensing.lasting, sensing.fresh = decay, math.sqrt(1.0 - decay * decay)
+        sensing.sizes[:] = np.repeat((errors.position, errors.velocity, errors.attitude, errors.rate), 3)
+        sensing.home[:3] = config.flight.home
         self._tick, self._delay = 0, round(delay_us / CONTROL_US)
-        board = parameters_of(config).arg, Estimator.allocate().arg, Control.allocate().arg
-        rows = [kind.rows(one) for kind, one in zip(structs, memory, strict=True)]
-        self._calls = [
-            bound(advance, *(one[n] for one in rows), sensing.arg, self._draws[n : n + 1], *board)
-            for n in range(count)
+        self._bind()
+
+    def _bind(self) -> None:
+        """Bind the step of every robot to the present memory."""
+        shared = self._parameters.arg, Estimator.allocate().arg, Control.allocate().arg, self._sensing.arg
+        rows = [kind.rows(memory) for kind, memory in zip(self._kinds, self._memory, strict=True)]
+        self._steps = [
+            bound(advance, *(one[n] for one in rows), self._draws[n : n + 1], *shared)
+            for n in range(len(self._draws))
         ]
+
+    def __deepcopy__(self, memo: object) -> Self:
+        """Return an independent copy."""
+        twin = copy(self)
+        twin._memory, twin._draws = [one.copy() for one in self._memory], self._draws.copy()
+        twin._sensing = self._sensing.copy()
+        twin._bind()
+        return twin
 
     def begin(self, n: int, episode: Episode, rng: np.random.Generator) -> None:
         """Put robot `n` at the start of an episode, at rest in moving air, and observe it."""
         drawn = int(episode.robot * len(self._offsets))
-        (bodies, airs, _), agents = self._robots, self._agents
-        for memory, templates in zip(self._robots, self._templates, strict=True):
+        bodies, airs, _, agents = self._memory
+        for memory, templates in zip(self._memory, self._templates, strict=False):
             memory[n] = templates[drawn]
         bodies["p_WB"][n] += episode.start
         airs["gusts"][n] = self._gust_rms[drawn] * normal(rng, GUSTS)
         agents["zero_offset"][n] = self._offsets[drawn]
         agents["path"][n] = episode.amplitude, episode.frequency_hz
         agents["pushes"][n] = episode.push_at, episode.push_kind, episode.push_size
-        agents["previous"][n] = 0.0
-        agents["errors"][n] = self._sensing.sizes * normal(rng, ERRORS)
+        agents["previous"][n] = agents["rates"][n] = 0.0
+        agents["errors"][n] = self._sensing.fields.sizes * normal(rng, ERRORS)
         agents["begins"][n] = 1
-        self._calls[n]()
+        self._steps[n]()
 
     def advance(self, actions: Actions, rng: np.random.Generator) -> None:
         """Advance all by 10 ms with their actions (N, 4)."""
         self._tick += 1
-        self._sensing.newest = i32(self._tick % SIGHTS)
-        self._sensing.oldest = i32((self._tick - self._delay) % SIGHTS)
-        self._agents["action"] = actions
+        sensing = self._sensing.fields
+        sensing.newest, sensing.oldest = i32(self._tick % SIGHTS), i32((self._tick - self._delay) % SIGHTS)
+        self.agents["action"] = actions
         self._draws[:] = normal(rng, self._draws.shape)
-        for call in self._calls:
-            call()
+        for step in self._steps:
+            step()
+
+    @property
+    def agents(self) -> NDArray[Any]:
+        """The records `Agent` after the last step, (N,)."""
+        return self._memory[-1]
 
     @property
     def lost(self) -> NDArray[np.bool_]:
         """Which robots have left the flow, fallen or tumbled, (N,)."""
-        return np.asarray(self._robots[0]["lost"] != 0)
+        return np.asarray(self._memory[0]["lost"] != 0)
 
     def truth(self, n: int) -> FloatyBlocks:
         """Return a copy of a robot's memory."""
-        copy = self._plant.copy()
-        for block, memory in zip(copy, self._robots, strict=True):
+        blocks = self._plant.copy()
+        for block, memory in zip(blocks, self._memory, strict=False):
             block.memory[:] = memory[n]
-        return copy
+        return blocks
 
 
 def _slow_gusts(airs: NDArray[Any]) -> Array:

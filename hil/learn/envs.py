@@ -148,7 +148,7 @@ class FastVectorEnv(VectorEnv[batch.Actions, batch.Actions, NDArray[Any]]):
             self.np_random = self._streams[0].spawn(1)[0]  # for common draws
         for n in range(self.num_envs):
             self._begin(n)
-        return self._fleet.observations.copy(), {}
+        return self._fleet.agents["observation"].copy(), {}
 
     def step(
         self, actions: batch.Actions
@@ -156,7 +156,7 @@ class FastVectorEnv(VectorEnv[batch.Actions, batch.Actions, NDArray[Any]]):
         """Advance all robots by 10 ms."""
         limited = _checked(actions, self.num_envs)
         self._fleet.advance(limited, self.np_random)
-        observations = np.clip(self._fleet.observations, -REACH, REACH)
+        observations = np.clip(self._fleet.agents["observation"], -REACH, REACH)
         self._steps += 1
         lost = self._fleet.lost
         late = (self._steps >= self._setup.steps) & ~lost
@@ -165,8 +165,8 @@ class FastVectorEnv(VectorEnv[batch.Actions, batch.Actions, NDArray[Any]]):
             info = {"final_obs": observations.copy(), "_final_obs": over}
             for n in np.flatnonzero(over):
                 self._begin(int(n))
-            observations[over] = self._fleet.observations[over]
-        return observations, self._fleet.rewards.copy(), lost, late, info
+            observations[over] = self._fleet.agents["observation"][over]
+        return observations, self._fleet.agents["reward"].copy(), lost, late, info
 
     def _begin(self, n: int) -> None:
         rng = self._streams[n]
@@ -189,15 +189,15 @@ class FastEnv(gymnasium.Env[batch.Actions, batch.Actions]):
         episode = draw_episode(self._task, self.np_random, self._setup.duration_s)
         self._fleet.begin(0, episode, self.np_random)
         self._steps = 0
-        return self._fleet.observations[0].copy(), {}
+        return self._fleet.agents["observation"][0].copy(), {}
 
     def step(self, action: batch.Actions) -> tuple[batch.Actions, float, bool, bool, Info]:
         limited = _checked(action, 1)
         self._fleet.advance(limited, self.np_random)
         self._steps += 1
         lost, late = bool(self._fleet.lost[0]), self._steps >= self._setup.steps
-        seen, reward = self._fleet.observations[0], float(self._fleet.rewards[0])
-        return np.clip(seen, -REACH, REACH), reward, lost, late, {}
+        agent = self._fleet.agents[0]
+        return np.clip(agent["observation"], -REACH, REACH), float(agent["reward"]), lost, late, {}
 
     @property
     def truth(self) -> FloatyBlocks:

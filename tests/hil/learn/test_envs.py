@@ -1,5 +1,6 @@
 """The environments: spaces, seeds, agreement of the two fidelities, and what the law on board sees."""
 
+import copy
 import math
 from pathlib import Path
 from types import SimpleNamespace
@@ -90,6 +91,14 @@ def test_the_same_seed_gives_the_same_bytes(fidelity: str) -> None:
 
     assert flown(3) == flown(3)
     assert flown(3) != flown(4)
+
+
+def test_a_copy_flies_on_from_the_same_state_apart_from_its_original() -> None:
+    env = gymnasium.make_vec("floaty/Push-v0", num_envs=2)
+    env.reset(seed=1)
+    twin = copy.deepcopy(env)
+    flown = [[one.step(np.tile(action, (2, 1)))[0] for action in actions(20, 0.2)] for one in (env, twin)]
+    np.testing.assert_array_equal(*flown)
 
 
 def test_a_row_of_many_robots_flies_as_the_seed_of_its_own() -> None:

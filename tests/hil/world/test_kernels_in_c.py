@@ -48,8 +48,8 @@ def sensor() -> Memory:
 
 
 def learner() -> Memory:
-    own = [agent.Agent.allocate(), agent.Sensing.allocate(), np.zeros((1, agent.DRAWS))]
-    return [*floaty()[:3], *own, Parameters.allocate(), Estimator.allocate(), Control.allocate()]
+    shared = [Parameters.allocate(), Estimator.allocate(), Control.allocate(), agent.Sensing.allocate()]
+    return [*floaty()[:3], agent.Agent.allocate(), np.zeros((1, agent.DRAWS)), *shared]
 
 
 def board() -> Memory:
