@@ -42,7 +42,7 @@ mutants: .venv/test.stamp
 bench: .venv/test.stamp
 	$(BIN)/python tools/bench.py
 
-# The lockstep loop's modules compiled by mypyc, with the C compiler of this machine; everything else does without one.
+# The lockstep loop's modules compiled by mypyc, with the C compiler of this machine.
 fast: .venv/fast.stamp
 	$(BIN)/python tools/fast.py
 
@@ -60,6 +60,7 @@ wheel: .venv/fast.stamp
 
 .venv/fly.stamp: .venv/pip.stamp pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[radio,mavlink,view,identify,design]'
+	@command -v gcc clang cc > /dev/null || $(BIN)/python -m pip install --quiet 'ziglang>=0.14'
 	@touch $@
 
 .venv/test.stamp: .venv/fly.stamp

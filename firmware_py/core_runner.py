@@ -4,34 +4,30 @@ The tasks call the core through a `CoreRunner` on the memory of `CoreBlocks`: th
 machine; under `firmware_py.export` also its plain Python, and machine code of a Cortex-M4.
 """
 
-import platform
-import sys
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
 from firmware_py import core, export
-from firmware_py.compiling import LIBRARY_SUFFIX, PLAIN, bound_in, hash_of, kept_library
+from firmware_py.compiling import PLAIN, SUFFIX, bound_in, fall_back, hash_of, kept_library
 from firmware_py.config import CpuConfig
+from firmware_py.core import entry
 from firmware_py.core.structs import Control, Estimator, Input, Parameters, Report, Sampling, Supervisor
 from firmware_py.core.subset import Block, Struct
-from firmware_py.export.c99 import core_texts, translate
+from firmware_py.export.c99 import translate
 from firmware_py.export.compilers import Compiler, by_first_that_works
 from firmware_py.export.errors import ExportError
 from firmware_py.export.methods import METHOD
 from firmware_py.export.native import build
-from firmware_py.export.plain import PlainModules
-from firmware_py.export.syntax import ENTRY
 from firmware_py.export.usage import Usage
 from firmware_py.kept_code import kept_folder, report
 from firmware_py.logic.loading import Logic
 from firmware_py.logic.plugs import CALLS
 
 SOURCES = tuple(Path(package.__path__[0]) for package in (core, export))
-_report = cache(report)  # once in a process
 
 
 class CoreRunner(Protocol):
@@ -116,10 +112,9 @@ class PlainRunner:
     """Runs the core's Python sources."""
 
     def __init__(self, blocks: CoreBlocks) -> None:
-        modules = PlainModules(core_texts()) if blocks.logic is None else blocks.logic.loaded.modules
-        entry = modules.load(ENTRY)
+        module = entry if blocks.logic is None else blocks.logic.loaded.entry
         self._calls = {
-            name: partial(getattr(entry, name), *(blocks.named[block].fields for block in taken))
+            name: partial(getattr(module, name), *(blocks.named[block].fields for block in taken))
             for name, taken in blocks.calls.items()
         }
 
@@ -134,19 +129,17 @@ def default_runner(blocks: CoreBlocks) -> CoreRunner:
     if not PLAIN:
         try:
             return NativeRunner(blocks)
-        except (ExportError, OSError) as error:  # or nothing may be executed from the folder of kept code
-            _report(f"the flight core flies as plain Python, far slower: {error}")
+        except (ExportError, OSError) as error:
+            fall_back(str(error))
     return PlainRunner(blocks)
 
 
 def core_library(logic: Logic | None) -> Path:
     """Return the core's library for this machine, with own logic in it. Raises `ExportError`."""
     sources = hash_of(*SOURCES)
-    sources.update(f"{sys.platform} {platform.machine()} {logic.loaded.digest if logic else ''}".encode())
-    path = kept_folder("c", sources.hexdigest()) / f"core{LIBRARY_SUFFIX}"
-    library = kept_library(path, partial(_compile, logic))
-    assert library is not None
-    return library
+    sources.update((logic.loaded.digest if logic else "").encode())
+    path = kept_folder("kernels", sources.hexdigest()) / f"core{SUFFIX}"
+    return kept_library(path, partial(_compile, logic))
 
 
 def _compile(logic: Logic | None) -> Path:

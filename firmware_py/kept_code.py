@@ -1,14 +1,13 @@
 """Where compiled code is kept, and the check before it is loaded. No other file chooses such a folder.
 
-Machine code, the pickles of numba's cache and the bytecode of templates act with all rights of the user who loads them. So
-they are in one folder, which only this user may own and write: `floaty` in the cache folder, or in NUMBA_CACHE_DIR; never
+Machine code and the bytecode of templates act with all rights of the user who loads them. So
+they are in one folder, which only this user may own and write: `floaty` in the cache folder, or in FLOATY_CACHE_DIR; never
 beside their sources, in a project, in a run folder or in the current folder. Where that folder cannot be used,
 `floaty-UID` in the folder for temporary files serves under the same conditions, and after it a folder that is deleted
 with the process.
 
-    numba/   `.so` of the world's kernels, `.machine`, numba's `.nbi` and `.nbc`,     firmware_py/compiling.py
-             the entry modules of own logic
-    c/       libraries and images that a C compiler made: core, meter, emulated chip  firmware_py/export/compilers.py
+    kernels/ libraries of flight core and world by their sources                      firmware_py/compiling.py
+    c/       what a C compiler made, by its inputs                                    firmware_py/export/compilers.py
     zig/     that compiler's own cache                                                firmware_py/export/compilers.py
     pages/   templates of pages as bytecode                                           hil/pictures/pages.py
 
@@ -27,7 +26,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Literal
 
-Part = Literal["numba", "c", "zig", "pages"]
+Part = Literal["kernels", "c", "zig", "pages"]
 PRIVATE = 0o700
 OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 UNUSED_S = 90 * 86_400  # then a folder of code is deleted
@@ -36,7 +35,7 @@ UNUSED_S = 90 * 86_400  # then a folder of code is deleted
 def kept_folder(part: Part, key: str = "") -> Path:
     """Return the folder of a part, or that of a key in it, which is made if it is missing."""
     name = sha256(key.encode()).hexdigest()[:16] if key else ""
-    chosen, home = (os.environ.get(variable, "") for variable in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"))
+    chosen, home = (os.environ.get(variable, "") for variable in ("FLOATY_CACHE_DIR", "XDG_CACHE_HOME"))
     try:
         return _made(_usable(chosen, home, tempfile.gettempdir()), part, name)
     except OSError:  # a full disk
@@ -64,7 +63,7 @@ def keep(path: Path, content: bytes) -> None:
 def _usable(chosen: str, home: str, temporary: str) -> Path:
     """Return the first folder that this user alone owns and may write; report each that is refused.
 
-    `chosen` and `home` are the values of NUMBA_CACHE_DIR and XDG_CACHE_HOME; empty: not set.
+    `chosen` and `home` are the values of FLOATY_CACHE_DIR and XDG_CACHE_HOME; empty: not set.
     """
     for folder in (_in_cache(chosen), Path(temporary, f"floaty-{os.geteuid()}")):
         try:

@@ -44,7 +44,7 @@ def observer(
     parameters: Block[Parameters], estimator: Block[Estimator], previous: Rows, out: Rows
 ) -> Callable[[], object]:
     """Return what writes the observation `out` (20,) of a board after its `previous` action (4,)."""
-    return bound(observe_board, parameters.arg, estimator.arg, previous, out)
+    return bound(observe_board, parameters, estimator, previous, out)
 
 
 def demonstrations_of(log: pa.Table, config: FirmwareConfig) -> Demonstrations:

@@ -18,7 +18,7 @@ from firmware_py.fast import STATE
 
 COMMIT = Path(__file__).parent / "commit.txt"
 ROOT = Path(__file__).parent.parent
-COMPUTING = ("numpy", "numba", "pyarrow")  # packages whose versions could affect the bits of a flight
+COMPUTING = ("numpy", "pyarrow")  # packages whose versions could affect the bits of a flight
 DEVELOPMENT = ("fast", "bench", "docs", "test", "clients")  # extras of the Makefile: no command asks for them
 # Git reports the commit, the C compilers build `--board c`, the last two are for exported and emulated images.
 PROGRAMS = ("git", "gcc", "clang", "arm-none-eabi-gcc", "gdb-multiarch")

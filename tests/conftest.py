@@ -42,9 +42,7 @@ LIMITS_S = {
     "long": 600.0,
     "fast": 300.0,
 }  # of one test with its fixtures, on a busy machine
-GRACE_S = (
-    60.0  # from a test's limit until its process ends, because numba's and C code let no exception through
-)
+GRACE_S = 60.0  # from a test's limit until its process ends, because C code lets no exception through
 
 
 # The sessions that `pytester` starts have another home, but the same compiled code.

@@ -29,10 +29,8 @@ from bench_kernel import kernel_run, simpy_run, us_per_activation
 from rich.console import Console
 from rich.table import Table
 
-from firmware_py.compiling import bound
 from firmware_py.config import parameters_of
-from firmware_py.core import entry
-from firmware_py.core.structs import Control, Estimator, Input, Report, Sampling, Supervisor
+from firmware_py.core_runner import CoreBlocks, default_runner
 from firmware_py.extras import install_command
 from firmware_py.fast import STALE, STATE
 from hil.commands.app import COMMANDS
@@ -85,16 +83,12 @@ def flight_s(recorded: bool) -> float:
 def core_us() -> tuple[float, float]:
     """Microseconds of one estimator tick (with a pose every other tick) and one controller tick."""
     parameters = parameters_of(load_config())
-    data, estimator, control = (struct.allocate() for struct in (Input, Estimator, Control))
-    sampling, supervisor, report = Sampling.allocate(), Supervisor.allocate(), Report.allocate()
-    entry.reset(parameters.arg, estimator.arg)
+    core = CoreBlocks(parameters, default_runner)
+    call, data = core.run.call, core.data
+    call("reset")
     data.fields.pose_quaternion[:] = 1.0, 0.0, 0.0, 0.0
     data.fields.mode = 1
     ticks = 0
-    file_pose = bound(entry.file_pose, parameters.arg, data.arg, estimator.arg, sampling.arg, supervisor.arg)
-    tick = bound(
-        entry.estimate, parameters.arg, data.arg, estimator.arg, control.arg, sampling.arg, report.arg
-    )
 
     def estimate() -> None:
         nonlocal ticks
@@ -102,11 +96,10 @@ def core_us() -> tuple[float, float]:
         data.fields.gyro_samples = 10
         if ticks % 2:
             data.fields.pose_age_us = 33_000
-            file_pose()
-        tick()
+            call("file_pose")
+        call("estimate")
 
-    steer = bound(entry.control, parameters.arg, data.arg, estimator.arg, control.arg)
-    return us_per_call(estimate), us_per_call(steer)
+    return us_per_call(estimate), us_per_call(lambda: call("control"))
 
 
 def plant_us() -> float:
@@ -275,7 +268,7 @@ def main() -> None:
         figures.add("whole binary, one simulated second", image_s(elf), "s")
     if options.compile:
         with tempfile.TemporaryDirectory() as folder:
-            first_s = start_up_s(NUMBA_CACHE_DIR=folder)
+            first_s = start_up_s(FLOATY_CACHE_DIR=folder)
         figures.add("start to first tick, first compilation ever", first_s, "s", digits=1)
     if options.campaign:
         add_campaign(figures)

@@ -2,10 +2,10 @@
 
     python tools/fast.py    (`make fast`; needs a C compiler and Python's headers, takes a minute or two)
 
-`firmware_py/fast.py` uses them until one of their sources changes. Modules with pydantic models, functions decorated for
-numba or protocols checked at run time cannot be compiled, nor classes that others inherit or copy, or that pydantic reads;
-code that runs once per flight need not be. Compiled code converts an int to a float where the type is `float`: values that
-may be ints have another type.
+`firmware_py/fast.py` uses them until one of their sources changes. Modules with pydantic models, kernels or
+protocols checked at run time cannot be compiled, nor classes that others inherit or copy, or that pydantic reads; code that
+runs once per flight need not be. Compiled code converts an int to a float where the type is `float`: values that may be
+ints have another type.
 """
 
 import ast
@@ -28,7 +28,7 @@ from firmware_py.fast import FOLDER, RECORD, digest  # noqa: E402 - from this tr
 
 PACKAGES = ("firmware_py", "ground_station", "hil")
 MODULES = {
-    "firmware_py": "elementary firmware geometry pilot supervisor tasks",
+    "firmware_py": "firmware geometry pilot supervisor tasks",
     "firmware_py/crazyflie": "commander planner stabilizer supervisor",
     "firmware_py/links": "crtp_stack localisation log",
     "firmware_py/rtos": "control_block kernel queue scheduler semaphore task timer",

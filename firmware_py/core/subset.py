@@ -4,23 +4,19 @@ Subset: module constants `f32(..)`, `i32(..)`, plain ints and arrays `constant(.
 with `f32`, `i32` or `Annotated[F32s, ...]` annotations); functions marked `@kernel` with annotated scalars and structs;
 `for` over `range`, `if`/`elif`/`else`; `+ - * /` on float32, `+ - * // %` on small non-negative int32; comparisons,
 `and`/`or`/`not`; calls of other kernels; `abs`, `sqrt`, `elapsed`. Floats never meet ints without `f32(..)`, and every
-constant is explicitly float32: numba would otherwise compute in double where CPython and C do not. `f64` and `F64s` are for
-the structs and kernels of the laboratory's world alone: the core's translator refuses them.
+constant is explicitly float32, as in C. `f64` and `F64s` are for the structs and kernels of the laboratory's world alone:
+the core's translator refuses them.
 
-A struct is one block of memory with the layout of the C struct (naturally aligned), so that plain Python, numba and the
-microcontroller can be compared byte by byte. Kernels are compiled by numba (`firmware_py.compiling`); with
-NUMBA_DISABLE_JIT=1 they stay plain Python that a debugger can step through.
+A struct is one block of memory with the layout of the C struct (naturally aligned), so that plain Python, C and the
+microcontroller can be compared byte by byte. Kernels are plain Python that a debugger can step through; their C flies.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar, Generic, Self, TypeAlias, TypeVar, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-
-from firmware_py import compiling
 
 f32 = np.float32
 i32 = np.int32
@@ -29,8 +25,12 @@ sqrt = np.sqrt  # correctly rounded on every target: sqrtss on x86, VSQRT.F32 on
 
 Integer: TypeAlias = int | np.int32
 
-# Compiles a function of the subset; the same function in plain Python when numba is switched off.
-kernel = compiling.compiler(Path(__file__).parent)
+Kernel = TypeVar("Kernel", bound=Callable[..., Any])
+
+
+def kernel(function: Kernel) -> Kernel:
+    """Mark a function that becomes C."""
+    return function
 
 
 @kernel
@@ -107,16 +107,14 @@ class Settable(Served):
 class Block(Generic[S_co]):
     """The memory of one instance of the struct class `kind`.
 
-    `memory` is a structured array of shape (1,), `fields` gives attribute access to it from outside the core, as if it
-    were the struct (array fields are views), `arg` is what a kernel takes from outside the core: the memory's one record,
-    or the fields when nothing is compiled.
+    `memory` is a structured array of shape (1,); `fields` gives attribute access to it, as if it were the struct: array
+    fields are views.
     """
 
-    def __init__(self, kind: type[S_co]) -> None:
+    def __init__(self, kind: type[S_co], memory: NDArray[Any] | None = None) -> None:
         self.kind = kind
-        self.memory: NDArray[Any] = np.zeros(1, kind.dtype)
+        self.memory: NDArray[Any] = np.zeros(1, kind.dtype) if memory is None else memory
         self.fields = cast(S_co, kind._view(self.memory))
-        self.arg = cast(S_co, self.fields if compiling.PLAIN else self.memory[0])
 
     def cell(self, name: str) -> memoryview:
         """Return the memory of a number: `cell[0]` reads it in a fifth of the time of `fields`."""
@@ -186,8 +184,3 @@ class Struct:
     def allocate(cls) -> Block[Self]:
         """Return a zeroed instance."""
         return Block(cls)
-
-    @classmethod
-    def rows(cls, memory: NDArray[Any]) -> Any:
-        """Return what a kernel takes from outside the core for a structured array of instances."""
-        return [cls._view(memory[n : n + 1]) for n in range(len(memory))] if compiling.PLAIN else memory

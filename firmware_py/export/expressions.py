@@ -103,7 +103,7 @@ class Expressions:
         if isinstance(node.value, bool):
             return Value("true" if node.value else "false", BOOL)
         if isinstance(node.value, float):
-            raise self.refuse(node, f"float literal {node.value} without f32(..): a double in numba")
+            raise self.refuse(node, f"float literal {node.value} without f32(..): a double in Python and C")
         literal = constant_literal(node)
         if literal is None:
             raise self.refuse(node, f"literal {node.value!r}")

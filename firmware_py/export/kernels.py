@@ -2,24 +2,22 @@
 
     path = library(advance, (body, air, flaps, draws))
 
-The method takes nothing and has the addresses of records and arrays in its `self`, as `firmware_py.compiling.bound` uses
-it. Every operation is rounded by itself: all compilers and numba compute the same bits.
+The method takes nothing and has the addresses of blocks and arrays in its `self`, as `firmware_py.compiling.bound` uses
+it. Every operation is rounded by itself: all compilers and plain Python compute the same bits.
 """
 
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from firmware_py.compiling import METHOD_IN_C, Arrays
 from firmware_py.export.c99 import CHECK, struct_definition
 from firmware_py.export.compilers import Compiler, by_first_that_works, compile_texts
 from firmware_py.export.errors import ExportError
 from firmware_py.export.functions import FunctionPrinter, block_comment, constant_definition
 from firmware_py.export.live_printing import HELPERS, LivePrinter
-from firmware_py.export.live_reading import Kernels, LiveModule, read_kernels
-from firmware_py.export.methods import PROTOTYPES, method
+from firmware_py.export.live_reading import Arrays, Kernels, LiveModule, read_kernels
+from firmware_py.export.methods import KERNEL, PROTOTYPES, method
 from firmware_py.export.syntax import BOOL, I64, VOID, Constant
 
 FLAGS = (
@@ -63,17 +61,14 @@ def translate(function: Callable[..., Any], arrays: Arrays) -> str:
             f"\n{HELPERS}\n",
             *(f"{constant_definition(one)}\n" for one in used.values()),
             *(f"\n{text}" for text in reversed(printed.values())),
-            method(METHOD_IN_C, kernels[-1].c_name, len(arrays), kernels[-1].result != VOID),
+            method(KERNEL, kernels[-1].c_name, len(arrays), kernels[-1].result != VOID),
         )
     )
 
 
-def library(function: Callable[..., Any], arrays: Arrays) -> Path | None:
-    """Return the library of a kernel by the first compiler that works; None without any."""
-    text = translate(function, arrays)
-    with suppress(ExportError):
-        return by_first_that_works(partial(build, text))
-    return None
+def library(function: Callable[..., Any], arrays: Arrays) -> Path:
+    """Return the library of a kernel by the first compiler that works. Raises `ExportError` without any."""
+    return by_first_that_works(partial(build, translate(function, arrays)))
 
 
 def build(text: str, compiler: Compiler) -> Path:

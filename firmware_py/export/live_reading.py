@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FunctionType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,7 @@ ARGUMENTS: tuple[tuple[Any, ValueType], ...] = (
     (f64, F64), (f32, F32), (int, I64), (i32, I64), (Integer, I64), (bool, BOOL),
     (F64s, ValueType("f64", 1)), (F32s, ValueType("f32", 1)), (I32s, ValueType("i32", 1)),
 )  # fmt: skip
+Arrays = tuple[NDArray[Any], ...]
 ELEMENTS = {np.dtype(f64): "f64", np.dtype(f32): "f32", np.dtype(i32): "i32"}
 
 
@@ -67,13 +68,13 @@ class Kernels:
     structs: list[tuple[StructType, np.dtype[Any]]]
 
 
-def read_kernels(function: Callable[..., Any], arrays: tuple[NDArray[Any], ...]) -> Kernels:
+def read_kernels(function: Callable[..., Any], arrays: Arrays) -> Kernels:
     """Return a kernel that takes records and arrays like these; it is the last one.
 
     Raises `ExportError` for anything that has no equal in C.
     """
     reader = _Reader()
-    kernel = reader.kernel(inspect.unwrap(function))
+    kernel = reader.kernel(cast(FunctionType, function))
     if len(arrays) != len(kernel.arguments):
         raise ExportError(f"{kernel.c_name} takes {len(kernel.arguments)} arguments, not {len(arrays)}")
     for (name, kind), array in zip(kernel.arguments.items(), arrays, strict=True):
@@ -139,9 +140,8 @@ class _Reader:
         thing = module.live.get(name)
         if name in module.names or name in module.builtins or thing is None:
             return
-        function = inspect.unwrap(thing) if callable(thing) else None
-        if isinstance(function, FunctionType):
-            module.names[name] = self.kernel(function)
+        if isinstance(thing, FunctionType):
+            module.names[name] = self.kernel(thing)
         elif constant := _constant(f"{module.name}_{name}", thing, I32 if module.core else I64):
             module.names[name] = constant
             module.defined.append(constant)

@@ -3,7 +3,8 @@
 A method takes nothing: its `self` has the addresses of what the function takes.
 """
 
-METHOD = "method_"  # before the name of an entry point of the core
+KERNEL = "method"  # in the library of a kernel
+METHOD = "method_"  # of an entry point of the core, before its name
 PROTOTYPES = "char *PyBytes_AsString(void *object);\nvoid *PyLong_FromLongLong(long long value);\n"
 
 

@@ -1,11 +1,13 @@
 """From the profile's `[logic]` to code that flies: the modules are read, checked, joined with the core and translated."""
 
+import builtins
 import difflib
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 from firmware_py.config import LogicConfig
@@ -14,8 +16,8 @@ from firmware_py.core.guard import Guard
 from firmware_py.core.subset import Block, Struct
 from firmware_py.errors import LogicError
 from firmware_py.export.c99 import Translation, core_texts, translate
-from firmware_py.export.plain import PlainModules
 from firmware_py.export.reading import read_modules
+from firmware_py.export.syntax import ENTRY, OWN
 from firmware_py.logic.budget import ARGUMENT, budgeted
 from firmware_py.logic.entry import GUARD, compose
 from firmware_py.logic.plugs import GROUP, POINTS, Plug, read_plug
@@ -29,7 +31,7 @@ class Loaded:
     plugs: tuple[Plug, ...]
     digest: str  # of the modules' texts
     calls: Mapping[str, tuple[str, ...]]
-    modules: PlainModules  # of the core and these, as Python
+    entry: ModuleType  # the calls, as Python
     translation: Translation
     structs: Mapping[str, type[Struct]]  # of the blocks that own logic adds to the core's
     files: Mapping[str, str]  # by plug point
@@ -140,21 +142,34 @@ def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
     if any(plug.charged for plug in plugs):
         translation = translate(texts, shown)
     files = {name: file for name, file, _ in modules}
-    run = PlainModules(texts, {f"own_{name}": file for name, file in files.items()})
+    own = SimpleNamespace()
     structs: dict[str, type[Struct]] = {GUARD: Guard}
     for plug in plugs:
+        name = f"own_{plug.point.name}"
         try:
-            module = run.load(f"own_{plug.point.name}")
+            module = _run(name, texts[name], files[plug.point.name], own)
         except Exception as error:
-            file = shown[f"own_{plug.point.name}"]
-            raise LogicError(f"{file}: {type(error).__name__}: {error}") from error
+            raise LogicError(f"{shown[name]}: {type(error).__name__}: {error}") from error
+        setattr(own, name, module)
         for argument, struct in plug.structs.items():
-            structs[plug.block(argument)] = getattr(
-                module, struct.name.removeprefix(plug.point.name.capitalize())
-            )
+            kind = getattr(module, struct.name.removeprefix(plug.point.name.capitalize()))
+            structs[plug.block(argument)] = kind
         if plug.charged:
             structs[plug.block(ARGUMENT)] = LoopBudget
+    run = _run(ENTRY, entry.text, f"{ENTRY}.py", own)
     return Loaded(plugs, digest, entry.calls, run, translation, structs, files)
+
+
+def _run(name: str, text: str, file: str, own: SimpleNamespace) -> ModuleType:
+    """Execute a module from its text, as of a file where a debugger stops; `own` has the user's modules."""
+
+    def import_(imported: str, *rest: Any) -> Any:
+        return own if imported == OWN else __import__(imported, *rest)
+
+    module = ModuleType(name)
+    module.__dict__["__builtins__"] = vars(builtins) | {"__import__": import_}
+    exec(compile(text, file, "exec"), module.__dict__)
+    return module
 
 
 def _with_budget(plug: Plug, texts: Mapping[str, str], shown: Mapping[str, str]) -> tuple[Plug, str]:

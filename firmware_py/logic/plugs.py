@@ -16,7 +16,6 @@ from types import FunctionType
 import numpy as np
 
 from firmware_py import table
-from firmware_py.compiling import Compiled
 from firmware_py.core import entry
 from firmware_py.core.subset import Logged, Tunable
 from firmware_py.export.errors import ExportError
@@ -36,7 +35,7 @@ OWN, MEMORY = "own", "memory"
 _SIGNATURES = {
     name: signature(function)
     for name, function in vars(entry).items()
-    if isinstance(function, Compiled | FunctionType) and name != "kernel" and not name.startswith("_")
+    if isinstance(function, FunctionType) and name != "kernel" and not name.startswith("_")
 }
 # The default core's entry points, and the blocks that they take; those that have an answer.
 CALLS: Mapping[str, tuple[str, ...]] = {name: tuple(one.parameters) for name, one in _SIGNATURES.items()}

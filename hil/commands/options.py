@@ -137,7 +137,7 @@ def runner_options(command: Command) -> Command:
     return command
 
 
-COMPILING = "first run on this machine: compiling flight core and plant, once, some ten seconds"
+COMPILING = "first run on this machine: compiling flight core and plant, once, some seconds"
 
 
 def asked_as(kind: type[Asked]) -> Callable[[Callable[..., int | None]], Callable[..., int | None]]:

@@ -339,7 +339,7 @@ class Quadrotor(InTunnel):
         r.rpm_to_thrust[:], r.rpm_to_torque[:] = config.rpm_to_thrust, config.rpm_to_torque
         r.curve_begin, r.dead_volts = config.curve_begin, config.curve_begin * config.dead_share
         r.shaking[:] = config.vibration
-        bound(calibrate, body.arg, self.rotors.arg)()
+        bound(calibrate, body, self.rotors)()
         r.ground_gain, r.radius, r.above = config.ground_effect, config.rotor_radius, config.rotor_above
         b.foot_spread, b.foot_below = arm_xy, config.foot_below
         b.foot_reach = math.sqrt(config.arm * config.arm + config.foot_below * config.foot_below)
@@ -351,8 +351,8 @@ class Quadrotor(InTunnel):
         r.strength[:] = 1.0 + config.motor_spread * normal(rng, 4)
         self._config = config
         self.room = Room(0.0, config.room, config.ceiling)
-        self._settle = bound(settle, self.rotors.arg)
-        memory = body.arg, self.tunnel.air.arg, self.rotors.arg
+        self._settle = bound(settle, self.rotors)
+        memory = body, self.tunnel.air, self.rotors
         self._evaluate, self._advance = bound(evaluate, *memory), bound(advance, *memory, self._draws)
         self.rpm, self.thrust = seen(r.rpm), seen(r.thrust)
         self.outputs: Sequence[tuple[int, int]] = OUTPUTS[config.motors]

@@ -34,7 +34,7 @@ class Analysis:
 def model_error(point: Point) -> float:
     """Return the largest difference between the flown plant and the Supplement's plates, [N] or [N m], over openings."""
     plates = calm_plates(point.geometry, point.speed, point.opening)
-    press = bound(evaluate, *plates.args)
+    press = bound(evaluate, *plates)
     places = np.stack(
         [np.linspace(point.low, point.high, CHECKED) * f % point.high for f in (1.0, 1.7, 2.3, 3.1)], axis=1
     )

@@ -122,7 +122,7 @@ class VirtualImu:
         if self._body is not body:
             self._body = body
             felt = body.omega_B, body.specific_force_B, body.vibration
-            self._measure = bound(channels, self._memory.arg, *felt, self._draws)
+            self._measure = bound(channels, self._memory, *felt, self._draws)
         if self._rows_left[0] == 0:
             self._draws[:] = normal(self._rng, (NOISE_ROWS, 6))
             self._rows_left[0] = NOISE_ROWS

@@ -111,7 +111,7 @@ class Probe:
 
     def __init__(self, calm_plant: FloatyBlocks) -> None:
         self._calm, self._plant = calm_plant, calm_plant.copy()
-        self._evaluate = bound(evaluate, *self._plant.args)
+        self._evaluate = bound(evaluate, *self._plant)
 
     def accelerations(self, cause: str, amount: float) -> Matrix:
         """Return linear (W) and angular accelerations (B), (6,), with a cause changed by `amount`."""
@@ -171,7 +171,7 @@ def trim_and_correct(plant: FloatyBlocks, config: PlantConfig, weight: Weight) -
     body, trimmed = design.body.fields, design.flaps.fields
     body.mass, body.inertia[:] = weight.mass, weight.inertia
     trimmed.drag_factor, trimmed.corrected, trimmed.pressure = 1.0, i32(0), 1.0
-    bound(evaluate, *design.args)()
+    bound(evaluate, *design)()
     flaps.pressure = trimmed.pressure = weight.mass * GRAVITY / body.wrench_B[2]
     flaps.airspeed = config.airspeed
     flaps.corrected = i32(config.variant != "plate")

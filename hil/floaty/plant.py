@@ -87,8 +87,8 @@ class Plant(InTunnel):
         self._counts: Sequence[int] = ()
         self._commanded = (SIGNS * config.hover_angle).tolist()
         f.command[:] = self._commanded
-        self._evaluate = bound(evaluate, *self.blocks.args)
-        self._advance = bound(advance, *self.blocks.args, self._draws)
+        self._evaluate = bound(evaluate, *self.blocks)
+        self._advance = bound(advance, *self.blocks, self._draws)
         self.flaps, self.plate_forces_W = seen(f.angle), seen(f.forces)
         self.wrench_B = seen(self._body.wrench_B)
         start = (0.0, 0.0, tunnel.hover_height) if p_WB is None else p_WB
@@ -161,6 +161,6 @@ class Plant(InTunnel):
         """Return force [N] and torque [N m], (3,) each in B, on the robot fixed level in the design's uniform flow."""
         calm_plant = calm(self.blocks, self._airspeed)
         calm_plant.flaps.fields.angle[:] = flaps
-        bound(evaluate, *calm_plant.args)()
+        bound(evaluate, *calm_plant)()
         force, torque = np.split(calm_plant.body.fields.wrench_B, 2)
         return force, torque

@@ -17,7 +17,7 @@ from firmware_py.core.structs import ATTITUDE, FLAP, POSITION, RATE, VELOCITY, C
 from firmware_py.core.subset import F32s, F64s, Integer, Struct, f32, f64, i32
 from hil.learn import tasks
 from hil.learn.tasks import PUSH_S, PUSHES
-from hil.world.fixed_order import SOURCES, TRANSLATOR, atan2, in_c, sine_ahead
+from hil.world.fixed_order import SOURCES, atan2, sine_ahead
 from hil.world.motion import evaluate, step
 from hil.world.servos import MIDDLE_COUNTS, PERIOD_COUNTS, RAD_PER_COUNT, TIMER_MHZ
 from hil.world.structs import GUSTS, STEP_US, Air, Flaps, Rigid
@@ -28,7 +28,7 @@ SEEN = 9  # position, velocity in W, and Euler angles, from the cameras
 ERRORS = SEEN + 3  # plus the rates, from the gyro
 DRAWS = GUSTS + ERRORS
 
-compiled = compiler(Path(__file__).parent, *SOURCES, TRANSLATOR, library=in_c)
+compiled = compiler(Path(__file__).parent, *SOURCES)
 reward_of = compiled(tasks.reward_of)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from firmware_py.compiling import bound
 from firmware_py.config import parameters_of
 from firmware_py.core.structs import Control, Estimator
-from firmware_py.core.subset import i32
+from firmware_py.core.subset import Block, i32
 from firmware_py.elementary import exp
 from hil.arguments import checked
 from hil.config import LabConfig
@@ -65,10 +65,8 @@ class Fleet:
         self._gust_rms = _slow_gusts(self._templates[1])
         self._offsets = np.array([world.zero_offset for world in worlds])
         self._kinds = (*(block.kind for block in self._plant), Agent)
-        self._memory, self._draws = (
-            [np.zeros(count, kind.dtype) for kind in self._kinds],
-            np.zeros((count, DRAWS)),
-        )
+        self._memory = [np.zeros(count, kind.dtype) for kind in self._kinds]
+        self._draws = np.zeros((count, DRAWS))
         self._sensing, self._parameters = Sensing.allocate(), parameters_of(config)
         sensing, decay = self._sensing.fields, exp(-CONTROL_US * 1e-6 / errors.tau_s)
         sensing.lasting, sensing.fresh = decay, math.sqrt(1.0 - decay * decay)
@@ -79,12 +77,11 @@ class Fleet:
 
     def _bind(self) -> None:
         """Bind the step of every robot to the present memory."""
-        shared = self._parameters.arg, Estimator.allocate().arg, Control.allocate().arg, self._sensing.arg
-        rows = [kind.rows(memory) for kind, memory in zip(self._kinds, self._memory, strict=True)]
-        self._steps = [
-            bound(advance, *(one[n] for one in rows), self._draws[n : n + 1], *shared)
-            for n in range(len(self._draws))
-        ]
+        shared = self._parameters, Estimator.allocate(), Control.allocate(), self._sensing
+        self._steps = []
+        for n in range(len(self._draws)):
+            rows = (Block(kind, one[n : n + 1]) for kind, one in zip(self._kinds, self._memory, strict=True))
+            self._steps.append(bound(advance, *rows, self._draws[n : n + 1], *shared))
 
     def __deepcopy__(self, memo: object) -> Self:
         """Return an independent copy."""

@@ -5,9 +5,7 @@ do not use them. This file suits the few small matrices of a flight. Normal nois
 """
 
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,23 +13,14 @@ from numpy.typing import NDArray
 from firmware_py import compiling, elementary
 from firmware_py.core.subset import F64s, Integer
 
-# The dependencies of the laboratory's compiled functions, besides their own files.
+# The dependencies of the laboratory's kernels, besides their own files.
 SOURCES = (
     Path(__file__).parent,
     Path(compiling.__file__).with_name("elementary.py"),
     Path(compiling.__file__).with_name("core"),
 )
-TRANSLATOR = Path(compiling.__file__).with_name("export")
 
-
-def in_c(function: Callable[..., Any], arrays: compiling.Arrays) -> Path | None:
-    """Return a kernel's library; None where no C compiler makes it."""
-    from firmware_py.export.kernels import library  # not needed where one is kept
-
-    return library(function, arrays)
-
-
-compiled = compiling.compiler(*SOURCES, TRANSLATOR, library=in_c)
+compiled = compiling.compiler(*SOURCES)
 
 Matrix = NDArray[np.float64]
 SIZE = 4  # of the largest matrix with eigenvalues, a turn's

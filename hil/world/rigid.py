@@ -71,9 +71,9 @@ class RigidBody(InTunnel):
         self._failed: str | None = None
         air = tunnel.air
         self._air = air.fields
-        self._surround, self._accelerate = bound(surround, body.arg, air.arg), bound(accelerate, body.arg)
-        self._begin, self._move = bound(begin, body.arg, air.arg, self._draws), bound(move, body.arg)
-        self._watch = bound(watch, body.arg, air.arg)
+        self._surround, self._accelerate = bound(surround, body, air), bound(accelerate, body)
+        self._begin, self._move = bound(begin, body, air, self._draws), bound(move, body)
+        self._watch = bound(watch, body, air)
         self.place(p_WB, UPRIGHT)
         if self._failed is not None:
             raise LabError(self._failed)

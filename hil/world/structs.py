@@ -138,11 +138,6 @@ class FloatyBlocks(NamedTuple):
     air: Block[Air]
     flaps: Block[Flaps]
 
-    @property
-    def args(self) -> tuple[Rigid, Air, Flaps]:
-        """What kernels take."""
-        return self.body.arg, self.air.arg, self.flaps.arg
-
     def copy(self) -> "FloatyBlocks":
         """Return an independent copy."""
         return FloatyBlocks(self.body.copy(), self.air.copy(), self.flaps.copy())

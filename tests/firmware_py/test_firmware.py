@@ -92,7 +92,7 @@ class Gyro:
 
     def add(self, *counts: int) -> bool:
         self.data.fields.gyro[:] = counts
-        return bool(entry.take_sample(self.data.arg, self.sampling.arg))
+        return bool(entry.take_sample(self.data.fields, self.sampling.fields))
 
     @property
     def bias(self) -> list[float]:

@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from firmware_py import compiling
-from firmware_py.compiling import Arrays, bound, compiler
+from firmware_py.compiling import bound, compiler
 from firmware_py.core.subset import F64s
+from firmware_py.export import kernels
 from firmware_py.export.compilers import compilers
+from firmware_py.export.errors import ExportError
 from firmware_py.export.kernels import library
+from firmware_py.export.live_reading import Arrays
 from firmware_py.kept_code import UNUSED_S, keep, kept_folder, may_load
 
 ABSENT_UID = 12345
@@ -23,7 +26,7 @@ def cache_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """The user's cache folder, and the folder for temporary files, of this test alone."""
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.delenv("FLOATY_CACHE_DIR", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
@@ -87,7 +90,7 @@ def test_where_neither_folder_can_be_used_one_serves_that_ends_with_the_process(
 
 
 def test_a_relative_folder_is_never_used(monkeypatch: pytest.MonkeyPatch, empty_folder: Path) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", ".")
+    monkeypatch.setenv("FLOATY_CACHE_DIR", ".")
     assert not kept_folder("c", "key").is_relative_to(empty_folder / "floaty")
     assert not (empty_folder / "floaty").exists()
 
@@ -105,27 +108,6 @@ def test_a_file_that_others_may_have_written_is_not_loaded(
     assert capsys.readouterr().err == f"floaty: {path}: {why}: it is not loaded\n"
 
 
-def test_doubtful_machine_code_and_pickles_are_compiled_again(
-    cache_home: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def double(x: np.ndarray) -> None:
-        x[0] *= 2.0
-
-    for _ in range(2):
-        monkeypatch.setattr(compiling, "_LOADED", {})  # as in another process
-        x = np.array([4.0])
-        bound(compiler()(double), x)()
-        assert (x[0], compiler()(double)(x), x[0]) == (8.0, None, 16.0)
-        files = [path for path in cache_home.rglob("*") if path.is_file()]
-        assert sorted(path.suffix for path in files) == [".machine", ".nbc", ".nbi"]
-        assert {path.stat().st_mode & 0o777 for path in files} == {0o600}
-        for path in files:
-            path.write_bytes(b"cos\nsystem\n(S'touch stolen'\ntR.")
-            path.chmod(0o666)
-    told = capsys.readouterr().err
-    assert told.count("others may write it: it is not loaded") == told.count("\n") > 0
-
-
 def twice(x: F64s) -> None:
     """Double the first number."""
     x[0] = 2.0 * x[0]
@@ -135,31 +117,44 @@ def twice(x: F64s) -> None:
 def test_a_library_is_compiled_once_and_again_when_others_may_have_written_it(
     cache_home: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made: list[Path | None] = []
+    made: list[Path] = []
 
-    def count_and_make(function: Callable[..., object], arrays: Arrays) -> Path | None:
+    def count_and_make(function: Callable[..., object], arrays: Arrays) -> Path:
         made.append(library(function, arrays))
         return made[-1]
 
-    def call() -> float:
-        monkeypatch.setattr(compiling, "_LOADED", {})  # as in another process
-        x = np.array([4.0])
-        bound(compiler(library=count_and_make)(twice), x)()
+    def call(*numbers: float) -> float:
+        monkeypatch.setattr(compiling, "_LIBRARIES", {})  # as in another process
+        x = np.array(numbers)
+        bound(compiler()(twice), x)()
         return float(x[0])
 
-    assert (call(), call(), len(made)) == (8.0, 8.0, 1)
+    monkeypatch.setattr(kernels, "library", count_and_make)
+    assert (call(4.0), call(4.0), len(made)) == (8.0, 8.0, 1)
     (kept,) = cache_home.rglob("*twice*.so")
-    assert (kept.stat().st_mode & 0o777, list(cache_home.rglob("*.machine"))) == (0o600, [])
+    assert kept.stat().st_mode & 0o777 == 0o600
     kept.chmod(0o666)
-    assert (call(), len(made)) == (8.0, 2)
+    assert (call(4.0), len(made)) == (8.0, 2)
     assert capsys.readouterr().err == f"floaty: {kept}: others may write it: it is not loaded\n"
+    assert (call(4.0, 1.0), len(made)) == (8.0, 3)
+    (other,) = cache_home.rglob("*twice*.so")
+    assert other != kept, "that for memory of another kind is kept beside it"
 
 
-def test_numba_compiles_what_no_c_compiler_makes(cache_home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiling, "_LOADED", {})
-    x = np.array([4.0])
-    bound(compiler(library=lambda function, arrays: None)(twice), x)()
-    assert (x[0], len(list(cache_home.rglob("*twice*.machine")))) == (8.0, 1)
+@pytest.mark.parametrize("error", [ExportError("no C compiler"), PermissionError(13, "Permission denied")])
+def test_without_compiled_code_python_computes_the_same_and_one_line_says_why(
+    error: Exception, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> Path:
+        raise error
+
+    monkeypatch.setattr(kernels, "library", fail)
+    compiling.fall_back.cache_clear()
+    for _ in range(2):
+        x = np.array([4.0])
+        bound(compiler()(twice), x)()
+        assert x[0] == 8.0
+    assert capsys.readouterr().err == f"floaty: flies as plain Python, far slower: {error}\n"
 
 
 def test_folders_that_nobody_has_used_for_long_are_deleted() -> None:

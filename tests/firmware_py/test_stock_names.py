@@ -137,5 +137,5 @@ def test_the_gyros_variance_is_that_of_the_samples_its_zero_is_from() -> None:
     data, sampling = Input.allocate(), Sampling.allocate()
     for number, sample in enumerate(samples):
         data.fields.gyro[:] = sample
-        assert entry.take_sample(data.arg, sampling.arg) == (number == 511)
+        assert entry.take_sample(data.fields, sampling.fields) == (number == 511)
     assert sampling.fields.variance == pytest.approx(np.var(samples, axis=0), rel=1e-5)

@@ -7,17 +7,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from firmware_py.config import parameters_of
-from firmware_py.core import entry
-from firmware_py.core.structs import (
-    GOAL_ABSOLUTE,
-    MODE_FLY,
-    Control,
-    Estimator,
-    Input,
-    Report,
-    Sampling,
-    Supervisor,
-)
+from firmware_py.core.structs import GOAL_ABSOLUTE, MODE_FLY
+from firmware_py.core_runner import CoreBlocks, default_runner
 from hil.config import load_config
 
 Vector = NDArray[np.float64]
@@ -29,36 +20,33 @@ class Core:
     """The flight core on the bench: poses and ticks go in, state comes out."""
 
     def __init__(self, **parameters: float) -> None:
-        self.parameters = parameters_of(CONFIG)
-        self.data, self.estimator, self.control = (kind.allocate() for kind in (Input, Estimator, Control))
-        self.sampling, self.supervisor, self.report = (
-            kind.allocate() for kind in (Sampling, Supervisor, Report)
-        )
+        blocks = CoreBlocks(parameters_of(CONFIG), default_runner)
+        self.parameters, self.data, self.estimator = blocks.parameters, blocks.data, blocks.estimator
+        self.control, self.sampling, self.supervisor = blocks.control, blocks.sampling, blocks.supervisor
+        self.report, self.call = blocks.report, blocks.run.call
         self.sampling.fields.phase = 9  # the estimator's tick comes in this step
         for name, value in parameters.items():
             self.parameters.memory[name] = value
         self.data.fields.poses_absolute, self.data.fields.goal_kind = 1, GOAL_ABSOLUTE  # seen from W's origin
         self.fields = self.estimator.fields
-        entry.reset(self.parameters.arg, self.estimator.arg)
+        self.call("reset")
 
     def pose(self, p: object, q: object = LEVEL, age_us: int = 40_000) -> int:
         """File a pose that will be `age_us` old at the next tick."""
         data = self.data.fields
         data.pose_position[:], data.pose_quaternion[:], data.pose_age_us = p, q, age_us
-        blocks = (self.parameters, self.data, self.estimator, self.sampling, self.supervisor)
-        return int(entry.file_pose(*(block.arg for block in blocks)))
+        return self.call("file_pose")
 
     def tick(self, gyro_sum: object = (0, 0, 0), samples: int = 10, command: object = (0, 0, 0, 0)) -> None:
         """Run one tick on gyro counts and the command (deviation from hover [rad]) that held until now."""
         data = self.data.fields
         data.gyro_sum[:], data.gyro_samples = gyro_sum, samples
         self.control.fields.command[:] = command
-        blocks = (self.parameters, self.data, self.estimator, self.control, self.sampling, self.report)
-        entry.estimate(*(block.arg for block in blocks))
+        self.call("estimate")
 
     def fly(self) -> None:
         self.data.fields.mode = MODE_FLY
-        entry.control(self.parameters.arg, self.data.arg, self.estimator.arg, self.control.arg)
+        self.call("control")
 
     @property
     def x(self) -> Vector:

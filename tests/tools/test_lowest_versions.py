@@ -54,7 +54,7 @@ def test_the_lowest_versions_fly(extras: str, tmp_path: Path, monkeypatch: pytes
     python = tmp_path / "lowest" / "bin" / "python"
     project = f"{ROOT}[{extras}]" if extras else str(ROOT)
     uv("pip", "install", "--quiet", "--python", python, "--resolution", "lowest-direct", project)
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "compiled"))
+    monkeypatch.setenv("FLOATY_CACHE_DIR", str(tmp_path / "compiled"))
     monkeypatch.chdir(tmp_path)
 
     def floaty(*arguments: str | Path, code: int = 0) -> str:

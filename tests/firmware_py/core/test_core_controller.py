@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from firmware_py.config import parameters_of
-from firmware_py.core import entry
-from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL, Control, Estimator, Input
+from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL
 from firmware_py.core.subset import Block
+from firmware_py.core_runner import CoreBlocks, default_runner
 from hil.config import load_config
 from support.paths import VECTORS
 
@@ -46,14 +46,15 @@ class Loop:
     """The controller alone, on a state that the test writes."""
 
     def __init__(self, profile: str = "floaty", overrides: tuple[str, ...] = ()) -> None:
-        self.parameters: Block = parameters_of(config(profile, overrides))
-        self.data, self.estimator, self.control = (kind.allocate() for kind in (Input, Estimator, Control))
+        self.core = CoreBlocks(parameters_of(config(profile, overrides)), default_runner)
+        self.parameters: Block = self.core.parameters
+        self.data, self.estimator, self.control = self.core.data, self.core.estimator, self.core.control
         self.data.fields.mode = MODE_FLY
 
     def step(self, state: object = None) -> None:
         if state is not None:
             self.estimator.fields.now[: np.size(state)] = state
-        entry.control(self.parameters.arg, self.data.arg, self.estimator.arg, self.control.arg)
+        self.core.run.call("control")
 
     @property
     def u(self) -> NDArray[np.float64]:

@@ -634,7 +634,7 @@ def test_reset_forgets_everything_but_the_counters() -> None:
         garbage = rng.uniform(-2, 2, kind.shape) if kind.base.kind == "f" else rng.integers(1, 9, kind.shape)
         used.estimator.memory[name] = garbage
     before = dict(used.counters)
-    entry.reset(used.parameters.arg, used.estimator.arg)
+    entry.reset(used.parameters.fields, used.estimator.fields)
     for tick in range(180):  # the goal jumps there and back; then poses are young for more than a second
         for core in (used, fresh):
             if tick in (10, 11) or 40 < tick < 170:

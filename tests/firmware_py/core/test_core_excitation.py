@@ -6,7 +6,6 @@ from numpy.typing import NDArray
 from scipy.signal import chirp
 
 from firmware_py.config import SIGNALS, parameters_of
-from firmware_py.core import entry
 from firmware_py.core.excitation import PERIOD, REALISATION, REALISATIONS
 from firmware_py.core.structs import (
     EXCITE_CHIRP,
@@ -14,10 +13,8 @@ from firmware_py.core.structs import (
     EXCITE_OFF,
     MODE_FLY,
     MODE_HOVER,
-    Control,
-    Estimator,
-    Input,
 )
+from firmware_py.core_runner import CoreBlocks, default_runner
 from hil.config import load_config
 
 BAND = ("excitation.low=0.2", "excitation.high=8")
@@ -29,13 +26,13 @@ class Board:
 
     def __init__(self, kind: int, **rms: float) -> None:
         overrides = (*BAND, *(f"excitation.{name}={value}" for name, value in rms.items()))
-        self.parameters = parameters_of(load_config("floaty", overrides))
-        self.data, self.estimator, self.control = (kind.allocate() for kind in (Input, Estimator, Control))
+        self.core = CoreBlocks(parameters_of(load_config("floaty", overrides)), default_runner)
+        self.parameters, self.data, self.control = self.core.parameters, self.core.data, self.core.control
         self.data.fields.mode = MODE_FLY
         self.parameters.fields.excite_kind = kind
 
     def tick(self) -> NDArray[np.float64]:
-        entry.control(self.parameters.arg, self.data.arg, self.estimator.arg, self.control.arg)
+        self.core.run.call("control")
         return self.control.fields.excitation.astype(float)
 
     def fly(self, ticks: int = PERIOD) -> NDArray[np.float64]:

@@ -5,7 +5,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from firmware_py.core import entry
 from firmware_py.core.structs import (
     GOAL_ABSOLUTE,
     GOAL_NONE,
@@ -35,7 +34,7 @@ def boxed() -> Core:
 
 def admits(core: Core, p_W: object) -> bool:
     core.data.fields.setpoint[:3] = p_W
-    return bool(entry.admits(core.parameters.arg, core.data.arg))
+    return bool(core.call("admits"))
 
 
 def test_a_set_point_is_admitted_inside_the_cylinder_around_home_and_nowhere_else() -> None:
@@ -76,12 +75,12 @@ def test_a_set_point_becomes_the_goal_and_one_without_yaw_keeps_the_goals(yaw: f
     data = core.data.fields
     data.setpoint_kind, data.goal[3] = SETPOINT_POSITION, 0.7
     data.setpoint[:], data.setpoint_velocity[:] = (*HOME, yaw), (0.1, 0.2, 0.3)
-    assert entry.follow(core.parameters.arg, core.data.arg) == SETPOINT_POSITION
+    assert core.call("follow") == SETPOINT_POSITION
     assert data.goal_kind == GOAL_ABSOLUTE
     assert data.goal == pytest.approx([*HOME, 0.7 if np.isnan(yaw) else yaw])
     assert data.goal_velocity == pytest.approx([0.1, 0.2, 0.3])
     data.setpoint[2] += ABOVE + INCH
-    assert entry.follow(core.parameters.arg, core.data.arg) == SETPOINT_OUTSIDE
+    assert core.call("follow") == SETPOINT_OUTSIDE
     assert data.goal[:3] == pytest.approx(HOME)
 
 

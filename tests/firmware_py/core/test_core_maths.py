@@ -61,6 +61,7 @@ def test_wrapped_angle_is_the_same_angle_inside_half_a_turn(x: float) -> None:
 
 
 @law
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @given(any_number, any_number)
 @example(math.nan, math.nan)
 @example(math.inf, -math.inf)

@@ -24,7 +24,7 @@ def test_an_observation_is_error_and_motion_in_heading_frame(state: Any, target:
     parameters, estimator = parameters_of(CONFIG), Estimator.allocate()
     estimator.fields.now[:], parameters.fields.target[:] = state, target
     out = np.full(OBSERVATIONS, np.nan, np.float32)
-    observe(parameters.arg, estimator.arg, np.array(previous, np.float32), out)
+    observe(parameters.fields, estimator.fields, np.array(previous, np.float32), out)
     yaw = state[8]
     R_HG = Rotation.from_euler("z", -yaw)
     error_H = R_HG.apply(np.subtract(target[:3], state[:3]))
@@ -39,12 +39,12 @@ def test_an_action_is_limited_and_means_a_share_of_each_input_s_limit() -> None:
     parameters, control = parameters_of(CONFIG), Control.allocate()
     parameters.fields.limit_u, parameters.fields.limit_u3 = 0.5, 0.25
     action = np.array([3.0, -0.5, 0.5, -math.inf], np.float32)
-    act(parameters.arg, action, control.arg)
+    act(parameters.fields, action, control.fields)
     assert action.tolist() == [1.0, -0.5, 0.5, -1.0]
     assert control.fields.u.tolist() == [0.5, -0.25, 0.125, -0.5]
 
 
 def test_a_nan_action_stays_nan_for_the_guard() -> None:
     parameters, control = parameters_of(CONFIG), Control.allocate()
-    act(parameters.arg, np.full(ACTIONS, np.nan, np.float32), control.arg)
+    act(parameters.fields, np.full(ACTIONS, np.nan, np.float32), control.fields)
     assert np.isnan(control.fields.u).all()

@@ -38,8 +38,13 @@ def test_the_core_turns_and_scales_the_gyro_as_the_driver_does() -> None:
     data.fields.gyro_sum[:] = 10 * np.array(COUNTS[:3])
     data.fields.gyro_samples = np.int32(10)
     data.fields.gyro_bias[:] = ZERO
-    entry.reset(parameters.arg, estimator.arg)
+    entry.reset(parameters.fields, estimator.fields)
     entry.estimate(
-        parameters.arg, data.arg, estimator.arg, control.arg, Sampling.allocate().arg, Report.allocate().arg
+        parameters.fields,
+        data.fields,
+        estimator.fields,
+        control.fields,
+        Sampling.allocate().fields,
+        Report.allocate().fields,
     )
     assert estimator.fields.now[RATE : RATE + 3] == pytest.approx(rates(COUNTS, ZERO), rel=1e-6)

@@ -9,13 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_py.compiling import METHOD_IN_C, Arrays, bound_in, compiler
+from firmware_py.compiling import bound_in, compiler
 from firmware_py.core.subset import F64s, I32s, Integer, f64, i32
 from firmware_py.elementary import atan2, exp, sine_ahead
 from firmware_py.export.compilers import Compiler, compilers
 from firmware_py.export.errors import ExportError
 from firmware_py.export.kernels import build, library, translate
-from support.plain_kernels import plain
+from firmware_py.export.live_reading import Arrays
+from firmware_py.export.methods import KERNEL
 
 COMPILERS = [one for one in compilers() if one.name != "cc"]
 IDS = [one.name for one in COMPILERS]
@@ -71,8 +72,7 @@ def fresh(numbers: list[float], first: int, second: int) -> Arrays:
 @pytest.mark.parametrize("compiler", COMPILERS, ids=IDS)
 def test_c_computes_the_bits_of_python(compiler: Compiler) -> None:
     in_c = fresh([0.0, 0.0], 0, 0)
-    in_python_only = plain(compute)
-    call = bound_in(build(translate(compute, in_c), compiler), METHOD_IN_C, *in_c)
+    call = bound_in(build(translate(compute, in_c), compiler), KERNEL, *in_c)
     number = st.floats(-700.0, 700.0)  # beyond, Python's ldexp may raise
     number |= st.sampled_from([0.0, -0.0, 1.0, -1.0])
 
@@ -85,7 +85,7 @@ def test_c_computes_the_bits_of_python(compiler: Compiler) -> None:
         for array, content in zip(in_c, in_python, strict=True):
             array[:] = content
         call()
-        in_python_only(*in_python)
+        compute(*in_python)
         assert [array.tobytes() for array in in_c] == [array.tobytes() for array in in_python]
 
     holds()
@@ -179,6 +179,5 @@ def test_a_system_compiler_that_does_not_work_is_passed_over(
     monkeypatch.setenv("PATH", str(tmp_path))
     numbers = np.array([1.0, 2.0, 0.0])
     path = library(swap, (numbers,))
-    assert path is not None
-    bound_in(path, METHOD_IN_C, numbers)()
+    bound_in(path, KERNEL, numbers)()
     assert numbers.tolist() == [2.0, 1.0, 0.0]

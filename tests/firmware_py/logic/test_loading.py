@@ -326,7 +326,7 @@ def test_a_project_gets_no_compiled_code(
 ) -> None:
     project, cache = tmp_path / "project", tmp_path / "cache"
     project.mkdir()
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
+    monkeypatch.setenv("FLOATY_CACHE_DIR", str(cache))
     config = own_config(project, AS_BUILT_IN)
     for _ in range(2):
         CoreBlocks(parameters_of(config), default_runner, load_logic(config.logic))
@@ -338,7 +338,7 @@ def test_a_project_gets_no_compiled_code(
 def test_without_a_compiler_own_logic_flies_as_python_and_one_line_names_what_to_install(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("FLOATY_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(compilers, "compilers", lambda: iter(()))
     config = own_config(tmp_path, AS_BUILT_IN + "    control.u[0] = f32(0.25)\n")
     for _ in range(2):
@@ -348,7 +348,7 @@ def test_without_a_compiler_own_logic_flies_as_python_and_one_line_names_what_to
     blocks.run.call("control")
     assert blocks.control.fields.u[0] == 0.25
     assert re.fullmatch(
-        r"floaty: the flight core flies as plain Python, far slower: no C compiler on this "
+        r"floaty: flies as plain Python, far slower: no C compiler on this "
         r"machine: .*pip install .*ziglang.*\n",
         capsys.readouterr().err,
     )

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
 ROOT = Path(hil.__file__).parents[1]
 # Packages of packages, those of the pytest plugin, and one for mypy.
 WITH_OTHERS = {
-    "PIL", "libusb_package", "llvmlite", "pydantic_core", "rerun_bindings", "usb", "hypothesis", "pytest", "_typeshed",
+    "PIL", "libusb_package", "pydantic_core", "rerun_bindings", "usb", "hypothesis", "pytest", "_typeshed",
 }  # fmt: skip
 
 
@@ -324,7 +324,7 @@ def test_a_user_without_a_name_and_a_home_flies_beside_the_folders_of_others() -
 
 
 HEAVY = {
-    "numpy", "scipy", "pandas", "pyarrow", "numba", "pydantic", "rerun", "matplotlib", "jinja2", "cflib", "pymavlink",
+    "numpy", "scipy", "pandas", "pyarrow", "pydantic", "rerun", "matplotlib", "jinja2", "cflib", "pymavlink",
     "control", "dask", "distributed", "unicorn", "prompt_toolkit",
 }  # fmt: skip
 

@@ -99,7 +99,7 @@ def test_a_propeller_approaches_its_speed_with_foersters_pole() -> None:
     for ms in range(2, 202, 2):
         body.advance(1000 * ms)
         speeds.append(body.rpm[0])
-    left = steady_rpm(body.rotors.arg, 2.0) - np.array(speeds)
+    left = steady_rpm(body.rotors.fields, 2.0) - np.array(speeds)
     assert left[1:] / left[:-1] == pytest.approx(0.9695404, abs=1e-4)
 
 
@@ -293,7 +293,7 @@ def test_every_fault_of_a_motor_turns_a_setting_of_it() -> None:
 def test_vibration_grows_with_the_square_of_the_rotors_speeds() -> None:
     hovering = spun_up((0.625,) * 4, hover_volts() / 0.625)
     assert hovering.vibration == pytest.approx([0.02, 0.5], rel=0.005)
-    assert rpm_for(hovering.rotors.arg, 0.029 * G / 4) == pytest.approx(hovering.rpm, rel=0.003)
+    assert rpm_for(hovering.rotors.fields, 0.029 * G / 4) == pytest.approx(hovering.rpm, rel=0.003)
     one = spun_up((0.625, 0.0, 0.0, 0.0), hover_volts() / 0.625)
     assert one.vibration == pytest.approx([0.01, 0.25], rel=0.005)
     slow = spun_up((0.4,) * 4)

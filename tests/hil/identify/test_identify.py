@@ -249,8 +249,8 @@ def servo_words(config: LabConfig, u: tuple[float, ...]) -> list[int]:
     """Return the words that the core sends to the servos for four inputs."""
     parameters, control = parameters_of(config), Control.allocate()
     control.fields.u[:] = u
-    allocate(parameters.arg, control.arg)
-    drive_servos(parameters.arg, control.arg)
+    allocate(parameters.fields, control.fields)
+    drive_servos(parameters.fields, control.fields)
     return control.fields.word.tolist()
 
 

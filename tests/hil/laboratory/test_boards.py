@@ -116,7 +116,7 @@ def test_the_emulated_chip_is_compiled_only_once(tmp_path: Path, monkeypatch: py
     for package in ("unicorn", "cffi", "ziglang"):
         pytest.importorskip(package)
     image = str(build())
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("FLOATY_CACHE_DIR", str(tmp_path / "cache"))
     places = set()
     for number in range(2):
         folder = tmp_path / str(number)

@@ -184,7 +184,7 @@ def test_log_carries_units_frames_and_origin(tmp_path: Path) -> None:
     metadata = table.schema.metadata
     assert json.loads(metadata[b"request"])["seed"] == 1
     assert json.loads(metadata[b"config"])["controller"]["gain_y"] == -1.8
-    assert b"numba" in metadata[b"program"]
+    assert b"numpy" in metadata[b"program"]
 
 
 def test_estimate_follows_the_truth(tmp_path: Path) -> None:

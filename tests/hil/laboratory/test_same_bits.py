@@ -1,4 +1,4 @@
-"""Same seed, same hash, whatever the processor: each setting makes BLAS, numpy, numba or the C library compute for another.
+"""Same seed, same hash, whatever the processor: each setting makes BLAS, numpy or the C library compute for another.
 
 Run as a script, this file flies all flights and prints their hashes.
 """
@@ -30,7 +30,7 @@ SETTINGS = {
     "haswell": {"OPENBLAS_CORETYPE": "Haswell"},
     "skylake": {"OPENBLAS_CORETYPE": "SkylakeX"},
     "numpy": {"NPY_DISABLE_CPU_FEATURES": NUMPY},
-    "numba": {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""},
+    "plain": {"FLOATY_PLAIN": "1"},
     "libm": {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4"},
 }
 NEEDS = {"haswell": "AVX2", "skylake": "AVX512_SKX"}  # cores whose code does not run everywhere
@@ -83,7 +83,7 @@ def test_every_setting_makes_the_same_flights(name: str, usual: list[str]) -> No
 @pytest.mark.long
 def test_without_a_system_compiler_the_world_makes_the_same_flights(usual: list[str], tmp_path: Path) -> None:
     (tmp_path / "programs").mkdir()
-    assert hashes({"PATH": str(tmp_path / "programs"), "NUMBA_CACHE_DIR": str(tmp_path)}) == usual
+    assert hashes({"PATH": str(tmp_path / "programs"), "FLOATY_CACHE_DIR": str(tmp_path)}) == usual
 
 
 if __name__ == "__main__":

@@ -19,12 +19,14 @@ from hil.pictures.report import write_report
 folder = Path(sys.argv[1]) / "run"
 fly(Request.of(find_experiment("hover"), duration_s=0.2), folder)
 write_report(folder)
-print(sorted({"numba", "pandas", "scipy"} & set(sys.modules)), len(load_log(folder).to_pandas()))
+print(sorted({"firmware_py.export.kernels", "pandas", "scipy"} & set(sys.modules)), len(load_log(folder).to_pandas()))
 """
 
 
 @pytest.mark.long
-def test_a_flight_and_its_report_load_neither_pandas_nor_scipy_nor_numba_again(tmp_path: Path) -> None:
+def test_a_flight_and_its_report_load_neither_pandas_nor_scipy_nor_the_translator_of_kernels_again(
+    tmp_path: Path,
+) -> None:
     assert importlib.util.find_spec("pandas")
     assert importlib.util.find_spec("scipy")
     for folder in ("compiles", "loads"):  # what the first flight on a machine compiles, all others load

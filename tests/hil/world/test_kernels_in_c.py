@@ -7,19 +7,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-<<<<<<< HEAD
-from firmware_py.compiling import METHOD_IN_C, bound_in
-from firmware_py.core.subset import Block, F64s
-||||||| parent of f0cbf61 (Fly the fast model of learning as C)
-from firmware_py.compiling import bound_in
-from firmware_py.core.subset import Block, F64s
-=======
 from firmware_py.compiling import bound_in
 from firmware_py.core.structs import Control, Estimator, Parameters
 from firmware_py.core.subset import Block
->>>>>>> f0cbf61 (Fly the fast model of learning as C)
 from firmware_py.export.compilers import Compiler, compilers
 from firmware_py.export.kernels import build, translate
+from firmware_py.export.methods import KERNEL
 from hil import demonstrations
 from hil.crazyflie import quadrotor
 from hil.devices import imu
@@ -27,7 +20,6 @@ from hil.learn import agent
 from hil.learn.tasks import PUSH_KINDS, PUSHES
 from hil.world import fixed_order, motion
 from hil.world.structs import GUSTS, NOISE_ROWS, Air, Flaps, Rigid
-from support.plain_kernels import plain
 
 COMPILERS = [one for one in compilers() if one.name != "cc"]
 STATES = 40
@@ -60,12 +52,12 @@ def matrices() -> Memory:
     return [np.zeros((4, 4)), np.zeros((4, 4))]
 
 
-def record_of(memory: Block[Any] | NDArray[Any]) -> Any:
-    return memory.memory[0] if isinstance(memory, Block) else memory
+def array_of(memory: Block[Any] | NDArray[Any]) -> NDArray[Any]:
+    return memory.memory if isinstance(memory, Block) else memory
 
 
 def bytes_of(memory: Memory) -> list[bytes]:
-    return [record_of(one).tobytes() for one in memory]
+    return [array_of(one).tobytes() for one in memory]
 
 
 def draw(rng: np.random.Generator, memory: Memory) -> None:
@@ -114,15 +106,14 @@ def test_steps_from_any_state_have_the_bits_of_python(
 ) -> None:
     rng = np.random.default_rng(2026)
     in_c, in_python = allocate(), allocate()
-    arrays = tuple(record_of(one) for one in in_c)
-    call, function = bound_in(build(translate(kernel, arrays), compiler), METHOD_IN_C, *arrays), plain(kernel)
+    arrays = tuple(array_of(one) for one in in_c)
+    call = bound_in(build(translate(kernel, arrays), compiler), KERNEL, *arrays)
     for _ in range(STATES):
         draw(rng, in_c)
         before = bytes_of(in_c)
         for ours, theirs in zip(in_python, in_c, strict=True):
-            memory = ours.memory if isinstance(ours, Block) else ours
-            memory[:] = theirs.memory if isinstance(theirs, Block) else theirs
+            array_of(ours)[:] = array_of(theirs)
         call()
         with np.errstate(all="ignore"):
-            function(*(one.fields if isinstance(one, Block) else one for one in in_python))
+            kernel(*(one.fields if isinstance(one, Block) else one for one in in_python))
         assert bytes_of(in_c) == bytes_of(in_python) != before
