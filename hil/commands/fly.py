@@ -17,6 +17,7 @@ from hil.errors import LabError, writing
 if TYPE_CHECKING:
     from hil.laboratory.flight import Flight
     from hil.laboratory.request import Options, Request
+    from hil.live.panel_commands import PanelCommands
 
 SEEDS_MAX = 10_000
 
@@ -118,7 +119,6 @@ def _fly_one(request: Request, folder: Path, target: str | None) -> int:
     """Fly one seed with all its pictures; return the exit code."""
     from hil.api import maker_of
     from hil.laboratory.run import fly
-    from hil.live.panel_commands import PanelCommands
 
     view = common.open_live(target)
     with common.progress_bar(TextColumn("{task.fields[now]}"), TimeRemainingColumn()) as progress:
@@ -127,6 +127,8 @@ def _fly_one(request: Request, folder: Path, target: str | None) -> int:
 
         def show(now_us: int, flight: Flight) -> None:
             if view is not None and not hands:
+                from hil.live.panel_commands import PanelCommands
+
                 hands.append(PanelCommands(view, flight, request.bench.in_lockstep))
             progress.update(bar, completed=now_us, total=flight.end_us, now=f"{now_us * 1e-6:6.1f} s")
 

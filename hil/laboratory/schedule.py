@@ -68,7 +68,8 @@ def load_schedule(folder: Path) -> pa.Table:
     if not path.exists():
         return SCHEMA.empty_table()
     try:
-        return pa.parquet.read_table(path, partitioning=None).cast(SCHEMA)
+        with pa.parquet.ParquetFile(path) as file:  # loads no datasets, as `read_table` does
+            return file.read().cast(SCHEMA)
     except (*ARROW_ERRORS, OSError) as error:
         raise LabError(f"{path}: not a schedule ({' '.join(str(error).split())})") from None
 
