@@ -3,6 +3,8 @@
 import csv
 import hashlib
 import io
+import os
+import tty
 from math import pi
 
 import numpy as np
@@ -15,13 +17,14 @@ from scipy.spatial.transform import Rotation
 from firmware_py.geometry import from_euler_zyx
 from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.telemetry import BLOCKS
+from ground_station.clock import clock_us
 from ground_station.config import LinkSettings, StationConfig
-from ground_station.controls import REPEAT_US, ControlAction, ControlRequest
+from ground_station.controls import REPEAT_US, Answer, ControlAction, ControlRequest
 from ground_station.errors import LinkError
 from ground_station.links.mavlink import MavlinkLink
 from ground_station.links.mavlink_budget import TELEMETRY_HZ, link_budget
-from ground_station.links.mavlink_controls import REASON_US
-from ground_station.links.mavlink_serial import named
+from ground_station.links.mavlink_controls import REASON_US, MavlinkControls
+from ground_station.links.mavlink_serial import MavlinkSerialLink, named
 from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation
 from ground_station.telemetry_log import TelemetryLog
@@ -251,6 +254,51 @@ def test_the_senders_of_frames_are_named_those_that_sent_most_first():
     )
 
 
+def test_the_summary_names_each_figure_and_texts_are_notices_once():
+    link, codec, now_us = (
+        MavlinkSerialLink("mavlink:COM3", LinkSettings(50.0, 900, 921_600)),
+        LinkWithCodec().codec,
+        clock_us(),
+    )
+    link.start_telemetry(now_us)
+    link.receive(now_us + 4_200, dialect.MAVLink_timesync_message(5, 1000 * now_us).pack(codec))
+    codec.seq = 3  # two are lost
+    text = dialect.MAVLink_statustext_message(6, b"hello").pack(codec)
+    link.receive(now_us + 5_000, text + heartbeat().pack(codec)[:-1] + b"x")
+    link.receive(now_us + 6_000, heartbeat().pack(codec))
+    assert link.summary() == "0 sent, 0 late  frames 3, 2 lost, 1 bad  round trip 4.2 ms"
+    assert (link.received_us, link.latency.us, link.supervisor_state) == (now_us + 6_000, 2_100, 2)
+    assert (link.notices(), link.notices()) == (["board: hello"], [])
+
+
+def test_a_line_that_is_opened_again_has_forgotten_the_board():
+    """Telemetry is requested in each connection, which is none before the board's heartbeat and its answer."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    link, bench = (
+        MavlinkSerialLink(f"mavlink:{os.ttyname(slave)}", LinkSettings(50.0, 900, 921_600)),
+        LinkWithCodec(),
+    )
+
+    def board_answers():
+        os.write(
+            master,
+            heartbeat().pack(bench.codec) + dialect.MAVLink_command_ack_message(511, 0).pack(bench.codec),
+        )
+        return False
+
+    for _ in range(2):
+        with pytest.raises(LinkError, match="stopped while connecting"):
+            link.open(lambda: True)
+        link.open(board_answers)
+        while not any(message.get_msgId() == COMMAND for _, message in bench.sent):
+            bench._transmit(0, os.read(master, 4096))
+        link.close()
+        bench.sent.clear()
+    os.close(master)
+    os.close(slave)
+
+
 def test_texts_and_refusals_are_collected():
     bench = LinkWithCodec()
     text = dialect.MAVLink_statustext_message(4, b"supervisor: failsafe, silence")
@@ -279,10 +327,32 @@ def test_a_refusal_without_reason_has_the_standard_s_word(result, word):
     bench = LinkWithCodec()
     controls, told = bench.link.controls, dialect.MAVLink_statustext_message(6, b"written by somebody")
     controls.ask(0, ControlRequest(ControlAction.SAVE))
+    bench.hear(500, dialect.MAVLink_command_ack_message(511, 0))  # of another command
+    assert controls.answer(500) is None
     bench.hear(1_000, dialect.MAVLink_command_ack_message(245, result), told)
     assert controls.answer(1_000 + REPEAT_US) is None
     assert controls.answer(1_000 + REASON_US).error == f"the board refuses PREFLIGHT_STORAGE: {word}"
     assert list(bench.link.texts) == ["board: written by somebody"]
+
+
+@given(st.lists(st.sampled_from((0, 1, 2, 3, 4, 5, 0xFFFF)), max_size=12))
+def test_a_list_is_whole_and_in_the_board_s_order_whatever_arrives_and_is_lost(arriving):
+    """Of five parameters; a value with a number beyond them is no part of the list."""
+    asked, now_us = [], 0
+    controls = MavlinkControls(lambda now_us, message: asked.append(message), lambda: 1)
+
+    def arrive(number):
+        controls.receive(now_us, services.parameter(f"P{number}", float(number), number, 5))
+
+    controls.ask(now_us, ControlRequest(ControlAction.LIST))
+    for number in arriving:
+        arrive(number)
+    del asked[: bool({*arriving} & {*range(5)})]  # of a list that begins
+    while (answer := controls.answer(now_us)) is None:
+        now_us += REPEAT_US
+        while asked:
+            arrive(getattr(asked.pop(), "param_index", 0))
+    assert answer == Answer(tuple((f"P{number}", float(number)) for number in range(5)))
 
 
 # Time

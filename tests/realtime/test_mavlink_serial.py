@@ -44,7 +44,7 @@ Talk = Callable[["Peer"], None]
         ("mavlink:/dev/ttyUSB0", ("/dev/ttyUSB0", 921_600)),
         ("mavlink:/dev/ttyUSB0,57600", ("/dev/ttyUSB0", 57_600)),
         ("mavlink:COM3,115200", ("COM3", 115_200)),
-        ("mavlink:socket://127.0.0.1:5760", ("socket://127.0.0.1:5760", 921_600)),
+        ("mavlink:socket://127.0.0.1:65535", ("socket://127.0.0.1:65535", 921_600)),
         ("mavlink:rfc2217://[::1]:4000,9600", ("rfc2217://[::1]:4000", 9600)),
         ("mavlink:rfc2217://host:4000?logging=debug", ("rfc2217://host:4000?logging=debug", 921_600)),
     ],
