@@ -2,6 +2,7 @@
 
 import copy
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,13 +11,17 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from scipy.spatial.transform import Rotation
 
 import hil.learn
+from firmware_py.core.observation import OBSERVATIONS
 from hil.config import load_config
 from hil.errors import LabError
-from hil.learn.batch import EstimateErrors
+from hil.floaty.plant import Plant
+from hil.learn.batch import EstimateErrors, Fleet
 from hil.learn.envs import REACH, FastEnv, FirmwareEnv, make_env
 from hil.learn.tasks import PUSHES, TASKS, EpisodeTask, draw_episode
+from hil.world.tunnel import GUST_RMS
 
 STILL = ["tunnel.turbulence=none"]
 
@@ -224,12 +229,54 @@ def test_an_age_of_the_pose_delays_the_observation_of_the_cameras_alone() -> Non
     home = load_config().flight.home
     seen = {env: [env.reset(seed=2)[0]] for env in (now, late)}
     for action in actions(40, 0.3):
+        rates = now.truth.body.fields.omega_B.copy()
+        steps = {env: env.step(action) for env in seen}
         for env, rows in seen.items():
-            rows.append(env.step(action)[0])
-        assert seen[now][-1][2] == pytest.approx(home[2] - now.truth.body.fields.p_WB[2], abs=1e-6)
+            rows.append(steps[env][0])
+        assert steps[now][1] == steps[late][1], "the reward is of the truth"
+        body, flaps = (block.fields for block in (now.truth.body, now.truth.flaps))
+        yaw, pitch, roll = Rotation.from_quat(body.q_WB, scalar_first=True).as_euler("ZYX")
+        assert seen[now][-1][2] == pytest.approx(home[2] - body.p_WB[2], abs=1e-6)
+        expected = (roll, pitch, -yaw, *(rates + body.omega_B) / 2, *(flaps.angle - flaps.hover))
+        assert seen[now][-1][6:16] == pytest.approx(np.array(expected), abs=2e-6)
     fresh, old = np.array(seen[now]), np.array(seen[late])
     np.testing.assert_array_equal(old[5:, :9], fresh[:-5, :9])
     np.testing.assert_array_equal(old[:, 9:], fresh[:, 9:])
+
+
+def test_errors_of_the_estimate_have_their_sizes_from_the_start_on_and_last_their_time() -> None:
+    """As the difference from a flight without errors: of 300 robots after each of 40 steps."""
+    errors = hil.learn.EstimateErrors(0.002, 0.03, 0.005, 0.07, tau_s=0.08)
+    rows = []
+    for one in (errors, hil.learn.EstimateErrors(0.0, 0.0, 0.0, 0.0)):
+        many = gymnasium.make_vec("floaty/Hover-v0", num_envs=300, overrides=STILL, errors=one)
+        seen = [many.reset(seed=3)[0]]
+        seen += [many.step(np.zeros((300, 4), np.float32))[0] for _ in range(40)]
+        rows.append(np.array(seen)[:, :, :12].reshape(41, 300, 4, 3))
+    error = rows[0] - rows[1]
+    sizes = np.sqrt((error**2).mean(axis=(1, 3)))
+    for at in (sizes[0], sizes[1:].mean(axis=0)):
+        assert at == pytest.approx((0.002, 0.03, 0.005, 0.07), rel=0.08)
+    kept = (error[8:] * error[:-8]).mean(axis=(0, 1, 3)) / (error**2).mean(axis=(0, 1, 3))
+    assert kept == pytest.approx((*3 * (math.exp(-1.0),), 0.0), abs=0.05)
+
+
+def test_each_robot_flies_in_the_gusts_of_its_own_tunnel_which_stay_as_strong_as_they_begin() -> None:
+    board, unused = load_config(), np.random.default_rng(1)
+    tunnels = [load_config("floaty", [f"tunnel.turbulence={level}"]) for level in ("none", "T1")]
+    worlds = [
+        Plant(one.geometry, one.plant, one.tunnel, one.actuators, unused, one.flight.home) for one in tunnels
+    ]
+    fleet, rng = Fleet(board, worlds, 400, 0, EstimateErrors()), np.random.default_rng(2)
+    episode, out = draw_episode(TASKS["Hover"], rng, 1.0), np.zeros((400, OBSERVATIONS), np.float32)
+    for n in range(400):
+        fleet.begin(n, replace(episode, robot=0.25 + 0.5 * (n % 2)), rng, out[n])
+    for _ in range(2):
+        gusts = np.array([fleet.truth(n).air.fields.gusts for n in range(400)])
+        assert not gusts[::2].any()
+        assert np.sqrt((gusts[1::2] ** 2).mean(axis=0)) == pytest.approx(GUST_RMS["T1"], rel=0.2)
+        for _ in range(50):
+            fleet.advance(np.zeros((400, 4), np.float32), rng, out, np.zeros(400))
 
 
 def test_robots_are_drawn_from_the_campaign_s_distributions_in_both_fidelities() -> None:
