@@ -4,6 +4,7 @@ import csv
 import hashlib
 import io
 import os
+import select
 import tty
 from math import pi
 
@@ -292,6 +293,7 @@ def test_a_line_that_is_opened_again_has_forgotten_the_board():
             link.open(lambda: True)
         link.open(board_answers)
         while not any(message.get_msgId() == COMMAND for _, message in bench.sent):
+            assert select.select((master,), (), (), 10.0)[0], "no request"
             bench._transmit(0, os.read(master, 4096))
         link.close()
         bench.sent.clear()

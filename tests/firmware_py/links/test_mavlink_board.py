@@ -517,6 +517,23 @@ def test_on_a_full_line_replies_wait_and_streams_are_dropped(client: MavlinkClie
     assert all((b - a) % 256 == 1 for a, b in pairwise(sequence))
 
 
+@pytest.mark.parametrize(("interval_us", "first_ms"), [(-1, None), (100_000, 200), (250_000, 250)])
+def test_a_stream_that_is_set_while_its_message_waits_begins_anew(
+    client: MavlinkClient, interval_us: int, first_ms: int | None
+) -> None:
+    """The message that waits for a full line is not sent; intervals count from boot."""
+    client.run(30_000)
+    client.command(511, 30, 10_000)
+    client.uart_room = 0
+    client.run(130_000)
+    client.command(511, 30, interval_us)
+    set_ms = client.now_us // 1000
+    client.uart_room = 1 << 30
+    client.run(301_000)
+    stamps = [stamp for message in client.of("ATTITUDE") if (stamp := message.time_boot_ms) >= set_ms]
+    assert stamps == ([] if first_ms is None else list(range(first_ms, 301, interval_us // 1000)))
+
+
 def test_more_streams_than_the_queue_takes_have_their_turns_too(client: MavlinkClient) -> None:
     slow_line(client, bytes_per_ms=1)
     numbers = (

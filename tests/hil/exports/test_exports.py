@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
@@ -115,6 +117,15 @@ def test_numbers_of_an_mcap_file_cover_the_log_and_name_unit_and_frame(folder: P
     assert len(in_poses) == 1 + 7 + 4 + 6
 
 
+def test_what_is_no_number_is_null_in_an_mcap_file(folder: Path, tmp_path: Path) -> None:
+    log = load_log(folder).slice(0, 4)
+    power = log.column_names.index("battery.power")
+    values = pa.array((1.5, math.nan, math.inf, -math.inf), pa.float32())
+    pq.write_table(log.set_column(power, log.schema.field(power), values), tmp_path / "log.parquet")
+    told = [one["battery_power"] for _, one in messages(write_mcap(tmp_path))["/battery"]]
+    assert told == [1.5, None, None, None]
+
+
 def test_frames_lead_from_the_world_to_the_estimate(folder: Path) -> None:
     _, last = messages(write_mcap(folder))["/tf"][-1]
     assert [(one.parent_frame_id, one.child_frame_id) for one in last.transforms] == [
@@ -165,8 +176,6 @@ def test_pymavlink_reads_the_flight_in_the_world_s_frame(folder: Path) -> None:
 
 @pytest.mark.parametrize("write", [write_csv, write_mcap, write_tlog])
 def test_a_killed_run_is_exported(folder: Path, tmp_path: Path, write: Callable[[Path], Path]) -> None:
-    import pyarrow as pa
-
     log = load_log(folder)
     with pa.ipc.new_stream(str(tmp_path / "log.arrows"), log.schema) as stream:
         stream.write_table(log.slice(0, 100))

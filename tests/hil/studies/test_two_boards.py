@@ -1,5 +1,6 @@
 """Why two boards fly one seed differently: what was put into a log as a difference is told, with its size."""
 
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
+from hil.laboratory.metrics import column
 from hil.laboratory.request import REAL, Bench, Request
 from hil.laboratory.result import read_result, write_result
 from hil.laboratory.run import fly
@@ -143,11 +145,18 @@ def test_only_equal_requests_on_two_boards_are_comparable(flown: Path, tmp_path:
 
 @pytest.mark.long
 def test_two_folders_of_runs_are_a_row_per_seed(cli: Cli, flown: Path, tmp_path: Path) -> None:
+    """The second body is 12.3 mm beside the first, and its board fuses three poses more."""
+
+    def beside(columns: Columns) -> None:
+        bumped(columns)
+        columns["truth.x"] += 0.0123
+        columns["estimator.fused"] += 3
+
     for name in ("first", "second"):
         (tmp_path / name).mkdir()
     for seed in (10, 2):
         shutil.copytree(flown, tmp_path / "first" / f"hover-{seed}")
-        other(flown, tmp_path / "second" / f"hover-{seed}", bumped)
+        other(flown, tmp_path / "second" / f"hover-{seed}", beside)
         for name in ("first", "second"):
             folder = tmp_path / name / f"hover-{seed}"
             result = read_result(folder)
@@ -156,9 +165,18 @@ def test_two_folders_of_runs_are_a_row_per_seed(cli: Cli, flown: Path, tmp_path:
     found = seeds_of(tmp_path / "first", tmp_path / "second")
     assert [one.seed for one in found] == [2, 10]
     assert all(one.first is not None and one.first.row == RELEASE + 1 for one in found)
-    assert all(one.apart_m == 0 and one.fused[0] == one.fused[1] for one in found)
     assert cli("compare", tmp_path / "first", tmp_path / "second") == 1
-    assert "2 seeds: rms errors within 0.0 % of the first's, bodies within 0.00 mm" in cli.out
+    free = load_flown(flown).log.slice(RELEASE)
+    x, y, z = (column(free, f"truth.{axis}") - column(free, f"goal.{axis}") for axis in "xyz")
+    rms = [100 * np.sqrt((error**2).mean()) for error in (x, y, z, x + 0.0123)]
+    row = next(line for line in cli.out.splitlines() if "101" not in line and " 10 " in line)
+    assert [float(number) for number in re.findall(r"\d+\.\d+", row)] == pytest.approx(
+        [*rms[:3], rms[3], *rms[1:3], 12.3, 0.01], abs=0.01
+    )
+    fused = int(column(free, "estimator.fused")[-1])
+    assert f"{fused} | {fused + 3}" in row
+    worst = 100 * abs(rms[3] / rms[0] - 1)
+    assert f"2 seeds: rms errors within {worst:.1f} % of the first's, bodies within 12.30 mm" in cli.out
     with pytest.raises(LabError, match="neither two runs nor folders with runs of the same names"):
         seeds_of(tmp_path / "first", flown.parent)
     shutil.copytree(flown, tmp_path / "alone")
