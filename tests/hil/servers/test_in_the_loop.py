@@ -220,6 +220,7 @@ def test_a_loop_with_gaps_and_pauses_that_begins_again_is_like_the_first(host: H
         begun = host.count
         host.looped.clear()
         host.client.execute([loop(Hil.STILL)])
+        host.run(30, sending=False)  # reports from before the first sample
         host.run(100)
         host.run(HIL_HOLD + 100, sending=False)
         host.run(50)
@@ -232,7 +233,7 @@ def test_a_loop_with_gaps_and_pauses_that_begins_again_is_like_the_first(host: H
         host.count = missing + 4
         host.run(60)
         leave()
-        return [told._replace(used=told.used - begun, state=0, cause=0) for told in host.looped]
+        return [told._replace(used=max(0, told.used - begun), state=0, cause=0) for told in host.looped]
 
     leave()
     first = played()
@@ -270,14 +271,17 @@ def test_a_pause_ends_after_a_time_with_the_last_sample(host: Host) -> None:
     assert host.looped[-1].late in range(told.late, 101)
 
 
-def test_samples_beyond_the_buffer_are_not_taken(host: Host) -> None:
+def test_64_samples_wait_and_none_beyond_them(host: Host) -> None:
     host.run(100)
+    host.looped.clear()
+    while not host.looped:
+        host.run(1)
+    used = host.looped[-1].used
     for _ in range(30):
         host.send(count=4)
-    host.run(10)
+    host.run(10, sending=False)
     told = host.looped[-1]
-    assert told.received in range(100 - HIL_WAITING + 60, 100 - HIL_WAITING + 70)
-    assert told.lost == 0
+    assert (told.used, told.waiting, told.received, told.lost) == (used + 10, 64 - 10, used + 64, 0)
 
 
 @pytest.mark.parametrize(
@@ -337,13 +341,18 @@ def test_a_host_that_is_gone_for_a_second_gives_the_board_its_own_gyro_back(host
     assert host.app.supervisor.state == State.FLYING
 
 
-def test_a_board_that_is_asked_into_the_loop_and_gets_no_sample_leaves_it(host: Host) -> None:
-    host.run(1005, sending=False)
-    told = len(host.looped)
-    assert told in (99, 100)
-    assert host.looped[-1].late == 0
-    host.run(100, sending=False)
-    assert len(host.looped) == told
+@pytest.mark.parametrize("again", [Hil.OFF, Hil.MOVING])
+def test_a_board_without_samples_leaves_the_loop_after_a_second_unless_it_is_asked_again(
+    host: Host, again: Hil
+) -> None:
+    mode = ctypes.c_uint8.in_dll(host.app.c, "floaty_hil_mode")
+    host.run(1000, sending=False)
+    assert mode.value == Hil.STILL
+    assert [(told.held, told.late) for told in host.looped] == [(held, 0) for held in range(10, 1001, 10)]
+    if again:
+        host.client.execute([loop(again)])
+    host.run(1, sending=False)
+    assert mode.value == again
 
 
 # Flights
