@@ -248,6 +248,10 @@ def test_telemetry_is_asked_for_at_the_first_frame_and_after_half_a_second_witho
         bench.hear(now_us, next(telemetry_packets(now_us // 1000)))
         bench.station.on_frame(MocapFrame(now_us, HOME.p_WG, UPRIGHT, True), now_us + 399_000)
     assert bench.requests == []
+    for late_us in (499_999, 500_000):
+        assert bench.requests == []
+        bench.station.on_frame(MocapFrame(now_us + late_us, HOME.p_WG, UPRIGHT, True), now_us + late_us)
+    assert len(bench.requests) == 1
 
 
 def telemetry_packets(timestamp_ms, blocks=START_ORDER):
@@ -282,6 +286,21 @@ def test_log_has_one_row_per_time_stamp_with_what_the_ground_knew(tmp_path):
         for variable in block.variables:
             expected = 0.5 + block.id if variable.type.is_float else block.id
             assert float(first[f"{variable.name} [{variable.unit}]"]) == expected
+
+
+def test_ages_count_to_the_sending_and_the_logged_goal_is_that_of_the_packet_s_arrival(tmp_path):
+    log = TelemetryLog(tmp_path / "telemetry.csv")
+    bench = StationWithPackets(latency_us=700, log=log.write, trajectory=Offsets(HOME, 45_000, x=Step(0.5)))
+    seen = MocapFrame(
+        1_000, HOME.p_WG, UPRIGHT, True, arrived_us=21_000, received_us=5_000, transmitted_us=11_000
+    )
+    bench.station.on_frame(seen, 33_000)
+    assert bench.station.budget.last() == (4_000, 6_000, 10_000, 20_000, 12_000, 700)
+    for data in telemetry_packets(20):
+        bench.hear(50_000, data)
+    log.close()
+    (row,) = rows(tmp_path / "telemetry.csv")
+    assert float(row["goal.x [m]"]) == 0.5
 
 
 def test_times_are_to_the_microsecond_on_a_computer_that_has_run_for_days(tmp_path):

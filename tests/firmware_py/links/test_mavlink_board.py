@@ -3,6 +3,7 @@
 import math
 import re
 import struct
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -11,6 +12,7 @@ import pymavlink.dialects.v20.development as dialect
 import pytest
 from scipy.spatial.transform import Rotation
 
+from firmware_py.links.parameters import Parameter, ParameterStorage
 from firmware_py.signals import COUNTERS
 from firmware_py.wire import telemetry
 from firmware_py.wire.mavlink import POSES
@@ -579,6 +581,12 @@ def test_waiting_messages_leave_within_a_tick_of_room(client: MavlinkClient) -> 
 # Parameters
 
 
+def own_parameters(client: MavlinkClient) -> Sequence[Parameter]:
+    """Those before the stock names."""
+    parameters = client.firmware.parameters
+    return parameters[: [one.name for one in parameters].index("activeMarker.back")]
+
+
 def parameter_list(client: MavlinkClient) -> dict[str, Any]:
     answers = client.ask("param_request_list", 1, 1, wait_us=200_000)
     return {answer.param_id: answer for answer in answers if answer.get_type() == "PARAM_VALUE"}
@@ -586,9 +594,7 @@ def parameter_list(client: MavlinkClient) -> dict[str, Any]:
 
 def test_the_list_is_complete_and_every_value_is_real32(client: MavlinkClient) -> None:
     table = parameter_list(client)
-    names = [parameter.name for parameter in client.firmware.parameters]
-    own = client.firmware.parameters[: names.index("activeMarker.back")]  # before the stock names
-    writable = [parameter for parameter in own if parameter.write is not None]
+    writable = [parameter for parameter in own_parameters(client) if parameter.write is not None]
     assert len(table) == len(writable) > 40
     assert {answer.param_index for answer in table.values()} == set(range(len(writable)))
     assert {answer.param_count for answer in table.values()} == {len(writable)}
@@ -781,6 +787,13 @@ def test_in_flight_only_a_forced_reset_is_obeyed(kind: str) -> None:
     assert ack.result == 0
     client.run(1_700_000)
     assert len(client.resets_us) == 1
+
+
+def test_exactly_the_persistent_parameters_are_stored(client: MavlinkClient) -> None:
+    assert client.command(245, 1)[0].result == 0
+    expected = {one.name: one.value() for one in own_parameters(client) if one.persistent}
+    assert ParameterStorage(client.eeprom).load() == expected
+    assert len(expected) < sum(one.write is not None for one in own_parameters(client))
 
 
 def test_the_heartbeat_is_armed_only_while_the_flaps_are_controlled() -> None:

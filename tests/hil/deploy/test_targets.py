@@ -1,0 +1,54 @@
+"""What the machine code of a check costs: per tick, per entry point and in memory, over all its flights."""
+
+from contextlib import ExitStack
+
+import pytest
+
+from firmware_py.config import LogicConfig, parameters_of
+from firmware_py.core_runner import CoreBlocks
+from firmware_py.export.cortex_m4 import CortexM4Runner
+from firmware_py.logic.loading import load_logic
+from hil.config import load_config
+from hil.deploy.targets import CORTEX_M4, TICK_HZ, Toolbox
+
+TICK = ("file_pose", "file_pose", "estimate", "supervise", "control")
+
+
+def test_every_cycle_after_the_first_tick_belongs_to_one_tick_and_flights_add_up() -> None:
+    """The first tick contains the boot. A flight of few calls needs less stack than the one before."""
+    config, logic = load_config(), load_logic(LogicConfig())
+    box = Toolbox([CORTEX_M4], LogicConfig())
+    used = box.machine_code
+    assert used is not None
+    instructions = cycles = stack = 0
+    worst = [0, 0]
+    calls: dict[str, int] = {}
+    for flight in (
+        (("reset", *TICK), TICK, ("estimate", "control"), TICK),
+        (("reset", "control"), ("control",)),
+    ):
+        with ExitStack() as flown:
+            runner = CoreBlocks(parameters_of(config), box.factories(flown)[CORTEX_M4], logic).run
+            assert isinstance(runner, CortexM4Runner)
+            before = 0, 0
+            for number, tick in enumerate(flight):
+                for name in tick:
+                    runner.call(name)
+                    calls[name] = calls.get(name, 0) + 1
+                now = tuple(
+                    sum(getattr(one, unit) for one in runner.load.values())
+                    for unit in ("instructions", "cycles")
+                )
+                spent, before = [end - begin for begin, end in zip(before, now, strict=True)], now
+                if number:
+                    instructions, cycles = instructions + spent[0], cycles + spent[1]
+                    worst = [max(pair) for pair in zip(worst, spent, strict=True)]
+            stack = max(stack, runner.stack_bytes)
+            ram = runner.ram_bytes
+    ticks = used.ticks
+    assert (ticks.calls, ticks.instructions, ticks.cycles) == (4, instructions, cycles)
+    assert [ticks.worst_instructions, ticks.worst_cycles] == worst
+    assert used.loads == pytest.approx((cycles / 4 / 168e6 * TICK_HZ, worst[1] / 168e6 * TICK_HZ))
+    assert (used.ram_bytes, used.stack_bytes) == (ram, stack)
+    assert stack > runner.stack_bytes
+    assert {name: load.calls for name, load in used.entries.items() if load.calls} == calls
