@@ -37,7 +37,7 @@ def replacing_older(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         _bring_back(folder)  # from an attempt that never began
         if older := list(folder.iterdir()):
-            if not (any((folder / name).exists() for name in (*DECIDING, EVENTS)) or _is_blank(folder)):
+            if not (any((folder / name).exists() for name in DECIDING) or _is_blank(folder)):
                 raise LabError(
                     f"--out {folder}: the folder is not empty and holds no run; choose another one"
                 )
