@@ -141,7 +141,7 @@ def test_hypothesis_shrinks_a_failing_flight_without_a_word_about_fixtures(pytes
         @given(push=faults("push.y", start_s=(0.0, 0.0)))
         @settings(max_examples=10, deadline=None, derandomize=True, database=None)
         def test_it(floaty, push):
-            floaty.fly(duration_s=0.1, faults=[push])
+            floaty.fly(duration_s=0.05, faults=[push], overrides={"flight.release_us": 10_000})
             assert push.size < 2.31
         """)
     result = pytester.runpytest_inprocess()
