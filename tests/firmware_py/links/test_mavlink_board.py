@@ -127,7 +127,7 @@ def test_the_age_of_a_pose_is_true_whatever_the_stations_clock_shows(ahead_us: i
 
 
 @pytest.mark.parametrize(
-    ("lag_us", "age_us"), [(-5_200, None), (-4_800, 0), (-200, 0), (499_800, 499_800), (500_200, None)]
+    ("lag_us", "age_us"), [(-5_020, None), (-4_980, 0), (-200, 0), (499_980, 499_980), (500_020, None)]
 )
 def test_ages_within_the_clock_error_are_zero_else_unknown(lag_us: int, age_us: int | None) -> None:
     client = MavlinkClient()
@@ -159,6 +159,14 @@ def test_the_clock_is_asked_ten_times_a_second_until_five_answers_came_then_twic
     assert asked_ms == [97, 194, 291, 388, 485, 582, 1069, 1556, 2043, 2530]
 
 
+def test_a_partner_that_never_answers_is_asked_for_five_seconds_then_twice_a_second() -> None:
+    client = MavlinkClient()
+    client.send("heartbeat", 6, 8, 0, 0, 4, 3)
+    client.run(6_000_000)
+    asked_ms = [t_us // 1000 for t_us, message in client.messages if message.get_type() == "TIMESYNC"]
+    assert asked_ms == [*range(97, 50 * 97 + 1, 97), 50 * 97 + 487, 50 * 97 + 2 * 487]
+
+
 @pytest.mark.parametrize("lag_us", [600_000, -20_000])
 def test_an_impossible_age_is_unknown(lag_us: int) -> None:
     client = MavlinkClient()
@@ -181,21 +189,22 @@ def test_poses_that_are_too_old_are_counted_and_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("start_us", "said"),
-    [(500_000, ["poses of 7/8 and 255/190 in turn: their age stays unknown"]), (1_000_000, [])],
+    ("back_us", "said"),
+    [(980_000, ["poses of 255/190 and 255/200 in turn: their age stays unknown"]), (1_020_000, [])],
 )
-def test_two_senders_of_poses_in_turn_are_named_and_one_that_takes_over_is_not(
-    start_us: int, said: list[str]
+def test_two_senders_of_poses_within_a_second_are_named_and_one_that_takes_over_is_not(
+    back_us: int, said: list[str]
 ) -> None:
-    client, other = MavlinkClient(), codec(7, 8)
+    client, other = MavlinkClient(), codec(255, 200)
 
     def pose(now_us: int) -> None:
         message = other.att_pos_mocap_encode(now_us, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, -1.15)
         client.receive(message.pack(other))
 
-    client.poses(100_000, 1_000_000)
-    for at_us in range(start_us, start_us + 500_000, 20_000):
+    client.poses(100_000, 500_001)
+    for at_us in range(520_000, 500_000 + back_us, 20_000):
         client.events.at(at_us, pose)
+    client.poses(500_000 + back_us, 500_000 + back_us + 1)
     client.run(1_600_000)
     assert [text for text in client.texts() if "in turn" in text] == said
 
@@ -260,6 +269,8 @@ def test_only_the_clock_of_the_sender_of_poses_counts() -> None:
         requests = [message for message in client.of("TIMESYNC") if message.tc1 == 0]
         if requests:
             client.receive(other.timesync_encode(1, requests[-1].ts1).pack(other))
+        if now_us % 100_000 == 0:
+            client.receive(other.heartbeat_encode(6, 8, 0, 0, 4).pack(other))
 
     for at_us in range(100_000, 1_500_000, 1000):
         client.events.at(at_us, lie)
@@ -878,6 +889,15 @@ def test_the_boards_own_frames_are_ignored_when_they_come_back(client: MavlinkCl
     client.run(client.now_us + 3000)
     assert client.messages == []
     assert client.firmware.signals.supervisor.armed
+
+
+def test_a_client_is_there_for_three_seconds_after_its_last_message(client: MavlinkClient) -> None:
+    client.run(10_000_000)
+    assert not client.stack.connected
+    client.send("heartbeat", 6, 8, 0, 0, 4, 3)
+    for at_us, connected in ((10_010_000, True), (12_990_000, True), (13_010_000, False)):
+        client.run(at_us)
+        assert client.stack.connected == connected
 
 
 def test_half_a_frame_does_not_hold_back_the_last_command(client: MavlinkClient) -> None:

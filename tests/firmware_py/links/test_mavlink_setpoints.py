@@ -180,6 +180,10 @@ def test_offboard_starts_and_ends_by_command(client: MavlinkClient, params: tupl
     assert current(client) == OFFBOARD
     assert client.command(DO_SET_MODE, 1, 4, 3)[0].result == ACCEPTED
     assert current(client) == HOLD
+    client.messages.clear()
+    by(client, OTHER, "set_position_target_local_ned", *target(0.1))
+    client.run(client.now_us + 600_000)
+    assert (aim(client), client.texts()) == (0.1, [])
 
 
 def test_the_older_message_chooses_modes_as_well(client: MavlinkClient) -> None:

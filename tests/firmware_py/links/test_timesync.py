@@ -76,6 +76,7 @@ def test_a_long_round_trip_is_not_believed() -> None:
     clock = RemoteClock()
     assert not exchange(clock, 0, LONGEST_US, 1)
     assert clock.offset_us(LONGEST_US + 1) is None
+    assert exchange(clock, LONGEST_US + 1, LONGEST_US - 1, 1)
 
 
 def test_an_old_offset_is_forgotten() -> None:
