@@ -120,7 +120,7 @@ def see(
     for i in range(3):
         now[ATTITUDE + i] = f32(sights[row, 6 + i] + errors[6 + i])
         now[RATE + i] = f32(agent.rates[i] + errors[SEEN + i])
-    now[ATTITUDE + 2] = f32(wrapped(f64(now[ATTITUDE + 2]) - goal[3]))
+    now[ATTITUDE + 2] = f32(f64(now[ATTITUDE + 2]) - goal[3])  # `observe` wraps it
     for i in range(4):
         now[FLAP + i] = f32(flaps.angle[i] - flaps.hover[i])
     observe(parameters, estimator, agent.previous, agent.observation)

@@ -20,6 +20,7 @@ from firmware_py.extras import install_command
 from firmware_py.logic.plugs import CALLS
 from hil.deploy.check import Checked, check_flight, plan, reached
 from hil.devices.board_firmware import PythonBoard
+from hil.experiments import EXPERIMENTS
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
 from support.command import Cli
@@ -119,6 +120,14 @@ def test_default_flights_are_ten_thousand_ticks_with_every_fault_in_time() -> No
         ("hover", False), ("yaw-step", False), ("hover", True), ("supervisor", True), ("failing-logic", False),
     ]  # fmt: skip
     assert sum(one.duration_s + one.config.flight.release_us * 1e-6 for one in flights) >= 100.0
+    for duration_s, faults in ((2.0, ()), (2.01, ("mocap.dropout@2:0.5=1",))):
+        short = plan(None, False, duration_s=duration_s)
+        assert [one.duration_s for one in short[:3]] == [duration_s] * 3
+        assert short[2].faults == faults
+    every = plan(None, True)
+    assert [one.duration_s for one in every[: len(EXPERIMENTS)]] == [
+        min(one.duration_s, 60.0) for one in EXPERIMENTS.values()
+    ]
 
 
 def test_another_robot_flies_with_the_faults_that_act_on_it() -> None:

@@ -9,7 +9,7 @@ from firmware_py.core_runner import CoreBlocks
 from firmware_py.export.cortex_m4 import CortexM4Runner
 from firmware_py.logic.loading import load_logic
 from hil.config import load_config
-from hil.deploy.targets import CORTEX_M4, TICK_HZ, Toolbox
+from hil.deploy.targets import CORTEX_M4, TARGETS, TICK_HZ, Toolbox, target_names
 
 TICK = ("file_pose", "file_pose", "estimate", "supervise", "control")
 
@@ -52,3 +52,8 @@ def test_every_cycle_after_the_first_tick_belongs_to_one_tick_and_flights_add_up
     assert (used.ram_bytes, used.stack_bytes) == (ram, stack)
     assert stack > runner.stack_bytes
     assert {name: load.calls for name, load in used.entries.items() if load.calls} == calls
+
+
+def test_targets_are_named_once_each_with_or_without_spaces() -> None:
+    assert target_names("plain, c-O2 ,plain,udp://127.0.0.1:9") == ("plain", "c-O2", "udp://127.0.0.1:9")
+    assert target_names(None) == TARGETS

@@ -241,6 +241,7 @@ def test_an_age_of_the_pose_delays_the_observation_of_the_cameras_alone() -> Non
         assert seen[now][-1][6:16] == pytest.approx(np.array(expected), abs=2e-6)
     fresh, old = np.array(seen[now]), np.array(seen[late])
     np.testing.assert_array_equal(old[5:, :9], fresh[:-5, :9])
+    np.testing.assert_array_equal(old[:5, :9], fresh[[0] * 5, :9])
     np.testing.assert_array_equal(old[:, 9:], fresh[:, 9:])
 
 
