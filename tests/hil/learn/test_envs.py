@@ -19,7 +19,7 @@ from hil.config import load_config
 from hil.errors import LabError
 from hil.floaty.plant import Plant
 from hil.learn.batch import EstimateErrors, Fleet
-from hil.learn.envs import REACH, FastEnv, FirmwareEnv, make_env
+from hil.learn.envs import REACH, FastEnv, FirmwareEnv, Setup, make_env
 from hil.learn.tasks import PUSHES, TASKS, EpisodeTask, draw_episode
 from hil.world.tunnel import GUST_RMS
 
@@ -109,10 +109,10 @@ def test_a_copy_flies_on_from_the_same_state_apart_from_its_original() -> None:
 def test_a_row_of_many_robots_flies_as_the_seed_of_its_own() -> None:
     """Starts, paths and pushes; the gusts of many are one stream."""
     many = gymnasium.make_vec("floaty/Track-v0", num_envs=3, overrides=STILL)
-    many.reset(seed=20)
+    many.reset(seed=0)
     alone = make_env("Track", overrides=STILL)
     assert isinstance(alone, FastEnv)
-    alone.reset(seed=22)
+    alone.reset(seed=2)
     for action in actions(30, 0.2):
         many.step(np.tile(action, (3, 1)))
         alone.step(action)
@@ -295,6 +295,19 @@ def test_robots_are_drawn_from_the_campaign_s_distributions_in_both_fidelities()
         assert 0.040 <= lag <= 0.060
     assert 2 < len(lags) <= 5
     whole.close()
+
+
+def test_every_robot_is_another_point_of_its_campaign_and_the_user_s_settings_come_last(
+    tmp_path: Path,
+) -> None:
+    """Each point of this campaign is flown by two seeds."""
+    (tmp_path / "robots.toml").write_text(
+        'experiments = ["hover"]\nflights = 2\nseeds = 2\n[parameters]\n"actuators.tau" = { uniform = [0.04, 0.06] }\n'
+    )
+    setup = Setup(robots=str(tmp_path / "robots.toml"), robot_count=5, overrides=["actuators.tau=0.07"])
+    found = setup.settings()
+    assert len(set(found)) == len(found) == 5
+    assert {load_config("floaty", one).actuators.tau for one in found} == {0.07}
 
 
 def test_faults_act_in_the_laboratory() -> None:
