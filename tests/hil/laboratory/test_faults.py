@@ -417,10 +417,9 @@ def test_a_fault_turns_its_own_knobs_and_no_other(link: str) -> None:
         assert turned <= set(kind.knobs), kind.meaning
 
 
-def test_a_change_between_two_faults_persists() -> None:
-    flight = lockstep_flight(
-        Request.of(HOVER, duration_s=1.0, faults=[parse("wind.fan@0.1:0.1=0.9"), parse("wind.fan@0.5:0.1=0.9")])
-    )  # fmt: skip
+def test_a_change_between_two_faults_persists_beside_a_third() -> None:
+    faults = ["wind.fan@0.1:0.1=0.9", "wind.fan@0.5:0.1=0.9", "imu.noise@0=2"]
+    flight = lockstep_flight(Request.of(HOVER, duration_s=1.0, faults=faults))
     flight.events.at(1_300_000, lambda _: flight.robot.body.tunnel.set_fan_factor(1.1))
     flight.run()
     assert flight.robot.body.tunnel.fan_factor == 1.1

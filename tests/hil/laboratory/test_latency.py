@@ -22,8 +22,9 @@ from ground_station.latency import (
     row_of,
 )
 from ground_station.mocap import MocapFrame
+from ground_station.telemetry_log import AGE_COLUMNS, TELEMETRY, TIME_COLUMN
 from hil.experiments import EXPERIMENTS
-from hil.laboratory.ages import STATION_CLOCK, ages_of, reported_ages, with_goals_sent
+from hil.laboratory.ages import STATION_CLOCK, ages_in_time_of, ages_of, reported_ages, with_goals_sent
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.recorder import load_log
 from hil.laboratory.request import MAVLINK, RADIO, Request
@@ -140,6 +141,14 @@ def test_cut_telemetry_is_read_up_to_the_cut(tmp_path: Path) -> None:
     assert budget_line(ages_of(reported_ages(telemetry.parent), log, RADIO)) == budget_line(result.ages)
     telemetry.write_text(text.splitlines(keepends=True)[0])
     assert ages_of(reported_ages(telemetry.parent), log, RADIO) == ()
+
+
+def test_ages_in_a_paced_log_are_at_its_time_not_at_the_station_s(tmp_path: Path) -> None:
+    titles = (TIME_COLUMN, *AGE_COLUMNS)
+    (tmp_path / TELEMETRY).write_text(f"{','.join(titles)}\n7.000020,1,2,3,6,5,4\n")
+    log = pa.table({"t": [0, 100_000], STATION_CLOCK: [7_000_000, 7_200_000]})
+    found = ages_in_time_of(iter([log.slice(0, 1), log.slice(1)]), tmp_path)
+    assert found.to_pylist() == [dict(zip(("t", *STAGES), (10.0, 1e3, 2e3, 3e3, 6e3, 5e3, 4e3), strict=True))]
 
 
 def test_a_log_gets_the_goals_that_the_station_recorded_at_their_time(tmp_path: Path) -> None:
