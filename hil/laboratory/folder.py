@@ -16,7 +16,7 @@ from pathlib import Path
 from ground_station.links.frame_log import FRAME_LOG
 from ground_station.telemetry_log import TELEMETRY
 from hil.errors import LabError, writing
-from hil.laboratory.recorder import EVENTS, PARQUET, STREAM, log_pieces
+from hil.laboratory.recorder import PARQUET, STREAM, log_pieces
 from hil.laboratory.request import Request
 from hil.laboratory.result import RESULT, read_result
 
@@ -24,7 +24,7 @@ RUNS = Path("runs")
 OLDER = "older-run"  # in a run folder, until the next flight begins
 OBSOLETE = "older-run.obsolete"  # its name while it is deleted
 DECIDING = (RESULT, PARQUET, STREAM)  # each describes its run
-EARLY = (TELEMETRY, FRAME_LOG, EVENTS)  # files that a flight opens before it records; empty until then
+EARLY = (TELEMETRY, FRAME_LOG)  # files that a flight opens before its log; empty until then
 
 
 @contextmanager

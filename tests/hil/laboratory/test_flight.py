@@ -261,6 +261,7 @@ class Reboots:
     count: int
 
     def __call__(self, flight: Flight) -> None:
+        flight.events.at(200_000, lambda now_us: flight.robot.board.reset())  # it flies again by the release
         for number in range(self.count):
             at_us = flight.release_us + 1_000_000 + 100_000 * number
             flight.events.at(at_us, lambda now_us: flight.robot.board.reset())
