@@ -41,8 +41,12 @@ def test_flight_without_a_recorder_keeps_what_is_noted() -> None:
     flight.close()
 
 
-@pytest.mark.parametrize("board", ["c", "python"])
-def test_an_estimate_that_is_not_finite_fails_the_flight_and_is_reported(tmp_path: Path, board: str) -> None:
+@pytest.mark.parametrize(("board", "faults"), [("python", ()), ("c", ("push.y@0.6=20",))])
+def test_an_estimate_that_is_not_finite_fails_the_flight_and_is_reported(
+    tmp_path: Path, board: str, faults: tuple[str, ...]
+) -> None:
+    """Also of a robot that is lost afterwards."""
+
     def made(*arguments: object) -> Flight:
         flight = in_lockstep(*arguments)  # type: ignore[arg-type]
 
@@ -52,9 +56,10 @@ def test_an_estimate_that_is_not_finite_fails_the_flight_and_is_reported(tmp_pat
         flight.events.at(1_500_000, spoil)
         return flight
 
-    request = Request.of(HOVER, duration_s=1.0, board=board)
+    request = Request.of(HOVER, duration_s=1.0, board=board, faults=faults)
     result = fly(request, tmp_path / "run", flight_of=made)
-    assert (result.outcome, result.passed) == ("error", False)
+    assert (result.outcome, result.passed, result.metrics["lost"]) == ("error", False, bool(faults))
+    assert ("left the flow" in str(result.cause)) == bool(faults)
     texts = [event["text"] for event in load_events(result.folder)]
     (text,) = (text for text in texts if "NaN" in text)
     assert text.startswith("the estimate was NaN or infinite at 1.5")

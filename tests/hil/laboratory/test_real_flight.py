@@ -13,6 +13,7 @@ import pyarrow as pa
 import pytest
 from mcap.reader import make_reader
 from pymavlink import mavutil
+from scipy.spatial.transform import Rotation
 
 import hil.pictures.figures
 from firmware_py.wire.supervisor import State
@@ -35,8 +36,8 @@ from hil.laboratory.ages import ages_in_time_of, reported_ages
 from hil.laboratory.channels import Unwrapped
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import ALWAYS, body, free_flight, known, measure
-from hil.laboratory.real_flight import RealFlight
-from hil.laboratory.recorder import Onlooker, Recorder, load_events, load_log
+from hil.laboratory.real_flight import RealFlight, why_lost
+from hil.laboratory.recorder import Onlooker, Recorder, load_events, load_log, release_of
 from hil.laboratory.request import REAL, Bench, Request
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.run import fly
@@ -278,14 +279,19 @@ class StationBench:
 def test_the_judged_part_lasts_from_trajectory_to_experiment_end(tmp_path: Path) -> None:
     bench = StationBench(tmp_path / "run", "yaw-step")
     bench.fly(1.0, (0.2, 0.0, 1.15))
-    bench.plan.start(bench.now_us)
-    bench.fly(EXPERIMENTS["yaw-step"].duration_s + 0.05)  # the cameras see the past
+    bench.plan.start(bench.now_us + 3_000)
+    bench.fly(2.0)
+    killed = load_log(tmp_path / "run")
+    begun = np.argmax(killed.column("flight.free").to_numpy())
+    assert release_of(killed.schema.metadata) == killed.column("t")[int(begun)].as_py()
+    bench.fly(EXPERIMENTS["yaw-step"].duration_s - 2.0 + 0.05)  # the cameras see the past
     bench.fly(2.0, (0.3, 0.0, 1.15))
     result = bench.result(interrupted=True)
     assert result.outcome == "completed"
     assert result.metrics["flown"] == pytest.approx(EXPERIMENTS["yaw-step"].duration_s, abs=0.03)
     assert result.metrics["max_x"] == pytest.approx(0.0, abs=1e-9)
     log = load_log(tmp_path / "run")
+    assert release_of(log.schema.metadata) == 1_003_000
     assert log.num_rows == pytest.approx(805, abs=2)
     (held,) = marks_of_flight(log).spells
     assert (held.kind, held.begin_s, held.end_s) == (
@@ -335,6 +341,15 @@ def test_a_comparison_shows_what_was_judged_and_a_second_around_it(tmp_path: Pat
     bench.result()
     times = _judged(load_log(tmp_path / "run")).column("t").to_numpy()
     assert (times[0], times[-1]) == pytest.approx((4e6, 11e6), abs=60_000)
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.6, 0.8, 0.0)])
+def test_a_robot_is_lost_by_its_tilt_about_any_axis_wherever_it_faces(axis: tuple[float, ...]) -> None:
+    for beyond in (-0.01, 0.01):
+        tilted = Rotation.from_rotvec((CONFIG.plant.limits.tilt + beyond) * np.array(axis))
+        w, x, y, z = (Rotation.from_euler("z", 2.0) * tilted).as_quat(scalar_first=True).tolist()
+        why = why_lost(MocapFrame(0, HOME.p_WG, (w, x, y, z), True), CONFIG)
+        assert (why is not None) == (beyond > 0.0)
 
 
 def test_a_robot_that_leaves_the_flow_is_lost_and_what_follows_is_not_judged(tmp_path: Path) -> None:
