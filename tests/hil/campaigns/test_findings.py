@@ -26,7 +26,7 @@ from hil.campaigns.findings import (
     pawn,
     slices,
 )
-from hil.campaigns.jobs import Row
+from hil.campaigns.jobs import Row, failed
 from hil.campaigns.report import write_report
 from hil.campaigns.run import STOP_FROM, Progress, Tally, interval
 from hil.campaigns.sampling import as_flown, axes, draw, plan_of, points_of, problem, value_at
@@ -318,6 +318,8 @@ def test_values_that_are_all_equal_depend_on_no_axis() -> None:
 def test_a_metric_that_is_no_number_is_beyond_every_limit() -> None:
     limit = SimpleNamespace(metric=METRICS["max_y"], bound=0.1)
     assert [_beyond(limit, value) for value in (0.2, np.nan, np.inf)] == [pytest.approx(1.0), np.inf, np.inf]
+    below_zero = SimpleNamespace(metric=METRICS["in_box"], bound=-2.0)
+    assert _beyond(below_zero, -3.0) == 0.5  # type: ignore[arg-type]
 
 
 def test_inert_axes_exceed_the_threshold_of_chance_in_one_of_twenty_campaigns() -> None:
@@ -329,6 +331,21 @@ def test_inert_axes_exceed_the_threshold_of_chance_in_one_of_twenty_campaigns() 
         points, values = rng.random((60, len(axes(spec)))), rng.normal(size=60)
         beyond += bool(influence_of(spec, "max_y", points, values).ranked)
     assert 1 <= beyond <= 3
+
+
+@pytest.mark.parametrize(("failures", "mapped"), [(4, False), (5, True), (7, True), (8, False)])
+def test_a_failure_map_needs_five_failures_and_five_flights_that_hold(failures: int, mapped: bool) -> None:
+    spec = spec_of(flights=12)
+    rows = [replace(planted(draw(spec, index)), passed=index >= failures) for index in range(12)]
+    found = find(spec, table_of([row.columns() for row in rows], schema_of(plan_of(spec))))
+    assert (found.failure_map is not None) == mapped
+
+
+def test_a_flight_that_was_not_flown_has_no_metric_and_no_verdict() -> None:
+    spec = spec_of(flights=1)
+    (row,) = table_of([failed(draw(spec, 0), "no board").columns()], schema_of(plan_of(spec))).to_pylist()
+    assert all(np.isnan(row[name]) for name in row if name.startswith("metric."))
+    assert {row[name] for name in row if name.startswith("holds.")} == {None}
 
 
 def test_an_index_whose_interval_is_too_wide_is_not_ranked() -> None:
