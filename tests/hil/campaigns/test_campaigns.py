@@ -279,6 +279,8 @@ def test_a_cell_of_the_failure_map_leads_to_its_flights(reported: tuple[Path, Fi
     )
     assert sum(int(cell[3]) for cell in cells) == 64, "half of the flights get a push"
     assert sum(int(cell[2]) for cell in cells) == found.rate.failed
+    shares = [int(cell[2]) / int(cell[3]) for cell in cells]
+    assert shares == sorted(shares, reverse=True)
     with Image.open(io.BytesIO(Page(text).pictures[1])) as picture:
         pixels = np.asarray(picture.convert("RGB")).astype(int)
     height, width, _ = pixels.shape

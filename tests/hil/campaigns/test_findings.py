@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -29,7 +30,17 @@ from hil.campaigns.findings import (
 from hil.campaigns.jobs import Row, failed
 from hil.campaigns.report import write_report
 from hil.campaigns.run import STOP_FROM, Progress, Tally, interval
-from hil.campaigns.sampling import as_flown, axes, draw, plan_of, points_of, problem, value_at
+from hil.campaigns.sampling import (
+    CubeAxis,
+    as_flown,
+    axes,
+    draw,
+    draw_at,
+    plan_of,
+    points_of,
+    problem,
+    value_at,
+)
 from hil.laboratory.metrics import METRICS
 from support.campaigns import BAD_PUSH, planted, spec_of
 from support.html_page import Page
@@ -86,6 +97,8 @@ def test_a_fault_happens_with_its_probability_and_is_marked_where_it_does(probab
     column = [axis.name for axis in axes(spec)].index("fault 1 push.y happens")
     flown = as_flown(spec, points_of(spec))
     assert flown[:, column].tolist() == happened.astype(float).tolist()
+    edge = np.full((1, len(axes(spec))), 1.0 - probability)  # as a design may have it
+    assert as_flown(spec, edge)[0, column] == len(draw_at(spec, edge[0], 0, 0, 0).options["faults"])
     size = [axis.name for axis in axes(spec)].index("fault 1 push.y size")
     assert (flown[~happened, size] == 0.5).all()
     assert (flown[happened, size] != 0.5).all()
@@ -100,6 +113,13 @@ def test_a_logarithmic_axis_goes_from_end_to_end_by_equal_factors(share: float) 
 def test_points_of_several_seeds_have_seeds_of_their_own() -> None:
     spec = spec_of(flights=12, seeds=3, seed=100)
     assert [draw(spec, index).options["seed"] for index in range(12)] == list(range(100, 112))
+
+
+def test_every_profile_flies_an_experiment_before_the_next_experiment() -> None:
+    pairs = list(product(("hover", "y-square"), ("floaty", "as-flown", "lqr")))
+    spec = spec_of(flights=6, experiments=("hover", "y-square"), profiles=("floaty", "as-flown", "lqr"))
+    jobs = [draw(spec, index) for index in range(6)]
+    assert [(job.experiment, job.options["profile"]) for job in jobs] == pairs
 
 
 @pytest.mark.parametrize(("bound", "good", "bad"), [("max", "1", "4"), ("min", "4", "1")])
@@ -206,11 +226,19 @@ def test_a_cell_names_its_failed_flights_first_and_whether_its_fault_happens() -
     points[4:, happens] = 1.0
     failed = np.array([False, True, False, True, False, True, True, False])
     weights = np.zeros(len(names))
-    weights[[happens, size]] = 2.0, 1.0
+    weights[[happens, size, names.index("actuators.tau")]] = 2.0, 1.0, -0.6
     found = FailureMap(axes(spec), np.arange(10, 18), points, failed, weights, 0.0)
     drawn = report._map(found)
     cells = {one.text: one for one in report._cells(spec, found, drawn)}
-    assert {names[column] for column in drawn.shown} == {"actuators.tau", "fault 1 push.y size"}
+    assert [names[column] for column in drawn.shown] == ["fault 1 push.y size", "actuators.tau"]
+    axes_shown = drawn.figure.axes[0]
+    assert (axes_shown.get_xlabel(), axes_shown.get_ylabel()) == ("fault 1 push.y size", "actuators.tau")
+    shades = axes_shown.collections[0]
+    for place in ((0.1, 0.2), (0.9, 0.2), (0.2, 0.9)):  # with the fault, and other numbers in their middle
+        point = np.full((1, len(names)), 0.5)
+        point[0, [happens, *drawn.shown]] = 1.0, *place
+        shade = next(n for n, path in enumerate(shades.get_paths()) if path.contains_point(place))
+        assert shades.levels[shade] <= 100.0 * found.chance(point)[0] <= shades.levels[shade + 1]
     assert [(one.failed, one.flown) for one in cells.values()] == [(2, 4)], "of those with the fault"
     (flights,) = (one.flights for one in cells.values())
     assert [flight[:2] for flight in flights] == [(15, True), (16, True), (14, False)]
@@ -218,6 +246,23 @@ def test_a_cell_names_its_failed_flights_first_and_whether_its_fault_happens() -
     assert (report._range(fault, 0.0, 0.5)[:8], report._range(fault, 0.5, 1.0)[:5]) == ("without ", "with ")
     assert report._ticks(fault) == ([0.0, 1.0], ["without", "with"])
     assert report._range(number, 0.0, 0.5) == "fault 1 push.y size 1 to 6.5"
+    kind = CubeAxis("kind", Distribution(choice=("a", "b")))
+    assert report._range(kind, 0.0, 0.5) == "kind a"
+    assert report._ticks(number) == ([0.1, 0.3, 0.5, 0.7, 0.9], ["2.1", "4.3", "6.5", "8.7", "10.9"])
+
+
+@pytest.mark.parametrize("bound", ["max", "min"])
+@pytest.mark.parametrize(("count", "scale"), [(100, "linear"), (101, "log")])
+def test_a_histogram_tells_what_fails_from_the_limit_itself_and_counts_few_flights_linearly(
+    bound: str, count: int, scale: str
+) -> None:
+    values = np.array([2.0, *np.linspace(1.0, 4.0, count - 1)])
+    metric = replace(METRICS["poses_refused"], bound=bound)
+    limited = Limited("hover", "floaty", "x", metric, 2.0, Rate(0, count), values)
+    shown, *_ = report._histograms([limited]).axes
+    failing = int(((values > 2.0) if bound == "max" else (values < 2.0)).sum())
+    heights = [sum(bar.get_height() for bar in bars) for bars in shown.containers]
+    assert (heights, shown.get_yscale()) == ([count - failing, failing], scale)
 
 
 def test_each_profile_s_rate_is_of_its_own_clusters() -> None:

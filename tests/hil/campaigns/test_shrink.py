@@ -65,19 +65,27 @@ def test_sizes_shrink_to_harmless(kind: str, fails: Callable[[float], bool], low
     assert low <= fault.size <= high
 
 
-def test_two_faults_that_fail_together_stay_both() -> None:
+def test_two_faults_that_fail_together_are_both_reduced() -> None:
+    least = shrink(
+        trial(*FAULTS),
+        DURATION_S,
+        lambda one: size_of(one, "push.y", 0.0) >= 7.0 and span_of(one, "mocap.dropout") >= 0.5,
+    )
+    assert {fault.kind for fault in least.faults} == {"push.y", "mocap.dropout"}
+    assert 7.0 <= size_of(least, "push.y", 0.0) <= 7.0 + 12.0 / 64
+    assert 0.5 <= span_of(least, "mocap.dropout") <= 0.5 + 2.0 / 64
+
+
+def test_a_parameter_without_which_it_holds_stays_and_each_other_part_costs_two_flights() -> None:
+    """Besides the whole: one without all parameters, which holds, and one without the part; the last holds."""
+    flown: list[Trial] = []
+
     def fails(one: Trial) -> bool:
-        return {"push.y", "mocap.dropout"} <= {fault.kind for fault in one.faults}
+        flown.append(one)
+        return "c.d=2" in one.settings
 
-    assert {fault.kind for fault in shrink(trial(*FAULTS), DURATION_S, fails).faults} == {
-        "push.y",
-        "mocap.dropout",
-    }
-
-
-def test_a_parameter_without_which_it_holds_stays() -> None:
-    least = shrink(trial(*FAULTS), DURATION_S, lambda one: "c.d=2" in one.settings)
-    assert least == Trial(("c.d=2",), ())
+    assert shrink(trial(*FAULTS), DURATION_S, fails) == Trial(("c.d=2",), ())
+    assert len(flown) == 1 + 2 * (len(FAULTS) + 1) + 1
 
 
 def test_a_fault_to_the_end_that_needs_all_its_time_stays_as_it_is_written() -> None:
