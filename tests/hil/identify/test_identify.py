@@ -1,5 +1,6 @@
 """Identification of planted robots: linear ones that scipy simulates, in coloured gusts, as telemetry.csv."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -230,18 +231,21 @@ def test_the_intervals_hold_the_truth_of_most_constants(tmp_path: Path) -> None:
 def test_a_written_profile_has_what_was_identified_and_holds_the_mean_inputs_by_its_trim(
     tmp_path: Path,
 ) -> None:
-    path, base, mean = tmp_path / "mine.toml", tmp_path / "base.toml", (0.02, -0.03, 0.05, 0.04)
+    path, base, mean = tmp_path / "mine.toml", tmp_path / "base.toml", (0.02, -0.03, 0.05, 0.0)
     base.write_text('base = "floaty"\n[servo]\ndirection = [1, -1, -1, 1]\n')
     columns = flight(1)
     columns |= {name: columns[name] + value for name, value in zip(INPUTS, mean, strict=True)}
     found = identify([load_record(written(tmp_path, columns), str(base))])
     notice = write_profile(path, str(base), found)
-    assert notice == "servo trim changed: the flights needed u1..u4 of 20, -30, 50, 40 mrad on the mean"
+    assert notice == "servo trim changed: the flights needed u1..u4 of 20, -30, 50, 0 mrad on the mean"
     before, after = load_config(str(base)), load_config(str(path))
     assert after.model.pitch_u2 == pytest.approx(-900, rel=0.1)
     assert after.model.flap_rate == pytest.approx(1 / 0.045, rel=0.1)
     assert after.model.roll_u1 == before.model.roll_u1
     assert "± " in path.read_text()
+    known = json.loads(path.with_suffix(".json").read_text())
+    spread = np.sqrt(np.diag(known["covariance"]))
+    assert 1.96 * spread == pytest.approx(np.array([*known["half_widths"].values()]), rel=1e-6)
     assert servo_words(after, (0.0, 0.0, 0.0, 0.0)) == pytest.approx(servo_words(before, mean), abs=20)
 
 

@@ -2,7 +2,8 @@
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from contextlib import nullcontext
+from dataclasses import asdict, replace
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from hil.config import LabConfig, load_config
 from hil.design.axes import DELAY, PITCH, ROLL, Axis, dynamics, robot_of
 from hil.design.loop import FREQUENCIES
 from hil.errors import LabError
+from hil.floaty.correction import OperatingPoint
 from hil.identify import spectra
 from hil.identify.flow import flow_of
 from hil.identify.identify import (
@@ -29,7 +31,7 @@ from hil.identify.identify import (
     interval_text,
     operating_point,
 )
-from hil.identify.joint import LATE_S, Estimate
+from hil.identify.joint import LATE_S, Estimate, Excited, identities, pose_lateness
 from hil.identify.pages import write_pages
 from hil.identify.plates import plant_of, straightened, turns_of
 from hil.identify.record import BOARD_COLUMN, EXCITATIONS, INPUTS, RATES, WRAP_MS, Record, load_record
@@ -260,6 +262,14 @@ def test_the_covariance_of_the_mean_is_that_of_numpy_over_the_lines_around() -> 
         assert found.C[row] == pytest.approx(expected), line
 
 
+@pytest.mark.parametrize(("off", "refused"), [(0.0498, False), (0.0503, True)])
+def test_an_excitation_of_which_a_twentieth_is_off_its_lines_is_refused(off: float, refused: bool) -> None:
+    sizes = np.zeros((4, 2, 4))
+    sizes[:, :, 0] = 1.0, off
+    with pytest.raises(LabError, match="not the same sum of lines") if refused else nullcontext():
+        spectra._refuse_impure("r", np.array([1, 2]), [np.array([1]), *[np.empty(0, int)] * 3], sizes)
+
+
 def swinging(robot: Mapping[str, float], hertz: float = 2.0, seconds: float = 60.0) -> Record:
     """A robot in still air that swings as its model says, with poses that are late as those of a flight."""
     axis, s = ROLL, 2j * np.pi * hertz
@@ -412,7 +422,41 @@ def test_turning_alone_pushes_a_robot_of_plates() -> None:
             ends.append(plates.acceleration_W[along])
         pushes[name] = (ends[0] - ends[1]) / 0.04
     assert turns_of(record) == pytest.approx(pushes, rel=1e-6)
+    heavy = CONFIG.plant.model_copy(update={"mass_factor": 1.3, "constant_factors": {"roll_roll": 1.2}})
+    other = replace(record, config=CONFIG.model_copy(update={"plant": heavy}))
+    assert turns_of(other) == turns_of(record), "the profile's plates alone"
     assert min(map(abs, pushes.values())) > 0.005
+
+
+def test_flat_plates_fulfil_the_identities_of_the_fit() -> None:
+    settings = ("plant.variant=plate", "tunnel.height_slope=0", "tunnel.profile_radius=5")
+    config = load_config("floaty", settings)
+    plates = asdict(plant_of(config).linearise(OperatingPoint(speed=config.plant.airspeed)))
+    turns = {"x_rate": 0.01, "y_rate": -0.02}
+    left = identities(plates | turns, config.plant.airspeed, turns)
+    assert left == pytest.approx([0.0] * 6, abs=1e-6)
+    for name in ("roll_vy", "y_vy", "pitch_vx", "x_vx", *turns):
+        changed = identities(
+            plates | turns | {name: (plates | turns)[name] + 0.03}, config.plant.airspeed, turns
+        )
+        assert sum(abs(one) > 0.01 for one in changed) == 1, name
+
+
+@pytest.mark.parametrize("late_s", [0.02, -0.008])
+def test_poses_are_late_by_the_cameras_angle_behind_the_gyro_s(late_s: float) -> None:
+    w = 2 * np.pi * np.array([0.5, 1.0, 3.0])
+    Z = np.stack([1.0 + 0j * w, 1j * w, np.exp(-1j * w * late_s), 0j * w], axis=1)
+    C = np.tile(1e-4 * np.eye(4, dtype=complex), (3, 1, 1))
+    shown = spectra.Spectra(w, Z, C, Z[None], Z[:, 0], np.ones((3, 4)))
+    assert pose_lateness([Excited(ROLL, 2, shown)], 2) == pytest.approx(late_s)
+    assert pose_lateness([Excited(ROLL, 2, shown)], 1) == LATE_S, "another record"
+
+
+def test_a_flap_follows_the_held_input_of_which_the_mean_of_two_ticks_is_reported() -> None:
+    w, lag, delay, tick_s = 2 * np.pi * np.array([0.5, 4.0, 12.0]), 0.05, 0.013, 0.01
+    reported = (1 + np.exp(-1j * w * tick_s)) / 2  # per commanded input
+    held = 2 * np.sin(w * tick_s / 2) / (w * tick_s) * np.exp(-1j * w * delay)
+    assert flap_response(w, lag, delay) * reported == pytest.approx(held / (1 + 1j * w * lag))
 
 
 def test_roll_lifts_a_robot_that_leans_and_no_other() -> None:
