@@ -69,17 +69,9 @@ FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 
 # Rooms that work with any body, which hil/bodies.py makes for them.
 ANY_BODY = (
-    "world",
-    "crazyflie",
-    "devices",
-    "laboratory",
-    "pictures",
-    "servers",
-    "live",
-    "exports",
-    "campaigns",
+    "world", "crazyflie", "devices", "laboratory", "pictures", "servers", "live", "exports", "campaigns",
     "testing",
-)
+)  # fmt: skip
 
 # Outside libraries that the core may use at all.
 CORE_LIBRARIES = {"numpy", "typing"}
@@ -176,13 +168,8 @@ CONFINED["click"] = CONFINED["rich"] = (
 CONFINED |= dict.fromkeys(("numpy.arctan2", "numpy.arcsin"), ("firmware_py/geometry.py",))
 NORMAL_NOISE = "hil/world/fixed_order.py"
 DRAWS = (
-    "standard_normal",
-    "exponential",
-    "standard_exponential",
-    "geometric",
-    "poisson",
-    "multivariate_normal",
-)
+    "standard_normal", "exponential", "standard_exponential", "geometric", "poisson", "multivariate_normal",
+)  # fmt: skip
 # Only the first prints texts of others; the next prints to a pipe, the third its own progress, the last paths in ASCII.
 PRINTERS = ("ground_station/lines.py", "hil/live/picture.py", "hil/api.py", "firmware_py/kept_code.py")
 SUBSET = "firmware_py/core/subset.py"  # the border of the subset: it may use the standard library
@@ -442,19 +429,9 @@ def test_a_planted_question_is_found() -> None:
 
 # What is made whole: nobody but its own class assigns to its attributes.
 WHOLE = (
-    "robot",
-    "flight",
-    "board",
-    "line",
-    "served",
-    "lab",
-    "recorder",
-    "link",
-    "radio",
-    "nrf51",
-    "firmware",
+    "robot", "flight", "board", "line", "served", "lab", "recorder", "link", "radio", "nrf51", "firmware",
     "uart",
-)
+)  # fmt: skip
 
 
 def completes_another(source: str) -> list[str]:

@@ -31,20 +31,10 @@ RUN_ELSEWHERE = {"docs/howto/python.md", "docs/howto/tests.md"}
 GENERATED = {
     f"docs/reference/{name}.md"
     for name in [
-        "cli",
-        "cli-studies",
-        "cli-programs",
-        "cli-boards",
-        "profile",
-        "profile-board",
-        "profile-world",
-        "profile-devices",
-        "parameters",
-        "variables",
-        "log",
-        "faults",
+        "cli", "cli-studies", "cli-programs", "cli-boards", "profile", "profile-board", "profile-world",
+        "profile-devices", "parameters", "variables", "log", "faults",
     ]
-}
+}  # fmt: skip
 PUBLISHED = ("https://arxiv.org/",)
 FRONT = ("README.md", "CONTRIBUTING.md", "pyproject.toml", "mkdocs.yml", "Makefile")
 PACKAGES = ("firmware_py", "ground_station", "hil", "profiles", "tools", "tests")
@@ -206,13 +196,9 @@ def dead_references(text: str, file: Path) -> set[str]:
     """Return the Markdown files that a text names and that are not there, and folders outside the repository."""
     named = set(re.findall(r"(?<![\w/.-])((?:[\w-]+/|\.\./)*[\w-]+\.md)\b", text))
     there = [
-        ROOT,
-        file.parent,
-        ROOT / "hil" / "commands" / "project",
-        ROOT / "firmware_py" / "export",
-        DOCS,
+        ROOT, file.parent, ROOT / "hil" / "commands" / "project", ROOT / "firmware_py" / "export", DOCS,
         *DOCS.iterdir(),
-    ]
+    ]  # fmt: skip
     dead = {
         name
         for name in named - GENERATED
@@ -324,18 +310,8 @@ def test_the_glossary_explains_frames_and_states_of_the_code() -> None:
     explained = GLOSSARY.read_text(encoding="utf-8")
     firsts = {term.split(",")[0] for term in terms()}
     assert {
-        "W",
-        "B",
-        "G",
-        "S",
-        "F1..F4",
-        "correction",
-        "release",
-        "lockstep",
-        "paced",
-        "innovation",
-        "mailbox",
-    } <= firsts
+        "W", "B", "G", "S", "F1..F4", "correction", "release", "lockstep", "paced", "innovation", "mailbox",
+    } <= firsts  # fmt: skip
     from firmware_py.wire.supervisor import State
 
     assert {state.name.lower() for state in State if state.name.lower() not in explained} == set()

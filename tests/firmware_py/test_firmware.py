@@ -155,21 +155,7 @@ def test_the_controller_runs_in_every_tenth_step_and_the_estimator_in_the_one_be
     data, sampling = core.data.fields, core.sampling.fields
     sampling.tick, sampling.phase = start, 0
     controls, estimates = [], []
-    for step in [
-        *range(1, 32),
-        45,
-        46,
-        49,
-        50,
-        52,
-        60,
-        85,
-        86,
-        90,
-        88,
-        97,
-        98,
-    ]:  # a clock that is set back moves nothing
+    for step in [*range(1, 32), 45, 46, 49, 50, 52, 60, 85, 86, 90, 88, 97, 98]:  # set back, it moves nothing
         data.tick = wrapped(start + step)
         if core.run.call("begin_step"):
             controls.append(step)

@@ -13,20 +13,9 @@ from hil.errors import LabError
 
 def test_shipped_profiles_load() -> None:
     assert profile_names() == [
-        "as-flown",
-        "cad",
-        "crazyflie",
-        "crazyflie-brushless",
-        "crazyflie-decks",
-        "design-best",
-        "design-double",
-        "design-flat",
-        "design-half",
-        "design-paper",
-        "floaty",
-        "lqr",
-        "original",
-    ]
+        "as-flown", "cad", "crazyflie", "crazyflie-brushless", "crazyflie-decks", "design-best",
+        "design-double", "design-flat", "design-half", "design-paper", "floaty", "lqr", "original",
+    ]  # fmt: skip
     for name in profile_names():
         load_config(name)
 

@@ -126,19 +126,10 @@ def test_gdb_shows_tasks_and_stops_at_a_write() -> None:
 
     printed = "\n".join(
         debugged(
-            run,
-            machine.image,
-            "break send_line",
-            "continue",
-            "info threads",
-            "thread apply all backtrace",
-            "delete",
-            "watch xTickCount",
-            "continue",
-            "backtrace 1",
-            "delete",
+            run, machine.image, "break send_line", "continue", "info threads", "thread apply all backtrace",
+            "delete", "watch xTickCount", "continue", "backtrace 1", "delete",
         )
-    )
+    )  # fmt: skip
     for name in ("REPORT, running", "FILTER, blocked", "FROZEN, suspended", "SPIN-0, ready"):
         assert f"({name}, priority " in printed
     assert re.search(r"receive \(\) at .*firmware.c:\d+|filter \(\) at .*firmware.c:\d+", printed), printed

@@ -64,13 +64,8 @@ def test_a_dialogue_flies_and_every_change_is_an_event(end: str, tmp_path: Path)
     assert {2, 3} <= set(log.column("supervisor.state").to_pylist())
     files = {path.name for path in folder.iterdir()}
     assert files == {
-        "log.parquet",
-        "events.jsonl",
-        "telemetry.csv",
-        "result.json",
-        "report.html",
-        "flight.rrd",
-    }
+        "log.parquet", "events.jsonl", "telemetry.csv", "result.json", "report.html", "flight.rrd",
+    }  # fmt: skip
     result = json.loads((folder / "result.json").read_text())
     assert (result["experiment"], result["seed"], result["board"]) == ("hover", None, "real")
     assert result["metrics"]["flown"] > 0.0

@@ -70,16 +70,9 @@ def build_app(
     sources = sorted((folder / "src").glob("*.c"))
     library = folder / "app.so"
     flags = (
-        "-std=gnu11",
-        "-fshort-enums",
-        "-O1",
-        "-Wall",
-        "-Werror",
-        "-Wdouble-promotion",
-        "-fno-math-errno",
-        "-shared",
-        "-fPIC",
-    )
+        "-std=gnu11", "-fshort-enums", "-O1", "-Wall", "-Werror", "-Wdouble-promotion", "-fno-math-errno",
+        "-shared", "-fPIC",
+    )  # fmt: skip
     zig = ("-fno-sanitize=all", "-Wl,--no-gc-sections") if compiler.name == "zig" else ()
     caches = {name: str(folder / "zig") for name in ("ZIG_LOCAL_CACHE_DIR", "ZIG_GLOBAL_CACHE_DIR")}
     subprocess.run(

@@ -15,13 +15,9 @@ def run(folder: Path, *command: str | Path, code: int = 0) -> subprocess.Complet
         name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PYTEST"))
     }
     ran = subprocess.run(
-        list(map(str, command)),
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
+        list(map(str, command)), cwd=folder, env=environment, capture_output=True, text=True,
         timeout=TIMEOUT_S,
-    )
+    )  # fmt: skip
     assert ran.returncode == code, ran.stdout[-4000:] + ran.stderr[-4000:]
     return ran
 

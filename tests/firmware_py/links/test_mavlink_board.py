@@ -550,24 +550,8 @@ def test_a_stream_that_is_set_while_its_message_waits_begins_anew(
 def test_more_streams_than_the_queue_takes_have_their_turns_too(client: MavlinkClient) -> None:
     slow_line(client, bytes_per_ms=1)
     numbers = (
-        *range(3),
-        *range(30, 34),
-        36,
-        74,
-        85,
-        105,
-        147,
-        148,
-        230,
-        242,
-        245,
-        251,
-        300,
-        331,
-        350,
-        375,
-        436,
-    )
+        *range(3), *range(30, 34), 36, 74, 85, 105, 147, 148, 230, 242, 245, 251, 300, 331, 350, 375, 436,
+    )  # fmt: skip
     for number in numbers:
         client.command(511, number, 10_000)
     client.run(client.now_us + 3_000_000)

@@ -19,14 +19,9 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
 
 ROOT = Path(hil.__file__).parent.parent
 FILES = [
-    ".gitignore",
-    "README.md",
-    "controller.py",
-    "experiments.py",
-    "profile.toml",
-    "pyproject.toml",
+    ".gitignore", "README.md", "controller.py", "experiments.py", "profile.toml", "pyproject.toml",
     "tests/test_flight.py",
-]
+]  # fmt: skip
 
 
 def files_in(folder: Path) -> list[str]:
@@ -127,18 +122,9 @@ def test_a_project_outside_the_clone_flies_tests_checks_and_exports_with_the_whe
     ]
     assert ("floaty.hash", read_result(project / "runs" / "hover-1").hash) in properties
     checked = run(
-        project,
-        command,
-        "deploy",
-        "check",
-        "hover",
-        "--profile",
-        "profile.toml",
-        "--duration",
-        "0.5",
-        "--targets",
-        "c-O2",
-    ).stdout
+        project, command, "deploy", "check", "hover", "--profile", "profile.toml", "--duration", "0.5",
+        "--targets", "c-O2",
+    ).stdout  # fmt: skip
     assert "no bit differs" in checked
     run(project, command, "deploy", "write", "app", "--profile", "profile.toml")
     assert any("integral" in path.read_text() for path in (project / "app").rglob("*.c"))

@@ -200,22 +200,14 @@ def test_drawn_polls_delay_like_real_ones(loss):
 
 @settings(deadline=None, max_examples=60)
 @given(
-    st.integers(0, 2**32),
-    st.floats(0, 0.7),
-    st.floats(0, 0.7),
-    st.integers(0, 30_000),
-    st.integers(0, 500),
-    st.sampled_from([250_000, 2_000_000]),
-)
+    st.integers(0, 2**32), st.floats(0, 0.7), st.floats(0, 0.7), st.integers(0, 30_000),
+    st.integers(0, 500), st.sampled_from([250_000, 2_000_000]),
+)  # fmt: skip
 def test_packets_arrive_at_most_once_and_in_order(seed, up_loss, down_loss, jitter_us, usb_us, rate):
     bench = RadioWithEnds(
-        seed=seed,
-        uplink_loss=up_loss,
-        downlink_loss=down_loss,
-        uplink_jitter_us=jitter_us,
-        usb_us=usb_us,
+        seed=seed, uplink_loss=up_loss, downlink_loss=down_loss, uplink_jitter_us=jitter_us, usb_us=usb_us,
         bits_per_second=rate,
-    )
+    )  # fmt: skip
     bench.pose_every(7_000, 60)
     bench.telemetry_every(20_000, 100, burst=4)
     bench.events.run(60_000_000)

@@ -97,14 +97,9 @@ def written(folder: Path, columns: dict[str, Array], *changes: Change) -> Path:
     path = folder / "telemetry.csv"
     header = ",".join(columns)
     np.savetxt(
-        path,
-        np.stack(list(columns.values()), axis=1),
-        "%.9g",
-        ",",
-        header=header,
-        comments="",
+        path, np.stack(list(columns.values()), axis=1), "%.9g", ",", header=header, comments="",
         encoding="utf-8",
-    )
+    )  # fmt: skip
     return path
 
 

@@ -55,13 +55,9 @@ def test_the_costs_of_the_profile_are_what_the_machine_code_takes(tmp_path: Path
 @pytest.mark.long
 def test_measured_costs_are_the_processor_time_of_the_tasks(tmp_path: Path) -> None:
     result = hover(
-        tmp_path,
-        "cpu.measured=true",
-        "cpu.estimator_us=0",
-        "cpu.controller_us=0",
-        board="cortex-m4",
+        tmp_path, "cpu.measured=true", "cpu.estimator_us=0", "cpu.controller_us=0", board="cortex-m4",
         duration_s=DURATION_S,
-    )
+    )  # fmt: skip
     assert result.passed
     assert result.usage is not None
     entries = result.usage.entries

@@ -72,39 +72,16 @@ def test_metrics_count_from_the_release_to_the_end() -> None:
     told = {name: value for name, value in values.items() if not np.isnan(value)}
     assert told == pytest.approx(
         {
-            "lost": 0.0,
-            "flown": 10.0,
-            "rms_x": rms_x,
-            "rms_y": rms_y,
-            "rms_z": np.sqrt((0.11**2 + 0.06**2 + 0.1**2) / 11),
-            "max_x": 0.3,
-            "max_y": 0.2,
-            "max_z": 0.11,
-            "within_6cm_x": 10 / 11,
-            "within_6cm_y": 10 / 11,
-            "within_6cm_z": 8 / 11,
-            "in_box": 8 / 11,
-            "attitude_max": 0.2,
-            "y_over_x": rms_y / rms_x,
-            "age_mean": 0.04,
-            "failsafe": 10.0 * 2 / 11,
-            "resets": 0.0,
-            "uncontrolled": 10.0 * 5 / 11,
-            "unseen": 0.0,
-            "line_up": 0.1,
-            "line_down": 0.5,
-            "line_overrun": 7.0,
-            "poses_refused": 2 + 1 + 14,
-            "frames_refused": 28.0,
-            "loop_delay": 0.002,
-            "loop_added": 0.005,
-            "loop_stood": 14.0,
-            "samples_held": 1.0,
-            "samples_late": 2.0,
-            "samples_lost": 3.0,
-            "samples_doubled": 4.0,
+            "lost": 0.0, "flown": 10.0, "rms_x": rms_x, "rms_y": rms_y,
+            "rms_z": np.sqrt((0.11**2 + 0.06**2 + 0.1**2) / 11), "max_x": 0.3, "max_y": 0.2, "max_z": 0.11,
+            "within_6cm_x": 10 / 11, "within_6cm_y": 10 / 11, "within_6cm_z": 8 / 11, "in_box": 8 / 11,
+            "attitude_max": 0.2, "y_over_x": rms_y / rms_x, "age_mean": 0.04, "failsafe": 10.0 * 2 / 11,
+            "resets": 0.0, "uncontrolled": 10.0 * 5 / 11, "unseen": 0.0, "line_up": 0.1, "line_down": 0.5,
+            "line_overrun": 7.0, "poses_refused": 2 + 1 + 14, "frames_refused": 28.0, "loop_delay": 0.002,
+            "loop_added": 0.005, "loop_stood": 14.0, "samples_held": 1.0, "samples_late": 2.0,
+            "samples_lost": 3.0, "samples_doubled": 4.0,
         }
-    )
+    )  # fmt: skip
     assert told.keys() <= METRICS.keys()
     short = measure(table.slice(0, 5), lost=True)  # a single row is free
     assert {name: value for name, value in short.items() if not np.isnan(value)} == {

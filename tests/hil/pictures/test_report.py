@@ -126,13 +126,8 @@ def test_the_report_tells_where_the_age_of_the_poses_comes_from(folder: Path) ->
     stages = read_result(folder).ages
     rows = report(folder).tables["ages"][1:]
     assert [row[0] for row in rows] == [
-        "pose on board",
-        "camera",
-        "processing",
-        "network",
-        "station",
-        "radio",
-    ]
+        "pose on board", "camera", "processing", "network", "station", "radio",
+    ]  # fmt: skip
     for row, stage in zip(rows, stages, strict=True):
         assert [float(text) for text in row[1:]] == pytest.approx(
             [1e-3 * stage.mean_us, 1e-3 * stage.p99_us], abs=0.006

@@ -340,16 +340,8 @@ def test_a_watchpoint_stops_after_the_access(kind: bytes, name: str) -> None:
         watch = b"%%s%s,%x,4" % (kind, place)
         # xTickCount is first written when the memory is cleared.
         return [
-            b"QStartNoAckMode",
-            watch % b"Z",
-            b"c",
-            b"c",
-            b"m%x,4" % place,
-            b"p0f",
-            watch % b"z",
-            b"c",
-            b"D",
-        ]
+            b"QStartNoAckMode", watch % b"Z", b"c", b"c", b"m%x,4" % place, b"p0f", watch % b"z", b"c", b"D",
+        ]  # fmt: skip
 
     machine, answers = on_chip(packets, 20_000)
     said = contents(answers)

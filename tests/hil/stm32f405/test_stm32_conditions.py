@@ -41,14 +41,10 @@ def executed(load: int, store: int, watched: tuple[int, int] | None = None) -> B
         (RAM, RAM + 0x40, (WRITES, RAM + 0x40)),
     ],
     ids=[
-        "two-pages",
-        "peripheral-read",
-        "peripheral-written",
-        "null-pointer",
-        "read-watched",
+        "two-pages", "peripheral-read", "peripheral-written", "null-pointer", "read-watched",
         "write-watched",
     ],
-)
+)  # fmt: skip
 def test_an_it_block_leaves_no_condition(load: int, store: int, watched: tuple[int, int] | None) -> None:
     assert executed(load, store, watched).chip.register("r7") == 5
 

@@ -57,23 +57,13 @@ class Strict(Bench):
 
 
 ALIGNED = {
-    "ldrd r0, r1, [r4]": "d4e9 0001",
-    "strd r0, r1, [r4, #8]": "c4e9 0201",
-    "ldm r4, {r0, r1}": "94e8 0300",
-    "ldm r4!, {r0, r8}": "b4e8 0101",
-    "stm r4!, {r0, r1}": "03c4",
-    "stmdb r4, {r0, r1}": "04e9 0300",
-    "vldr s0, [r4]": "94ed 000a",
-    "vstr s0, [r4, #4]": "84ed 010a",
-    "vldm r4, {s0-s3}": "94ec 040a",
-    "vstmdb r4!, {s0-s1}": "24ed 020a",
-    "vldr d0, [r4]": "94ed 000b",
-    "vstr d0, [r4, #8]": "84ed 020b",
-    "vldm r4!, {d0-d1}": "b4ec 040b",
-    "vstm r4, {d0}": "84ec 020b",
-    "ldrex r0, [r4]": "54e8 000f",
+    "ldrd r0, r1, [r4]": "d4e9 0001", "strd r0, r1, [r4, #8]": "c4e9 0201", "ldm r4, {r0, r1}": "94e8 0300",
+    "ldm r4!, {r0, r8}": "b4e8 0101", "stm r4!, {r0, r1}": "03c4", "stmdb r4, {r0, r1}": "04e9 0300",
+    "vldr s0, [r4]": "94ed 000a", "vstr s0, [r4, #4]": "84ed 010a", "vldm r4, {s0-s3}": "94ec 040a",
+    "vstmdb r4!, {s0-s1}": "24ed 020a", "vldr d0, [r4]": "94ed 000b", "vstr d0, [r4, #8]": "84ed 020b",
+    "vldm r4!, {d0-d1}": "b4ec 040b", "vstm r4, {d0}": "84ec 020b", "ldrex r0, [r4]": "54e8 000f",
     "strex r2, r0, [r4]": "44e8 0002",
-}
+}  # fmt: skip
 HALF_WORDS = {"ldrexh r0, [r4]": "d4e8 5f0f", "strexh r2, r0, [r4]": "c4e8 520f"}
 EVERY = ALIGNED | HALF_WORDS
 

@@ -100,17 +100,8 @@ def test_a_lost_robot_ends_in_one_line(cli: Cli, tmp_path: Path, arguments: list
 def test_tuning_from_the_authors_gains_hovers_like_the_default_profile(cli: Cli, tmp_path: Path) -> None:
     out = tmp_path / "mine.toml"
     arguments = (
-        "--profile",
-        "cad",
-        "--repeat",
-        "1",
-        "--out",
-        out,
-        "--runs",
-        tmp_path / "runs",
-        "--robots",
-        "10",
-    )
+        "--profile", "cad", "--repeat", "1", "--out", out, "--runs", tmp_path / "runs", "--robots", "10",
+    )  # fmt: skip
     assert cli("tune", *arguments) == 0
     shown = cli.out
     assert "least of 11" in shown

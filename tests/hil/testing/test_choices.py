@@ -33,14 +33,8 @@ def test_of_a_few_flights_all_are_shown_and_of_more_the_last(count: int) -> None
 
 def test_names_that_differ_in_what_a_folder_cannot_have_get_folders_of_their_own() -> None:
     names = [
-        "a[1]",
-        "a-1",
-        "a(1)",
-        "a.py::test[x/y]",
-        "a.py::test[x y]",
-        "a" * NAME_MAX,
-        "a" * (NAME_MAX + 1),
-    ]
+        "a[1]", "a-1", "a(1)", "a.py::test[x/y]", "a.py::test[x y]", "a" * NAME_MAX, "a" * (NAME_MAX + 1),
+    ]  # fmt: skip
     names += ["x" * (NAME_MAX + 20), "x" * (NAME_MAX + 20) + "y"]
     folders = [folder_of(name) for name in names]
     assert len(set(folders)) == len(names)

@@ -76,13 +76,9 @@ def test_endurance_is_that_of_the_differential_equation(power: float) -> None:
 
 def test_draw_is_the_power_model_of_the_paper_and_the_servos() -> None:
     plant = Plant(
-        GeometryConfig(),
-        PlantConfig(),
-        TunnelConfig(),
-        PlantServoConfig(),
-        np.random.default_rng(1),
+        GeometryConfig(), PlantConfig(), TunnelConfig(), PlantServoConfig(), np.random.default_rng(1),
         loads=CONFIG,
-    )
+    )  # fmt: skip
     plant.hold()
     assert Battery(CONFIG, plant.draw(0, 4.0)).power == pytest.approx(0.3 + 4 * 0.50)
     before = plant.flaps.copy()
