@@ -107,7 +107,8 @@ def silent(peer: Peer) -> None:
 
 
 def noisy(peer: Peer) -> None:
-    peer.write(bytes(range(256)))
+    broken = peer.codec.heartbeat_encode(0, 0, 1, 2, 4, 3).pack(peer.codec)
+    peer.write(bytes(range(256)) + broken[:-1] + bytes((broken[-1] ^ 1,)))
     time.sleep(0.02)
 
 
@@ -142,14 +143,10 @@ def link_to(peer: Peer, key: str = "") -> MavlinkSerialLink:
     return MavlinkSerialLink(peer.uri, LinkSettings(50.0, 0, 921_600, bytes.fromhex(key)))
 
 
-def test_a_line_on_which_nothing_comes_is_given_up_after_four_seconds(peers: Callable[..., Peer]) -> None:
-    peer = peers(silent)
-    refused(peer.uri, f"{peer.uri}: no heartbeat within 4 s: no bytes arrive")
-
-
 @pytest.mark.parametrize(
     ("talk", "station_key", "board_key", "message"),
     [
+        (silent, "", "", "no heartbeat within 1 s: no bytes arrive"),
         (noisy, "", "", r"no heartbeat within 1 s: \d+ bytes, not one frame: wrong baud rate\?"),
         (beats, "", "", r"system 1 answers no command within 1 s: does it want signed frames"),
         (board, KEY, "", r"no heartbeat within 1 s: \d+ frames not signed with mavlink.signing_key"),
