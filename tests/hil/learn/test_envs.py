@@ -14,7 +14,6 @@ from gymnasium.utils.env_checker import check_env
 from scipy.spatial.transform import Rotation
 
 import hil.learn
-from firmware_py.core.observation import OBSERVATIONS
 from hil.config import load_config
 from hil.errors import LabError
 from hil.floaty.plant import Plant
@@ -269,15 +268,15 @@ def test_each_robot_flies_in_the_gusts_of_its_own_tunnel_which_stay_as_strong_as
         Plant(one.geometry, one.plant, one.tunnel, one.actuators, unused, one.flight.home) for one in tunnels
     ]
     fleet, rng = Fleet(board, worlds, 400, 0, EstimateErrors()), np.random.default_rng(2)
-    episode, out = draw_episode(TASKS["Hover"], rng, 1.0), np.zeros((400, OBSERVATIONS), np.float32)
+    episode = draw_episode(TASKS["Hover"], rng, 1.0)
     for n in range(400):
-        fleet.begin(n, replace(episode, robot=0.25 + 0.5 * (n % 2)), rng, out[n])
+        fleet.begin(n, replace(episode, robot=0.25 + 0.5 * (n % 2)), rng)
     for _ in range(2):
         gusts = np.array([fleet.truth(n).air.fields.gusts for n in range(400)])
         assert not gusts[::2].any()
         assert np.sqrt((gusts[1::2] ** 2).mean(axis=0)) == pytest.approx(GUST_RMS["T1"], rel=0.2)
         for _ in range(50):
-            fleet.advance(np.zeros((400, 4), np.float32), rng, out, np.zeros(400))
+            fleet.advance(np.zeros((400, 4), np.float32), rng)
 
 
 def test_robots_are_drawn_from_the_campaign_s_distributions_in_both_fidelities() -> None:
