@@ -269,7 +269,7 @@ def test_only_the_clock_of_the_sender_of_poses_counts() -> None:
         requests = [message for message in client.of("TIMESYNC") if message.tc1 == 0]
         if requests:
             client.receive(other.timesync_encode(1, requests[-1].ts1).pack(other))
-        if now_us % 100_000 == 0:
+        if now_us % 10_000 == 0:
             client.receive(other.heartbeat_encode(6, 8, 0, 0, 4).pack(other))
 
     for at_us in range(100_000, 1_500_000, 1000):
