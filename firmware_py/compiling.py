@@ -39,13 +39,9 @@ ctypes.pythonapi.PyCFunction_NewEx.argtypes = (ctypes.c_void_p, ctypes.py_object
 
 def compiler(*sources: Path) -> Callable[[Function], Function]:
     """Return the decorator for kernels that depend only on `sources`, files or folders, and on their own file."""
-    shared = hash_of(*sources, TRANSLATOR)
 
     def compiled(function: Function) -> Function:
-        stamp = shared.copy()
-        source = inspect.getfile(function)
-        stamp.update(_content(source, os.stat(source).st_mtime_ns))
-        _STAMPS[function] = stamp.hexdigest()
+        _STAMPS[function] = hash_of(*sources, TRANSLATOR, Path(inspect.getfile(function)))
         return function
 
     return compiled
@@ -54,18 +50,14 @@ def compiler(*sources: Path) -> Callable[[Function], Function]:
 _STAMPS: dict[Callable[..., Any], str] = {}
 
 
-def hash_of(*sources: Path) -> "hashlib._Hash":
-    """Return a hash of the machine, Python, numpy, this module and the content of files and folders; it may go on."""
+@cache
+def hash_of(*sources: Path) -> str:
+    """Return a hash of the machine, Python, numpy, this module and the present content of files and folders."""
     found = hashlib.sha256(f"{sys.platform} {platform.machine()} {sys.version} {np.__version__}".encode())
     for source in (Path(__file__), *sources):
         for path in sorted(source.glob("*.py")) if source.is_dir() else (source,):
             found.update(path.read_bytes())
-    return found
-
-
-@cache
-def _content(source: str, _changed_ns: int) -> bytes:
-    return Path(source).read_bytes()
+    return found.hexdigest()
 
 
 def bound(function: Callable[..., Any], *memory: Memory) -> Callable[[], Any]:
@@ -103,9 +95,6 @@ def kept_library(path: Path, make: Callable[[], Path]) -> Path:
     made = make()
     with suppress(OSError):
         keep(path, made.read_bytes())
-        for older in path.parent.glob(f"{path.name.rsplit('-', 1)[0]}-*{SUFFIX}"):  # for other memory
-            if older != path:
-                older.unlink(missing_ok=True)
     return path if path.exists() else made
 
 

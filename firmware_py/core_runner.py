@@ -136,10 +136,8 @@ def default_runner(blocks: CoreBlocks) -> CoreRunner:
 
 def core_library(logic: Logic | None) -> Path:
     """Return the core's library for this machine, with own logic in it. Raises `ExportError`."""
-    sources = hash_of(*SOURCES)
-    sources.update((logic.loaded.digest if logic else "").encode())
-    path = kept_folder("kernels", sources.hexdigest()) / f"core{SUFFIX}"
-    return kept_library(path, partial(_compile, logic))
+    folder = kept_folder("kernels", hash_of(*SOURCES) + (logic.loaded.digest if logic else ""))
+    return kept_library(folder / f"core{SUFFIX}", partial(_compile, logic))
 
 
 def _compile(logic: Logic | None) -> Path:

@@ -61,7 +61,7 @@ def find_compiler(name: str = "") -> Compiler:
 
 
 def _no_compiler(name: str) -> ExportError:
-    return ExportError(f"no C compiler{name} on this machine: {install_command('deploy')}")
+    return ExportError(f"no C compiler{name} on this machine: {install_command('compiler')}")
 
 
 def by_first_that_works(make: Callable[[Compiler], Path]) -> Path:

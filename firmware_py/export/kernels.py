@@ -20,10 +20,7 @@ from firmware_py.export.live_reading import Arrays, Kernels, LiveModule, read_ke
 from firmware_py.export.methods import KERNEL, PROTOTYPES, method
 from firmware_py.export.syntax import BOOL, I64, VOID, Constant
 
-FLAGS = (
-    "-O2", "-shared", "-fPIC", "-std=c99", "-ffp-contract=off", "-fno-math-errno", "-fno-sanitize=all",
-    "-Wall", "-Wextra", "-Werror",
-)  # fmt: skip
+FLAGS = ("-O2", "-shared", "-fPIC", "-std=c99", "-ffp-contract=off", "-fno-math-errno", "-fno-sanitize=all")
 HEAD = """\
 #include <float.h>
 #include <stdbool.h>
@@ -71,9 +68,9 @@ def library(function: Callable[..., Any], arrays: Arrays) -> Path:
     return by_first_that_works(partial(build, translate(function, arrays)))
 
 
-def build(text: str, compiler: Compiler) -> Path:
+def build(text: str, compiler: Compiler, flags: tuple[str, ...] = ()) -> Path:
     """Return the library of a kernel in C; it is compiled unless it is kept. Raises `ExportError`."""
-    return compile_texts({"kernels.c": text}, ("kernels.c", "-lm"), FLAGS, "kernels.so", compiler)
+    return compile_texts({"kernels.c": text}, ("kernels.c", "-lm"), (*FLAGS, *flags), "kernels.so", compiler)
 
 
 def _layout(found: Kernels) -> str:

@@ -14,7 +14,7 @@ from firmware_py.extras import install_command
 from support.paths import ROOT
 
 
-@pytest.mark.parametrize("extra", ["deploy", "mavlink", "mocap", "radio", "view"])
+@pytest.mark.parametrize("extra", ["compiler", "deploy", "mavlink", "mocap", "radio", "view"])
 def test_the_command_names_what_the_extra_needs(extra: str) -> None:
     described = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"][
         "optional-dependencies"

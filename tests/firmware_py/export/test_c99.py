@@ -11,7 +11,7 @@ from firmware_py.core import structs
 from firmware_py.export.c99 import ExportError, Translation, core_texts, translate
 from firmware_py.export.compilers import Compiler, compilers
 from firmware_py.export.literals import float_literal
-from firmware_py.export.native import build
+from firmware_py.export.native import STRICT, build
 from firmware_py.export.profile_c import profile_hash, profile_source
 from firmware_py.logic.plugs import ANSWERING, CALLS
 from hil.config import load_config
@@ -198,10 +198,10 @@ def test_the_shortest_of_two_arrays_bounds_an_index(arrays: tuple[str, str]) -> 
 @pytest.mark.parametrize("standard", ["-std=c99", "-std=gnu11"])
 @pytest.mark.parametrize("compiler", COMPILERS, ids=IDS)
 def test_strict_compilers_accept_the_core_without_a_warning(compiler: Compiler, standard: str) -> None:
-    build(C, compiler, "-Os", (standard,))
+    build(C, compiler, "-Os", (*STRICT, standard))
     warned = C.source + "\nstatic int32_t never(void) { return 1; }\n"
     with pytest.raises(ExportError, match="never"):
-        build(Translation(C.header, warned, ()), compiler, "-Os", (standard,))
+        build(Translation(C.header, warned, ()), compiler, "-Os", (*STRICT, standard))
 
 
 def test_the_c_has_no_double_no_library_and_no_memory_of_its_own() -> None:

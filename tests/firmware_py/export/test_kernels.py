@@ -72,7 +72,7 @@ def fresh(numbers: list[float], first: int, second: int) -> Arrays:
 @pytest.mark.parametrize("compiler", COMPILERS, ids=IDS)
 def test_c_computes_the_bits_of_python(compiler: Compiler) -> None:
     in_c = fresh([0.0, 0.0], 0, 0)
-    call = bound_in(build(translate(compute, in_c), compiler), KERNEL, *in_c)
+    call = bound_in(build(translate(compute, in_c), compiler, ("-Wall", "-Wextra", "-Werror")), KERNEL, *in_c)
     number = st.floats(-700.0, 700.0)  # beyond, Python's ldexp may raise
     number |= st.sampled_from([0.0, -0.0, 1.0, -1.0])
 

@@ -22,6 +22,7 @@ from hil.world import fixed_order, motion
 from hil.world.structs import GUSTS, NOISE_ROWS, Air, Flaps, Rigid
 
 COMPILERS = [one for one in compilers() if one.name != "cc"]
+WARNINGS = ("-Wall", "-Wextra", "-Werror")
 STATES = 40
 FEW_ROWS = 8
 Memory = list[Block[Any] | NDArray[Any]]
@@ -107,7 +108,7 @@ def test_steps_from_any_state_have_the_bits_of_python(
     rng = np.random.default_rng(2026)
     in_c, in_python = allocate(), allocate()
     arrays = tuple(array_of(one) for one in in_c)
-    call = bound_in(build(translate(kernel, arrays), compiler), KERNEL, *arrays)
+    call = bound_in(build(translate(kernel, arrays), compiler, WARNINGS), KERNEL, *arrays)
     for _ in range(STATES):
         draw(rng, in_c)
         before = bytes_of(in_c)
