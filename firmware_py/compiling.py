@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.core.subset import Block
-from firmware_py.export.errors import ExportError
+from firmware_py.export.errors import CompilerError
 from firmware_py.export.methods import KERNEL
 from firmware_py.kept_code import keep, kept_folder, may_load, report
 
@@ -61,12 +61,15 @@ def hash_of(*sources: Path) -> str:
 
 
 def bound(function: Callable[..., Any], *memory: Memory) -> Callable[[], Any]:
-    """Return the call of a kernel on the present memory of blocks and arrays."""
+    """Return the call of a kernel on the present memory of blocks and arrays.
+
+    Raises `ExportError` for a kernel outside the subset.
+    """
     if not PLAIN:
         arrays = tuple(one.memory if isinstance(one, Block) else one for one in memory)
         try:
             return bound_in(_library(function, arrays), KERNEL, *arrays)
-        except (ExportError, OSError) as error:
+        except (CompilerError, OSError) as error:
             fall_back(str(error))
     return partial(function, *(one.fields if isinstance(one, Block) else one for one in memory))
 

@@ -19,7 +19,7 @@ from firmware_py.core.structs import Control, Estimator, Input, Parameters, Repo
 from firmware_py.core.subset import Block, Struct
 from firmware_py.export.c99 import translate
 from firmware_py.export.compilers import Compiler, by_first_that_works
-from firmware_py.export.errors import ExportError
+from firmware_py.export.errors import CompilerError
 from firmware_py.export.methods import METHOD
 from firmware_py.export.native import build
 from firmware_py.export.usage import Usage
@@ -93,7 +93,7 @@ class CoreBlocks:
 class NativeRunner:
     """Runs the core as C on the blocks' memory.
 
-    `library` is one of `firmware_py.export.native.build`; None: that of all flights. Raises `ExportError` where no C
+    `library` is one of `firmware_py.export.native.build`; None: that of all flights. Raises `CompilerError` where no C
     compiler works.
     """
 
@@ -129,13 +129,13 @@ def default_runner(blocks: CoreBlocks) -> CoreRunner:
     if not PLAIN:
         try:
             return NativeRunner(blocks)
-        except (ExportError, OSError) as error:
+        except (CompilerError, OSError) as error:
             fall_back(str(error))
     return PlainRunner(blocks)
 
 
 def core_library(logic: Logic | None) -> Path:
-    """Return the core's library for this machine, with own logic in it. Raises `ExportError`."""
+    """Return the core's library for this machine, with own logic in it. Raises `CompilerError`."""
     folder = kept_folder("kernels", hash_of(*SOURCES) + (logic.loaded.digest if logic else ""))
     return kept_library(folder / f"core{SUFFIX}", partial(_compile, logic))
 

@@ -12,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from firmware_py.export.errors import ExportError
+from firmware_py.export.errors import CompilerError
 from firmware_py.extras import install_command
 from firmware_py.kept_code import kept_folder, may_load
 
@@ -35,11 +35,11 @@ class Compiler:
 
 
 def zig() -> Compiler:
-    """Return the clang inside the package `ziglang`. Raises `ExportError` when that is missing."""
+    """Return the clang inside the package `ziglang`. Raises `CompilerError` when that is missing."""
     try:
         return Compiler("zig", (sys.executable, "-m", "ziglang", "cc"), version("ziglang"))
     except PackageNotFoundError:
-        raise ExportError(f"the compiler ziglang is missing: {install_command('deploy')}") from None
+        raise CompilerError(f"the compiler ziglang is missing: {install_command('deploy')}") from None
 
 
 def compilers() -> Iterator[Compiler]:
@@ -53,27 +53,27 @@ def compilers() -> Iterator[Compiler]:
 
 
 def find_compiler(name: str = "") -> Compiler:
-    """Return the compiler of that name, or the first one; raises `ExportError` if there is none."""
+    """Return the compiler of that name, or the first one; raises `CompilerError` if there is none."""
     for compiler in compilers():
         if name in ("", compiler.name):
             return compiler
     raise _no_compiler(f" {name}" if name else "")
 
 
-def _no_compiler(name: str) -> ExportError:
-    return ExportError(f"no C compiler{name} on this machine: {install_command('compiler')}")
+def _no_compiler(name: str) -> CompilerError:
+    return CompilerError(f"no C compiler{name} on this machine: {install_command('compiler')}")
 
 
 def by_first_that_works(make: Callable[[Compiler], Path]) -> Path:
     """Return what the first compiler makes that can, the system's before ziglang, which takes several times as long.
 
-    Raises `ExportError` with the first complaint.
+    Raises `CompilerError` with the first complaint.
     """
-    first: ExportError | None = None
+    first: CompilerError | None = None
     for compiler in sorted(compilers(), key=lambda one: one.name == "zig"):
         try:
             return make(compiler)
-        except ExportError as error:
+        except CompilerError as error:
             first = first or error
     raise first or _no_compiler("")
 
@@ -83,7 +83,7 @@ def compile_texts(
 ) -> Path:
     """Compile texts in a separate folder, unless that was done before; return the path of the output.
 
-    Raises `ExportError` with the compiler's first complaint.
+    Raises `CompilerError` with the compiler's first complaint.
     """
     command = (*compiler.command, *flags)
     place = kept_folder("c", repr((compiler.version, sys.platform, command, sorted(texts.items()), inputs)))
@@ -95,7 +95,7 @@ def compile_texts(
         for name, text in texts.items():
             (place / name).write_text(text, encoding="utf-8")
     except OSError as error:
-        raise ExportError(f"{place}: cannot be written ({error.strerror or error})") from None
+        raise CompilerError(f"{place}: cannot be written ({error.strerror or error})") from None
     caches = {name: str(kept_folder("zig")) for name in ("ZIG_LOCAL_CACHE_DIR", "ZIG_GLOBAL_CACHE_DIR")}
     for _ in range(ATTEMPTS):
         done = _run((*command, "-o", partial, *inputs), cwd=place, env=os.environ | caches)
@@ -103,7 +103,7 @@ def compile_texts(
             break
     if done.returncode:
         complaints = [line for line in done.stderr.splitlines() if "error" in line]
-        raise ExportError(f"{compiler.name}: {(complaints or [f'exit {done.returncode}'])[0]}")
+        raise CompilerError(f"{compiler.name}: {(complaints or [f'exit {done.returncode}'])[0]}")
     (place / partial).chmod(0o700)
     (place / partial).replace(result)
     return result

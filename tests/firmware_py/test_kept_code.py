@@ -13,7 +13,7 @@ from firmware_py.compiling import bound, compiler
 from firmware_py.core.subset import F64s
 from firmware_py.export import kernels
 from firmware_py.export.compilers import compilers
-from firmware_py.export.errors import ExportError
+from firmware_py.export.errors import CompilerError, ExportError
 from firmware_py.export.kernels import library
 from firmware_py.export.live_reading import Arrays
 from firmware_py.kept_code import UNUSED_S, keep, kept_folder, may_load
@@ -144,7 +144,7 @@ def test_a_library_is_compiled_once_and_again_when_others_may_have_written_it(
     )  # one for each shape
 
 
-@pytest.mark.parametrize("error", [ExportError("no C compiler"), PermissionError(13, "Permission denied")])
+@pytest.mark.parametrize("error", [CompilerError("no C compiler"), PermissionError(13, "Permission denied")])
 def test_without_compiled_code_python_computes_the_same_and_one_line_says_why(
     error: Exception, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -158,6 +158,16 @@ def test_without_compiled_code_python_computes_the_same_and_one_line_says_why(
         bound(compiler()(twice), x)()
         assert x[0] == 8.0
     assert capsys.readouterr().err == f"floaty: flies as plain Python, far slower: {error}\n"
+
+
+def outside(x: F64s) -> None:
+    """Do what the subset has not."""
+    x[0] = max(x.tolist())
+
+
+def test_a_kernel_outside_the_subset_does_not_fly_as_python() -> None:
+    with pytest.raises(ExportError, match=r"test_kept_code\.py:.*call"):
+        bound(compiler()(outside), np.array([4.0]))
 
 
 def test_folders_that_nobody_has_used_for_long_are_deleted() -> None:
