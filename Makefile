@@ -60,7 +60,7 @@ wheel: .venv/fast.stamp
 
 .venv/fly.stamp: .venv/pip.stamp pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[radio,mavlink,view,identify,design]'
-	@command -v gcc clang cc > /dev/null || $(BIN)/python -m pip install --quiet --editable '.[compiler]'
+	@{ command -v gcc || command -v clang || command -v cc; } > /dev/null || $(BIN)/python -m pip install --quiet --editable '.[compiler]'
 	@touch $@
 
 .venv/test.stamp: .venv/fly.stamp

@@ -101,9 +101,11 @@ def kept_library(path: Path, make: Callable[[], Path]) -> Path:
     return path if path.exists() else made
 
 
-def is_kept(function: Callable[..., Any]) -> bool:
-    """Return whether a kernel has been compiled on this machine already."""
-    return any(_folder(function).glob(_name(function, "*")))
+def must_compile(function: Callable[..., Any]) -> bool:
+    """Return whether a kernel has not been compiled on this machine yet, and will be."""
+    from firmware_py.export.compilers import compilers
+
+    return not PLAIN and not any(_folder(function).glob(_name(function, "*"))) and any(compilers())
 
 
 class _Method(ctypes.Structure):

@@ -163,10 +163,10 @@ def check_profile(option: str, path: Path | None) -> None:
 
 def announce_compilation() -> None:
     """Announce that the first run compiles, which takes a while."""
-    from firmware_py.compiling import is_kept
+    from firmware_py.compiling import must_compile
     from hil.devices.imu import channels
 
-    if not is_kept(channels):
+    if must_compile(channels):
         warn(COMPILING)
 
 

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_py.compiling import bound, compiler, is_kept
+from firmware_py.compiling import bound, compiler, must_compile
 from firmware_py.core.subset import F64s
 from inner import FACTOR, half
 
@@ -31,10 +31,10 @@ def outer(x: F64s) -> None:
     x[0] = FACTOR * half(x[0])
 
 if __name__ == "__main__":
-    x, before = np.array([8.0]), is_kept(outer)
+    x, before = np.array([8.0]), must_compile(outer)
     call = bound(outer, x)
     call()
-    print(before, x[0], is_kept(outer), type(call).__name__)
+    print(before, x[0], must_compile(outer), type(call).__name__)
 """
 INNER = """
 from pathlib import Path
@@ -51,7 +51,7 @@ def half(x: float) -> float:
 
 
 @pytest.mark.parametrize("kept", ["XDG_CACHE_HOME", "FLOATY_CACHE_DIR"])
-def test_compiled_code_is_kept_until_a_source_changes(kept: str, tmp_path: Path) -> None:
+def test_compiled_code_must_compile_until_a_source_changes(kept: str, tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     environment.pop("FLOATY_CACHE_DIR", None)
     environment[kept] = str(tmp_path / "cache")
@@ -65,12 +65,12 @@ def test_compiled_code_is_kept_until_a_source_changes(kept: str, tmp_path: Path)
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
         return done.stdout.strip()
 
-    assert run(factor=3.0, half=0.5) == "False 12.0 True builtin_function_or_method"
-    assert run(factor=3.0, half=0.5) == "True 12.0 True builtin_function_or_method"
-    assert run(factor=5.0, half=0.5) == "False 20.0 True builtin_function_or_method", (
+    assert run(factor=3.0, half=0.5) == "True 12.0 False builtin_function_or_method"
+    assert run(factor=3.0, half=0.5) == "False 12.0 False builtin_function_or_method"
+    assert run(factor=5.0, half=0.5) == "True 20.0 False builtin_function_or_method", (
         "a constant of another file"
     )
-    assert run(factor=5.0, half=0.6) == "False 24.0 True builtin_function_or_method", (
+    assert run(factor=5.0, half=0.6) == "True 24.0 False builtin_function_or_method", (
         "a function of another file"
     )
     assert {path.name for path in package.iterdir()} == {"outer.py", "inner.py"}
