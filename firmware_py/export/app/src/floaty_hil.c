@@ -116,7 +116,6 @@ bool floaty_hil_switched(void) {
   }
   used = late = silent_steps = 0;
   held_before = floaty_hil_held;
-  memset(&taken, 0, sizeof taken);
   running = false;
   floaty_hil_mode = wanted;
   modes += 1;
