@@ -51,7 +51,7 @@ def half(x: float) -> float:
 
 
 @pytest.mark.parametrize("kept", ["XDG_CACHE_HOME", "FLOATY_CACHE_DIR"])
-def test_compiled_code_must_compile_until_a_source_changes(kept: str, tmp_path: Path) -> None:
+def test_compiled_code_is_kept_until_a_source_changes(kept: str, tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     environment.pop("FLOATY_CACHE_DIR", None)
     environment[kept] = str(tmp_path / "cache")
