@@ -41,23 +41,27 @@ def compiler(*sources: Path) -> Callable[[Function], Function]:
     """Return the decorator for kernels that depend only on `sources`, files or folders, and on their own file."""
 
     def compiled(function: Function) -> Function:
-        _STAMPS[function] = hash_of(*sources, TRANSLATOR, Path(inspect.getfile(function)))
+        _SOURCES[function] = (*sources, TRANSLATOR, Path(inspect.getfile(function)))
         return function
 
     return compiled
 
 
-_STAMPS: dict[Callable[..., Any], str] = {}
+_SOURCES: dict[Callable[..., Any], tuple[Path, ...]] = {}
 
 
-@cache
 def hash_of(*sources: Path) -> str:
     """Return a hash of the machine, Python, numpy, this module and the present content of files and folders."""
     found = hashlib.sha256(f"{sys.platform} {platform.machine()} {sys.version} {np.__version__}".encode())
     for source in (Path(__file__), *sources):
         for path in sorted(source.glob("*.py")) if source.is_dir() else (source,):
-            found.update(path.read_bytes())
+            found.update(_digest(path, os.stat(path).st_mtime_ns))
     return found.hexdigest()
+
+
+@cache
+def _digest(path: Path, _changed_ns: int) -> bytes:
+    return hashlib.sha256(path.read_bytes()).digest()
 
 
 def bound(function: Callable[..., Any], *memory: Memory) -> Callable[[], Any]:
@@ -146,7 +150,7 @@ def _library(function: Callable[..., Any], arrays: tuple[NDArray[Any], ...]) -> 
 
 
 def _folder(function: Callable[..., Any]) -> Path:
-    return kept_folder("kernels", f"{function.__module__} {_STAMPS[function]}")
+    return kept_folder("kernels", f"{function.__module__} {hash_of(*_SOURCES[function])}")
 
 
 def _name(function: Callable[..., Any], kinds: str) -> str:
