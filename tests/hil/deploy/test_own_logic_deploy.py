@@ -140,7 +140,7 @@ def discrete_model() -> tuple[np.ndarray, np.ndarray]:
     def advanced(x: np.ndarray, command: np.ndarray) -> np.ndarray:
         x = x.astype(np.float32)
         work = [np.zeros(16, np.float32) for _ in range(2)]
-        model.advance_state(parameters.memory[0], none, one, x, command[None, :].astype(np.float32), 0, *work)
+        model.advance_state(parameters.fields, none, one, x, command[None, :].astype(np.float32), 0, *work)
         return x.astype(float)
 
     A = np.column_stack([advanced(column, np.zeros(4)) for column in np.eye(16)])
