@@ -136,8 +136,8 @@ def test_the_tests_of_a_project_fly_over_a_real_link(pytester: pytest.Pytester) 
             assert flight.request.bench.link.startswith("radio://")
             assert flight.outcome == "completed"
 
-        @pytest.mark.floaty(boards=["c"])
-        def test_c(floaty):
+        @pytest.mark.floaty(boards=["python"])
+        def test_python(floaty):
             floaty.fly()
 
         @pytest.mark.floaty(needs="lockstep")
