@@ -67,10 +67,10 @@ def _digest(path: Path, _changed_ns: int) -> bytes:
 def bound(function: Callable[..., Any], *memory: Memory) -> Callable[[], Any]:
     """Return the call of a kernel on the present memory of blocks and arrays.
 
-    Raises `ExportError` for a kernel outside the subset.
+    An array with gaps, like a column of a matrix, is Python's. Raises `ExportError` for a kernel outside the subset.
     """
-    if not PLAIN:
-        arrays = tuple(one.memory if isinstance(one, Block) else one for one in memory)
+    arrays = tuple(one.memory if isinstance(one, Block) else one for one in memory)
+    if not PLAIN and all(one.flags.c_contiguous for one in arrays):
         try:
             return bound_in(_library(function, arrays), KERNEL, *arrays)
         except (CompilerError, OSError) as error:

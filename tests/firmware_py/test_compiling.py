@@ -96,6 +96,18 @@ def test_a_bound_call_is_that_of_python_on_the_memory_as_it_is() -> None:
     assert (count_down(left, by), left[0]) == (True, 10)
 
 
+@kernel
+def clear_second(row: I32s) -> None:
+    """Clear the second number."""
+    row[1] = i32(0)
+
+
+def test_an_array_with_gaps_is_changed_in_its_own_places() -> None:
+    memory = np.ones((2, 3), np.int32)
+    bound(clear_second, memory[:, 1])()
+    assert memory.tolist() == [[1, 1, 1], [1, 0, 1]]
+
+
 def test_the_memory_of_a_bound_call_lives_as_long_as_the_call() -> None:
     left = numbers(2)
     alive = weakref.ref(left)
