@@ -48,14 +48,10 @@ CHECK = "#define LAYOUT(name, holds) typedef char layout_##name[(holds) ? 1 : -1
 
 @dataclass(frozen=True, slots=True)
 class Translation:
-    """The C of the core; `functions` are the C names of all functions in their order.
-
-    `entries` are the entry points: how many blocks each takes, and whether it has an answer.
-    """
+    """The C of the core; `entries`: how many blocks each entry point takes, and whether it has an answer."""
 
     header: str
     source: str
-    functions: tuple[str, ...]
     version: str = ""  # hash of the Python sources
     entries: Mapping[str, tuple[int, bool]] = dataclasses.field(default_factory=dict)
 
@@ -88,9 +84,8 @@ def translate(texts: Mapping[str, str] | None = None, own: Mapping[str, str] = N
     used = {id(constant) for printer in printers.values() for constant in printer.constants}
     version = hashlib.sha256("\0".join(texts[module.name] for module in modules).encode()).hexdigest()[:12]
     header = _header(modules, [printers[kernel.c_name] for kernel in public], version)
-    names = tuple(kernel.c_name for kernel in kernels)
     entries = {one.c_name.removeprefix(CORE): (len(one.arguments), one.result != VOID) for one in public}
-    return Translation(header, _source(modules, printed, used), names, version, entries)
+    return Translation(header, _source(modules, printed, used), version, entries)
 
 
 def _rename_equal_constants(modules: list[Module]) -> None:

@@ -19,9 +19,14 @@ from firmware_py.kept_code import kept_folder, may_load
 ATTEMPTS = 3  # clang itself crashed once (SIGBUS) in a run of all tests
 
 SYSTEM_COMPILERS = ("gcc", "clang", "cc")
+LIBRARY_FLAGS = (
+    "-shared",
+    "-fPIC",
+    "-std=c99",
+    "-fno-sanitize=all",
+)  # zig traps undefined behaviour by default
 HOST_FLAGS = (
-    "-O2", "-shared", "-fPIC", "-std=c99", "-fno-sanitize=all",
-    "-Wall", "-Wextra", "-Wno-unused-parameter", "-Werror",  # callbacks take what unicorn gives
+    "-O2", *LIBRARY_FLAGS, "-Wall", "-Wextra", "-Wno-unused-parameter", "-Werror",  # callbacks take what unicorn gives
 )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from firmware_py.export.c99 import CHECK, struct_definition
-from firmware_py.export.compilers import Compiler, by_first_that_works, compile_texts
+from firmware_py.export.compilers import LIBRARY_FLAGS, Compiler, by_first_that_works, compile_texts
 from firmware_py.export.errors import ExportError
 from firmware_py.export.functions import FunctionPrinter, block_comment, constant_definition
 from firmware_py.export.live_printing import HELPERS, LivePrinter
@@ -20,7 +20,7 @@ from firmware_py.export.live_reading import Arrays, Kernels, LiveModule, read_ke
 from firmware_py.export.methods import KERNEL, PROTOTYPES, method
 from firmware_py.export.syntax import BOOL, I64, VOID, Constant
 
-FLAGS = ("-O2", "-shared", "-fPIC", "-std=c99", "-ffp-contract=off", "-fno-math-errno", "-fno-sanitize=all")
+FLAGS = ("-O2", *LIBRARY_FLAGS, "-ffp-contract=off", "-fno-math-errno")
 HEAD = """\
 #include <float.h>
 #include <stdbool.h>

@@ -3,14 +3,12 @@
 from pathlib import Path
 
 from firmware_py.export.c99 import Translation
-from firmware_py.export.compilers import Compiler, compile_texts, find_compiler
+from firmware_py.export.compilers import LIBRARY_FLAGS, Compiler, compile_texts, find_compiler
 from firmware_py.export.methods import METHOD, PROTOTYPES, method
 from firmware_py.export.syntax import CORE
 
-FLAGS = ("-std=c99", "-fno-math-errno")
+FLAGS = (*LIBRARY_FLAGS, "-nostdlib", "-fno-math-errno")
 STRICT = ("-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Werror")  # for tests: compilers differ
-LIBRARY_FLAGS = ("-shared", "-fPIC", "-nostdlib")
-ZIG_FLAGS = ("-fno-sanitize=all",)  # zig checks for undefined behaviour by default and traps
 
 
 def build(
@@ -21,7 +19,6 @@ def build(
 ) -> Path:
     """Return the shared library of the core; it is compiled unless it is kept."""
     compiler = compiler or find_compiler()
-    no_traps = ZIG_FLAGS if compiler.name == "zig" else ()
     methods = "".join(
         method(METHOD + name, CORE + name, arguments, answers)
         for name, (arguments, answers) in translation.entries.items()
@@ -31,5 +28,5 @@ def build(
         "floaty_core.c": translation.source,
         "methods.c": f'#include "floaty_core.h"\n\n{PROTOTYPES}{methods}',
     }
-    command = (optimisation, *FLAGS, *LIBRARY_FLAGS, *no_traps, *flags)
-    return compile_texts(texts, ("floaty_core.c", "methods.c"), command, "floaty_core.so", compiler)
+    inputs = ("floaty_core.c", "methods.c")
+    return compile_texts(texts, inputs, (optimisation, *FLAGS, *flags), "floaty_core.so", compiler)

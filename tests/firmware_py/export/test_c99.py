@@ -201,7 +201,7 @@ def test_strict_compilers_accept_the_core_without_a_warning(compiler: Compiler, 
     build(C, compiler, "-Os", (*STRICT, standard))
     warned = C.source + "\nstatic int32_t never(void) { return 1; }\n"
     with pytest.raises(ExportError, match="never"):
-        build(Translation(C.header, warned, ()), compiler, "-Os", (*STRICT, standard))
+        build(Translation(C.header, warned), compiler, "-Os", (*STRICT, standard))
 
 
 def test_the_c_has_no_double_no_library_and_no_memory_of_its_own() -> None:
@@ -214,7 +214,7 @@ def test_the_c_has_no_double_no_library_and_no_memory_of_its_own() -> None:
 def test_a_struct_of_another_layout_does_not_compile() -> None:
     swapped = C.header.replace("int32_t quiet_ticks;", "int32_t spare;\n    int32_t quiet_ticks;")
     with pytest.raises(ExportError, match="layout_FloatyEstimator"):
-        build(Translation(swapped, C.source, ()))
+        build(Translation(swapped, C.source))
     for struct in (structs.Parameters, structs.Input, structs.Estimator, structs.Control):
         assert f"sizeof(Floaty{struct.__name__}) == {struct.dtype.itemsize})" in C.source
 
@@ -271,7 +271,7 @@ def test_every_float_literal_is_read_by_the_compiler_as_that_float() -> None:
     values = np.concatenate([values, np.array([0.0, -0.0, 1e-45, 3.4028235e38, 16777216.0], np.float32)])
     table = ",\n".join(map(float_literal, values))
     source = f"extern const float table[];\nconst float table[] = {{\n{table}}};\n"
-    library = ctypes.CDLL(str(build(Translation("", source, ()), optimisation="-O0")))
+    library = ctypes.CDLL(str(build(Translation("", source), optimisation="-O0")))
     got = np.ctypeslib.as_array((ctypes.c_float * values.size).in_dll(library, "table"))
     assert got.tobytes() == values.tobytes()
 
@@ -280,7 +280,7 @@ def test_every_float_literal_is_read_by_the_compiler_as_that_float() -> None:
 @pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 def test_a_profile_in_c_has_the_bits_of_the_emulators_parameters(overrides: list[str]) -> None:
     config = load_config(overrides=overrides)
-    library = ctypes.CDLL(str(build(Translation(C.header, profile_source(config), ()))))
+    library = ctypes.CDLL(str(build(Translation(C.header, profile_source(config)))))
     expected, got = parameters_of(config), structs.Parameters.allocate()
     got.memory.view(np.uint8)[:] = 0xAA
     library.floaty_core_init(ctypes.c_void_p(got.memory.ctypes.data))
