@@ -23,16 +23,17 @@ from numpy.typing import NDArray
 
 from firmware_py.core.subset import Block
 from firmware_py.export.errors import CompilerError
-from firmware_py.export.methods import KERNEL
+from firmware_py.export.methods import METHOD
 from firmware_py.kept_code import keep, kept_folder, may_load, report
 
 PLAIN = os.environ.get("FLOATY_PLAIN", "0") not in ("", "0")
 SUFFIX = ".so"
 TRANSLATOR = Path(__file__).with_name("export")
-NO_ARGUMENTS = 4  # `METH_NOARGS`
+FAST_CALL = 0x80  # `METH_FASTCALL`
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 Memory = Block[Any] | NDArray[Any]
+Functions = tuple[Callable[..., Any], ...]
 ctypes.pythonapi.PyCFunction_NewEx.restype = ctypes.py_object
 ctypes.pythonapi.PyCFunction_NewEx.argtypes = (ctypes.c_void_p, ctypes.py_object, ctypes.py_object)
 
@@ -64,21 +65,28 @@ def _digest(path: Path, _changed_ns: int) -> bytes:
     return hashlib.sha256(path.read_bytes()).digest()
 
 
-def bound(function: Callable[..., Any], *memory: Memory) -> Callable[[], Any]:
-    """Return the call of a kernel on the present memory of blocks and arrays.
+def bound(function: Callable[..., Any], *memory: Memory) -> Callable[..., Any]:
+    """Return the call of a kernel on the present memory of blocks and arrays; its integers are the call's arguments.
 
     An array with gaps, like a column of a matrix, is Python's. Raises `ExportError` for a kernel outside the subset.
     """
+    return bound_together((function,), *memory)[0]
+
+
+def bound_together(functions: Functions, *memory: Memory) -> list[Callable[..., Any]]:
+    """Return the calls of kernels that take the same memory, from one library."""
     arrays = tuple(one.memory if isinstance(one, Block) else one for one in memory)
     if not PLAIN and all(one.flags.c_contiguous for one in arrays):
         try:
-            return bound_in(_library(function, arrays), KERNEL, *arrays)
+            library = _library(functions, arrays)
+            return [bound_in(library, METHOD + function.__name__, *arrays) for function in functions]
         except (CompilerError, OSError) as error:
             fall_back(str(error))
-    return partial(function, *(one.fields if isinstance(one, Block) else one for one in memory))
+    taken = [one.fields if isinstance(one, Block) else one for one in memory]
+    return [partial(function, *taken) for function in functions]
 
 
-def bound_in(library: Path, method: str, *arrays: NDArray[Any]) -> Callable[[], Any]:
+def bound_in(library: Path, method: str, *arrays: NDArray[Any]) -> Callable[..., Any]:
     """Return the call of a method in a library on the present memory of arrays.
 
     Raises `OSError` in a file system from which nothing may be executed.
@@ -86,7 +94,7 @@ def bound_in(library: Path, method: str, *arrays: NDArray[Any]) -> Callable[[], 
     places = struct.pack(f"{len(arrays)}P", *(one.ctypes.data for one in arrays))
     # the unused last argument keeps the memory alive as long as the call
     made = ctypes.pythonapi.PyCFunction_NewEx(ctypes.byref(_method_in(library, method)[0]), places, arrays)
-    return cast(Callable[[], Any], made)
+    return cast(Callable[..., Any], made)
 
 
 @cache
@@ -109,7 +117,7 @@ def must_compile(function: Callable[..., Any]) -> bool:
     """Return whether a kernel has not been compiled on this machine yet, and will be."""
     from firmware_py.export.compilers import compilers
 
-    return not PLAIN and not any(_folder(function).glob(_name(function, "*"))) and any(compilers())
+    return not PLAIN and not any(_folder((function,)).glob(_name((function,), "*"))) and any(compilers())
 
 
 class _Method(ctypes.Structure):
@@ -128,30 +136,32 @@ def _method_in(library: Path, name: str) -> tuple[_Method, Any]:
     """Return a method in a library, and the owner of its machine code, which Python never frees."""
     code = ctypes.CDLL(str(library))
     address = ctypes.cast(code[name], ctypes.c_void_p).value
-    return _Method(name.encode(), address, NO_ARGUMENTS, None), code
+    return _Method(name.encode(), address, FAST_CALL, None), code
 
 
-_LIBRARIES: dict[tuple[Callable[..., Any], str], Path] = {}
+_LIBRARIES: dict[tuple[Functions, str], Path] = {}
 
 
-def _library(function: Callable[..., Any], arrays: tuple[NDArray[Any], ...]) -> Path:
-    """Return the library of a kernel for memory of these kinds. Raises `ExportError`."""
+def _library(functions: Functions, arrays: tuple[NDArray[Any], ...]) -> Path:
+    """Return the library of kernels for memory of these kinds. Raises `ExportError`."""
     kinds = hashlib.sha256(repr([(one.dtype.str, one.shape) for one in arrays]).encode()).hexdigest()[:16]
-    key = function, kinds
+    key = functions, kinds
     if key not in _LIBRARIES:
 
         def make() -> Path:
             from firmware_py.export.kernels import library  # not needed where one is kept
 
-            return library(function, arrays)
+            return library(functions, arrays)
 
-        _LIBRARIES[key] = kept_library(_folder(function) / _name(function, kinds), make)
+        _LIBRARIES[key] = kept_library(_folder(functions) / _name(functions, kinds), make)
     return _LIBRARIES[key]
 
 
-def _folder(function: Callable[..., Any]) -> Path:
-    return kept_folder("kernels", f"{function.__module__} {hash_of(*_SOURCES[function])}")
+def _folder(functions: Functions) -> Path:
+    names = " ".join(f"{one.__module__}.{one.__name__}" for one in functions)
+    sources = dict.fromkeys(source for one in functions for source in _SOURCES[one])
+    return kept_folder("kernels", f"{names} {hash_of(*sources)}")
 
 
-def _name(function: Callable[..., Any], kinds: str) -> str:
-    return f"{function.__module__}.{function.__name__}-{kinds}{SUFFIX}"
+def _name(functions: Functions, kinds: str) -> str:
+    return f"{functions[0].__module__}.{functions[0].__name__}-{kinds}{SUFFIX}"

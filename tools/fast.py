@@ -31,7 +31,6 @@ MODULES = {
     "firmware_py": "firmware geometry pilot supervisor tasks",
     "firmware_py/crazyflie": "commander planner stabilizer supervisor",
     "firmware_py/links": "crtp_stack localisation log",
-    "firmware_py/rtos": "control_block kernel queue scheduler semaphore task timer",
     "firmware_py/wire": "crtp log telemetry",
     "ground_station": "corrections mocap pose_filter station telemetry_log tracker",
     "ground_station/links": "log_blocks loopback",

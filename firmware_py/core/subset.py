@@ -4,8 +4,8 @@ Subset: module constants `f32(..)`, `i32(..)`, plain ints and arrays `constant(.
 with `f32`, `i32` or `Annotated[F32s, ...]` annotations); functions marked `@kernel` with annotated scalars and structs;
 `for` over `range`, `if`/`elif`/`else`; `+ - * /` on float32, `+ - * // %` on small non-negative int32; comparisons,
 `and`/`or`/`not`; calls of other kernels; `abs`, `sqrt`, `elapsed`. Floats never meet ints without `f32(..)`, and every
-constant is explicitly float32, as in C. `f64` and `F64s` are for the structs and kernels of the laboratory's world alone:
-the core's translator refuses them.
+constant is explicitly float32, as in C. `f64`, `i64` and their arrays are for the structs and kernels of the laboratory
+alone, the world and the scheduler: the core's translator refuses them.
 
 A struct is one block of memory with the layout of the C struct (naturally aligned), so that plain Python, C and the
 microcontroller can be compared byte by byte. Kernels are plain Python that a debugger can step through; their C flies.
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 f32 = np.float32
 i32 = np.int32
 f64 = float
+i64 = int
 sqrt = np.sqrt  # correctly rounded on every target: sqrtss on x86, VSQRT.F32 on the Cortex-M4
 
 Integer: TypeAlias = int | np.int32
@@ -42,6 +43,7 @@ def elapsed(later: Integer, earlier: Integer) -> i32:
 F32s: TypeAlias = NDArray[np.float32]
 I32s: TypeAlias = NDArray[np.int32]
 F64s: TypeAlias = NDArray[np.float64]
+I64s: TypeAlias = NDArray[np.int64]
 
 
 def constant(*rows: float | Sequence[float]) -> F32s:
@@ -169,11 +171,15 @@ class Struct:
         scalars = tuple(column[0] for column in columns if len(column) == 2)
         arrays = tuple(column[0] for column in columns if len(column) == 3)
 
+        wide = {
+            column[0] for column in columns if np.dtype(column[1]) == np.int64
+        }  # Python's own integers, twice as fast
+
         def bind(view: Any, memory: NDArray[Any]) -> None:
             for name in scalars:
-                setattr(view, "_" + name, memory[name])
+                setattr(view, "_" + name, memory[name].data if name in wide else memory[name])
             for name in arrays:
-                setattr(view, name, memory[name][0])
+                setattr(view, name, memory[name][0].data if name in wide else memory[name][0])
 
         body: dict[str, Any] = {name: _scalar_property(name) for name in scalars}
         body["__slots__"] = (*("_" + name for name in scalars), *arrays)

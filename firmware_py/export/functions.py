@@ -75,7 +75,7 @@ class FunctionPrinter:
 
     def _write(self, node: ast.stmt, depth: int, text: str) -> None:
         """Print a line with the comment behind its statement, folded if it is long."""
-        simple = not isinstance(node, ast.If | ast.For)
+        simple = not isinstance(node, ast.If | ast.For | ast.While)
         scope = self.kernel.scope
         comment = scope.comment(node) if simple else scope.trailing.get(node.lineno, "")
         self._fold(depth, text)

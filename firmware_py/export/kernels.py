@@ -1,12 +1,12 @@
-"""The laboratory's kernels as C, compiled into a library with one method of CPython.
+"""The laboratory's kernels as C, compiled into a library with a method of CPython for each.
 
-    path = library(advance, (body, air, flaps, draws))
+    path = library((begin, move), (body, air, flaps, draws))
 
-The method takes nothing and has the addresses of blocks and arrays in its `self`, as `firmware_py.compiling.bound` uses
-it. Every operation is rounded by itself: all compilers and plain Python compute the same bits.
+A method has the addresses of blocks and arrays in its `self`, as `firmware_py.compiling.bound` uses it. Every operation is
+rounded by itself: all compilers and plain Python compute the same bits.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from firmware_py.export.errors import ExportError
 from firmware_py.export.functions import FunctionPrinter, block_comment, constant_definition
 from firmware_py.export.live_printing import HELPERS, LivePrinter
 from firmware_py.export.live_reading import Arrays, Kernels, LiveModule, read_kernels
-from firmware_py.export.methods import KERNEL, PROTOTYPES, method
+from firmware_py.export.methods import METHOD, PROTOTYPES, method
 from firmware_py.export.syntax import BOOL, I64, VOID, Constant
 
 FLAGS = ("-O2", *LIBRARY_FLAGS, "-ffp-contract=off", "-fno-math-errno")
@@ -34,13 +34,14 @@ HEAD = """\
 """
 
 
-def translate(function: Callable[..., Any], arrays: Arrays) -> str:
-    """Return the C of a kernel on memory of this kind, with all that it calls. Raises `ExportError`."""
-    found = read_kernels(function, arrays)
-    kernels = found.kernels
-    if kernels[-1].result not in (VOID, BOOL, I64):
-        raise ExportError(f"{kernels[-1].c_name} returns a float: a method of CPython returns whole numbers")
-    reached = {kernels[-1].c_name} | kernels[-1].calls
+def translate(functions: Sequence[Callable[..., Any]], arrays: Arrays) -> str:
+    """Return the C of kernels on memory of this kind, with all that they call. Raises `ExportError`."""
+    found = read_kernels(functions, arrays)
+    kernels, roots = found.kernels, found.roots
+    for root in roots:
+        if root.result not in (VOID, BOOL, I64):
+            raise ExportError(f"{root.c_name} returns a float: a method of CPython returns whole numbers")
+    reached = {one for root in roots for one in (root.c_name, *root.calls)}
     printed: dict[str, str] = {}
     used: dict[str, Constant] = {}
     for kernel in reversed(kernels):  # callers first: they show the shapes of array arguments
@@ -51,21 +52,30 @@ def translate(function: Callable[..., Any], arrays: Arrays) -> str:
             used |= {one.c_name: one for one in printer.constants}
     return "".join(
         (
-            block_comment(f"{kernels[-1].c_name}, written from Python by firmware_py/export/kernels.py"),
+            block_comment("Kernels, written from Python by firmware_py/export/kernels.py"),
             f"{HEAD}{PROTOTYPES}\n",
             *(f"{struct_definition(struct)}\n" for struct, _ in found.structs),
             _layout(found),
             f"\n{HELPERS}\n",
             *(f"{constant_definition(one)}\n" for one in used.values()),
             *(f"\n{text}" for text in reversed(printed.values())),
-            method(KERNEL, kernels[-1].c_name, len(arrays), kernels[-1].result != VOID),
+            *(
+                method(
+                    METHOD + function.__name__,
+                    root.c_name,
+                    len(arrays),
+                    root.result != VOID,
+                    len(root.arguments) - len(arrays),
+                )
+                for function, root in zip(functions, roots, strict=True)
+            ),
         )
     )
 
 
-def library(function: Callable[..., Any], arrays: Arrays) -> Path:
-    """Return the library of a kernel by the first compiler that works. Raises `ExportError` without any."""
-    return by_first_that_works(partial(build, translate(function, arrays)))
+def library(functions: Sequence[Callable[..., Any]], arrays: Arrays) -> Path:
+    """Return the library of kernels by the first compiler that works. Raises `ExportError` without any."""
+    return by_first_that_works(partial(build, translate(functions, arrays)))
 
 
 def build(text: str, compiler: Compiler, flags: tuple[str, ...] = ()) -> Path:

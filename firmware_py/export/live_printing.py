@@ -2,7 +2,7 @@
 
 They compute in `double`, with integers of 64 bits, and call `math`, `min` and `max`; an integer next to a float becomes a
 float, as in Python, and `float` meets `double` through `f32(..)` and `f64(..)` only. Locals may get their first value in any
-block, and a tuple on the left takes one on the right.
+block, and a tuple on the left takes one on the right. There are `while`, `break`, and operators that assign.
 """
 
 import ast
@@ -169,6 +169,16 @@ class LivePrinter(FunctionPrinter):
                 assert node.value is not None
                 value = self._print.value(node.value, alone=True)
                 self._write(node, depth, self._put(node, target, value))
+            case ast.AugAssign(target=target):
+                combined = ast.copy_location(ast.BinOp(target, node.op, node.value), node)
+                self._write(node, depth, self._put(node, target, self._print.value(combined)))
+            case ast.While(orelse=[]):
+                test = self._print.scalar(node.test, BOOL, "the condition")
+                self._write(node, depth, f"while ({test.text}) {{")
+                self._block(node.body, depth + 1)
+                self._lines.append(f"{'    ' * depth}}}")
+            case ast.Break():
+                self._write(node, depth, "break;")
             case _:
                 super()._statement(node, depth)
 

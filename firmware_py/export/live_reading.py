@@ -8,7 +8,7 @@ core's kernels, which keep the core's types.
 
 import ast
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FunctionType
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.core import subset
-from firmware_py.core.subset import F32s, F64s, I32s, Integer, Struct, f32, f64, i32
+from firmware_py.core.subset import F32s, F64s, I32s, I64s, Integer, Struct, f32, f64, i32
 from firmware_py.export.errors import ExportError, refusal
 from firmware_py.export.literals import literal
 from firmware_py.export.locals import find_writes
@@ -42,9 +42,10 @@ from firmware_py.export.syntax import (
 ARGUMENTS: tuple[tuple[Any, ValueType], ...] = (
     (f64, F64), (f32, F32), (int, I64), (i32, I64), (Integer, I64), (bool, BOOL),
     (F64s, ValueType("f64", 1)), (F32s, ValueType("f32", 1)), (I32s, ValueType("i32", 1)),
+    (I64s, ValueType("i64", 1)),
 )  # fmt: skip
 Arrays = tuple[NDArray[Any], ...]
-ELEMENTS = {np.dtype(f64): "f64", np.dtype(f32): "f32", np.dtype(i32): "i32"}
+ELEMENTS = {np.dtype(f64): "f64", np.dtype(f32): "f32", np.dtype(i32): "i32", np.dtype(np.int64): "i64"}
 
 
 @dataclass(slots=True)
@@ -62,27 +63,32 @@ class LiveModule(Module):
 
 @dataclass(slots=True)
 class Kernels:
-    """A kernel and all that it calls, in the order of C, and their structs with the dtypes."""
+    """Kernels and all that they call, in the order of C, and their structs with the dtypes."""
 
+    roots: list[Signature]
     kernels: list[Signature]
     structs: list[tuple[StructType, np.dtype[Any]]]
 
 
-def read_kernels(function: Callable[..., Any], arrays: Arrays) -> Kernels:
-    """Return a kernel that takes records and arrays like these; it is the last one.
+def read_kernels(functions: Sequence[Callable[..., Any]], arrays: Arrays) -> Kernels:
+    """Return kernels that take records and arrays like these, and integers behind them.
 
     Raises `ExportError` for anything that has no equal in C.
     """
     reader = _Reader()
-    kernel = reader.kernel(cast(FunctionType, function))
-    if len(arrays) != len(kernel.arguments):
-        raise ExportError(f"{kernel.c_name} takes {len(kernel.arguments)} arguments, not {len(arrays)}")
-    for (name, kind), array in zip(kernel.arguments.items(), arrays, strict=True):
-        if kind.rank and array.dtype in ELEMENTS:
-            kernel.arguments[name] = ValueType(ELEMENTS[array.dtype], array.ndim, array.shape)
-        elif kind.struct is None or array.dtype != reader.structs[kind.base][1]:
-            raise ExportError(f"{name} of {kernel.c_name}: {array.dtype} is not its memory")
-    return Kernels(list(reader.kernels.values()), list(reader.structs.values()))
+    roots = [reader.kernel(cast(FunctionType, function)) for function in functions]
+    for kernel in roots:
+        given = list(kernel.arguments.values())[len(arrays) :]
+        if len(arrays) > len(kernel.arguments) or any(kind != I64 for kind in given):
+            raise ExportError(
+                f"{kernel.c_name} takes {len(kernel.arguments)} arguments, not {len(arrays)} and integers"
+            )
+        for (name, kind), array in zip(kernel.arguments.items(), arrays, strict=False):
+            if kind.rank and kind.base == ELEMENTS.get(array.dtype):
+                kernel.arguments[name] = ValueType(ELEMENTS[array.dtype], array.ndim, array.shape)
+            elif kind.struct is None or array.dtype != reader.structs[kind.base][1]:
+                raise ExportError(f"{name} of {kernel.c_name}: {array.dtype} is not its memory")
+    return Kernels(roots, list(reader.kernels.values()), list(reader.structs.values()))
 
 
 class _Reader:
@@ -192,6 +198,9 @@ def _constant(c_name: str, value: object, integer: ValueType) -> Constant | None
     if isinstance(value, tuple) and value and all(isinstance(one, float) for one in value):
         text = ", ".join(double_literal(one) for one in value)
         return Constant(c_name, ValueType("f64", 1, (len(value),)), f"{{{text}}}", "", False)
+    if isinstance(value, tuple) and value and all(isinstance(one, int) for one in value):
+        text = ", ".join(str(one) for one in value)
+        return Constant(c_name, ValueType("i64", 1, (len(value),)), f"{{{text}}}", "", False)
     return None
 
 

@@ -124,6 +124,9 @@ def _uses(body: list[ast.stmt], block: Block) -> Iterator[tuple[str, Block, ast.
             case ast.For():
                 yield from _names(node.iter, block)
                 yield from _uses(node.body, (*block, id(node), 0))
+            case ast.While():
+                yield from _names(node.test, block)
+                yield from _uses(node.body, (*block, id(node), 0))
             case ast.Assign():
                 yield from _names(node.value, block)
                 for target in node.targets:

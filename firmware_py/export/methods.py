@@ -1,21 +1,35 @@
 """Functions of a C library as methods of CPython, which `firmware_py.compiling.bound_in` binds to memory.
 
-A method takes nothing: its `self` has the addresses of what the function takes.
+The `self` of a method has the addresses of the memory that the function takes; integers follow as its arguments.
 """
 
-KERNEL = "method"  # in the library of a kernel
-METHOD = "method_"  # of an entry point of the core, before its name
-PROTOTYPES = "char *PyBytes_AsString(void *object);\nvoid *PyLong_FromLongLong(long long value);\n"
+METHOD = "method_"  # before the name of a kernel or of an entry point of the core
+PROTOTYPES = """\
+char *PyBytes_AsString(void *object);
+void *PyLong_FromLongLong(long long value);
+long long PyLong_AsLongLong(void *object);
+void *PyErr_Occurred(void);
+int PyErr_BadArgument(void);
+"""
 
 
-def method(name: str, function: str, arguments: int, answers: bool) -> str:
-    """Return the C of a method that calls a function with so many addresses; without an answer it returns 0."""
-    places = ", ".join(f"places[{index}]" for index in range(arguments))
-    call = f"{function}({places})"
+def method(name: str, function: str, memory: int, answers: bool, numbers: int = 0) -> str:
+    """Return the C of a method that calls a function with addresses and integers; without an answer it returns 0."""
+    taken = [f"places[{index}]" for index in range(memory)] + [f"given_{index}" for index in range(numbers)]
+    call = f"{function}({', '.join(taken)})"
     before, result = ("", call) if answers else (f"    {call};\n", "0")
+    head = f"void *{name}(void *self, void *const *given, intptr_t count)"
+    checks = f"    if (count != {numbers}) return PyErr_BadArgument(), (void *)0;\n"
+    if numbers:
+        checks += "".join(
+            f"    const int64_t given_{index} = PyLong_AsLongLong(given[{index}]);\n"
+            for index in range(numbers)
+        )
+        checks += "    if (PyErr_Occurred()) return 0;\n"
+    else:
+        checks += "    (void)given;\n"
     return (
-        f"\nvoid *{name}(void *self, void *unused);\n\n"
-        f"void *{name}(void *self, void *unused) {{\n"
-        f"    void **places = (void **)PyBytes_AsString(self);\n    (void)unused;\n"
-        f"{before}    return PyLong_FromLongLong({result});\n}}\n"
+        f"\n{head};\n\n{head} {{\n"
+        f"    void **places = (void **)PyBytes_AsString(self);\n"
+        f"{checks}{before}    return PyLong_FromLongLong({result});\n}}\n"
     )

@@ -26,7 +26,7 @@ def build(
     texts = {
         "floaty_core.h": translation.header,
         "floaty_core.c": translation.source,
-        "methods.c": f'#include "floaty_core.h"\n\n{PROTOTYPES}{methods}',
+        "methods.c": f'#include "floaty_core.h"\n#include <stdint.h>\n\n{PROTOTYPES}{methods}',
     }
     inputs = ("floaty_core.c", "methods.c")
     return compile_texts(texts, inputs, (optimisation, *FLAGS, *flags), "floaty_core.so", compiler)

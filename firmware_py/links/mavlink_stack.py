@@ -14,7 +14,7 @@ from firmware_py.board import Board
 from firmware_py.config import CpuConfig, MavlinkConfig
 from firmware_py.links.console import Notices
 from firmware_py.rtos import Kernel, Queue
-from firmware_py.rtos.scheduler import GO_ON
+from firmware_py.rtos.tables import GO_ON
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_dialect import NUMBERS, Message, sender_of

@@ -6,8 +6,8 @@ FreeRTOS's words in Python spelling; ticks are 1 ms, instants are integer micros
 
 from firmware_py.rtos.errors import KernelError, StuckTaskError, TaskError, WatchdogError
 from firmware_py.rtos.kernel import Kernel
+from firmware_py.rtos.memory import FOREVER, TICK_US
 from firmware_py.rtos.queue import Queue
-from firmware_py.rtos.scheduler import FOREVER, TICK_US
 from firmware_py.rtos.semaphore import Mutex, Semaphore
 from firmware_py.rtos.statistics import Statistics, TaskReport
 from firmware_py.rtos.task import Task

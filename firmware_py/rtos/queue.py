@@ -1,62 +1,67 @@
 """Bounded queues: tasks send and receive with a timeout, interrupts send at once or not at all.
 
 A full queue drops the newest item once its timeout is over and counts it in `dropped`. Items are any object but None,
-which means "nothing came". Waiting tasks are served by priority, first come first served among equals.
+which means "nothing came". Waiting tasks are served by priority, first come first served among equals. The kernel counts
+the items; the object holds them.
 """
 
 from collections import deque
 from collections.abc import Generator, Iterable
 from typing import ClassVar, Generic, TypeVar
 
-from firmware_py.rtos.control_block import ControlBlock
 from firmware_py.rtos.errors import KernelError
-from firmware_py.rtos.scheduler import FOREVER, GO_ON, IN_INTERRUPT, IN_TASK, Scheduler
+from firmware_py.rtos.memory import AGAIN, DONE, FAILED, FOREVER, SWITCH, WAITS
+from firmware_py.rtos.tables import Cell, Entry, Tables
 
 T = TypeVar("T")
 
 
-class Queue(Generic[T]):
-    """A queue of at most `length` items; made by `Kernel.create_queue`."""
+class Waited(Entry):
+    """What tasks wait for: a count from 0 to `length`."""
 
-    kind: ClassVar[str] = "queue"
+    kind: ClassVar[str]
+    dropped = Cell("dropped")  # items that found the queue full
+    high_water = Cell("high_water")  # the most items that ever waited
 
-    def __init__(self, kernel: Scheduler, length: int, name: str) -> None:
+    def __init__(self, kernel: Tables, length: int, count: int, name: str) -> None:
         if length < 1:
             raise KernelError(f"{self.kind} {name}: length {length}, it must be at least 1")
-        self._kernel = kernel
-        self._items: deque[T] = deque()
-        self._receivers: list[ControlBlock] = []
-        self._senders: list[ControlBlock] = []
+        super().__init__(kernel, kernel.add_object(f"{self.kind} {name}", length, count), name)
         self.length = length
-        self.name = name
-        self.number = 0  # how the trace calls this queue
-        self.dropped = 0  # items that found the queue full
-        self.high_water = 0  # the most items that ever waited
+
+    @property
+    def number(self) -> int:
+        """How the trace calls it."""
+        return self.kernel.numbers[self.index]
+
+    @number.setter
+    def number(self, number: int) -> None:
+        self.kernel.numbers[self.index] = number
 
     def __len__(self) -> int:
-        return len(self._items)
+        return int(self.kernel.memory.count[self.index])
+
+
+class Queue(Waited, Generic[T]):
+    """A queue of at most `length` items; made by `Kernel.create_queue`."""
+
+    kind = "queue"
+
+    def __init__(self, kernel: Tables, length: int, name: str) -> None:
+        super().__init__(kernel, length, 0, name)
+        self._items: deque[T] = deque()
 
     def send(self, item: T, timeout: int = FOREVER) -> Generator[int, None, bool]:
         """Append `item`, waiting up to `timeout` ticks for space; False when it was dropped."""
-        kernel = self._kernel
-        items = self._items
-        if item is None:
-            raise self._null_item()
-        if timeout and kernel.suspended:
-            kernel.check_may_wait()
-        if len(items) >= self.length:
-            deadline = kernel.deadline(timeout)
-            while len(items) >= self.length:
-                if not kernel.wait_in(self._senders, deadline, "Q_SEND", self.number):
-                    self.dropped += 1
-                    return False
-                yield 0
-        if kernel.trace is not None:
-            kernel.record("Q_SEND", self.number, len(items))
-        items.append(item)
-        if len(items) > self.high_water:
-            self.high_water = len(items)
-        if self._receivers and kernel.wake(self._receivers.pop(0)) and kernel.preemption:
+        kernel = self.kernel
+        self._check(item)
+        while (answer := kernel.calls.send(self.index, timeout)) == WAITS:
+            timeout = AGAIN
+            yield 0
+        if answer <= FAILED:
+            return bool(kernel.done(answer))
+        self._items.append(item)
+        if answer == SWITCH:
             yield 0
         return True
 
@@ -66,42 +71,23 @@ class Queue(Generic[T]):
         `yield from` it lets a receiver of higher priority run at once; the plain call lets it run at the caller's next
         `yield from` that blocks, yields or works.
         """
-        kernel = self._kernel
-        items = self._items
-        if item is None:
-            raise self._null_item()
-        if kernel.context == IN_INTERRUPT:
-            raise kernel.misplaced(f"{self.kind} {self.name}: sending without waiting")
-        if len(items) >= self.length:
-            self.dropped += 1
-            kernel.failed("Q_SEND_FAIL", self.number)
-            return GO_ON
-        if kernel.trace is not None:
-            kernel.record("Q_SEND", self.number, len(items))
-        items.append(item)
-        if len(items) > self.high_water:
-            self.high_water = len(items)
-        return kernel.wake_first(self._receivers) if self._receivers else GO_ON
+        self._check(item)
+        answer = self.kernel.calls.send(self.index, 0)
+        if answer > FAILED:
+            self._items.append(item)
+        return self.kernel.outcome(answer, f"queue {self.name}: sending without waiting")
 
     def receive(self, timeout: int = FOREVER) -> Generator[int, None, T | None]:
         """Take the oldest item, waiting up to `timeout` ticks for one; None when none came."""
-        kernel = self._kernel
-        items = self._items
-        if timeout and kernel.suspended:
-            kernel.check_may_wait()
-        if items:
-            kernel.count_call()
-        else:
-            # Written out, not called, because this is the hot loop.
-            deadline = timeout if timeout < 0 else kernel.tick_count + timeout
-            while not items:
-                if not kernel.wait_in(self._receivers, deadline, "Q_RECV", self.number):
-                    return None
-                yield 0
-        if kernel.trace is not None:
-            kernel.record("Q_RECV", self.number, len(items))
-        item = items.popleft()
-        if self._senders and kernel.wake(self._senders.pop(0)) and kernel.preemption:
+        kernel = self.kernel
+        while (answer := kernel.calls.receive(self.index, timeout)) == WAITS:
+            timeout = AGAIN
+            yield 0
+        if answer <= FAILED:
+            kernel.done(answer)
+            return None
+        item = self._items.popleft()
+        if answer == SWITCH:
             yield 0
         return item
 
@@ -111,18 +97,11 @@ class Queue(Generic[T]):
         A sender of higher priority that waited for the space runs at the caller's next `yield from` that blocks,
         yields or works, not here: use `receive(0)` where that matters.
         """
-        kernel = self._kernel
-        items = self._items
-        if not items:
-            kernel.failed("Q_RECV_FAIL", self.number)
+        answer = self.kernel.calls.receive(self.index, 0)
+        if answer <= FAILED:
+            self.kernel.done(answer)
             return None
-        kernel.count_call()
-        if kernel.trace is not None:
-            kernel.record("Q_RECV", self.number, len(items))
-        item = items.popleft()
-        if self._senders:
-            kernel.wake_first(self._senders)
-        return item
+        return self._items.popleft()
 
     def reset(self) -> Iterable[int]:
         """Empty the queue; one sender that waited for space goes on, as with xQueueReset.
@@ -130,39 +109,23 @@ class Queue(Generic[T]):
         `yield from queue.reset()` lets it run at once if its priority is higher; the plain call, at the caller's next
         `yield from` that blocks, yields or works.
         """
-        kernel = self._kernel
-        if kernel.context == IN_INTERRUPT:
-            raise kernel.misplaced(f"queue {self.name}: reset")
-        kernel.count_call()
+        after = self.kernel.outcome(self.kernel.calls.reset(self.index), f"queue {self.name}: reset")
         self._items.clear()
-        return kernel.wake_first(self._senders) if self._senders else GO_ON
+        return after
 
     def wait_for_item(self, wake_tick: int) -> None:
         """Block the running task until an item comes or, unless negative, `wake_tick`; for the timer service."""
-        self._kernel.check_may_wait()
-        self._kernel.block(self._receivers, wake_tick)
+        self.kernel.done(self.kernel.calls.wait_for_item(self.index, wake_tick))
 
     def send_from_isr(self, item: T) -> bool:
         """Append `item` from an interrupt; False when the queue was full and it was dropped."""
-        if item is None:
-            raise self._null_item()
-        kernel = self._kernel
-        if kernel.context == IN_TASK:
-            raise kernel.misplaced(f"{self.kind} {self.name}: sending from an interrupt")
-        items = self._items
-        if len(items) >= self.length:
-            if kernel.trace is not None:
-                kernel.trace(kernel.now_us, "Q_SEND_ISR_FAIL", "isr", self.number, 0)
-            self.dropped += 1
-            kernel.interrupted(False)
-            return False
-        if kernel.trace is not None:
-            kernel.trace(kernel.now_us, "Q_SEND_ISR", "isr", self.number, len(items))
-        items.append(item)
-        if len(items) > self.high_water:
-            self.high_water = len(items)
-        kernel.interrupted(bool(self._receivers) and kernel.wake(self._receivers.pop(0)))
-        return True
+        self._check(item)
+        answer = self.kernel.calls.send_from_isr(self.index)
+        if answer == DONE:
+            self._items.append(item)
+            return True
+        return bool(self.kernel.done(answer, f"queue {self.name}: sending from an interrupt"))
 
-    def _null_item(self) -> KernelError:
-        return KernelError(f'queue {self.name}: None cannot be sent, it stands for "nothing came"')
+    def _check(self, item: T) -> None:
+        if item is None:
+            raise KernelError(f'queue {self.name}: None cannot be sent, it stands for "nothing came"')

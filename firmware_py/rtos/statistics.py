@@ -4,16 +4,15 @@ An activation of a task lasts from the instant at which it becomes ready after a
 response time is that duration, its start latency the part before it first runs. The kernel keeps the counts in the tasks.
 """
 
-from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from firmware_py.rtos.control_block import NO_DEADLINE_US, READY
 from firmware_py.rtos.errors import KernelError
 from firmware_py.rtos.kernel import Kernel
+from firmware_py.rtos.memory import LATENCY_BOUNDS_US, LATENCY_CLASSES, MAX_PRIORITIES, NEVER_US
 from firmware_py.rtos.task import Task
 
-LATENCY_BOUNDS_US = (1, 10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)  # of the histogram's classes
+__all__ = ["LATENCY_BOUNDS_US", "ProcessorLoad", "Statistics", "TaskReport"]
 
 
 class ProcessorLoad:
@@ -64,27 +63,27 @@ class Statistics:
         self._kernel = kernel
         self._tasks = list(kernel.tasks)
         for task in self._tasks:
-            task.deadline_us = deadlines_us.get(task.name, NO_DEADLINE_US)
+            kernel.memory.response_limit_us[task.index] = deadlines_us.get(task.name, NEVER_US)
 
     def reports(self) -> list[TaskReport]:
         """Return the tasks in the order of their creation, between two runs."""
         return [self._report(task) for task in self._tasks]
 
     def _report(self, task: Task) -> TaskReport:
-        lasting_us = self._kernel.now_us - task.released_us if task.place == READY else 0
-        delayed = [0] * (len(LATENCY_BOUNDS_US) + 1)
-        for latency_us, count in task.latencies.items():
-            delayed[bisect_right(LATENCY_BOUNDS_US, latency_us)] += count
-        started = task.activations + (task.place == READY and not task.fresh)
-        delayed[0] += started - sum(delayed)
+        memory, index = self._kernel.memory, task.index
+        ready = 0 <= memory.place[index] < MAX_PRIORITIES
+        lasting_us = self._kernel.now_us - int(memory.released_us[index]) if ready else 0
+        activations, deadline_us = int(memory.activations[index]), int(memory.response_limit_us[index])
+        late = [int(memory.late[index, interval]) for interval in range(LATENCY_CLASSES)]
+        late[0] += activations + (ready and not memory.fresh[index]) - sum(late)
         return TaskReport(
             name=task.name,
-            priority=task.base_priority,
+            priority=int(memory.base_priority[index]),
             run_time_us=self._kernel.run_time_us(task),
-            activations=task.activations,
-            worst_response_us=max(task.worst_response_us, lasting_us),
-            worst_latency_us=max(task.latencies, default=0),
-            latency_histogram=tuple(delayed),
-            deadline_us=None if task.deadline_us == NO_DEADLINE_US else task.deadline_us,
-            deadline_misses=task.deadline_misses + (lasting_us > task.deadline_us),
+            activations=activations,
+            worst_response_us=max(int(memory.worst_response_us[index]), lasting_us),
+            worst_latency_us=int(memory.worst_latency_us[index]),
+            latency_histogram=tuple(late),
+            deadline_us=None if deadline_us == NEVER_US else deadline_us,
+            deadline_misses=int(memory.limit_misses[index]) + (lasting_us > deadline_us),
         )

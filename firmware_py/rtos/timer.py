@@ -11,8 +11,9 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 
 from firmware_py.rtos.errors import KernelError
+from firmware_py.rtos.memory import FOREVER
+from firmware_py.rtos.processor import Processor
 from firmware_py.rtos.queue import Queue
-from firmware_py.rtos.scheduler import FOREVER, Scheduler
 
 RELOAD, START, RESET, STOP, CHANGE_PERIOD = range(5)  # FreeRTOS's command numbers
 COMMAND_QUEUE_LENGTH = 20  # crazyflie-firmware, FreeRTOSConfig.h
@@ -73,7 +74,7 @@ class _Command:
 class TimerService:
     """The timer service task ("Tmr Svc"), its command queue and the running timers in the order of their expiry."""
 
-    def __init__(self, kernel: Scheduler) -> None:
+    def __init__(self, kernel: Processor) -> None:
         self.kernel = kernel
         self.commands: Queue[_Command] = Queue(kernel, COMMAND_QUEUE_LENGTH, "timer commands")
         self._running: list[Timer] = []
@@ -83,8 +84,7 @@ class TimerService:
         if self.kernel.suspended:
             timeout = 0
         sent = yield from self.commands.send(_Command(number, timer, value), timeout)
-        if self.kernel.trace is not None:
-            self.kernel.record("TMR_CMD", number, int(sent))
+        self.kernel.record("TMR_CMD", number, int(sent))
         return sent
 
     def run(self) -> Generator[int, None, None]:
@@ -103,8 +103,8 @@ class TimerService:
         if len(self.commands):
             return
         wake_tick = self._running[0].expiry_tick if self._running else FOREVER
-        if self.kernel.trace is not None:  # FreeRTOS's "for ever" wraps around to the tick before now
-            self.kernel.record("DELAY_UNTIL", wake_tick if wake_tick != FOREVER else now - 1)
+        # FreeRTOS's "for ever" wraps around to the tick before now
+        self.kernel.record("DELAY_UNTIL", wake_tick if wake_tick != FOREVER else now - 1)
         self.commands.wait_for_item(wake_tick)
 
     def _expire(self, timer: Timer, now: int) -> Generator[int, None, None]:

@@ -119,8 +119,8 @@ def test_a_library_is_compiled_once_and_again_when_others_may_have_written_it(
 ) -> None:
     made: list[Path] = []
 
-    def count_and_make(function: Callable[..., object], arrays: Arrays) -> Path:
-        made.append(library(function, arrays))
+    def count_and_make(functions: tuple[Callable[..., object], ...], arrays: Arrays) -> Path:
+        made.append(library(functions, arrays))
         return made[-1]
 
     def call(*numbers: float) -> float:

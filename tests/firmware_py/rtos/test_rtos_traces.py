@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+from firmware_py import compiling
 from support.paths import ROOT, VECTORS
 
 TOOL = ROOT / "tools" / "freertos_scenario.py"
@@ -25,9 +26,11 @@ def test_all_62_random_scenarios_and_17_corners_are_there():
     assert len(SCENARIOS) == 62 + 17
 
 
+@pytest.mark.parametrize("plain", [False, True], ids=["c", "plain"])
 @pytest.mark.parametrize("mode", ["coop", "preempt"])
 @pytest.mark.parametrize("name", SCENARIOS)
-def test_trace_is_that_of_freertos(name, mode):
+def test_trace_is_that_of_freertos(name, mode, plain, monkeypatch):
+    monkeypatch.setattr(compiling, "PLAIN", plain)
     lines = []
     freertos_scenario.trace((VECTORS / f"{name}.txt").read_text(), mode == "preempt", lines.append)
     assert "".join(lines) == recorded(name, mode)

@@ -12,7 +12,7 @@ from firmware_py.core.structs import Control, Estimator, Parameters
 from firmware_py.core.subset import Block
 from firmware_py.export.compilers import Compiler, compilers
 from firmware_py.export.kernels import build, translate
-from firmware_py.export.methods import KERNEL
+from firmware_py.export.methods import METHOD
 from hil import demonstrations
 from hil.crazyflie import quadrotor
 from hil.devices import imu
@@ -108,7 +108,9 @@ def test_steps_from_any_state_have_the_bits_of_python(
     rng = np.random.default_rng(2026)
     in_c, in_python = allocate(), allocate()
     arrays = tuple(array_of(one) for one in in_c)
-    call = bound_in(build(translate(kernel, arrays), compiler, WARNINGS), KERNEL, *arrays)
+    call = bound_in(
+        build(translate((kernel,), arrays), compiler, WARNINGS), METHOD + kernel.__name__, *arrays
+    )
     for _ in range(STATES):
         draw(rng, in_c)
         before = bytes_of(in_c)
