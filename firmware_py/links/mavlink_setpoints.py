@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from math import isnan
 
 from firmware_py.crazyflie.planner import PathPoint
-from firmware_py.geometry import Vector, in_goal_frame, rotate, to_euler_zyx, wrap_angle, yaw_quaternion
+from firmware_py.geometry import Vector, in_goal_frame, rotate, to_euler_zyx, yaw_quaternion
 from firmware_py.links.mavlink_stack import INFO, WARNING, MavlinkStack, Task
 from firmware_py.pilot import Pilot
 from firmware_py.rtos import FOREVER, TICK_US
@@ -69,7 +69,7 @@ class SetpointService:
         p_BG, _ = in_goal_frame(p_WG, yaw_quaternion(yaw), before.p_WB, yaw_before)
         x, y, z = rotate(yaw_quaternion(yaw_after), p_BG)
         px, py, pz = after.p_WB
-        self._goal = (x + px, y + py, z + pz), wrap_angle(yaw + yaw_after - yaw_before)
+        self._goal = (x + px, y + py, z + pz), yaw + yaw_after - yaw_before
 
     @property
     def goal(self) -> Goal:

@@ -219,7 +219,7 @@ def test_the_goal_moves_with_the_frame_of_the_poses_so_the_robot_does_not(kind: 
 
     def pose(now_us: int) -> None:
         late = now_us >= 1_500_000
-        x, y, z, yaw = (0.3, -0.2, -1.3, -1.0) if late else (0.05, 0.02, -1.2, 0.1)  # NED
+        x, y, z, yaw = (0.3, -0.2, -1.3, -1.7) if late else (0.05, 0.02, -1.2, 1.7)  # NED
         resets = 255 if late and counted else 7
         if kind in VISION:
             client.send(kind, now_us, x, y, z, 0.0, 0.0, yaw, unknown, resets)
@@ -240,6 +240,8 @@ def test_the_goal_moves_with_the_frame_of_the_poses_so_the_robot_does_not(kind: 
     assert (report.x, report.y, report.z) == pytest.approx((0.3, -0.2, -1.3), abs=0.03)
     said = ["poses: their frame has moved by 0.35 m, and the goal with it"] if counted else []
     assert [text for text in client.texts() if "frame" in text] == said
+    client.command(512, NUMBERS["POSITION_TARGET_LOCAL_NED"])
+    assert client.of("POSITION_TARGET_LOCAL_NED")[-1].yaw == pytest.approx(math.tau - 3.4 if counted else 0.0)
 
 
 def test_another_sender_is_no_relocalisation() -> None:
@@ -970,6 +972,16 @@ def test_each_counter_and_deviation_has_its_own_place_in_the_messages(client: Ma
             else:
                 seen = found[-1].pos_horiz_accuracy, found[-1].pos_vert_accuracy
                 assert seen == pytest.approx((0.3, deviations[2]), abs=0.02)
+
+
+def test_the_estimate_is_healthy_while_poses_are_recent() -> None:
+    client, found = MavlinkClient(), []
+    client.poses(1_000_000, 1_500_000)
+    for at_us in (20_000, 900_000, 1_100_000, 1_600_000, 2_200_000):
+        client.run(at_us)
+        client.command(512, NUMBERS["ESTIMATOR_STATUS"])
+        found.append(client.of("ESTIMATOR_STATUS")[-1].flags != 0)
+    assert found == [False, False, True, True, False]
 
 
 def test_without_mavlink_there_is_no_task_and_no_variable_of_it() -> None:
