@@ -1,13 +1,11 @@
 """`floaty serve` and unmodified cflib: by radio with and without losses, by UDP, in this and in other processes."""
 
 import gc
-import socket
 import subprocess
 import sys
 import threading
 import warnings
 from collections.abc import Iterator
-from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -114,34 +112,6 @@ def test_a_board_off_or_in_its_bootloader_gets_its_button_pressed(served: Served
         served.wait_for("gyro zero", PATIENCE_S)
     switch.close()
     CflibClient(served.radio_uris[0], cache).ready().close()
-
-
-def probe_for_ever(prober: socket.socket) -> None:
-    while True:
-        prober.send(b"\xff")
-        prober.recv(64)
-
-
-def test_a_udp_port_that_was_taken_meanwhile_is_waited_for(served: Served) -> None:
-    switch = PowerSwitch(served.radio_uris[0])
-    host, port = served.udp_uris[0].removeprefix("udp://").split(":")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as prober:
-        prober.connect((host, int(port)))
-        prober.settimeout(PATIENCE_S)
-        served.forget()
-        switch.stm_power_down()
-        with pytest.raises(ConnectionRefusedError):
-            probe_for_ever(prober)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as thief:
-            thief.bind((host, int(port)))
-            switch.stm_power_up()
-            served.wait_for(f"udp port {port}.*trying again", PATIENCE_S)
-        served.wait_for(f"udp port {port} is open again", PATIENCE_S)
-        with suppress(ConnectionRefusedError):  # the report of an earlier probe
-            prober.send(b"\xff")
-        prober.send(b"\xff")
-        assert prober.recv(64) == b"\xff"
-    switch.close()
 
 
 def test_a_program_in_another_process_needs_only_the_printed_line(served: Served) -> None:

@@ -224,14 +224,16 @@ static TaskFunction_t app_task;
 
 void crtpRegisterPortCB(int port, CrtpCallback cb) { callbacks[port] = cb; }
 
-/* The last packet, which waits for the task of its port unless it is taken back. */
-static CRTPPacket waiting;
+/* The last packets, which wait for the task of their port unless they are taken back, the oldest first. */
+#define RECEIVE_QUEUE 16
+static CRTPPacket waiting[RECEIVE_QUEUE];
+static unsigned received;
 int32_t stub_waits;
 
 int crtpReceivePacket(CRTPPort port, CRTPPacket *packet) {
-  const bool there = stub_waits && waiting.port == port;
-  *packet = waiting;
-  stub_waits = stub_waits && !there;
+  *packet = waiting[(received - (unsigned)stub_waits) % RECEIVE_QUEUE];
+  const bool there = stub_waits && packet->port == port;
+  stub_waits -= there;
   return there ? pdTRUE : pdFALSE;
 }
 
@@ -242,8 +244,8 @@ void stub_radio(int port, int channel, const uint8_t *data, int length) {
   packet.port = (uint8_t)(port & 15);
   packet.channel = (uint8_t)(channel & 3);
   memcpy(packet.data, data, (size_t)length);
-  waiting = packet;
-  stub_waits = 1;
+  waiting[received++ % RECEIVE_QUEUE] = packet;
+  stub_waits += 1;
   if (callbacks[port]) {
     callbacks[port](&packet);
   }

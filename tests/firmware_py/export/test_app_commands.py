@@ -2,6 +2,7 @@
 
 import ctypes
 import struct
+from errno import EBUSY
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -82,15 +83,22 @@ def test_the_app_takes_back_what_the_python_board_refuses_and_nothing_else(app: 
         report.position[:], report.attitude[2] = PLACE, YAW
     ctypes.c_int32.in_dll(app.c, "stub_planner").value = FLYING if flying else 0
     waits, rng, refused = ctypes.c_int32.in_dll(app.c, "stub_waits"), np.random.default_rng(7), []
+    waiting: list[bytes] = []
     for command in 300 * list(LAYOUTS):
+        if len(waiting) == 3 or rng.random() < 0.5:  # the firmware's commander gets its turn
+            waiting, waits.value = [], 0
         data = drawn(command, rng)
         app.radio(data, PORT, 0)
-        answer = app.sent()
-        refused.append(bool(answer))
-        if answer:
-            assert answer[1:] == data[:3].ljust(3, b"\0") + bytes((ENOEXEC,))
-        assert waits.value == (not answer), "what is not taken back waits for the firmware"
-        assert bool(answer) == (board_of(flying).execute(data, 1.0) == ENOEXEC), (command.name, data.hex())
+        waiting.append(data)
+        answers = list(iter(app.sent, b""))
+        refused.append(bool(answers))
+        if answers:
+            errors = (*[EBUSY] * (len(waiting) - 1), ENOEXEC)
+            assert [answer[1:4] for answer in answers] == [each[:3].ljust(3, b"\0") for each in waiting]
+            assert [tuple(answer[4:]) for answer in answers] == [(error,) for error in errors]
+            waiting = []
+        assert waits.value == len(waiting), "what is not taken back waits for the firmware"
+        assert bool(answers) == (board_of(flying).execute(data, 1.0) == ENOEXEC), (command.name, data.hex())
     assert 0.2 < np.mean(refused) < 0.8
 
 

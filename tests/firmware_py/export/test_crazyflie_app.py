@@ -606,7 +606,7 @@ def test_absolute_poses_become_corrections(app: App, library: Path, tmp_path: Pa
             if how == "quaternion":  # a full-state set-point
                 app.setpoint.yaw_mode, app.setpoint.quat_mode, app.setpoint.yaw = 0, 1, 0.0
                 s = app.setpoint
-                s.qw, s.qx, s.qy, s.qz = yaw_quaternion(goal_yaw)
+                s.qw, s.qx, s.qy, s.qz = from_euler_zyx(0.3, -0.4, goal_yaw)
         if step % 20 == 5:
             p += rng.normal(0, 0.002, 3)
             p_WB = (p[0].item(), p[1].item(), p[2].item())

@@ -66,7 +66,7 @@ def compute(numbers: F64s, table: F64s, counts: I32s) -> None:
         table[ROW, i] = table[ROW, i] + reduced(a, i - counts[1])
     counts[0], counts[1] = i32(max(math.floor(a), f64(counts[1]))), i32(a > b)
     numbers[7], numbers[8], numbers[9] = exp(a), sine_ahead(b, counts[1]), atan2(a, b)
-    numbers[10] = math.inf if a == b else math.ldexp(a, int(counts[1]) - 3) * math.pi
+    numbers[10] = a - (math.inf if a == b else math.ldexp(a, int(counts[1]) - 3)) * math.pi
 
 
 def fresh(numbers: list[float], first: int, second: int) -> Arrays:

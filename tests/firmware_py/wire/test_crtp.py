@@ -131,8 +131,9 @@ def test_block_fits_a_packet_and_comes_back(block):
     number, timestamp_ms, packed = log.decode_data(crtp.decode(raw).data)
     assert (number, timestamp_ms) == (block.id, 123_456)
     assert block.unpack(packed) == pytest.approx(block.si_of(values), rel=1e-7)
-    with pytest.raises(WireError, match="bytes of values"):
-        block.unpack(packed[1:])
+    for wrong in (packed[1:], packed + b"\0"):
+        with pytest.raises(WireError, match=f"{len(wrong)} bytes of values instead of {len(packed)}"):
+            block.unpack(wrong)
 
 
 @pytest.mark.parametrize("block", telemetry.ALL_BLOCKS, ids=lambda block: f"block{block.id}")

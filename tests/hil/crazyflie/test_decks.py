@@ -65,8 +65,9 @@ def test_memories_are_found_and_read_in_pieces() -> None:
 
 def test_a_memory_keeps_writes_and_an_absent_one_is_silent() -> None:
     decks = DeckBench("flow2").decks
-    decks.answer(syslink.WRITE_MEMORY, struct.pack("<BHH", 0, 100, 3) + b"abc")
-    assert decks.answer(syslink.READ_MEMORY, struct.pack("<BH", 0, 99) + bytes(5))[3:] == b"\xffabc\xff"
+    for at, data in ((109, b"abc"), (110, b"xyz")):  # up to its last byte, and beyond
+        decks.answer(syslink.WRITE_MEMORY, struct.pack("<BHH", 0, at, 3) + data)
+    assert decks.answer(syslink.READ_MEMORY, struct.pack("<BH", 0, 108) + bytes(5))[3:] == b"\xffabc"
     assert decks.answer(syslink.MEMORY_INFO, b"\1")[0] == 0xFF
     assert decks.answer(syslink.READ_MEMORY, b"\1\0\0" + bytes(9))[0] == 0xFF
 

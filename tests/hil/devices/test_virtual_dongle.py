@@ -394,7 +394,31 @@ def test_power_switch() -> None:
     assert bench.exchange(NULL) == b"\x00"
     board.press_button(bench.events.now_us)
     assert (board.power, len(stm.starts)) == (Power.RUNNING, 2)
-    assert bench.exchange(NULL)[0] & 1
+
+
+@pytest.mark.parametrize("how", ["reset", "power cycle", "button"])
+def test_a_radio_chip_that_starts_has_forgotten_its_queue_its_answer_and_safelink(how: str) -> None:
+    bench = DongleAndBoard()
+    board = bench.board
+    for packet in (b"\xff\x05\x01", b"\xf3\xfe\xff", b"\xf3\xfe\x01" if how == "button" else NULL):
+        bench.exchange(packet)
+    for data in (b"\x10first", b"\x10second"):
+        assert board.send(bench.events.now_us, data)
+    if how == "reset":
+        bench.exchange(b"\xf7\xfe\xf0\x01")
+        bench.wait(RESET_DELAY_US)
+    elif how == "power cycle":
+        board.power_cycle(bench.events.now_us)
+    else:
+        board.press_button(bench.events.now_us)
+    for packet in 2 * (
+        b"\x10one",
+        b"\x10two",
+    ):  # the same counters: with safelink the second would be a repetition
+        answer = bench.exchange(packet)
+        assert (answer[1] & 0xF3, answer[2:]) == (0xF3, bytes((1, 40)))
+    bench.wait(1000)
+    assert bench.stm.packets == 2 * [b"\x10one", b"\x10two"]
 
 
 def test_the_battery_voltage_is_answered() -> None:

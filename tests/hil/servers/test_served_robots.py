@@ -1,12 +1,18 @@
 """What a server shows of its first robot, and where several start."""
 
+import socket
+
 import pytest
 
+from hil.clock import Readers
 from hil.config import load_config
 from hil.errors import LabError
+from hil.events import EventQueue
 from hil.laboratory.lockstep import image_at
 from hil.laboratory.recorder import stored_in
+from hil.laboratory.robot import Site, Streams
 from hil.scene import Look
+from hil.servers.served_robot import UDP_RETRY_US, ServedRobot
 from hil.servers.server import Server, Service
 from support.stm32_firmware import build
 from support.watching import Watcher
@@ -36,6 +42,29 @@ def test_firmware_without_the_app_is_reported() -> None:
     lines: list[str] = []
     Server(Service(load_config(), executor=image_at(str(build()), None)), lines.append).close()
     assert [line for line in lines if "the image lacks Floaty's app" in line]
+
+
+def test_a_udp_port_that_was_taken_meanwhile_is_waited_for_each_time() -> None:
+    lines: list[str] = []
+    expected: list[str] = []
+    events = EventQueue()
+    site = Site(load_config(), events, Streams.of_seed(1), lambda *_: None)
+    served = ServedRobot(1, site, lines.append)
+    readers: Readers = {}
+    port = int(served.serve_udp(0, readers).rpartition(":")[2])
+    for _ in range(2):
+        served.stop(events.now_us)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as thief:
+            thief.bind(("127.0.0.1", port))
+            served.start(events.now_us)
+            events.run(events.now_us + 2 * UDP_RETRY_US)
+            assert not readers
+        events.run(events.now_us + UDP_RETRY_US)
+        assert len(readers) == 1
+        taken = f"board 1: udp port {port}: Address already in use; trying again"
+        expected += [taken, f"board 1: udp port {port} is open again"]
+        assert lines == expected
+    served.close()
 
 
 # Where several robots of one server start

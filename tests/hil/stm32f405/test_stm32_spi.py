@@ -149,13 +149,13 @@ def test_a_device_on_i2c_gets_writes_only_and_can_move() -> None:
         return answers
 
     bench[i2c + 0x1C], bench[i2c] = 35, 1
-    for data, times in ((b"\3", 0), (b"\3\7", 1)):
+    for data, before, times in ((b"\3", 0, 0), (b"\3\7", 0, 1), (b"\3", 1, 1)):
         assert address(0x29 << 1)
         for byte in data:
             bench[i2c + 0x10] = byte
             bench.wait(100)
         bench.chip.tell_devices()
-        assert len(told) == 0, "its transfer goes on"
+        assert len(told) == before, "its transfer goes on"
         bench[i2c] = 1 << 9 | 1  # stop
         bench.wait(100)
         bench.chip.tell_devices()
