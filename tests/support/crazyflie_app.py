@@ -109,6 +109,9 @@ class App:
         self.sensors = ctypes.c_int32.in_dll(c, "stub_sensors")
         self.estimator_type = ctypes.c_int32.in_dll(c, "stub_estimator")
         self.connected = ctypes.c_int32.in_dll(c, "stub_connected")
+        self.armed = ctypes.c_int32.in_dll(c, "stub_armed")  # the firmware's supervisor
+        self.can_arm = ctypes.c_int32.in_dll(c, "stub_can_arm")
+        self.can_fly = ctypes.c_int32.in_dll(c, "stub_can_fly")
         self.after_watchdog = ctypes.c_int32.in_dll(c, "stub_after_watchdog")
         self.after_assert = ctypes.c_int32.in_dll(c, "stub_after_assert")
         self.self_test_passed = ctypes.c_int32.in_dll(c, "stub_self_test_passed")

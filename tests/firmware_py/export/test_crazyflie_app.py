@@ -545,6 +545,37 @@ def test_a_stop_by_either_port_lasts_until_a_reboot(app: App, port: int) -> None
     assert app.stop_requested.value == 1  # the firmware locks itself
 
 
+def test_core_and_firmware_arm_and_disarm_each_other_each_time(app: App) -> None:
+    flying(app)
+    step = 1200
+
+    def go_on(core: int | None = None, client: int | None = None) -> tuple[bool, bool]:
+        """Let one of them act; return whether core and firmware are armed soon after."""
+        nonlocal step
+        if core is not None:
+            app.set("floaty.armed", core)
+        if client is not None:
+            app.armed.value = client
+        app.can_fly.value = app.armed.value
+        fly_on(app, step, 40)
+        step += 40
+        return bool(app.supervisor.armed), bool(app.armed.value)
+
+    for _ in range(2):
+        app.can_arm.value = 1  # the firmware's checks have passed
+        assert go_on(client=0) == (False, False)
+        assert go_on(client=1) == (True, True)
+        assert go_on(core=0) == (False, False)
+        assert go_on(core=1) == (True, True)
+        assert go_on(core=0) == (False, False)
+        app.can_arm.value = 0
+        assert go_on(client=1) == (True, True), "it was ready to be armed"
+        assert go_on(core=0) == (False, False)
+        assert go_on(client=1) == (False, False), "it armed itself after its checks"
+        app.can_arm.value = 1
+        assert go_on(core=1) == (True, True)
+
+
 def test_the_watchdog_of_the_stop_is_the_firmwares(app: App) -> None:
     app.boot()
     app.radio(b"\x04")
@@ -623,6 +654,10 @@ def test_absolute_poses_become_corrections(app: App, library: Path, tmp_path: Pa
 
 def test_the_firmwares_commander_gets_the_state_in_the_world(app: App) -> None:
     app.boot(absolute=True)
+    commanded(app, **position(0.0, 0.0, 1.0, 170.0))
+    app.setpoint.derivatives[1:4] = 0.5, -0.25, 0.125  # its velocity, behind a time
+    app.step(0)
+    assert list(app.data.setpoint_velocity) == [0.5, -0.25, 0.125]
     commanded(app, **position(0.0, 0.0, 1.0, 170.0))
     q_WB = from_euler_zyx(0.02, -0.01, 3.2)
     for step in range(1, 1000):

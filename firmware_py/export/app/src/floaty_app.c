@@ -110,7 +110,7 @@ static void match_arming(void) {
   static bool held, waits; /* the firmware's supervisor is kept disarmed, and waits for the request to arm */
   const bool armed = supervisorIsArmed();
   if (floaty_supervisor.armed && armed) {
-    held = false;
+    held = waits = false;
   } else if (floaty_supervisor.armed && held) {
     supervisorRequestArming(true);
   } else if (floaty_supervisor.armed && (supervisorCanFly() || supervisorCanArm())) {
