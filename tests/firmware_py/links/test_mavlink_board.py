@@ -957,7 +957,8 @@ def test_each_counter_and_deviation_has_its_own_place_in_the_messages(client: Ma
     counters.frames, counters.lost, counters.bad_crc = 80, 20, 7
     client.stack.refused, client.stack._transmit.dropped, client.uart_overruns = 20, 40, 3
     estimator.refused, estimator.too_old, estimator.invalid = 100, 200, 400
-    for deviations in ((0.2, 0.3, 0.4), (0.3, 0.2, 0.1)):
+    for frozen, deviations in ((0, (0.2, 0.3, 0.4)), (1, (0.3, 0.2, 0.1))):
+        client.firmware._core.sampling.fields.recovering = 1000 * frozen
         estimator.P[range(3), range(3)] = np.square(deviations)
         client.messages.clear()
         for number in ("NAMED_VALUE_FLOAT", "SYS_STATUS", "ESTIMATOR_STATUS"):
@@ -968,6 +969,8 @@ def test_each_counter_and_deviation_has_its_own_place_in_the_messages(client: Ma
                 assert named == {"refused": 700, "up_lost": 20, "tx_dropped": 40, "overruns": 3}
             elif number == "SYS_STATUS":
                 assert found[-1].errors_comm == 7 + 20 + 3
+                gyro = found[-1].onboard_control_sensors_health & dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
+                assert bool(gyro) == (not frozen)
                 assert 1800 < found[-1].drop_rate_comm <= 2000, "20 of 100, and the requests that came since"
             else:
                 seen = found[-1].pos_horiz_accuracy, found[-1].pos_vert_accuracy
