@@ -32,7 +32,7 @@ WILD = {
 ONE_NAN = 0x7FC00000
 SPECIAL_FLOATS = np.array(
     [0.0, -0.0, 1.0, -1.0, 1e-45, -1e-42, 1.1754942e-38, 3.4028235e38, -3.4028235e38, 1e30, -1e20, 16777216.0,
-     np.inf, -np.inf, np.nan, 1000.0, -1000.0, 3.1415927], np.float32,
+     np.inf, -np.inf, np.nan, 1000.0, -1000.0, -998.0, 3.1415927], np.float32,
 )  # fmt: skip
 SPECIAL_INTEGERS = np.array([0, 1, 2, -1, 3, 10, 100_000, 131_072, -(2**31), 2**31 - 1], np.int32)
 

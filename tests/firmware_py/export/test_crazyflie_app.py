@@ -780,12 +780,16 @@ def test_a_packet_of_packed_poses_without_any_is_malformed(app: App) -> None:
     assert app.log("floaty.malformed") == before + 1
 
 
-@pytest.mark.parametrize("data", [b"\x03\x00", b"\x04\x00"])
-def test_an_emergency_packet_of_another_size_changes_nothing(app: App, data: bytes) -> None:
+@pytest.mark.parametrize(("channel", "size"), [(1, 2), (0, 1), (2, 1)])
+@pytest.mark.parametrize("kind", [3, 4])
+def test_an_emergency_packet_of_another_size_or_channel_changes_nothing(
+    app: App, kind: int, channel: int, size: int
+) -> None:
     flying(app)
-    app.radio(data)
-    fly_on(app, 1200, 200)
-    assert (app.supervisor.state, app.watchdog_fed.value) == (reference.State.FLYING, 0)
+    app.radio(bytes((kind, 0))[:size], channel=channel)
+    assert (app.stop_requested.value, app.watchdog_fed.value) == (0, 0)
+    fly_on(app, 1200, 20)
+    assert app.supervisor.state == reference.State.FLYING
 
 
 def test_with_corrections_a_commanded_position_is_refused_in_one_line(app: App) -> None:

@@ -231,6 +231,7 @@ def test_dead_air_bounds_both_queues_and_the_newest_corrections_survive():
     assert (bench.on_board, bench.on_ground) == ([], [])
     assert (radio.up.queue_high_water, radio.down.queue_high_water) == (4, 8)
     assert radio.down.dropped == 192
+    assert radio.air.retried == 3 * radio.air.unanswered > 0
     assert not radio.downlink(999_999, bytes(TELEMETRY))
     radio.medium.uplink_loss = 0.0
     bench.events.run(2_000_000)

@@ -303,8 +303,10 @@ def test_the_bitstream_is_changed_for_the_client_that_asks(lab: MotiveBench, cli
     assert client.hear() == packet(MessageId.RESPONSE, b"Bitstream,4.1.0\0")
     client.say(MessageId.REQUEST, b"Bitstream,3.1\0")
     assert client.hear() == packet(MessageId.RESPONSE, struct.pack("<i", 0))
-    lab.expose()
-    assert decode(client.hear(), (3, 1)).number == 1
+    for number in (1, 2):
+        lab.expose()
+        assert decode(client.hear(), (3, 1)).number == number
+        client.say(MessageId.KEEPALIVE)
     client.say(MessageId.REQUEST, b"Bitstream,2.9\0")
     assert client.hear() == packet(MessageId.RESPONSE, struct.pack("<i", -1))
     client.say(MessageId.REQUEST, b"StartRecording\0")

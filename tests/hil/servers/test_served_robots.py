@@ -1,5 +1,6 @@
 """What a server shows of its first robot, and where several start."""
 
+import select
 import socket
 
 import pytest
@@ -64,6 +65,24 @@ def test_a_udp_port_that_was_taken_meanwhile_is_waited_for_each_time() -> None:
         taken = f"board 1: udp port {port}: Address already in use; trying again"
         expected += [taken, f"board 1: udp port {port} is open again"]
         assert lines == expected
+    served.close()
+
+
+def test_a_new_client_on_the_radio_ends_the_session_on_udp() -> None:
+    events = EventQueue()
+    served = ServedRobot(1, Site(load_config(), events, Streams.of_seed(1), lambda *_: None), lambda _: None)
+    readers: Readers = {}
+    port = int(served.serve_udp(0, readers).rpartition(":")[2])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.sendto(b"\xf0", ("127.0.0.1", port))
+        ((source, read),) = readers.items()
+        assert select.select([source], [], [], 20.0)[0]
+        read(0)
+        assert served.udp is not None and served.udp.has_session(0)
+        served.nrf51.hear(0, b"\xf0")  # goes on
+        assert served.udp.has_session(0)
+        served.nrf51.hear(0, b"\xff\x05\x01")  # switches safelink on: a new one
+        assert not served.udp.has_session(0)
     served.close()
 
 

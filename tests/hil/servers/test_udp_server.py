@@ -74,6 +74,8 @@ def test_a_client_that_is_silent_for_long_loses_the_board(board: Board, clients:
     board.read(SESSION_TIMEOUT_US + 1)
     assert board.received == [b"\xf0a", b"\xf0c"]
     assert board.said[-1].endswith("1 packets of others were ignored")
+    board.server.end_session()
+    assert (len(board.said), board.server.ignored) == (2, 0), "none of the second session"
 
 
 def test_a_client_that_is_gone_makes_room_at_once(board: Board, clients: list[socket.socket]) -> None:
