@@ -70,9 +70,7 @@ def test_killing_the_board_ends_the_flight_in_one_line_with_its_log(library: Pat
 
 
 @pytest.mark.parametrize(
-    ("medium", "overrides"),
-    [("radio", LOSSY), ("udp", ())],
-    ids=["lossy-radio", "good-udp"],
+    ("medium", "overrides"), [("radio", LOSSY), ("udp", ())], ids=["lossy-radio", "good-udp"]
 )
 def test_hover_with_the_board_in_the_loop_holds_all_limits(
     cli: Cli, library: Path, medium: str, overrides: tuple[str, ...], tmp_path: Path

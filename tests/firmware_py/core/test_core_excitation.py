@@ -7,13 +7,7 @@ from scipy.signal import chirp
 
 from firmware_py.config import SIGNALS, parameters_of
 from firmware_py.core.excitation import PERIOD, REALISATION, REALISATIONS
-from firmware_py.core.structs import (
-    EXCITE_CHIRP,
-    EXCITE_MULTISINE,
-    EXCITE_OFF,
-    MODE_FLY,
-    MODE_HOVER,
-)
+from firmware_py.core.structs import EXCITE_CHIRP, EXCITE_MULTISINE, EXCITE_OFF, MODE_FLY, MODE_HOVER
 from firmware_py.core_runner import CoreBlocks, default_runner
 from hil.config import load_config
 

@@ -18,13 +18,7 @@ from firmware_py.export.compilers import Compiler, compilers, find_compiler
 from firmware_py.export.errors import ExportError
 from firmware_py.export.native import build
 from support import core_streams
-from support.core_streams import (
-    Recording,
-    first_difference,
-    record_flight,
-    record_plausible,
-    record_wild,
-)
+from support.core_streams import Recording, first_difference, record_flight, record_plausible, record_wild
 from support.paths import ROOT, TESTS
 
 C = translate()
