@@ -157,11 +157,3 @@ def test_four_boards_on_one_dongle(cache: Path) -> None:
         for thread in closing:
             thread.join(PATIENCE_S)
         assert all(client.gone.is_set() for client in clients)
-
-
-def test_the_built_in_station_flies_and_ctrl_c_ends_in_order() -> None:
-    with serve("--udp", "0", "--station") as served:
-        served.wait_for("board 1: released", PATIENCE_S)
-        assert served.interrupt() == 0
-        served.wait_for("^stopped", PATIENCE_S)
-        assert not any("lost" in line for line in served.lines)

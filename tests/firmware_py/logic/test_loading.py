@@ -98,15 +98,20 @@ IN_THE_LAW = [
 ]  # fmt: skip
 
 
+def refused_in(folder: Path, text: str, line: int) -> str:
+    """The reason, in one line with its place."""
+    with pytest.raises(LabError) as error:
+        own_config(folder, text)
+    assert "\n" not in str(error.value)
+    place = f"{folder / 'controller.py'}:{line}: "
+    assert str(error.value).startswith(place)
+    return str(error.value).removeprefix(place)
+
+
 @pytest.mark.parametrize(("statement", "line", "told"), IN_THE_LAW, ids=[row[0] for row in IN_THE_LAW])
 def test_an_unsupported_statement_is_one_line(tmp_path: Path, statement: str, line: int, told: str) -> None:
     text = changed(LAW, IN_LAW, IN_LAW + indent(f"{statement}\n", "    "))
-    with pytest.raises(LabError) as error:
-        own_config(tmp_path, text)
-    first = line_of(text, IN_LAW) + 1
-    assert str(error.value).startswith(f"{tmp_path / 'controller.py'}:{first + line}: ")
-    assert told in str(error.value)
-    assert "\n" not in str(error.value)
+    assert told in refused_in(tmp_path, text, line_of(text, IN_LAW) + 1 + line)
 
 
 AT_LAW = "@kernel\ndef control_law"
@@ -211,12 +216,7 @@ MISTAKES = [
 @pytest.mark.parametrize(("old", "new", "at", "told"), MISTAKES)
 def test_a_mistake_is_reported_with_its_place(tmp_path: Path, old: str, new: str, at: str, told: str) -> None:
     text = changed(LAW, old, new)
-    with pytest.raises(LabError) as error:
-        own_config(tmp_path, text)
-    line = line_of(text, at) + at.count("\n") if at else 1
-    assert str(error.value).startswith(f"{tmp_path / 'controller.py'}:{line}: ")
-    assert told in str(error.value)
-    assert "\n" not in str(error.value)
+    assert told in refused_in(tmp_path, text, line_of(text, at) + at.count("\n") if at else 1)
 
 
 @pytest.mark.parametrize(

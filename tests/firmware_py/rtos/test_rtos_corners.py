@@ -52,18 +52,28 @@ def priority_at(kernel, task, instants_us):
     return priorities
 
 
-def test_a_holder_keeps_the_priority_of_the_next_waiter_when_one_gives_up(kernel):
-    mutex = kernel.create_mutex("mutex")
-    holder = kernel.create_task("holder", 2, holder_of(kernel, [mutex], 9_500))
-    start(kernel, high=(5, taker_of(kernel, mutex, 2, 2)), middle=(4, taker_of(kernel, mutex, 1, 6)))
-    assert priority_at(kernel, holder, [500, 1_500, 2_500, 4_500, 7_500]) == [2, 4, 5, 4, 2]
-
-
-def test_a_holder_falls_back_only_when_the_last_of_equal_waiters_gives_up(kernel):
-    mutex = kernel.create_mutex("mutex")
-    holder = kernel.create_task("holder", 2, holder_of(kernel, [mutex], 9_500))
-    start(kernel, first=(4, taker_of(kernel, mutex, 1, 2)), second=(4, taker_of(kernel, mutex, 2, 4)))
-    assert priority_at(kernel, holder, [1_500, 2_500, 3_500, 5_500, 6_500]) == [4, 4, 4, 4, 2]
+@pytest.mark.parametrize(
+    (
+        "count",
+        "waiters",
+        "instants_us",
+        "priorities",
+    ),  # a waiter: its priority, when it asks, how long it waits
+    [
+        (1, ((5, 2, 2), (4, 1, 6)), [500, 1_500, 2_500, 4_500, 7_500], [2, 4, 5, 4, 2]),
+        (1, ((4, 1, 2), (4, 2, 4)), [1_500, 2_500, 3_500, 5_500, 6_500], [4, 4, 4, 4, 2]),
+        (2, ((5, 1, 2),), [1_500, 3_500, 9_400, 9_550], [5, 5, 5, 2]),
+    ],
+    ids=["that of the next waiter", "that of equal waiters", "that lent until it gives both mutexes"],
+)
+def test_a_holder_keeps_a_priority_when_a_waiter_gives_up(kernel, count, waiters, instants_us, priorities):
+    mutexes = [kernel.create_mutex(f"mutex {number}") for number in range(count)]
+    holder = kernel.create_task("holder", 2, holder_of(kernel, mutexes, 9_500))
+    start(
+        kernel,
+        **{f"waiter {i}": (p, taker_of(kernel, mutexes[0], *when)) for i, (p, *when) in enumerate(waiters)},
+    )
+    assert priority_at(kernel, holder, instants_us) == priorities
 
 
 def test_a_holder_is_not_lowered_below_its_own_priority_by_a_waiter_that_is_less_urgent(kernel):
@@ -77,13 +87,6 @@ def test_a_holder_is_not_lowered_below_its_own_priority_by_a_waiter_that_is_less
     holder = kernel.create_task("holder", 3, body)
     start(kernel, low=(2, taker_of(kernel, mutex, 1, FOREVER)), high=(5, taker_of(kernel, mutex, 2, 2)))
     assert priority_at(kernel, holder, [1_500, 2_500, 4_500]) == [3, 5, 3]
-
-
-def test_a_holder_of_two_mutexes_keeps_what_was_lent_until_it_gives_both(kernel):
-    mutexes = [kernel.create_mutex("one"), kernel.create_mutex("two")]
-    holder = kernel.create_task("holder", 2, holder_of(kernel, mutexes, 5_500))
-    start(kernel, high=(5, taker_of(kernel, mutexes[0], 1, 2)))
-    assert priority_at(kernel, holder, [1_500, 3_500, 5_400, 5_550]) == [5, 5, 5, 2]
 
 
 def test_a_priority_set_while_one_is_lent_counts_when_the_mutex_is_given(kernel):

@@ -72,21 +72,21 @@ def test_a_long_message_arrives_in_chunks_of_the_threshold():
     ]
 
 
-def test_messages_without_a_gap_share_chunks():
+@pytest.mark.parametrize(
+    ("writes", "chunks"),
+    [
+        # the second one waits for the first until 400
+        ([(0, b"a" * 40), (100, b"b" * 40)], [(640, b"a" * 40 + b"b" * 24), (810, b"b" * 16)]),
+        # a gap shorter than a byte does not end a chunk
+        ([(0, b"a" * 10), (109, b"b" * 10), (300, b"c")], [(219, b"a" * 10 + b"b" * 10), (320, b"c")]),
+    ],
+)
+def test_messages_without_a_gap_share_chunks(writes, chunks):
     bench = LineWithEnds(baud=1_000_000, host_latency_us=0)
-    bench.write(0, b"a" * 40)
-    bench.write(100, b"b" * 40)  # waits for the first until 400
+    for at_us, data in writes:
+        bench.write(at_us, data)
     bench.run()
-    assert bench.on_ground == [(640, b"a" * 40 + b"b" * 24), (810, b"b" * 16)]
-
-
-def test_a_gap_shorter_than_a_byte_does_not_end_a_chunk():
-    bench = LineWithEnds(baud=1_000_000, host_latency_us=0)
-    bench.write(0, b"a" * 10)
-    bench.write(109, b"b" * 10)
-    bench.write(300, b"c")
-    bench.run()
-    assert bench.on_ground == [(219, b"a" * 10 + b"b" * 10), (320, b"c")]
+    assert bench.on_ground == chunks
 
 
 def test_line_load_and_latency_are_counted():

@@ -45,14 +45,19 @@ def test_firmware_without_the_app_is_reported() -> None:
     assert [line for line in lines if "the image lacks Floaty's app" in line]
 
 
+def on_udp(lines: list[str]) -> tuple[ServedRobot, Readers, int]:
+    """A robot on simulated time with its UDP port; what it reports."""
+    readers: Readers = {}
+    site = Site(load_config(), EventQueue(), Streams.of_seed(1), lambda *_: None)
+    served = ServedRobot(1, site, lines.append)
+    return served, readers, int(served.serve_udp(0, readers).rpartition(":")[2])
+
+
 def test_a_udp_port_that_was_taken_meanwhile_is_waited_for_each_time() -> None:
     lines: list[str] = []
     expected: list[str] = []
-    events = EventQueue()
-    site = Site(load_config(), events, Streams.of_seed(1), lambda *_: None)
-    served = ServedRobot(1, site, lines.append)
-    readers: Readers = {}
-    port = int(served.serve_udp(0, readers).rpartition(":")[2])
+    served, readers, port = on_udp(lines)
+    events = served.robot.events
     for _ in range(2):
         served.stop(events.now_us)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as thief:
@@ -69,16 +74,14 @@ def test_a_udp_port_that_was_taken_meanwhile_is_waited_for_each_time() -> None:
 
 
 def test_a_new_client_on_the_radio_ends_the_session_on_udp() -> None:
-    events = EventQueue()
-    served = ServedRobot(1, Site(load_config(), events, Streams.of_seed(1), lambda *_: None), lambda _: None)
-    readers: Readers = {}
-    port = int(served.serve_udp(0, readers).rpartition(":")[2])
+    served, readers, port = on_udp([])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.sendto(b"\xf0", ("127.0.0.1", port))
         ((source, read),) = readers.items()
         assert select.select([source], [], [], 20.0)[0]
         read(0)
-        assert served.udp is not None and served.udp.has_session(0)
+        assert served.udp is not None
+        assert served.udp.has_session(0)
         served.nrf51.hear(0, b"\xf0")  # goes on
         assert served.udp.has_session(0)
         served.nrf51.hear(0, b"\xff\x05\x01")  # switches safelink on: a new one

@@ -79,22 +79,15 @@ def test_dshot_by_dma_moves_an_esc_and_its_answer_is_captured(compiler: str) -> 
     assert period_us(edges, 0.8 * 281) == pytest.approx(60e6 / (2400 * 6), rel=0.005)
 
 
-def test_a_hungry_watchdog_resets() -> None:
-    machine = FirmwareOnChip(planted=HUNGRY_WATCHDOG)
-    why = Why.TIME
-    while why in (Why.TIME, Why.SERIAL, Why.COMPARE) and machine.chip.now_us < 400 * MS:
-        why = machine.run(400 * MS)
-    assert why & Why.WATCHDOG
-    assert 190 * MS < machine.chip.now_us < 215 * MS  # 200 periods of 32 / 32 kHz after the start
-
-
-def test_a_failed_assertion_keeps_its_snapshot_over_the_reset() -> None:
-    machine = FirmwareOnChip(planted=ASSERTION)
-    why = Why.TIME
-    while why in (Why.TIME, Why.SERIAL, Why.COMPARE) and machine.chip.now_us < 100 * MS:
-        why = machine.run(100 * MS)
-    assert why & Why.RESET
-    assert machine.peek("snapshot") == 0x2F8A_001F
+def test_a_hungry_watchdog_resets_and_a_failed_assertion_keeps_its_snapshot_over_the_reset() -> None:
+    machines = [FirmwareOnChip(planted=planted) for planted in (HUNGRY_WATCHDOG, ASSERTION)]
+    for machine, expected in zip(machines, (Why.WATCHDOG, Why.RESET), strict=True):
+        why = Why.TIME
+        while why in (Why.TIME, Why.SERIAL, Why.COMPARE) and machine.chip.now_us < 400 * MS:
+            why = machine.run(400 * MS)
+        assert why & expected
+    assert 190 * MS < machines[0].chip.now_us < 215 * MS  # 200 periods of 32 / 32 kHz after the start
+    assert machines[1].peek("snapshot") == 0x2F8A_001F
 
 
 def test_a_step_into_an_interrupt_ends_in_front_of_its_handler() -> None:
