@@ -14,6 +14,7 @@ from hil.config import load_config
 from hil.crazyflie import syslink
 from hil.devices.board_firmware import PowerOn, PythonBoard
 from hil.servers.dongle_plugin import CONTROL, VARIABLE, WRITE, Connection, frame
+from hil.servers.dongle_server import AHEAD
 from hil.servers.server import Doors, Server, Service
 from hil.servers.swarm import Swarm
 from support.serving import PATIENCE_S, Served, serve
@@ -60,6 +61,11 @@ def test_one_dongle_reaches_every_robot_by_its_address_and_nobody_by_another(ser
     with closing(Dongle(served)) as dongle:
         for _ in range(3):
             assert [dongle.send(last) for last in (0xE7, 0x02, 0x03)] == [1, 1, 0]
+        dongle.request(SET_ACKS, 0)
+        for _ in range(2 * AHEAD):  # none of them is awaited
+            dongle.write(NULL)
+        dongle.request(SET_ACKS, 1)
+        assert dongle.send(0xE7) == ACKNOWLEDGED
 
 
 def test_a_robot_that_a_client_moves_is_found_on_its_new_channel(served: Served) -> None:

@@ -366,6 +366,21 @@ def test_a_debugger_that_has_left_stops_nothing_any_more() -> None:
     server.close()
 
 
+def test_a_stop_selects_the_running_thread() -> None:
+    machine = FirmwareOnChip()
+    chip, place = machine.chip, machine.image.symbol("vTaskSwitchContext").address
+    machine.run(30_000)
+    kernel = FreeRtos(machine.image, chip.read)
+    protocol = RemoteProtocol(chip, kernel)  # type: ignore[arg-type]
+    other = next(task.block for task in kernel.tasks() if task.block != kernel.current_block)
+    assert ask(protocol, b"Z0,%x,2" % place) == ask(protocol, b"Hg%x" % other) == b"OK"
+    assert protocol.receive(framed(b"c")) == b"+"
+    while not chip.run(200_000 * CYCLES_PER_US) & Why.BREAK:
+        assert chip.now_us < 200_000
+    protocol.stopped(SIGTRAP)
+    assert ask(protocol, b"p0f") == pack("<I", place).hex().encode()
+
+
 def test_the_chip_waits_for_its_debugger_at_its_first_instruction() -> None:
     machine, answers = on_chip(lambda _: [b"QStartNoAckMode", b"pf", b"me000ed28,4", b"D"], 2_000)
     reset = framed(pack("<I", machine.image.reset).hex().encode())

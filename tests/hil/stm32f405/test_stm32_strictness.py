@@ -176,10 +176,18 @@ def test_unalign_trp_forbids_every_unaligned_access(code: str) -> None:
     assert (bench.cfsr, bench.stacked_pc) == (UNALIGNED, START)
 
 
-def test_an_unaligned_access_to_a_peripheral_is_a_usage_fault() -> None:
-    bench = Strict("2068", {"r4": GPIOA + 2})
+@pytest.mark.parametrize(
+    ("address", "status"),
+    [
+        (GPIOA, UNALIGNED), (0x5000_0000, UNALIGNED), (0xA000_0000, UNALIGNED), (0xC000_0000, UNALIGNED),
+        (0x6000_0000, PRECISERR | BFARVALID), (0x9FFF_FFF0, PRECISERR | BFARVALID),
+    ],
+    ids=hex,
+)  # fmt: skip
+def test_an_unaligned_access_to_a_device_is_a_usage_fault(address: int, status: int) -> None:
+    bench = Strict("2068", {"r4": address + 2})
     bench.run()
-    assert bench.cfsr == UNALIGNED
+    assert bench.cfsr == status
 
 
 def test_an_unaligned_access_within_a_block_costs_what_an_aligned_one_costs() -> None:
@@ -300,6 +308,21 @@ def test_a_division_by_zero_is_a_usage_fault_if_the_firmware_wants_it_so(code: s
     assert (bench.cfsr, bench.stacked_pc) == (DIVBYZERO, START)
     bench = Strict(code, {"r0": 1, "r1": 7})
     assert (bench.run(), bench.chip.register("r0")) == (0, 0)
+
+
+def test_a_breakpoint_holds_each_arrival_once() -> None:
+    bench = Strict("0137 fde7")  # adds r7, #1; b to it
+    chip = bench.chip
+    chip.breakpoints = {START}
+    for moves_pc, counted in ((True, 0), (True, 0), (False, 1), (False, 2)):
+        if moves_pc:
+            chip.set_register("pc", START + 2)
+        assert chip.run(chip.state.now + 1000) & Why.BREAK
+        assert (chip.register("pc"), chip.register("r7")) == (START, counted)
+    chip.set_register("pc", START + 2)
+    chip.step()  # onto it
+    assert chip.run(chip.state.now + 1000) & Why.BREAK
+    assert (chip.register("pc"), chip.register("r7")) == (START, 3)
 
 
 def test_a_breakpoint_instruction_without_a_debugger_is_a_hard_fault() -> None:
