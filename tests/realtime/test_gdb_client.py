@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -12,12 +13,9 @@ import pytest
 pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
-from hil.stm32f405.chip import CYCLES_PER_US
-from hil.stm32f405.freertos import FreeRtos
-from hil.stm32f405.gdb import DebuggedChip, GdbServer
+from hil.stm32f405.gdb import GdbServer
 from hil.stm32f405.image import Image
 from support import stm32_firmware
-from support.bare_cortex import BareCortex
 from support.paths import ROOT
 from support.serving import FLOATY
 from support.stm32_machine import FirmwareOnChip
@@ -54,9 +52,9 @@ def debugged(run: Callable[[GdbServer], object], image: Image, *commands: str) -
 
 @pytest.mark.parametrize("compiler", ["clang", "gcc"])
 def test_gdb_stops_at_a_breakpoint_and_names_the_callers(compiler: str) -> None:
-    image = Image(stm32_firmware.build(compiler))
+    machine = FirmwareOnChip(compiler, planted=ASSERTION)
     printed = debugged(
-        BareCortex(image).run_for, image, f"set var $r0 = {ASSERTION}", "set var $lr = 0xffffffff", "set var $pc = go_wrong",
+        partial(machine.run_debugged, end_us=30_000), machine.image,
         "break assertFail", "continue", "backtrace 2", "print $pc == (long)assertFail & ~1", "info breakpoints",
     )  # fmt: skip
     text = "\n".join(printed)
@@ -69,10 +67,9 @@ def test_gdb_stops_at_a_breakpoint_and_names_the_callers(compiler: str) -> None:
 
 
 def test_gdb_reads_and_changes_registers_and_memory() -> None:
-    image = Image(stm32_firmware.build())
-    machine = BareCortex(image)
+    machine = FirmwareOnChip()
     printed = debugged(
-        machine.run_for, image, "set var $d5 = -2.5", "print $d5", "print $s10", "set var $basepri = 0x50",
+        machine.run_debugged, machine.image, "set var $d5 = -2.5", "print $d5", "print $s10", "set var $basepri = 0x50",
         "print/x $basepri", "set var $r9 = 0xcafe", "print/x $r9", "set var xTickCount = 4711", "print xTickCount",
         "set var tasks[2].pcTaskName[1] = 'q'", "print tasks[2].pcTaskName", "x/1i $pc",
     )  # fmt: skip
@@ -80,32 +77,26 @@ def test_gdb_reads_and_changes_registers_and_memory() -> None:
     assert values[0] == "-2.5"
     assert values[2:5] == ["0x50", "0xcafe", "4711"]
     assert values[5] == r'"\000q\000\000\000\000\000"'
-    assert machine.register("d5") == 0xC004_0000_0000_0000
-    assert machine.register("basepri") == 0x50
+    assert machine.chip.register("d5") == 0xC004_0000_0000_0000
+    assert machine.chip.register("basepri") == 0x50
     assert any("Reset_Handler" in line and ":" in line for line in printed[-4:])
 
 
 def test_gdb_steps_one_instruction_and_one_line() -> None:
-    image = Image(stm32_firmware.build())
-    machine = BareCortex(image)
-    printed = debugged(machine.run_for, image, "print/x $pc", "stepi", "print/x $pc", "next", "print/x $pc")
+    machine = FirmwareOnChip()
+    commands = ("print/x $pc", "stepi", "print/x $pc", "next", "print/x $pc")
+    printed = debugged(machine.run_debugged, machine.image, *commands)
     before, behind, line = (int(text.partition(" = ")[2], 16) for text in printed if text.startswith("$"))
-    assert before == image.reset
+    assert before == machine.image.reset
     assert behind - before in (2, 4)
     assert line > behind
 
 
 def test_gdb_sees_through_an_interrupt_into_the_task_below_it() -> None:
     machine = FirmwareOnChip("gcc")
-    chip = machine.chip
-
-    def run(server: GdbServer) -> None:
-        debugged_chip = DebuggedChip(chip, server)
-        while chip.now_us < 30_000:
-            debugged_chip.run(30_000 * CYCLES_PER_US)
-
     printed = debugged(
-        run, machine.image, "break USART6_Handler", "break DMA1_Stream0_Handler", "continue", "backtrace",
+        partial(machine.run_debugged, end_us=30_000), machine.image,
+        "break USART6_Handler", "break DMA1_Stream0_Handler", "continue", "backtrace",
         "print i2c_reads", "print/x $psp > 0x20000000", "delete", "print $basepri",
     )  # fmt: skip
     frames = [line.split(" ", 1)[1].strip() for line in printed if line.startswith("#")]
@@ -117,16 +108,10 @@ def test_gdb_sees_through_an_interrupt_into_the_task_below_it() -> None:
 
 def test_gdb_shows_tasks_and_stops_at_a_write() -> None:
     machine = FirmwareOnChip("gcc")
-    chip, kernel = machine.chip, FreeRtos(machine.image, machine.chip.read)
-
-    def run(server: GdbServer) -> None:
-        debugged_chip = DebuggedChip(chip, server, kernel)
-        while chip.now_us < 30_000:
-            debugged_chip.run(30_000 * CYCLES_PER_US)
-
     printed = "\n".join(
         debugged(
-            run, machine.image, "break send_line", "continue", "info threads", "thread apply all backtrace",
+            partial(machine.run_debugged, end_us=30_000), machine.image,
+            "break send_line", "continue", "info threads", "thread apply all backtrace",
             "delete", "watch xTickCount", "continue", "backtrace 1", "delete",
         )
     )  # fmt: skip

@@ -325,6 +325,7 @@ def test_the_bootloader_is_at_the_address_that_cflib_computes_and_back() -> None
     assert bench.exchange(b"\xff\xff\x10") == b"\x01"  # no contents: anything else breaks cflib's flashing
     info = bench.exchange(NULL)
     assert info[1:4] == b"\xff\xff\x10"
+    assert 0 < bench.events.now_us - bench.board.heard_us < 1000  # then nobody presses its button
     bench.exchange(b"\xff\xfe\xf0\x01")
     bench.wait(RESET_DELAY_US + 1000)
     assert bench.board.power is Power.RUNNING
