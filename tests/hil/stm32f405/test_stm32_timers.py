@@ -50,17 +50,6 @@ def test_each_timer_has_its_clock_its_width_and_its_interrupt(bench: Bench, numb
     assert bench.is_pending(irq)
 
 
-def test_a_timer_of_32_bits_counts_on_behind_65535(bench: Bench) -> None:
-    base = TIMERS[5][0]
-    start(bench, base, prescaler=0, period=199_999)
-    bench.wait(2000)
-    assert bench[base + CNT] == 168_000
-    assert bench[base + SR] & 1 == 0
-    bench.wait(1000)
-    assert bench[base + CNT] == 52_000
-    assert bench[base + SR] & 1 == 1
-
-
 def test_a_flag_is_cleared_by_writing_0_and_kept_by_writing_1(bench: Bench) -> None:
     start(bench, TIM7)
     bench.wait(150)
