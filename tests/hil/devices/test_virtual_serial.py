@@ -77,6 +77,7 @@ def test_a_long_message_arrives_in_chunks_of_the_threshold():
     [
         # the second one waits for the first until 400
         ([(0, b"a" * 40), (100, b"b" * 40)], [(640, b"a" * 40 + b"b" * 24), (810, b"b" * 16)]),
+        ([(0, b"a" * 40), (100, b"b" * 24)], [(640, b"a" * 40 + b"b" * 24)]),  # nothing is left over
         # a gap shorter than a byte does not end a chunk
         ([(0, b"a" * 10), (109, b"b" * 10), (300, b"c")], [(219, b"a" * 10 + b"b" * 10), (320, b"c")]),
     ],
