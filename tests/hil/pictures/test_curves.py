@@ -11,12 +11,12 @@ import pytest
 
 from firmware_py.geometry import from_euler_zyx, yaw_quaternion
 from hil.errors import LabError
-from hil.pictures import compare, curves
+from hil.pictures import compare, curves, trials
 from hil.pictures.panels import TOGETHER_S, marks_of_flight, saturated
-from hil.pictures.trials import openings
 from hil.pictures.viewer.plots import RATES
 
 RELEASE = {b"release_us": b"0"}
+SENSES = np.array([1.0, -1.0, 1.0, -1.0])  # of opening flaps
 MEMBERS = (("up", "down"), ("x", "y", "z"), ("roll", "pitch", "yaw"), ("1", "2", "3", "4"))
 
 
@@ -163,12 +163,17 @@ def test_a_spell_to_the_end_ends_with_the_last_row() -> None:
     assert [(one.begin_s, one.end_s) for one in marks.spells] == [(0.01, 0.02)]
 
 
-def test_the_mean_opening_counts_every_flap_in_its_own_sense() -> None:
-    flaps = {1: 0.1, 2: -0.2, 3: 0.3, 4: -0.4}
-    angles = {f"{kind}.flap_{n}": [angle] * 30 for kind in ("truth", "control") for n, angle in flaps.items()}
-    value, command = openings(flight([0.0] * 30, **angles))
-    assert value == pytest.approx(np.full(30, np.degrees(0.25)))
-    assert command == pytest.approx(value)
+def test_a_trial_shows_the_true_value_beside_its_target_and_the_mean_opening_each_flap_in_its_sense() -> None:
+    kinds, numbers = ("truth", "goal", "control"), np.arange(1.0, 13.0).reshape(3, 4)
+    names = [(*(f"{kind}.{name}" for name in "xyz"), f"{kind}.yaw") for kind in kinds[:2]]
+    names += [tuple(f"{kind}.flap_{n}" for n in (1, 2, 3, 4)) for kind in kinds[::2]]
+    values = [*numbers[:2], 0.1 * numbers[0] * SENSES, 0.2 * numbers[0] * SENSES]
+    columns = dict(zip(np.ravel(names).tolist(), np.ravel(values).tolist(), strict=True))
+    rows = flight([np.degrees(4.0)] * 30, **{name: [value] * 30 for name, value in columns.items()})
+    turns = np.degrees((4.0 + 2 * np.pi, 8.0)), np.degrees((0.25, 0.5))
+    expected = {trials.X: (100, 500), trials.Y: (200, 600), trials.Z: (300, 700), trials.YAW: turns[0]}
+    for curve, shown in (expected | {trials.OPENING: turns[1]}).items():
+        assert [one[7] for one in curve.read(rows)] == pytest.approx(shown)
 
 
 def test_logs_differ_first_where_they_do_a_gap_equals_a_gap_and_a_longer_one_goes_on() -> None:

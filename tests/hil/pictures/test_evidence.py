@@ -1,5 +1,6 @@
 """What the report says about a fault: the robot, the board's belief, its poses and its flaps, as the log has them."""
 
+import json
 import re
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from hil.laboratory.run import fly
 from hil.pictures.curves import since_release
 from hil.pictures.figures import course_of, goal_moves
 from hil.pictures.panels import saturated
-from hil.pictures.story import _rotors, evidence, failures_of, story_of
+from hil.pictures.story import _before, _rotors, evidence, failures_of, story_of
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +113,19 @@ def test_a_limit_that_failed_names_the_fault_that_began_last(folder: Path) -> No
     assert (
         first.cause == f"{first.at_s - 1.5:.2f} s after the begin of push.y@1.5=3 (3 N: force along y of W)"
     )
+
+
+@pytest.mark.parametrize(
+    ("at_s", "named"),
+    [(0.99, None), (1.0, 0), (2.99, 0), (3.0, 1), (3.5, 1), (6.3, 1), (6.31, 0), (10.0, 0), (10.01, None)],
+)
+def test_a_fault_is_a_cause_from_its_begin_to_three_seconds_after_its_end(
+    at_s: float, named: int | None
+) -> None:
+    faults = ["wind.fan@1:6=0.9", "push.y@3:0.3=1"]
+    about = {b"release_us": b"0", b"request": json.dumps({"faults": faults}).encode()}
+    cause = _before(pa.table({"t": []}).replace_schema_metadata(about), at_s)
+    assert (faults[named] if named is not None else "no fault was in force") in cause
 
 
 def test_the_course_is_the_flight_from_the_first_goal_red_while_a_fault_is_in_force(folder: Path) -> None:
