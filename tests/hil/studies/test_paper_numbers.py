@@ -11,7 +11,6 @@ from hil.design.tune import GainTask, refuse_late
 from hil.errors import LabError
 from hil.studies.paper import Paper, Spread, Trials
 from hil.studies.study import outcome_of
-from hil.studies.tuning import Round, rms
 
 
 def result(outcome: str = "completed", passed: bool = True, **metrics: float) -> Any:
@@ -72,19 +71,6 @@ def test_the_representative_flight_has_the_median_error_and_a_lost_one_is_the_wo
 @pytest.mark.parametrize(("failsafe_s", "outcome"), [(0.0, "holds"), (0.01, "failsafe"), (2.0, "failsafe")])
 def test_a_row_of_failsafe_is_one_that_the_supervisor_opened(failsafe_s: float, outcome: str) -> None:
     assert outcome_of(result(failsafe=failsafe_s)) == outcome
-
-
-def test_new_gains_are_better_when_they_hover_no_worse() -> None:
-    def of(before: Any, after: Any) -> Any:
-        return Round(SimpleNamespace(before=before), (after,), "given", "written")  # type: ignore[arg-type]
-
-    better, worse = of(placed(0.03, 0.04), placed(0.01)), of(placed(0.01), placed(0.03, 0.04))
-    assert (better.better, better.profile, better.worth_another) == (True, "written", True)
-    assert (worse.better, worse.profile, worse.worth_another) == (False, "given", False)
-    assert of(placed(0.01), placed(0.01)).better
-    assert not of(placed(0.01), placed(0.0099)).worth_another
-    assert not of(placed(0.01), placed(0.0, outcome="lost")).better
-    assert rms(placed(0.03, 0.0, 0.04)) == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize(

@@ -4,22 +4,24 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from hil.campaigns.jobs import Job, Row
 from hil.config import load_config
-from hil.design.axes import ROLL, gains_in, robot_of
+from hil.design.axes import DELAY, ROLL, gains_in, robot_of
 from hil.design.loop import FREQUENCIES, Timing, build
-from hil.design.tune import Flow, GainTask, judged, refuse_late
-from hil.errors import LabError
+from hil.design.margins import margins, pose_delay_margin, worst
+from hil.design.tune import Flow, GainTask, judged, motion
 from hil.experiments import find_experiment
 from hil.floaty.plant import Plant
 from hil.laboratory.request import Options, Request
 from hil.laboratory.robot import Streams
 from hil.laboratory.run import fly
-from hil.studies.tuning import Round
+from hil.studies import tuning
+from hil.studies.tuning import Round, TuningFlights, rms
 from support.command import Cli
 
 
@@ -48,24 +50,25 @@ def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: list[str],
     assert message in cli.refusal("tune", *arguments)
 
 
-def test_a_loop_that_bears_less_delay_than_the_link_has_is_refused_with_both_numbers() -> None:
+def test_an_axis_is_judged_by_old_and_new_gains_for_its_robot_and_by_the_worst_of_all() -> None:
     config = load_config()
-    robot, timing, gains = robot_of(config), Timing.of(config, 0.04), gains_in(config, ROLL)
-    still = Flow(np.zeros((len(FREQUENCIES), 2, 2), complex), 0.0, 0.0)
-    task = GainTask(ROLL, still, config, timing, 0.0)
-    one = judged(task, [robot], [build(ROLL, robot, config, timing)], gains, gains)
-    least = min(one.least.delay, one.least_late)
-    refuse_late([one], 0.99 * least)
-    with pytest.raises(
-        LabError,
-        match=f"roll, y tolerates {1e3 * least:.1f} ms of delay, and poses arrive up to 100.0 ms later",
-    ):
-        refuse_late([one], 0.1)
+    timing, old = Timing.of(config, 0.04), gains_in(config, ROLL)
+    robots, new = [robot_of(config), robot_of(config) | {DELAY: 0.014}], 0.9 * old
+    loops = [build(ROLL, robot, config, timing) for robot in robots]
+    white = 1e-3 * np.stack([np.eye(2, dtype=complex)] * len(FREQUENCIES))
+    task = GainTask(ROLL, Flow(white, 0.0, 0.0), config, timing, 0.0)
+    one, each = judged(task, robots, loops, old, new), [margins(loop, new) for loop in loops]
+    late = [pose_delay_margin(ROLL, robot, config, timing, new) for robot in robots]
+    assert late[1] < late[0]
+    assert (one.late, one.least_late) == tuple(late)
+    assert (one.old_margins, one.margins, one.least) == (margins(loops[0], old), each[0], worst(each))
+    assert (one.old_motion, one.motion) == tuple(motion(loops[0], task, gains) for gains in (old, new))
+    assert (one.old.tolist(), one.new.tolist()) == (old.tolist(), new.tolist())
 
 
 def hovered(rms_m: float, outcome: str = "completed") -> Row:
-    metrics = {"rms_x": rms_m, "rms_y": 0.0, "rms_z": 0.0}
-    return Row(Job(0, "hover", Options(), {}), outcome, "", True, "", metrics, {})
+    metrics = {"rms_x": 0.48 * rms_m, "rms_y": 0.6 * rms_m, "rms_z": 0.64 * rms_m}
+    return Row(Job(0, "hover", Options(), {}, Path("run")), outcome, "", True, "", metrics, {})
 
 
 @pytest.mark.parametrize(
@@ -73,15 +76,42 @@ def hovered(rms_m: float, outcome: str = "completed") -> Row:
     [
         (hovered(0.02), hovered(0.018), True, True),
         (hovered(0.02), hovered(0.0195), True, False),
+        (hovered(0.02), hovered(0.02), True, False),
         (hovered(0.02), hovered(0.021), False, False),
         (hovered(0.02), hovered(0.01, "lost"), False, False),
     ],
 )
 def test_new_gains_are_judged_against_the_old_ones(old: Row, new: Row, better: bool, another: bool) -> None:
-    tuned = SimpleNamespace(before=old)
-    one = Round(tuned, (new,), "given.toml", Path("tuned.toml"))  # type: ignore[arg-type]
+    one = Round(SimpleNamespace(before=old), (new,), "given.toml", Path("tuned.toml"))  # type: ignore[arg-type]
     assert (one.better, one.worth_another) == (better, another)
     assert one.profile == ("tuned.toml" if better else "given.toml")
+    assert rms(old) == pytest.approx(0.02)
+
+
+def test_a_round_begins_with_the_gains_of_the_one_before_and_other_seeds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    flown: list[tuple[Path, int, str]] = []
+    hovers = iter([(0.04, 0.03), (0.03, 0.0299), (0.03, 0.03)])
+
+    def log(name: str, flights: Any, folder: Path) -> list[Row]:
+        flown.extend((folder, options["seed"], options["profile"]) for _, options in flights.values())
+        return [hovered(0.02)]
+
+    def fly_round(model: str, own: TuningFlights, count: int) -> Round:
+        old, new = map(hovered, next(hovers))
+        return Round(SimpleNamespace(before=old), (new,), model, own.folder / "tuned.toml")  # type: ignore[arg-type]
+
+    for name in ("load_record", "identify", "write_profile", "_tunable"):
+        monkeypatch.setattr(tuning, name, lambda *_: None)
+    monkeypatch.setattr(tuning, "fly_round", fly_round)
+    own = TuningFlights(5, "c", Path("out"), SimpleNamespace(log=log))  # type: ignore[arg-type]
+    given = [one.given for one in tuning.rounds("floaty", own, 3, 9)]
+    assert given == [f"out/round-{number}/model.toml" for number in (1, 2)]
+    begun = ((1, 5, "floaty"), (2, 15, "out/round-1/tuned.toml"))
+    assert flown == [
+        (Path(f"out/round-{n}"), seed + one, base) for n, seed, base in begun for one in range(4)
+    ]
 
 
 @pytest.mark.long
