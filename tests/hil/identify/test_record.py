@@ -170,7 +170,8 @@ def test_rows_with_an_unknown_value_are_left_out(tmp_path: Path, title: str, val
     [
         (lambda text: text.replace(",", ";"), r"separated by ';'; ',' is expected"),
         (rows_changed(lambda rows: [*rows[60:], *rows[:60]]), "runs backwards"),
-        (rows_changed(lambda rows: [row.replace(",", "000,", 1) for row in rows]), "another unit, such as microseconds"),
+        (rows_changed(lambda rows: [row.replace(",", "000,", 1) for row in rows]),
+         r"advances by 20000 and 'ground.t \[s\]' by 0.02: is one of them in another unit, such as microseconds"),
         (cell(INPUTS[0], "soon"), "could not convert string to float: 'soon'"),
     ],
     ids=["semicolons", "parts exchanged", "microseconds", "word"],

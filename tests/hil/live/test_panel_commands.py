@@ -30,13 +30,15 @@ class Script:
         self.answers: list[str] = []
         self.known: dict[str, float] = {}
         self.shown = 0
+        self.gone = False
 
     def lines(self) -> list[str]:
         self._looks += 1
         return self._at.get(self._looks, [])
 
     def wait(self) -> list[str]:
-        return [self._paused.pop(0)] if self._paused else []
+        self.gone = not self._paused
+        return [] if self.gone else [self._paused.pop(0)]
 
     def answer(self, t_us: int, text: str) -> None:
         self.answers.append(text)
@@ -132,6 +134,7 @@ def test_a_paused_flight_steps_and_ends_as_an_unpaused_one(tmp_path: Path) -> No
     assert times["step"] - times["step 100"] == 100_000
     assert times["go"] == times["mark still"] == times["step"] + 10_000
     assert view.shown == load_log(tmp_path / "paused").num_rows
+    assert not view.gone, "a step pauses once"
 
 
 def test_a_flight_whose_station_is_another_program_does_not_pause(tmp_path: Path) -> None:
