@@ -39,7 +39,6 @@ from hil.campaigns.sampling import (
     plan_of,
     points_of,
     problem,
-    value_at,
 )
 from hil.laboratory.metrics import METRICS
 from support.campaigns import BAD_PUSH, planted, spec_of
@@ -102,17 +101,6 @@ def test_a_fault_happens_with_its_probability_and_is_marked_where_it_does(probab
     size = [axis.name for axis in axes(spec)].index("fault 1 push.y size")
     assert (flown[~happened, size] == 0.5).all()
     assert (flown[happened, size] != 0.5).all()
-
-
-@pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 1.0])
-def test_a_logarithmic_axis_goes_from_end_to_end_by_equal_factors(share: float) -> None:
-    varies = Distribution(log_uniform=(2.0, 32.0))
-    assert value_at(varies, share) == pytest.approx(2.0 * 16.0**share)
-
-
-def test_points_of_several_seeds_have_seeds_of_their_own() -> None:
-    spec = spec_of(flights=12, seeds=3, seed=100)
-    assert [draw(spec, index).options["seed"] for index in range(12)] == list(range(100, 112))
 
 
 def test_every_profile_flies_an_experiment_before_the_next_experiment() -> None:
@@ -193,14 +181,6 @@ def test_rows_beyond_the_end_are_dropped_and_a_row_that_came_twice_counts_once(t
         rows.add(planted(draw(spec, index)))
     rows.close(4)
     assert rows.table(["index"])["index"].to_pylist() == [0, 1, 2, 3]
-
-
-def test_a_campaign_of_one_flight_has_one_row(tmp_path: Path) -> None:
-    spec = spec_of(flights=1)
-    rows = Dataset(tmp_path, plan_of(spec), False)
-    rows.add(planted(draw(spec, 0)))
-    rows.close(1)
-    assert rows.table(["index"])["index"].to_pylist() == [0]
 
 
 def test_every_point_has_the_row_of_its_flight() -> None:

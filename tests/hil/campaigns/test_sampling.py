@@ -1,7 +1,6 @@
 """Flight number i is a function of (spec, i): the same in any order, with the distributions that the spec names."""
 
 import math
-import warnings
 from typing import Any
 
 import numpy as np
@@ -163,9 +162,3 @@ def test_a_campaign_over_seeds_alone_has_no_axes() -> None:
     spec = spec_of(parameters={}, faults=[], flights=3)
     assert axes(spec) == ()
     assert [draw(spec, index).options["seed"] for index in range(3)] == [1, 2, 3]
-
-
-def test_sample_sizes_cause_no_warning() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        points_of(spec_of(sampling="sobol", flights=37), 5, 11)

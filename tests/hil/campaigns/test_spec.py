@@ -110,10 +110,3 @@ def test_files_that_a_spec_names_begin_at_its_folder(tmp_path: Path) -> None:
     assert spec.experiments == (f"{tmp_path}/mine.py:PUSHED", "hover")
     assert spec.profiles == (f"{tmp_path}/lab.toml",)
     assert spec.board == f"{tmp_path}/cf2.elf"
-
-
-def test_a_missing_extra_names_its_installation(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hil.errors.find_spec", lambda name: None)
-    assert cli("campaign", "table") == 2
-    assert "floaty campaign: SALib is missing: " in cli.err
-    assert "pip install 'dask[distributed]" in cli.err

@@ -16,7 +16,6 @@ import pytest
 from firmware_py.core import structs
 from firmware_py.core_runner import CoreBlocks, CoreRunner, NativeRunner, RunnerFactory, default_runner
 from firmware_py.export.c99 import translate
-from firmware_py.extras import install_command
 from firmware_py.logic.plugs import CALLS
 from hil.deploy.check import Checked, check_flight, plan, reached
 from hil.devices.board_firmware import PythonBoard
@@ -233,17 +232,6 @@ def test_code_outside_its_memory_is_exit_1(cli: Cli, monkeypatch: pytest.MonkeyP
     options = ("--duration", "0.1", "--targets", "cortex-m4", "--source", "wild.c")
     assert cli("deploy", "check", "hover", *options) == 1
     assert "tick 23, in estimate: " in cli.out
-
-
-@pytest.mark.parametrize("package", ["unicorn", "elftools.elf.elffile"])
-def test_a_missing_package_is_one_line_and_exit_code_two(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path, package: str
-) -> None:
-    monkeypatch.chdir(built)
-    monkeypatch.setitem(sys.modules, package, None)
-    assert cli.refusal("deploy", "check", "hover", "--targets", "cortex-m4").endswith(
-        f"is missing: {install_command('deploy')}\n"
-    )
 
 
 FIRMWARE = """

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import math
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
@@ -115,15 +113,6 @@ def test_numbers_of_an_mcap_file_cover_the_log_and_name_unit_and_frame(folder: P
     in_poses = {name.replace(".", "_") for name in log.column_names} - described.keys()
     assert all(name == "t" or name.startswith(("truth_", "goal_", "estimate_")) for name in in_poses)
     assert len(in_poses) == 1 + 7 + 4 + 6
-
-
-def test_what_is_no_number_is_null_in_an_mcap_file(folder: Path, tmp_path: Path) -> None:
-    log = load_log(folder).slice(0, 4)
-    power = log.column_names.index("battery.power")
-    values = pa.array((1.5, math.nan, math.inf, -math.inf), pa.float32())
-    pq.write_table(log.set_column(power, log.schema.field(power), values), tmp_path / "log.parquet")
-    told = [one["battery_power"] for _, one in messages(write_mcap(tmp_path))["/battery"]]
-    assert told == [1.5, None, None, None]
 
 
 def test_frames_lead_from_the_world_to_the_estimate(folder: Path) -> None:

@@ -98,8 +98,3 @@ def test_what_the_model_does_not_explain_is_the_flow() -> None:
     band = (FREQUENCIES > 0.3) & (FREQUENCIES < 8.0)
     assert np.mean(found[band, 1, 1].real) == pytest.approx(per_hz, rel=0.25)
     assert np.mean(found[band & (FREQUENCIES < 1.0), 0, 0].real) < 0.05
-
-
-def test_a_hover_too_short_to_tell_the_flow_is_refused() -> None:
-    with pytest.raises(LabError, match="15 s after the first 2 s are needed"):
-        flow_of(hover(14.0)[0], PITCH, robot_of(CONFIG))

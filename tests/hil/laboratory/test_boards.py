@@ -1,13 +1,10 @@
 """Flights on the other boards: the exported C, and its machine code on the emulated Cortex-M4, against Python's."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
-from firmware_py.extras import install_command
-from hil.commands.app import main
 from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
@@ -80,31 +77,10 @@ def test_the_report_shows_what_the_board_takes(tmp_path: Path) -> None:
     assert "instructions" in page
 
 
-def test_an_unknown_board_is_refused() -> None:
-    with pytest.raises(LabError, match="--board stm8: no such file; expected c, python, cortex-m4, an image"):
-        Request.of(HOVER, board="stm8")
-
-
 @pytest.mark.parametrize("link", ["udp://127.0.0.1:19850", "radio://0/80/2M/E7E7E7E7E7"])
 def test_over_a_link_only_c_flies(link: str) -> None:
     with pytest.raises(LabError, match="only c flies over a link"):
         Request.of(HOVER, link=link, board="python")
-
-
-@pytest.mark.parametrize("missing", ["unicorn", "elftools.elf.elffile"])
-def test_a_missing_package_is_one_line(
-    missing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, missing, None)
-    out = str(tmp_path / "run")
-    monkeypatch.setattr(sys, "argv", ["floaty", "fly", "hover", "--board", "cortex-m4", "--out", out])
-    with pytest.raises(SystemExit) as end:
-        main()
-    said = capsys.readouterr().err.strip()
-    assert end.value.code == 2
-    assert said.count("\n") == 0
-    assert said.startswith("floaty: --board cortex-m4: ")
-    assert said.endswith(f"is missing: {install_command('deploy')}")
 
 
 @pytest.mark.long

@@ -2,18 +2,12 @@
 
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
 import pytest
 
-from firmware_py.wire.mavlink_frames import FrameCounters
-from hil.crazyflie.shockburst import AirCounters
-from hil.devices.radio import DirectionCounters
-from hil.devices.uart import LineCounters
 from hil.errors import LabError
-from hil.laboratory.channels import radio_channel, serial_channel
 from hil.laboratory.recorder import (
     BATCHES_PER_PIECE,
     ROWS_PER_BATCH,
@@ -143,40 +137,3 @@ def test_a_folder_without_a_log_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "log.arrows").write_bytes(b"not arrow at all")
     with pytest.raises(LabError, match="not a flight log"):
         load_log(tmp_path)
-
-
-def logged(channel: Channel) -> dict[str, int]:
-    names = [name for quantity in channel.quantities for name in quantity.names]
-    return dict(zip(names, channel.read(), strict=True))
-
-
-def test_each_counter_of_a_link_has_its_own_column() -> None:
-    up, down = (DirectionCounters(*range(first, first + 6)) for first in (10, 20))
-    air = AirCounters(retried=30, unanswered=31)
-    radio = SimpleNamespace(up=up, down=down, air=air)
-    expected = {"link.retried": 30, "link.unanswered": 31}
-    for way, counters in (("up", up), ("down", down)):
-        for name in ("sent", "delivered", "dropped"):
-            expected[f"link.{way}_{name}"] = getattr(counters, name)
-        expected[f"link.{way}_latency_sum"] = counters.latency_sum_us
-    assert logged(radio_channel(radio)) == expected  # type: ignore[arg-type]
-
-
-def test_each_counter_of_a_serial_line_has_its_own_column() -> None:
-    up, down = (LineCounters(*range(first, first + 9)) for first in (10, 100))
-    board, station = FrameCounters(bad_crc=1, lost=2), FrameCounters(bad_crc=3, lost=4)
-    uart, firmware, link = (
-        SimpleNamespace(up=up, down=down), SimpleNamespace(mavlink=SimpleNamespace(counters=board)),
-        SimpleNamespace(counters=station),
-    )  # fmt: skip
-    expected = {
-        "serial.overrun": up.overrun_bytes, "serial.no_room": up.dropped_bytes + down.dropped_bytes,
-        "serial.cut": up.cut_bytes + down.cut_bytes, "serial.wrong_bits": up.wrong_bits + down.wrong_bits,
-        "serial.up_bad": 1, "serial.up_lost": 2, "serial.down_bad": 3, "serial.down_lost": 4,
-    }  # fmt: skip
-    for way, counters in (("up", up), ("down", down)):
-        expected[f"link.{way}_delivered"] = counters.deliveries
-        expected[f"link.{way}_latency_sum"] = counters.latency_sum_us
-        expected[f"serial.{way}_busy"] = counters.busy_us
-        expected[f"serial.{way}_bytes"] = counters.sent_bytes
-    assert logged(serial_channel(uart, firmware, link)) == expected  # type: ignore[arg-type]

@@ -26,13 +26,6 @@ needs_image = pytest.mark.skipif(
 PROFILE = "crazyflie"
 
 
-def test_profile_without_an_image_is_one_clear_line() -> None:
-    with pytest.raises(
-        LabError, match=r"^profile crazyflie: its robot flies with .* --board FILE: the image"
-    ):
-        Request.of(HOVER, profile=PROFILE)
-
-
 def test_flight_too_short_for_take_off_and_landing_is_refused(tmp_path: Path) -> None:
     image = tmp_path / "cf2.elf"
     image.write_bytes(b"")

@@ -44,11 +44,6 @@ def flight(yaw: Sequence[float], period_us: int = 10_000, **columns: Sequence[fl
     ).replace_schema_metadata(RELEASE)
 
 
-@pytest.mark.parametrize(("yaw", "error"), [(179.0, -1.0), (-179.0, 1.0), (180.0, 0.0), (90.0, -90.0)])
-def test_the_attitude_error_goes_the_short_way_round(yaw: float, error: float) -> None:
-    assert curves.ATTITUDE.read(flight([yaw]))[0] == pytest.approx([0.0, 0.0, error], abs=1e-9)
-
-
 def test_angles_have_their_own_names() -> None:
     rows = flight(
         [180.0],

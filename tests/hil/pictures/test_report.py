@@ -19,7 +19,6 @@ from firmware_py.wire.supervisor import State
 from ground_station.latency import STAGES
 from ground_station.telemetry_log import TELEMETRY
 from hil.config import load_config
-from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
 from hil.laboratory import ages
 from hil.laboratory.metrics import ALWAYS, METRICS, judge
@@ -307,26 +306,6 @@ def test_the_script_that_draws_is_uplot_as_npm_has_it() -> None:
         "script": "2d27e8ad3d228164525ce213f9dc716f39b4e3aee0cc773fb3491c96cf4921a2",
         "style": "df630c6a8d6f8eeaff264b50f73ce5b114f646ffd9a0bb74f049b0a00135fa04",
     }
-
-
-def test_without_a_log_there_is_no_report(tmp_path: Path) -> None:
-    with pytest.raises(LabError, match="expected a run folder"):
-        write_report(tmp_path)
-
-
-def test_what_never_happened_reads_never_and_holds_the_limit(folder: Path) -> None:
-    result = read_result(folder)
-    (verdict,) = judge({"controller_late_from": math.inf}, {"controller_late_from": 0.6}, {})
-    never = dataclasses.replace(
-        result, metrics={"controller_late_from": math.inf, "rms_x": math.nan}, verdicts=(verdict,)
-    )
-    write_result(never)
-    told = read_result(folder)
-    assert told.metrics["controller_late_from"] == math.inf
-    assert math.isnan(told.metrics["rms_x"])
-    (row,) = metric_rows(told)
-    assert (row.value, row.mark) == ("never", "ok")
-    assert str(told.verdicts[0]).startswith("controller_late_from = never")
 
 
 def test_a_metric_without_a_value_is_a_dash_and_fails(folder: Path) -> None:

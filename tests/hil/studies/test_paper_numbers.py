@@ -68,9 +68,18 @@ def test_the_representative_flight_has_the_median_error_and_a_lost_one_is_the_wo
     assert Trials("floaty", (lost,)).representative_first() == [lost]
 
 
-@pytest.mark.parametrize(("failsafe_s", "outcome"), [(0.0, "holds"), (0.01, "failsafe"), (2.0, "failsafe")])
-def test_a_row_of_failsafe_is_one_that_the_supervisor_opened(failsafe_s: float, outcome: str) -> None:
-    assert outcome_of(result(failsafe=failsafe_s)) == outcome
+@pytest.mark.parametrize(
+    ("flown", "outcome"),
+    [
+        (result(), "holds"), (result(passed=False), "degrades"), (result(failsafe=0.01), "failsafe"),
+        (result("reset"), "failsafe"), (result("lost", failsafe=1.0), "lost"), (result("error"), "error"),
+        (result("interrupted"), "error"),
+    ],
+)  # fmt: skip
+def test_a_flight_holds_degrades_is_opened_by_the_supervisor_lost_or_an_error(
+    flown: Any, outcome: str
+) -> None:
+    assert outcome_of(flown) == outcome
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.campaigns.jobs import Job, Row, fly_job
+from hil.campaigns.jobs import fly_job
 from hil.commands.app import main
 from hil.config import load_config
 from hil.laboratory.request import Options
@@ -26,11 +26,6 @@ from hil.studies.study import (
     outcome_of,
     summarise,
 )
-
-
-def flight(settings: tuple[str, ...], fault: str, seconds: float) -> Row:
-    options = Options(overrides=settings, duration_s=seconds, faults=(fault,) if fault else ())
-    return fly_job(Job(0, "hover", options, {}))
 
 
 @pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
@@ -70,26 +65,6 @@ def test_a_model_error_scales_the_constants_of_its_part_and_no_other() -> None:
     assert {name: ratio[name] for name in inputs} == pytest.approx(dict.fromkeys(inputs, 1.3))
     assert {ratio[name] for name in right if name not in inputs} == {1.0}
     assert request.config.plant == load_config().plant, "the world stays right"
-
-
-@pytest.mark.parametrize(
-    ("settings", "fault", "outcome"),
-    [
-        ((), "", "holds"),
-        (("tunnel.gust_scale=3",), "", "degrades"),
-        ((), "radio.cut@0.2:0.52", "failsafe"),
-        (("tunnel.speed=7",), "", "lost"),
-    ],
-)
-def test_outcomes_are_distinguished(settings: tuple[str, ...], fault: str, outcome: str) -> None:
-    result = flight(settings, fault, 2.0)
-    assert outcome_of(result) == outcome, result.metrics
-    assert outcome != "lost" or result.failed == ["lost"], "a loss leaves the other limits unjudged"
-
-
-def test_an_error_is_not_an_outcome_of_the_robot() -> None:
-    result = flight((), "", 0.1)
-    assert outcome_of(dataclasses.replace(result, outcome="error")) == "error"
 
 
 def unchanged(size: float) -> Options:
