@@ -3,7 +3,6 @@
 import json
 import math
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,17 +36,6 @@ def test_the_examples_of_the_page_work(monkeypatch: pytest.MonkeyPatch) -> None:
     late = json.loads(Path("later/result.json").read_text())
     assert late["faults"] == ["mocap.slow@0.5:3=0.02", "mocap.slow@2:1=0.05"]
     assert late["metrics"]["age_mean"] > 0.06
-
-
-def test_importing_the_package_loads_nothing_else() -> None:
-    check = "import hil, sys; sys.exit(any(name in sys.modules for name in ('numpy', 'pydantic', 'hil.api')))"
-    assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
-
-
-@pytest.mark.long
-def test_flying_loads_no_drawing_and_no_link() -> None:
-    check = "import hil, sys; hil.fly; sys.exit(any(name in sys.modules for name in ('matplotlib', 'cflib', 'rerun')))"
-    assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
 
 
 def test_every_name_of_the_package_is_there_and_no_other() -> None:

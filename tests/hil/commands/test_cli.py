@@ -349,8 +349,18 @@ def test_a_command_imports_no_other() -> None:
     assert shown.endswith("DESIGN False\n")
 
 
-def test_listing_the_studies_loads_neither_an_extra_nor_what_draws() -> None:
-    code = "import hil.studies.catalogue, sys; print(*{'scipy.optimize', 'control', 'matplotlib'} & {*sys.modules})"
+@pytest.mark.parametrize(
+    ("code", "late"),
+    [
+        ("import hil", "numpy pydantic hil.api"),
+        ("import hil.experiments", "matplotlib"),
+        ("import hil.studies.catalogue", "scipy.optimize control matplotlib"),
+        ("import hil.testing.plugin", "numpy hil.api hypothesis"),
+        pytest.param("import hil; hil.fly", "matplotlib cflib rerun", marks=pytest.mark.long),
+    ],
+)
+def test_a_module_loads_what_it_needs_alone(code: str, late: str) -> None:
+    code += f"; import sys; print(*{{*{late.split()}}} & {{*sys.modules}})"
     found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert found.stdout.strip() == ""
 

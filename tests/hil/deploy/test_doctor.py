@@ -98,10 +98,6 @@ def freeze(board: Board) -> None:
     board.noise = 0.0
 
 
-def shake(board: Board) -> None:
-    board.noise = 500.0
-
-
 def forget(board: Board) -> None:
     board.services = []
 
@@ -156,12 +152,6 @@ def test_a_board_without_samples_is_reported(cli: Cli, board: Board, monkeypatch
     monkeypatch.setattr("hil.deploy.doctor.LOOP_TIMEOUT_US", 50_000)
     assert cli("board", "doctor", URI) == 1
     assert findings(cli)["loop"].startswith("!carries 0 samples/s of 1000: ")
-
-
-def test_a_board_in_someones_hand_moves_and_is_well(cli: Cli, board: Board) -> None:
-    shake(board)
-    assert cli("board", "doctor", URI) == 0
-    assert findings(cli)["gyro"].startswith("alive; the board moves")
 
 
 def test_another_profile_on_board_is_reported(cli: Cli, board: Board) -> None:

@@ -118,24 +118,6 @@ def test_the_difference_is_the_second_less_the_first_at_the_same_time(runs: dict
     assert difference(a.log, b.log.slice(0, 0)) is None
 
 
-def test_a_turn_through_180_degrees_is_no_difference_of_360(runs: dict[str, Path]) -> None:
-    """The rows of the second are 5 ms later, so that its values are interpolated across the step."""
-    logs = []
-    for degrees, later_us in (([-179.95], 0), ([179.9, -179.9], 5_000)):
-        log = load_flown(runs["one"]).log
-        half, zero = np.radians(np.resize(degrees, log.num_rows)) / 2, np.zeros(log.num_rows)
-        columns = {"truth.qw": np.cos(half), "truth.qx": zero, "truth.qy": zero, "truth.qz": np.sin(half)}
-        for name, values in (
-            columns | {"goal.yaw": zero, "t": log.column("t").to_numpy() + later_us}
-        ).items():
-            place = log.column_names.index(name)
-            log = log.set_column(place, log.schema.field(place), pa.array(values))
-        logs.append(log)
-    plot = difference(*logs)
-    assert plot is not None
-    assert np.abs(plot.panels[1].series[2].values).max() < 0.2
-
-
 @pytest.mark.long
 def test_two_robots_are_compared_by_position_and_attitude(runs: dict[str, Path], tmp_path: Path) -> None:
     flaps = load_flown(runs["one"])
