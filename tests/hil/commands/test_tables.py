@@ -14,6 +14,7 @@ import pytest
 from hil.campaigns.jobs import Job, Row
 from hil.campaigns.run import Runner
 from hil.commands.compare import _print_seeds
+from hil.commands.options import exit_code
 from hil.commands.tables import SEED_COLUMNS, print_result, print_seeds
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import METRICS, Verdict
@@ -85,7 +86,9 @@ def test_a_table_into_a_closed_pipe_is_an_error_that_a_flight_handles(
 def test_a_held_limit_is_ok_and_a_missed_one_fails(flown: Result, capsys: pytest.CaptureFixture[str]) -> None:
     for holds, mark in ((True, "ok"), (False, "FAILS")):
         verdict = Verdict("rms_x", 0.01, 0.02, holds, "m", "max")
-        print_result(replace(flown, metrics=flown.metrics | {"rms_x": 0.01}, verdicts=(verdict,)))
+        judged = replace(flown, metrics=flown.metrics | {"rms_x": 0.01}, verdicts=(verdict,))
+        print_result(judged)
+        assert exit_code(judged) == (0 if holds else 1)
         (line,) = [line for line in capsys.readouterr().out.splitlines() if "rms_x" in line]
         assert [cell.strip() for cell in line.split("│")[-3:-1]] == ["<= 2 cm", mark]
 
