@@ -34,6 +34,10 @@ def crew() -> Iterator[Workers]:
     workers.close()
 
 
+def cluster(workers: int, threads: int = 1) -> LocalCluster:
+    return LocalCluster(workers, threads, dashboard_address=":0", silence_logs=50)
+
+
 def rows_of(crew: Workers, spec: Spec, fly_one: FlyOne) -> dict[int, Row]:
     plan = plan_of(spec)
     rows = list(crew.fly(map(plan.job, range(spec.flights)), lambda: 0, fly_one))
@@ -112,9 +116,7 @@ def test_workers_end_with_a_program_that_is_killed() -> None:
 
 def test_a_cluster_that_is_there_flies_the_same_dataset(tmp_path: Path) -> None:
     spec = spec_of(flights=20)
-    with LocalCluster(
-        n_workers=1, threads_per_worker=2, dashboard_address=":0", silence_logs=50
-    ) as there:  # fmt: skip
+    with cluster(1, 2) as there:
         crew = Workers(0, there.scheduler_address)
         flyer = partial(crew.fly, stopped=lambda: 0, fly_one=planted)
         dataset = Dataset(tmp_path / "cluster", plan_of(spec), False)
@@ -129,7 +131,7 @@ def test_a_flight_that_kills_the_cluster_s_worker_each_time_is_a_row(tmp_path: P
     spec = spec_of(flights=6, settings=[str(once)])
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 0}),
-        LocalCluster(n_workers=3, threads_per_worker=1, dashboard_address=":0", silence_logs=50) as there,
+        cluster(3) as there,
     ):
         crew = Workers(0, there.scheduler_address)
         rows = rows_of(crew, spec, killing)
@@ -142,9 +144,7 @@ def test_a_flight_that_kills_the_cluster_s_worker_each_time_is_a_row(tmp_path: P
 
 def test_a_cluster_that_loses_its_workers_or_itself_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     for loss in (lambda there: there.scale(0), lambda there: there.close()):
-        with LocalCluster(
-            n_workers=1, threads_per_worker=1, dashboard_address=":0", silence_logs=50
-        ) as there:  # fmt: skip
+        with cluster(1) as there:
             crew = Workers(0, there.scheduler_address)
             flights = crew.fly(map(plan_of(spec_of(flights=500)).job, range(500)), lambda: 0, planted)
             next(flights)

@@ -1,7 +1,6 @@
 """`floaty board doctor`: what is connected, in plain words, on the exported app."""
 
 import ctypes
-from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -94,30 +93,17 @@ def test_a_board_that_is_well_is_described_and_gets_its_own_gyro_back(cli: Cli, 
     assert board.closed == 1
 
 
-def freeze(board: Board) -> None:
-    board.noise = 0.0
-
-
-def forget(board: Board) -> None:
-    board.services = []
-
-
 @pytest.mark.parametrize(
-    ("ail", "subject", "said"),
+    ("state", "subject", "said"),
     [
-        (freeze, "gyro", "!dead or frozen: 60 times the same counts"),
-        (forget, "firmware", "!does not tell its version"),
+        ({"noise": 0.0}, "gyro", "!dead or frozen: 60 times the same counts"),
+        ({"services": []}, "firmware", "!does not tell its version"),
     ],
-)  # fmt: skip
+)
 def test_a_defect_is_marked_and_is_exit_code_one(
-    cli: Cli,
-    board: Board,
-    monkeypatch: pytest.MonkeyPatch,
-    ail: Callable[[Board], None],
-    subject: str,
-    said: str,
+    cli: Cli, board: Board, monkeypatch: pytest.MonkeyPatch, state: dict[str, Any], subject: str, said: str
 ) -> None:
-    ail(board)
+    vars(board).update(state)
     monkeypatch.setattr("hil.deploy.doctor.VERSION_TIMEOUT_S", 0.02)
     assert cli("board", "doctor", URI) == 1
     found = findings(cli)

@@ -111,28 +111,26 @@ def keep(chosen: Callable[[int], NDArray[np.bool_]]) -> Change:
     return lambda columns: {name: values[chosen(len(values))] for name, values in columns.items()}
 
 
-def assert_true(found: Identification) -> None:
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("seed", "kept"),
+    [
+        (1, lambda n: np.ones(n, bool)),
+        (2, lambda n: np.random.default_rng(3).random(n) > 0.2),
+        (4, lambda n: np.arange(n) % 2 == 0),
+    ],
+    ids=["all rows", "a fifth lost", "another rate"],
+)
+def test_a_planted_robot_is_found_in_coloured_gusts(
+    tmp_path: Path, seed: int, kept: Callable[[int], NDArray[np.bool_]]
+) -> None:
+    found = identified(tmp_path, flight(seed), keep(kept))
     for name in ("pitch_u2", "pitch_rate", "pitch_pitch", "lag"):
         constant = found.constant(name)
         value, half = constant.joint
         assert constant.verdict == IDENTIFIED, (name, constant.why)
         assert abs(value - PITCH[name]) <= 1.5 * half, name
         assert value == pytest.approx(PITCH[name], rel=0.10), name
-
-
-@pytest.mark.long
-def test_a_planted_robot_is_found_in_coloured_gusts(tmp_path: Path) -> None:
-    assert_true(identified(tmp_path, flight(1)))
-
-
-@pytest.mark.long
-def test_a_fifth_of_the_rows_may_be_lost(tmp_path: Path) -> None:
-    assert_true(identified(tmp_path, flight(2), keep(lambda n: np.random.default_rng(3).random(n) > 0.2)))
-
-
-@pytest.mark.long
-def test_another_sample_rate_does_no_harm(tmp_path: Path) -> None:
-    assert_true(identified(tmp_path, flight(4), keep(lambda n: np.arange(n) % 2 == 0)))
 
 
 @pytest.mark.parametrize(

@@ -108,16 +108,3 @@ def test_shipped_laws_hover_within_limits_and_alike_on_every_board(tmp_path: Pat
     ]
     assert [result.passed for result in results] == [True] * 3
     assert len({result.hash for result in results}) == 1
-
-
-@pytest.mark.long
-def test_the_laws_that_ship_take_off(tmp_path: Path) -> None:
-    for profile in ("original", "lqr"):
-        result = hover(tmp_path / profile, profile=profile, duration_s=2.0)
-        assert result.passed, result.verdicts
-        assert (
-            result.hash
-            != hover(
-                tmp_path / "usual", profile="as-flown" if profile == "original" else "floaty", duration_s=2.0
-            ).hash
-        )

@@ -16,6 +16,7 @@ from hil.laboratory.run import fly
 from hil.live import feed
 from hil.live.feed import Feed, LiveView
 from hil.world.body import Channel, Quantity
+from support.watching import Watcher
 
 # Pictures that do not behave, in place of `hil.live.picture`; what they do is their whole program.
 STALLS = "print('ready', flush=True); import signal; signal.pause()"
@@ -162,34 +163,18 @@ def test_a_full_feed_drops_the_oldest_and_never_waits() -> None:
     assert seen == [0, 6, 7, 8]
 
 
-class Seen:
-    """An onlooker."""
-
-    def __init__(self) -> None:
-        self.times: list[int] = []
-        self.sizes: list[int] = []
-        self.texts: list[tuple[int, str, str]] = []
-
-    def rows(self, batch: pa.RecordBatch) -> None:
-        self.times += batch.column("t").to_pylist()
-        self.sizes.append(batch.num_rows)
-
-    def note(self, t_us: int, source: str, text: str) -> None:
-        self.texts.append((t_us, source, text))
-
-
 @pytest.mark.parametrize("kept", [True, False])
 def test_a_viewer_gets_every_row_once_five_times_a_second(kept: bool, tmp_path: Path) -> None:
-    seen, value = Seen(), [0.0]
+    seen, value = Watcher(), [0.0]
     channel = Channel("float64", lambda: value, (Quantity(("x",), "m"),))
     recorder = Recorder(tmp_path if kept else None, (channel,), {}, seen)
     for row in range(250):
         recorder.row(10_000 * row)
     recorder.note(2_500_000, "lab", "over")
     recorder.close()
-    assert seen.times == [10_000 * row for row in range(250)]
-    assert max(seen.sizes) == 20
-    assert seen.texts == [(2_500_000, "lab", "over")]
+    assert pa.Table.from_batches(seen.batches)["t"].to_pylist() == [10_000 * row for row in range(250)]
+    assert max(batch.num_rows for batch in seen.batches) == 20
+    assert seen.notes == [(2_500_000, "lab", "over")]
     assert bool(list(tmp_path.iterdir())) is kept
 
 

@@ -2,7 +2,6 @@
 
 import csv
 import math
-import sys
 from itertools import islice
 from pathlib import Path
 
@@ -13,12 +12,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hil.commands import app
 from hil.config import load_config
 from hil.design.authority import pressure_at, wrenches
 from hil.floaty.plant import Plant
 from hil.studies.drag_model import ANGLES_DEG, QUANTITIES, ROWS, SWEEPS, measure
 from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
+from support.command import Cli
 
 AZIMUTHS = np.radians((-45.0, 45.0, 135.0, -135.0))  # of the flap axes, outwards
 AXES = np.array([0.0, 0.0, 0.07])  # above the centre of mass
@@ -98,11 +97,8 @@ def test_the_sweeps_are_the_papers() -> None:
 
 
 @pytest.mark.long
-def test_the_command_writes_table_figures_and_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["floaty", "drag-model", "--out", str(tmp_path / "out")])
-    with pytest.raises(SystemExit) as end:
-        app.main()
-    assert end.value.code == 0
+def test_the_command_writes_table_figures_and_page(cli: Cli, tmp_path: Path) -> None:
+    assert cli("drag-model", "--out", tmp_path / "out") == 0
     with (tmp_path / "out" / "drag_model.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == ROWS == 4 * len(ANGLES_DEG)

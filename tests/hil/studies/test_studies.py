@@ -2,13 +2,11 @@
 
 import dataclasses
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
 from hil.campaigns.jobs import fly_job
-from hil.commands.app import main
 from hil.config import load_config
 from hil.laboratory.request import Options
 from hil.pictures.drawing import png
@@ -26,6 +24,7 @@ from hil.studies.study import (
     outcome_of,
     summarise,
 )
+from support.command import Cli
 
 
 @pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
@@ -136,20 +135,10 @@ def test_a_study_that_was_cut_short_has_a_picture_and_does_not_hold() -> None:
 
 
 @pytest.mark.long
-def test_a_study_can_be_flown_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(
-        sys, "argv", ["floaty", "study", "loss", "--seeds", "1", "--out", str(tmp_path / "out")]
-    )
-    with pytest.raises(SystemExit) as left:
-        main()
-    assert left.value.code == 0
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "campaigns",
-        "report.html",
-        "result.json",
-        "studies.html",
-        "study-loss.png",
-    }
+def test_a_study_can_be_flown_alone(cli: Cli, tmp_path: Path) -> None:
+    assert cli("study", "loss", "--seeds", "1", "--out", tmp_path / "out") == 0
+    names = "campaigns report.html result.json studies.html study-loss.png"
+    assert " ".join(sorted(path.name for path in (tmp_path / "out").iterdir())) == names
     (told,) = json.loads((tmp_path / "out" / "result.json").read_text())["studies"]
     assert told["as_expected"] is True
     assert [len(variant["cells"]) for variant in told["variants"]] == [7, 7]
