@@ -17,6 +17,7 @@ from firmware_py.core import structs
 from firmware_py.core_runner import CoreBlocks, CoreRunner, NativeRunner, RunnerFactory, default_runner
 from firmware_py.export.c99 import translate
 from firmware_py.logic.plugs import CALLS
+from hil.commands.deploy import _print_sum
 from hil.deploy.check import Checked, check_flight, plan, reached
 from hil.devices.board_firmware import PythonBoard
 from hil.experiments import EXPERIMENTS
@@ -96,7 +97,7 @@ def test_a_differing_target_is_found() -> None:
     assert found.differences[0].values == (0, 1)
 
 
-def test_a_target_that_has_differed_does_not_hide_the_others() -> None:
+def test_a_target_that_has_differed_does_not_hide_the_others(capsys: pytest.CaptureFixture[str]) -> None:
     def factories(stack: ExitStack) -> dict[str, RunnerFactory]:
         def spoil(blocks: CoreBlocks) -> None:
             blocks.control.fields.count[0] += 1
@@ -111,6 +112,8 @@ def test_a_target_that_has_differed_does_not_hide_the_others() -> None:
     assert [target.ticks for target in checked.targets] == [20, 150]
     assert not checked.equal
     assert checked.targets[1].divergence is None
+    _print_sum([checked, checked], True)
+    assert capsys.readouterr().out.startswith("40 ticks, c beside spoilt, python: spoilt DIFFERS\n")
 
 
 def test_default_flights_are_ten_thousand_ticks_with_every_fault_in_time() -> None:

@@ -1,6 +1,7 @@
 """Gains, profiles and optimised shapes: what is promised holds, and what is written flies."""
 
 import math
+import tomllib
 from functools import cache
 from pathlib import Path
 
@@ -86,6 +87,13 @@ def test_a_written_profile_is_the_robot_that_was_written(name: str, tmp_path: Pa
     assert coefficient_of(again) == pytest.approx(coefficient_of(CONFIG), rel=1e-9), "the same plates"
     assert again.model.model_dump() == pytest.approx(shipped.model.model_dump(), rel=1e-3)
     assert again.controller.model_dump() == pytest.approx(shipped.controller.model_dump(), rel=0.02, abs=1e-3)
+
+
+@pytest.mark.parametrize(("length", "radius"), [(0.5, None), (1.0, None), (2.0, 0.9)])
+def test_the_tunnel_grows_with_a_robot_and_never_shrinks(length: float, radius: float | None) -> None:
+    written = tomllib.loads(profile_text(PAPER, {}, "about", length))
+    assert written["tunnel"] == {"speed": PAPER.speed} | ({"profile_radius": radius} if radius else {})
+    assert (written["allocation"]["opening_min"], written["allocation"]["opening_max"]) == (0.0, 0.9)
 
 
 def test_the_flat_robot_falls_over_in_the_time_of_its_pole() -> None:

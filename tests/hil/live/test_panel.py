@@ -5,6 +5,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from tornado.httpclient import HTTPClientError, HTTPRequest
@@ -15,7 +16,7 @@ from hil.experiments import EXPERIMENTS
 from hil.laboratory.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
-from hil.live.panel import COMMANDS, LINE_MOST, PanelScreen
+from hil.live.panel import COMMANDS, LINE_MOST, ROWS_MOST, TEXTS_MOST, PanelScreen, _Socket
 
 
 @pytest.fixture
@@ -93,6 +94,16 @@ def test_lines_reach_the_flight_and_bad_ones_fail(panel: PanelScreen, loop: IOLo
     assert receive(loop, socket)["values"] == {"extCtrl.y_P": 1.6}
     assert typed == ["mark one", "mark two"]
     socket.close()
+
+
+def test_a_page_that_reads_slowly_gets_the_newest_rows_and_texts_and_all_values() -> None:
+    page = SimpleNamespace(_late={}, _sending=True)
+    for n in range(ROWS_MOST + 10):
+        _Socket.tell(page, {"curves": [[n]], "texts": [f"{n}"], "values": {f"{n % 60}": n}, "state": n})  # type: ignore[arg-type]
+    late, last = page._late, ROWS_MOST + 9
+    assert (late["curves"], late["state"]) == ([[n] for n in range(10, ROWS_MOST + 10)], last)
+    assert late["texts"] == [f"{n}" for n in range(last - TEXTS_MOST + 1, last + 1)]
+    assert sorted(late["values"].values()) == list(range(last - 59, last + 1))
 
 
 def test_a_page_shows_only_the_newest_row(panel: PanelScreen, loop: IOLoop, tmp_path: Path) -> None:

@@ -15,9 +15,10 @@ from hil.laboratory.recorder import load_log, stored_in
 from hil.laboratory.request import Request
 from hil.laboratory.result import read_result
 from hil.laboratory.run import fly
-from hil.pictures.curves import since_release
+from hil.pictures.curves import BLUE, since_release
 from hil.pictures.figures import course_of, goal_moves
 from hil.pictures.panels import saturated
+from hil.pictures.path import FlownPath, path_of
 from hil.pictures.story import _before, _rotors, evidence, failures_of, story_of
 
 
@@ -137,6 +138,14 @@ def test_the_course_is_the_flight_from_the_first_goal_red_while_a_fault_is_in_fo
     times = since_release(free)
     within = ((times >= 0.5) & (times <= 0.9)) | (times >= 1.2)
     assert (course.troubled == within).mean() > 0.98
+
+
+def test_a_path_begins_with_a_ring_and_ends_with_a_dot() -> None:
+    places = np.array([(0.0, 0.0, 0.0), (8.0, 4.0, 0.0), (5.0, 5.0, 5.0)])
+    still = path_of(FlownPath(places, np.zeros((3, 3)), np.zeros(3, bool), 10.0))
+    ends = re.findall(r'<circle cx="(-?[\d.]+)" cy="(-?[\d.]+)"[^>]* fill="([^"]+)"', still.content.decode())
+    assert ends[2::2] == [("0.0", "0.0", "white")] * 2, "from above and from the side"
+    assert ends[3::2] == [(f"{50 / 1.1:.1f}", f"{-50 / 1.1:.1f}", BLUE)] * 2
 
 
 def rotors(count: int, *given_mN: float) -> pa.Table:

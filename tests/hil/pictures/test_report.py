@@ -149,19 +149,18 @@ def test_the_report_tells_where_the_flight_comes_from(folder: Path) -> None:
 
 
 @pytest.mark.usefixtures("few_pictures")
-def test_a_failed_limit_comes_first(folder: Path) -> None:
-    change_result(
-        folder,
-        passed=False,
-        outcome="lost",
-        cause="fell",
-        verdicts=[
-            {"metric": "max_z", "value": 0.5, "bound": 0.1, "holds": False, "unit": "m", "sense": "max"}
-        ],
-    )
-    first = report(folder).tables["metrics"][1]
+def test_a_failed_limit_comes_first_and_its_instant_is_shown_close_up(folder: Path) -> None:
+    log = load_log(folder)
+    place, z = log.column_names.index("truth.z"), log.column("truth.z").to_numpy().copy()
+    z[150:] += 0.5  # 0.5 s after the release
+    pq.write_table(log.set_column(place, log.schema.field(place), pa.array(z)), folder / "log.parquet")
+    failed = {"value": 0.5, "bound": 0.1, "holds": False, "unit": "m", "sense": "max"}
+    verdicts = [failed | {"metric": name} for name in ("max_z", "rise")]
+    change_result(folder, passed=False, verdicts=verdicts)
+    page = report(folder)
+    first = page.tables["metrics"][1]
     assert first[:1] + first[2:5] == ["max_z", "cm", "≤ 10", "fails"]
-    assert "lost: fell" in (folder / "report.html").read_text(encoding="utf-8")
+    assert page.plots["close-up-1"]["window"] == pytest.approx([-1.5, 1.5], abs=2e-3)
 
 
 @pytest.mark.long

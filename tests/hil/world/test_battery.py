@@ -3,12 +3,14 @@
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad, solve_ivp
 
-from hil.experiments.power import VEHICLES
+from hil.config import load_config
+from hil.experiments.power import VEHICLES, estimate, until_empty
 from hil.floaty.plant import Plant
 from hil.laboratory.metrics import column, free_flight
 from hil.laboratory.recorder import load_events, load_log
@@ -104,6 +106,19 @@ def test_the_log_holds_the_power_of_the_flaps_that_moved(tmp_path: Path) -> None
     spent = (column(log, "battery.charge")[0] - column(log, "battery.charge")[-1]) * CONFIG.capacity
     current = column(log, "battery.power")[1:] / (2 * column(log, "battery.voltage")[1:])
     assert spent == pytest.approx(current.sum() * 0.01, rel=1e-3)
+
+
+@pytest.mark.parametrize(("state", "minutes"), [(3, 2.0), (2, np.nan)])
+def test_power_is_per_mass_of_the_flown_robot_and_endurance_ends_with_the_failsafe(
+    state: int, minutes: float
+) -> None:
+    config = load_config(overrides=["plant.mass_factor=1.25", "battery.capacity=100"])
+    columns = {"t": [1_000_000, 121_000_000], "battery.power": [3.0, 4.0], "supervisor.state": [2, state]}
+    flight = pa.table(columns).replace_schema_metadata({"config": config.model_dump_json()})
+    expected = {"power": 3.5, "specific_power": 3.5 / (1.25 * 0.34), "endurance": minutes}
+    assert until_empty(flight) == pytest.approx(expected, nan_ok=True)
+    empty_min = endurance(BatteryConfig(capacity=100), 3.5, 3.2) / 60
+    assert estimate(flight) == pytest.approx(expected | {"endurance": empty_min})
 
 
 @pytest.mark.long
