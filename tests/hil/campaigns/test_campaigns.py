@@ -17,6 +17,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
+from rich.console import Console
 from scipy.stats import binomtest
 
 from hil.campaigns.config import Spec
@@ -24,9 +25,10 @@ from hil.campaigns.dataset import ARRIVING, FLIGHTS, Dataset
 from hil.campaigns.findings import Findings, find
 from hil.campaigns.jobs import Job, Row, fly_job
 from hil.campaigns.report import write_report
-from hil.campaigns.run import Flyer, Standing, conduct, interval
+from hil.campaigns.run import Flyer, Runner, Standing, conduct, interval
 from hil.campaigns.sampling import draw, plan_of
 from hil.errors import LabError
+from hil.laboratory.request import Options
 from support.browser import BROWSER, browser
 from support.campaigns import BAD_PUSH, planted, spec_of
 from support.full_disk import small_files
@@ -38,7 +40,7 @@ def nothing(standing: Standing) -> None:
 
 
 def flown_into(folder: Path, spec: Spec, flyer: Flyer, resume: bool = False) -> Standing:
-    return conduct(Dataset(folder, plan_of(spec), resume), flyer, nothing)
+    return conduct(Dataset(folder, plan_of(spec), resume, replace=resume), flyer, nothing)
 
 
 def workers(count: int, asked: list[int] | None = None) -> Flyer:
@@ -96,6 +98,18 @@ def test_a_campaign_that_was_interrupted_flies_the_rest_and_nothing_twice(tmp_pa
     assert sorted(asked) == list(range(40))
     flown_into(tmp_path / "straight", spec, workers(1))
     assert bytes_of(tmp_path / "out") == bytes_of(tmp_path / "straight")
+
+
+@pytest.mark.parametrize("stops", [[], [signal.SIGINT]])
+def test_an_interrupted_runner_has_no_rows_to_go_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stops: list[int]
+) -> None:
+    runner = Runner(Console())
+    monkeypatch.setattr(
+        runner, "fly", lambda name, jobs, out: runner._stops.extend(stops) or [*map(planted, jobs)]
+    )
+    flown = runner.log("x", {"a": ("hover", Options(seed=3, faults=()))}, tmp_path)
+    assert [(row.seed, row.folder) for row in flown] == ([] if stops else [(3, tmp_path / "a")])
 
 
 def limited(flyer: Flyer, count: int) -> Flyer:

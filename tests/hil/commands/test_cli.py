@@ -79,6 +79,7 @@ UDP = ("--link", "udp://127.0.0.1:1")
         (["station", *UDP, "--out", "a", "--log", "b"], "--log b: --out a has a telemetry.csv"),
         (["param", "list", "--link", "usb://1"], "usb://1: expected radio://"),
         (["fly", "hover", "--seeds", "2", "--perfetto"], "--seeds 2"),
+        (["fly", "hover", "--resume"], "--workers, --cluster and --resume are for several --seeds"),
         (["fly", "hover", "--gdb", "3333"], "--gdb 3333: needs one flight with an image as --board"),
         (["serve", "--gdb", "3333"], "--gdb 3333: needs one board and an image as --board"),
         (["fly", "hover", "--bogus"], "No such option"),

@@ -236,6 +236,10 @@ def test_a_written_profile_has_what_was_identified_and_holds_the_mean_inputs_by_
     assert after.model.flap_rate == pytest.approx(1 / 0.045, rel=0.1)
     assert after.model.roll_u1 == before.model.roll_u1
     assert "± " in path.read_text()
+    estimate = found.estimate
+    for (name, value), variance in zip(estimate.values.items(), np.diag(estimate.covariance), strict=True):
+        curved = 0.0 if name == "delay" else 0.03 * abs(value)
+        assert estimate.errors[name] == pytest.approx(1.96 * np.hypot(np.sqrt(variance), curved)), name
     known = json.loads(path.with_suffix(".json").read_text())
     spread = np.sqrt(np.diag(known["covariance"]))
     assert 1.96 * spread == pytest.approx(np.array([*known["half_widths"].values()]), rel=1e-6)

@@ -66,6 +66,19 @@ def test_an_estimate_that_is_not_finite_fails_the_flight_and_is_reported(
     assert text in str(result.cause)
 
 
+def test_an_estimate_that_is_not_finite_again_after_a_reset_is_reported_again() -> None:
+    flight = lockstep_flight(Request.of(HOVER, duration_s=0.1, overrides=["flight.release_us=2500000"]))
+    for number in range(2):
+        for at_us, act in (
+            (1_200_000, lambda _: flight.robot.firmware._core.estimator.fields.x.fill(np.nan)),
+            (1_300_000, lambda _: flight.robot.board.reset()),
+        ):
+            flight.events.at(at_us + 1_000_000 * number, act)
+    flight.run()
+    told = [text[:42] for _, text in flight._early if "NaN" in text]
+    assert told == [f"the estimate was NaN or infinite at {number}.21 s" for number in (1, 2)]
+
+
 def test_flight_makes_no_garbage_that_only_the_collector_frees() -> None:
     for duration_s in (0.1, 2.0):  # the first one leaves what is made once per process
         flight = lockstep_flight(Request.of(HOVER, duration_s=duration_s))

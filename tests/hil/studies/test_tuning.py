@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hil.campaigns.jobs import Job, Row
+from hil.commands.identify import _edges
 from hil.config import load_config
 from hil.design.axes import DELAY, ROLL, gains_in, robot_of
 from hil.design.loop import FREQUENCIES, Timing, build
@@ -64,6 +65,11 @@ def test_an_axis_is_judged_by_old_and_new_gains_for_its_robot_and_by_the_worst_o
     assert (one.old_margins, one.margins, one.least) == (margins(loops[0], old), each[0], worst(each))
     assert (one.old_motion, one.motion) == tuple(motion(loops[0], task, gains) for gains in (old, new))
     assert (one.old.tolist(), one.new.tolist()) == (old.tolist(), new.tolist())
+    tuned: Any = SimpleNamespace(tuned=SimpleNamespace(axes=(one,), robots=SimpleNamespace(drawn=robots[1:])))
+    shown = {column.header: [*column.cells] for column in _edges(tuned).columns}
+    assert shown["late poses"] == ["", *(f"{1e3 * one:.0f} ms" for one in late)]
+    delays = [found.delay for found in (one.old_margins, one.margins, one.least)]
+    assert shown["delay"] == [f"{1e3 * delay:.0f} ms" for delay in delays]
 
 
 def hovered(rms_m: float, outcome: str = "completed") -> Row:
