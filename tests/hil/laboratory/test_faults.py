@@ -23,7 +23,7 @@ from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, Experiment
 from hil.floaty.plant import Plant
 from hil.laboratory.fault_kinds import KINDS, MARKERS_ON, Kind
-from hil.laboratory.faults import SWITCHED_ON, Fault, check, parse, spans_of, switched_on
+from hil.laboratory.faults import SWITCHED_ON, Fault, check, parse, spans_of, switched_on, why_not
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_events, load_log
@@ -462,6 +462,41 @@ def test_an_experiments_faults_that_do_not_concern_the_flight_are_left_out(tmp_p
     fly(Request.of(experiment, duration_s=1.0, faults=[parse("push.y@0.5")]), tmp_path / "run")
     begun = [event["text"] for event in load_events(tmp_path / "run") if event["text"].startswith("fault")]
     assert begun[::2] == ["fault push.x@0.2=0.1 begins", "fault push.y@0.5=2 begins"]
+
+
+@pytest.mark.parametrize("link", [RADIO, MAVLINK])
+def test_faults_that_together_leave_a_knobs_range_stop_at_its_end_and_give_it_back(link: str) -> None:
+    """Every kind three times at once, at its largest and at its smallest: the flight goes on, and ends as it began."""
+    flight = lockstep_flight(Request.of(HOVER, overrides=[MARKERS_ON], duration_s=1.0, link=link))
+    kinds = {
+        name: kind for name, kind in KINDS.items() if not why_not(kind, flight.robot.links, flight.config)
+    }
+    knobs = [knob for kind in kinds.values() for knob in kind.knobs]
+    before = [knob.read(flight.robot) for knob in knobs]
+    robot, board = flight.robot, flight.switchboard
+    for name, kind in kinds.items():
+        for size in {kind.low, kind.high}:
+            faults = [Fault(name, number, 1.0, size) for number in range(3)]
+            for fault in faults:
+                board.begin(fault, flight.now_us)
+            robot.look(flight.now_us)
+            assert np.isfinite([knob.read(robot) for knob in kind.knobs if name != "imu.saturation"]).all()
+            for fault in faults:
+                board.end(fault, flight.now_us)
+    assert [knob.read(robot) for knob in knobs] == before
+    assert board.active == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "most"),
+    [("wind.fan", 2.0, 2.0), ("wind.gusts", 5.0, 5.0), ("imu.noise", 1000.0, 1000.0), ("cpu.load", 1.0, 1.0)],
+)
+def test_two_faults_of_the_largest_size_are_one_of_that_size(kind: str, size: float, most: float) -> None:
+    flight = lockstep_flight(Request.of(HOVER, duration_s=1.0))
+    (knob,) = KINDS[kind].knobs
+    for start_s in (0.0, 1.0):
+        flight.switchboard.begin(Fault(kind, start_s, 1.0, size), flight.now_us)
+        assert knob.read(flight.robot) == most
 
 
 # What becomes of the hover

@@ -1,6 +1,6 @@
 """The errors that metrics are made of are those that the board flies on; metrics count from the release to the end."""
 
-from math import pi
+from math import pi, radians
 
 import numpy as np
 import pyarrow as pa
@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_py.geometry import from_euler_zyx, in_goal_frame, to_euler_zyx
+from firmware_py.geometry import from_euler_zyx, in_goal_frame, to_euler_zyx, yaw_quaternion
+from hil.experiments import measures
 from hil.laboratory.metrics import (
     ALWAYS,
     METRICS,
@@ -112,3 +113,57 @@ def test_a_profile_s_limits_replace_those_of_the_experiment_and_of_every_flight(
 
 def test_what_never_happens_is_shown_as_never() -> None:
     assert (show(np.inf, "s"), show(0.123, "m"), show(-np.inf, "")) == ("never", "12.3 cm", "-inf")
+
+
+ROWS = 400
+TIMES = 10_000 * np.arange(ROWS)
+
+
+def turned(yaw: np.ndarray, goal: np.ndarray) -> pa.Table:
+    """Rows of a flight at home that looks along `yaw`, wanted is `goal` [rad]."""
+    q = np.array([yaw_quaternion(angle) for angle in yaw.tolist()])
+    zero = np.zeros(len(yaw))
+    columns = {
+        "t": TIMES[: len(yaw)],
+        "flight.free": zero + 1,
+        "goal.yaw": goal,
+        "supervisor.state": zero + 2,
+    }
+    columns |= {f"truth.q{part}": q[:, index] for index, part in enumerate("wxyz")}
+    columns |= dict.fromkeys(("truth.x", "truth.y", "truth.z", "goal.x", "goal.y", "goal.z", "truth.r"), zero)
+    columns |= {f"estimate.{name}": zero for name in ("x", "y", "z", "p", "q", "r")}
+    columns |= dict.fromkeys(("estimator.refused", "estimator.too_old", "estimator.invalid"), zero)
+    return pa.table(columns | {"estimator.pose_age_us": zero + 40_000})
+
+
+@pytest.mark.parametrize("facing", [0.0, 180.0, -180.0, 179.0, -179.0, 540.0])
+@pytest.mark.parametrize("first", [0.01, -0.01])
+def test_metrics_are_the_same_when_yaw_crosses_180_degrees(facing: float, first: float) -> None:
+    goal = np.full(ROWS, radians(facing))
+    error = first + 0.05 * np.sin(2 * pi * 0.5 * 1e-6 * TIMES)
+    flight = turned(goal + error, goal)
+    assert attitude_error(flight)[:, 2] == pytest.approx(error, abs=1e-9)
+    assert measure(flight, lost=False)["attitude_max"] == pytest.approx(np.abs(error).max())
+    yaw, wanted = measures.yaw_and_goal(flight)
+    assert yaw - wanted == pytest.approx(error, abs=1e-9)
+    assert measures.yaw_sine(0.5, flight)["rms_yaw"] == pytest.approx(np.sqrt((error**2).mean()))
+
+
+@pytest.mark.parametrize("facing", [0.0, 100.0, 180.0, -100.0])
+def test_a_step_across_180_degrees_settles_where_one_elsewhere_does(facing: float) -> None:
+    seconds = 1e-6 * TIMES
+    since = np.maximum(seconds - 1.0, 0.0)
+    goal = radians(facing) + radians(110.0) * (seconds >= 1.0)
+    yaw = radians(facing) + radians(110.0) * (1 - np.exp(-since / 0.2))
+    found = measures.yaw_step(turned(yaw, goal))
+    first_within = np.flatnonzero(since >= -0.2 * np.log(0.05))[0]
+    assert found["settle"] == pytest.approx(seconds[first_within] - 1.0)
+    assert found["overshoot"] == 0.0
+
+
+def test_a_step_settles_at_the_first_row_from_which_it_stays_within_5_percent() -> None:
+    times, goal = np.arange(6.0), np.array([0.0, 1, 1, 1, 1, 1])
+    ((rise_s, settle_s, overshoot),) = measures.steps(times, np.array([0, 0.5, 1.2, 0.94, 0.96, 1.0]), goal)
+    assert (rise_s, settle_s, overshoot) == (1.0, 3.0, pytest.approx(0.2))
+    ((_, never_s, _),) = measures.steps(times, np.array([0, 0.5, 1.2, 0.94, 0.96, 0.9]), goal)
+    assert np.isnan(never_s)
