@@ -171,6 +171,22 @@ def test_a_trial_shows_the_true_value_beside_its_target_and_the_mean_opening_eac
         assert [one[7] for one in curve.read(rows)] == pytest.approx(shown)
 
 
+def test_pictures_of_batteries_and_take_offs_show_the_columns_of_their_labels() -> None:
+    columns = {
+        f"battery.{name}": [value] * 200
+        for name, value in (("voltage", 3.9), ("power", 3.4), ("charge", 0.7))
+    }
+    columns |= {
+        name: [value] * 200 for name, value in (("truth.z", 0.549), ("truth.vz", 0.3), ("flow.z", 9.0))
+    }
+    rows = flight([0.0] * 200, **columns, **{"goal.z": [1.049] * 200})
+    for draw, expected in (
+        (trials.discharge, [[3.9], [3.4, 3.4], [70.0]]), (trials.take_off_and_landing, [[50.0, 100.0], [30.0], [9.0], []]),
+    ):  # fmt: skip
+        shown = [[line.values[0] for line in panel.series] for panel in draw(rows).panels]
+        assert shown == [pytest.approx(values) for values in expected]
+
+
 def test_logs_differ_first_where_they_do_a_gap_equals_a_gap_and_a_longer_one_goes_on() -> None:
     a = flight([0.0] * 5, **{"truth.x": [0.0, nan, 1.0, 2.0, 3.0], "truth.y": [0.0, 0, 0, 0, 1]})
     b = flight([0.0] * 5, **{"truth.x": [0.0, nan, 1.0, 2.0, 4.0], "truth.y": [0.0, 0, 0, 9, 1]})

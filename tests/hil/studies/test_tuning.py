@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hil.campaigns.jobs import Job, Row
-from hil.commands.identify import _edges
+from hil.commands.identify import _edges, _gains, _motion
 from hil.config import load_config
 from hil.design.axes import DELAY, ROLL, gains_in, robot_of
 from hil.design.loop import FREQUENCIES, Timing, build
@@ -65,8 +65,16 @@ def test_an_axis_is_judged_by_old_and_new_gains_for_its_robot_and_by_the_worst_o
     assert (one.old_margins, one.margins, one.least) == (margins(loops[0], old), each[0], worst(each))
     assert (one.old_motion, one.motion) == tuple(motion(loops[0], task, gains) for gains in (old, new))
     assert (one.old.tolist(), one.new.tolist()) == (old.tolist(), new.tolist())
-    tuned: Any = SimpleNamespace(tuned=SimpleNamespace(axes=(one,), robots=SimpleNamespace(drawn=robots[1:])))
-    shown = {column.header: [*column.cells] for column in _edges(tuned).columns}
+    tuned: Any = SimpleNamespace(axes=(one,), robots=SimpleNamespace(drawn=robots[1:]), before=hovered(0.02))
+    flown = hovered(0.03), hovered(0.05, "lost"), hovered(0.04)
+    tables = [table(Round(tuned, flown, "given", Path("tuned"))) for table in (_gains, _motion, _edges)]
+    gains, moved, shown = ({one.header: [*one.cells] for one in table.columns} for table in tables)
+    assert [gains[f"gains, {name}"][0][-20:] for name in ("old", "new")] == [
+        ", ".join(f"{gain:.4g}" for gain in own)[-20:] for own in (old, new)
+    ]
+    predicted = [f"{100 * found.main:.2f} cm" for found in (one.old_motion, one.motion)]
+    cells = [predicted[0], "1.20 cm", predicted[1], "1.80 cm", "lost, 2.40 cm"]
+    assert [*moved.values()][1:] == [[cell] for cell in cells], "of y"
     assert shown["late poses"] == ["", *(f"{1e3 * one:.0f} ms" for one in late)]
     delays = [found.delay for found in (one.old_margins, one.margins, one.least)]
     assert shown["delay"] == [f"{1e3 * delay:.0f} ms" for delay in delays]
