@@ -70,8 +70,13 @@ PUSH = HOVER + '[[faults]]\nkind = "push.y"\n'
             HOVER + 'sampling = "morris"\nstop = "failure rate known to ±1 %"\n[table]',
             "needs all its flights",
         ),
-        (HOVER.replace('"]', '", "hovver"]'), "experiment 'hovver': unknown; did you mean hover?"),
-        (HOVER + 'profiles = ["floaty", "flaoty"]', "did you mean floaty?"),
+        (HOVER.replace("hover", "hovver"), "experiment 'hovver': unknown; did you mean hover?"),
+        (PUSH.replace('"]', '", "yaw-step"]') + "start_s = 20", "push.y@20=2: the flight ends 5 s after"),
+        (HOVER + 'profiles = ["flaoty"]', "did you mean floaty?"),
+        (
+            HOVER + 'profiles = ["floaty", "crazyflie"]',
+            "profile crazyflie: its robot flies with the Crazyflie's",
+        ),
         (HOVER + 'board = "cf2.elf"', "cf2.elf: no such file; expected c, python"),
     ],
 )

@@ -75,14 +75,14 @@ def test_a_board_that_closes_its_loop_earlier_differs_by_its_boot_time(flown: Pa
 def test_another_gyro_zero_is_measured_before_the_flights_part(flown: Path, tmp_path: Path) -> None:
     def change(columns: Columns) -> None:
         bumped(columns)
-        for name, offset in zip(RATES, (-4e-4, 1e-4, 0.0), strict=True):
+        for name, offset in zip(RATES, (-4e-4, -1e-4, 0.0), strict=True):
             columns[name] += np.float32(offset)
             columns[name][RELEASE + 2 :] += np.float32(0.5)  # what comes of the other counts is no cause
 
     found = two_boards(load_flown(flown), other(flown, tmp_path / "b", change))
     assert found.first is not None
     assert (found.first.row, found.first.why) == (RELEASE + 1, "sensor start")
-    assert any("-0.400 +0.100 +0.000 mrad/s (p q r)" in cause for cause in found.causes)
+    assert any("-0.400 -0.100 +0.000 mrad/s (p q r)" in cause for cause in found.causes)
 
 
 def test_an_estimator_that_begins_later_differs_by_its_phase(flown: Path, tmp_path: Path) -> None:
