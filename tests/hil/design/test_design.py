@@ -195,6 +195,13 @@ def test_roll_stability_and_best_hover_angles_are_those_of_the_specification() -
     assert verdicts["airspeed over m / l²"] == "agrees"
 
 
+def test_the_exponent_of_a_power_law_is_that_of_its_ends() -> None:
+    for law in sweeps.scaling(PAPER):
+        whole = law.x.argmax(), law.x.argmin()
+        (x, last_x), (y, last_y) = law.x[[*whole]], law.y[[*whole]]
+        assert y / last_y == pytest.approx((x / last_x) ** law.exponent, rel=1e-3), (law.quantity, law.cause)
+
+
 def test_the_slowest_pole_is_never_hidden() -> None:
     spun = Linear(np.diag([0.0, -1.0, 0, 2.0, 0, 0, -3.0, 0, 0]), np.zeros((9, 4)))
     assert spun.growth(ROLL) == 2.0
