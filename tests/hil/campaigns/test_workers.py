@@ -11,11 +11,12 @@ from pathlib import Path
 import dask
 import pytest
 from distributed import LocalCluster
+from rich.console import Console
 
 from hil.campaigns.config import Spec
 from hil.campaigns.dataset import Dataset
 from hil.campaigns.jobs import Row, fly_job
-from hil.campaigns.run import Standing, conduct
+from hil.campaigns.run import Runner, Standing, conduct
 from hil.campaigns.sampling import draw, plan_of
 from hil.campaigns.workers import DIED, FlyOne, Workers
 from hil.errors import LabError
@@ -165,7 +166,7 @@ def _nothing(standing: Standing) -> None:
 def test_a_cluster_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hil.campaigns.workers.CONNECT_S", 1.0)
     with pytest.raises(LabError, match=r"--cluster tcp://127\.0\.0\.1:9: no workers"):
-        Workers(0, "tcp://127.0.0.1:9")
+        list(Runner(Console(), cluster="tcp://127.0.0.1:9")._flown(map(plan_of(spec_of()).job, range(1))))
 
 
 def test_the_command_flies_and_resumes(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

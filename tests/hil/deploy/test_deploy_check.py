@@ -17,7 +17,7 @@ from firmware_py.core import structs
 from firmware_py.core_runner import CoreBlocks, CoreRunner, NativeRunner, RunnerFactory, default_runner
 from firmware_py.export.c99 import translate
 from firmware_py.logic.plugs import CALLS
-from hil.commands.deploy import _print_sum
+from hil.commands.deploy import _print_flight, _print_sum
 from hil.deploy.check import Checked, check_flight, plan, reached
 from hil.devices.board_firmware import PythonBoard
 from hil.experiments import EXPERIMENTS
@@ -114,6 +114,9 @@ def test_a_target_that_has_differed_does_not_hide_the_others(capsys: pytest.Capt
     assert checked.targets[1].divergence is None
     _print_sum([checked, checked], True)
     assert capsys.readouterr().out.startswith("40 ticks, c beside spoilt, python: spoilt DIFFERS\n")
+    _print_flight(checked)
+    calls = checked.targets[1].calls
+    assert capsys.readouterr().out.endswith(f"\n  python        150 ticks {calls:>7} calls  equal\n")
 
 
 def test_default_flights_are_ten_thousand_ticks_with_every_fault_in_time() -> None:
