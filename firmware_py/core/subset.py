@@ -4,16 +4,17 @@ Subset: module constants `f32(..)`, `i32(..)`, plain ints and arrays `constant(.
 with `f32`, `i32` or `Annotated[F32s, ...]` annotations); functions marked `@kernel` with annotated scalars and structs;
 `for` over `range`, `if`/`elif`/`else`; `+ - * /` on float32, `+ - * // %` on small non-negative int32; comparisons,
 `and`/`or`/`not`; calls of other kernels; `abs`, `sqrt`, `elapsed`. Floats never meet ints without `f32(..)`, and every
-constant is explicitly float32, as in C. `f64`, `i64` and their arrays are for the structs and kernels of the laboratory
-alone, the world and the scheduler: the core's translator refuses them.
+constant is explicitly float32, as in C. `f64`, `i64` and their arrays, `call` and tasks (`firmware_py/rtos/awaited.py`) are
+for the laboratory alone, the world and the scheduler: the core's translator refuses them.
 
 A struct is one block of memory with the layout of the C struct (naturally aligned), so that plain Python, C and the
 microcontroller can be compared byte by byte. Kernels are plain Python that a debugger can step through; their C flies.
 """
 
-from collections.abc import Callable, Sequence
+import ctypes
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, Self, TypeAlias, TypeVar, cast, get_args
+from typing import Any, ClassVar, Final, Generic, Self, TypeAlias, TypeVar, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,25 @@ def elapsed(later: Integer, earlier: Integer) -> i32:
     """Return the time between two instants of a clock of 32 bits that wraps."""
     return i32(((int(later) - int(earlier) + 2147483648) & 4294967295) - 2147483648)
 
+
+def call(function: int) -> int:
+    """Call the object of Python that a field holds, see `Block.connect`; return its integer, 0 for None."""
+    answer = ctypes.cast(function, ctypes.py_object).value()
+    return 0 if answer is None else int(answer)
+
+
+def step(task: Generator[int, None, object]) -> int:
+    """Take a step of a task that is C; in Python the scheduler steps its generator."""
+    raise NotImplementedError(task)
+
+
+# What a call of the scheduler answers a task: SWITCH and WAITS give up the processor, after WAITS the call is made AGAIN.
+# Values below FAILED are errors.
+FAILED: Final = 0
+DONE: Final = 1
+SWITCH: Final = 2
+WAITS: Final = 3
+AGAIN: Final = -(1 << 62)  # as a timeout: the wait goes on
 
 F32s: TypeAlias = NDArray[np.float32]
 I32s: TypeAlias = NDArray[np.int32]
@@ -117,6 +137,13 @@ class Block(Generic[S_co]):
         self.kind = kind
         self.memory: NDArray[Any] = np.zeros(1, kind.dtype) if memory is None else memory
         self.fields = cast(S_co, kind._view(self.memory))
+        self._connected: dict[str, Callable[[], int | None]] = {}  # keeps them alive
+
+    def connect(self, **functions: Callable[[], int | None]) -> None:
+        """Let fields of type i64 hold the functions that kernels `call`."""
+        self._connected |= functions
+        for name, function in functions.items():
+            setattr(self.fields, name, id(function))
 
     def cell(self, name: str) -> memoryview:
         """Return the memory of a number: `cell[0]` reads it in a fifth of the time of `fields`."""

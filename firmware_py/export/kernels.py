@@ -13,10 +13,11 @@ from typing import Any
 
 from firmware_py.export.c99 import CHECK, struct_definition
 from firmware_py.export.compilers import LIBRARY_FLAGS, Compiler, by_first_that_works, compile_texts
+from firmware_py.export.coroutines import printer_of
 from firmware_py.export.errors import ExportError
-from firmware_py.export.functions import FunctionPrinter, block_comment, constant_definition
-from firmware_py.export.live_printing import HELPERS, LivePrinter
-from firmware_py.export.live_reading import Arrays, Kernels, LiveModule, read_kernels
+from firmware_py.export.functions import block_comment, constant_definition
+from firmware_py.export.live_printing import HELPERS
+from firmware_py.export.live_reading import CALL, Arrays, Kernels, LiveModule, read_kernels
 from firmware_py.export.methods import METHOD, PROTOTYPES, method
 from firmware_py.export.syntax import BOOL, I64, VOID, Constant
 
@@ -47,7 +48,7 @@ def translate(functions: Sequence[Callable[..., Any]], arrays: Arrays) -> str:
     for kernel in reversed(kernels):  # callers first: they show the shapes of array arguments
         if kernel.c_name in reached:
             assert isinstance(kernel.scope, LiveModule)
-            printer = FunctionPrinter(kernel) if kernel.scope.core else LivePrinter(kernel)
+            printer = printer_of(kernel)
             printed[kernel.c_name] = printer.text()
             used |= {one.c_name: one for one in printer.constants}
     return "".join(
@@ -66,6 +67,7 @@ def translate(functions: Sequence[Callable[..., Any]], arrays: Arrays) -> str:
                     len(arrays),
                     root.result != VOID,
                     len(root.arguments) - len(arrays),
+                    CALL in root.calls,
                 )
                 for function, root in zip(functions, roots, strict=True)
             ),

@@ -2,7 +2,8 @@
 
 They compute in `double`, with integers of 64 bits, and call `math`, `min` and `max`; an integer next to a float becomes a
 float, as in Python, and `float` meets `double` through `f32(..)` and `f64(..)` only. Locals may get their first value in any
-block, and a tuple on the left takes one on the right. There are `while`, `break`, and operators that assign.
+block, and a tuple on the left takes one on the right. There are `while`, `break`, and operators that assign. What raises in
+Python ends the C functions, too: whoever may `call` Python returns an integer, and checks behind each such statement.
 """
 
 import ast
@@ -11,10 +12,11 @@ import math
 from types import ModuleType
 from typing import Any, ClassVar
 
+from firmware_py.core import subset
 from firmware_py.core.subset import f32, f64, i32
 from firmware_py.export.expressions import OR, UNARY, Expressions, Value, describe
 from firmware_py.export.functions import C_TYPES, FunctionPrinter, declare
-from firmware_py.export.live_reading import LiveModule, double_literal
+from firmware_py.export.live_reading import CALL, LiveModule, double_literal
 from firmware_py.export.syntax import BOOL, F32, F64, I32, I64, Signature, ValueType
 
 CHOICE = 1
@@ -40,6 +42,14 @@ __attribute__((unused)) static inline int64_t floor_of(double x) {
     return whole - ((double)whole > x ? 1 : 0);
 }
 
+__attribute__((unused)) static inline int64_t call_of(int64_t function) {
+    void *const answer = PyObject_CallNoArgs((void *)(intptr_t)function);
+    if (!answer) return -1;
+    const int64_t number = answer == (void *)&_Py_NoneStruct ? 0 : PyLong_AsLongLong(answer);
+    Py_DecRef(answer);
+    return number;
+}
+
 __attribute__((unused)) static inline double ldexp_of(double x, int64_t doublings) {
     return __builtin_ldexp(x, (int)doublings);
 }
@@ -56,6 +66,11 @@ class LiveExpressions(Expressions):
         assert isinstance(kernel.scope, LiveModule)
         self._globals = kernel.scope.live
         self.rounds_down = True
+        self.raised = False  # by the statement that is being printed
+
+    def spelled(self, name: str) -> str:
+        """Return a local as C writes it."""
+        return name
 
     def place(self, node: ast.expr) -> Value:
         """Return an array's element or a field as it is in memory."""
@@ -120,6 +135,11 @@ class LiveExpressions(Expressions):
         meant = self._meant(node.func)
         if node.keywords or meant is None:
             raise self.refuse(node, f"call {ast.unparse(node)}")
+        if meant is subset.call and len(node.args) == 1:
+            function = self.scalar(node.args[0], I64, "what is called")
+            return self._raising(node, alone, Value(f"{CALL}({function.text})", I64))
+        if meant is subset.step and len(node.args) == 1:
+            return self.value(node.args[0], alone)
         if meant in (f64, f32, int, i32, bool) and len(node.args) == 1:
             return self._converted(node, meant)
         if meant in FUNCTIONS and len(node.args) == len(FUNCTIONS[meant][1]):
@@ -127,7 +147,21 @@ class LiveExpressions(Expressions):
             pairs = zip(node.args, kinds, strict=True)
             texts = [self.fit(argument, self.value(argument), kind) for argument, kind in pairs]
             return Value(f"{name}({', '.join(texts)})", result)
-        return self._kernel(node, ast.unparse(node.func), alone)
+        name = ast.unparse(node.func)
+        kernel = self.module.names.get(name)
+        value = self._kernel(node, name, alone)
+        return (
+            self._raising(node, alone, value)
+            if isinstance(kernel, Signature) and CALL in kernel.calls
+            else value
+        )
+
+    def _raising(self, node: ast.Call, alone: bool, value: Value) -> Value:
+        """Return a call that may raise; its statement is followed by a check."""
+        if not alone:
+            raise self.refuse(node, "a call of Python inside an expression: give it a statement")
+        self.raised = True
+        return value
 
     def _converted(self, node: ast.Call, target: Any) -> Value:
         value = self.value(node.args[0])
@@ -157,6 +191,15 @@ class LivePrinter(FunctionPrinter):
     _print: LiveExpressions
 
     def _statement(self, node: ast.stmt, depth: int) -> None:
+        self._plain_statement(node, depth)
+        if self._print.raised:
+            self._print.raised = False
+            if self.kernel.result != I64:
+                raise self._print.refuse(node, "a call of Python: the function must return an integer")
+            if not isinstance(node, ast.Return):
+                self._fold(depth, "if (PyErr_Occurred()) return -1;")
+
+    def _plain_statement(self, node: ast.stmt, depth: int) -> None:
         match node:
             case ast.Assign(targets=[ast.Tuple(elts=targets)], value=ast.Tuple(elts=values)):
                 if len(targets) != len(values):
@@ -201,7 +244,7 @@ class LivePrinter(FunctionPrinter):
             return f"{place.text} = {self._print.fit(node, value, place.kind)};"
         name, local = target.id, self._locals[target.id]
         if name in self._print.names:
-            return f"{name} = {self._print.fit(node, value, self._print.names[name])};"
+            return f"{self._print.spelled(name)} = {self._print.fit(node, value, self._print.names[name])};"
         if value.kind.base not in C_TYPES or (value.kind.rank and local.assignments > 1):
             raise self._print.refuse(node, f"local {name} of type {describe(value.kind)}")
         self._print.names[name] = value.kind

@@ -8,11 +8,11 @@ core's kernels, which keep the core's types.
 
 import ast
 import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FunctionType
-from typing import Any, cast
+from typing import Any, cast, get_origin
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,7 @@ ARGUMENTS: tuple[tuple[Any, ValueType], ...] = (
     (I64s, ValueType("i64", 1)),
 )  # fmt: skip
 Arrays = tuple[NDArray[Any], ...]
+CALL = "call_of"  # in C, of `subset.call`
 ELEMENTS = {np.dtype(f64): "f64", np.dtype(f32): "f32", np.dtype(i32): "i32", np.dtype(np.int64): "i64"}
 
 
@@ -120,6 +121,8 @@ class _Reader:
         c_name = f"{module.name}_{function.__name__}"
         kernel = Signature(c_name, module.path, node, arguments, result, False, module)
         find_writes(kernel)
+        if any(module.live[name] is subset.call for name in _names(node) if name in module.builtins):
+            kernel.calls.add(CALL)
         self.kernels[function] = kernel
         return kernel
 
@@ -136,7 +139,11 @@ class _Reader:
             name = function.__module__.replace(".", "_")
             doc = ast.get_docstring(tree) or ""
             module = LiveModule(name, path, doc, live=function.__globals__, functions=functions)
-            module.builtins = {key for key, thing in module.live.items() if vars(subset).get(key) is thing}
+            module.builtins = {
+                key
+                for key, thing in module.live.items()
+                if callable(thing) and vars(subset).get(key) is thing
+            }
             read_comments(module, text)
             self._modules[path] = module
         return self._modules[path]
@@ -148,6 +155,8 @@ class _Reader:
             return
         if isinstance(thing, FunctionType):
             module.names[name] = self.kernel(thing)
+        elif isinstance(call := getattr(thing, "call", None), FunctionType):  # for `yield from`
+            module.names[name] = self.kernel(call)
         elif constant := _constant(f"{module.name}_{name}", thing, I32 if module.core else I64):
             module.names[name] = constant
             module.defined.append(constant)
@@ -156,6 +165,8 @@ class _Reader:
         if inspect.isclass(annotation) and issubclass(annotation, Struct):
             struct = self._struct(annotation)
             return ValueType(struct.name, struct=struct)
+        if get_origin(annotation) is Generator:
+            return I64
         for known, kind in ARGUMENTS:
             if annotation == known:
                 return I32 if module.core and kind == I64 else kind

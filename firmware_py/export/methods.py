@@ -9,15 +9,28 @@ char *PyBytes_AsString(void *object);
 void *PyLong_FromLongLong(long long value);
 long long PyLong_AsLongLong(void *object);
 void *PyErr_Occurred(void);
+void *PyObject_CallNoArgs(void *callable);
+void Py_DecRef(void *object);
+extern char _Py_NoneStruct;
 int PyErr_BadArgument(void);
 """
 
 
-def method(name: str, function: str, memory: int, answers: bool, numbers: int = 0) -> str:
-    """Return the C of a method that calls a function with addresses and integers; without an answer it returns 0."""
+def method(
+    name: str, function: str, memory: int, answers: bool, numbers: int = 0, raises: bool = False
+) -> str:
+    """Return the C of a method that calls a function with addresses and integers; without an answer it returns 0.
+
+    `raises`: the function may call Python.
+    """
     taken = [f"places[{index}]" for index in range(memory)] + [f"given_{index}" for index in range(numbers)]
     call = f"{function}({', '.join(taken)})"
     before, result = ("", call) if answers else (f"    {call};\n", "0")
+    if raises:
+        before, result = (
+            f"    const int64_t answer = {call};\n    if (PyErr_Occurred()) return 0;\n",
+            "answer",
+        )
     head = f"void *{name}(void *self, void *const *given, intptr_t count)"
     checks = f"    if (count != {numbers}) return PyErr_BadArgument(), (void *)0;\n"
     if numbers:

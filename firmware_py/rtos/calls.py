@@ -96,16 +96,30 @@ def take_notification(k: KernelMemory, clear: int) -> int:
 
 @compiled
 def work(k: KernelMemory, duration_us: int) -> int:
-    """Take processor time at once if nothing can happen before the work is done; otherwise it has to be yielded."""
+    """Let the running task take processor time: at once if nothing can happen meanwhile."""
     if duration_us <= 0:
         return counted(k, DONE)
     end_us = k.now_us + duration_us
     if end_us >= k.next_tick_us or end_us > k.until_us or k.switch_pending > 0:
-        return WAITS
+        k.asked_us = duration_us
+        return SWITCH
     k.work_us[k.current] += duration_us
     k.now_us = end_us
     k.calls = 0
     return DONE
+
+
+@compiled
+def sleep_until(k: KernelMemory, wake_tick: int) -> int:
+    """Let the running task wait for a tick and nothing else."""
+    answer = block(k, NO_LIST, wake_tick)
+    return SWITCH if answer == WAITS else answer
+
+
+@compiled
+def pending(k: KernelMemory) -> int:
+    """Let a task of higher priority run that a plain call woke."""
+    return SWITCH if k.switch_pending > 0 and k.suspended == 0 else DONE
 
 
 @compiled
@@ -116,7 +130,7 @@ def delay(k: KernelMemory, ticks: int) -> int:
     if k.suspended > 0:
         return MAY_NOT_WAIT
     record(k, DELAY, k.current, ticks, 0)
-    return block(k, NO_LIST, k.tick_count + ticks)
+    return sleep_until(k, k.tick_count + ticks)
 
 
 @compiled
@@ -127,7 +141,7 @@ def delay_until(k: KernelMemory, wake_tick: int) -> int:
     if wake_tick <= k.tick_count:
         return SWITCH
     record(k, DELAY_UNTIL, k.current, wake_tick, 0)
-    return block(k, NO_LIST, wake_tick)
+    return sleep_until(k, wake_tick)
 
 
 @compiled

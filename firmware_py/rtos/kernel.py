@@ -7,11 +7,11 @@ from collections.abc import Callable, Generator, Iterable
 from typing import Any, TypeVarTuple
 
 from firmware_py.rtos.errors import KernelError
-from firmware_py.rtos.memory import DONE, MAX_PRIORITIES, WAITS
+from firmware_py.rtos.memory import DONE, MAX_PRIORITIES
 from firmware_py.rtos.processor import Processor
 from firmware_py.rtos.queue import Queue, T
 from firmware_py.rtos.semaphore import Mutex, Semaphore
-from firmware_py.rtos.tables import GIVE_UP, GO_ON, Trace
+from firmware_py.rtos.tables import GIVE_UP, Trace
 from firmware_py.rtos.task import Task
 from firmware_py.rtos.timer import SERVICE_PRIORITY, Callback, Timer, TimerService
 
@@ -93,8 +93,7 @@ class Kernel(Processor):
 
     def work(self, duration_us: int) -> Iterable[int]:
         """Take processor time; others may run in between."""
-        answer = self.calls.work(duration_us)
-        return (duration_us,) if answer == WAITS else self.outcome(answer)
+        return self.outcome(self.calls.work(duration_us))
 
     def task_yield(self) -> Iterable[int]:
         """Let the next task of the same priority run."""
@@ -102,7 +101,7 @@ class Kernel(Processor):
 
     def yield_if_pending(self) -> Iterable[int]:
         """Let a task of higher priority run that a plain call woke; use it after callbacks, which cannot yield."""
-        return GIVE_UP if self.memory.switch_pending and not self.suspended else GO_ON
+        return self.outcome(self.calls.pending())
 
     def delay(self, ticks: int) -> Iterable[int]:
         """Wait until the tick count has risen by `ticks`; 0 is `task_yield`."""
@@ -127,11 +126,11 @@ class Kernel(Processor):
         Hardware checks `interrupts_off`. Ticks are caught up afterwards, where a real processor loses all but one.
         """
         self.suspend_all()
-        self.interrupts_off = True
+        self._interrupts_off[0] = 1
 
     def exit_critical(self) -> Iterable[int]:
         """End `enter_critical`, which must not be nested; pending events happen now."""
-        self.interrupts_off = False
+        self._interrupts_off[0] = 0
         return self.resume_all()
 
     def suspend_all(self) -> None:

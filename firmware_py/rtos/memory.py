@@ -7,7 +7,7 @@ come the ends of the lists. Task 0 is the caller before the start. Times are mic
 
 from typing import Annotated, Final
 
-from firmware_py.core.subset import I64s, Struct, i64
+from firmware_py.core.subset import AGAIN, DONE, FAILED, SWITCH, WAITS, I64s, Struct, i64
 
 TICK_US: Final = 1000
 MAX_PRIORITIES: Final = 7  # the Crazyflie's six, 0 to 5, and one above them for simulated interrupts
@@ -27,6 +27,8 @@ LATENCY_BOUNDS_US: Final = (
     10_000,
 )  # of the histogram's classes
 LATENCY_CLASSES: Final = len(LATENCY_BOUNDS_US) + 1
+FRAMES: Final = 32  # native tasks have an index below
+FRAME: Final = 16  # numbers: where it goes on, its timeout, an answer, and its locals
 ROWS: Final = 1024  # of the trace, during one call
 
 ITEMS: Final = 2 * TASKS
@@ -41,11 +43,9 @@ SUSPENDED: Final = -1
 DELETED: Final = -2
 NO_LIST: Final = -1
 
-FOREVER: Final = (
-    -1
-)  # a timeout that never ends, FreeRTOS's portMAX_DELAY; any other timeout is a number of ticks
+# A timeout that never ends, FreeRTOS's portMAX_DELAY; any other timeout is a number of ticks.
+FOREVER: Final = -1
 NEVER_US: Final = 1 << 62
-AGAIN: Final = -NEVER_US  # as a timeout: the wait of this task goes on
 SLEEP_US: Final = 1 << 50  # the work of the idle task, until any interrupt
 # Calls of the kernel, or switches, at one instant after which the running task counts as stuck. The most that a task
 # of the firmware needs is 25.
@@ -56,12 +56,8 @@ BEFORE_START: Final = 0
 IN_TASK: Final = 1
 IN_INTERRUPT: Final = 2
 
-# Answers of calls: SWITCH and WAITS give up the processor, after WAITS the call is made AGAIN.
-FAILED: Final = 0
-DONE: Final = 1
-SWITCH: Final = 2
-WAITS: Final = 3
-# Errors.
+# Answers of calls are those of the subset, and errors.
+__all__ = ["AGAIN", "DONE", "FAILED", "SWITCH", "WAITS"]
 STUCK: Final = -1
 MAY_NOT_WAIT: Final = -2
 WAITS_IN_INTERRUPT: Final = -3
@@ -95,7 +91,8 @@ class KernelMemory(Struct):
     # The processor.
     preemption: i64
     now_us: i64
-    until_us: i64  # how far the present run goes
+    end_us: i64  # how far the present run goes
+    until_us: i64  # and its present leg: harness in C acts between the legs
     next_wake_us: i64  # of the next thing that happens without a new interrupt
     next_tick_us: i64
     tick_count: i64  # up to date while tasks run
@@ -106,11 +103,13 @@ class KernelMemory(Struct):
     context: i64
     suspended: i64  # how many calls of suspend_all wait for their resume_all
     switch_pending: i64
+    interrupts_off: i64
     interrupted: i64
     task_woken: i64  # whether the latest call from an interrupt woke a task above the running one
     idle_yielded: i64
     idle_slept: i64  # since it has yielded
     calls: i64  # of the kernel at this instant
+    asked_us: i64  # work that the running task has asked for, until it gives up the processor
     steps: i64  # of tasks since `steps_us`
     steps_us: i64
     tasks: i64
@@ -144,6 +143,8 @@ class KernelMemory(Struct):
     late: Annotated[I64s, TASKS, LATENCY_CLASSES]  # activations that did not run at once, by start latency
     response_limit_us: Annotated[I64s, TASKS]
     limit_misses: Annotated[I64s, TASKS]
+
+    frames: Annotated[I64s, FRAMES, FRAME]  # of native tasks
 
     # Queues; semaphores are queues of tokens, and mutexes have only their `holder` and waiting receivers.
     length: Annotated[I64s, OBJECTS]

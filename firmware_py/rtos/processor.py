@@ -23,7 +23,6 @@ class Processor(Tables):
         super().__init__(preemption, trace)
         self.tasks: list[Task] = []
         self._steps: list[Callable[[], int]] = [int]  # of the tasks' generators, by index
-        self.interrupts_off = False
         self._started = False
 
     @property
@@ -31,6 +30,11 @@ class Processor(Tables):
         """The next instant at which anything happens without a new interrupt, None when nothing ever will."""
         wake_us: int = self._wake[0]
         return None if wake_us == NEVER_US else wake_us
+
+    @property
+    def interrupts_off(self) -> bool:
+        """Whether a task has blocked interrupts."""
+        return bool(self._interrupts_off[0])
 
     @property
     def current(self) -> Task:
@@ -71,6 +75,8 @@ class Processor(Tables):
 
     def stop_before(self, now_us: int) -> None:
         """End the present run just before an instant at which hardware acts first."""
+        if now_us <= self._run_end[0]:
+            self._run_end[0] = now_us - 1
         if now_us <= self._until[0]:
             self._until[0] = now_us - 1
 

@@ -93,9 +93,11 @@ def step_idle(k: KernelMemory) -> int:
 def settle(k: KernelMemory, yielded_us: int) -> None:
     """Take what the running task has yielded: work, or the processor. Switch to another task where that is due."""
     task = k.current
-    if yielded_us > 0:
-        k.work_left_us[task] = yielded_us
-        k.work_us[task] += yielded_us
+    work_us = yielded_us + k.asked_us
+    k.asked_us = 0
+    if work_us > 0:
+        k.work_left_us[task] = work_us
+        k.work_us[task] += work_us
     else:
         k.switch_pending = 1
     if k.switch_pending > 0 and k.suspended == 0:
@@ -175,6 +177,7 @@ def next_task(k: KernelMemory) -> int:
 def begin(k: KernelMemory, now_us: int, until_us: int) -> int:
     """Do all that is due up to and including an instant, until every task waits or works; then go on until the later one."""
     k.until_us = until_us if until_us > now_us else now_us
+    k.end_us = k.until_us
     if k.interrupted > 0 and k.next_wake_us > now_us:
         k.next_wake_us = now_us
     return next_task(k)

@@ -1,10 +1,11 @@
 """The kernel's memory as Python sees it: its calls, their answers and errors, and the trace."""
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from types import SimpleNamespace
 from typing import Final
 
-from firmware_py.compiling import bound_together
+from firmware_py.compiling import Functions, Memory, bound_together
 from firmware_py.rtos import calls, mutexes, queues, ready, scheduler
 from firmware_py.rtos.errors import KernelError, StuckTaskError, TaskError
 from firmware_py.rtos.memory import (
@@ -40,7 +41,7 @@ _CALLS: tuple[Callable[..., int | None], ...] = (
     scheduler.end_task, ready.leave_tasks, ready.counted, ready.block, queues.add_object, queues.send,
     queues.send_from_isr, queues.receive, queues.reset, queues.wait_for_item, mutexes.take_mutex, mutexes.give_mutex,
     mutexes.give_mutex_from_isr, calls.notify, calls.notify_from_isr, calls.await_notification, calls.take_notification,
-    calls.work, calls.delay, calls.delay_until, calls.suspend_task, calls.resume_task, calls.set_priority,
+    calls.work, calls.pending, calls.delay, calls.delay_until, calls.suspend_task, calls.resume_task, calls.set_priority,
     calls.suspend_all, calls.resume_all,
 )  # fmt: skip
 
@@ -52,7 +53,7 @@ class Tables:
     """
 
     def __init__(self, preemption: bool, trace: Trace | None) -> None:
-        block = KernelMemory.allocate()
+        self.tables = block = KernelMemory.allocate()
         self.memory = block.fields
         bound = bound_together(_CALLS, block)
         self._untraced = {call.__name__: one for call, one in zip(_CALLS, bound, strict=True)}
@@ -60,9 +61,10 @@ class Tables:
         self.names = ["main"]
         self.numbers: list[int] = []
         self.preemption = preemption
-        self._now, self._until, self._wake = (
-            block.cell(name) for name in ("now_us", "until_us", "next_wake_us")
+        self._now, self._run_end, self._until, self._wake = (
+            block.cell(name) for name in ("now_us", "end_us", "until_us", "next_wake_us")
         )
+        self._interrupts_off = block.cell("interrupts_off")
         self._tick, self._suspended, self._current = (
             block.cell(name) for name in ("tick_count", "suspended", "current")
         )
@@ -112,6 +114,19 @@ class Tables:
             else {name: self._traced(one) for name, one in self._untraced.items()}
         )
         vars(self.calls).update(made)
+
+    def run_by(self, functions: Functions, *memory: Memory) -> bool:
+        """Replace calls by kernels of the same names that take the steps of some tasks themselves; return whether they do.
+
+        They do not where Python flies: it steps the generators of all tasks.
+        """
+        made = bound_together(functions, self.tables, *memory)
+        if any(isinstance(one, partial) for one in made):
+            return False
+        self._untraced |= {one.__name__: call for one, call in zip(functions, made, strict=True)}
+        self._kept = memory
+        self.set_trace(self.trace)
+        return True
 
     def count_call(self) -> None:
         """Count a call that returns at once."""

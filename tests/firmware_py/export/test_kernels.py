@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_py.compiling import bound_in, compiler
-from firmware_py.core.subset import F64s, I32s, Integer, f64, i32
+from firmware_py import compiling
+from firmware_py.compiling import bound, bound_in, compiler
+from firmware_py.core.subset import F64s, I32s, I64s, Integer, Struct, call, f64, i32, i64
 from firmware_py.elementary import atan2, exp, sine_ahead
 from firmware_py.export.compilers import Compiler, compilers
 from firmware_py.export.errors import ExportError
@@ -108,6 +109,26 @@ def library_sine(numbers: F64s) -> None:
 
 
 @kernel
+def asks_inside(counts: I64s) -> int:
+    """Do."""
+    return 1 + call(counts[0])
+
+
+@kernel
+def asks_and_goes_on(counts: I64s) -> None:
+    """Do."""
+    call(counts[0])
+
+
+@kernel
+def asks_for_truth(counts: I64s) -> int:
+    """Do."""
+    if call(counts[0]) > 0:
+        return 1
+    return 0
+
+
+@kernel
 def listed(numbers: F64s) -> None:
     """Do."""
     numbers[0] = max([numbers[1], 1.0])
@@ -149,6 +170,9 @@ def recursive(numbers: F64s) -> None:
     ("function", "reason"),
     [
         (library_sine, "call of math.sin, which is no kernel"),
+        (asks_inside, "a call of Python inside an expression: give it a statement"),
+        (asks_for_truth, "a call of Python inside an expression: give it a statement"),
+        (asks_and_goes_on, "a call of Python: the function must return an integer"),
         (listed, "call of max, which is no kernel"),
         (by_float, "an index is f64, not i64"),
         (beyond, "index 11: f64 array of 11 has 0..10"),
@@ -160,6 +184,8 @@ def recursive(numbers: F64s) -> None:
 )
 def test_what_has_no_equal_in_c_is_refused(function: Any, reason: str) -> None:
     arrays = fresh([0.0, 0.0], 0, 0)[: 2 if function is swap else 1]
+    if function.__name__.startswith("asks"):
+        arrays = (np.zeros(1, np.int64),)
     with pytest.raises(ExportError) as refused:
         translate((function,), arrays)
     assert reason in str(refused.value)
@@ -184,3 +210,46 @@ def test_a_system_compiler_that_does_not_work_is_passed_over(
     path = library((swap,), (numbers,))
     bound_in(path, METHOD + "swap", numbers)()
     assert numbers.tolist() == [2.0, 1.0, 0.0]
+
+
+class Asked(Struct):
+    """Functions of Python, and their answers."""
+
+    function: i64
+    answers: i64
+
+
+@kernel
+def ask(asked: Asked) -> int:
+    """Ask."""
+    answer = call(asked.function)
+    asked.answers += 1
+    return answer
+
+
+@kernel
+def ask_twice(asked: Asked) -> int:
+    """Ask."""
+    first = ask(asked)
+    second = ask(asked)
+    return 10 * first + second
+
+
+@pytest.mark.parametrize("plain", [False, True], ids=["c", "plain"])
+def test_a_kernel_calls_python_and_ends_where_that_raises(
+    plain: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compiling, "PLAIN", plain)
+    asked, answers = Asked.allocate(), [7, 3, 5]
+    asked.connect(function=lambda: answers.pop())
+    ask_both = bound(ask_twice, asked)
+    assert ask_both() == 53
+    with pytest.raises(IndexError, match="pop from empty list"):
+        ask_both()
+    assert asked.fields.answers == 3
+    asked.connect(function=lambda: None)
+    assert ask_both() == 0
+    asked.connect(function=lambda: "one")  # type: ignore[arg-type,return-value]
+    with pytest.raises((TypeError, ValueError)):
+        ask_both()
+    assert asked.fields.answers == 5
