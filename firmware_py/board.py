@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Protocol
 
+from firmware_py.core.subset import I32s
 from firmware_py.wire.mavlink_numbers import CommandResult
 
 # Gyro x y z, accelerometer x y z, int16, sensor frame. The six stay packed: code compiled by mypyc would unpack and repack
@@ -16,6 +17,7 @@ class Board(Protocol):
     """The hardware below the drivers."""
 
     eeprom: bytearray  # (8192,) survives power cycles; all 0xFF when new
+    imu: I32s  # (6,) the registers of the BMI088, as `ImuCounts`
 
     def read_imu(self) -> ImuCounts:
         """Return the registers of the BMI088 as they are now."""

@@ -71,7 +71,6 @@ class CoreBlocks:
         self.sampling = Sampling.allocate()  # by both
         self.supervisor = Supervisor.allocate()  # by the stabilizer task, and by requests
         self.report = Report.allocate()  # by the estimator task
-        self.watchdog_fed_us = 0  # by the stabilizer task
         self.logic = logic
         self.calls = CALLS if logic is None else logic.loaded.calls
         own = {} if logic is None else logic.allocate()
@@ -81,6 +80,10 @@ class CoreBlocks:
         }  # fmt: skip
         self.named = core | own
         self.run: CoreRunner = runner(self)
+
+    def entry(self, name: str) -> Callable[[], int]:
+        """Return the call of an entry point."""
+        return self.run.calls[name] if type(self.run) is NativeRunner else partial(self.run.call, name)
 
     @property
     def inputs(self) -> frozenset[str]:
@@ -99,13 +102,13 @@ class NativeRunner:
 
     def __init__(self, blocks: CoreBlocks, library: Path | None = None) -> None:
         library = library or core_library(blocks.logic)
-        self._calls = {
+        self.calls = {
             name: bound_in(library, METHOD + name, *(blocks.named[block].memory for block in taken))
             for name, taken in blocks.calls.items()
         }
 
     def call(self, name: str) -> int:
-        return self._calls[name]()  # type: ignore[no-any-return]
+        return self.calls[name]()  # type: ignore[no-any-return]
 
 
 class PlainRunner:

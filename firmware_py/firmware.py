@@ -4,15 +4,17 @@ Hardware calls `imu_ready`, `radio_received` and `uart_ready` (interrupts), then
 `Board`.
 """
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from numpy.typing import NDArray
 
 from firmware_py.board import Board
+from firmware_py.compiling import Memory
 from firmware_py.config import FirmwareConfig, MavlinkConfig, parameters_of
 from firmware_py.core.structs import HORIZON_LIMIT, POSE_FROZEN, POSE_NO_CORRECTION, POSE_TOO_OLD, TICK_US
 from firmware_py.core.subset import i32
-from firmware_py.core_runner import CoreBlocks, CoreCosts, RunnerFactory, costs_of, default_runner
+from firmware_py.core_runner import CoreBlocks, CoreCosts, RunnerFactory, default_runner
 from firmware_py.drivers.imu import acceleration, rates
 from firmware_py.export.usage import Usage
 from firmware_py.geometry import Vector
@@ -26,14 +28,14 @@ from firmware_py.links.parameters import Parameter, ParameterService, ParameterS
 from firmware_py.links.platform import PlatformService
 from firmware_py.logic.loading import load_logic
 from firmware_py.parameters import parameters
-from firmware_py.pilot import Arrived, Pilot
-from firmware_py.rtos import Kernel, Queue, WatchdogError
+from firmware_py.pilot import Pilot
+from firmware_py.rtos import Kernel, WatchdogError
 from firmware_py.rtos.statistics import Statistics
 from firmware_py.running import Running, StockState
 from firmware_py.signals import Signals
 from firmware_py.stock_names import stock_parameters, stock_variables
 from firmware_py.supervisor import CoreSupervisor
-from firmware_py.tasks import estimator_task, power_task, sensors_task, stabilizer_task
+from firmware_py.tasks import Findings, FlightTasks
 from firmware_py.variables import log_variables
 from firmware_py.wire import WireError
 from firmware_py.wire.crtp import Correction
@@ -42,7 +44,6 @@ from firmware_py.wire.memories import CONFIG_SIZE, RadioSettings, decode_config,
 if TYPE_CHECKING:
     from firmware_py.links.mavlink_stack import MavlinkStack
 
-MEASUREMENT_QUEUE = 20  # original firmware
 OLDEST_POSE_US = HORIZON_LIMIT * TICK_US  # at the estimator's tick
 # Of each activation: a tick's work of the flight path ends before the next tick.
 DEADLINES_US = {"SENSORS": 1000, "STABILIZER": 1000, "KALMAN": 1000}
@@ -81,24 +82,11 @@ class Firmware:
         self.pilot = Pilot(
             core, self._supervisor, lambda: acceleration(board.read_imu()), self._notices.refuse
         )
-        self._imu_ready = self.kernel.create_binary_semaphore("imuReady")
-        data_ready = self.kernel.create_binary_semaphore("dataReady")
-        estimator_run = self.kernel.create_binary_semaphore("runTaskSemaphore")
-        self.measurements: Queue[Arrived] = self.kernel.create_queue(MEASUREMENT_QUEUE, "measurements")
-        kernel, cost, costs = self.kernel, config.cpu, costs_of(core.run, config.cpu)
-        kernel.create_task(
-            "SENSORS", 4, sensors_task,
-            kernel, cost, board, self._imu_ready, data_ready, core, self._zero_found,
-        )  # fmt: skip
-        kernel.create_task(
-            "STABILIZER", 5, stabilizer_task,
-            kernel, cost, board, data_ready, estimator_run, self._supervisor, core, costs, self.pilot,
-        )  # fmt: skip
-        kernel.create_task(
-            "KALMAN", 2, estimator_task,
-            kernel, cost, estimator_run, self.measurements, core, costs, self._pose_refused, self._pose_gated,
-        )  # fmt: skip
-        kernel.create_task("PWRMGNT", 0, power_task, kernel, board, core)
+        findings = Findings(self._zero_found, self._pose_refused, self._pose_gated)
+        self._tasks = FlightTasks(
+            self.kernel, config.cpu, board, core, self._supervisor, self.pilot, findings
+        )
+        self.measurements = self._tasks.measurements
         self.mavlink = self._mavlink_stack(config) if mavlink else None
         self._start_services(config)
         self.signals = Signals.of(core.estimator.memory, core.control.memory, self._supervisor)
@@ -168,6 +156,10 @@ class Firmware:
         self._console.listeners.append(stack.console_line)
 
     @property
+    def flight_path(self) -> Sequence[Memory]:
+        return self._tasks.memory
+
+    @property
     def log_numbers(self) -> dict[str, int]:
         return {variable.name: number for number, variable in enumerate(self.variables)}
 
@@ -197,7 +189,7 @@ class Firmware:
     def imu_ready(self) -> None:
         """Signal a new sample of the IMU (interrupt). While interrupts are off, samples are missed."""
         if not self.kernel.interrupts_off:
-            self._imu_ready.give_from_isr()
+            self._tasks.imu_ready.give_from_isr()
 
     def radio_received(self, data: bytes, broadcast: bool = False) -> None:
         """Take a packet from the radio chip (interrupt). While interrupts are off, packets are lost."""
@@ -216,7 +208,7 @@ class Firmware:
 
     def check_watchdog(self) -> None:
         """Raise `WatchdogError` when the stabilizer has not run for too long; the hardware calls this now and then."""
-        late_us = self.kernel.now_us - self._core.watchdog_fed_us
+        late_us = self.kernel.now_us - self._tasks.fed_us
         if late_us > WATCHDOG_US:
             text = f"watchdog reset, STABILIZER has not run for {late_us / 1000:.0f} ms and this task has the processor"
             raise WatchdogError(self.kernel.current.name, self.kernel.now_us, text)

@@ -3,110 +3,274 @@
 The IMU interrupt wakes SENSORS, which reads it and lets STABILIZER run on the next tick edge; STABILIZER lets the
 estimator run, closes the loop in every tenth tick and writes servo counts to the timers. The estimator works one tick
 before the controller, so that a pose reaches the flaps in 1 to 11 ms.
+
+The three tasks fly as C in the scheduler's loop, and as generators where Python flies everything.
 """
 
 from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
 
+from firmware_py import rtos
 from firmware_py.board import Board
+from firmware_py.compiling import compiler
 from firmware_py.config import CpuConfig
-from firmware_py.core.structs import POSE_ON_TIME
-from firmware_py.core.subset import i32
-from firmware_py.core_runner import CoreBlocks, CoreCosts
+from firmware_py.core import structs, subset
+from firmware_py.core.structs import POSE_ON_TIME, Estimator, Input, Sampling
+from firmware_py.core.subset import I32s, Struct, call, i32, i64, step
+from firmware_py.core_runner import CoreBlocks, costs_of
 from firmware_py.crazyflie.planner import PathPoint
 from firmware_py.pilot import Arrived, Pilot, put_goal
-from firmware_py.rtos import Kernel, Queue, Semaphore
+from firmware_py.rtos import FOREVER, Kernel, KernelError, Queue
+from firmware_py.rtos.awaited import Steps, delay_until, give, take, work, yield_if_pending
+from firmware_py.rtos.memory import FRAMES, KernelMemory
+from firmware_py.rtos.scheduler import begin as begin_run
+from firmware_py.rtos.scheduler import next_task as take_next
+from firmware_py.rtos.scheduler import resume as resume_run
 from firmware_py.supervisor import CoreSupervisor, wrapped
 from firmware_py.wire.crtp import Correction
 
-Task = Generator[int, None, None]
+compiled = compiler(Path(rtos.__path__[0]), Path(structs.__file__), Path(subset.__file__))
+MEASUREMENT_QUEUE: Final = 20  # original firmware
+POWER_PERIOD: Final = 100  # likewise
+DATA_TIMEOUT: Final = 1  # tick edges without a sample after which the stabilizer runs without the IMU
 
-POWER_PERIOD = 100  # original firmware
-DATA_TIMEOUT = 1  # tick edges without a sample after which the stabilizer runs without the IMU
+
+class FlightPath(Struct):
+    """What the three tasks share: objects and tasks of the scheduler, processor times, and functions to `call`."""
+
+    imu_ready: i64
+    data_ready: i64
+    estimator_run: i64
+    measurements: i64
+    sensors: i64
+    stabilizer: i64
+    kalman: i64
+    sensors_us: i64
+    stabilizer_us: i64
+    kalman_us: i64
+    fed_us: i64  # when the watchdog was fed
+    # Entry points of the core, and their processor times.
+    take_sample: i64
+    begin_step: i64
+    control: i64
+    control_us: i64
+    estimate: i64
+    estimate_us: i64
+    # What Python does for the tasks.
+    zero_found: i64
+    decide: i64
+    write_compare: i64
+    take_pose: i64
+    pose_gated: i64
 
 
-def sensors_task(
-    kernel: Kernel,
-    cost: CpuConfig,
-    board: Board,
-    imu_ready: Semaphore,
-    data_ready: Semaphore,
-    core: CoreBlocks,
-    zero_found: Callable[[], None],
-) -> Task:
+@compiled
+def sensors(k: KernelMemory, path: FlightPath, data: Input, imu: I32s) -> Steps:
     """Read the IMU whenever it has data."""
-    cost_us, gyro = cost.sensors_us, core.data.fields.gyro.data
     while True:
-        yield from imu_ready.take()
-        yield from kernel.work(cost_us)
-        gyro[0], gyro[1], gyro[2] = board.read_imu()[:3]
-        if core.run.call("take_sample"):
-            zero_found()
-            yield from kernel.yield_if_pending()
-        yield from data_ready.give_nowait()
+        yield from take(k, path.imu_ready, FOREVER)
+        yield from work(k, path.sensors_us)
+        data.gyro[0], data.gyro[1], data.gyro[2] = imu[0], imu[1], imu[2]
+        found = call(path.take_sample)
+        if found > 0:
+            call(path.zero_found)
+            yield from yield_if_pending(k)
+        yield from give(k, path.data_ready, 0)
 
 
-def stabilizer_task(  # noqa: PLR0913 - what a task uses is wired once
-    kernel: Kernel,
-    cost: CpuConfig,
-    board: Board,
-    data_ready: Semaphore,
-    estimator_run: Semaphore,
-    supervisor: CoreSupervisor,
-    core: CoreBlocks,
-    costs: CoreCosts,
-    pilot: Pilot,
-) -> Task:
+@compiled
+def stabilizer(k: KernelMemory, path: FlightPath, data: Input) -> Steps:
     """Run at 1 kHz on the tick edge after each IMU sample; control at 100 Hz."""
-    cost_us, tick = cost.stabilizer_us, core.data.cell("tick")
     while True:
-        if (yield from data_ready.take(DATA_TIMEOUT)):
-            yield from kernel.delay_until(kernel.tick_count + 1)
-        core.watchdog_fed_us = kernel.now_us
-        if cost_us:
-            yield from kernel.work(cost_us)
-        tick[0] = kernel.tick_count
-        control_runs = core.run.call("begin_step")
-        yield from estimator_run.give_nowait()
-        if control_runs:
-            yield from kernel.work(costs.control_us())
-            pilot.step(kernel.now_us)
-            supervisor.update(kernel.now_us)
-            yield from kernel.yield_if_pending()
-            core.run.call("control")
-            board.write_compare(core.control.fields.count.tolist())
+        came = yield from take(k, path.data_ready, DATA_TIMEOUT)
+        if came > 0:
+            yield from delay_until(k, k.tick_count + 1)
+        path.fed_us = k.now_us
+        if path.stabilizer_us > 0:
+            yield from work(k, path.stabilizer_us)
+        data.tick = i32(k.tick_count)
+        control_runs = call(path.begin_step)
+        yield from give(k, path.estimator_run, 0)
+        if control_runs > 0:
+            cost_us = call(path.control_us)
+            yield from work(k, cost_us)
+            call(path.decide)
+            yield from yield_if_pending(k)
+            call(path.control)
+            call(path.write_compare)
 
 
-def estimator_task(  # noqa: PLR0913 - what a task uses is wired once
-    kernel: Kernel,
-    cost: CpuConfig,
-    estimator_run: Semaphore,
-    measurements: Queue[Arrived],
-    core: CoreBlocks,
-    costs: CoreCosts,
-    pose_refused: Callable[[int, Correction], None],
-    pose_gated: Callable[[], None],
-) -> Task:
+@compiled
+def kalman(k: KernelMemory, path: FlightPath, sampling: Sampling, estimator: Estimator) -> Steps:
     """Take poses at 1 kHz, estimate at 100 Hz."""
-    cost_us, estimate_due = cost.kalman_us, core.sampling.cell("estimate_due")
-    gated = core.estimator.cell("refused")
     while True:
-        yield from estimator_run.take()
-        if cost_us:
-            yield from kernel.work(cost_us)
-        while (arrived := measurements.receive_nowait()) is not None:
-            if (answer := hand_pose_to_core(kernel, core, *arrived)) != POSE_ON_TIME:
-                pose_refused(answer, arrived[1])
-                yield from kernel.yield_if_pending()
-        if estimate_due[0]:
-            yield from kernel.work(costs.estimate_us())
-            before = gated[0]
-            core.run.call("estimate")
-            if gated[0] != before:
-                pose_gated()
-                yield from kernel.yield_if_pending()
+        yield from take(k, path.estimator_run, FOREVER)
+        if path.kalman_us > 0:
+            yield from work(k, path.kalman_us)
+        while k.count[path.measurements] > 0:
+            refused = call(path.take_pose)
+            if refused > 0:
+                yield from yield_if_pending(k)
+        if sampling.estimate_due > 0:
+            cost_us = call(path.estimate_us)
+            yield from work(k, cost_us)
+            before = estimator.refused
+            call(path.estimate)
+            if estimator.refused != before:
+                call(path.pose_gated)
+                yield from yield_if_pending(k)
 
 
-def power_task(kernel: Kernel, board: Board, core: CoreBlocks) -> Task:
+@compiled
+def fly(
+    k: KernelMemory,
+    path: FlightPath,
+    data: Input,
+    imu: I32s,
+    sampling: Sampling,
+    estimator: Estimator,
+    first: int,
+) -> int:
+    """Take the steps of the three tasks, from a task on, until another one is to take a step; return it."""
+    task = first
+    while task > 0:
+        yielded_us = 0
+        if task == path.sensors:
+            yielded_us = step(sensors(k, path, data, imu))
+        elif task == path.stabilizer:
+            yielded_us = step(stabilizer(k, path, data))
+        elif task == path.kalman:
+            yielded_us = step(kalman(k, path, sampling, estimator))
+        else:
+            return task
+        if yielded_us < 0:
+            return yielded_us
+        task = resume_run(k, yielded_us)
+    return task
+
+
+@compiled
+def begin(  # noqa: PLR0913 - what the tasks use is wired once
+    k: KernelMemory,
+    path: FlightPath,
+    data: Input,
+    imu: I32s,
+    sampling: Sampling,
+    estimator: Estimator,
+    now_us: int,
+    until_us: int,
+) -> int:
+    """Do what the scheduler's `begin` does."""
+    task = begin_run(k, now_us, until_us)
+    return fly(k, path, data, imu, sampling, estimator, task)
+
+
+@compiled
+def resume(
+    k: KernelMemory,
+    path: FlightPath,
+    data: Input,
+    imu: I32s,
+    sampling: Sampling,
+    estimator: Estimator,
+    yielded_us: int,
+) -> int:
+    """Do what the scheduler's `resume` does."""
+    task = resume_run(k, yielded_us)
+    return fly(k, path, data, imu, sampling, estimator, task)
+
+
+@compiled
+def next_task(
+    k: KernelMemory, path: FlightPath, data: Input, imu: I32s, sampling: Sampling, estimator: Estimator
+) -> int:
+    """Do what the scheduler's `next_task` does."""
+    task = take_next(k)
+    return fly(k, path, data, imu, sampling, estimator, task)
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What the tasks report."""
+
+    zero_found: Callable[[], None]
+    pose_refused: Callable[[int, Correction], None]  # (POSE_..., pose)
+    pose_gated: Callable[[], None]
+
+
+class FlightTasks:
+    """The tasks of the flight path in a scheduler; `imu_ready` is the IMU's, `measurements` are the poses' to arrive."""
+
+    def __init__(
+        self,
+        kernel: Kernel,
+        cpu: CpuConfig,
+        board: Board,
+        core: CoreBlocks,
+        supervisor: CoreSupervisor,
+        pilot: Pilot,
+        findings: Findings,
+    ) -> None:
+        self.imu_ready = kernel.create_binary_semaphore("imuReady")
+        data_ready = kernel.create_binary_semaphore("dataReady")
+        estimator_run = kernel.create_binary_semaphore("runTaskSemaphore")
+        self.measurements: Queue[Arrived] = kernel.create_queue(MEASUREMENT_QUEUE, "measurements")
+        self._kernel, self._board, self._core = kernel, board, core
+        self._supervisor, self._pilot, self._findings = supervisor, pilot, findings
+        self._path = FlightPath.allocate()
+        path, costs = self._path.fields, costs_of(core.run, cpu)
+        path.imu_ready, path.data_ready = self.imu_ready.index, data_ready.index
+        path.estimator_run, path.measurements = estimator_run.index, self.measurements.index
+        path.sensors_us, path.stabilizer_us, path.kalman_us = cpu.sensors_us, cpu.stabilizer_us, cpu.kalman_us
+        entries = {name: core.entry(name) for name in ("take_sample", "begin_step", "control", "estimate")}
+        self._path.connect(
+            **entries,
+            control_us=costs.control_us,
+            estimate_us=costs.estimate_us,
+            zero_found=findings.zero_found,
+            decide=self._decide,
+            write_compare=self._write_compare,
+            take_pose=self._take_pose,
+            pose_gated=findings.pose_gated,
+        )
+        k, data, sampling = kernel.memory, core.data, core.sampling
+        estimated = sampling.fields, core.estimator.fields
+        path.sensors = kernel.create_task("SENSORS", 4, sensors, k, path, data.fields, board.imu).index
+        path.stabilizer = kernel.create_task("STABILIZER", 5, stabilizer, k, path, data.fields).index
+        path.kalman = kernel.create_task("KALMAN", 2, kalman, k, path, *estimated).index
+        if max(path.sensors, path.stabilizer, path.kalman) >= FRAMES:
+            raise KernelError(f"the flight tasks are not among the first {FRAMES} tasks")
+        kernel.create_task("PWRMGNT", 0, power_task, kernel, board, core)
+        # What `fly` takes behind the scheduler's memory.
+        self.memory = self._path, data, board.imu, sampling, core.estimator
+        kernel.run_by((begin, resume, next_task), *self.memory)
+
+    @property
+    def fed_us(self) -> int:
+        """When the watchdog was fed."""
+        return self._path.fields.fed_us
+
+    def _decide(self) -> None:
+        now_us = self._kernel.now_us
+        self._pilot.step(now_us)
+        self._supervisor.update(now_us)
+
+    def _write_compare(self) -> None:
+        self._board.write_compare(self._core.control.fields.count.tolist())
+
+    def _take_pose(self) -> bool:
+        """Hand the next pose to the core; return whether it was refused."""
+        arrived = self.measurements.receive_nowait()
+        assert arrived is not None
+        answer = hand_pose_to_core(self._kernel, self._core, *arrived)
+        if answer != POSE_ON_TIME:
+            self._findings.pose_refused(answer, arrived[1])
+        return answer != POSE_ON_TIME
+
+
+def power_task(kernel: Kernel, board: Board, core: CoreBlocks) -> Generator[int, None, None]:
     """Measure the supply voltage at 10 Hz."""
     wake_tick = kernel.tick_count
     while True:

@@ -45,6 +45,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "firmware_py.errors", "firmware_py.extras", "firmware_py.fast", "firmware_py.logic", "firmware_py.policy",
         "firmware_py.section", "firmware_py.table", "firmware_py.kept_code",
         "firmware_py.core.subset",  # the language of the world's kernels
+        "firmware_py.tasks", "firmware_py.core.structs",  # the loop in C takes their steps
     ),
 }  # fmt: skip
 
@@ -102,7 +103,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "onnx": ("firmware_py/policy/reading.py",),
     "safetensors": ("firmware_py/policy/reading.py",),
     "elftools": ("firmware_py/export/elf.py",),
-    "ctypes": ("firmware_py/compiling.py", "firmware_py/export/cortex_m4.py"),
+    "ctypes": ("firmware_py/compiling.py", "firmware_py/core/subset.py", "firmware_py/export/cortex_m4.py"),
     "cffi": ("hil/stm32f405/chip.py",),
     "subprocess": (
         "hil/installation.py", "hil/live/", "hil/servers/linked.py",

@@ -28,7 +28,7 @@ from firmware_py.fast import FOLDER, RECORD, digest  # noqa: E402 - from this tr
 
 PACKAGES = ("firmware_py", "ground_station", "hil")
 MODULES = {
-    "firmware_py": "firmware geometry pilot supervisor tasks",
+    "firmware_py": "firmware geometry pilot supervisor",
     "firmware_py/crazyflie": "commander planner stabilizer supervisor",
     "firmware_py/links": "crtp_stack localisation log",
     "firmware_py/wire": "crtp log telemetry",

@@ -4,7 +4,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from firmware_py.board import EEPROM_SIZE, ImuCounts
+from firmware_py.core.subset import I32s, i32
 from firmware_py.rtos import TICK_US
 from firmware_py.wire.mavlink_numbers import CommandResult
 from hil.devices.board_firmware import Processor
@@ -67,7 +70,7 @@ class VirtualBoard:
         requests: Requests = NO_REQUESTS,
         eeprom: bytearray | None = None,
     ) -> None:
-        self.imu: ImuCounts = STILL
+        self.imu = np.array(STILL, i32)
         self.battery_mv = 3900
         self.eeprom = new_eeprom() if eeprom is None else eeprom
         self._servo, self._radio, self._console, self._uart = servo, radio, console, uart
@@ -76,8 +79,8 @@ class VirtualBoard:
         self._events: EventQueue | None = None
         self._booted_us = 0
 
-    def measure(self, counts: ImuCounts) -> None:
-        self.imu = counts
+    def measure(self, counts: Sequence[int] | I32s) -> None:
+        self.imu[:] = counts
 
     def supply(self, millivolts: int) -> None:
         self.battery_mv = millivolts
@@ -96,7 +99,7 @@ class VirtualBoard:
         return self._booted_us + (self._kernel.now_us if self._kernel else 0)
 
     def read_imu(self) -> ImuCounts:
-        return self.imu
+        return tuple(self.imu.tolist())
 
     def read_battery_mv(self) -> int:
         return self.battery_mv
@@ -133,8 +136,8 @@ class VirtualBoard:
 
     def _let_hardware_go_first(self) -> None:
         """Stop the tasks before the hardware's next event."""
-        if self._kernel and self._events and self._events.next_us is not None:
-            self._kernel.stop_before(self._events.next_us - self._booted_us)
+        if self._kernel and self._events and self._events.other_us is not None:
+            self._kernel.stop_before(self._events.other_us - self._booted_us)
 
     def debug_write(self, text: str) -> None:
         self._console(self.now_us, text)

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Protocol
 from numpy.typing import NDArray
 
 from firmware_py.board import Board, ImuCounts
+from firmware_py.compiling import Memory
 from firmware_py.config import FirmwareConfig
 from firmware_py.core_runner import RunnerFactory, default_runner
 from firmware_py.export.usage import Usage
@@ -199,6 +200,10 @@ class BoardFirmware(Protocol):
     @property
     def signals(self) -> Signals:
         """Views on its estimate, counters, inputs, counts and supervisor; NaN for numbers it does not report."""
+
+    @property
+    def flight_path(self) -> Sequence[Memory] | None:
+        """The memory of its flight tasks, for the laboratory's loop; None for other firmware."""
 
     @property
     def variables(self) -> Sequence[BoardVariable]:

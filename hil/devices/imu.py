@@ -105,6 +105,7 @@ class VirtualImu:
         imu.bias[:] = normal(rng, 6) * np.repeat([config.gyro_bias, config.accel_bias], 3)
         for part, bandwidth in ((slice(3), config.gyro_bandwidth), (slice(3, 6), config.accel_bandwidth)):
             imu.b0[part], imu.a1[part], imu.a2[part] = low_pass(bandwidth)
+        self.count = imu.count  # (6,) of the last sample
         self._draws = np.zeros((NOISE_ROWS, 6))
         self._rows_left = self._memory.cell("rows_left")
         self._measure: Callable[[], object]
@@ -119,6 +120,11 @@ class VirtualImu:
 
     def sample(self, body: Motion) -> ImuCounts:
         """Return gyro x y z and accelerometer x y z counts, in S, of the body as it moves now."""
+        self.measure(body)
+        return tuple(self.count.tolist())
+
+    def measure(self, body: Motion) -> None:
+        """Take a sample into `count`."""
         if self._body is not body:
             self._body = body
             felt = body.omega_B, body.specific_force_B, body.vibration
@@ -127,13 +133,13 @@ class VirtualImu:
             self._draws[:] = normal(self._rng, (NOISE_ROWS, 6))
             self._rows_left[0] = NOISE_ROWS
         self._measure()
-        return tuple(self._memory.fields.count.tolist())
 
     def twin(self) -> "VirtualImu":
         """Return an independent copy of this specimen, which draws the same noise."""
         twin = copy(self)
         twin._memory, twin._rng, twin._draws = self._memory.copy(), deepcopy(self._rng), self._draws.copy()
         twin._rows_left, twin._body = twin._memory.cell("rows_left"), None
+        twin.count = twin._memory.fields.count
         return twin
 
     def continue_from(self, earlier: "VirtualImu") -> None:

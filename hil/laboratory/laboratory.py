@@ -1,7 +1,8 @@
 """The common time line of robot, cameras, link and station: firmware runs up to the next hardware event, then that happens.
 
 With a wall clock every event waits for its time, and bytes from outside arrive in between. IMU samples are events, so
-the firmware acts at most a millisecond late there; its own time is exact.
+the firmware acts at most a millisecond late there; its own time is exact. Without one, a robot that `beats` takes the
+samples up to the next other event by itself.
 """
 
 from collections.abc import Callable
@@ -64,23 +65,24 @@ class Laboratory:
 
     def _step(self, clock: Clock) -> None:
         """Run the firmware up to the hardware's next event or an earlier input from outside, then that."""
-        until_us = clock.wait_until(self._next_event_us())
         robot = self._robot
+        beats = robot is not None and robot.beats and not clock.paced  # by itself
+        until_us = clock.wait_until(self._next_event_us(beats))
         if robot is not None:
             robot.run(self.now_us, until_us - 1)
-        now_us = min(until_us, self._next_event_us())  # a task may have triggered an earlier event
+        now_us = min(until_us, self._next_event_us(beats))  # a task may have triggered an earlier event
         if robot is not None:
             robot.advance(now_us)
         if now_us == until_us:
             clock.serve(now_us)
-        self.events.run(now_us)
+        self.events.run(now_us, beats)
         self.now_us = now_us
         if clock.paced:  # answers to what is outside do not wait for the next event
             self._run_firmware()
 
-    def _next_event_us(self) -> int:
-        """Return the next hardware event's time, or the end."""
-        next_us, end_us = self.events.next_us, self.end_us
+    def _next_event_us(self, beats: bool) -> int:
+        """Return the time of the next hardware event that the robot does not run by itself, or the end."""
+        next_us, end_us = self.events.other_us if beats else self.events.next_us, self.end_us
         return end_us if next_us is None or next_us > end_us else next_us
 
     def _run_firmware(self) -> None:

@@ -20,6 +20,7 @@ from hil.bodies import make_body
 from hil.config import LabConfig, load_config
 from hil.crazyflie import syslink
 from hil.crazyflie.shockburst import Air
+from hil.devices.beats import let_beat
 from hil.devices.board import InjectFailure, Requests, Thief, VirtualBoard, new_eeprom, unsupported
 from hil.devices.board_firmware import Executor, PowerOn, PythonBoard
 from hil.devices.cameras import VirtualMocap
@@ -104,6 +105,7 @@ class Robot:
         self.start_W = (home[0] + offset[0], home[1] + offset[1], home[2] + offset[2])
         self.config = config
         self.events = site.events
+        self._beat_us = site.events.beat.cell("now_us")
         self.say = site.say
         self.free = False
         self.powered = True
@@ -153,6 +155,7 @@ class Robot:
         self.firmware = self.executor.boot(start)
         self.imu.continue_from(specimen)
         self.board.run_on(self.firmware.kernel, self.events)
+        self._in_c = let_beat(self.firmware, self.events.beat, now_us, self._take_beat)
         if self._thief is not None:
             self._occupy(self._thief)
 
@@ -160,9 +163,14 @@ class Robot:
         """Stop the firmware; the servos keep their last pulse."""
         self.powered = False
 
+    @property
+    def beats(self) -> bool:
+        """Whether a run of its processor takes the samples of the IMU by itself."""
+        return self.powered and self._in_c
+
     def watch(self, start_us: int) -> None:
         """Start IMU and cameras, which run for ever."""
-        self.events.every(IMU_PERIOD_US, start_us + IMU_PERIOD_US, self._sample)
+        self.events.set_beat(IMU_PERIOD_US, start_us + IMU_PERIOD_US, self._sample)
         self.events.every(self.config.mocap.period_us, start_us + MOCAP_PHASE_US, self._expose)
 
     def seen_by(self, see: See) -> None:
@@ -252,12 +260,21 @@ class Robot:
             self.firmware.uart_ready()
 
     def _sample(self, now_us: int) -> None:
+        if self._measured(now_us):
+            self.firmware.imu_ready()
+
+    def _take_beat(self) -> bool:
+        return self._measured(self._beat_us[0])
+
+    def _measured(self, now_us: int) -> bool:
+        """Take a sample; return whether the IMU raises its interrupt."""
         self.body.advance(now_us)
-        if self.powered:
-            counts = self.imu.sample(self.body)
-            if not self.imu.silent:
-                self.board.measure(counts)
-                self.firmware.imu_ready()
+        if not self.powered:
+            return False
+        self.imu.measure(self.body)
+        if not self.imu.silent:
+            self.board.measure(self.imu.count)
+        return not self.imu.silent
 
     def _expose(self, now_us: int) -> None:
         self.body.advance(now_us)

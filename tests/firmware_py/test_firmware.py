@@ -10,8 +10,8 @@ from firmware_py.core.sampling import WINDOW
 from firmware_py.core.structs import Input, Sampling
 from firmware_py.core_runner import CoreBlocks, default_runner
 from firmware_py.errors import FirmwareError
-from firmware_py.firmware import MEASUREMENT_QUEUE
 from firmware_py.supervisor import wrapped
+from firmware_py.tasks import MEASUREMENT_QUEUE
 from firmware_py.wire import crtp, telemetry
 from firmware_py.wire.supervisor import State
 from hil.config import load_config
@@ -168,6 +168,6 @@ def test_the_controller_runs_in_every_tenth_step_and_the_estimator_in_the_one_be
 
 def test_an_error_in_a_task_names_task_and_time(bench: FirmwareBench) -> None:
     bench.run(50_000)
-    bench.imu = None  # type: ignore[assignment]  # a driver that returns nonsense
-    with pytest.raises(FirmwareError, match=r"task SENSORS at 5[01]\.\d+ ms: TypeError"):
+    bench.write_compare = None  # type: ignore[method-assign,assignment]  # a driver that is not there
+    with pytest.raises(FirmwareError, match=r"task STABILIZER at 6?[05]\d?\.\d+ ms: TypeError"):
         bench.run(60_000)

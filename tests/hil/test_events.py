@@ -1,5 +1,7 @@
 """The order of hardware events."""
 
+from functools import partial
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -53,6 +55,39 @@ def test_a_callback_that_raises_leaves_the_rest_planned():
     assert events.next_us == 2
     events.run(5)
     assert ran == [2]
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 40), st.sampled_from([0, 5, 10]))),
+    st.integers(0, 8),
+    st.lists(st.integers(0, 9)),
+)
+def test_the_beat_happens_in_turn_like_what_is_planned_for_every_period(others, place, passed_us):
+    """What repeats is planned among the others; runs go on in any portions."""
+
+    def ran(how):
+        events, log, now_us = EventQueue(), [], 0
+        for number in range(len(others) + 1):
+            if number == min(place, len(others)):
+                getattr(events, how)(5, 5, lambda us: log.append((us, "beat")))
+            if number < len(others):
+                start_us, period_us = others[number]
+                note = partial(lambda number, us: log.append((us, number)), number)
+                events.every(period_us, start_us, note) if period_us else events.at(start_us, note)
+        for portion_us in passed_us:
+            now_us += portion_us
+            events.run(now_us)
+        return log
+
+    assert ran("every") == ran("set_beat")
+
+
+def test_there_is_one_beat():
+    events, ran = EventQueue(), []
+    for start_us in (1, 2, 3):
+        events.set_beat(10, start_us, ran.append)
+    events.run(13)
+    assert ran == [1, 2, 3, 11, 12, 13]
 
 
 def test_a_period_counts_from_the_planned_instant():

@@ -116,10 +116,10 @@ def first_difference(recording: Recording, library: Path) -> int | None:
 
 
 class RecordingRunner:
-    """Runs the core and writes down what goes in and what comes out."""
+    """Runs the core's Python and writes down what goes in and what comes out."""
 
     def __init__(self, core: CoreBlocks) -> None:
-        self._core, self._inner = core, core.run
+        self._core, self._inner = core, PlainRunner(core)
         self.recording = Recording([block.bytes() for block in blocks_of(core)])
 
     def call(self, name: str) -> int:
@@ -135,11 +135,10 @@ def record_flight(duration_s: float) -> Recording:
     """Return the core's calls in a hover with pushes and with gaps, outliers and late poses."""
     faults = ["push.y@2=2", "push.roll@3=0.2", "mocap.dropout@4:0.4", "push.z@5=2"]
     request = Request.of(HOVER, duration_s=duration_s, faults=faults)
-    flight = lockstep_flight(request, executor=PythonBoard(PlainRunner))
-    core = flight.robot.firmware._core
-    runner = RecordingRunner(core)
-    core.run = runner  # type: ignore[assignment]
+    flight = lockstep_flight(request, executor=PythonBoard(RecordingRunner))
     flight.run()
+    runner = flight.robot.firmware._core.run
+    assert isinstance(runner, RecordingRunner)
     return runner.recording
 
 

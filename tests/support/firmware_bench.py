@@ -55,7 +55,7 @@ class FirmwareBench(VirtualBoard):
 
     def _sample(self, now_us: int) -> None:
         if self.imu_alive:
-            self.imu = (*self.imu[:2], self.imu[2] ^ self.imu_noise, *self.imu[3:])
+            self.imu[2] ^= self.imu_noise
             self.firmware.imu_ready()
         if self.polling:
             self.firmware.radio_polled()

@@ -97,7 +97,7 @@ def test_height_velocity_and_heading_have_the_standards_units(moving: MavlinkCli
 def test_the_imu_measures_in_si_in_the_bodys_axes() -> None:
     client = MavlinkClient()
     client.run(GYRO_ZERO_US)  # three counts of rest are zero from now on
-    client.imu = (3 + 1000, -2 + 2000, 1 - 3000, 100, 200, 1365)
+    client.imu[:] = (3 + 1000, -2 + 2000, 1 - 3000, 100, 200, 1365)
     found = once(client, 105)
     to_B = Rotation.from_euler("z", -45, degrees=True)  # x of the sensor lies 45 deg to the right
     rates = TURN.apply(to_B.apply(np.radians(np.array((1000, 2000, -3000)) * 2000 / 32768)))

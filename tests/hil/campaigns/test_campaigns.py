@@ -365,8 +365,8 @@ def test_flights_without_an_end_are_distinct_failures(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("limit", "value", "ended"),
     [
-        ("simulated_s", 1.27, False),
-        ("simulated_s", 1.271, True),
+        ("simulated_s", 1.26, False),
+        ("simulated_s", 1.28, True),
         ("wall_s", 2.4, False),
         ("wall_s", 2.6, True),
     ],
@@ -374,7 +374,7 @@ def test_flights_without_an_end_are_distinct_failures(tmp_path: Path) -> None:
 def test_a_flight_beyond_its_time_limit_is_a_row_that_names_it(
     limit: str, value: float, ended: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is asked at 0.02, 0.27, 0.52 ... 1.27 s, and a clock of the wall shows half a second more each time."""
+    """It is asked shortly after 0.02, 0.27, 0.52 ... 1.27 s, and a clock of the wall shows half a second more each time."""
     clock = SimpleNamespace(monotonic=(0.5 * number for number in count(1000)).__next__)
     monkeypatch.setattr("hil.campaigns.jobs.time", clock)
     row = fly_job(draw(spec_of(limits={limit: value}), 0))

@@ -361,4 +361,4 @@ def test_markers_leave_all_other_randomness_as_it_was() -> None:
 
 
 def random_parts(flight: Flight) -> tuple[object, ...]:
-    return flight.robot.body.flow_W.tolist(), flight.robot.board.imu, flight.line.radio.up.sent
+    return flight.robot.body.flow_W.tolist(), flight.robot.board.imu.tolist(), flight.line.radio.up.sent
