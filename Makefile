@@ -4,13 +4,11 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 unexport PYTHONDONTWRITEBYTECODE  # the tests start many programs: each would compile all sources anew
 
-.PHONY: fly test test-all check bench mutants docs pictures fast dist wheel clients clean
+.PHONY: fly test test-all check bench mutants docs pictures dist clients clean
 
 fly: .venv/fly.stamp
 	$(BIN)/floaty fly hover
 
-# Tests replace parts of classes, which compiled ones (`make fast`) do not let them; those have tests of their own.
-test test-all: export FLOATY_PURE = 1
 test: .venv/test.stamp
 	$(BIN)/python -m pytest -n auto
 
@@ -42,16 +40,9 @@ mutants: .venv/test.stamp
 bench: .venv/test.stamp
 	$(BIN)/python tools/bench.py
 
-# The lockstep loop's modules compiled by mypyc, with the C compiler of this machine.
-fast: .venv/fast.stamp
-	$(BIN)/python tools/fast.py
-
-# A wheel of pure Python for any machine, and the sdist from which it was built; `make wheel`: compiled, for this Python.
+# A wheel of pure Python for any machine, and the sdist from which it was built.
 dist: .venv/test.stamp
 	$(BIN)/python -m build --no-isolation
-
-wheel: .venv/fast.stamp
-	FLOATY_COMPILED=1 $(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist .
 
 .venv/pip.stamp:
 	$(PYTHON) -m venv .venv
@@ -71,9 +62,5 @@ wheel: .venv/fast.stamp
 	$(BIN)/python -m pip install --quiet --editable '.[docs,export]'
 	@touch $@
 
-.venv/fast.stamp: .venv/fly.stamp
-	$(BIN)/python -m pip install --quiet --editable '.[fast]'
-	@touch $@
-
 clean:
-	rm -rf .venv runs dist site firmware_py/compiled
+	rm -rf .venv runs dist site

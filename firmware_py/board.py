@@ -6,8 +6,7 @@ from typing import Protocol
 from firmware_py.core.subset import I32s
 from firmware_py.wire.mavlink_numbers import CommandResult
 
-# Gyro x y z, accelerometer x y z, int16, sensor frame. The six stay packed: code compiled by mypyc would unpack and repack
-# a tuple of known length at every call.
+# Gyro x y z, accelerometer x y z, int16, sensor frame.
 ImuCounts = tuple[int, ...]
 
 EEPROM_SIZE = 8192

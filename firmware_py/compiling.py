@@ -113,6 +113,13 @@ def kept_library(path: Path, make: Callable[[], Path]) -> Path:
     return path if path.exists() else made
 
 
+def flies_as() -> str:
+    """Return what flies on this machine: "C", or "plain Python" where nothing compiles."""
+    from firmware_py.export.compilers import compilers
+
+    return "C" if not PLAIN and any(compilers()) else "plain Python"
+
+
 def must_compile(function: Callable[..., Any]) -> bool:
     """Return whether a kernel has not been compiled on this machine yet, and will be."""
     from firmware_py.export.compilers import compilers

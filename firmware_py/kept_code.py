@@ -11,7 +11,7 @@ with the process.
     zig/     that compiler's own cache                                                firmware_py/export/compilers.py
     pages/   templates of pages as bytecode                                           hil/pictures/pages.py
 
-What `make fast` compiles belongs to the installation (`firmware_py/fast.py`), and `*.pyc` to Python.
+`*.pyc` belong to Python.
 """
 
 import atexit

@@ -8,8 +8,6 @@ first use.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from firmware_py import fast as fast  # lets compiled modules be found
-
 if TYPE_CHECKING:
     from hil.api import *
 

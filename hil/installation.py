@@ -1,4 +1,4 @@
-"""Describes the installation: version, commit, compiled modules, packages of the extras, and programs that are called or
+"""Describes the installation: version, what flies, commit, packages of the extras, and programs that are called or
 recommended.
 
 A clone asks git for its commit. A wheel or an sdist has it in a file, written by `tools/build_hook.py`: git would report
@@ -13,13 +13,13 @@ from collections.abc import Iterable, Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from firmware_py.compiling import flies_as
 from firmware_py.extras import PROJECT, packages_of_extras
-from firmware_py.fast import STATE
 
 COMMIT = Path(__file__).parent / "commit.txt"
 ROOT = Path(__file__).parent.parent
 COMPUTING = ("numpy", "pyarrow")  # packages whose versions could affect the bits of a flight
-DEVELOPMENT = ("fast", "bench", "docs", "test", "clients")  # extras of the Makefile: no command asks for them
+DEVELOPMENT = ("bench", "docs", "test", "clients")  # extras of the Makefile: no command asks for them
 # Git reports the commit, the C compilers build `--board c`, the last two are for exported and emulated images.
 PROGRAMS = ("git", "gcc", "clang", "arm-none-eabi-gcc", "gdb-multiarch")
 PROGRAM_TIMEOUT_S = 2.0
@@ -50,11 +50,11 @@ def versions() -> dict[str, str]:
 
 
 def describe() -> str:
-    """Return the lines of `floaty --version`; the first one is `floaty, version VERSION, STATE` in every release."""
+    """Return the lines of `floaty --version`; the first one is `floaty, version VERSION, WHAT FLIES` in every release."""
     rows = list(_rows())
     width = max(len(name) for name, _ in rows)
     lines = [f"{name:{width}}  {text}" for name, text in rows]
-    return "\n".join((f"floaty, version {_version(PROJECT)}, {STATE}", *lines))
+    return "\n".join((f"floaty, version {_version(PROJECT)}, {flies_as()}", *lines))
 
 
 def _rows() -> Iterator[tuple[str, str]]:

@@ -22,12 +22,11 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "firmware_py.compiling": ("firmware_py.kept_code", "firmware_py.core.subset", "firmware_py.export"),
     "firmware_py.kept_code": (),
     "firmware_py.extras": (),
-    "firmware_py.fast": (),
     "firmware_py.section": (),
     "firmware_py": ("firmware_py",),
     "ground_station": (
         "ground_station", "firmware_py.wire", "firmware_py.geometry", "firmware_py.elementary", "firmware_py.extras",
-        "firmware_py.fast", "firmware_py.section", "firmware_py.table",
+        "firmware_py.section", "firmware_py.table",
         "firmware_py.core.structs",  # the oldest pose that the board can use
     ),
     "hil.stm32f405": ("hil", "firmware_py.export", "firmware_py.extras"),
@@ -42,7 +41,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "firmware_py.firmware", "firmware_py.core_runner", "firmware_py.export", "firmware_py.board",
         "firmware_py.config", "firmware_py.signals", "firmware_py.rtos",
         "firmware_py.wire", "firmware_py.geometry", "firmware_py.elementary", "firmware_py.compiling",
-        "firmware_py.errors", "firmware_py.extras", "firmware_py.fast", "firmware_py.logic", "firmware_py.policy",
+        "firmware_py.errors", "firmware_py.extras", "firmware_py.logic", "firmware_py.policy",
         "firmware_py.section", "firmware_py.table", "firmware_py.kept_code",
         "firmware_py.core.subset",  # the language of the world's kernels
         "firmware_py.tasks", "firmware_py.core.structs",  # the loop in C takes their steps

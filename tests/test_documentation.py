@@ -241,8 +241,7 @@ def test_the_table_of_extras_is_that_of_the_project_and_other_pages_lead_there()
     declared = {
         extra: {re.split(r"[<>=]", package)[0] for package in packages}
         for extra, packages in project["optional-dependencies"].items()
-        if extra
-        not in ("fast", "bench", "docs", "test", "clients")  # what `make` targets of the clone install
+        if extra not in ("bench", "docs", "test", "clients")  # what `make` targets of the clone install
     }
     page = DOCS / "howto" / "installation.md"
     rows = re.findall(r"^\| `([a-z]+)` \|.*\| ([^|]+) \|$", page.read_text(encoding="utf-8"), re.MULTILINE)

@@ -32,7 +32,6 @@ from rich.table import Table
 from firmware_py.config import parameters_of
 from firmware_py.core_runner import CoreBlocks, default_runner
 from firmware_py.extras import install_command
-from firmware_py.fast import STALE, STATE
 from hil.commands.app import COMMANDS
 from hil.commands.options import right
 from hil.config import load_config
@@ -186,8 +185,8 @@ class Figures:
     """The measurements: a table for people, and the same for programs."""
 
     def __init__(self) -> None:
-        self.table = Table("what", *right("value", "compared"), title=f"floaty bench: {STATE}")
-        self.values: dict[str, float | str] = {"code": STATE}
+        self.table = Table("what", *right("value", "compared"), title="floaty bench")
+        self.values: dict[str, float] = {}
 
     def add(self, name: str, value: float, unit: str, compared: str = "", digits: int = 2) -> None:
         self.table.add_row(name, f"{value:.{digits}f} {unit}", compared)
@@ -275,8 +274,6 @@ def main() -> None:
     Console(width=100).print(figures.table)
     if options.json:
         options.json.write_text(json.dumps(figures.values, indent=1) + "\n", encoding="utf-8")
-    if STALE:
-        print(f"what `make fast` has compiled is not used: {STALE}")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from firmware_py.fast import STATE
 from hil.learn.envs import make_env, make_vec
 
 MANY, FAST_STEPS, PEER_STEPS = 1024, 100, 30
@@ -79,7 +78,7 @@ PEERS = {f"RotorPy, {MANY} quadrotors": rotorpy, "gym-pybullet-drones, one quadr
 
 
 def main() -> None:
-    table = Table(title=f"control steps of 10 ms per second and core: {STATE}")
+    table = Table(title="control steps of 10 ms per second and core")
     table.add_column("environment")
     table.add_column("steps/s", justify="right")
     table.add_row(f"fast, {MANY} robots", f"{fast():,.0f}")

@@ -136,7 +136,7 @@ def main(arguments: Sequence[str], root: Path = ROOT) -> int:
     )
     parser.add_argument("--jobs", metavar="N", type=int, default=os.cpu_count() or 1, help="files at a time")
     options = parser.parse_args(arguments)
-    os.environ |= {"FLOATY_PURE": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
     room = root / options.room
     planted = files(room, root, options.sample)
     if not planted:

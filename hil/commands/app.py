@@ -17,7 +17,6 @@ from typing import Any, TextIO
 import click
 
 from firmware_py.extras import why_missing
-from firmware_py.fast import STALE
 from ground_station.stops import stopped_like_ctrl_c
 from hil.commands.options import INTERRUPTED, warn
 from hil.errors import LabError, OutputError
@@ -150,8 +149,6 @@ def main() -> None:
     os.environ["PYTHONSAFEPATH"] = "1"
     gc.set_threshold(100_000, 20, 50)  # imports alone would cause 0.3 s of collections
     atexit.register(gc.freeze)  # Python's last collection would delay the prompt by 0.5 s
-    if STALE:
-        warn(f"floaty: pure Python, not what `make fast` has compiled: {STALE}")
     try:
         _check_names(sys.argv[1:])
         with stopped_like_ctrl_c(), _printing():

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from firmware_py import extras
-from firmware_py.fast import STATE
+from firmware_py.compiling import flies_as
 from hil import installation
 from hil.campaigns.dataset import about
 from hil.campaigns.jobs import Job, Plan
@@ -40,8 +40,17 @@ def rows() -> dict[str, str]:
 
 def test_the_first_line_is_for_programs_and_the_others_are_aligned(program: Program) -> None:
     first, *others = describe().splitlines()
-    assert first == f"floaty, version {version('floaty-hil')}, {STATE}"
+    assert first == f"floaty, version {version('floaty-hil')}, {flies_as()}"
     assert len({len(row[0]) for line in others if (row := re.match(r"\w+( [\w-]+)? {2,}", line))}) == 1
+
+
+def test_what_flies_is_c_where_a_compiler_is(program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)  # no ziglang
+    assert flies_as() == "plain Python"
+    program("clang", "true")
+    assert flies_as() == "C"
+    monkeypatch.setattr("firmware_py.compiling.PLAIN", True)
+    assert flies_as() == "plain Python"
 
 
 def test_missing_git_and_tools_are_reported(program: Program) -> None:
