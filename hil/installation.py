@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from firmware_py.compiling import flies_as
 from firmware_py.extras import PROJECT, packages_of_extras
 
 COMMIT = Path(__file__).parent / "commit.txt"
@@ -51,6 +50,8 @@ def versions() -> dict[str, str]:
 
 def describe() -> str:
     """Return the lines of `floaty --version`; the first one is `floaty, version VERSION, WHAT FLIES` in every release."""
+    from firmware_py.compiling import flies_as  # numpy, slow to load
+
     rows = list(_rows())
     width = max(len(name) for name, _ in rows)
     lines = [f"{name:{width}}  {text}" for name, text in rows]
