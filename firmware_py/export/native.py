@@ -18,15 +18,20 @@ def build(
     flags: tuple[str, ...] = (),
 ) -> Path:
     """Return the shared library of the core; it is compiled unless it is kept."""
-    compiler = compiler or find_compiler()
+    compiler, inputs = compiler or find_compiler(), ("floaty_core.c", "methods.c")
+    return compile_texts(
+        texts_of(translation), inputs, (optimisation, *FLAGS, *flags), "floaty_core.so", compiler
+    )
+
+
+def texts_of(translation: Translation) -> dict[str, str]:
+    """Return the library's sources."""
     methods = "".join(
         method(METHOD + name, CORE + name, arguments, answers)
         for name, (arguments, answers) in translation.entries.items()
     )
-    texts = {
+    return {
         "floaty_core.h": translation.header,
         "floaty_core.c": translation.source,
         "methods.c": f'#include "floaty_core.h"\n#include <stdint.h>\n\n{PROTOTYPES}{methods}',
     }
-    inputs = ("floaty_core.c", "methods.c")
-    return compile_texts(texts, inputs, (optimisation, *FLAGS, *flags), "floaty_core.so", compiler)

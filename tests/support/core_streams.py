@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from firmware_py.config import parameters_of
 from firmware_py.core.structs import Control, Estimator, Input, Parameters, Report, Sampling, Supervisor
 from firmware_py.core.subset import Block
-from firmware_py.core_runner import CoreBlocks, NativeRunner, PlainRunner
+from firmware_py.core_runner import CoreBlocks, NativeRunner, PlainRunner, RunnerFactory
 from hil.config import load_config
 from hil.devices.board_firmware import PythonBoard
 from hil.experiments.position import HOVER
@@ -99,19 +99,20 @@ def run_step(core: CoreBlocks, step: Step) -> bytes:
     return repr(result).encode() + b"".join(map(block_bits, blocks_of(core)))
 
 
-def replay(recording: Recording, library: Path | None) -> Iterator[bytes]:
-    """Yield result and blocks after each recorded call on a compiled library, or on Python."""
-    runner = partial(NativeRunner, library=library) if library else PlainRunner
-    core = CoreBlocks(Parameters.allocate(), runner)
+def replay(recording: Recording, on: Path | RunnerFactory) -> Iterator[bytes]:
+    """Yield result and blocks after each recorded call on a compiled library, or on another runner."""
+    core = CoreBlocks(
+        Parameters.allocate(), partial(NativeRunner, library=on) if isinstance(on, Path) else on
+    )
     for block, content in zip(blocks_of(core), recording.start, strict=True):
         fill(block, content)
     for step in recording.steps:
         yield run_step(core, step)
 
 
-def first_difference(recording: Recording, library: Path) -> int | None:
+def first_difference(recording: Recording, on: Path | RunnerFactory) -> int | None:
     """Return the first call after which the memory is not what was recorded."""
-    pairs = zip(replay(recording, library), recording.after, strict=True)
+    pairs = zip(replay(recording, on), recording.after, strict=True)
     return next((index for index, (got, expected) in enumerate(pairs) if got != expected), None)
 
 
@@ -174,7 +175,7 @@ def record_wild(seed: int, count: int) -> Recording:
         second = wild_words(rng, data) if rng.random() < 0.7 else sane[1]
         floats = wild_words(rng, estimator) if rng.random() < 0.15 else b""
         recording.steps.append(Step(str(call), first, second, floats))
-    recording.after = list(replay(recording, None))
+    recording.after = list(replay(recording, PlainRunner))
     return recording
 
 
@@ -231,7 +232,7 @@ def record_plausible(seed: int, ticks: int) -> Recording:
         calls += ["admits", "follow"]
         calls += ["request"] if rng.random() < 0.02 else []
         recording.steps += [Step(call, parameters.bytes(), data.bytes()) for call in calls]
-    recording.after = list(replay(recording, None))
+    recording.after = list(replay(recording, PlainRunner))
     return recording
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from firmware_py.compiling import bound_in
+from firmware_py.compiling import bound, bound_in
 from firmware_py.core.structs import Control, Estimator, Parameters
 from firmware_py.core.subset import Block
 from firmware_py.export.compilers import Compiler, compilers
@@ -20,6 +20,7 @@ from hil.learn import agent
 from hil.learn.tasks import PUSH_KINDS, PUSHES
 from hil.world import fixed_order, motion
 from hil.world.structs import GUSTS, NOISE_ROWS, Air, Flaps, Rigid
+from support.other_machine import TARGETS, OtherMachine
 
 COMPILERS = [one for one in compilers() if one.name != "cc"]
 WARNINGS = ("-Wall", "-Wextra", "-Werror")
@@ -61,6 +62,13 @@ def bytes_of(memory: Memory) -> list[bytes]:
     return [array_of(one).tobytes() for one in memory]
 
 
+def make_nan_one(array: NDArray[Any]) -> None:
+    """Give every NaN of float64 the same bits: processors differ in them."""
+    for part in [array[name] for name in array.dtype.names or ()] or [array]:
+        if part.dtype == np.float64:
+            part[np.isnan(part)] = np.nan
+
+
 def draw(rng: np.random.Generator, memory: Memory) -> None:
     """Fill memory with finite numbers of many sizes, and with what steps, roots and floors need."""
     for one in memory:
@@ -89,19 +97,18 @@ def draw(rng: np.random.Generator, memory: Memory) -> None:
             fields.rows_left, fields.limit[:] = rng.integers(1, FEW_ROWS), 32768.0
 
 
+KERNELS: dict[str, tuple[Callable[..., None], Callable[[], Memory]]] = {
+    "floaty": (motion.advance, floaty),
+    "quadrotor": (quadrotor.advance, crazyflie),
+    "imu": (imu.channels, sensor),
+    "learn": (agent.advance, learner),
+    "observation": (demonstrations.observe_board, board),
+    "eigen": (fixed_order.diagonalise, matrices),
+}
+
+
 @pytest.mark.parametrize("compiler", COMPILERS, ids=[one.name for one in COMPILERS])
-@pytest.mark.parametrize(
-    ("kernel", "allocate"),
-    [
-        (motion.advance, floaty),
-        (quadrotor.advance, crazyflie),
-        (imu.channels, sensor),
-        (agent.advance, learner),
-        (demonstrations.observe_board, board),
-        (fixed_order.diagonalise, matrices),
-    ],
-    ids=["floaty", "quadrotor", "imu", "learn", "observation", "eigen"],
-)
+@pytest.mark.parametrize(("kernel", "allocate"), KERNELS.values(), ids=KERNELS)
 def test_steps_from_any_state_have_the_bits_of_python(
     kernel: Callable[..., None], allocate: Callable[[], Memory], compiler: Compiler
 ) -> None:
@@ -120,3 +127,27 @@ def test_steps_from_any_state_have_the_bits_of_python(
         with np.errstate(all="ignore"):
             kernel(*(one.fields if isinstance(one, Block) else one for one in in_python))
         assert bytes_of(in_c) == bytes_of(in_python) != before
+
+
+@pytest.mark.long
+@pytest.mark.skipif("zig" not in [one.name for one in COMPILERS], reason="no ziglang")
+@pytest.mark.parametrize("target", TARGETS)
+@pytest.mark.parametrize(("kernel", "allocate"), KERNELS.values(), ids=KERNELS)
+def test_other_machines_compute_the_same_bits(
+    kernel: Callable[..., None], allocate: Callable[[], Memory], target: str
+) -> None:
+    rng = np.random.default_rng(2027)
+    here, there = allocate(), allocate()
+    arrays, copies = ([array_of(one) for one in memory] for memory in (here, there))
+    call = bound(kernel, *here)
+    machine = OtherMachine(target, {"kernels.c": translate((kernel,), tuple(arrays))})
+    for _ in range(STATES):
+        draw(rng, here)
+        before = bytes_of(here)
+        for ours, theirs in zip(copies, arrays, strict=True):
+            ours[:] = theirs
+        call()
+        machine.call(kernel.__name__, copies)
+        for one in (*arrays, *copies):
+            make_nan_one(one)
+        assert bytes_of(there) == bytes_of(here) != before
