@@ -2,7 +2,7 @@
 
 A kernel is a function of the subset (`firmware_py.core.subset`) and stays plain Python. `bound` returns its call on memory
 that does not move: as a method of CPython in a C library, or the Python itself where no C compiler works, and with
-FLOATY_PLAIN=1, for debuggers and coverage. `firmware_py/kept_code.py` has the folders of the libraries.
+FLOATY_PURE=1, for debuggers and coverage. `firmware_py/kept_code.py` has the folders of the libraries.
 """
 
 import ctypes
@@ -26,7 +26,7 @@ from firmware_py.export.errors import CompilerError
 from firmware_py.export.methods import METHOD
 from firmware_py.kept_code import keep, kept_folder, may_load, report
 
-PLAIN = os.environ.get("FLOATY_PLAIN", "0") not in ("", "0")
+PLAIN = os.environ.get("FLOATY_PURE", "0") not in ("", "0")
 SUFFIX = ".so"
 TRANSLATOR = Path(__file__).with_name("export")
 FAST_CALL = 0x80  # `METH_FASTCALL`

@@ -30,7 +30,7 @@ SETTINGS = {
     "haswell": {"OPENBLAS_CORETYPE": "Haswell"},
     "skylake": {"OPENBLAS_CORETYPE": "SkylakeX"},
     "numpy": {"NPY_DISABLE_CPU_FEATURES": NUMPY},
-    "plain": {"FLOATY_PLAIN": "1"},
+    "plain": {"FLOATY_PURE": "1"},
     "libm": {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4"},
 }
 NEEDS = {"haswell": "AVX2", "skylake": "AVX512_SKX"}  # cores whose code does not run everywhere
