@@ -110,9 +110,8 @@ def kalman(k: KernelMemory, path: FlightPath, sampling: Sampling, estimator: Est
         if path.kalman_us > 0:
             yield from work(k, path.kalman_us)
         while k.count[path.measurements] > 0:
-            refused = call(path.take_pose)
-            if refused > 0:
-                yield from yield_if_pending(k)
+            call(path.take_pose)
+            yield from yield_if_pending(k)
         if sampling.estimate_due > 0:
             cost_us = call(path.estimate_us)
             yield from work(k, cost_us)
@@ -260,14 +259,13 @@ class FlightTasks:
     def _write_compare(self) -> None:
         self._board.write_compare(self._core.control.fields.count.tolist())
 
-    def _take_pose(self) -> bool:
-        """Hand the next pose to the core; return whether it was refused."""
+    def _take_pose(self) -> None:
+        """Hand the next pose to the core."""
         arrived = self.measurements.receive_nowait()
         assert arrived is not None
         answer = hand_pose_to_core(self._kernel, self._core, *arrived)
         if answer != POSE_ON_TIME:
             self._findings.pose_refused(answer, arrived[1])
-        return answer != POSE_ON_TIME
 
 
 def power_task(kernel: Kernel, board: Board, core: CoreBlocks) -> Generator[int, None, None]:

@@ -124,7 +124,7 @@ class Flight:
     @property
     def now_us(self) -> int:
         """The present instant of the simulation."""
-        return max(self.lab.now_us, self.events.now_us)
+        return max(self.lab.now_us, self.events.now_us, self.robot.board.now_us)
 
     @property
     def resets(self) -> int:

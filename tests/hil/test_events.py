@@ -58,14 +58,14 @@ def test_a_callback_that_raises_leaves_the_rest_planned():
 
 
 @given(
-    st.lists(st.tuples(st.integers(0, 40), st.sampled_from([0, 5, 10]))),
-    st.integers(0, 8),
-    st.lists(st.integers(0, 9)),
+    st.lists(st.tuples(st.sampled_from([4, 5, 10, 12]), st.sampled_from([0, 5, 10])), max_size=4),
+    st.integers(0, 4),
+    st.lists(st.integers(1, 12), min_size=1, max_size=6),
 )
 def test_the_beat_happens_in_turn_like_what_is_planned_for_every_period(others, place, passed_us):
-    """What repeats is planned among the others; runs go on in any portions."""
+    """What repeats is planned among the others; runs go on in any portions, and may leave the beat if it is the last."""
 
-    def ran(how):
+    def ran(how, leave=False):
         events, log, now_us = EventQueue(), [], 0
         for number in range(len(others) + 1):
             if number == min(place, len(others)):
@@ -76,10 +76,27 @@ def test_the_beat_happens_in_turn_like_what_is_planned_for_every_period(others, 
                 events.every(period_us, start_us, note) if period_us else events.at(start_us, note)
         for portion_us in passed_us:
             now_us += portion_us
+            if leave:
+                events.run(now_us, leave_beat=True)
+                assert events.other_us is None or events.other_us > now_us
             events.run(now_us)
         return log
 
-    assert ran("every") == ran("set_beat")
+    assert ran("every") == ran("set_beat") == ran("set_beat", leave=True)
+
+
+def test_a_beat_that_is_last_is_left_on_request():
+    events, ran = EventQueue(), []
+    events.set_beat(10, 10, ran.append)
+    events.every(10, 10, lambda us: ran.append(-us))
+    events.run(10, leave_beat=True)
+    assert (ran, events.next_us) == ([10, -10], 20)  # the beat came first
+    events.at(20, lambda us: ran.append(0))
+    events.run(20, leave_beat=True)
+    assert ran[2:] == [20, -20, 0]
+    events.at(25, ran.append)
+    events.run(30, leave_beat=True)
+    assert (ran[5:], events.next_us) == ([25, 30, -30], 40)
 
 
 def test_there_is_one_beat():

@@ -165,6 +165,16 @@ def forgetful(k: KernelMemory, counts: Counts) -> Steps:
 
 
 @compiled
+def remembering(k: KernelMemory, counts: Counts) -> Steps:
+    """Keep as much as there is room for."""
+    a, b, c, d, e, f, g = 1, 2, 3, 4, 5, 6, 7
+    h, i, j, m, n, o = 1, 2, 3, 4, 5, 6
+    while True:
+        yield from delay(k, a + b + c + d + e + f + g + h + i + j + m + n + o)
+        counts.late += 1
+
+
+@compiled
 def looping(k: KernelMemory, counts: Counts) -> Steps:
     """Wait in a loop over a range."""
     for tick in range(3):
@@ -190,5 +200,6 @@ def waits_for_python(k: KernelMemory, counts: Counts) -> Steps:
 )
 def test_what_a_task_of_c_cannot_do_is_refused(task, reason):
     memory = KernelMemory.allocate().memory, Counts.allocate().memory
+    assert "frame[15] = 6" in translate((remembering,), memory)
     with pytest.raises(ExportError, match=reason):
         translate((task,), memory)

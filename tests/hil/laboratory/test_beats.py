@@ -1,10 +1,13 @@
 """The loop in C flies what the time line of Python flies, bit for bit."""
 
+import hashlib
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 import pytest
 
 from firmware_py.export.compilers import compilers
+from firmware_py.rtos import Kernel
 from hil.experiments import EXPERIMENTS
 from hil.laboratory import robot
 from hil.laboratory.flight import Flight
@@ -21,9 +24,46 @@ FLIGHTS: dict[str, Options] = {
 }
 
 
-def flown(options: Options, folder: Path) -> tuple[str, bytes]:
-    result = fly(Request.of(EXPERIMENTS["hover"], **{"duration_s": 0.8, **options}), folder)
-    return result.hash, (folder / "schedule.parquet").read_bytes()
+def greedy(kernel: Kernel) -> Generator[int, None, None]:
+    """Block interrupts, so that samples are missed."""
+    while True:
+        yield from kernel.delay(70)
+        kernel.enter_critical()
+        yield from kernel.work(2500)
+        yield from kernel.exit_critical()
+
+
+def with_greedy_task(flight: Flight) -> None:
+    kernel = flight.robot.firmware.scheduler
+    assert isinstance(kernel, Kernel)
+    kernel.create_task("GREEDY", 3, greedy, kernel)
+
+
+def without_power(flight: Flight) -> None:
+    """Cut the power for a while; nothing is measured then."""
+    board, kept = flight.robot.board, []
+    flight.events.at(1_100_300, lambda _: flight.robot.cut_power())
+    flight.events.at(1_101_000, lambda _: kept.extend(board.imu.tolist()))
+    flight.events.at(1_150_000, lambda _: kept.append(board.imu.tolist() == kept))
+    flight.events.at(1_150_700, lambda now_us: (flight.robot.boot(now_us), kept.append(True)))
+    flight.events.at(1_200_000, lambda _: kept.append(board.imu.tolist() != kept[:6]))
+    flight.events.at(1_200_000, lambda _: flight.note("lab", f"kept: {kept[6:]}"))
+
+
+CHANGES: dict[str, Callable[[Flight], None]] = {"greedy": with_greedy_task, "no power": without_power}
+
+
+def flown(options: Options, folder: Path, change: Callable[[Flight], None] | None = None) -> tuple[str, ...]:
+    def made(*arguments: object) -> Flight:
+        flight = in_lockstep(*arguments)  # type: ignore[arg-type]
+        if change is not None:
+            change(flight)
+        return flight
+
+    request = Request.of(EXPERIMENTS["hover"], **{"duration_s": 0.8, **options})
+    result = fly(request, folder, flight_of=made)
+    schedule = hashlib.sha256((folder / "schedule.parquet").read_bytes()).hexdigest()
+    return result.hash, schedule, (folder / "events.jsonl").read_text()
 
 
 @pytest.mark.parametrize("options", FLIGHTS.values(), ids=FLIGHTS)
@@ -33,6 +73,17 @@ def test_a_flight_in_c_is_that_of_the_time_line(
     in_c = flown(options, tmp_path / "c")
     monkeypatch.setattr(robot, "let_beat", lambda *_: False)
     assert flown(options, tmp_path / "python") == in_c
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_a_changed_board_is_the_same_in_c_and_on_the_time_line(
+    change: Callable[[Flight], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    in_c = flown({}, tmp_path / "c", change)
+    assert change is not without_power or "kept: [True, True, True]" in in_c[2]
+    assert in_c[0] != flown({}, tmp_path / "usual")[0]
+    monkeypatch.setattr(robot, "let_beat", lambda *_: False)
+    assert flown({}, tmp_path / "python", change) == in_c
 
 
 @pytest.mark.skipif(not any(compilers()), reason="no C compiler")
