@@ -4,13 +4,11 @@ Hardware calls `imu_ready`, `radio_received` and `uart_ready` (interrupts), then
 `Board`.
 """
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from numpy.typing import NDArray
 
 from firmware_py.board import Board
-from firmware_py.compiling import Memory
 from firmware_py.config import FirmwareConfig, MavlinkConfig, parameters_of
 from firmware_py.core.structs import HORIZON_LIMIT, POSE_FROZEN, POSE_NO_CORRECTION, POSE_TOO_OLD, TICK_US
 from firmware_py.core.subset import i32
@@ -156,8 +154,8 @@ class Firmware:
         self._console.listeners.append(stack.console_line)
 
     @property
-    def flight_path(self) -> Sequence[Memory]:
-        return self._tasks.memory
+    def flight_tasks(self) -> FlightTasks:
+        return self._tasks
 
     @property
     def log_numbers(self) -> dict[str, int]:

@@ -4,7 +4,8 @@ The IMU interrupt wakes SENSORS, which reads it and lets STABILIZER run on the n
 estimator run, closes the loop in every tenth tick and writes servo counts to the timers. The estimator works one tick
 before the controller, so that a pose reaches the flaps in 1 to 11 ms.
 
-The three tasks fly as C in the scheduler's loop, and as generators where Python flies everything.
+The three tasks fly as C, in one loop with the scheduler and the IMU's beat, from one other event of hardware to the next.
+A run has a leg up to each beat. Where Python flies everything, the tasks are generators.
 """
 
 from collections.abc import Callable, Generator
@@ -18,15 +19,15 @@ from firmware_py.compiling import compiler
 from firmware_py.config import CpuConfig
 from firmware_py.core import structs, subset
 from firmware_py.core.structs import POSE_ON_TIME, Estimator, Input, Sampling
-from firmware_py.core.subset import I32s, Struct, call, i32, i64, step
+from firmware_py.core.subset import Block, I32s, Struct, call, i32, i64, step
 from firmware_py.core_runner import CoreBlocks, costs_of
 from firmware_py.crazyflie.planner import PathPoint
 from firmware_py.pilot import Arrived, Pilot, put_goal
 from firmware_py.rtos import FOREVER, Kernel, KernelError, Queue
 from firmware_py.rtos.awaited import Steps, delay_until, give, take, work, yield_if_pending
-from firmware_py.rtos.memory import FRAMES, KernelMemory
+from firmware_py.rtos.memory import FRAMES, NEVER_US, Beat, KernelMemory
+from firmware_py.rtos.queues import send_from_isr
 from firmware_py.rtos.scheduler import begin as begin_run
-from firmware_py.rtos.scheduler import next_task as take_next
 from firmware_py.rtos.scheduler import resume as resume_run
 from firmware_py.supervisor import CoreSupervisor, wrapped
 from firmware_py.wire.crtp import Correction
@@ -51,6 +52,7 @@ class FlightPath(Struct):
     stabilizer_us: i64
     kalman_us: i64
     fed_us: i64  # when the watchdog was fed
+    booted_us: i64  # when the processor's clock began, by that of the beat
     # Entry points of the core, and their processor times.
     take_sample: i64
     begin_step: i64
@@ -58,6 +60,7 @@ class FlightPath(Struct):
     control_us: i64
     estimate: i64
     estimate_us: i64
+    sample: i64  # at a beat: takes a sample, and returns whether the IMU interrupts the processor
     # What Python does for the tasks.
     zero_found: i64
     decide: i64
@@ -123,15 +126,9 @@ def kalman(k: KernelMemory, path: FlightPath, sampling: Sampling, estimator: Est
 
 
 @compiled
-def fly(
-    k: KernelMemory,
-    path: FlightPath,
-    data: Input,
-    imu: I32s,
-    sampling: Sampling,
-    estimator: Estimator,
-    first: int,
-) -> int:
+def step_tasks(
+    k: KernelMemory, path: FlightPath, data: Input, imu: I32s, sampling: Sampling, estimator: Estimator, first: int
+) -> int:  # fmt: skip
     """Take the steps of the three tasks, from a task on, until another one is to take a step; return it."""
     task = first
     while task > 0:
@@ -151,43 +148,67 @@ def fly(
 
 
 @compiled
-def begin(  # noqa: PLR0913 - what the tasks use is wired once
-    k: KernelMemory,
-    path: FlightPath,
-    data: Input,
-    imu: I32s,
-    sampling: Sampling,
-    estimator: Estimator,
-    now_us: int,
-    until_us: int,
-) -> int:
-    """Do what the scheduler's `begin` does."""
-    task = begin_run(k, now_us, until_us)
-    return fly(k, path, data, imu, sampling, estimator, task)
+def take_beat(k: KernelMemory, path: FlightPath, beat: Beat) -> int:
+    """Let the next beat happen: take a sample, and interrupt the processor; return an error below 0."""
+    k.now_us = beat.next_us - path.booted_us
+    beat.now_us = beat.next_us
+    beat.next_us += beat.period_us
+    beat.planned += 1
+    beat.order = beat.planned
+    has_data = call(path.sample)
+    if has_data > 0 and k.interrupts_off == 0:
+        return send_from_isr(k, path.imu_ready)
+    return 0
 
 
 @compiled
-def resume(
-    k: KernelMemory,
-    path: FlightPath,
-    data: Input,
-    imu: I32s,
-    sampling: Sampling,
-    estimator: Estimator,
-    yielded_us: int,
-) -> int:
+def begin_leg(k: KernelMemory, path: FlightPath, beat: Beat, now_us: int, end_us: int) -> int:
+    """Do what the scheduler's `begin` does, up to the next beat."""
+    before_us = beat.next_us - path.booted_us - 1
+    task = begin_run(k, now_us, before_us if before_us < end_us else end_us)
+    if end_us > k.end_us:
+        k.end_us = end_us
+    return task
+
+
+@compiled
+def fly(  # noqa: PLR0913 - what the tasks use is wired once
+    k: KernelMemory, path: FlightPath, data: Input, imu: I32s, sampling: Sampling, estimator: Estimator,
+    beat: Beat, first: int,
+) -> int:  # fmt: skip
+    """Go on from a task on to the end of the run, beat by beat, or until a task of Python is to take a step; return it."""
+    task = step_tasks(k, path, data, imu, sampling, estimator, first)
+    while task == 0 and k.until_us < k.end_us:
+        answer = take_beat(k, path, beat)
+        if answer < 0:
+            return answer
+        task = begin_leg(k, path, beat, k.now_us, k.end_us)
+        task = step_tasks(k, path, data, imu, sampling, estimator, task)
+    return task
+
+
+@compiled
+def begin(  # noqa: PLR0913 - what the tasks use is wired once
+    k: KernelMemory, path: FlightPath, data: Input, imu: I32s, sampling: Sampling, estimator: Estimator,
+    beat: Beat, now_us: int, until_us: int,
+) -> int:  # fmt: skip
+    """Do what the scheduler's `begin` does, after a beat that is due."""
+    if beat.next_us - path.booted_us <= now_us:
+        answer = take_beat(k, path, beat)
+        if answer < 0:
+            return answer
+    task = begin_leg(k, path, beat, now_us, until_us)
+    return fly(k, path, data, imu, sampling, estimator, beat, task)
+
+
+@compiled
+def resume(  # noqa: PLR0913 - what the tasks use is wired once
+    k: KernelMemory, path: FlightPath, data: Input, imu: I32s, sampling: Sampling, estimator: Estimator,
+    beat: Beat, yielded_us: int,
+) -> int:  # fmt: skip
     """Do what the scheduler's `resume` does."""
     task = resume_run(k, yielded_us)
-    return fly(k, path, data, imu, sampling, estimator, task)
-
-
-@compiled
-def next_task(
-    k: KernelMemory, path: FlightPath, data: Input, imu: I32s, sampling: Sampling, estimator: Estimator
-) -> int:
-    """Do what the scheduler's `next_task` does."""
-    task = take_next(k)
-    return fly(k, path, data, imu, sampling, estimator, task)
+    return fly(k, path, data, imu, sampling, estimator, beat, task)
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,9 +263,19 @@ class FlightTasks:
         if max(path.sensors, path.stabilizer, path.kalman) >= FRAMES:
             raise KernelError(f"the flight tasks are not among the first {FRAMES} tasks")
         kernel.create_task("PWRMGNT", 0, power_task, kernel, board, core)
-        # What `fly` takes behind the scheduler's memory.
-        self.memory = self._path, data, board.imu, sampling, core.estimator
-        kernel.run_by((begin, resume, next_task), *self.memory)
+        self._memory = self._path, data, board.imu, sampling, core.estimator
+        beat = Beat.allocate()
+        beat.fields.next_us = NEVER_US
+        kernel.run_by((begin, resume), *self._memory, beat)
+
+    def take_beats(self, beat: Block[Beat], booted_us: int, sample: Callable[[], bool]) -> bool:
+        """Let runs of the processor take the beats by themselves; return whether they do.
+
+        `booted_us`: when the processor's clock began, by that of the beat. `sample` returns whether the IMU interrupts.
+        """
+        self._path.fields.booted_us = booted_us
+        self._path.connect(sample=sample)
+        return self._kernel.run_by((begin, resume), *self._memory, beat)
 
     @property
     def fed_us(self) -> int:

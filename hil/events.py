@@ -9,25 +9,14 @@ from collections.abc import Callable
 from heapq import heappop, heappush, heapreplace
 from typing import Final
 
-from firmware_py.core.subset import Struct, i64
+from firmware_py.rtos.memory import NEVER_US, Beat
 
 Callback = Callable[[int], object]  # receives the planned instant [us]
 
 EVENTS_AT_ONE_INSTANT: Final = 10_000  # a hover needs 4
-NEVER_US: Final = 1 << 62
 
 
 NOTHING: Final[tuple[int, int, int, Callback]] = (NEVER_US, 0, 0, int)  # in an empty heap
-
-
-class Beat(Struct):
-    """The event that repeats most."""
-
-    next_us: i64
-    period_us: i64
-    now_us: i64  # of the beat that happens
-    order: i64  # of the next one among the planned events
-    planned: i64  # events so far
 
 
 class EndlessInstantError(Exception):

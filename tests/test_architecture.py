@@ -44,7 +44,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "firmware_py.errors", "firmware_py.extras", "firmware_py.logic", "firmware_py.policy",
         "firmware_py.section", "firmware_py.table", "firmware_py.kept_code",
         "firmware_py.core.subset",  # the language of the world's kernels
-        "firmware_py.tasks", "firmware_py.core.structs",  # the loop in C takes their steps
+        "firmware_py.tasks",
     ),
 }  # fmt: skip
 

@@ -85,6 +85,16 @@ EVENTS: Final = (
 ) = range(len(EVENTS))  # fmt: skip
 
 
+class Beat(Struct):
+    """The event of the hardware that repeats most, which a run may take by itself; by the hardware's clock."""
+
+    next_us: i64
+    period_us: i64
+    now_us: i64  # of the beat that happens
+    order: i64  # of the next one among the planned events
+    planned: i64  # events so far
+
+
 class KernelMemory(Struct):
     """Everything that the kernel knows; truths are 0 and 1."""
 

@@ -185,8 +185,9 @@ def begin(k: KernelMemory, now_us: int, until_us: int) -> int:
 
 @compiled
 def resume(k: KernelMemory, yielded_us: int) -> int:
-    """Go on after a step of the running task, which has yielded its work, or 0 for the processor."""
-    settle(k, yielded_us)
+    """Go on after a step of the running task, which has yielded its work, or 0 for the processor; below 0: after a pause."""
+    if yielded_us >= 0:
+        settle(k, yielded_us)
     return next_task(k)
 
 

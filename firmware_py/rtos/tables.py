@@ -37,7 +37,7 @@ GO_ON: Final[tuple[int, ...]] = ()  # ... and when the caller just continues
 Trace = Callable[[int, str, str, int, int], None]
 
 _CALLS: tuple[Callable[..., int | None], ...] = (
-    scheduler.boot, scheduler.add_task, scheduler.start, scheduler.begin, scheduler.resume, scheduler.next_task,
+    scheduler.boot, scheduler.add_task, scheduler.start, scheduler.begin, scheduler.resume,
     scheduler.end_task, ready.leave_tasks, ready.counted, ready.block, queues.add_object, queues.send,
     queues.send_from_isr, queues.receive, queues.reset, queues.wait_for_item, mutexes.take_mutex, mutexes.give_mutex,
     mutexes.give_mutex_from_isr, calls.notify, calls.notify_from_isr, calls.await_notification, calls.take_notification,
@@ -176,7 +176,7 @@ class Tables:
             answer = call(*arguments)
             self._read_trace()
             while answer == TRACE_FULL:
-                answer = self._untraced["next_task"]()
+                answer = self._untraced["resume"](-1)
                 self._read_trace()
             return answer
 

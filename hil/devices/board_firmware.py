@@ -13,13 +13,13 @@ from typing import Any, ClassVar, Protocol
 from numpy.typing import NDArray
 
 from firmware_py.board import Board, ImuCounts
-from firmware_py.compiling import Memory
 from firmware_py.config import FirmwareConfig
 from firmware_py.core_runner import RunnerFactory, default_runner
 from firmware_py.export.usage import Usage
 from firmware_py.firmware import Firmware
 from firmware_py.rtos import TaskReport
 from firmware_py.signals import Signals
+from firmware_py.tasks import FlightTasks
 from firmware_py.wire.scalars import Scalar
 from hil.crazyflie.log_table import ImageParameter
 from hil.crazyflie.shockburst import syslink_us
@@ -202,8 +202,8 @@ class BoardFirmware(Protocol):
         """Views on its estimate, counters, inputs, counts and supervisor; NaN for numbers it does not report."""
 
     @property
-    def flight_path(self) -> Sequence[Memory] | None:
-        """The memory of its flight tasks, for the laboratory's loop; None for other firmware."""
+    def flight_tasks(self) -> FlightTasks | None:
+        """The tasks that may take the beats of the hardware by themselves; None for other firmware."""
 
     @property
     def variables(self) -> Sequence[BoardVariable]:

@@ -132,7 +132,7 @@ class ImageFirmware:
 
     usage: ClassVar[None] = None
     mavlink: ClassVar[None] = None
-    flight_path: ClassVar[None] = None
+    flight_tasks: ClassVar[None] = None
     overrun: ClassVar[str] = ""
 
     def __init__(

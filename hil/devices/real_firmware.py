@@ -108,7 +108,7 @@ class RealFirmware:
     usage: ClassVar[None] = None
     clock_us: ClassVar[None] = None
     mavlink: ClassVar[None] = None
-    flight_path: ClassVar[None] = None
+    flight_tasks: ClassVar[None] = None
     flashed: ClassVar[None] = None
     overrun: ClassVar[str] = ""
 

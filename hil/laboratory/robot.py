@@ -20,7 +20,6 @@ from hil.bodies import make_body
 from hil.config import LabConfig, load_config
 from hil.crazyflie import syslink
 from hil.crazyflie.shockburst import Air
-from hil.devices.beats import let_beat
 from hil.devices.board import InjectFailure, Requests, Thief, VirtualBoard, new_eeprom, unsupported
 from hil.devices.board_firmware import Executor, PowerOn, PythonBoard
 from hil.devices.cameras import VirtualMocap
@@ -155,7 +154,8 @@ class Robot:
         self.firmware = self.executor.boot(start)
         self.imu.continue_from(specimen)
         self.board.run_on(self.firmware.kernel, self.events)
-        self._in_c = let_beat(self.firmware, self.events.beat, now_us, self._take_beat)
+        flight = self.firmware.flight_tasks
+        self._in_c = flight is not None and flight.take_beats(self.events.beat, now_us, self._take_beat)
         if self._thief is not None:
             self._occupy(self._thief)
 

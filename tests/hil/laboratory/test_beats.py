@@ -8,8 +8,8 @@ import pytest
 
 from firmware_py.export.compilers import compilers
 from firmware_py.rtos import Kernel
+from firmware_py.tasks import FlightTasks
 from hil.experiments import EXPERIMENTS
-from hil.laboratory import robot
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import in_lockstep
 from hil.laboratory.request import Options, Request
@@ -71,7 +71,7 @@ def test_a_flight_in_c_is_that_of_the_time_line(
     options: Options, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     in_c = flown(options, tmp_path / "c")
-    monkeypatch.setattr(robot, "let_beat", lambda *_: False)
+    monkeypatch.setattr(FlightTasks, "take_beats", lambda *_: False)
     assert flown(options, tmp_path / "python") == in_c
 
 
@@ -82,7 +82,7 @@ def test_a_changed_board_is_the_same_in_c_and_on_the_time_line(
     in_c = flown({}, tmp_path / "c", change)
     assert change is not without_power or "kept: [True, True, True]" in in_c[2]
     assert in_c[0] != flown({}, tmp_path / "usual")[0]
-    monkeypatch.setattr(robot, "let_beat", lambda *_: False)
+    monkeypatch.setattr(FlightTasks, "take_beats", lambda *_: False)
     assert flown({}, tmp_path / "python", change) == in_c
 
 
