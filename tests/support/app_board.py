@@ -49,7 +49,7 @@ class AppBoard:
 class AppFirmware:
     """The app that has booted, stepped with every sample of the IMU, which has its own gyro."""
 
-    flashed = scheduler = usage = clock_us = mavlink = None
+    flashed = scheduler = usage = clock_us = mavlink = flight_tasks = None
     overrun = ""
     variables = ()
 
