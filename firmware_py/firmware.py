@@ -81,10 +81,10 @@ class Firmware:
             core, self._supervisor, lambda: acceleration(board.read_imu()), self._notices.refuse
         )
         findings = Findings(self._zero_found, self._pose_refused, self._pose_gated)
-        self._tasks = FlightTasks(
+        self.flight_tasks = FlightTasks(
             self.kernel, config.cpu, board, core, self._supervisor, self.pilot, findings
         )
-        self.measurements = self._tasks.measurements
+        self.measurements = self.flight_tasks.measurements
         self.mavlink = self._mavlink_stack(config) if mavlink else None
         self._start_services(config)
         self.signals = Signals.of(core.estimator.memory, core.control.memory, self._supervisor)
@@ -154,10 +154,6 @@ class Firmware:
         self._console.listeners.append(stack.console_line)
 
     @property
-    def flight_tasks(self) -> FlightTasks:
-        return self._tasks
-
-    @property
     def log_numbers(self) -> dict[str, int]:
         return {variable.name: number for number, variable in enumerate(self.variables)}
 
@@ -187,7 +183,7 @@ class Firmware:
     def imu_ready(self) -> None:
         """Signal a new sample of the IMU (interrupt). While interrupts are off, samples are missed."""
         if not self.kernel.interrupts_off:
-            self._tasks.imu_ready.give_from_isr()
+            self.flight_tasks.imu_ready.give_from_isr()
 
     def radio_received(self, data: bytes, broadcast: bool = False) -> None:
         """Take a packet from the radio chip (interrupt). While interrupts are off, packets are lost."""
@@ -206,7 +202,7 @@ class Firmware:
 
     def check_watchdog(self) -> None:
         """Raise `WatchdogError` when the stabilizer has not run for too long; the hardware calls this now and then."""
-        late_us = self.kernel.now_us - self._tasks.fed_us
+        late_us = self.kernel.now_us - self.flight_tasks.fed_us
         if late_us > WATCHDOG_US:
             text = f"watchdog reset, STABILIZER has not run for {late_us / 1000:.0f} ms and this task has the processor"
             raise WatchdogError(self.kernel.current.name, self.kernel.now_us, text)

@@ -37,7 +37,7 @@ class EventQueue:
             self.beat.cell(name) for name in ("next_us", "order", "planned")
         )
         self._beat_us[0] = NEVER_US
-        self._beat_callback: Callback | None = None
+        self._beat_callback: Callback = int
         self._at_this_instant = 0  # events that ran at `now_us`
         self.other_us: int | None = None
         self.now_us = 0
@@ -51,13 +51,12 @@ class EventQueue:
         return None if beat_us == NEVER_US else beat_us
 
     def set_beat(self, period_us: int, start_us: int, callback: Callback) -> None:
-        """Plan `callback` like `every`. There is one beat."""
-        if self._beat_callback is not None:
-            return self.every(period_us, start_us, callback)
-        self._beat_callback = callback
-        beat = self.beat.fields
-        beat.period_us, beat.next_us, beat.order = period_us, start_us, self._next_order()
-        return None
+        """Plan `callback` like `every`, as the beat if there is none yet."""
+        if self._beat_us[0] != NEVER_US:
+            self.every(period_us, start_us, callback)
+        else:
+            self._beat_callback, beat = callback, self.beat.fields
+            beat.period_us, beat.next_us, beat.order = period_us, start_us, self._next_order()
 
     def at(self, time_us: int, callback: Callback) -> None:
         """Plan `callback(time_us)`. Raises `ValueError` for a past instant."""
@@ -72,8 +71,7 @@ class EventQueue:
     def run(self, now_us: int, leave_beat: bool = False) -> None:
         """Run everything due by `now_us`, including what the callbacks plan until then.
 
-        `leave_beat`: leave a beat that is the last thing due.
-        Raises `EndlessInstantError` if that does not end.
+        Raises `EndlessInstantError` if that does not end. `leave_beat`: leave a beat that is the last event due.
         """
         heap, beat_us = self._heap, self._beat_us
         try:
@@ -81,7 +79,7 @@ class EventQueue:
                 time_us, order, period_us, callback = heap[0] if heap else NOTHING
                 beats = (beat_us[0], self._beat_order[0]) < (time_us, order)
                 if beats:
-                    time_us, callback = beat_us[0], self._beat_callback or callback
+                    time_us, callback = beat_us[0], self._beat_callback
                 if time_us > now_us or (beats and leave_beat and (not heap or heap[0][0] > now_us)):
                     break
                 if time_us != self.now_us:

@@ -198,15 +198,15 @@ class Struct:
         scalars = tuple(column[0] for column in columns if len(column) == 2)
         arrays = tuple(column[0] for column in columns if len(column) == 3)
 
-        wide = {
-            column[0] for column in columns if np.dtype(column[1]) == np.int64
-        }  # Python's own integers, twice as fast
+        def seen(memory: NDArray[Any]) -> Any:
+            """Return a view; integers of 64 bits become Python's own, in half the time."""
+            return memory.data if memory.dtype == np.int64 else memory
 
         def bind(view: Any, memory: NDArray[Any]) -> None:
             for name in scalars:
-                setattr(view, "_" + name, memory[name].data if name in wide else memory[name])
+                setattr(view, "_" + name, seen(memory[name]))
             for name in arrays:
-                setattr(view, name, memory[name][0].data if name in wide else memory[name][0])
+                setattr(view, name, seen(memory[name][0]))
 
         body: dict[str, Any] = {name: _scalar_property(name) for name in scalars}
         body["__slots__"] = (*("_" + name for name in scalars), *arrays)

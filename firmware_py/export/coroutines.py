@@ -64,7 +64,8 @@ class CoroutinePrinter(LivePrinter):
         self._declared.append(f"    int64_t *const frame = {memory}->frames[{memory}->current];")
         self._declared.append("    switch (frame[0]) {\n    case 0:;")
         self._body = [*self._body, ast.Return(ast.Constant(-1), lineno=self.kernel.node.end_lineno or 0)]
-        return f"{super().text().removesuffix('}' + chr(10))}    }}\n    return -1;\n}}\n"
+        text = super().text().removesuffix("}\n")
+        return f"{text}    }}\n    return -1;\n}}\n"
 
     def _plain_statement(self, node: ast.stmt, depth: int) -> None:
         match node:

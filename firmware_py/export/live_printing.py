@@ -2,8 +2,10 @@
 
 They compute in `double`, with integers of 64 bits, and call `math`, `min` and `max`; an integer next to a float becomes a
 float, as in Python, and `float` meets `double` through `f32(..)` and `f64(..)` only. Locals may get their first value in any
-block, and a tuple on the left takes one on the right. There are `while`, `break`, and operators that assign. What raises in
-Python ends the C functions, too: whoever may `call` Python returns an integer, and checks behind each such statement.
+block, and a tuple on the left takes one on the right. There are `while`, `break`, and operators that assign.
+
+An exception in Python ends the C functions, too: a function that may `call` Python returns an integer, and checks for an
+exception after each such statement.
 """
 
 import ast
@@ -148,13 +150,10 @@ class LiveExpressions(Expressions):
             texts = [self.fit(argument, self.value(argument), kind) for argument, kind in pairs]
             return Value(f"{name}({', '.join(texts)})", result)
         name = ast.unparse(node.func)
-        kernel = self.module.names.get(name)
         value = self._kernel(node, name, alone)
-        return (
-            self._raising(node, alone, value)
-            if isinstance(kernel, Signature) and CALL in kernel.calls
-            else value
-        )
+        kernel = self.module.names[name]
+        assert isinstance(kernel, Signature)
+        return self._raising(node, alone, value) if CALL in kernel.calls else value
 
     def _raising(self, node: ast.Call, alone: bool, value: Value) -> Value:
         """Return a call that may raise; its statement is followed by a check."""

@@ -25,24 +25,16 @@ def method(
     """
     taken = [f"places[{index}]" for index in range(memory)] + [f"given_{index}" for index in range(numbers)]
     call = f"{function}({', '.join(taken)})"
-    before, result = ("", call) if answers else (f"    {call};\n", "0")
-    if raises:
-        before, result = (
-            f"    const int64_t answer = {call};\n    if (PyErr_Occurred()) return 0;\n",
-            "answer",
-        )
+    check = "if (PyErr_Occurred()) return 0;"
+    read = [f"const int64_t given_{index} = PyLong_AsLongLong(given[{index}]);" for index in range(numbers)]
+    lines = [
+        "void **places = (void **)PyBytes_AsString(self);",
+        f"if (count != {numbers}) return PyErr_BadArgument(), (void *)0;",
+        *([*read, check] if numbers else ["(void)given;"]),
+        f"const int64_t answer = {call};" if answers else f"{call};",
+        *([check] if raises else []),
+        f"return PyLong_FromLongLong({'answer' if answers else '0'});",
+    ]
     head = f"void *{name}(void *self, void *const *given, intptr_t count)"
-    checks = f"    if (count != {numbers}) return PyErr_BadArgument(), (void *)0;\n"
-    if numbers:
-        checks += "".join(
-            f"    const int64_t given_{index} = PyLong_AsLongLong(given[{index}]);\n"
-            for index in range(numbers)
-        )
-        checks += "    if (PyErr_Occurred()) return 0;\n"
-    else:
-        checks += "    (void)given;\n"
-    return (
-        f"\n{head};\n\n{head} {{\n"
-        f"    void **places = (void **)PyBytes_AsString(self);\n"
-        f"{checks}{before}    return PyLong_FromLongLong({result});\n}}\n"
-    )
+    body = "".join(f"    {line}\n" for line in lines)
+    return f"\n{head};\n\n{head} {{\n{body}}}\n"

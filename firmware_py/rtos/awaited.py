@@ -11,7 +11,7 @@
 
 from collections.abc import Callable, Generator
 
-from firmware_py.rtos import calls, mutexes, queues
+from firmware_py.rtos import calls, queues
 from firmware_py.rtos.memory import AGAIN, FAILED, SWITCH, WAITS, KernelMemory
 
 Steps = Generator[int, None, int | None]
@@ -35,8 +35,6 @@ class Awaited:
 
 take = receive = Awaited(queues.receive)
 give = send = Awaited(queues.send)
-take_mutex = Awaited(mutexes.take_mutex)
-give_mutex = Awaited(mutexes.give_mutex)
 delay = Awaited(calls.delay)
 delay_until = Awaited(calls.delay_until)
 work = Awaited(calls.work)

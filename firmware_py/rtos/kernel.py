@@ -80,16 +80,14 @@ class Kernel(Processor):
 
     def run_times_us(self) -> list[int]:
         """Return the run time of every task, in the order of their creation."""
-        memory, now_us, ends = self.memory, self.now_us, len(self.tasks) + 1
+        memory, ends = self.memory, len(self.tasks) + 1
         left_us = memory.work_left_us[:ends].tolist()
-        left_us[memory.current] = memory.work_end_us - now_us
-        times_us = [work - left for work, left in zip(memory.work_us[:ends].tolist(), left_us, strict=True)][
-            1:
-        ]
-        idle = memory.idle - 1
-        times_us[idle] = 0
-        times_us[idle] = now_us - sum(times_us)
-        return times_us
+        left_us[memory.current] = memory.work_end_us - self.now_us
+        pairs = zip(memory.work_us[:ends].tolist(), left_us, strict=True)
+        times_us = [work - left for work, left in pairs]
+        times_us[memory.idle] = 0
+        times_us[memory.idle] = self.now_us - sum(times_us)
+        return times_us[1:]  # task 0 is none
 
     def work(self, duration_us: int) -> Iterable[int]:
         """Take processor time; others may run in between."""

@@ -13,19 +13,8 @@ TICK_US: Final = 1000
 MAX_PRIORITIES: Final = 7  # the Crazyflie's six, 0 to 5, and one above them for simulated interrupts
 TASKS: Final = 2048  # at most, with the caller before the start
 OBJECTS: Final = 128  # queues, semaphores and mutexes, at most
-LATENCY_BOUNDS_US: Final = (
-    1,
-    10,
-    20,
-    50,
-    100,
-    200,
-    500,
-    1_000,
-    2_000,
-    5_000,
-    10_000,
-)  # of the histogram's classes
+# Of the histogram's classes.
+LATENCY_BOUNDS_US: Final = (1, 10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 LATENCY_CLASSES: Final = len(LATENCY_BOUNDS_US) + 1
 FRAMES: Final = 32  # native tasks have an index below
 FRAME: Final = 16  # numbers: where it goes on, its timeout, an answer, and its locals
@@ -102,7 +91,7 @@ class KernelMemory(Struct):
     preemption: i64
     now_us: i64
     end_us: i64  # how far the present run goes
-    until_us: i64  # and its present leg: harness in C acts between the legs
+    until_us: i64  # how far its present leg goes: beats of the hardware happen between two legs
     next_wake_us: i64  # of the next thing that happens without a new interrupt
     next_tick_us: i64
     tick_count: i64  # up to date while tasks run

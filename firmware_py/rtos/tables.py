@@ -60,7 +60,6 @@ class Tables:
         self.calls = SimpleNamespace(**self._untraced)
         self.names = ["main"]
         self.numbers: list[int] = []
-        self.preemption = preemption
         self._now, self._run_end, self._until, self._wake = (
             block.cell(name) for name in ("now_us", "end_us", "until_us", "next_wake_us")
         )

@@ -184,7 +184,7 @@ def looping(k: KernelMemory, counts: Counts) -> Steps:
 
 @compiled
 def waits_for_python(k: KernelMemory, counts: Counts) -> Steps:
-    """Wait for what is no call of the scheduler."""
+    """Wait for something other than a call of the scheduler."""
     while True:
         yield from iter(k)
         counts.late += 1
