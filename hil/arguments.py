@@ -4,7 +4,6 @@ Subscripted types are checked element by element; any real number is a `float`, 
 """
 
 import inspect
-import reprlib
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, wraps
@@ -14,7 +13,7 @@ from typing import Any, Literal, TypeVar, Union, Unpack, get_args, get_origin, g
 
 import numpy as np
 
-from hil.errors import LabError, hint
+from hil.errors import LabError, hint, shown
 
 Checked = TypeVar("Checked", bound=Callable[..., Any])
 Value = TypeVar("Value")
@@ -86,11 +85,6 @@ def _plain(value: Any) -> Any:
 def _require(function: str, name: str, value: Any, kind: Any) -> None:
     if not fits(value, kind):
         raise LabError(f"{function}: {name} = {shown(value)}: expected {_described(kind)}")
-
-
-def shown(value: object) -> str:
-    """Return a value for one line of an error, shortened."""
-    return " ".join(reprlib.repr(value).split()).encode(errors="backslashreplace").decode()
 
 
 def fits(value: Any, kind: Any) -> bool:

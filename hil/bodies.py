@@ -9,8 +9,7 @@ import numpy as np
 
 from hil.config import LabConfig
 from hil.crazyflie.decks import DECKS
-from hil.crazyflie.failures import MOTOR_FAILURES
-from hil.crazyflie.quadrotor import Quadrotor
+from hil.crazyflie.quadrotor import MOTOR_FAILURES, Quadrotor
 from hil.errors import LabError, blame, hint
 from hil.floaty.correction import PAPER_TABLE
 from hil.floaty.plant import SERVO_FAILURES, Plant

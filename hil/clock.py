@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from ground_station.clock import readable as readable
+from ground_station.clock import readable
 
 PROCESS = Path("/proc/self/stat")
 START_TIME = 19  # index of the field after the process's name, in ticks since the machine's boot

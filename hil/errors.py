@@ -1,6 +1,7 @@
 """The exceptions of the laboratory; the command line turns them into one line and exit code 2."""
 
 import difflib
+import reprlib
 import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -95,6 +96,11 @@ def hint(word: str, known: Iterable[str], otherwise: str = "") -> str:
         return f"did you mean {near[0]}?"
     more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
     return otherwise or f"there are {', '.join(names[:LISTED]) or 'none'}{more}"
+
+
+def shown(value: object) -> str:
+    """Return a value for one line of an error, shortened."""
+    return " ".join(reprlib.repr(value).split()).encode(errors="backslashreplace").decode()
 
 
 def blame(error: BaseException) -> str:

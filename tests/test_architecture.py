@@ -115,7 +115,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
         "hil/servers/udp_server.py", "hil/servers/serial_server.py", "hil/servers/motive.py",
         "ground_station/sources/optitrack.py", "ground_station/sources/motioncapture_process.py",
     ),
-    "select": ("ground_station/clock.py",),
+    "select": ("ground_station/clock.py", "hil/stm32f405/gdb.py"),
     "selectors": ("ground_station/clock.py",),
     "platformdirs": ("firmware_py/kept_code.py",),
     "jinja2.FileSystemBytecodeCache": ("hil/pictures/pages.py",),

@@ -22,7 +22,7 @@ from firmware_py.core.subset import F64s, Struct, f64, i32
 from firmware_py.elementary import cos
 from firmware_py.section import Section, number
 from hil.scene import CENTRE, PALE, Look, Markers, box, eight_markers
-from hil.world.body import Channel, Quantity, Setting, Vector, View
+from hil.world.body import Channel, Failure, Quantity, Setting, Vector, View, of_each_actuator
 from hil.world.config import BatteryConfig, PlantConfig, TunnelConfig
 from hil.world.fixed_order import atan2, compiled, exp, normal
 from hil.world.in_tunnel import UPRIGHT, InTunnel, seen, settings_of
@@ -49,7 +49,16 @@ LOSS_TEXTS = {
     HIT_FLOOR: "hit the floor at {:.2f} m/s",
     TUMBLED: "tumbled: tilt {:.2f} rad",
 }
-
+MOTOR_FAILURES = of_each_actuator({
+    "motor.weak.{}": Failure(
+        "factor on thrust and torque of propeller {}, as of a chipped one", "", 0.8, 0.0, 1.5, "motor.strength.{}", "times",
+        "holds",
+    ),
+    "motor.stop.{}": Failure("motor {} gets no current", "", 0.0, 0.0, 0.0, "motor.current.{}", "times", "lost"),
+    "motor.stuck.{}": Failure(
+        "motor {} stays at its last command", "", 0.0, 0.0, 0.0, "motor.obeys.{}", "times", "lost"
+    ),
+})  # fmt: skip
 
 Positive = Annotated[float, Field(gt=0.0)]
 

@@ -25,13 +25,13 @@ from firmware_py.core_runner import CoreBlocks, CoreRunner, default_runner
 from firmware_py.elementary import atan2
 from firmware_py.geometry import rotation_matrix, to_euler_zyx, wrap_angle
 from ground_station.trajectory import Goal, Offsets, Sine, Trajectory
-from hil.arguments import checked, shown
+from hil.arguments import checked
 from hil.campaigns.config import find_spec, read_spec
 from hil.campaigns.sampling import draw
 from hil.config import DEFAULT_PROFILE, Overrides, load_config, settings_of
 from hil.demonstrations import observer
 from hil.devices.board_firmware import PythonBoard
-from hil.errors import LabError
+from hil.errors import LabError, shown
 from hil.floaty.plant import Plant
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.faults import Fault

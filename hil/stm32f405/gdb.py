@@ -4,11 +4,11 @@ While the chip is stopped at a breakpoint the whole laboratory waits: no time pa
 continues as if it had not stopped. Ctrl-C is checked each time the laboratory runs the chip.
 """
 
+import select
 import socket
 from collections.abc import Callable
 from contextlib import suppress
 
-from hil.clock import readable
 from hil.errors import LabError
 from hil.stm32f405.chip import Chip, Why
 from hil.stm32f405.freertos import FreeRtos
@@ -61,7 +61,9 @@ class GdbServer:
     def wants_to_stop(self) -> bool:
         """Return whether the debugger sent Ctrl-C, or a new one connected, while the machine ran."""
         waiting = self._listener if self._client is None else self._client
-        if not readable([waiting], 0):
+        inputs = select.poll()
+        inputs.register(waiting, select.POLLIN)
+        if not inputs.poll(0):
             return False
         if self._client is None:
             return self._admit()

@@ -7,8 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from hil.config import load_config
-from hil.crazyflie.failures import MOTOR_FAILURES
-from hil.crazyflie.quadrotor import STEPS, Quadrotor, QuadrotorConfig, rpm_for, steady_rpm
+from hil.crazyflie.quadrotor import MOTOR_FAILURES, STEPS, Quadrotor, QuadrotorConfig, rpm_for, steady_rpm
 from hil.errors import LabError
 from hil.laboratory.fault_kinds import KINDS
 from hil.world.config import BatteryConfig, TunnelConfig
