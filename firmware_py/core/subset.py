@@ -192,7 +192,8 @@ class Struct:
             shape = tuple(size for size in getattr(kind, "__metadata__", ()) if isinstance(size, int))
             element = getattr(kind, "__origin__", kind)
             if shape:
-                element = get_args(get_args(element)[1])[0]  # of the dtype
+                element = get_args(element)[-1]  # the dtype; from numpy 2.5 on its scalar
+                (element,) = get_args(element) or (element,)
             columns.append((name, element, shape) if shape else (name, element))
         cls.dtype = np.dtype(columns, align=True)
         scalars = tuple(column[0] for column in columns if len(column) == 2)
