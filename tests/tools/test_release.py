@@ -20,12 +20,14 @@ PACKAGES = ("firmware_py", "ground_station", "hil")
 COMMIT = "hil/commit.txt"
 
 
-def test_the_version_is_the_last_one_in_the_list_of_changes() -> None:
-    releases = re.findall(
-        r"^## (\d\S*) \((\d{4}-\d\d-\d\d)\)$", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE
-    )
+def test_the_version_is_the_first_one_in_the_list_of_changes() -> None:
+    changes = (ROOT / "CHANGELOG.md").read_text("utf-8")
+    releases = re.findall(r"^## (.+) \((\d{4}-\d\d-\d\d|Unreleased)\)$", changes, re.MULTILINE)
+    assert len(releases) == len(re.findall(r"^## ", changes, re.MULTILINE))
     assert releases[0][0] == VERSION
-    assert [day for _, day in releases] == sorted((day for _, day in releases), reverse=True)
+    dates = [day for _, day in releases]
+    assert dates == sorted(dates, reverse=True), "newest first; a letter sorts after all digits"
+    assert "Unreleased" not in dates[1:]
 
 
 def tracked(*folders: str) -> set[str]:
