@@ -1,12 +1,19 @@
-"""ruff and mypy are part of the tests."""
+"""ruff and mypy are part of the tests; the files for people who join name what exists."""
 
+import os
+import re
+import shutil
 import subprocess
 import sys
+import tomllib
+from configparser import ConfigParser
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
-ROOT = Path(__file__).parent.parent
+from support.paths import ROOT
 
 
 @pytest.mark.parametrize(
@@ -17,3 +24,41 @@ def test_the_sources_are_clean(command: str) -> None:
         [sys.executable, "-m", *command.split()], cwd=ROOT, capture_output=True, text=True, timeout=300
     )
     assert ran.returncode == 0, ran.stdout[-4000:] + ran.stderr[-1000:]
+
+
+def parsed(path: str | Path) -> dict[str, Any]:
+    content: dict[str, Any] = yaml.safe_load((ROOT / path).read_text("utf-8"))
+    return content
+
+
+def test_workflows_run_targets_of_make_and_programs_of_the_project_on_admitted_pythons() -> None:
+    [phony] = re.findall(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE)
+    jobs = parsed(".github/workflows/tests.yml")["jobs"]
+    commands = [step["run"].split() for job in jobs.values() for step in job["steps"] if "run" in step]
+    assert [command[:2] for command in commands] == [["make", "test"], ["sudo", ".ci/run"]]
+    assert commands[0][1] in phony.split()
+    assert os.access(ROOT / commands[1][1], os.X_OK)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    assert project["requires-python"] == f">={jobs['test']['strategy']['matrix']['python'][0]}"
+
+
+def test_hooks_before_a_commit_are_tools_of_the_environment_without_settings() -> None:
+    [repo] = parsed(".pre-commit-config.yaml")["repos"]
+    assert repo["repo"] == "local"
+    for hook in repo["hooks"]:
+        folder, tool = os.path.split(hook["entry"].split()[0])
+        assert (folder, hook["language"]) == (".venv/bin", "system")
+        assert shutil.which(tool, path=os.path.dirname(sys.executable)), tool
+        assert "--" not in hook["entry"]
+
+
+def test_form_citation_and_editor_settings_are_read_and_agree_with_the_project() -> None:
+    asked = {item["id"]: item["attributes"] for item in parsed(".github/ISSUE_TEMPLATE/bug.yml")["body"]}
+    assert set(asked) == {"version", "command", "expected", "run"}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    citation = parsed("CITATION.cff")
+    assert (str(citation["version"]), citation["license"]) == (project["version"], project["license"])
+    assert f"({citation['preferred-citation']['url']})" in (ROOT / "README.md").read_text("utf-8")
+    editor = ConfigParser()
+    editor.read_string("[top]\n" + (ROOT / ".editorconfig").read_text("utf-8"))
+    assert editor["Makefile"]["indent_style"] == "tab"
