@@ -12,7 +12,7 @@ from contextlib import suppress
 from hil.errors import LabError
 from hil.stm32f405.chip import Chip, Why
 from hil.stm32f405.freertos import FreeRtos
-from hil.stm32f405.gdb_protocol import SIGINT, SIGTRAP, Debuggee, RemoteProtocol, Wish
+from hil.stm32f405.gdb_protocol import SIGINT, SIGTRAP, Debuggee, RemoteProtocol, ResumeRequest
 
 HOST = "127.0.0.1"
 READ_SIZE = 4096
@@ -43,20 +43,20 @@ class GdbServer:
     def port(self) -> int:
         return int(self._listener.getsockname()[1])
 
-    def hold(self, signal: int = SIGTRAP, watched: int | None = None) -> Wish:
+    def hold(self, signal: int = SIGTRAP, watched: int | None = None) -> ResumeRequest:
         """Stop the machine until the debugger runs, steps, leaves or ends it; wait for a debugger first."""
         if self._client is None:
             self._waiting(self.port)
             while not self._admit():
                 pass
-        elif self._protocol.wish in (Wish.RUN, Wish.STEP):
+        elif self._protocol.request in (ResumeRequest.RUN, ResumeRequest.STEP):
             self._send(self._protocol.stopped(signal, watched))
-        while self._client is not None and self._protocol.wish is Wish.STOP:
+        while self._client is not None and self._protocol.request is ResumeRequest.STOP:
             self._receive()
-        wish = self._protocol.wish
-        if wish in (Wish.DETACH, Wish.KILL):
+        request = self._protocol.request
+        if request in (ResumeRequest.DETACH, ResumeRequest.KILL):
             self._disconnect()
-        return wish
+        return request
 
     def wants_to_stop(self) -> bool:
         """Return whether the debugger sent Ctrl-C, or a new one connected, while the machine ran."""
@@ -96,7 +96,7 @@ class GdbServer:
         if data:
             self._send(self._protocol.receive(data))
         else:
-            self._protocol.leave(Wish.DETACH)
+            self._protocol.leave(ResumeRequest.DETACH)
             self._disconnect()
 
     def _send(self, data: bytes) -> None:
@@ -116,19 +116,19 @@ class DebuggedChip:
     def __init__(self, chip: Chip, server: GdbServer, kernel: FreeRtos | None = None) -> None:
         server.attach(chip, kernel)
         self._chip, self._server = chip, server
-        self._wish = Wish.STOP
+        self._request = ResumeRequest.STOP
 
     def run(self, until_cycles: int) -> int:
         """Run up to a time, or until the caller must act, like `Chip.run`.
 
         Raises `KeyboardInterrupt` when the debugger ends it.
         """
-        if self._wish is Wish.STOP or self._server.wants_to_stop():
+        if self._request is ResumeRequest.STOP or self._server.wants_to_stop():
             self._hold(SIGINT)
         seen: int = Why.TIME
         state = self._chip.state
         while True:
-            stopped = self._wish is Wish.STEP
+            stopped = self._request is ResumeRequest.STEP
             # The caller acts between two blocks, as without a debugger: never inside one, where `resume` is the pc.
             until = int(state.now) if seen else until_cycles
             seen |= self._chip.step() & ~Why.STEP if stopped else self._chip.run(until)
@@ -145,6 +145,6 @@ class DebuggedChip:
                 return seen
 
     def _hold(self, signal: int, watched: int | None = None) -> None:
-        self._wish = self._server.hold(signal, watched)
-        if self._wish is Wish.KILL:
+        self._request = self._server.hold(signal, watched)
+        if self._request is ResumeRequest.KILL:
             raise KeyboardInterrupt

@@ -48,7 +48,7 @@ class Debuggee(Protocol):
         """Change a register."""
 
 
-class Wish(Enum):
+class ResumeRequest(Enum):
     """The debugger's request to the machine."""
 
     STOP = auto()
@@ -103,7 +103,7 @@ class Framing:
 
 
 class RemoteProtocol:
-    """One debugger of one machine: answers its queries; `wish` is its request to the machine."""
+    """One debugger of one machine: answers its queries; `request` is its request to the machine."""
 
     def __init__(self, debuggee: Debuggee, kernel: FreeRtos | None = None) -> None:
         """`kernel` has the tasks, GDB's threads, each by the address of its control block."""
@@ -115,7 +115,7 @@ class RemoteProtocol:
         self._acknowledging = True
         self._signal = SIGTRAP
         self._last = b""
-        self.wish = Wish.STOP
+        self.request = ResumeRequest.STOP
         self.interrupted = False  # Ctrl-C arrived while the machine ran
         self._commands: dict[bytes, Callable[[bytes], bytes]] = {
             b"?": lambda _: self._stop_reply(),
@@ -126,16 +126,16 @@ class RemoteProtocol:
             b"M": self._write,
             b"Z": lambda rest: self._breakpoint(rest, True),
             b"z": lambda rest: self._breakpoint(rest, False),
-            b"c": lambda rest: self._resume(Wish.RUN, rest),
-            b"s": lambda rest: self._resume(Wish.STEP, rest),
-            b"C": lambda rest: self._resume(Wish.RUN, rest.partition(b";")[2]),
-            b"S": lambda rest: self._resume(Wish.STEP, rest.partition(b";")[2]),
+            b"c": lambda rest: self._resume(ResumeRequest.RUN, rest),
+            b"s": lambda rest: self._resume(ResumeRequest.STEP, rest),
+            b"C": lambda rest: self._resume(ResumeRequest.RUN, rest.partition(b";")[2]),
+            b"S": lambda rest: self._resume(ResumeRequest.STEP, rest.partition(b";")[2]),
             b"q": self._query,
             b"Q": self._set,
             b"H": self._select,
             b"T": lambda rest: b"OK" if _hex(rest) in self._all_threads() else MALFORMED,
-            b"D": lambda _: self._leave(Wish.DETACH, b"OK"),
-            b"k": lambda _: self._leave(Wish.KILL, b""),
+            b"D": lambda _: self._leave(ResumeRequest.DETACH, b"OK"),
+            b"k": lambda _: self._leave(ResumeRequest.KILL, b""),
         }
 
     def receive(self, data: bytes) -> bytes:
@@ -143,7 +143,7 @@ class RemoteProtocol:
         self._items += self._framing.take(data)
         answers, waiting = b"", []
         for item in self._items:
-            if self.wish is Wish.STOP or not item.startswith(b"$"):
+            if self.request is ResumeRequest.STOP or not item.startswith(b"$"):
                 answers += self._answered(item)
             else:
                 waiting.append(item)
@@ -152,21 +152,21 @@ class RemoteProtocol:
 
     def stopped(self, signal: int, watched: int | None = None) -> bytes:
         """Return the report to the debugger that its running machine has stopped, and the watched access."""
-        self.wish, self._signal, self.interrupted, self._thread = Wish.STOP, signal, False, 0
+        self.request, self._signal, self.interrupted, self._thread = ResumeRequest.STOP, signal, False, 0
         self._last = framed(self._stop_reply(watched))
         return self._last + self.receive(b"")
 
-    def leave(self, wish: Wish) -> None:
+    def leave(self, request: ResumeRequest) -> None:
         """Remove all breakpoints from the machine."""
         self._debuggee.breakpoints.clear()
         for watched in self._watched:
             self._debuggee.watch(*watched, on=False)
         self._watched.clear()
-        self.wish = wish
+        self.request = request
 
     def _answered(self, item: bytes) -> bytes:
         if item == INTERRUPT:
-            self.interrupted = self.wish in (Wish.RUN, Wish.STEP)
+            self.interrupted = self.request in (ResumeRequest.RUN, ResumeRequest.STEP)
         if not item.startswith(b"$"):
             return {b"!": b"-" if self._acknowledging else b"", b"-": self._last}.get(item, b"")
         acknowledgement = b"+" if self._acknowledging else b""
@@ -184,7 +184,11 @@ class RemoteProtocol:
             return framed(MALFORMED)
         except LabError:
             return framed(FAULT)
-        return b"" if self.wish in (Wish.RUN, Wish.STEP, Wish.KILL) else framed(answer)
+        return (
+            b""
+            if self.request in (ResumeRequest.RUN, ResumeRequest.STEP, ResumeRequest.KILL)
+            else framed(answer)
+        )
 
     def _stop_reply(self, watched: int | None = None) -> bytes:
         why = b"" if watched is None else b"watch:%x;" % watched
@@ -266,10 +270,10 @@ class RemoteProtocol:
             self._watched ^= {watched}
         return b"OK"
 
-    def _resume(self, wish: Wish, address: bytes) -> bytes:
+    def _resume(self, request: ResumeRequest, address: bytes) -> bytes:
         if address:
             self._debuggee.set_register("pc", _hex(address) & ~1)
-        self.wish = wish
+        self.request = request
         return b""
 
     def _query(self, rest: bytes) -> bytes:
@@ -292,8 +296,8 @@ class RemoteProtocol:
         self._acknowledging = False
         return b"OK"
 
-    def _leave(self, wish: Wish, answer: bytes) -> bytes:
-        self.leave(wish)
+    def _leave(self, request: ResumeRequest, answer: bytes) -> bytes:
+        self.leave(request)
         return answer
 
 

@@ -16,7 +16,15 @@ from hil.errors import LabError
 from hil.stm32f405.chip import CYCLES_PER_US, Chip, Why
 from hil.stm32f405.freertos import FreeRtos
 from hil.stm32f405.gdb import DebuggedChip, GdbServer
-from hil.stm32f405.gdb_protocol import PACKET_SIZE, REGISTERS, SIGINT, SIGTRAP, RemoteProtocol, Wish, framed
+from hil.stm32f405.gdb_protocol import (
+    PACKET_SIZE,
+    REGISTERS,
+    SIGINT,
+    SIGTRAP,
+    RemoteProtocol,
+    ResumeRequest,
+    framed,
+)
 from hil.stm32f405.image import Image
 from support import stm32_firmware
 from support.stm32_machine import FirmwareOnChip
@@ -104,7 +112,7 @@ def test_malformed_packets_do_nothing(protocol: RemoteProtocol, machine: Chip, p
     assert ask(protocol, packet) == b"E01"
     assert ask(protocol, b"g") == before
     assert machine.breakpoints == set()
-    assert protocol.wish is Wish.STOP
+    assert protocol.request is ResumeRequest.STOP
 
 
 @settings(max_examples=25)
@@ -186,14 +194,14 @@ def test_a_run_ends_in_front_of_a_breakpoint_and_a_step_behind_one_instruction(
     server, line = client
     there = image.reset + 8
     line.sendall(framed(b"QStartNoAckMode") + framed(b"Z1,%x,2" % there) + framed(b"c"))
-    assert server.hold() is Wish.RUN
+    assert server.hold() is ResumeRequest.RUN
     assert machine.register("pc") == image.reset
     line.sendall(framed(b"pf") + framed(b"s") + framed(b"pf") + framed(b"z1,%x,2" % there) + framed(b"D"))
     assert machine.run(1000 * CYCLES_PER_US) & Why.BREAK
     assert machine.register("pc") == there
-    assert server.hold() is Wish.STEP
+    assert server.hold() is ResumeRequest.STEP
     machine.step()
-    assert server.hold() is Wish.DETACH
+    assert server.hold() is ResumeRequest.DETACH
     assert machine.register("pc") in (there + 2, there + 4)
     pcs = [framed(pack("<I", pc).hex().encode()) for pc in (there, machine.register("pc"))]
     stopped = framed(b"T05thread:1;")
@@ -207,12 +215,12 @@ def test_ctrl_c_stops_a_run(client: tuple[GdbServer, socket.socket], machine: Ch
     machine.write(RAM + 0x100, bytes.fromhex("fee7"))  # b .
     machine.set_register("pc", RAM + 0x100)
     line.sendall(framed(b"QStartNoAckMode") + framed(b"c"))
-    assert server.hold() is Wish.RUN
+    assert server.hold() is ResumeRequest.RUN
     assert not server.wants_to_stop()
     line.sendall(b"\x03")
     assert server.wants_to_stop()
     line.sendall(framed(b"D"))
-    assert server.hold(SIGINT) is Wish.DETACH
+    assert server.hold(SIGINT) is ResumeRequest.DETACH
     assert line.recv(4096) == b"+" + framed(b"OK") + framed(b"T02thread:1;") + framed(b"OK")
 
 
@@ -222,14 +230,14 @@ def test_after_a_hang_up_the_machine_runs_and_accepts_another(
     server, line = client
     line.sendall(framed(b"Z0,%x,2" % image.reset))
     line.shutdown(socket.SHUT_WR)
-    assert server.hold() is Wish.DETACH
+    assert server.hold() is ResumeRequest.DETACH
     assert machine.breakpoints == set()
     assert not server.wants_to_stop()
     with socket.create_connection(("127.0.0.1", server.port)) as other:
         other.sendall(b"+")
         assert server.wants_to_stop()
         other.sendall(framed(b"k"))
-        assert server.hold() is Wish.KILL
+        assert server.hold() is ResumeRequest.KILL
 
 
 def test_what_is_not_a_debugger_is_closed_and_writes_nothing(machine: Chip) -> None:
@@ -239,7 +247,7 @@ def test_what_is_not_a_debugger_is_closed_and_writes_nothing(machine: Chip) -> N
     page, silent, debugger = (socket.create_connection(("127.0.0.1", server.port), 10.0) for _ in range(3))
     page.sendall(b"POST / HTTP/1.1\r\n\r\n" + framed(b"M20000100,4:deadbeef"))
     debugger.sendall(framed(b"D"))
-    assert server.hold() is Wish.DETACH
+    assert server.hold() is ResumeRequest.DETACH
     assert machine.read(RAM + 0x100, 4) == before
     for closed in (page, silent, debugger):
         closed.close()
@@ -273,7 +281,7 @@ def test_time_stops_while_gdb_asks(client: tuple[GdbServer, socket.socket], mach
     server, line = client
     before = [machine.register(name) for name, _ in REGISTERS]
     line.sendall(b"".join(framed(b"m20000000,4") for _ in range(50)) + framed(b"c"))
-    assert server.hold(SIGTRAP) is Wish.RUN
+    assert server.hold(SIGTRAP) is ResumeRequest.RUN
     assert [machine.register(name) for name, _ in REGISTERS] == before
 
 
