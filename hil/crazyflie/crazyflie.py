@@ -14,7 +14,7 @@ from hil.crazyflie.decks import Decks
 from hil.crazyflie.parts import BRUSHED, BRUSHLESS, Parts
 from hil.crazyflie.radio_line import Outside, RadioLine
 from hil.errors import LabError
-from hil.stm32f405.chip import SOFTWARE, WATCHDOG, Chip, Why
+from hil.stm32f405.chip import SOFTWARE, WATCHDOG, Chip, StopReason
 from hil.stm32f405.crash import Crash, CrashReports
 from hil.stm32f405.freertos import FreeRtos
 from hil.stm32f405.gdb import DebuggedChip, GdbServer
@@ -111,36 +111,38 @@ class Crazyflie:
 
     # What the chip does to the outside
 
-    def _act(self, why: int) -> None:
-        if why & Why.SERIAL:
+    def _act(self, reason: int) -> None:
+        if reason & StopReason.SERIAL:
             self.radio.sent()
-        if why & Why.DEVICE:
+        if reason & StopReason.DEVICE:
             self.chip.tell_devices()
-        if why & Why.COMPARE:
+        if reason & StopReason.COMPARE:
             counts = tuple(self.chip.state.compare[timer][channel] for timer, channel in self._outputs)
             if counts != self._counts:
                 self._counts = counts
                 self._outside.write_compare(counts)
-        if why & (Why.LOW_READ | Why.LOW_WRITE):
+        if reason & (StopReason.LOW_READ | StopReason.LOW_WRITE):
             address = self.chip.state.fault_address
-            self._report_access(address, self._crashes.low_access(address, bool(why & Why.LOW_WRITE)))
-        if why & Why.DIVISION:
+            self._report_access(
+                address, self._crashes.low_access(address, bool(reason & StopReason.LOW_WRITE))
+            )
+        if reason & StopReason.DIVISION:
             self._outside.debug_write(str(self._crashes.division()))
-        if why & Why.OVERFLOW:
+        if reason & StopReason.OVERFLOW:
             self._report(self._crashes.overflow(self.chip.state.overflow))
-        if why & Why.BREAK:
+        if reason & StopReason.BREAK:
             self._look_at_tasks(AT_CRASH_US)
             self._report(self._crashes.here())
             self._crashed = True
             self.chip.crash_points.clear()  # a handler may be a loop of one instruction
-        if why & Why.LOCKUP:
+        if reason & StopReason.LOCKUP:
             self._report(self._crashes.lockup())
             self._crashed = True
-        if why & Why.WATCHDOG:
+        if reason & StopReason.WATCHDOG:
             self._look_at_tasks(AT_CRASH_US)
             self._report(self._crashes.watchdog())
             self._reset(WATCHDOG)
-        elif why & Why.RESET:
+        elif reason & StopReason.RESET:
             self._report(self._crashes.software_reset())
             self._reset(SOFTWARE)
 

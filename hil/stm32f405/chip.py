@@ -38,8 +38,8 @@ CORTEX_M4_FEATURES, MAIN_EXTENSION = 0x54_0102_C2E8, 1 << 38
 POWER_ON, SOFTWARE, WATCHDOG = 0x0C00_0000, 0x1400_0000, 0x2400_0000
 
 
-class Why(IntEnum):
-    """Reasons why a run ended early: `WHY_...` of machine.h."""
+class StopReason(IntEnum):
+    """Reasons why a run ended early: `STOP_...` of machine.h."""
 
     TIME = 0
     SERIAL = 1  # a USART has sent something and is silent now
@@ -163,22 +163,22 @@ class Chip:
         return int(self.state.now) // CYCLES_PER_US
 
     def run(self, until_cycles: int) -> int:
-        """Run up to a time, or until the caller must act; return why it ended, a sum of `Why`."""
+        """Run up to a time, or until the caller must act; return why it ended, a sum of `StopReason`."""
         if self.breakpoints | self.crash_points != self._planted:
             self._plant(self.breakpoints | self.crash_points)
         return self._after(self._library.machine_run(self.state, until_cycles))
 
-    def _after(self, why: int) -> int:
+    def _after(self, reason: int) -> int:
         """Map flash at 0 as well, as after a normal start, when it is first read there."""
-        if why & Why.LOW_READ:
+        if reason & StopReason.LOW_READ:
             self._cpu.mem_map_ptr(0, self.flash.size, self._readable, self.flash.ctypes.data)
-        return why
+        return reason
 
     def step(self) -> int:
         self._cpu.ctl_flush_tb()  # hooks act on code translated after them, until it is flushed
-        why = self._after(self._library.machine_step(self.state))
+        reason = self._after(self._library.machine_step(self.state))
         self._cpu.ctl_flush_tb()
-        return why
+        return reason
 
     def reset(self, cause: int) -> None:
         """Reset the processor: memory is kept, time continues."""
@@ -240,7 +240,7 @@ class Chip:
         return int(self.state.device[device].first)
 
     def tell_devices(self) -> None:
-        """Let the devices act that were written to: a run that ended so has `Why.DEVICE`."""
+        """Let the devices act that were written to: a run that ended so has `StopReason.DEVICE`."""
         touched, self.state.touched = int(self.state.touched), 0
         for device, act in self._acts.items():
             if touched >> device & 1:

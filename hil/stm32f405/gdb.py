@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from hil.errors import LabError
-from hil.stm32f405.chip import Chip, Why
+from hil.stm32f405.chip import Chip, StopReason
 from hil.stm32f405.freertos import FreeRtos
 from hil.stm32f405.gdb_protocol import SIGINT, SIGTRAP, Debuggee, RemoteProtocol, ResumeRequest
 
@@ -125,23 +125,23 @@ class DebuggedChip:
         """
         if self._request is ResumeRequest.STOP or self._server.wants_to_stop():
             self._hold(SIGINT)
-        seen: int = Why.TIME
+        seen: int = StopReason.TIME
         state = self._chip.state
         while True:
             stopped = self._request is ResumeRequest.STEP
             # The caller acts between two blocks, as without a debugger: never inside one, where `resume` is the pc.
             until = int(state.now) if seen else until_cycles
-            seen |= self._chip.step() & ~Why.STEP if stopped else self._chip.run(until)
+            seen |= self._chip.step() & ~StopReason.STEP if stopped else self._chip.run(until)
             pc = self._chip.register("pc")
-            if seen & Why.BREAK and pc in self._chip.breakpoints:
-                seen &= seen if pc in self._chip.crash_points else ~Why.BREAK
+            if seen & StopReason.BREAK and pc in self._chip.breakpoints:
+                seen &= seen if pc in self._chip.crash_points else ~StopReason.BREAK
                 stopped = True
-            if seen & Why.WATCHPOINT:
-                seen &= ~Why.WATCHPOINT
+            if seen & StopReason.WATCHPOINT:
+                seen &= ~StopReason.WATCHPOINT
                 self._hold(SIGTRAP, state.watch_address)
             elif stopped:
                 self._hold(SIGTRAP)
-            if seen & Why.BREAK or (state.resume != state.pc and (seen or state.now >= until_cycles)):
+            if seen & StopReason.BREAK or (state.resume != state.pc and (seen or state.now >= until_cycles)):
                 return seen
 
     def _hold(self, signal: int, watched: int | None = None) -> None:

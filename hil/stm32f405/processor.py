@@ -87,8 +87,8 @@ class ChipProcessor:
             if due_us is not None and due_us <= until_us:
                 until_us = due_us
             if state.now < until_us * CYCLES_PER_US:
-                if why := self._run_chip(until_us * CYCLES_PER_US):
-                    self._act(why)
+                if reason := self._run_chip(until_us * CYCLES_PER_US):
+                    self._act(reason)
             elif until_us == due_us:
                 own.run(until_us)
             else:

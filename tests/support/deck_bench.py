@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from hil.crazyflie.decks import Decks
-from hil.stm32f405.chip import Why
+from hil.stm32f405.chip import StopReason
 from hil.stm32f405.processor import ChipProcessor
 from hil.world.body import Carrier
 from hil.world.room import Room
@@ -30,17 +30,17 @@ class DeckBench(Bench):
         self[SPI1] = 1 << 6 | 5 << 3 | 1 << 2
 
     def _act(self, why: int) -> None:
-        if why & Why.DEVICE:
+        if why & StopReason.DEVICE:
             self.chip.tell_devices()
 
     def place(self, p_WB: tuple[float, ...], q_WB: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)) -> None:
         self.motion.p_WB, self.motion.q_WB = np.array(p_WB), np.array(q_WB)
 
-    def wait(self, us: int) -> Why:
+    def wait(self, us: int) -> StopReason:
         self.us += us
         self.processor.run(self.us)
         self.chip.tell_devices()  # of what the test wrote between two runs
-        return Why.TIME
+        return StopReason.TIME
 
     # I2C
 

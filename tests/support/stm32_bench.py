@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
-from hil.stm32f405.chip import CYCLES_PER_US, FLASH, RAM, Chip, Why, build_machine
+from hil.stm32f405.chip import CYCLES_PER_US, FLASH, RAM, Chip, StopReason, build_machine
 
 SLEEP = bytes.fromhex("30bffde7")  # wfi; b to it
 PENDING = 0xE000_E200  # of the interrupts, NVIC_ISPR
@@ -27,9 +27,9 @@ class Bench:
     def __setitem__(self, address: int, value: int) -> None:
         self.chip.write(address, pack("<I", value))
 
-    def wait(self, us: int) -> Why:
+    def wait(self, us: int) -> StopReason:
         self.us += us
-        why = Why.TIME
+        why = StopReason.TIME
         while self.chip.state.now < self.us * CYCLES_PER_US:
             why |= self.chip.run(self.us * CYCLES_PER_US)
         return why

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
-from hil.stm32f405.chip import CYCLES_PER_US, Chip, Why, build_machine
+from hil.stm32f405.chip import CYCLES_PER_US, Chip, StopReason, build_machine
 from hil.stm32f405.freertos import FreeRtos
 from hil.stm32f405.gdb import DebuggedChip, GdbServer
 from hil.stm32f405.image import Image
@@ -33,15 +33,15 @@ class FirmwareOnChip:
             self.chip, FreeRtos.of(self.image, self.chip.read), lambda why: None, self.chip.run
         )
 
-    def run(self, us: int) -> Why:
+    def run(self, us: int) -> StopReason:
         """Run until that long after power-on, or until something stops the chip."""
         return self.chip.run(us * CYCLES_PER_US)
 
     def run_debugged(self, server: GdbServer, end_us: int = 1000) -> None:
         """Run until that long after power-on, or until it resets, as a debugger wants."""
         chip = DebuggedChip(self.chip, server, FreeRtos(self.image, self.chip.read))
-        why = int(Why.TIME)
-        while self.chip.now_us < end_us and why in (Why.TIME, Why.SERIAL, Why.COMPARE):
+        why = int(StopReason.TIME)
+        while self.chip.now_us < end_us and why in (StopReason.TIME, StopReason.SERIAL, StopReason.COMPARE):
             why = chip.run(end_us * CYCLES_PER_US)
 
     def peek(self, name: str, index: int = 0) -> int:

@@ -19,7 +19,7 @@ struct esc *esc_at(struct machine *m, unsigned timer, unsigned channel)
 static void set_throttle(struct machine *m, struct esc *e, uint32_t throttle)
 {
     if (e->throttle != throttle)
-        m->why |= WHY_COMPARE;
+        m->stop_reason |= STOP_COMPARE;
     e->throttle = m->compare[e->timer][e->channel] = throttle;
 }
 

@@ -68,7 +68,7 @@ void note_overflow(struct machine *m)
     if (m->overflow)
         return;
     m->overflow = m->task[m->running].block;
-    m->why |= WHY_OVERFLOW;
+    m->stop_reason |= STOP_OVERFLOW;
 }
 
 static void look(struct machine *m)
@@ -155,7 +155,7 @@ unsigned next_exception(struct machine *m, int waking)
 
 static void lock_up(struct machine *m, uint32_t pc)
 {
-    m->why |= WHY_LOCKUP;
+    m->stop_reason |= STOP_LOCKUP;
     m->locked = 1;
     m->pc = pc;
     m->stopping = 1;
@@ -495,7 +495,7 @@ void system_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t given,
             break;
         m->aircr = value & 0x700;
         if (value & 4)
-            m->why |= WHY_RESET;
+            m->stop_reason |= STOP_RESET;
         break;
     case 0xED10: m->scr = value; break;
     case 0xED14: m->ccr = value; break;

@@ -79,7 +79,7 @@ void device_end(struct machine *m, struct device *d)
 {
     if (d && d->watched && d->wrote) {
         m->touched |= 1u << (d - m->device);
-        m->why |= WHY_DEVICE;
+        m->stop_reason |= STOP_DEVICE;
         d->wrote = 0;
     }
 }

@@ -48,7 +48,7 @@ static void happen(struct machine *m, unsigned slot)
         usart_receive_due(m, slot - DUE_RECEIVE);
     } else if (slot < DUE_ESC) {
         m->due[slot] = NEVER;
-        m->why |= WHY_WATCHDOG;
+        m->stop_reason |= STOP_WATCHDOG;
     } else {
         esc_due(m, slot - DUE_ESC);
     }
@@ -123,7 +123,7 @@ static void on_block(uc_engine *uc, uint64_t address, uint32_t size, void *user)
         look_at_stack_pointer(m);
     if (m->next_due <= m->now)
         let_happen(m);
-    if (m->now >= m->until || m->why) {
+    if (m->now >= m->until || m->stop_reason) {
         if (!m->stepping) {
             stop(m, (uint32_t)address);
             return;
@@ -202,7 +202,7 @@ static void on_break(uc_engine *uc, uint64_t address, uint32_t size, void *user)
         return;
     }
     m->skip_at = m->resume = (uint32_t)address;
-    m->why |= WHY_BREAK;
+    m->stop_reason |= STOP_BREAK;
     stop(m, (uint32_t)address);
 }
 
@@ -216,7 +216,7 @@ static void on_sleep(uc_engine *uc, uint64_t address, uint32_t size, void *user)
     for (;;) {
         if (m->next_due <= m->now)
             let_happen(m);
-        if (m->now >= m->until || m->why) {
+        if (m->now >= m->until || m->stop_reason) {
             m->asleep = 1;
             stop(m, after);
             return;
@@ -251,7 +251,7 @@ static void on_division(uc_engine *uc, uint64_t address, uint32_t size, void *us
         return;
     m->divided = 1;
     m->resume = (uint32_t)address;
-    m->why |= WHY_DIVISION;
+    m->stop_reason |= STOP_DIVISION;
     stop(m, (uint32_t)address);
 }
 
@@ -362,7 +362,7 @@ void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause)
     m->stack_begin = m->canary = m->overflow = 0;
     for (unsigned i = 0; i < m->task_count; i++)
         m->task[i].busy_since = 0;
-    m->attention = m->asleep = m->locked = m->why = m->watchdog_on = 0;
+    m->attention = m->asleep = m->locked = m->stop_reason = m->watchdog_on = 0;
     m->watchdog_reload = 0xFFF;
     m->vtor = vectors;
     m->ccr = 0x200;
@@ -403,13 +403,13 @@ void fault_of(struct machine *m, int error)
         raise_fault(m, USAGE_FAULT, INVSTATE, pc);
     } else if ((error == READ_UNMAPPED || error == FETCH_UNMAPPED) && m->fault_address < FLASH_SIZE) {
         m->resume = m->pc; /* the alias of flash, mapped after this report */
-        m->why |= WHY_LOW_READ;
+        m->stop_reason |= STOP_LOW_READ;
     } else if (error == WRITE_PROTECTED || (error == WRITE_UNMAPPED && m->fault_address < FLASH_SIZE)) {
         /* A store to flash has no effect unless it is being programmed. */
         uint16_t first;
         if (m->fault_address < FLASH_SIZE && is_new_low_writer(m)) {
             m->resume = m->pc;
-            m->why |= WHY_LOW_WRITE;
+            m->stop_reason |= STOP_LOW_WRITE;
             return;
         }
         memcpy(&first, m->flash + (m->pc & (FLASH_SIZE - 1)), sizeof first);
@@ -438,11 +438,11 @@ static void execute(struct machine *m, uint64_t count_of)
     }
 }
 
-/* Run up to a time, or until the caller must act; return the reason (`WHY_...`, 0: it is `until`). */
+/* Run up to a time, or until the caller must act; return the reason (`STOP_...`, 0: it is `until`). */
 uint32_t machine_run(struct machine *m, uint64_t until)
 {
     m->until = until;
-    m->why = 0;
+    m->stop_reason = 0;
     m->stepping = 0;
     if (m->skip_at != m->pc) /* the pc has changed since */
         m->skip_at = NOWHERE;
@@ -450,8 +450,8 @@ uint32_t machine_run(struct machine *m, uint64_t until)
         if (m->resume != m->pc) {
             m->resume = NOWHERE;
             let_happen(m);
-            if (m->why || m->now >= until)
-                return m->why;
+            if (m->stop_reason || m->now >= until)
+                return m->stop_reason;
         }
         uint64_t next = m->next_due < until ? m->next_due : until;
         if (m->owed && m->resume != m->pc && in_task(m) && !next_exception(m, 0)) {
@@ -471,8 +471,8 @@ uint32_t machine_run(struct machine *m, uint64_t until)
             m->asleep = 0;
         }
         execute(m, 0);
-        if (m->why & (WHY_BREAK | WHY_LOW_READ | WHY_LOW_WRITE | WHY_DIVISION))
-            return m->why;
+        if (m->stop_reason & (STOP_BREAK | STOP_LOW_READ | STOP_LOW_WRITE | STOP_DIVISION))
+            return m->stop_reason;
     }
 }
 
@@ -490,7 +490,7 @@ static void on_step(uc_engine *uc, uint64_t address, uint32_t size, void *user)
 /* Execute one instruction, or enter one exception. */
 uint32_t machine_step(struct machine *m)
 {
-    m->why = 0;
+    m->stop_reason = 0;
     if (m->resume != m->pc) {
         m->resume = NOWHERE;
         let_happen(m);
@@ -512,9 +512,9 @@ uint32_t machine_step(struct machine *m)
     m->engine.hook_del(m->engine.uc, hook);
     m->stepping = 0;
     m->skip_at = m->pc;
-    if (m->pc == pc + 2 && !m->why)
+    if (m->pc == pc + 2 && !m->stop_reason)
         m->asleep = m->flash[(pc - FLASH_BASE) % FLASH_SIZE] == 0x30 && m->flash[(pc + 1 - FLASH_BASE) % FLASH_SIZE] == 0xBF;
-    return m->why | WHY_STEP;
+    return m->stop_reason | STOP_STEP;
 }
 
 /* Set or remove a breakpoint; return 0 without room. */
@@ -549,7 +549,7 @@ void note_access(struct watchpoint *w, uint32_t first, uint32_t size)
     if (first >= w->address + w->size || first + size <= w->address)
         return;
     w->machine->watch_address = first > w->address ? first : w->address;
-    w->machine->why |= WHY_WATCHPOINT;
+    w->machine->stop_reason |= STOP_WATCHPOINT;
 }
 
 /* Set or remove a watchpoint of a GDB kind: 2 writes, 3 reads, 4 both; return 0 without room. */

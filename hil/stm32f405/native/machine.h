@@ -45,9 +45,9 @@ enum {
 
 /* Why a run stopped before its time. */
 enum {
-    WHY_SERIAL = 1, WHY_COMPARE = 2, WHY_RESET = 4, WHY_WATCHDOG = 8, WHY_BREAK = 16, WHY_LOCKUP = 32, WHY_STEP = 64,
-    WHY_OVERFLOW = 128, WHY_LOW_READ = 256, WHY_DIVISION = 512, WHY_WATCHPOINT = 1024,
-    WHY_LOW_WRITE = 2048, WHY_DEVICE = 4096,
+    STOP_SERIAL = 1, STOP_COMPARE = 2, STOP_RESET = 4, STOP_WATCHDOG = 8, STOP_BREAK = 16, STOP_LOCKUP = 32, STOP_STEP = 64,
+    STOP_OVERFLOW = 128, STOP_LOW_READ = 256, STOP_DIVISION = 512, STOP_WATCHPOINT = 1024,
+    STOP_LOW_WRITE = 2048, STOP_DEVICE = 4096,
 };
 
 /* Registers by unicorn's numbers. */
@@ -176,7 +176,7 @@ struct task_switch {
 struct machine {
     uint64_t now, instructions, exceptions, sleeping; /* `sleeping`: cycles spent in WFI */
     uint64_t next_due;
-    uint32_t pc, why, asleep, watchdog_on;
+    uint32_t pc, stop_reason, asleep, watchdog_on;
     uint32_t fault_address, unknown_count;
     uint32_t unknown[16]; /* peripherals that were used: not modelled, or with 1 added those without a clock */
     uint64_t owed, taken; /* cycles that an outside load takes before all tasks, but not before interrupts; has taken */

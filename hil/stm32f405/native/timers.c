@@ -50,7 +50,7 @@ static void write_ccr(struct machine *m, unsigned n, unsigned channel, uint32_t 
     m->timer[n].others[CCR1 / 4 + channel] = value;
     if (!esc_at(m, n, channel) && m->compare[n][channel] != value) {
         m->compare[n][channel] = value;
-        m->why |= WHY_COMPARE;
+        m->stop_reason |= STOP_COMPARE;
     }
 }
 

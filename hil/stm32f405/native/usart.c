@@ -68,7 +68,7 @@ void usart_send_due(struct machine *m, unsigned n)
     }
     if (!u->sending) {
         u->sr |= TC;
-        m->why |= WHY_SERIAL;
+        m->stop_reason |= STOP_SERIAL;
     }
     update_line(m, n);
 }

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 pytest.importorskip("unicorn")
 
 from hil.errors import LabError
-from hil.stm32f405.chip import CYCLES_PER_US, Chip, Why
+from hil.stm32f405.chip import CYCLES_PER_US, Chip, StopReason
 from hil.stm32f405.freertos import FreeRtos
 from hil.stm32f405.gdb import DebuggedChip, GdbServer
 from hil.stm32f405.gdb_protocol import (
@@ -197,7 +197,7 @@ def test_a_run_ends_in_front_of_a_breakpoint_and_a_step_behind_one_instruction(
     assert server.hold() is ResumeRequest.RUN
     assert machine.register("pc") == image.reset
     line.sendall(framed(b"pf") + framed(b"s") + framed(b"pf") + framed(b"z1,%x,2" % there) + framed(b"D"))
-    assert machine.run(1000 * CYCLES_PER_US) & Why.BREAK
+    assert machine.run(1000 * CYCLES_PER_US) & StopReason.BREAK
     assert machine.register("pc") == there
     assert server.hold() is ResumeRequest.STEP
     machine.step()
@@ -322,12 +322,12 @@ def test_a_breakpoint_where_crashes_are_reported_stops_for_both() -> None:
             b"".join(map(framed, (b"QStartNoAckMode", b"Z0,%x,2" % place, b"c", b"p0f", b"c", b"D")))
         )
         chip = DebuggedChip(machine.chip, server)
-        why = Why.SERIAL
-        while why in (Why.SERIAL, Why.COMPARE):
+        why = StopReason.SERIAL
+        while why in (StopReason.SERIAL, StopReason.COMPARE):
             why = chip.run(100_000 * CYCLES_PER_US)
         server.close()
         answers = contents(b"".join(iter(lambda: line.recv(1 << 16), b"")))
-    assert why == Why.BREAK  # the report's
+    assert why == StopReason.BREAK  # the report's
     assert machine.chip.register("pc") == place
     assert answers[-2:] == [b"T05thread:1;", pack("<I", place).hex().encode()]
 
@@ -358,10 +358,10 @@ def test_a_debugger_that_has_left_stops_nothing_any_more() -> None:
     with socket.create_connection(("127.0.0.1", server.port)) as line:
         line.sendall(b"".join(map(framed, (b"QStartNoAckMode", b"Z2,%x,4" % place, b"D"))))
         chip = DebuggedChip(machine.chip, server)
-        assert chip.run(CYCLES_PER_US) == Why.TIME
+        assert chip.run(CYCLES_PER_US) == StopReason.TIME
     for end_us in (2_000, 4_000):  # the chip itself, without its debugger
         while machine.chip.now_us < end_us:
-            assert machine.chip.run(end_us * CYCLES_PER_US) & Why.WATCHPOINT == 0
+            assert machine.chip.run(end_us * CYCLES_PER_US) & StopReason.WATCHPOINT == 0
     server.close()
 
 
@@ -374,7 +374,7 @@ def test_a_stop_selects_the_running_thread() -> None:
     other = next(task.block for task in kernel.tasks() if task.block != kernel.current_block)
     assert ask(protocol, b"Z0,%x,2" % place) == ask(protocol, b"Hg%x" % other) == b"OK"
     assert protocol.receive(framed(b"c")) == b"+"
-    while not chip.run(200_000 * CYCLES_PER_US) & Why.BREAK:
+    while not chip.run(200_000 * CYCLES_PER_US) & StopReason.BREAK:
         assert chip.now_us < 200_000
     protocol.stopped(SIGTRAP)
     assert ask(protocol, b"p0f") == pack("<I", place).hex().encode()
@@ -393,7 +393,7 @@ def test_a_breakpoint_of_others_is_theirs() -> None:
     server = GdbServer(0)
     with socket.create_connection(("127.0.0.1", server.port)) as line:
         line.sendall(framed(b"c"))
-        assert DebuggedChip(machine.chip, server).run(5_000 * CYCLES_PER_US) == Why.BREAK
+        assert DebuggedChip(machine.chip, server).run(5_000 * CYCLES_PER_US) == StopReason.BREAK
     assert machine.chip.register("pc") == place
     server.close()
 

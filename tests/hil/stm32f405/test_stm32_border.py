@@ -9,7 +9,7 @@ pytest.importorskip("cffi")
 
 from hil.errors import LabError
 from hil.stm32f405 import chip
-from hil.stm32f405.chip import SOURCES, Chip, Why, build_machine, declared
+from hil.stm32f405.chip import SOURCES, Chip, StopReason, build_machine, declared
 from support.stm32_bench import Bench
 
 
@@ -25,7 +25,7 @@ def constants(prefix: str) -> dict[str, int]:
 
 
 def test_python_s_reasons_to_stop_are_the_machine_s() -> None:
-    assert {why.name: why.value for why in Why if why} == constants("WHY_")
+    assert {why.name: why.value for why in StopReason if why} == constants("STOP_")
 
 
 def test_python_s_memories_lie_where_the_machine_has_them() -> None:

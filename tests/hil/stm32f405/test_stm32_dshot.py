@@ -9,7 +9,7 @@ pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
 from hil.errors import LabError
-from hil.stm32f405.chip import RAM, SOFTWARE, Why
+from hil.stm32f405.chip import RAM, SOFTWARE, StopReason
 from support.dshot import frame_of, period_us
 from support.stm32_bench import Bench
 
@@ -48,7 +48,7 @@ class Wire(Bench):
         self[STREAM + 0xC], self[STREAM] = BUFFER, control
         self[self.timer + DIER] = 1 << 9 + self.channel
 
-    def send(self, frame: int, inverted: bool = False, bits: int = 16, size: int = WORDS) -> Why:
+    def send(self, frame: int, inverted: bool = False, bits: int = 16, size: int = WORDS) -> StopReason:
         pulses = [ONE if frame >> 15 - bit & 1 else ZERO for bit in range(bits)] + [0]
         self[self.timer + CR1] = self[self.timer + CNT] = self[self.timer + CCR1 + 4 * self.channel] = 0
         self[self.timer + ARR] = PERIOD - 1
@@ -82,9 +82,9 @@ def wire() -> Wire:
 def test_a_frame_of_sixteen_pulses_is_a_throttle(wire: Wire) -> None:
     assert frame_of(1046) == 0b1000_0010_1100_0110  # the description's example
     wire.send(frame_of(0))
-    assert wire.send(frame_of(1046)) & Why.COMPARE
+    assert wire.send(frame_of(1046)) & StopReason.COMPARE
     assert wire.throttle == 1046
-    assert not wire.send(frame_of(1046)) & Why.COMPARE, "the same again"
+    assert not wire.send(frame_of(1046)) & StopReason.COMPARE, "the same again"
     wire.send(frame_of(2047, request=1))
     assert wire.throttle == 2047
 
@@ -134,9 +134,9 @@ def test_no_motor_starts_before_it_was_told_to_stand(wire: Wire) -> None:
 def test_a_silent_wire_stops_the_motor_which_then_waits_for_a_stop(wire: Wire) -> None:
     wire.send(frame_of(0))
     wire.send(frame_of(700))
-    assert not wire.wait(150_000) & Why.COMPARE
+    assert not wire.wait(150_000) & StopReason.COMPARE
     assert wire.throttle == 700
-    assert wire.wait(20_000) & Why.COMPARE
+    assert wire.wait(20_000) & StopReason.COMPARE
     assert wire.throttle == 0
     wire.send(frame_of(700))
     assert wire.throttle == 0
@@ -146,8 +146,8 @@ def test_a_reset_of_the_chip_is_silence_for_the_esc(wire: Wire) -> None:
     wire.send(frame_of(0))
     wire.send(frame_of(700))
     wire.chip.reset(SOFTWARE)
-    assert not wire.wait(150_000) & Why.COMPARE
-    assert wire.wait(20_000) & Why.COMPARE
+    assert not wire.wait(150_000) & StopReason.COMPARE
+    assert wire.wait(20_000) & StopReason.COMPARE
     assert wire.throttle == 0
 
 
@@ -174,7 +174,7 @@ def test_a_word_moves_once_a_period_and_only_while_its_request_is_enabled(wire: 
 def test_without_an_esc_the_words_are_compare_counts() -> None:
     wire = Wire(1, 1)
     wire.channel = 3
-    assert wire.send(frame_of(0)) & Why.COMPARE
+    assert wire.send(frame_of(0)) & StopReason.COMPARE
     wire._move(pack("<2I", 77, 99), 2, TO_TIMER | WORDS)
     wire.wait(20)
     assert (wire.throttle, wire[wire.timer + CCR1 + 12]) == (99, 99)

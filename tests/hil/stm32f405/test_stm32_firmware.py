@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hil.stm32f405.chip import Why
+from hil.stm32f405.chip import StopReason
 from support.dshot import period_us
 from support.stm32_machine import FirmwareOnChip
 
@@ -21,9 +21,9 @@ def run(machine: FirmwareOnChip, begin_ms: int, end_ms: int, gyro: bool = True) 
         if gyro:
             machine.chip.pin("C", 14, True)
             machine.chip.pin("C", 14, False)
-        while (why := machine.run((ms + 1) * MS)) != Why.TIME:
-            assert why in (Why.SERIAL, Why.COMPARE), why
-            if why == Why.SERIAL:
+        while (why := machine.run((ms + 1) * MS)) != StopReason.TIME:
+            assert why in (StopReason.SERIAL, StopReason.COMPARE), why
+            if why == StopReason.SERIAL:
                 sent += machine.chip.sent(6)
     return sent
 
@@ -81,9 +81,11 @@ def test_dshot_by_dma_moves_an_esc_and_its_answer_is_captured(compiler: str) -> 
 
 def test_a_hungry_watchdog_resets_and_a_failed_assertion_keeps_its_snapshot_over_the_reset() -> None:
     machines = [FirmwareOnChip(planted=planted) for planted in (HUNGRY_WATCHDOG, ASSERTION)]
-    for machine, expected in zip(machines, (Why.WATCHDOG, Why.RESET), strict=True):
-        why = Why.TIME
-        while why in (Why.TIME, Why.SERIAL, Why.COMPARE) and machine.chip.now_us < 400 * MS:
+    for machine, expected in zip(machines, (StopReason.WATCHDOG, StopReason.RESET), strict=True):
+        why = StopReason.TIME
+        while (
+            why in (StopReason.TIME, StopReason.SERIAL, StopReason.COMPARE) and machine.chip.now_us < 400 * MS
+        ):
             why = machine.run(400 * MS)
         assert why & expected
     assert 190 * MS < machines[0].chip.now_us < 215 * MS  # 200 periods of 32 / 32 kHz after the start

@@ -10,7 +10,7 @@ import pytest
 
 from hil.crazyflie.log_table import log_table, parameter_table
 from hil.stm32f405 import stopped_tasks
-from hil.stm32f405.chip import Why
+from hil.stm32f405.chip import StopReason
 from hil.stm32f405.crash import CrashReports
 from hil.stm32f405.freertos import FreeRtos, Wait
 from hil.stm32f405.image import Image
@@ -38,10 +38,10 @@ def reports_of(machine: FirmwareOnChip) -> CrashReports:
     return CrashReports(machine.image, machine.chip, FreeRtos(machine.image, machine.chip.read), "assertFail")
 
 
-def run_to_end(machine: FirmwareOnChip, end_ms: int) -> Why:
+def run_to_end(machine: FirmwareOnChip, end_ms: int) -> StopReason:
     """Run until something else than outputs stops the chip, or for so long."""
-    why = Why.SERIAL
-    while why and not why & ~(Why.SERIAL | Why.COMPARE):
+    why = StopReason.SERIAL
+    while why and not why & ~(StopReason.SERIAL | StopReason.COMPARE):
         why = machine.run(end_ms * MS)
     return why
 
@@ -90,7 +90,7 @@ def crashed(machine: FirmwareOnChip) -> str:
     """Run into the first crash and return it in words."""
     reports = reports_of(machine)
     machine.chip.crash_points |= reports.addresses
-    assert run_to_end(machine, 100) == Why.BREAK
+    assert run_to_end(machine, 100) == StopReason.BREAK
     return str(reports.here())
 
 
@@ -130,7 +130,7 @@ def test_an_assertion_is_reported_with_text_and_caller(compiler: str) -> None:
     )
     # What the firmware itself keeps for after the reset says the same.
     machine.chip.crash_points.clear()
-    assert run_to_end(machine, 100) & Why.RESET
+    assert run_to_end(machine, 100) & StopReason.RESET
     magic, _, file, kept = machine.peek_all("snapshot", 4)
     assert (magic, kept) == (0x2F8A_001F, line)
     assert machine.chip.read(file, 11) == b"firmware.c\0"
@@ -153,7 +153,7 @@ def test_a_call_through_a_null_pointer_is_a_change_to_arm_code(compiler: str) ->
     )
 
 
-def stopped(machine: FirmwareOnChip, why: Why) -> tuple[ChipProcessor, CrashReports]:
+def stopped(machine: FirmwareOnChip, why: StopReason) -> tuple[ChipProcessor, CrashReports]:
     processor = machine.processor()
     assert run_to_end(machine, 100) == why
     return processor, reports_of(machine)
@@ -163,24 +163,26 @@ def stopped(machine: FirmwareOnChip, why: Why) -> tuple[ChipProcessor, CrashRepo
 @pytest.mark.parametrize(
     ("planted", "why", "expected", "text"),
     [
-        (NULL_READ, Why.LOW_READ, "null pointer: read at 0x00000008, ", "return nowhere[2]"),
-        (NULL_WRITE, Why.LOW_WRITE, "null pointer: write to 0x0000000c, ", "nowhere[3] = 1"),
+        (NULL_READ, StopReason.LOW_READ, "null pointer: read at 0x00000008, ", "return nowhere[2]"),
+        (NULL_WRITE, StopReason.LOW_WRITE, "null pointer: write to 0x0000000c, ", "nowhere[3] = 1"),
     ],
 )
-def test_a_null_access_reports_once(compiler: str, planted: int, why: Why, expected: str, text: str) -> None:
+def test_a_null_access_reports_once(
+    compiler: str, planted: int, why: StopReason, expected: str, text: str
+) -> None:
     machine = FirmwareOnChip(compiler, planted=planted)
     _, reports = stopped(machine, why)
-    crash = str(reports.low_access(machine.chip.state.fault_address, why is Why.LOW_WRITE))
+    crash = str(reports.low_access(machine.chip.state.fault_address, why is StopReason.LOW_WRITE))
     assert crash.startswith(expected)
     assert f"in task REPORT: go_wrong (firmware.c:{line_of(text)}) < report (" in crash
     lines = machine.peek("lines_sent")
-    assert run_to_end(machine, 100) == Why.TIME
+    assert run_to_end(machine, 100) == StopReason.TIME
     assert machine.peek("lines_sent") > lines + 3
 
 
 def test_flash_is_read_at_address_0() -> None:
     machine = FirmwareOnChip(planted=NULL_READ)
-    stopped(machine, Why.LOW_READ)
+    stopped(machine, StopReason.LOW_READ)
     machine.chip.step()
     words = [machine.chip.register(name) for name in ("r0", "r1", "r2", "r3")]
     assert 0xFFFF_FFFF in words  # erased: the image begins at 16 kB
@@ -189,11 +191,11 @@ def test_flash_is_read_at_address_0() -> None:
 @COMPILERS
 def test_the_first_division_by_zero_is_reported_where_it_is(compiler: str) -> None:
     machine = FirmwareOnChip(compiler, planted=DIVISION)
-    _, reports = stopped(machine, Why.DIVISION)
+    _, reports = stopped(machine, StopReason.DIVISION)
     text = str(reports.division())
     assert text.startswith("division by zero: its result is 0; no fault follows")
     assert f"in task REPORT: go_wrong (firmware.c:{line_of('return 7 / zero')}) < report (" in text
-    assert run_to_end(machine, 100) == Why.TIME
+    assert run_to_end(machine, 100) == StopReason.TIME
 
 
 @COMPILERS
@@ -204,7 +206,7 @@ def test_the_task_that_hangs_is_named_while_others_run(compiler: str) -> None:
         machine.chip.pin("C", 14, True)
         machine.chip.pin("C", 14, False)
         machine.run(us)
-    assert run_to_end(machine, 85) == Why.TIME
+    assert run_to_end(machine, 85) == StopReason.TIME
     assert machine.peek("samples_taken") > 50
     found = processor.longest_busy(5_000)
     assert found is not None
@@ -225,7 +227,7 @@ def test_a_task_that_hangs_is_named_from_within_an_interrupt() -> None:
     processor = machine.processor()
     run_to_end(machine, 60)
     machine.chip.breakpoints |= {machine.image.symbol("tick").address}
-    assert run_to_end(machine, 100) == Why.BREAK
+    assert run_to_end(machine, 100) == StopReason.BREAK
     found = processor.longest_busy(5_000)
     assert found is not None
     assert ", in task REPORT: hang (firmware.c:" in str(reports_of(machine).hang(*found))
@@ -244,7 +246,7 @@ def test_a_task_that_waits_is_not_busy() -> None:
 @COMPILERS
 def test_a_stack_that_overflows_names_its_task_at_once(compiler: str) -> None:
     machine = FirmwareOnChip(compiler, planted=OVERFLOW)
-    _, reports = stopped(machine, Why.OVERFLOW)
+    _, reports = stopped(machine, StopReason.OVERFLOW)
     text = str(reports.overflow(machine.chip.state.overflow))
     assert text.startswith("stack overflow, in task REPORT: dig (firmware.c:")
     assert re.search(r"\), \d\d times < (go_wrong \(firmware.c:\d+\) < )?report ", text)
@@ -252,7 +254,7 @@ def test_a_stack_that_overflows_names_its_task_at_once(compiler: str) -> None:
 
 def test_a_stack_that_overflows_within_one_block_names_its_task_at_the_next_interrupt() -> None:
     machine = FirmwareOnChip(planted=BRIEF_OVERFLOW)
-    _, reports = stopped(machine, Why.OVERFLOW)
+    _, reports = stopped(machine, StopReason.OVERFLOW)
     text = str(reports.overflow(machine.chip.state.overflow))
     assert text.startswith("stack overflow, some calls before this place, in task REPORT: ")
 
@@ -269,7 +271,7 @@ def test_an_assertion_without_text_is_reported_by_its_addresses() -> None:
 def test_a_watchdog_reset_names_the_running_task() -> None:
     machine = FirmwareOnChip(planted=HUNGRY_WATCHDOG)
     reports = reports_of(machine)
-    assert run_to_end(machine, 400) & Why.WATCHDOG
+    assert run_to_end(machine, 400) & StopReason.WATCHDOG
     text = str(reports.watchdog())
     assert re.match(r"watchdog reset: nobody fed it in time; this ran then, in task SPIN-[01]: ", text)
     assert re.search(r"check_fp_registers \(firmware.c:\d+\) < spin_[01] \(firmware.c:\d+\)", text)
@@ -284,7 +286,7 @@ def test_a_fault_in_an_interrupt_names_its_handler() -> None:
     machine.chip.write(handler, bytes.fromhex("00de"))
     machine.chip.crash_points |= reports.addresses
     machine.chip.pin("C", 14, True)
-    assert run_to_end(machine, 100) == Why.BREAK
+    assert run_to_end(machine, 100) == StopReason.BREAK
     assert str(reports.here()).startswith(
         "HardFault: undefined instruction, in interrupt 40 (EXTI15_10_Handler): EXTI15_10_Handler (firmware.c:"
     )
@@ -304,7 +306,7 @@ def test_an_unhandled_fault_is_reported_as_lock_up() -> None:
     while machine.chip.register("xpsr") & 0x1FF:
         machine.chip.step()
     machine.chip.set_register("sp", 0x3000_0000)
-    assert run_to_end(machine, 100) == Why.LOCKUP
+    assert run_to_end(machine, 100) == StopReason.LOCKUP
     text = str(reports_of(machine).lockup())
     assert text.startswith("lock-up, no fault handler could run: access to where there is no memory ")
     assert re.search(r", in task [\w-]+: \w+ \(firmware.c:\d+\)", text)
@@ -317,7 +319,7 @@ def test_before_the_scheduler_main_is_named() -> None:
     machine.chip.set_register("pc", machine.image.symbol("go_wrong").address)
     machine.chip.set_register("r0", ASSERTION)
     machine.chip.set_register("lr", machine.image.reset | 1)
-    assert run_to_end(machine, 100) == Why.BREAK
+    assert run_to_end(machine, 100) == StopReason.BREAK
     assert "in main, before the scheduler ran: go_wrong (" in str(reports.here())
 
 

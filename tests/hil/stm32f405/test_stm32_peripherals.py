@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("unicorn")
 
 from hil.errors import LabError
-from hil.stm32f405.chip import CYCLES_PER_US, FLASH, RAM, Why
+from hil.stm32f405.chip import CYCLES_PER_US, FLASH, RAM, StopReason
 from support.stm32_bench import Bench
 
 TIM3, I2C1, IWDG = 0x4000_0400, 0x4000_5400, 0x4000_3000
@@ -104,10 +104,10 @@ def test_a_watchdog_that_is_fed_does_not_bite(bench: Bench) -> None:
     bench[IWDG + 4], bench[IWDG + 8] = 0, 31
     bench[IWDG] = 0xCCCC
     for _ in range(3):
-        assert bench.wait(3900) == Why.TIME
+        assert bench.wait(3900) == StopReason.TIME
         bench[IWDG] = 0xAAAA
-    assert bench.wait(3900) == Why.TIME
-    assert bench.wait(200) & Why.WATCHDOG
+    assert bench.wait(3900) == StopReason.TIME
+    assert bench.wait(200) & StopReason.WATCHDOG
 
 
 def test_a_store_into_flash_changes_nothing_and_the_next_instruction_follows() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from hil.errors import LabError
 from hil.stm32f405 import chip as chip_module
-from hil.stm32f405.chip import Why
+from hil.stm32f405.chip import StopReason
 from support.stm32_bench import FLASH, RAM, Bench
 
 START, VECTORS, DATA = FLASH + 8, RAM + 0x4000, RAM + 0x2000
@@ -230,7 +230,7 @@ def test_a_step_behind_wfi_wakes_the_processor() -> None:
 def test_a_watchpoint_sees_an_unaligned_access(code: str, kind: int) -> None:
     bench = Strict(code, {"r4": DATA + 5})
     bench.chip.watch(kind, DATA + 8, 1, True)
-    assert bench.chip.run(1680) & Why.WATCHPOINT
+    assert bench.chip.run(1680) & StopReason.WATCHPOINT
     assert bench.chip.state.watch_address == DATA + 8
 
 
@@ -317,11 +317,11 @@ def test_a_breakpoint_holds_each_arrival_once() -> None:
     for moves_pc, counted in ((True, 0), (True, 0), (False, 1), (False, 2)):
         if moves_pc:
             chip.set_register("pc", START + 2)
-        assert chip.run(chip.state.now + 1000) & Why.BREAK
+        assert chip.run(chip.state.now + 1000) & StopReason.BREAK
         assert (chip.register("pc"), chip.register("r7")) == (START, counted)
     chip.set_register("pc", START + 2)
     chip.step()  # onto it
-    assert chip.run(chip.state.now + 1000) & Why.BREAK
+    assert chip.run(chip.state.now + 1000) & StopReason.BREAK
     assert (chip.register("pc"), chip.register("r7")) == (START, 3)
 
 
@@ -468,13 +468,13 @@ def test_a_fault_while_interrupts_are_masked_is_a_hard_fault() -> None:
 
 @pytest.mark.parametrize("code", ["71b6 00de", "71b6 00df"], ids=["udf", "svc"])
 def test_a_fault_while_faults_are_masked_locks_up(code: str) -> None:
-    assert Strict(code).wait(RUN_US) & Why.LOCKUP  # cpsid f
+    assert Strict(code).wait(RUN_US) & StopReason.LOCKUP  # cpsid f
 
 
 def test_a_vector_table_without_memory_locks_up() -> None:
     bench = Strict("00df")
     bench[VTOR] = NO_MEMORY
-    assert bench.wait(RUN_US) & Why.LOCKUP
+    assert bench.wait(RUN_US) & StopReason.LOCKUP
     assert bench.chip.state.hfsr & VECTTBL
 
 
