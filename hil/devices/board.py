@@ -153,8 +153,8 @@ class VirtualBoard:
         return result
 
 
-class Thief:
-    """The share of every tick that it takes, 0..1; may change at any time."""
+class CpuLoad:
+    """A load on the processor: the share of every tick that it takes, 0..1; may change at any time."""
 
     __slots__ = ("share",)
 

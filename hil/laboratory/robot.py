@@ -20,7 +20,7 @@ from hil.bodies import make_body
 from hil.config import LabConfig, load_config
 from hil.crazyflie import syslink
 from hil.crazyflie.shockburst import Air
-from hil.devices.board import InjectFailure, Requests, Thief, VirtualBoard, new_eeprom, unsupported
+from hil.devices.board import CpuLoad, InjectFailure, Requests, VirtualBoard, new_eeprom, unsupported
 from hil.devices.board_firmware import Executor, PowerOn, PythonBoard
 from hil.devices.cameras import VirtualMocap
 from hil.devices.imu import GYRO_COUNTS, VirtualImu
@@ -120,7 +120,7 @@ class Robot:
         self.executor = site.executor
         self._ports = ports
         self._carrier = Carrier(self.body, streams.board, self.body.room, config.robot.decks, self.body.escs)
-        self._thief: Thief | None = None
+        self._thief: CpuLoad | None = None
         self._seen_by: list[See] = []
         self._resets = 0
         self._failures: tuple[str, ...] = ()  # of the firmware before the last power-on
@@ -178,14 +178,14 @@ class Robot:
         self._seen_by.append(see)
 
     @property
-    def thief(self) -> Thief:
+    def thief(self) -> CpuLoad:
         """The load that takes processor time from the board, created at first use; its share is 0 until set."""
         if self._thief is None:
-            self._thief = Thief()
+            self._thief = CpuLoad()
             self._occupy(self._thief)
         return self._thief
 
-    def _occupy(self, thief: Thief) -> None:
+    def _occupy(self, thief: CpuLoad) -> None:
         if self.firmware.scheduler is None:
             raise LabError("--hil: the processor time of a real board cannot be taken")
         self.firmware.scheduler.occupy("THIEF", thief.taken_us)
