@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from hil.devices.board_firmware import Executor
     from hil.live.feed import LiveView
     from hil.servers.motive import VirtualMotive
-    from hil.servers.server import Doors, Opened, Server
+    from hil.servers.server import Endpoints, OpenEndpoints, Server
     from hil.servers.swarm import Swarm
 
 Say = Callable[[str], None]
@@ -113,7 +113,7 @@ def serve(asked: ServeOptions) -> int:
     from hil.laboratory.fault_kinds import MARKERS_ON
     from hil.laboratory.faults import check, parse
     from hil.servers.serial_server import parse_addresses
-    from hil.servers.server import Doors, Server, Service
+    from hil.servers.server import Endpoints, Server, Service
     from hil.servers.swarm import Swarm
 
     markers = (MARKERS_ON,) if asked.motive else ()
@@ -128,13 +128,13 @@ def serve(asked: ServeOptions) -> int:
     check(planned, inf, "mavlink" if serial else "radio", config)
     common.announce_compilation()
     plan = Service(config, 1, asked.seed, bool(serial), planned, asked.state, _executor(asked))
-    doors = Doors(asked.udp, asked.radio_port if asked.radio else None, serial, station, asked.motive)
+    endpoints = Endpoints(asked.udp, asked.radio_port if asked.radio else None, serial, station, asked.motive)
     records = Records()
     say = records.say
-    with closing(Swarm(plan, asked.boards, doors, say)) as swarm:
+    with closing(Swarm(plan, asked.boards, endpoints, say)) as swarm:
         view = common.open_live(asked.target, say)
         with closing(Server(plan, say, view, swarm.to_peers)) as server:
-            _run(server, swarm, doors, view, say)
+            _run(server, swarm, endpoints, view, say)
     say(f"stopped; time stood still for {server.clock.stood_still_us / 1000:.0f} ms")
     return INCOMPLETE if records.incomplete else 0
 
@@ -150,8 +150,8 @@ def _executor(asked: ServeOptions) -> Executor:
     return image_at(asked.board, None, debugger(asked.gdb, Path(asked.board), stack))
 
 
-def _run(server: Server, swarm: Swarm, doors: Doors, view: LiveView | None, say: Say) -> None:
-    """Open the doors of all robots and serve until Ctrl-C, with faults typed at the terminal or in the picture's panel."""
+def _run(server: Server, swarm: Swarm, endpoints: Endpoints, view: LiveView | None, say: Say) -> None:
+    """Open all robots' endpoints and serve until Ctrl-C, with faults typed at the terminal or in the picture's panel."""
     from ground_station.stops import stop_signals
     from hil.servers.live_faults import LiveFaults
 
@@ -166,8 +166,8 @@ def _run(server: Server, swarm: Swarm, doors: Doors, view: LiveView | None, say:
         return bool(stops)
 
     others = swarm.wait()
-    _print_addresses([server.open(doors, [other.dongles for other in others]), *others], say)
-    motive = _motive(server, 1 + len(others), say) if doors.motive else None
+    _print_addresses([server.open(endpoints, [other.dongles for other in others]), *others], say)
+    motive = _motive(server, 1 + len(others), say) if endpoints.motive else None
     with nullcontext() if motive is None else closing(motive):
         swarm.listen(server, answer, motive)
         faults = LiveFaults(server, answer, swarm.terminals)
@@ -220,7 +220,7 @@ def _motive(server: Server, count: int, say: Say) -> VirtualMotive:
     return motive
 
 
-def _print_addresses(robots: list[Opened], say: Say) -> None:
+def _print_addresses(robots: list[OpenEndpoints], say: Say) -> None:
     """Say where clients find the robots."""
     if robots[0].dongles:
         for line in radio_hint(robots[0].dongles, [robot.radio for robot in robots]).splitlines():

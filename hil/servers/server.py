@@ -87,7 +87,7 @@ class Shown:
 
 
 @dataclass(frozen=True, slots=True)
-class Doors:
+class Endpoints:
     """What to open to clients; ports are those of robot 1, 0: any."""
 
     udp: int | None = None
@@ -98,7 +98,7 @@ class Doors:
 
 
 @dataclass(frozen=True, slots=True)
-class Opened:
+class OpenEndpoints:
     """Where clients find a robot; what is not open is empty or 0."""
 
     radio: str  # its URI
@@ -157,19 +157,19 @@ class Server:
         self._shown = None if onlooker is None else Shown(self.served, onlooker)
         self.lab.events.every(RECORD_PERIOD_US, RECORD_PHASE_US, self._look)
 
-    def open(self, doors: Doors, others: Sequence[int] = ()) -> Opened:
+    def open(self, endpoints: Endpoints, others: Sequence[int] = ()) -> OpenEndpoints:
         """Open the robot to clients; `others` are the ports of the other robots' Crazyradios. Raises `LabError`."""
         served, readers, later = self.served, self.clock.readers, self.number - 1
         dongles, udp, mavlink = 0, "", ""
-        if doors.radio is not None:
-            dongles = served.serve_radio(0 if later else doors.radio, readers, others)
-        if doors.udp is not None:
-            udp = served.serve_udp(doors.udp and doors.udp + later, readers)
-        if doors.mavlink:
-            mavlink = served.serve_mavlink(doors.mavlink[later], readers)
-        if doors.station is not None:
-            served.fly(doors.station == "poses")
-        return Opened(served.uri, dongles, udp, mavlink)
+        if endpoints.radio is not None:
+            dongles = served.serve_radio(0 if later else endpoints.radio, readers, others)
+        if endpoints.udp is not None:
+            udp = served.serve_udp(endpoints.udp and endpoints.udp + later, readers)
+        if endpoints.mavlink:
+            mavlink = served.serve_mavlink(endpoints.mavlink[later], readers)
+        if endpoints.station is not None:
+            served.fly(endpoints.station == "poses")
+        return OpenEndpoints(served.uri, dongles, udp, mavlink)
 
     def hear_peer(self, settings: AirSettings, packet: bytes) -> None:
         """Let the board hear a packet of another robot's board."""

@@ -18,7 +18,7 @@ from hil.crazyflie.nrf51 import AirSettings
 from hil.errors import LabError
 from hil.servers.live_faults import LiveFaults
 from hil.servers.motive import VirtualMotive
-from hil.servers.server import Doors, Opened, Server, Service, show
+from hil.servers.server import Endpoints, OpenEndpoints, Server, Service, show
 
 FORK = multiprocessing.get_context("fork")  # a robot starts in 0.1 s with what is loaded already
 END_TIMEOUT_S = 10.0  # for a process to end in order
@@ -28,21 +28,21 @@ Call = Callable[..., None]
 class Swarm:
     """The processes of all robots but the first, of which `plan` is; `say` gets lines for the user."""
 
-    def __init__(self, plan: Service, count: int, doors: Doors, say: Call) -> None:
+    def __init__(self, plan: Service, count: int, endpoints: Endpoints, say: Call) -> None:
         self._pipes: dict[int, Connection] = {}
         self._processes: dict[int, multiprocessing.process.BaseProcess] = {}
-        self._opened: dict[int, Opened] = {}
+        self._opened: dict[int, OpenEndpoints] = {}
         self._say = say
         self._calls: dict[str, Call] = {"say": say, "opened": self._opened.__setitem__, "fail": _fail}
         for number in range(2, count + 1):
             near, far = FORK.Pipe()
             self._pipes[number] = near
-            process = FORK.Process(target=self._serve, args=(replace(plan, number=number), doors, far))
+            process = FORK.Process(target=self._serve, args=(replace(plan, number=number), endpoints, far))
             self._processes[number] = process
             process.start()
             far.close()
 
-    def wait(self) -> list[Opened]:
+    def wait(self) -> list[OpenEndpoints]:
         """Wait until the robots are open to clients. Raises `LabError` if one cannot be."""
         for number in self._pipes:
             while number not in self._opened:
@@ -121,7 +121,7 @@ class Swarm:
             raise LabError("its process has ended") from None
         self._calls[name](*arguments)
 
-    def _serve(self, plan: Service, doors: Doors, pipe: Connection) -> None:
+    def _serve(self, plan: Service, endpoints: Endpoints, pipe: Connection) -> None:
         """Serve a robot in this process."""
         for number in STOPS:  # robot 1's process ends the others
             signal.signal(number, signal.SIG_IGN)
@@ -129,7 +129,7 @@ class Swarm:
             other.close()
         with suppress(BrokenPipeError):
             try:
-                _serve_apart(plan, doors, pipe)
+                _serve_apart(plan, endpoints, pipe)
             except LabError as error:
                 pipe.send(("fail", (str(error),)))
 
@@ -138,7 +138,7 @@ def _fail(text: str) -> None:
     raise LabError(text)
 
 
-def _serve_apart(plan: Service, doors: Doors, pipe: Connection) -> None:
+def _serve_apart(plan: Service, endpoints: Endpoints, pipe: Connection) -> None:
     def calling(name: str) -> Call:
         return lambda *arguments: pipe.send((name, arguments))
 
@@ -162,8 +162,8 @@ def _serve_apart(plan: Service, doors: Doors, pipe: Connection) -> None:
         "end": end,
     }
     try:
-        opened = server.open(doors)
-        if doors.motive:
+        opened = server.open(endpoints)
+        if endpoints.motive:
             show(server.robot, server.clock, partial(calling("take"), plan.number))
         calling("opened")(plan.number, opened)
         server.clock.readers[pipe.fileno()] = read

@@ -15,7 +15,7 @@ from hil.crazyflie import syslink
 from hil.devices.board_firmware import PowerOn, PythonBoard
 from hil.servers.dongle_plugin import CONTROL, VARIABLE, WRITE, Connection, frame
 from hil.servers.dongle_server import AHEAD
-from hil.servers.server import Doors, Server, Service
+from hil.servers.server import Endpoints, Server, Service
 from hil.servers.swarm import Swarm
 from support.serving import PATIENCE_S, Served, serve
 
@@ -194,11 +194,11 @@ class Talker(PythonBoard):
 
 def test_a_peer_packet_of_one_board_reaches_those_of_all_other_processes() -> None:
     said: list[str] = []
-    plan, doors = Service(load_config(), executor=Talker()), Doors(udp=0)
-    with closing(Swarm(plan, 3, doors, said.append)) as swarm:
+    plan, endpoints = Service(load_config(), executor=Talker()), Endpoints(udp=0)
+    with closing(Swarm(plan, 3, endpoints, said.append)) as swarm:
         others = swarm.wait()
         with closing(Server(plan, said.append, None, swarm.to_peers)) as server:
-            ports = [int(robot.udp.rpartition(":")[2]) for robot in (server.open(doors), *others)]
+            ports = [int(robot.udp.rpartition(":")[2]) for robot in (server.open(endpoints), *others)]
             swarm.listen(server, said.append, None)
             for number, port in enumerate(ports, 1):
                 with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
