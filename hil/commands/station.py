@@ -104,15 +104,21 @@ def station(asked: StationOptions) -> int:
     records = Records()
     view = common.open_live(asked.target, records.say)
     flight = _recorded(asked, experiment, view, records)
-    desk = Desk(flight, view, records.say)
+    console = OperatorConsole(flight, view, records.say)
     know = view.know if view is not None and asked.target == "foxglove:parameters" else None
-    operator = Operator(_trajectory_of, desk.reply, desk.note, know)
+    operator = Operator(_trajectory_of, console.reply, console.note, know)
     log = flight.telemetry if flight is not None and asked.out is not None else asked.log
     session = Session(
         asked.uri, asked.mocap, experiment.trajectory, asked.start_s, log, asked.record, asked.tlog, records
     )
     failure, interrupted = fly_with(
-        operator, config.ground, session, desk.report, asked.duration, desk.hands(operator), [*EXPERIMENTS]
+        operator,
+        config.ground,
+        session,
+        console.report,
+        asked.duration,
+        console.hands(operator),
+        [*EXPERIMENTS],
     )
     result = flight.close(failure, interrupted) if flight is not None else None
     if result is not None:
@@ -143,7 +149,7 @@ def _recorded(
 
 
 @dataclass(frozen=True, slots=True)
-class Desk:
+class OperatorConsole:
     """The operator's output: the terminal, and the flight's record and picture if there are any."""
 
     flight: RealFlight | None
