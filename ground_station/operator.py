@@ -16,7 +16,7 @@ from firmware_py.wire.supervisor import State
 from ground_station.config import GroundConfig
 from ground_station.controls import Answer, ControlAction, ControlRequest, ControlsError, Settings
 from ground_station.errors import LinkError, MocapError
-from ground_station.program import Cockpit, Hand, Session, fly, run_until, why
+from ground_station.program import Cockpit, LoopHook, Session, fly, run_until, why
 from ground_station.stops import stop_signals
 from ground_station.terminal import Terminal
 from ground_station.trajectory import Goal, Hold, Trajectory
@@ -255,7 +255,7 @@ def fly_with(
     session: Session,
     say: Callable[[str], None],
     duration_s: float | None,
-    hands: Sequence[Hand] = (),
+    hooks: Sequence[LoopHook] = (),
     names: Sequence[str] = (),
 ) -> tuple[str, bool]:
     """Fly with an operator at the terminal, whose lines `names` complete, until a signal of `STOPS` or for a duration.
@@ -273,7 +273,7 @@ def fly_with(
     failure = ""
     try:
         stopping = run_until(lambda: bool(stops), duration_s)
-        fly(settings, session, say, stopping, [*hands, steer])
+        fly(settings, session, say, stopping, [*hooks, steer])
     except (LinkError, MocapError, OSError, ImportError) as error:
         failure = why(error, session.uri)
     finally:

@@ -61,7 +61,7 @@ class Cockpit:
     plan: FlightPlan
 
 
-Hand = Callable[[Cockpit, int], None]  # called with the instant in every turn of the station's loop
+LoopHook = Callable[[Cockpit, int], None]  # called with the instant in every turn of the station's loop
 
 
 @dataclass(slots=True)
@@ -177,7 +177,7 @@ def fly(
     session: Session,
     say: Callable[[str], None],
     stopping: Callable[[], bool],
-    hands: Sequence[Hand] = (),
+    hooks: Sequence[LoopHook] = (),
 ) -> None:
     """Fly until stopped, or to the end of a replay.
 
@@ -213,8 +213,8 @@ def fly(
         def turn(now_us: int) -> None:
             if plan.start_us is None and link.supervisor_state == State.FLYING:
                 plan.start(now_us + round(session.start_s * 1e6))
-            for hand in hands:
-                hand(cockpit, now_us)
+            for hook in hooks:
+                hook(cockpit, now_us)
 
         longest_us = settings.tracker.reacquire_us if settings.tracker.enabled else WINDOW_US
         rate = FrameRate(settings.frame_period_us, settings.station.corrections_hz, longest_us)

@@ -18,7 +18,7 @@ from hil.errors import LabError
 
 if TYPE_CHECKING:
     from ground_station.operator import Operator
-    from ground_station.program import Cockpit, Hand
+    from ground_station.program import Cockpit, LoopHook
     from ground_station.records import Records
     from hil.laboratory.experiment import Experiment
     from hil.laboratory.real_flight import RealFlight
@@ -117,7 +117,7 @@ def station(asked: StationOptions) -> int:
         session,
         console.report,
         asked.duration,
-        console.hands(operator),
+        console.hooks(operator),
         [*EXPERIMENTS],
     )
     result = flight.close(failure, interrupted) if flight is not None else None
@@ -175,7 +175,7 @@ class OperatorConsole:
         if self.view is not None:
             self.view.answer(0 if self.flight is None else self.flight.log_us, text)
 
-    def hands(self, operator: Operator) -> list[Hand]:
+    def hooks(self, operator: Operator) -> list[LoopHook]:
         """Return the parts of the picture and the record in every turn of the flight."""
         view = self.view
 
