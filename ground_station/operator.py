@@ -16,7 +16,7 @@ from firmware_py.wire.supervisor import State
 from ground_station.config import GroundConfig
 from ground_station.controls import Answer, ControlAction, ControlRequest, ControlsError, Settings
 from ground_station.errors import LinkError, MocapError
-from ground_station.program import Cockpit, LoopHook, Session, fly, run_until, why
+from ground_station.program import LoopHook, Session, StationSession, fly, run_until, why
 from ground_station.stops import stop_signals
 from ground_station.terminal import Terminal
 from ground_station.trajectory import Goal, Hold, Trajectory
@@ -81,35 +81,35 @@ class Operator:
         else:
             self._say(f"{line}: {LINES} lines wait already; it is dropped")
 
-    def turn(self, cockpit: Cockpit, now_us: int) -> None:
+    def turn(self, session: StationSession, now_us: int) -> None:
         """Continue the present line, or begin the next."""
-        self._watch(cockpit, now_us)
+        self._watch(session, now_us)
         if self._talk is not None:
-            answer = cockpit.link.answer(now_us)
+            answer = session.link.answer(now_us)
             if answer is not None:
-                self._on_answer(cockpit, now_us, answer)
+                self._on_answer(session, now_us, answer)
         elif self._lines:
-            self._begin(self._lines.popleft(), cockpit, now_us)
-        elif self._is_learning and cockpit.link.supervisor_state is not None:
+            self._begin(self._lines.popleft(), session, now_us)
+        elif self._is_learning and session.link.supervisor_state is not None:
             self._is_learning = False
             self._line, self._talk = "parameters", self._learn()
-            self._go_on(cockpit, now_us, None)
+            self._go_on(session, now_us, None)
 
-    def _begin(self, line: str, cockpit: Cockpit, now_us: int) -> None:
+    def _begin(self, line: str, session: StationSession, now_us: int) -> None:
         line = self._line = line.strip()
         try:
             words = line.split(None, 1) if line.startswith("mark ") else shlex.split(line)
             if not words:
                 return
-            self._execute(words[0], words[1:], cockpit, now_us)
+            self._execute(words[0], words[1:], session, now_us)
         except (ControlsError, ValueError) as error:
             self._refuse(str(error))
 
-    def _execute(self, command: str, words: list[str], cockpit: Cockpit, now_us: int) -> None:
+    def _execute(self, command: str, words: list[str], session: StationSession, now_us: int) -> None:
         """Execute a line at once, or begin its dialogue with the board."""
         at_once: dict[str, Callable[[], str]] = {
-            "goal": lambda: self._goal(words, cockpit, now_us),
-            "fly": lambda: self._fly(words, cockpit, now_us),
+            "goal": lambda: self._goal(words, session, now_us),
+            "fly": lambda: self._fly(words, session, now_us),
             "mark": lambda: f"mark {_words(words, 'mark TEXT', 1)[0].strip()}",
             "help": self._help,
         }
@@ -124,19 +124,19 @@ class Operator:
             self._finish(at_once[command]())
         elif command in talks:
             self._talk = talks[command](words)
-            self._go_on(cockpit, now_us, None)
+            self._go_on(session, now_us, None)
         else:
             near = get_close_matches(command, COMMANDS, 1)
             hint = f"did you mean {near[0]}?" if near else "help lists the commands"
             raise ControlsError(f"unknown; {hint}")
 
-    def _on_answer(self, cockpit: Cockpit, now_us: int, answer: Answer) -> None:
+    def _on_answer(self, session: StationSession, now_us: int, answer: Answer) -> None:
         try:
             if answer.error:
                 raise ControlsError(answer.error)
             if self._know is not None:
                 self._know(answer.values)
-            self._go_on(cockpit, now_us, answer.values)
+            self._go_on(session, now_us, answer.values)
         except ControlsError as error:
             self._refuse(str(error))
 
@@ -144,7 +144,7 @@ class Operator:
         self._talk = None
         self._say(f"{self._line}: {why}")
 
-    def _go_on(self, cockpit: Cockpit, now_us: int, values: Settings | None) -> None:
+    def _go_on(self, session: StationSession, now_us: int, values: Settings | None) -> None:
         assert self._talk is not None
         try:
             request = next(self._talk) if values is None else self._talk.send(values)
@@ -152,7 +152,7 @@ class Operator:
             self._talk = None
             self._finish(done.value)
         else:
-            cockpit.link.ask(now_us, request)
+            session.link.ask(now_us, request)
 
     def _finish(self, done: str) -> None:
         """Record and show an action, if there is something to note."""
@@ -162,21 +162,21 @@ class Operator:
 
     # The commands
 
-    def _goal(self, words: list[str], cockpit: Cockpit, now_us: int) -> str:
+    def _goal(self, words: list[str], session: StationSession, now_us: int) -> str:
         numbers = [_number(word) for word in words]
         if len(numbers) not in (3, 4):
             raise ControlsError("expected goal X Y Z [YAW], metres in W and degrees")
         place = (numbers[0], numbers[1], numbers[2])
-        home = cockpit.plan.home.p_WG
+        home = session.plan.home.p_WG
         if max(abs(a - b) for a, b in zip(place, home, strict=True)) > REACH:
             raise ControlsError(f"more than {REACH:g} m from home, {' '.join(f'{x:g}' for x in home)}")
-        yaw = radians(numbers[3]) if len(numbers) == 4 else cockpit.plan.at(now_us).yaw
-        cockpit.plan.steer(Hold(Goal(place, yaw)))
+        yaw = radians(numbers[3]) if len(numbers) == 4 else session.plan.at(now_us).yaw
+        session.plan.steer(Hold(Goal(place, yaw)))
         return f"goal {' '.join(f'{x:g}' for x in place)} m, yaw {degrees(yaw):.4g} deg"
 
-    def _fly(self, words: list[str], cockpit: Cockpit, now_us: int) -> str:
+    def _fly(self, words: list[str], session: StationSession, now_us: int) -> str:
         (name,) = _words(words, "fly NAME", 1)
-        cockpit.plan.steer(self._find(name)(cockpit.plan.home, now_us))
+        session.plan.steer(self._find(name)(session.plan.home, now_us))
         return f"fly {name}"
 
     def _write(self, words: list[str]) -> Talk:
@@ -236,10 +236,10 @@ class Operator:
             self._say(line)
         return ""
 
-    def _watch(self, cockpit: Cockpit, now_us: int) -> None:
+    def _watch(self, session: StationSession, now_us: int) -> None:
         """Remember values that have flown well for a while."""
-        frame, flying = cockpit.ground.frame, cockpit.link.supervisor_state == State.FLYING
-        goal = cockpit.plan.at(now_us).p_WG
+        frame, flying = session.ground.frame, session.link.supervisor_state == State.FLYING
+        goal = session.plan.at(now_us).p_WG
         near = frame is not None and hypot(*(a - b for a, b in zip(frame.p_WB, goal, strict=True))) <= WELL
         if not (flying and near):
             self._well_since_us = None
@@ -265,10 +265,10 @@ def fly_with(
     stops = stop_signals()
     terminal = Terminal(lambda: (*COMMANDS, *names, *operator.known))
 
-    def steer(cockpit: Cockpit, now_us: int) -> None:
+    def steer(live: StationSession, now_us: int) -> None:
         for line in terminal.lines():
             operator.take(line)
-        operator.turn(cockpit, now_us)
+        operator.turn(live, now_us)
 
     failure = ""
     try:

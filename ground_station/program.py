@@ -53,7 +53,7 @@ class Session:
 
 
 @dataclass(frozen=True, slots=True)
-class Cockpit:
+class StationSession:
     """The view of a recorder or an operator on a flight."""
 
     link: LiveLink
@@ -61,7 +61,8 @@ class Cockpit:
     plan: FlightPlan
 
 
-LoopHook = Callable[[Cockpit, int], None]  # called with the instant in every turn of the station's loop
+# Called with the instant in every turn of the station's loop.
+LoopHook = Callable[[StationSession, int], None]
 
 
 @dataclass(slots=True)
@@ -205,7 +206,7 @@ def fly(
             source = RecordingSource(source, records.guarded(session.record, seen.write))
         plan = FlightPlan(Goal(settings.home, 0.0), session.trajectory)
         ground = GroundStation(link, plan, write_sample, settings.station, tracker)
-        cockpit = Cockpit(link, ground, plan)
+        live = StationSession(link, ground, plan)
 
         def over() -> bool:
             return stopping() or (isinstance(played, ReplaySource) and played.over)
@@ -214,7 +215,7 @@ def fly(
             if plan.start_us is None and link.supervisor_state == State.FLYING:
                 plan.start(now_us + round(session.start_s * 1e6))
             for hook in hooks:
-                hook(cockpit, now_us)
+                hook(live, now_us)
 
         longest_us = settings.tracker.reacquire_us if settings.tracker.enabled else WINDOW_US
         rate = FrameRate(settings.frame_period_us, settings.station.corrections_hz, longest_us)

@@ -18,7 +18,7 @@ from hil.errors import LabError
 
 if TYPE_CHECKING:
     from ground_station.operator import Operator
-    from ground_station.program import Cockpit, LoopHook
+    from ground_station.program import LoopHook, StationSession
     from ground_station.records import Records
     from hil.laboratory.experiment import Experiment
     from hil.laboratory.real_flight import RealFlight
@@ -179,7 +179,7 @@ class OperatorConsole:
         """Return the parts of the picture and the record in every turn of the flight."""
         view = self.view
 
-        def take_lines(cockpit: Cockpit, now_us: int) -> None:
+        def take_lines(session: StationSession, now_us: int) -> None:
             for line in view.lines() if view is not None else ():
                 operator.take(line)
 

@@ -15,7 +15,7 @@ from firmware_py.signals import COUNTERS, Signals
 from firmware_py.table import whole_names
 from firmware_py.wire.telemetry import ATTITUDE, BLOCKS, SLOW_BLOCKS, TIMESTAMP_MASK
 from ground_station.latency import STAGES
-from ground_station.program import Cockpit
+from ground_station.program import StationSession
 from ground_station.tracker import Tracker
 from ground_station.trajectory import Goal, Trajectory
 from hil.devices.board_firmware import BoardFirmware
@@ -306,8 +306,8 @@ class Unwrapped:
 class StationView:
     """A ground station's current values as rows of a log; `start_us` is the log's time 0."""
 
-    def __init__(self, cockpit: Cockpit, start_us: int) -> None:
-        self._link, self._ground, self._start_us = cockpit.link, cockpit.ground, start_us
+    def __init__(self, session: StationSession, start_us: int) -> None:
+        self._link, self._ground, self._start_us = session.link, session.ground, start_us
         self._poses, self._rejected = Unwrapped(), Unwrapped()
 
     def state(self) -> int:
@@ -357,10 +357,10 @@ class StationView:
 
 
 def station_channels(
-    cockpit: Cockpit, free: Callable[[], bool], goal: Callable[[], Goal], start_us: int
+    session: StationSession, free: Callable[[], bool], goal: Callable[[], Goal], start_us: int
 ) -> tuple[Channel, ...]:
     """Return the channels of a flight that only its ground station sees; `start_us` is the log's time 0."""
-    view, ground = StationView(cockpit, start_us), cockpit.ground
+    view, ground = StationView(session, start_us), session.ground
     tracker = () if ground.tracker is None else (tracker_channel(ground.tracker),)
     return (
         Channel("int8", lambda: (free(), view.state()), STATES),

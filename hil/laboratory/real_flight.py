@@ -14,7 +14,7 @@ from firmware_py.elementary import cos
 from firmware_py.wire.supervisor import State
 from ground_station.clock import clock_us
 from ground_station.mocap import MocapFrame
-from ground_station.program import Cockpit
+from ground_station.program import StationSession
 from ground_station.records import Records
 from ground_station.telemetry_log import TELEMETRY
 from hil.bodies import make_body
@@ -91,36 +91,36 @@ class RealFlight:
         """The current time by the log's clock."""
         return self._now_us - self._start_us
 
-    def turn(self, cockpit: Cockpit, now_us: int) -> None:
+    def turn(self, session: StationSession, now_us: int) -> None:
         """Record a row when it is due."""
         if now_us < self._next_us:
             return
         if self._recorder is None:
-            self._recorder = self._begin(cockpit)
+            self._recorder = self._begin(session)
             for early in self._early:
                 self._note(*early)
         self._now_us = now_us
         self._next_us = now_us - now_us % RECORD_PERIOD_US + RECORD_PERIOD_US
-        self._look(cockpit, now_us)
+        self._look(session, now_us)
         self._recorder.row(now_us - self._start_us)
 
-    def _begin(self, cockpit: Cockpit) -> Recorder:
+    def _begin(self, session: StationSession) -> Recorder:
         metadata = {
             **metadata_of(self._request, self._program, self._look_of_robot),
             STATION_START.decode(): str(self._start_us),
         }
         channels = station_channels(
-            cockpit, lambda: self._is_free, lambda: cockpit.plan.at(self._now_us), self._start_us
+            session, lambda: self._is_free, lambda: session.plan.at(self._now_us), self._start_us
         )
         return Recorder(self._folder, channels, metadata, self._onlooker, self._records)
 
-    def _look(self, cockpit: Cockpit, now_us: int) -> None:
+    def _look(self, session: StationSession, now_us: int) -> None:
         """Note the board's state, the trajectory's begin and end, and a loss."""
-        state = cockpit.link.supervisor_state
+        state = session.link.supervisor_state
         if state != self._state and state is not None:
             self._state = state
             self._note(now_us, "board", f"supervisor: {State(state).name.lower()}")
-        recorder, frame, start_us = self._recorder, cockpit.ground.frame, cockpit.plan.start_us
+        recorder, frame, start_us = self._recorder, session.ground.frame, session.plan.start_us
         if recorder is None or start_us is None or now_us < start_us:
             return
         if recorder.release_us is None:

@@ -21,7 +21,7 @@ from ground_station.config import StationConfig
 from ground_station.latency import LinkLatency
 from ground_station.links.loopback import LoopbackLink
 from ground_station.mocap import MocapFrame
-from ground_station.program import Cockpit
+from ground_station.program import StationSession
 from ground_station.records import Records
 from ground_station.station import GroundStation
 from ground_station.trajectory import FlightPlan, Goal
@@ -102,8 +102,8 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     record = recorder_of(real, experiment.name, lambda: flight.now_us, [])
     plan = FlightPlan(HOME, experiment.trajectory)
     plan.start(CONFIG.flight.release_us)
-    cockpit = Cockpit(Link(flight.line.station), flight.line.station, plan)  # type: ignore[arg-type, attr-defined]
-    flight.events.every(TURN_US, TURN_US, lambda now_us: record.turn(cockpit, now_us))
+    session = StationSession(Link(flight.line.station), flight.line.station, plan)  # type: ignore[arg-type, attr-defined]
+    flight.events.every(TURN_US, TURN_US, lambda now_us: record.turn(session, now_us))
     flight.run(recorder=recorder)
     recorder.close()
     flight.close()
@@ -246,7 +246,7 @@ class StationBench:
         self._link = SimpleNamespace(
             latency=link.latency, late=0, sent=0, quality=99.0, rssi=40.0, supervisor_state=State.FLYING
         )  # fmt: skip
-        self.cockpit = Cockpit(self._link, self.ground, self.plan)  # type: ignore[arg-type]
+        self.session = StationSession(self._link, self.ground, self.plan)  # type: ignore[arg-type]
 
     def fly(self, duration_s: float, p: tuple[float, float, float] = HOME.p_WG) -> None:
         """Turn after turn with the robot at a place."""
@@ -254,7 +254,7 @@ class StationBench:
         while self.now_us < end_us:
             self.now_us += TURN_US
             self.ground.on_frame(MocapFrame(self.now_us - AGE_US, p, (1.0, 0.0, 0.0, 0.0), True), self.now_us)
-            self.record.turn(self.cockpit, self.now_us)
+            self.record.turn(self.session, self.now_us)
 
     def result(self, **how: Any) -> Result:
         result = self.record.close(**how)
@@ -298,7 +298,7 @@ def test_time_without_poses_is_not_flown_and_fails_its_limit(tmp_path: Path, com
     end_us = bench.now_us + 3_500_000
     while bench.now_us < end_us:
         bench.now_us += TURN_US
-        bench.record.turn(bench.cockpit, bench.now_us)
+        bench.record.turn(bench.session, bench.now_us)
     if comes_back:
         bench.fly(1.0)
     result = bench.result()
@@ -312,7 +312,7 @@ def test_a_real_board_that_calibrates_again_was_reset(tmp_path: Path) -> None:
     bench = StationBench(tmp_path / "run")
     bench.plan.start(bench.now_us)
     for state in (State.FLYING, State.CALIBRATING, State.FLYING, State.CALIBRATING, State.FLYING):
-        bench.cockpit.link.supervisor_state = state  # type: ignore[misc]
+        bench.session.link.supervisor_state = state  # type: ignore[misc]
         bench.fly(0.5)
     result = bench.result()
     assert (result.outcome, result.cause) == ("reset", "the board was reset 2 times")
@@ -391,7 +391,7 @@ def test_slow_cameras_do_not_make_more_than_a_second_be_lost(tmp_path: Path) -> 
     bench = StationBench(tmp_path / "run")
     for _ in range(32):
         bench.now_us += 95_000
-        bench.record.turn(bench.cockpit, bench.now_us)
+        bench.record.turn(bench.session, bench.now_us)
     left = Path(shutil.copytree(tmp_path / "run", tmp_path / "left"))
     bench.record.close()
     assert load_log(left).column("t")[-1].as_py() > 32 * 95_000 - 1_100_000
