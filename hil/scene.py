@@ -49,8 +49,8 @@ class Markers:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Look:
-    """A whole robot."""
+class VisualModel:
+    """How a whole robot is drawn."""
 
     parts: tuple[Part, ...] = ()
     frame: tuple[Points, ...] = ()  # lines through (N, 3) points: the rods between parts
@@ -68,7 +68,7 @@ class Look:
         return {"parts": parts, **lines, "knot": self.knot, "markers": self.markers}
 
     @classmethod
-    def read(cls, stored: Mapping[str, Any]) -> "Look":
+    def read(cls, stored: Mapping[str, Any]) -> "VisualModel":
         """Return the stored look; an empty one if a log has none."""
         parts = tuple(
             Part(**{**part, "triangles": np.array(part["triangles"]).reshape(-1, 3, 3)})

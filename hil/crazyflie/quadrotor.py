@@ -21,7 +21,7 @@ from firmware_py.compiling import bound
 from firmware_py.core.subset import F64s, Struct, f64, i32
 from firmware_py.elementary import cos
 from firmware_py.section import Section, number
-from hil.scene import CENTRE, PALE, Look, Markers, box, eight_markers
+from hil.scene import CENTRE, PALE, Markers, VisualModel, box, eight_markers
 from hil.world.body import Channel, Failure, Quantity, Setting, Vector, View, of_each_actuator
 from hil.world.config import BatteryConfig, PlantConfig, TunnelConfig
 from hil.world.fixed_order import atan2, compiled, exp, normal
@@ -409,7 +409,7 @@ class Quadrotor(InTunnel):
         return self.rotors.fields.wanted
 
     @property
-    def look(self) -> Look:
+    def look(self) -> VisualModel:
         """Two beams with a rotor at each end, the front ones orange, and the board between them."""
         r, above = self.rotors.fields, self._config.rotor_above
         ends = [(x, y, 0.0) for x, y in zip(r.x.tolist(), r.y.tolist(), strict=True)]
@@ -423,7 +423,9 @@ class Quadrotor(InTunnel):
             for i, (x, y, _) in enumerate(ends)
         ]  # fmt: skip
         board = box((0.03, 0.03, 0.012))
-        return Look((board, *rotors), beams, beams, CENTRE, tuple(map(tuple, self.markers.places.tolist())))
+        return VisualModel(
+            (board, *rotors), beams, beams, CENTRE, tuple(map(tuple, self.markers.places.tolist()))
+        )
 
     @property
     def markers(self) -> Markers:

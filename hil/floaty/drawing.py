@@ -14,7 +14,7 @@ import numpy as np
 
 from hil.floaty.geometry import axis_of, surfaces, triangles, weigh
 from hil.floaty.shape import MIRRORS
-from hil.scene import PALE, Look, Markers, Part, Points
+from hil.scene import PALE, Markers, Part, Points, VisualModel
 from hil.world.config import GeometryConfig, NetConfig
 
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7")  # of flaps 1 to 4, as of their curves
@@ -76,7 +76,7 @@ def markers_of(geometry: GeometryConfig, ground: NetConfig) -> Markers:
     return Markers(marker_places(geometry, ground), weigh(geometry).axis_height, geometry.footprint / 2)
 
 
-def look_of(geometry: GeometryConfig, ground: NetConfig) -> Look:
+def look_of(geometry: GeometryConfig, ground: NetConfig) -> VisualModel:
     """Return the whole robot."""
     height, axes = weigh(geometry).axis_height, flap_axes(geometry).tolist()
     place = (0.0, 0.0, height)
@@ -89,7 +89,7 @@ def look_of(geometry: GeometryConfig, ground: NetConfig) -> Look:
     ]  # fmt: skip
     base = Part("base", base_triangles(geometry), PALE, place, force="force.base")
     rod = np.array([(0.0, 0.0, 0.0), place])
-    return Look(
+    return VisualModel(
         (base, *flaps), (rod, *stand_lines(geometry, ground)), outline(geometry), place,
         tuple(map(tuple, marker_places(geometry, ground).tolist())),
     )  # fmt: skip

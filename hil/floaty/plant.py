@@ -11,7 +11,7 @@ from hil.floaty.correction import LEVEL, Constants, OperatingPoint, calm, linear
 from hil.floaty.drawing import look_of, markers_of
 from hil.floaty.geometry import weigh
 from hil.floaty.shape import SIGNS, place_plates
-from hil.scene import Look, Markers
+from hil.scene import Markers, VisualModel
 from hil.world.body import ACTUATORS, Channel, Failure, Quantity, Vector, View, of_each_actuator
 from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 from hil.world.in_tunnel import AT_REST, UPRIGHT, InTunnel, seen, settings_of
@@ -129,7 +129,7 @@ class Plant(InTunnel):
             f.next_us, f.next[:] = next_period_us(now_us), self._commanded
 
     @property
-    def look(self) -> Look:
+    def look(self) -> VisualModel:
         return look_of(self._geometry, self._ground)
 
     @property

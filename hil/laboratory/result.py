@@ -29,7 +29,7 @@ from hil.laboratory.experiment import unknown
 from hil.laboratory.metrics import Figure, Metric, Verdict, judge, measure
 from hil.laboratory.recorder import load_log, stored_in
 from hil.laboratory.request import Find, Request, StoredRequest
-from hil.scene import Look
+from hil.scene import VisualModel
 from hil.whole_files import write_whole
 
 RESULT = "result.json"
@@ -64,7 +64,7 @@ class Program:
         return cls(versions(), commit(), digest_of(config.logic), digest_of_body(config))
 
 
-def metadata_of(request: Request, program: Program, look: Look) -> dict[str, str]:
+def metadata_of(request: Request, program: Program, look: VisualModel) -> dict[str, str]:
     """Return a flight's origin and its robot's look as text for the log's schema."""
     return {
         "request": json.dumps(request.stored()),

@@ -29,7 +29,7 @@ from hil.live.window import LOOPBACK
 from hil.pictures import curves
 from hil.pictures.pages import data_uri, library
 from hil.pictures.video import GOAL_COLUMNS, VideoScene
-from hil.scene import Look, Points
+from hil.scene import Points, VisualModel
 
 PORT = 9095
 PAGE = Path(__file__).with_name("panel.html")
@@ -92,7 +92,9 @@ class PanelScreen:
             path, course = body(past, "x", "y", "z")[::3], column(past, *GOAL_COLUMNS)[::3]
             path, file = path[np.isfinite(path).all(axis=1)], io.BytesIO()
             self._goals.append(column(row, *GOAL_COLUMNS)[0])
-            scene = VideoScene(Look.read(stored_in(row.schema.metadata, "look")), np.array(self._goals), path)
+            scene = VideoScene(
+                VisualModel.read(stored_in(row.schema.metadata, "look")), np.array(self._goals), path
+            )
             scene.at(row, path, course).save(file, format="png", compress_level=1)
             message["scene"] = data_uri(file.getvalue())
         return message

@@ -24,7 +24,7 @@ from hil.pictures import curves, scene
 from hil.pictures.curves import since_release
 from hil.pictures.drawing import STYLE, figure_of
 from hil.pictures.panels import Plot, marks_of_flight, panel
-from hil.scene import Look, Part, Points
+from hil.scene import Part, Points, VisualModel
 
 VIDEO, GIF = "flight.mp4", "flight.gif"
 FRAMES_HZ = 30
@@ -89,7 +89,7 @@ def frames(log: pa.Table, instants: NDArray[np.float64] | None = None) -> Iterat
     flight = known(free_flight(log))
     instants = _instants(log) if instants is None else instants
     times, path, course = since_release(flight), body(flight, "x", "y", "z"), column(flight, *GOAL_COLUMNS)
-    view = VideoScene(Look.read(stored_in(flight.schema.metadata, "look")), course, path)
+    view = VideoScene(VisualModel.read(stored_in(flight.schema.metadata, "look")), course, path)
     graph = _Graph(log, flight)
     rows = np.searchsorted(times, instants)
     for row, at_s in zip(rows.tolist(), instants.tolist(), strict=True):
@@ -115,7 +115,7 @@ def faces(
 class VideoScene:
     """Draws the robot at a row of a flight, its path, its goal with the box, and the goal's path."""
 
-    def __init__(self, robot: Look, goals: Points, places: Points) -> None:
+    def __init__(self, robot: VisualModel, goals: Points, places: Points) -> None:
         """Look at the middle of the goals, from where they and the robot's places, (N, 3) [m] each, are in the picture."""
         self._robot = robot
         middle = (goals.min(axis=0) + goals.max(axis=0)) / 2

@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.scene import Look, Markers
+from hil.scene import Markers, VisualModel
 from hil.world.room import Room
 from hil.world.tunnel import Tunnel
 
@@ -144,7 +144,7 @@ class Body(Motion, Protocol):
         """The speeds of motors with ESCs that take DSHOT [rpm], (4,); None: it has none."""
 
     @property
-    def look(self) -> Look:
+    def look(self) -> VisualModel:
         """Its look, for the pictures."""
 
     @property

@@ -14,7 +14,7 @@ import numpy as np
 from firmware_py.compiling import bound
 from firmware_py.core.subset import i32
 from hil.errors import LabError, blame
-from hil.scene import Look, Markers, Part, ball, eight_markers
+from hil.scene import Markers, Part, VisualModel, ball, eight_markers
 from hil.world.body import Channel, Quantity, Setting, Vector
 from hil.world.config import BatteryConfig, PlantConfig, TunnelConfig
 from hil.world.in_tunnel import UPRIGHT, InTunnel
@@ -110,14 +110,16 @@ class RigidBody(InTunnel):
     # For the laboratory
 
     @property
-    def look(self) -> Look:
+    def look(self) -> VisualModel:
         """Its parts; the ghost at the goal is a cross. Raises `LabError` for anything else as parts."""
         if not (isinstance(self.parts, Sequence) and all(isinstance(part, Part) for part in self.parts)):
             raise LabError(
                 f"{type(self).__name__}.parts = {self.parts!r}: expected (ball(..), box(..), Part(..))"
             )
         cross = tuple(np.array((-line, line)) for line in self.radius * np.eye(3))
-        return Look(self.parts, (), cross, (0.0, 0.0, 0.0), tuple(map(tuple, self.markers.places.tolist())))
+        return VisualModel(
+            self.parts, (), cross, (0.0, 0.0, 0.0), tuple(map(tuple, self.markers.places.tolist()))
+        )
 
     @property
     def markers(self) -> Markers:

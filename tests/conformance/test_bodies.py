@@ -7,7 +7,7 @@ import pytest
 
 from hil.bodies import BODIES, make_body
 from hil.config import LabConfig, load_config
-from hil.scene import Look
+from hil.scene import VisualModel
 from hil.world.body import Body
 from support.paths import ROOT
 
@@ -87,7 +87,7 @@ def test_it_can_be_drawn_and_seen(body: Body) -> None:
     assert body.look.parts
     assert all(part.triangles.shape[1:] == (3, 3) for part in body.look.parts)
     assert body.markers.places.shape == (8, 3)
-    assert Look.read(body.look.stored()).stored() == body.look.stored()
+    assert VisualModel.read(body.look.stored()).stored() == body.look.stored()
 
 
 def test_the_same_instant_has_the_same_bits_however_the_time_to_it_is_divided(config: LabConfig) -> None:

@@ -16,7 +16,7 @@ from hil.laboratory.recorder import load_log, stored_in
 from hil.laboratory.result import Result
 from hil.pictures import video
 from hil.pictures.report import write_report
-from hil.scene import Look
+from hil.scene import VisualModel
 from support.flights import hover
 from support.paths import ROOT
 
@@ -209,7 +209,7 @@ def test_its_report_and_scene_show_what_it_describes(flown: Result) -> None:
     assert "What your own robot logs of itself." in page
     assert "along_x" in page
     assert "True angle of each flap" not in page
-    look = Look.read(stored_in(load_log(flown.folder).schema.metadata, "look"))
+    look = VisualModel.read(stored_in(load_log(flown.folder).schema.metadata, "look"))
     assert [part.name for part in look.parts] == ["ball"]
     picture = np.asarray(next(video.frames(load_log(flown.folder))))
     assert (picture[:, : video.SIDE] == (200, 204, 208)).all(axis=2).sum() > 1000  # the ball, pale

@@ -12,7 +12,7 @@ from hil.laboratory.metrics import BOX, body, column
 from hil.laboratory.recorder import stored_in
 from hil.pictures import scene
 from hil.pictures.viewer.track import RecordingTrack, Times, rgba
-from hil.scene import Look, Part
+from hil.scene import Part, VisualModel
 from hil.world.config import PlantConfig, TunnelConfig
 
 METRES_PER_NEWTON = 0.15  # length of the drag arrows, and of pushes
@@ -40,7 +40,7 @@ class Scene:
             key: value for key, value in config.get("plant", {}).items() if key in PlantConfig.model_fields
         }
         self._track = track
-        self._robot = Look.read(stored_in(schema.metadata, "look"))
+        self._robot = VisualModel.read(stored_in(schema.metadata, "look"))
         self._forced = [part for part in self._robot.parts if f"{part.force}_x" in schema.names]
         self._plant = PlantConfig.model_validate(plant)  # older logs have the shape in [plant]
         self._tunnel = TunnelConfig.model_validate(config.get("tunnel", {}))

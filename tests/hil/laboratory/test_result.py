@@ -29,7 +29,7 @@ from hil.laboratory.result import (
     with_resets,
     write_result,
 )
-from hil.scene import Look
+from hil.scene import VisualModel
 from hil.world.body import Channel, Quantity
 from support.command import Cli
 
@@ -127,7 +127,7 @@ def test_a_complete_run_within_limits_passes(result: Result, outcome: Any, holds
 )  # fmt: skip
 def test_bad_result_is_one_line(cli: Cli, result: Result, damage: Callable[[Path], None], told: str) -> None:
     write_result(result)
-    killed(result.folder, metadata_of(result.request, result.program, Look()))
+    killed(result.folder, metadata_of(result.request, result.program, VisualModel()))
     damage(result.folder)
     error = cli.refusal("report", result.folder)
     assert error.startswith(f"floaty: {result.folder / RESULT}: ")
@@ -140,7 +140,7 @@ def killed(folder: Path, metadata: dict[str, str]) -> None:
 
 
 def test_the_origin_of_a_killed_run_is_read_from_its_log(result: Result) -> None:
-    killed(result.folder, metadata_of(result.request, result.program, Look()))
+    killed(result.folder, metadata_of(result.request, result.program, VisualModel()))
     read = read_result(result.folder)
     assert (read.request, read.program) == (result.request, result.program)
     assert (read.outcome, read.passed, read.hash, read.folder) == ("error", False, "", result.folder)

@@ -16,7 +16,7 @@ from hil.laboratory.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.pictures import curves, video
-from hil.scene import Look
+from hil.scene import VisualModel
 from support.command import Cli
 
 av = pytest.importorskip("av")
@@ -71,7 +71,7 @@ def test_the_scene_shows_every_goal_and_every_place_of_the_robot() -> None:
     for far in (0.0, 0.5, 3.0):
         goals = np.array([(0.0, 0.0, 0.0), (far, -far, 2 * far), (-far, far, 0.0)])
         for places in (still, goals + np.array([0.3, 0.0, -0.3])):
-            view = video.VideoScene(Look(), goals, places)
+            view = video.VideoScene(VisualModel(), goals, places)
             seen, distances = view._seen(np.concatenate([goals, places]))
             assert (distances > 0.3).all()
             assert seen.min() > 0

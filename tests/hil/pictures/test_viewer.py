@@ -43,7 +43,7 @@ from hil.pictures.viewer.plots import PLOTS, rates
 from hil.pictures.viewer.recording import RerunFlight, write_rrd, write_run_rrd
 from hil.pictures.viewer.scene import HIDDEN, METRES_PER_NEWTON, PUSH_SHOWN_US, SEEN
 from hil.pictures.viewer.track import FROM_RELEASE, FROM_START, timeline_of
-from hil.scene import Look, Part, ball, box
+from hil.scene import Part, VisualModel, ball, box
 from hil.world.config import GeometryConfig, NetConfig
 from hil.world.structs import Flaps
 
@@ -263,9 +263,9 @@ def test_drag_acts_on_the_turned_flaps(folder: Path) -> None:
 
 def test_a_look_is_stored_and_read_back_equal() -> None:
     look = look_of(GeometryConfig(), NetConfig())
-    again = Look.read(json.loads(json.dumps(look.stored())))
+    again = VisualModel.read(json.loads(json.dumps(look.stored())))
     assert json.dumps(again.stored()) == json.dumps(look.stored())
-    assert Look.read({}).parts == ()
+    assert VisualModel.read({}).parts == ()
 
 
 @pytest.mark.parametrize(("part", "area"), [(ball(0.1), 4 * np.pi * 0.01), (box((0.1, 0.2, 0.3)), 0.22)])

@@ -12,7 +12,7 @@ from hil.events import EventQueue
 from hil.laboratory.lockstep import image_at
 from hil.laboratory.recorder import stored_in
 from hil.laboratory.robot import Site, Streams
-from hil.scene import Look
+from hil.scene import VisualModel
 from hil.servers.served_robot import UDP_RETRY_US, ServedRobot
 from hil.servers.server import Server, Service
 from support.stm32_firmware import build
@@ -25,7 +25,7 @@ def test_rows_of_a_served_robot_describe_its_look() -> None:
     server.lab.end_at(1_000_000)
     server.lab.run()
     server.close()
-    look = Look.read(stored_in(watcher.batches[0].schema.metadata, "look"))
+    look = VisualModel.read(stored_in(watcher.batches[0].schema.metadata, "look"))
     own = server.robot.body.look
     assert [part.name for part in look.parts] == [part.name for part in own.parts]
     assert len(look.outline) == len(own.outline) > 0
