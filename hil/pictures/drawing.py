@@ -19,7 +19,7 @@ from hil.pictures.panels import INK, Marks, Panel, Plot, Series, marks_of_flight
 
 MARK_LENGTH = 28  # letters
 WIDTH, DPI = 9.2, 115  # [in], 1/in
-SPELL_COLOURS = {"held": curves.GREY, "fault": curves.RED, "failsafe": curves.PINK, "limit": curves.YELLOW}
+INTERVAL_COLOURS = {"held": curves.GREY, "fault": curves.RED, "failsafe": curves.PINK, "limit": curves.YELLOW}
 INSTANT_COLOURS = {"operator": curves.BLUE, "lost": INK}
 SHADE = 0.18  # opacity
 STRIP = 0.04  # of the axes' height: commands at their limits
@@ -107,14 +107,18 @@ def _draw(axes: Axes, panel: Panel) -> None:
 
 def draw_marks(axes: Sequence[Axes], marks: Marks) -> None:
     """Shade and mark the events; the first axes name them. The time axis is zero at the release."""
-    for spell in marks.spells:
-        high = STRIP if spell.kind == "limit" else 1.0
-        alpha = 0.9 if spell.kind == "limit" else SHADE
+    for interval in marks.intervals:
+        high = STRIP if interval.kind == "limit" else 1.0
+        alpha = 0.9 if interval.kind == "limit" else SHADE
         for one in axes:
             one.axvspan(
-                spell.begin_s, spell.end_s, 0.0, high, color=SPELL_COLOURS[spell.kind], alpha=alpha, linewidth=0
+                interval.begin_s, interval.end_s, 0.0, high, color=INTERVAL_COLOURS[interval.kind], alpha=alpha, linewidth=0
             )  # fmt: skip
-    faults = [(spell.begin_s, spell.text, curves.RED) for spell in marks.spells if spell.kind == "fault"]
+    faults = [
+        (interval.begin_s, interval.text, curves.RED)
+        for interval in marks.intervals
+        if interval.kind == "fault"
+    ]
     for instant in marks.instants:
         colour = INSTANT_COLOURS[instant.kind]
         for one in axes:

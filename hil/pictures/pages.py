@@ -80,7 +80,7 @@ def saved(folder: Path, name: str, title: str, caption: str, draw: Callable[[], 
 
 def draw(picture: Picture, marks: Marks, *flights: pa.Table) -> PageFigure:
     """Return a picture of flights for a page."""
-    acted = {spell.text.partition(".")[0] for spell in marks.spells if spell.kind == "fault"}
+    acted = {interval.text.partition(".")[0] for interval in marks.intervals if interval.kind == "fault"}
     figure = PageFigure(
         picture.title.lower().replace(" ", "-"), picture.title, picture.caption,
         folded=bool(picture.about) and not acted.intersection(picture.about),

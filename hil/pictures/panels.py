@@ -79,7 +79,7 @@ class Still:
 
 
 @dataclass(frozen=True, slots=True)
-class Spell:
+class Interval:
     """An interval of a flight that every figure shades."""
 
     kind: str  # held, fault, failsafe, limit
@@ -101,14 +101,14 @@ class Instant:
 class Marks:
     """The marks of every figure of a flight."""
 
-    spells: tuple[Spell, ...] = ()
+    intervals: tuple[Interval, ...] = ()
     instants: tuple[Instant, ...] = ()
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """The kinds of marks, without repetition."""
         return tuple(
-            dict.fromkeys([*(one.kind for one in self.spells), *(one.kind for one in self.instants)])
+            dict.fromkeys([*(one.kind for one in self.intervals), *(one.kind for one in self.instants)])
         )
 
 
@@ -145,19 +145,21 @@ def marks_of_flight(log: pa.Table, lost: str | None = None) -> Marks:
     if len(times) == 0:
         return Marks()
     held = times[(column(log, "flight.free") < 0.5) & (times < 0.0)]
-    spells = [Spell("held", held[0], held[-1])] if len(held) > 1 else []
+    intervals = [Interval("held", held[0], held[-1])] if len(held) > 1 else []
     release_us = release_of(log.schema.metadata)
     for span in spans_of(log.schema.metadata):
         if span.begin_s < times[-1]:
-            spells.append(Spell("fault", span.begin_s, min(span.end_s, float(times[-1])), str(span.fault)))
-    spells += _spells("failsafe", times, column(log, "supervisor.state") == State.FAILSAFE)
+            intervals.append(
+                Interval("fault", span.begin_s, min(span.end_s, float(times[-1])), str(span.fault))
+            )
+    intervals += _intervals("failsafe", times, column(log, "supervisor.state") == State.FAILSAFE)
     for name, at_limit in saturated(log):
-        spells += _spells("limit", times, at_limit & (times > 0.0), name)
+        intervals += _intervals("limit", times, at_limit & (times > 0.0), name)
     instants = [Instant("operator", 1e-6 * (us - release_us), text) for us, text in marks_of(log)]
     free = free_flight(log)
     if lost is not None and free.num_rows:
         instants.append(Instant("lost", float(since_release(free)[-1]), lost))
-    return Marks(tuple(spells), tuple(instants))
+    return Marks(tuple(intervals), tuple(instants))
 
 
 def spans(acts: NDArray[np.bool_]) -> list[list[int]]:
@@ -168,7 +170,7 @@ def spans(acts: NDArray[np.bool_]) -> list[list[int]]:
     return edges
 
 
-def _spells(kind: str, times: Signal, acts: NDArray[np.bool_], text: str = "") -> Iterator[Spell]:
+def _intervals(kind: str, times: Signal, acts: NDArray[np.bool_], text: str = "") -> Iterator[Interval]:
     joined: list[list[float]] = []
     for begin, end in spans(acts):
         begin_s, end_s = float(times[begin]), float(times[min(end, len(times) - 1)])
@@ -176,7 +178,7 @@ def _spells(kind: str, times: Signal, acts: NDArray[np.bool_], text: str = "") -
             joined[-1][1] = end_s
         else:
             joined.append([begin_s, end_s])
-    return (Spell(kind, begin_s, end_s, text) for begin_s, end_s in joined)
+    return (Interval(kind, begin_s, end_s, text) for begin_s, end_s in joined)
 
 
 def saturated(flight: pa.Table) -> Iterator[tuple[str, NDArray[np.bool_]]]:

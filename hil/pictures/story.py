@@ -23,7 +23,7 @@ from hil.pictures import curves
 from hil.pictures.curves import Curves, since_release
 from hil.pictures.figures import lanes_of_states, without_a_pose
 from hil.pictures.pages import PageFigure, embedded
-from hil.pictures.panels import Marks, Panel, Plot, Series, Spell, panel, saturated
+from hil.pictures.panels import Interval, Marks, Panel, Plot, Series, panel, saturated
 
 FAILSAFE = "supervisor: failsafe, "  # begins a line of the board; its cause follows
 MEANING = {
@@ -199,12 +199,14 @@ def close_ups(log: pa.Table, marks: Marks, passed_s: float | None = None) -> lis
 
 def _windows(marks: Marks, passed_s: float | None) -> list[tuple[str, float, float, float]]:
     """Return title, instant, begin and end [s]."""
-    faults = [spell for spell in marks.spells if spell.kind == "fault"]
+    faults = [interval for interval in marks.intervals if interval.kind == "fault"]
     windows = []
     for begin_s, together in groupby(sorted(faults, key=_begin), key=_begin):
-        spells = list(together)
-        end_s = min(max(spell.end_s for spell in spells), begin_s + FAULT_S) + AFTER_S
-        windows.append((", ".join(spell.text for spell in spells), begin_s, begin_s - BEFORE_S, end_s))
+        intervals = list(together)
+        end_s = min(max(interval.end_s for interval in intervals), begin_s + FAULT_S) + AFTER_S
+        windows.append(
+            (", ".join(interval.text for interval in intervals), begin_s, begin_s - BEFORE_S, end_s)
+        )
     further = [
         (f"Loss: {loss.text}", loss.t_s, loss.t_s - LAST_S, loss.t_s + BEFORE_S)
         for loss in marks.instants
@@ -218,8 +220,8 @@ def _windows(marks: Marks, passed_s: float | None) -> list[tuple[str, float, flo
     return windows
 
 
-def _begin(spell: Spell) -> float:
-    return spell.begin_s
+def _begin(interval: Interval) -> float:
+    return interval.begin_s
 
 
 def _plot(rows: pa.Table, window_s: tuple[float, float]) -> Plot:

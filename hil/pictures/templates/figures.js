@@ -37,10 +37,10 @@
     ctx.beginPath();
     ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
     ctx.clip();
-    for (const spell of marks.spells) {
-      const begin = u.valToPos(spell.begin_s, "x", true), end = u.valToPos(spell.end_s, "x", true);
-      const high = spell.kind === "limit" ? STRIP_PX * devicePixelRatio : bbox.height;
-      ctx.fillStyle = SHADES[spell.kind];
+    for (const interval of marks.intervals) {
+      const begin = u.valToPos(interval.begin_s, "x", true), end = u.valToPos(interval.end_s, "x", true);
+      const high = interval.kind === "limit" ? STRIP_PX * devicePixelRatio : bbox.height;
+      ctx.fillStyle = SHADES[interval.kind];
       ctx.fillRect(begin, bbox.top + bbox.height - high, Math.max(end - begin, 1), high);
     }
     ctx.restore();
@@ -90,8 +90,8 @@
 
     function name(u) {
       const rows = []; // where the last text of each row ends
-      const texts = marks.spells.filter((spell) => spell.kind === "fault")
-        .map((spell) => [spell.begin_s, spell.text, "#a04000"])
+      const texts = marks.intervals.filter((interval) => interval.kind === "fault")
+        .map((interval) => [interval.begin_s, interval.text, "#a04000"])
         .concat(marks.instants.map((instant) => [instant.t_s, instant.text, MARKS[instant.kind]]))
         .sort((a, b) => a[0] - b[0]);
       ctx.font = TEXT.replace(/^\d+/, (px) => px * scale);

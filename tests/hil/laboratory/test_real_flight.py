@@ -279,7 +279,7 @@ def test_the_judged_part_lasts_from_trajectory_to_experiment_end(tmp_path: Path)
     log = load_log(tmp_path / "run")
     assert release_of(log.schema.metadata) == 1_003_000
     assert log.num_rows == pytest.approx(805, abs=2)
-    (held,) = marks_of_flight(log).spells
+    (held,) = marks_of_flight(log).intervals
     assert (held.kind, held.begin_s, held.end_s) == (
         "held",
         pytest.approx(-1.0, abs=0.05),

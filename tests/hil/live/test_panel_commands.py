@@ -85,9 +85,9 @@ def test_goal_fault_and_note_act_and_are_events(tmp_path: Path) -> None:
     ]  # fmt: skip
     assert any("mocap.dropout" in text for source, text in texts if source == "lab")
     log = with_marks(log, load_events(tmp_path / "run"))
-    (spell,) = [one for one in marks_of_flight(log).spells if one.kind == "fault"]
-    assert spell.text == "mocap.dropout:0.2=1"
-    assert (spell.begin_s, spell.end_s) == pytest.approx((moved_s, moved_s + 0.2), abs=0.02)
+    (interval,) = [one for one in marks_of_flight(log).intervals if one.kind == "fault"]
+    assert interval.text == "mocap.dropout:0.2=1"
+    assert (interval.begin_s, interval.end_s) == pytest.approx((moved_s, moved_s + 0.2), abs=0.02)
     told = [moment.text for moment in story_of(log, read_result(tmp_path / "run"))]
     assert [text for text in told if "fault" in text] == [
         "fault mocap.dropout:0.2=1 begins", "fault mocap.dropout:0.2=1 ends",

@@ -1,4 +1,4 @@
-"""The arithmetic of curves, spells and pictures: half turns, gaps, states, ends of ranges."""
+"""The arithmetic of curves, intervals and pictures: half turns, gaps, states, ends of ranges."""
 
 import json
 import re
@@ -141,21 +141,23 @@ def test_a_flap_that_opens_the_other_way_is_at_its_limit_at_both_ends(angle: flo
     assert found == ({"flap 2": [False, True]} if at_limit else {})
 
 
-@pytest.mark.parametrize(("gap", "spells"), [(9, 1), (11, 2)])
-def test_a_failsafe_that_ends_for_less_than_a_tenth_of_a_second_is_one_spell(gap: int, spells: int) -> None:
+@pytest.mark.parametrize(("gap", "intervals"), [(9, 1), (11, 2)])
+def test_a_failsafe_that_ends_for_less_than_a_tenth_of_a_second_is_one_interval(
+    gap: int, intervals: int
+) -> None:
     states = [2, *[3] * 30, *[2] * gap, *[3] * 30, 2]
     marks = marks_of_flight(flight([0.0] * len(states), **{"supervisor.state": states}))
-    found = [(one.begin_s, one.end_s) for one in marks.spells if one.kind == "failsafe"]
-    assert len(found) == spells, TOGETHER_S
+    found = [(one.begin_s, one.end_s) for one in marks.intervals if one.kind == "failsafe"]
+    assert len(found) == intervals, TOGETHER_S
     assert found[0][0] == pytest.approx(0.01)
     assert found[-1][1] == pytest.approx(0.01 * (len(states) - 1))
-    if spells == 2:
+    if intervals == 2:
         assert found[0][1] == pytest.approx(0.31), "to the first row without it"
 
 
-def test_a_spell_to_the_end_ends_with_the_last_row() -> None:
+def test_an_interval_to_the_end_ends_with_the_last_row() -> None:
     marks = marks_of_flight(flight([0.0] * 3, **{"supervisor.state": [2, 3, 3]}))
-    assert [(one.begin_s, one.end_s) for one in marks.spells] == [(0.01, 0.02)]
+    assert [(one.begin_s, one.end_s) for one in marks.intervals] == [(0.01, 0.02)]
 
 
 def test_a_trial_shows_the_true_value_beside_its_target_and_the_mean_opening_each_flap_in_its_sense() -> None:

@@ -255,7 +255,7 @@ def test_faults_failsafe_flap_limits_and_loss_are_marked_and_shown_close_up(fold
     page = Page(write_report(folder).read_text(encoding="utf-8"))
     (marks,) = page.marks
     assert {plot["marks"] for plot in page.plots.values()} == {0}
-    times = [(one["kind"], one["text"], one["begin_s"], one["end_s"]) for one in marks["spells"]]
+    times = [(one["kind"], one["text"], one["begin_s"], one["end_s"]) for one in marks["intervals"]]
     exact = functools.partial(pytest.approx, abs=2e-3)
     assert times == [
         ("held", "", exact(-1.0), exact(-0.01)),
