@@ -62,8 +62,8 @@ class Rate:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Standing(Rate):
-    """The interim result."""
+class InterimResult(Rate):
+    """The failure rate of the flights so far."""
 
     planned: int
     complete: bool  # all needed flights have been flown
@@ -134,29 +134,29 @@ class Progress:
         return (high - low) / 2.0 <= self._plan.half_width
 
     @property
-    def standing(self) -> Standing:
+    def interim(self) -> InterimResult:
         tally = self._all if self.end is None else self._known
         planned = self._plan.flights if self.end is None else self.end
-        return Standing(**asdict(tally.rate), planned=planned, complete=self.end is not None)
+        return InterimResult(**asdict(tally.rate), planned=planned, complete=self.end is not None)
 
 
-def conduct(dataset: Dataset, flyer: Flyer, show: Callable[[Standing], None]) -> Standing:
+def conduct(dataset: Dataset, flyer: Flyer, show: Callable[[InterimResult], None]) -> InterimResult:
     """Fly the flights missing in the dataset, until all are flown, the rate is known or the flyer ends."""
     plan, progress, there = dataset.plan, Progress(dataset.plan), set()
     for row in dataset.table(["index", "passed"]).to_pylist():
         progress.add(row["index"], row["passed"])
         there.add(row["index"])
-    show(progress.standing)
+    show(progress.interim)
     rows = flyer(plan.job(index) for index in range(plan.flights) if index not in there)
     try:
         while progress.end is None and (flown := next(rows, None)) is not None:
             dataset.add(flown)
             progress.add(flown.job.index, flown.passed)
-            show(progress.standing)
+            show(progress.interim)
     finally:
         rows.close()
         dataset.close(progress.end)
-    return progress.standing
+    return progress.interim
 
 
 class Runner:
@@ -187,7 +187,7 @@ class Runner:
         """Whether it was asked to end early."""
         return bool(self._stops)
 
-    def campaign(self, plan: Plan, folder: Path, replace: bool = False) -> tuple[Dataset, Standing]:
+    def campaign(self, plan: Plan, folder: Path, replace: bool = False) -> tuple[Dataset, InterimResult]:
         """Fly a plan into the dataset of a folder; an unfinished plan there may be replaced, unless it is resumed."""
         dataset = Dataset(folder, plan, self._resume, replace)
         with self._progress() as show, self._stops_noted():
@@ -232,7 +232,7 @@ class Runner:
                 signal.signal(number, handler)
 
     @contextmanager
-    def _progress(self) -> Iterator[Callable[[Standing], None]]:
+    def _progress(self) -> Iterator[Callable[[InterimResult], None]]:
         columns = (
             TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"),
             TimeRemainingColumn(),
@@ -241,11 +241,11 @@ class Runner:
         with Bar(*columns, console=self._notices, transient=True, disable=quiet) as bar:
             task = bar.add_task("flying", rate="")
 
-            def show(standing: Standing) -> None:
-                low, high = standing.interval
+            def show(interim: InterimResult) -> None:
+                low, high = interim.interval
                 speed = bar.tasks[task].speed
                 pace = f"{speed:.1f} flights/s, " if speed else ""
-                rate = f"{pace}{standing.failed} failed: {100 * low:.1f}..{100 * high:.1f} %"
-                bar.update(task, completed=standing.flown, total=standing.planned, rate=rate)
+                rate = f"{pace}{interim.failed} failed: {100 * low:.1f}..{100 * high:.1f} %"
+                bar.update(task, completed=interim.flown, total=interim.planned, rate=rate)
 
             yield show

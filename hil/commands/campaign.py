@@ -48,8 +48,8 @@ def campaign(
     if shrink is not None:
         return _shrink(read, draw(read, shrink))
     with Runner(notices, workers, cluster, resume) as runner:
-        dataset, standing = runner.campaign(plan_of(read), out or Path("runs") / f"campaign-{file.stem}")
-    page, findings = write_report(spec, read, dataset, standing.complete)
+        dataset, interim = runner.campaign(plan_of(read), out or Path("runs") / f"campaign-{file.stem}")
+    page, findings = write_report(spec, read, dataset, interim.complete)
     say(f"failed: {findings.rate}")
     several = len(findings.cells) > 1
     for cell in findings.cells:
@@ -65,7 +65,7 @@ def campaign(
         say(f"  flight {worst.index}: {worst.command}")
     say(f"  {page}")
     if runner.interrupted:
-        warn(f"interrupted: {standing.flown} flights are kept; --resume flies the others")
+        warn(f"interrupted: {interim.flown} flights are kept; --resume flies the others")
         return INTERRUPTED
     return 0
 

@@ -25,7 +25,7 @@ from hil.campaigns.dataset import ARRIVING, FLIGHTS, Dataset
 from hil.campaigns.findings import Findings, find
 from hil.campaigns.jobs import Job, Row, fly_job
 from hil.campaigns.report import write_report
-from hil.campaigns.run import Flyer, Runner, Standing, conduct, interval
+from hil.campaigns.run import Flyer, InterimResult, Runner, conduct, interval
 from hil.campaigns.sampling import draw, plan_of
 from hil.errors import LabError
 from hil.laboratory.request import Options
@@ -35,11 +35,11 @@ from support.full_disk import small_files
 from support.html_page import Page
 
 
-def nothing(standing: Standing) -> None:
+def nothing(interim: InterimResult) -> None:
     """Show nothing."""
 
 
-def flown_into(folder: Path, spec: Spec, flyer: Flyer, resume: bool = False) -> Standing:
+def flown_into(folder: Path, spec: Spec, flyer: Flyer, resume: bool = False) -> InterimResult:
     return conduct(Dataset(folder, plan_of(spec), resume, replace=resume), flyer, nothing)
 
 
@@ -220,17 +220,17 @@ def test_a_folder_is_not_mistaken_for_another_campaign(tmp_path: Path) -> None:
 
 def test_flying_stops_at_the_first_flight_by_which_the_rate_is_known_well_enough(tmp_path: Path) -> None:
     spec = spec_of(flights=2000, stop="failure rate known to ±6 %")
-    standing = flown_into(tmp_path / "out", spec, workers(3))
+    interim = flown_into(tmp_path / "out", spec, workers(3))
     table = pq.read_table(tmp_path / "out" / FLIGHTS)
     failed = [not one for one in table["passed"].to_pylist()]
-    assert table["index"].to_pylist() == list(range(standing.flown))
+    assert table["index"].to_pylist() == list(range(interim.flown))
 
     def half(n: int) -> float:
         low, high = binomtest(sum(failed[:n]), n).proportion_ci(0.95, "wilson")
         return float(high - low) / 2.0
 
-    assert half(standing.flown) <= 0.06 < half(standing.flown - 1)
-    assert standing.failed == sum(failed)
+    assert half(interim.flown) <= 0.06 < half(interim.flown - 1)
+    assert interim.failed == sum(failed)
 
 
 def test_the_interval_is_wilson_s() -> None:

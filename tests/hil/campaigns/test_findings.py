@@ -55,7 +55,7 @@ def ended(passed: list[bool], order: list[int], flights: int, half_width: float 
     progress = Progress(SimpleNamespace(flights=flights, half_width=half_width, cluster=1))  # type: ignore[arg-type]
     for index in order:
         progress.add(index, passed[index])
-    return progress.end, progress.standing
+    return progress.end, progress.interim
 
 
 @settings(max_examples=20)
@@ -69,13 +69,13 @@ def test_a_campaign_ends_at_the_same_flight_whatever_order_its_rows_arrive_in(da
 
 def test_a_campaign_may_end_from_its_thirtieth_flight_on_and_at_the_width_itself() -> None:
     all_hold = [True] * 60
-    end, standing = ended(all_hold, list(range(60)), 60, half(0, STOP_FROM))
+    end, interim = ended(all_hold, list(range(60)), 60, half(0, STOP_FROM))
     assert end == STOP_FROM
-    assert (standing.flown, standing.failed, standing.complete) == (STOP_FROM, 0, True)  # type: ignore[attr-defined]
+    assert (interim.flown, interim.failed, interim.complete) == (STOP_FROM, 0, True)  # type: ignore[attr-defined]
     assert ended(all_hold, list(range(60)), 60, half(0, STOP_FROM + 1))[0] == STOP_FROM + 1  # type: ignore[index]
     last_fails = [*all_hold[:-1], False]  # and comes first
-    _, standing = ended(last_fails, [59, *range(59)], 60, half(0, STOP_FROM))
-    assert (standing.flown, standing.failed) == (STOP_FROM, 0)  # type: ignore[attr-defined]
+    _, interim = ended(last_fails, [59, *range(59)], 60, half(0, STOP_FROM))
+    assert (interim.flown, interim.failed) == (STOP_FROM, 0)  # type: ignore[attr-defined]
     assert ended(all_hold, list(range(60)), 60, 0.5)[0] == STOP_FROM  # type: ignore[index]
 
 
@@ -84,7 +84,7 @@ def test_a_campaign_of_n_flights_ends_with_the_last_of_them_and_not_before() -> 
     for index, end in ((2, None), (1, None), (0, 3)):
         progress.add(index, index != 1)
         assert progress.end == end
-    assert (progress.standing.failed, progress.standing.flown) == (1, 3)
+    assert (progress.interim.failed, progress.interim.flown) == (1, 3)
 
 
 @pytest.mark.parametrize("probability", [0.2, 0.8])

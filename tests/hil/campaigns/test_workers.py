@@ -16,7 +16,7 @@ from rich.console import Console
 from hil.campaigns.config import Spec
 from hil.campaigns.dataset import Dataset
 from hil.campaigns.jobs import Row, fly_job
-from hil.campaigns.run import Runner, Standing, conduct
+from hil.campaigns.run import InterimResult, Runner, conduct
 from hil.campaigns.sampling import draw, plan_of
 from hil.campaigns.workers import DIED, FlyOne, Workers
 from hil.errors import LabError
@@ -159,7 +159,7 @@ def test_a_cluster_that_loses_its_workers_or_itself_is_one_line(monkeypatch: pyt
             crew.close()
 
 
-def _nothing(standing: Standing) -> None:
+def _nothing(interim: InterimResult) -> None:
     """Show nothing."""
 
 
