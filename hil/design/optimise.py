@@ -40,8 +40,8 @@ BAD = -1.0  # figure of a robot that violates a condition
 
 
 @dataclass(frozen=True, slots=True)
-class Tried:
-    """A robot that was evaluated."""
+class Candidate:
+    """A robot that the search has evaluated."""
 
     point: Point
     stiffness: float  # f_αα [1/s2]
@@ -55,10 +55,10 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Optimum:
-    best: Tried
-    reference: Tried
+    best: Candidate
+    reference: Candidate
     reference_flies: bool  # by the conditions of the search
-    tried: tuple[Tried, ...]
+    tried: tuple[Candidate, ...]
 
 
 def held(point: Point) -> tuple[float, float]:
@@ -130,7 +130,7 @@ class Shapes:
     def __init__(self, reference: Point, figure: str) -> None:
         self._reference, self._of, self._speed = reference, FIGURES[figure], reference.speed
         self.share = authorities(reference)
-        self.tried: list[Tried] = []
+        self.tried: list[Candidate] = []
         self.first = np.clip(shape_of(reference.geometry), LOW, HIGH)
 
     def build(self, x: NDArray[np.float64]) -> Point | None:
@@ -213,12 +213,12 @@ def optimise(reference: Point, figure: str, seed: int, generations: int = GENERA
     return Optimum(best, own, all(map(_flies, around(reference))), tuple(tried))
 
 
-def _look(point: Point, reference: Mapping[str, float], ratio: float) -> Tried:
+def _look(point: Point, reference: Mapping[str, float], ratio: float) -> Candidate:
     f = point.linear.constants
-    return Tried(point, f.roll_roll, least(authorities(point), dict(reference)), ratio)
+    return Candidate(point, f.roll_roll, least(authorities(point), dict(reference)), ratio)
 
 
-def front(tried: tuple[Tried, ...], figure: str) -> NDArray[np.float64]:
+def front(tried: tuple[Candidate, ...], figure: str) -> NDArray[np.float64]:
     """Return (M, 2) of stability -f_αα and figure: robots not dominated in both."""
     found = sorted(placed(tried, figure).tolist(), reverse=True)
     kept: list[list[float]] = []
@@ -228,7 +228,7 @@ def front(tried: tuple[Tried, ...], figure: str) -> NDArray[np.float64]:
     return np.array(kept)
 
 
-def placed(tried: tuple[Tried, ...], figure: str) -> NDArray[np.float64]:
+def placed(tried: tuple[Candidate, ...], figure: str) -> NDArray[np.float64]:
     """Return stability -f_αα [1/s2] and figure of each robot, (N, 2)."""
     return np.array([(-one.stiffness, one.reached(figure)) for one in tried])
 

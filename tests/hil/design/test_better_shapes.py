@@ -223,7 +223,9 @@ def test_every_number_of_a_shape_at_a_bound_of_the_search_is_named(number: int) 
 def test_lighter_or_wider_robots_hold_slower_air_in_the_same_proportion() -> None:
     low, high = search.held(PAPER)
     lines = search.exercise(
-        search.Optimum(*2 * (search.Tried(PAPER, -16.0, 1.0, high / low),), True, ()), low / 1.25, high / 1.25
+        search.Optimum(*2 * (search.Candidate(PAPER, -16.0, 1.0, high / low),), True, ()),
+        low / 1.25,
+        high / 1.25,
     )
     mass, span = 0.34 / 1.25**2, 23.0 * 1.25
     assert f"with {1e3 * mass:.0f} g instead of 340 g" in lines[1]
