@@ -145,7 +145,7 @@ def _recorded(
         return None
     bench = Bench(link=asked.uri, board=REAL)
     request = Request(experiment, asked.profile, asked.overrides, 0, experiment.duration_s, (), bench)
-    return RealFlight(asked.out, request, records, records.say, onlooker=view)
+    return RealFlight(asked.out, request, records, records.say, observer=view)
 
 
 @dataclass(frozen=True, slots=True)

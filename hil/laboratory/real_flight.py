@@ -24,7 +24,7 @@ from hil.laboratory.ages import STATION_START
 from hil.laboratory.channels import station_channels
 from hil.laboratory.flight import RECORD_PERIOD_US
 from hil.laboratory.metrics import check_limits, measure
-from hil.laboratory.recorder import STREAM, Onlooker, Recorder, load_log
+from hil.laboratory.recorder import STREAM, Observer, Recorder, load_log
 from hil.laboratory.request import Request, why_left
 from hil.laboratory.result import Outcome, Program, Result, judged, metadata_of, with_resets, write_result
 from hil.laboratory.robot import Streams
@@ -33,7 +33,7 @@ from hil.laboratory.robot import Streams
 class RealFlight:
     """Records one flight of `floaty station` into a new `folder`; the station's program calls `turn` in its loop.
 
-    Without a folder nothing is stored, but onlookers get the rows. A write that fails ends its file by the rule of
+    Without a folder nothing is stored, but observers get the rows. A write that fails ends its file by the rule of
     `records`. Raises `LabError` when the folder exists: a real flight cannot be repeated.
     """
 
@@ -44,10 +44,10 @@ class RealFlight:
         records: Records,
         say: Callable[[str], None],
         clock: Callable[[], int] = clock_us,
-        onlooker: Onlooker | None = None,
+        observer: Observer | None = None,
     ) -> None:
         self._folder = folder
-        self._onlooker = onlooker
+        self._observer = observer
         self._request = request
         self._experiment = request.experiment
         self._config = request.config
@@ -112,7 +112,7 @@ class RealFlight:
         channels = station_channels(
             session, lambda: self._is_free, lambda: session.plan.at(self._now_us), self._start_us
         )
-        return Recorder(self._folder, channels, metadata, self._onlooker, self._records)
+        return Recorder(self._folder, channels, metadata, self._observer, self._records)
 
     def _look(self, session: StationSession, now_us: int) -> None:
         """Note the board's state, the trajectory's begin and end, and a loss."""

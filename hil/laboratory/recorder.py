@@ -47,7 +47,7 @@ ROWS_PER_BATCH, BATCH_US = 100, 1_000_000  # whichever is full first goes to dis
 BUFFER_BYTES = 1 << 18  # of the file, more than a batch: it is written at once
 BATCHES_PER_PIECE = 160  # of a long flight's log, written and read at once
 PIECES_IN_MEMORY = 3  # of a log that is read as a whole: eight minutes
-ROWS_SHOWN = 20  # given to the onlooker together: five times a second
+ROWS_SHOWN = 20  # given to the observer together: five times a second
 SETTINGS = "settings"  # source of the events about what an image took over and what it lacks
 MAPPED: WeakSet[mmap.mmap] = WeakSet()  # the files of long logs that are in use
 OPERATOR = "operator"  # source of the events that an operator caused at the terminal
@@ -60,7 +60,7 @@ PARQUET, STREAM, EVENTS = "log.parquet", "log.arrows", "events.jsonl"
 P = ParamSpec("P")
 
 
-class Onlooker(Protocol):
+class Observer(Protocol):
     """Watches a flight while it is recorded. Neither call blocks or raises."""
 
     def rows(self, batch: pa.RecordBatch) -> None:
@@ -71,10 +71,10 @@ class Onlooker(Protocol):
 
 
 class Recorder:
-    """Writes one flight into its run folder, and passes it to an onlooker; without a folder nothing is stored.
+    """Writes one flight into its run folder, and passes it to an observer; without a folder nothing is stored.
 
     A write that fails raises `OSError`; or, with the `records` of a real flight, it ends its file by their rule, while the
-    onlooker sees the rest.
+    observer sees the rest.
     """
 
     def __init__(
@@ -82,12 +82,12 @@ class Recorder:
         folder: Path | None,
         channels: tuple[Channel, ...],
         metadata: Mapping[str, str],
-        onlooker: Onlooker | None = None,
+        observer: Observer | None = None,
         records: Records | None = None,
     ) -> None:
         self._records = records
         self.release_us: int | None = None
-        self._onlooker = onlooker
+        self._observer = observer
         self._folder = folder
         self._row = self._shown = 0
         times = Channel("int64", lambda: 0, (Quantity(("t",), "us"),))
@@ -160,8 +160,8 @@ class Recorder:
 
     def note(self, now_us: int, source: str, text: str) -> None:
         """Add a line of text to the log, written to disk at once."""
-        if self._onlooker is not None:
-            self._onlooker.note(now_us, source, text)
+        if self._observer is not None:
+            self._observer.note(now_us, source, text)
         if self._events is not None:
             line = json.dumps({"t_us": now_us, "source": source, "text": text}) + "\n"
             self._write(EVENTS, self._write_line, self._events, line)
@@ -207,10 +207,10 @@ class Recorder:
             self._records.attempt(self._folder / name, file.close)
 
     def show(self) -> None:
-        """Pass the rows that it has not seen to the onlooker, which may keep them."""
-        if self._onlooker is not None:
+        """Pass the rows that it has not seen to the observer, which may keep them."""
+        if self._observer is not None:
             fresh = self._batch.slice(self._shown, self._row - self._shown).serialize()
-            self._onlooker.rows(pa.ipc.read_record_batch(fresh, self._schema))
+            self._observer.rows(pa.ipc.read_record_batch(fresh, self._schema))
             self._shown = self._row
 
 

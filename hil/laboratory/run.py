@@ -21,7 +21,7 @@ from hil.laboratory.flight import Flight
 from hil.laboratory.folder import replacing_older
 from hil.laboratory.laboratory import Progress
 from hil.laboratory.lockstep import in_lockstep
-from hil.laboratory.recorder import Onlooker, Recorder, load_log
+from hil.laboratory.recorder import Observer, Recorder, load_log
 from hil.laboratory.request import Request
 from hil.laboratory.result import (
     Outcome,
@@ -47,7 +47,7 @@ def fly(
     request: Request,
     folder: Path,
     progress: Callable[[int, Flight], None] | None = None,
-    onlooker: Onlooker | None = None,
+    observer: Observer | None = None,
     flight_of: MakeFlight = in_lockstep,
 ) -> Result:
     """Fly once and write everything but the pictures into `folder`, replacing an older run.
@@ -63,7 +63,7 @@ def fly(
             flight = flight_of(request, folder / TELEMETRY, stack)
         program = Program.of(request.config)
         metadata = metadata_of(request, program, flight.robot.body.look)
-        recorder = Recorder(folder, flight.channels(), metadata, onlooker)
+        recorder = Recorder(folder, flight.channels(), metadata, observer)
         pace = Pace(LOADED_US)
 
         def on_progress(now_us: int) -> None:

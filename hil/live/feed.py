@@ -72,7 +72,7 @@ class Feed:
 
 
 class LiveView:
-    """`hil.laboratory.recorder.Onlooker` of a picture in another process, which `command` starts.
+    """`hil.laboratory.recorder.Observer` of a picture in another process, which `command` starts.
 
     `say` gets lines for the user. Raises `LabError` when the picture reports that it cannot open; a silent one is
     not waited for.
@@ -107,7 +107,7 @@ class LiveView:
             self._end()
             raise LabError(self._failure)
 
-    # Recorder's onlooker
+    # Recorder's observer
 
     def rows(self, batch: pa.RecordBatch) -> None:
         """Queue the next rows, with the texts before them."""

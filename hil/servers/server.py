@@ -25,7 +25,7 @@ from hil.laboratory.channels import (
 from hil.laboratory.faults import Fault, Switchboard
 from hil.laboratory.flight import RECORD_PERIOD_US, RECORD_PHASE_US
 from hil.laboratory.laboratory import NEVER_US, Laboratory
-from hil.laboratory.recorder import Onlooker, Recorder
+from hil.laboratory.recorder import Observer, Recorder
 from hil.laboratory.robot import PYTHON_BOARD, Robot, Site, Streams, with_system
 from hil.servers.failures import Failures
 from hil.servers.holder import Holder
@@ -51,9 +51,9 @@ def show(robot: Robot, clock: Paced, take: Callable[..., None]) -> None:
 
 
 class Shown:
-    """Shows a served robot to onlookers, with home as its goal: the clients' goals are unknown here."""
+    """Shows a served robot to observers, with home as its goal: the clients' goals are unknown here."""
 
-    def __init__(self, served: ServedRobot, onlooker: Onlooker) -> None:
+    def __init__(self, served: ServedRobot, observer: Observer) -> None:
         self._served = served
         if served.robot.firmware.flashed is None:
             # A fault may add this task later, but the columns must include all tasks.
@@ -65,7 +65,7 @@ class Shown:
             "config": config.model_dump_json(),
             "look": json.dumps(served.robot.body.look.stored()),
         }
-        self._recorder = Recorder(None, self._channels(), metadata, onlooker)
+        self._recorder = Recorder(None, self._channels(), metadata, observer)
 
     def row(self, now_us: int) -> None:
         """Take a sample of it."""
@@ -127,14 +127,14 @@ class Service:
 class Server:
     """Releases a robot when it flies and puts it back when it is lost; serve it to clients, then `run`.
 
-    `say` gets lines for the user, `onlooker` sees the robot, `to_peers` gets the board's packets to those of other robots.
+    `say` gets lines for the user, `observer` sees the robot, `to_peers` gets the board's packets to those of other robots.
     """
 
     def __init__(
         self,
         plan: Service,
         say: Callable[[str], None],
-        onlooker: Onlooker | None = None,
+        observer: Observer | None = None,
         to_peers: ToPeers = lambda *_: None,
     ) -> None:
         number, config = plan.number, plan.config
@@ -144,7 +144,7 @@ class Server:
         self.clock = Paced()
         self.lab = Laboratory(self.clock)
         self.number = number
-        self._plan, self._say, self._onlooker = plan, say, onlooker
+        self._plan, self._say, self._observer = plan, say, observer
         self._planned = False  # its faults
         streams = Streams.of_seed(plan.seed + number - 1)
         site = Site(config, self.lab.events, streams, self._note, plan.executor)
@@ -154,7 +154,7 @@ class Server:
         self.switchboard = Switchboard(robot)
         self._holder = Holder(robot, self._let_go)
         robot.watch(0)
-        self._shown = None if onlooker is None else Shown(self.served, onlooker)
+        self._shown = None if observer is None else Shown(self.served, observer)
         self.lab.events.every(RECORD_PERIOD_US, RECORD_PHASE_US, self._look)
 
     def open(self, endpoints: Endpoints, others: Sequence[int] = ()) -> OpenEndpoints:
@@ -193,8 +193,8 @@ class Server:
 
     def _note(self, source: str, text: str) -> None:
         self._say(f"board {self.number}: {text}")
-        if self._onlooker is not None:
-            self._onlooker.note(self.lab.now_us, source, text)
+        if self._observer is not None:
+            self._observer.note(self.lab.now_us, source, text)
 
     def _fail(self, now_us: int, unit: int, failing: int, instance: int) -> CommandResult:
         return Failures(self.robot, self.switchboard).inject(now_us, unit, failing, instance)

@@ -1,4 +1,4 @@
-"""An onlooker that keeps the rows that it is shown."""
+"""An observer that keeps the rows that it is shown."""
 
 import pyarrow as pa
 

@@ -36,7 +36,7 @@ from hil.laboratory.channels import Unwrapped
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import ALWAYS, body, free_flight, known, measure
 from hil.laboratory.real_flight import RealFlight, why_lost
-from hil.laboratory.recorder import Onlooker, Recorder, load_events, load_log, release_of
+from hil.laboratory.recorder import Observer, Recorder, load_events, load_log, release_of
 from hil.laboratory.request import REAL, Bench, Request
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.run import fly
@@ -65,12 +65,12 @@ def recorder_of(
     clock: Any,
     said: list[str],
     records: Records | None = None,
-    onlooker: Onlooker | None = None,
+    observer: Observer | None = None,
 ) -> RealFlight:
     chosen = EXPERIMENTS[experiment]
     bench = Bench("udp://127.0.0.1:19850", REAL)
     request = Request(chosen, "floaty", (), 0, chosen.duration_s, (), bench)
-    return RealFlight(folder, request, records or Records(), said.append, clock, onlooker)
+    return RealFlight(folder, request, records or Records(), said.append, clock, observer)
 
 
 class Link:
@@ -236,9 +236,9 @@ class StationBench:
         self.now_us = 7_000_000
         self.said: list[str] = []
         self.records = Records()
-        self.onlooker = Watcher()
+        self.observer = Watcher()
         self.record = recorder_of(
-            folder, experiment, lambda: self.now_us, self.said, self.records, self.onlooker
+            folder, experiment, lambda: self.now_us, self.said, self.records, self.observer
         )
         self.plan = FlightPlan(HOME, EXPERIMENTS[experiment].trajectory)
         link = LoopbackLink(lambda now_us, data: None, 1_400, dict)
@@ -441,8 +441,8 @@ def test_a_disk_that_stays_full_keeps_what_is_on_it_and_the_picture_goes_on(tmp_
     assert sorted(line.split(": ")[0] for line in notices) == [
         str(tmp_path / "run" / name) for name in ("events.jsonl", "log.arrows")
     ]
-    assert sum(batch.num_rows for batch in bench.onlooker.batches) > 140
-    assert "hover begins" in [text for *_, text in bench.onlooker.notes]
+    assert sum(batch.num_rows for batch in bench.observer.batches) > 140
+    assert "hover begins" in [text for *_, text in bench.observer.notes]
     assert bench.records.incomplete
 
 

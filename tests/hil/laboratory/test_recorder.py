@@ -11,7 +11,7 @@ from hil.errors import LabError
 from hil.laboratory.recorder import (
     BATCHES_PER_PIECE,
     ROWS_PER_BATCH,
-    Onlooker,
+    Observer,
     Recorder,
     forget_read_columns,
     load_events,
@@ -21,7 +21,7 @@ from hil.world.body import Channel, Quantity
 from support.watching import Watcher
 
 
-def make(folder: Path, values: np.ndarray, onlooker: Onlooker | None = None) -> Recorder:
+def make(folder: Path, values: np.ndarray, observer: Observer | None = None) -> Recorder:
     return Recorder(
         folder,
         (
@@ -29,7 +29,7 @@ def make(folder: Path, values: np.ndarray, onlooker: Onlooker | None = None) -> 
             Channel("int32", lambda: int(values[0]), (Quantity(("n",), ""),)),
         ),
         {"seed": "7"},
-        onlooker,
+        observer,
     )
 
 
@@ -65,7 +65,7 @@ def test_a_long_log_is_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert sorted(tmp_path.iterdir()) == files
 
 
-def test_rows_that_an_onlooker_keeps_stay_as_they_were_recorded(tmp_path: Path) -> None:
+def test_rows_that_an_observer_keeps_stay_as_they_were_recorded(tmp_path: Path) -> None:
     watcher, values = Watcher(), np.zeros(2)
     recorder = make(tmp_path, values, watcher)
     for row in range(250):

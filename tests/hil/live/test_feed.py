@@ -53,7 +53,7 @@ def rows(first: int, count: int) -> pa.RecordBatch:
 
 
 def flight_hash(folder: Path, view: LiveView | None) -> str:
-    return fly(Request.of(EXPERIMENTS["hover"], duration_s=0.5), folder, onlooker=view).hash
+    return fly(Request.of(EXPERIMENTS["hover"], duration_s=0.5), folder, observer=view).hash
 
 
 @pytest.fixture(scope="module")
