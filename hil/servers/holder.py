@@ -1,4 +1,4 @@
-"""The person at the tunnel: releases a robot once it flies in its holder, and returns it when it is lost."""
+"""The launch clamp: it releases a robot once that flies in the holder, and a lost robot returns to it."""
 
 from collections.abc import Callable
 
@@ -10,8 +10,8 @@ PUT_BACK_US = 1_000_000  # after a loss
 WATCH_PERIOD_US = 10_000
 
 
-class Holder:
-    """Watches one robot. Calls `let_go` when it has flown in its holder for a second, or stands on the floor."""
+class LaunchClamp:
+    """Holds one robot. Calls `let_go` when it has flown in its holder for a second, or stands on the floor."""
 
     def __init__(self, robot: Robot, let_go: Callable[[int], None]) -> None:
         self._robot = robot

@@ -30,7 +30,7 @@ from hil.laboratory.request import Request
 from hil.laboratory.robot import PYTHON_BOARD, Site
 from hil.servers.dongle_plugin import VARIABLE
 from hil.servers.dongle_server import HOST
-from hil.servers.holder import HOLD_US, Holder
+from hil.servers.holder import HOLD_US, LaunchClamp
 from hil.servers.motive import Streaming, name_of
 from hil.servers.serial_server import Address
 from hil.servers.served_robot import ServedRobot
@@ -124,7 +124,7 @@ class StationProcess:
             self._release_us = now_us
             release(now_us)
 
-        Holder(self.robot, let_go)
+        LaunchClamp(self.robot, let_go)
 
     def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
         """Return the counters of line and board; the station keeps its own record."""

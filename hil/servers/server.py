@@ -28,7 +28,7 @@ from hil.laboratory.laboratory import NEVER_US, Laboratory
 from hil.laboratory.recorder import Observer, Recorder
 from hil.laboratory.robot import PYTHON_BOARD, Robot, Site, Streams, with_system
 from hil.servers.failures import Failures
-from hil.servers.holder import Holder
+from hil.servers.holder import LaunchClamp
 from hil.servers.motive import Streaming, VirtualMotive
 from hil.servers.serial_server import Address
 from hil.servers.served_robot import ServedRobot
@@ -152,7 +152,7 @@ class Server:
         robot = self.robot = self.served.robot
         self.lab.add(robot)
         self.switchboard = Switchboard(robot)
-        self._holder = Holder(robot, self._let_go)
+        self._clamp = LaunchClamp(robot, self._let_go)
         robot.watch(0)
         self._shown = None if observer is None else Shown(self.served, observer)
         self.lab.events.every(RECORD_PERIOD_US, RECORD_PHASE_US, self._look)
@@ -223,4 +223,4 @@ class Server:
                 self.served.start(now_us)
         if lost is not None and robot.free:
             robot.say("lab", f"lost: {lost}; it is put back")
-            self._holder.put_back_later(now_us)
+            self._clamp.put_back_later(now_us)

@@ -14,7 +14,7 @@ from hil.errors import LabError
 from hil.laboratory.faults import Fault, parse
 from hil.laboratory.laboratory import Laboratory
 from hil.laboratory.robot import Ports, Robot, Site, Streams, nobody_listens
-from hil.servers.holder import Holder
+from hil.servers.holder import LaunchClamp
 from hil.servers.live_faults import LiveFaults
 from hil.servers.served_robot import ServedRobot
 from hil.servers.server import Server, Service
@@ -253,7 +253,7 @@ def test_a_holder_releases_only_a_flying_robot() -> None:
     robot.body.hold()
     lab.add(robot)
     gone: list[int] = []
-    Holder(robot, gone.append)
+    LaunchClamp(robot, gone.append)
     robot.watch(0)
     lab.end_at(3 * SECOND_US)
     lab.run()
