@@ -17,7 +17,7 @@ from hil.arguments import checked, fits
 from hil.bodies import FAILURES
 from hil.config import DEFAULT_PROFILE
 from hil.errors import LabError, blame, hint, shown
-from hil.laboratory.robot import LINKS, Robot, attributes_of, specimen
+from hil.laboratory.robot import LINKS, Robot, attributes_of, probe
 from hil.world.body import Failure
 
 Outcome = Literal["holds", "degrades", "failsafe", "lost", ""]
@@ -108,7 +108,7 @@ def knob(owner: Callable[[Robot], object], name: str, blend: Blend) -> Knob:
     Raises `LabError` for an attribute that is missing or not a number.
     """
     try:
-        part = owner(specimen("", markers=True))
+        part = owner(probe("", markers=True))
     except Exception as error:
         raise LabError(f"knob {name!r}: {blame(error)}") from error
     if name not in (known := attributes_of(part)):
@@ -350,7 +350,7 @@ def declare(name: str, kind: Kind) -> Kind:
 def _try(name: str, kind: Kind) -> None:
     """Change and reset all knobs of a kind, on every robot that it affects. Raises `LabError` when that fails."""
     for link in (kind.link,) if kind.link else LINKS:
-        robot = specimen(link, kind.markers)
+        robot = probe(link, kind.markers)
         for one in kind.knobs:
             try:
                 before = one.read(robot)

@@ -324,7 +324,7 @@ LINKS: tuple[Literal["radio", "mavlink"], ...] = ("radio", "mavlink")
 
 
 @cache
-def specimen(link: Literal["", "radio", "mavlink"], markers: bool) -> Robot:
+def probe(link: Literal["", "radio", "mavlink"], markers: bool) -> Robot:
     """Return a booted robot that never flies, to try a user's declarations; without a link it has both."""
     config, events = load_config(overrides=("markers.enabled=true",) if markers else ()), EventQueue()
     site = Site(config, events, Streams.of_seed(0), lambda *_: None)

@@ -41,7 +41,7 @@ from hil.api import command_of, request_of
 from hil.errors import hint
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import KINDS, add
-from hil.laboratory.robot import attributes_of, specimen
+from hil.laboratory.robot import attributes_of, probe
 from hil.testing import Flights, Waypoints, faults, trajectories
 from support.choices import choice
 
@@ -305,7 +305,7 @@ def test_a_knob_that_cannot_be_turned_is_refused_where_its_kind_is_declared() ->
 
 def test_the_page_lists_the_attributes_that_a_knob_can_set() -> None:
     page = (Path(hil.__file__).parent.parent / "docs/howto/python.md").read_text()
-    robot = specimen("", markers=True)
+    robot = probe("", markers=True)
     rows = re.findall(r"^\| `robot\.([\w.]+)`.*?\| (.*) \|$", page, re.MULTILINE)
     assert len(rows) == 6
     for part, names in rows:
