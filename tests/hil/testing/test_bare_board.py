@@ -56,7 +56,7 @@ def test_poses_at_50_hz_let_it_fly_and_silence_ends_that(board: BareBoard) -> No
     board.receive(POSE, every_ms=20)
     board.expect("supervisor: flying", within_ms=500)
     board.run(ms=1000)
-    board.hush()
+    board.stop_repeating()
     hushed_us = board.now_us
     board.expect("supervisor: failsafe", within_ms=1000)
     assert board.now_us - hushed_us == pytest.approx(load_config().supervisor.pose_timeout_us, abs=30_000)

@@ -66,7 +66,7 @@ def test_a_packet_that_is_hushed_is_not_repeated_beside_the_next_one() -> None:
     arrived: list[bytes] = []
     board._arrive = arrived.append  # type: ignore[method-assign]
     board.receive(b"\x30a", every_ms=10)
-    board.hush()
+    board.stop_repeating()
     board.receive(b"\x30b", every_ms=10)
     board.run(ms=35)
     assert arrived == [b"\x30a", *[b"\x30b"] * 4]
