@@ -25,7 +25,7 @@ from hil.scene import CENTRE, PALE, Markers, VisualModel, box, eight_markers
 from hil.world.body import Channel, Failure, Quantity, Setting, Vector, View, of_each_actuator
 from hil.world.config import BatteryConfig, PlantConfig, TunnelConfig
 from hil.world.fixed_order import atan2, compiled, exp, normal
-from hil.world.in_tunnel import UPRIGHT, InTunnel, seen, settings_of
+from hil.world.in_tunnel import UPRIGHT, TunnelBody, seen, settings_of
 from hil.world.motion import GRAVITY, accelerate, begin, lose, move, surround
 from hil.world.room import Room
 from hil.world.structs import NOISE_ROWS, Air, Rigid
@@ -316,7 +316,7 @@ def advance(body: Rigid, air: Air, rotors: Rotors, draws: F64s) -> None:
         step(body, air, rotors, draws)
 
 
-class Quadrotor(InTunnel):
+class Quadrotor(TunnelBody):
     """The robot, its motors and the room, in the air of a tunnel whose fans may stand still.
 
     Beside the views of every body: rpm, thrust (4,) of the rotors [rpm, N]; escs those speeds for the ESCs of brushless

@@ -14,7 +14,7 @@ from hil.floaty.shape import SIGNS, place_plates
 from hil.scene import Markers, VisualModel
 from hil.world.body import ACTUATORS, Channel, Failure, Quantity, Vector, View, of_each_actuator
 from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
-from hil.world.in_tunnel import AT_REST, UPRIGHT, InTunnel, seen, settings_of
+from hil.world.in_tunnel import AT_REST, UPRIGHT, TunnelBody, seen, settings_of
 from hil.world.motion import advance, evaluate
 from hil.world.servos import OUTPUTS, commanded_angles, next_period_us
 from hil.world.structs import Flaps, FloatyBlocks, Rigid
@@ -50,8 +50,8 @@ def assemble(
     return blocks, knobs
 
 
-class Plant(InTunnel):
-    """Body, servos, tether and the air around them; these views of the truth besides those of `InTunnel`:
+class Plant(TunnelBody):
+    """Body, servos, tether and the air around them; these views of the truth besides those of `TunnelBody`:
 
     blocks the kernels' memory; flaps (4,) [rad] signed flap angles; wrench_B (6,) force [N] and torque [N m] of the flow
     about the centre of mass; zero_offset (4,) [rad] of the servos' middle, for which the board was trimmed; servo_trim (4,)

@@ -34,7 +34,7 @@ LOSS_TEXTS = {
 }
 
 
-class InTunnel:
+class TunnelBody:
     """The common part of all bodies in the tunnel: the views of `hil.world.body.Motion`, and v_WB (3,) [m/s].
 
     `acceleration_W` [m/s2] and `alpha_B` [rad/s2] are (3,). The body's memory includes mass and inertia.

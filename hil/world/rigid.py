@@ -17,7 +17,7 @@ from hil.errors import LabError, blame
 from hil.scene import Markers, Part, VisualModel, ball, eight_markers
 from hil.world.body import Channel, Quantity, Setting, Vector
 from hil.world.config import BatteryConfig, PlantConfig, TunnelConfig
-from hil.world.in_tunnel import UPRIGHT, InTunnel
+from hil.world.in_tunnel import UPRIGHT, TunnelBody
 from hil.world.motion import accelerate, begin, move, surround, watch
 from hil.world.servos import OUTPUTS
 from hil.world.structs import NOISE_ROWS, STEP_US, Rigid
@@ -44,7 +44,7 @@ class World(Protocol):
         """The power of the electronics."""
 
 
-class RigidBody(InTunnel):
+class RigidBody(TunnelBody):
     """A body made of `mass` [kg], `inertia` about x, y, z of B [kg m2] and a method `wrench`.
 
     `counts` are the last counts of the board's four timers.
