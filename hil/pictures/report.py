@@ -28,7 +28,7 @@ from hil.pictures.gallery import pictures_of
 from hil.pictures.links import link_to
 from hil.pictures.pages import PageFigure, draw, write_page, zoomable
 from hil.pictures.panels import QUESTIONS, Marks, marks_of_flight
-from hil.pictures.story import close_ups, failures_of, story_of
+from hil.pictures.timeline import close_ups, failures_of, story_of
 
 REPORT = "report.html"
 

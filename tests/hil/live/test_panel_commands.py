@@ -19,7 +19,7 @@ from hil.live.panel_commands import PanelCommands
 from hil.pictures.curves import since_release, with_marks
 from hil.pictures.panels import marks_of_flight
 from hil.pictures.report import fault_rows
-from hil.pictures.story import close_ups, story_of
+from hil.pictures.timeline import close_ups, story_of
 
 
 class Script:

@@ -19,7 +19,7 @@ from hil.pictures.curves import BLUE, since_release
 from hil.pictures.figures import course_of, goal_moves
 from hil.pictures.panels import saturated
 from hil.pictures.path import FlownPath, path_of
-from hil.pictures.story import _before, _rotors, evidence, failures_of, story_of
+from hil.pictures.timeline import _before, _rotors, evidence, failures_of, story_of
 
 
 @pytest.fixture(scope="module")

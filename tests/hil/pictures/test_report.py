@@ -32,7 +32,7 @@ from hil.pictures.figures import PICTURES, goal_moves, latency_budget
 from hil.pictures.links import link_to
 from hil.pictures.pages import library, thinned
 from hil.pictures.report import metric_rows, write_report
-from hil.pictures.story import story_of
+from hil.pictures.timeline import story_of
 from support.html_page import Page, lines_of
 
 

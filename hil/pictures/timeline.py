@@ -1,4 +1,4 @@
-"""The story of a flight, at the beginning of its report: failures and events, in seconds from the release; and close-ups
+"""The timeline of a flight, at the beginning of its report: failures and events, in seconds from the release; and close-ups
 around each fault, around the first exceeded limit, and in the last seconds before a loss, with sentences on the robot,
 the board's estimate, its poses and its flaps, which state only recorded facts.
 """
