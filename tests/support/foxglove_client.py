@@ -1,5 +1,6 @@
 """A client of Foxglove's WebSocket protocol, as far as the tests need one: JSON and binary messages."""
 
+import asyncio
 import json
 import struct
 from typing import Any
@@ -12,11 +13,17 @@ PROTOCOL = "foxglove.sdk.v1"
 MESSAGE = struct.Struct("<BIQ")  # operation 1, subscription, log time [ns]
 
 
+def current_loop() -> IOLoop:
+    """Return a new loop and make it the current one: from Python 3.12 on, asyncio does not do so by itself."""
+    asyncio.set_event_loop(asyncio.new_event_loop())
+    return IOLoop.current()
+
+
 class FoxgloveClient:
     """Connects to a `ws://HOST:PORT`."""
 
     def __init__(self, address: str, **headers: str) -> None:
-        self._loop = IOLoop(make_current=True)
+        self._loop = current_loop()
         request = HTTPRequest(address, headers=headers)
         try:
             self._socket = self._loop.run_sync(

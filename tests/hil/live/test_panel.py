@@ -17,6 +17,7 @@ from hil.laboratory.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.live.panel import COMMANDS, LINE_MOST, ROWS_MOST, TEXTS_MOST, PanelScreen, _Socket
+from support.foxglove_client import current_loop
 
 
 @pytest.fixture
@@ -33,7 +34,7 @@ def panel(typed: list[str]) -> Iterator[PanelScreen]:
 
 @pytest.fixture
 def loop() -> Iterator[IOLoop]:
-    loop = IOLoop(make_current=True)
+    loop = current_loop()
     yield loop
     loop.close(all_fds=True)
 
