@@ -19,24 +19,24 @@ import pyarrow as pa
 
 from firmware_py.export.boards import C
 from ground_station import trajectory
-from hil.arguments import Known, checked
 from hil.config import DEFAULT_PROFILE, LabConfig
-from hil.demonstrations import Demonstrations, demonstrations_of
 from hil.errors import LabError, reading
-from hil.experiments import check_flown, find_again, find_experiment, find_shipped, finder_of
+from hil.laboratory.arguments import Known, checked
 from hil.laboratory.experiment import Experiment
+from hil.laboratory.experiments import check_flown, find_again, find_experiment, find_shipped, finder_of
 from hil.laboratory.fault_kinds import Kind, Knob, declare, knob
 from hil.laboratory.faults import Fault
 from hil.laboratory.faults import parse as fault
+from hil.laboratory.files.folder import folder_of, reserved
+from hil.laboratory.files.recorder import config_of, load_events, load_log
+from hil.laboratory.files.result import Outcome, Result, read_result
 from hil.laboratory.flight import Flight
-from hil.laboratory.folder import folder_of, reserved
 from hil.laboratory.lockstep import in_lockstep
 from hil.laboratory.metrics import METRICS, Metric, Verdict, column, free_flight, position_error
-from hil.laboratory.recorder import config_of, load_events, load_log
 from hil.laboratory.request import RADIO, Options, Request
-from hil.laboratory.result import Outcome, Result, read_result
 from hil.laboratory.run import MakeFlight
 from hil.laboratory.run import fly as fly_into
+from hil.pictures.exports.demonstrations import Demonstrations, demonstrations_of
 from hil.world.rigid import RigidBody
 
 __all__ = [

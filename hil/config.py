@@ -20,13 +20,13 @@ from firmware_py.errors import FirmwareError
 from firmware_py.logic.loading import load_logic
 from firmware_py.section import Section, number
 from ground_station.config import CaptureConfig, GroundConfig, PilotConfig, StationConfig, TrackerConfig
-from hil.crazyflie.config import RadioConfig
-from hil.crazyflie.quadrotor import QuadrotorConfig
-from hil.devices.config import ImuConfig, MarkersConfig, MocapConfig, SerialConfig
+from hil.board.config import ImuConfig, MarkersConfig, MocapConfig, SerialConfig
+from hil.emulator.crazyflie.config import RadioConfig
 from hil.errors import LabError, hint, shown
-from hil.floaty.geometry import check
-from hil.floaty.shape import check_hover
 from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
+from hil.world.floaty.geometry import check
+from hil.world.floaty.shape import check_hover
+from hil.world.quadrotor import QuadrotorConfig
 
 DEFAULT_PROFILE = "floaty"
 Overrides = Sequence[str] | Mapping[str, Any]  # "section.key=value", or the values by "section.key"

@@ -29,13 +29,13 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "firmware_py.section", "firmware_py.table",
         "firmware_py.core.structs",  # the oldest pose that the board can use
     ),
-    "hil.stm32f405": ("hil", "firmware_py.export", "firmware_py.extras"),
-    "hil.crazyflie": (
+    "hil.emulator.stm32f405": ("hil", "firmware_py.export", "firmware_py.extras"),
+    "hil.emulator.crazyflie": (
         "hil", "firmware_py.wire.scalars", "firmware_py.wire.memories", "firmware_py.elementary", "firmware_py.section",
         "firmware_py.compiling", "firmware_py.core.subset",
     ),
-    "hil.learn": ("hil", "ground_station", "firmware_py"),
-    "hil.demonstrations": ("hil", "firmware_py"),
+    "hil.research.learn": ("hil", "ground_station", "firmware_py"),
+    "hil.pictures.exports.demonstrations": ("hil", "firmware_py"),
     "hil": (
         "hil", "ground_station",
         "firmware_py.firmware", "firmware_py.core_runner", "firmware_py.export", "firmware_py.board",
@@ -67,7 +67,7 @@ FLOORS = (
 )
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 
-# Rooms that work with any body, which hil/bodies.py makes for them.
+# Rooms that work with any body, which hil/laboratory/bodies.py makes for them.
 ANY_BODY = (
     "world", "crazyflie", "devices", "laboratory", "pictures", "servers", "live", "exports", "campaigns",
     "testing",
@@ -79,43 +79,43 @@ CORE_LIBRARIES = {"numpy", "typing"}
 # Module or attribute -> the files that alone may use it.
 CONFINED: dict[str, tuple[str, ...]] = {
     "rerun": ("hil/pictures/viewer/",),
-    "foxglove": ("hil/exports/mcap.py", "hil/live/foxglove_server.py"),
-    "gymnasium": ("hil/learn/",),
+    "foxglove": ("hil/pictures/exports/mcap.py", "hil/live/foxglove_server.py"),
+    "gymnasium": ("hil/research/learn/",),
     "av": ("hil/pictures/video.py",),
     "tornado": ("hil/live/panel.py", "hil/live/local_server.py", "hil/live/foxglove_server.py"),
     "youplot": ("hil/pictures/pages.py",),
     "time": (
-        "hil/clock.py", "hil/commands/listing.py",
-        "hil/campaigns/jobs.py", "ground_station/clock.py",
+        "hil/board/clock.py", "hil/commands/listing.py",
+        "hil/research/campaigns/jobs.py", "ground_station/clock.py",
     ),
     "datetime": (),
     "asyncio": (),
     "threading": (
-        "hil/live/feed.py", "hil/live/local_server.py", "hil/campaigns/workers.py",
+        "hil/live/feed.py", "hil/live/local_server.py", "hil/research/campaigns/workers.py",
         "ground_station/links/live_link.py", "ground_station/links/crazyradio.py", "ground_station/links/mavlink_serial.py",
         "ground_station/terminal.py",
     ),
     "prompt_toolkit": ("ground_station/terminal.py",),
-    "multiprocessing": ("hil/campaigns/workers.py", "hil/servers/swarm.py"),
-    "concurrent": ("hil/campaigns/workers.py",),
-    "unicorn": ("firmware_py/export/cortex_m4.py", "hil/stm32f405/chip.py"),
+    "multiprocessing": ("hil/research/campaigns/workers.py", "hil/servers/swarm.py"),
+    "concurrent": ("hil/research/campaigns/workers.py",),
+    "unicorn": ("firmware_py/export/cortex_m4.py", "hil/emulator/stm32f405/chip.py"),
     "onnx": ("firmware_py/policy/reading.py",),
     "safetensors": ("firmware_py/policy/reading.py",),
     "elftools": ("firmware_py/export/elf.py",),
     "ctypes": ("firmware_py/compiling.py", "firmware_py/core/subset.py", "firmware_py/export/cortex_m4.py"),
-    "cffi": ("hil/stm32f405/chip.py",),
+    "cffi": ("hil/emulator/stm32f405/chip.py",),
     "subprocess": (
-        "hil/installation.py", "hil/live/", "hil/servers/linked.py",
+        "hil/laboratory/files/installation.py", "hil/live/", "hil/servers/linked.py",
         "ground_station/sources/motioncapture_client.py",
         "firmware_py/export/compilers.py",
     ),
     "socket": (
-        "hil/clock.py", "hil/stm32f405/gdb.py",
+        "hil/board/clock.py", "hil/emulator/stm32f405/gdb.py",
         "hil/live/window.py", "hil/servers/dongle_plugin.py", "hil/servers/tcp_port.py",
         "hil/servers/udp_server.py", "hil/servers/serial_server.py", "hil/servers/motive.py",
         "ground_station/sources/optitrack.py", "ground_station/sources/motioncapture_process.py",
     ),
-    "select": ("ground_station/clock.py", "hil/stm32f405/gdb.py"),
+    "select": ("ground_station/clock.py", "hil/emulator/stm32f405/gdb.py"),
     "selectors": ("ground_station/clock.py",),
     "platformdirs": ("firmware_py/kept_code.py",),
     "jinja2.FileSystemBytecodeCache": ("hil/pictures/pages.py",),
@@ -124,7 +124,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "shelve": (),
     "random": (),
     "secrets": (),
-    "numpy.random.default_rng": ("hil/laboratory/robot.py", "hil/campaigns/sampling.py"),
+    "numpy.random.default_rng": ("hil/laboratory/robot.py", "hil/research/campaigns/sampling.py"),
     "numpy.random.seed": (),
     "cflib": ("ground_station/links/crazyradio.py", "ground_station/links/packets.py", "ground_station/flashing.py"),
     "serial": ("ground_station/links/mavlink_serial.py",),
@@ -134,25 +134,25 @@ CONFINED: dict[str, tuple[str, ...]] = {
     ),
     "filterpy": (),
     "motioncapture": ("ground_station/sources/motioncapture_process.py",),
-    "scipy": ("hil/design/", "hil/identify/", "hil/campaigns/"),
-    "control.dlqr": ("hil/design/",),
-    "control.stability_margins": ("hil/design/",),  # `control` alone is also a name of ours
-    "SALib": ("hil/campaigns/",),
+    "scipy": ("hil/research/design/", "hil/research/identify/", "hil/research/campaigns/"),
+    "control.dlqr": ("hil/research/design/",),
+    "control.stability_margins": ("hil/research/design/",),  # `control` alone is also a name of ours
+    "SALib": ("hil/research/campaigns/",),
     "dask": (),
-    "distributed": ("hil/campaigns/workers.py",),
+    "distributed": ("hil/research/campaigns/workers.py",),
     "pytest": ("hil/testing/",),
     "hypothesis": ("hil/testing/strategies.py",),
-    "perfetto": ("hil/exports/perfetto.py",),
-    "matplotlib": ("hil/pictures/", "hil/studies/", "hil/design/", "hil/identify/", "hil/campaigns/report.py"),
-    "pyarrow": ("hil/api.py", "hil/exports/", "hil/laboratory/", "hil/experiments/", "hil/pictures/", "hil/studies/",
-        "hil/live/", "hil/campaigns/", "hil/demonstrations.py",
+    "perfetto": ("hil/pictures/exports/perfetto.py",),
+    "matplotlib": ("hil/pictures/", "hil/research/studies/", "hil/research/design/", "hil/research/identify/", "hil/research/campaigns/report.py"),
+    "pyarrow": ("hil/api.py", "hil/pictures/exports/", "hil/laboratory/", "hil/laboratory/experiments/", "hil/pictures/", "hil/research/studies/",
+        "hil/live/", "hil/research/campaigns/", "hil/pictures/exports/demonstrations.py",
     ),
 }  # fmt: skip
 # BLAS, LAPACK, the C library's functions and numpy's vector code have other last bits on other processors, so they
 # stay out of all that flies; these files look at what was flown, or are done before.
 AFTER_THE_FLIGHT = (
-    "hil/laboratory/metrics.py", "hil/pictures/", "hil/experiments/measures.py", "hil/experiments/take_off.py",
-    "hil/design/", "hil/identify/", "hil/campaigns/findings.py", "hil/studies/paper_identification.py",
+    "hil/laboratory/metrics.py", "hil/pictures/", "hil/laboratory/experiments/measures.py", "hil/laboratory/experiments/take_off.py",
+    "hil/research/design/", "hil/research/identify/", "hil/research/campaigns/findings.py", "hil/research/studies/paper_identification.py",
 )  # fmt: skip
 BY_PROCESSOR = """
     math.sin math.cos math.tan math.asin math.acos math.atan math.atan2 math.exp math.expm1 math.log math.log1p math.log2
@@ -162,7 +162,7 @@ BY_PROCESSOR = """
 """.split()  # noqa: SIM905
 CONFINED |= dict.fromkeys(BY_PROCESSOR, AFTER_THE_FLIGHT)
 CONFINED["click"] = CONFINED["rich"] = (
-    "hil/commands/", "hil/campaigns/run.py",
+    "hil/commands/", "hil/research/campaigns/run.py",
 )  # fmt: skip
 # Of a whole flight.
 CONFINED |= dict.fromkeys(("numpy.arctan2", "numpy.arcsin"), ("firmware_py/geometry.py",))
@@ -272,31 +272,34 @@ def test_file_keeps_to_its_room(path: Path) -> None:
         ("firmware_py/core/model.py", "from firmware_py.geometry import multiply"),
         ("firmware_py/core/model.py", "import scipy"),
         ("firmware_py/wire/crtp.py", "from firmware_py.board import Board"),
-        ("firmware_py/tasks.py", "from hil.events import EventQueue"),
+        ("firmware_py/tasks.py", "from hil.emulator.events import EventQueue"),
         ("firmware_py/tasks.py", "import time"),
         ("ground_station/station.py", "from firmware_py.firmware import Firmware"),
         ("ground_station/tracker.py", "from firmware_py.core import maths"),
         ("hil/laboratory/robot.py", "from firmware_py.core import entry"),
-        ("hil/floaty/plant.py", "from hil.devices.imu import VirtualImu"),
-        ("hil/laboratory/flight.py", "from hil.experiments import EXPERIMENTS"),
+        ("hil/world/floaty/plant.py", "from hil.board.imu import VirtualImu"),
+        ("hil/laboratory/flight.py", "from hil.laboratory.experiments import EXPERIMENTS"),
         ("hil/pictures/report.py", "import hil.servers.server"),
-        ("hil/laboratory/robot.py", "from hil.floaty.plant import Plant"),
-        ("hil/pictures/viewer/scene.py", "from hil.floaty.geometry import weigh"),
-        ("hil/campaigns/run.py", "from distributed import Client"),
-        ("hil/campaigns/run.py", "from hil.studies.paper import fly_paper"),
-        ("hil/clock.py", "from hil.config import LabConfig"),
-        ("hil/stm32f405/processor.py", "from firmware_py.rtos import Kernel"),
-        ("hil/stm32f405/chip.py", "from hil.crazyflie import syslink"),
-        ("hil/crazyflie/crazyflie.py", "from firmware_py.board import Board"),
-        ("hil/devices/imu.py", "from firmware_py.drivers.imu import body_of"),
+        ("hil/laboratory/robot.py", "from hil.world.floaty.plant import Plant"),
+        ("hil/pictures/viewer/scene.py", "from hil.world.floaty.geometry import weigh"),
+        ("hil/research/campaigns/run.py", "from distributed import Client"),
+        ("hil/research/campaigns/run.py", "from hil.research.studies.paper import fly_paper"),
+        ("hil/board/clock.py", "from hil.config import LabConfig"),
+        ("hil/emulator/stm32f405/processor.py", "from firmware_py.rtos import Kernel"),
+        ("hil/emulator/stm32f405/chip.py", "from hil.emulator.crazyflie import syslink"),
+        ("hil/emulator/crazyflie/crazyflie.py", "from firmware_py.board import Board"),
+        ("hil/board/imu.py", "from firmware_py.drivers.imu import body_of"),
         ("hil/pictures/report.py", "import rerun as rr"),
-        ("hil/devices/imu.py", "import numpy as np\nrng = np.random.default_rng()"),
-        ("hil/devices/imu.py", "from numpy.random import default_rng"),
-        ("hil/devices/markers.py", "import numpy as np\nx = np.cos(1.0)"),
+        ("hil/board/imu.py", "import numpy as np\nrng = np.random.default_rng()"),
+        ("hil/board/imu.py", "from numpy.random import default_rng"),
+        ("hil/board/markers.py", "import numpy as np\nx = np.cos(1.0)"),
         ("ground_station/trajectory.py", "from math import sin"),
-        ("hil/floaty/shape.py", "x = AXIS @ vector"),
-        ("hil/floaty/correction.py", "import numpy as np\nx = np.polynomial.polynomial.polyfit(a, b, 3)"),
-        ("hil/devices/cameras.py", "x = rng.standard_normal(3)"),
+        ("hil/world/floaty/shape.py", "x = AXIS @ vector"),
+        (
+            "hil/world/floaty/correction.py",
+            "import numpy as np\nx = np.polynomial.polynomial.polyfit(a, b, 3)",
+        ),
+        ("hil/board/cameras.py", "x = rng.standard_normal(3)"),
         ("hil/commands/param.py", "print(name)"),
     ],
 )

@@ -35,12 +35,12 @@ from firmware_py.extras import install_command
 from hil.commands.app import COMMANDS
 from hil.commands.options import right
 from hil.config import load_config
-from hil.experiments import EXPERIMENTS
-from hil.floaty.plant import Plant
+from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.files.recorder import Recorder
 from hil.laboratory.lockstep import lockstep_flight
-from hil.laboratory.recorder import Recorder
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
+from hil.world.floaty.plant import Plant
 
 ROOT = Path(__file__).parent.parent
 FLIGHT_S = 30.0
@@ -129,7 +129,7 @@ def command_s(*words: str, **environment: str) -> float:
 def start_up_s(board: str = "c", **environment: str) -> float:
     """Processor time of a process that flies until its first ticks."""
     code = (
-        "from contextlib import ExitStack; from hil.experiments import EXPERIMENTS;"
+        "from contextlib import ExitStack; from hil.laboratory.experiments import EXPERIMENTS;"
         "from hil.laboratory.lockstep import in_lockstep; from hil.laboratory.request import Request;"
         f"request = Request.of(EXPERIMENTS['hover'], duration_s=1.0, board={board!r});"
         "flight = in_lockstep(request, None, ExitStack()); flight.lab.end_at(30_000); flight.run()"

@@ -8,10 +8,10 @@ from contextlib import closing
 
 import psutil
 
-from hil.campaigns.config import find_spec, read_spec
-from hil.campaigns.jobs import Job, Row, failed, fly_job
-from hil.campaigns.sampling import plan_of
-from hil.campaigns.workers import FlyOne, Workers
+from hil.research.campaigns.config import find_spec, read_spec
+from hil.research.campaigns.jobs import Job, Row, failed, fly_job
+from hil.research.campaigns.sampling import plan_of
+from hil.research.campaigns.workers import FlyOne, Workers
 
 FLIGHTS = 24
 EMPTY_FLIGHTS = 300

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hil.learn.envs import make_env, make_vec
+from hil.research.learn.envs import make_env, make_vec
 
 MANY, FAST_STEPS, PEER_STEPS = 1024, 100, 30
 WHOLE_STEPS = 200  # before the robot, which nothing controls, is lost: after 2.7 s

@@ -18,7 +18,7 @@ class ReleaseHook(BuildHookInterface[Any]):
         if version != "standard":
             return
         sys.path.insert(0, self.root)
-        from hil.installation import COMMIT, commit
+        from hil.laboratory.files.installation import COMMIT, commit
 
         # An sdist has the file already, and packs it with the package.
         if not COMMIT.is_file() and (text := commit()):

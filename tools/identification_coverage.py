@@ -19,13 +19,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hil.campaigns.run import Runner
 from hil.errors import LabError
-from hil.floaty.correction import PAPER_TABLE
-from hil.identify.identify import IDENTIFIED, IdentifiedConstant, identify
-from hil.identify.record import load_record
 from hil.laboratory.request import Options
-from hil.studies.tuning import EXCITATIONS
+from hil.research.campaigns.run import Runner
+from hil.research.identify.identify import IDENTIFIED, IdentifiedConstant, identify
+from hil.research.identify.record import load_record
+from hil.research.studies.tuning import EXCITATIONS
+from hil.world.floaty.correction import PAPER_TABLE
 
 FIRST_SEED = 1001  # not used in development
 UNTOUCHED = ("z_vz",)  # follows from the plate's physics

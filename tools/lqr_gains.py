@@ -7,9 +7,20 @@ are the optimum of all 16 states. The weights are Bryson's: one accepted error c
 import sys
 
 from hil.config import LabConfig, load_config
-from hil.design.axes import ANGLE, AXES, HEIGHT, POSITION, RATE, STEP_S, VELOCITY, YAW, dynamics, robot_of
-from hil.design.gains import regulator
-from hil.design.loop import held
+from hil.research.design.axes import (
+    ANGLE,
+    AXES,
+    HEIGHT,
+    POSITION,
+    RATE,
+    STEP_S,
+    VELOCITY,
+    YAW,
+    dynamics,
+    robot_of,
+)
+from hil.research.design.gains import regulator
+from hil.research.design.loop import held
 
 ACCEPTED = {POSITION: 0.05, VELOCITY: 0.2, ANGLE: 0.15, RATE: 2.0}  # [m], [m/s], [rad], [rad/s]
 BETTER = {YAW: {ANGLE: 0.1}, HEIGHT: {POSITION: 0.03}}

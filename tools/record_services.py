@@ -16,9 +16,9 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
+from hil.board.image_firmware import ChipImage  # noqa: E402
 from hil.deploy.service_programs import PROGRAMS, STOCK  # noqa: E402 - from this tree
 from hil.deploy.services import ServiceBench, play_in_copies  # noqa: E402
-from hil.devices.image_firmware import ChipImage  # noqa: E402
 
 FOLDER = ROOT / "tests" / "vectors" / "services"
 

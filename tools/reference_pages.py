@@ -19,9 +19,9 @@ sys.path.insert(
 
 from firmware_py.firmware import Firmware
 from firmware_py.table import OF_PROFILE
+from hil.board.pins import VirtualBoard
 from hil.commands import app
 from hil.config import LabConfig, load_config
-from hil.devices.board import VirtualBoard
 from hil.laboratory.fault_kinds import KINDS
 
 # The meaning of the groups of columns; a group without a sentence, or the reverse, ends the build.

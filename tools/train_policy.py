@@ -20,7 +20,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
-import hil.learn  # noqa: F401 - registers the environments
+import hil.research.learn  # noqa: F401 - registers the environments
 
 SCALE = np.repeat(  # of an observation: m, m/s, rad, rad/s, rad, -1..1
     np.array([0.1, 0.3, 0.2, 1.5, 0.2, 1.0], np.float32), (3, 3, 3, 3, 4, 4)

@@ -20,7 +20,7 @@ from firmware_py.extras import why_missing
 from ground_station.stops import stopped_like_ctrl_c
 from hil.commands.options import INTERRUPTED, warn
 from hil.errors import LabError, OutputError
-from hil.installation import describe
+from hil.laboratory.files.installation import describe
 
 # File and function of each command, in the order of the help.
 COMMANDS = {

@@ -11,8 +11,8 @@ from hil.commands.options import INTERRUPTED, PATH, announce_compilation, notice
 from hil.errors import LabError, require
 
 if TYPE_CHECKING:
-    from hil.campaigns.config import Spec
-    from hil.campaigns.jobs import Job
+    from hil.research.campaigns.config import Spec
+    from hil.research.campaigns.jobs import Job
 
 
 @click.command()
@@ -34,10 +34,10 @@ def campaign(
     interrupted, likewise.
     """
     require("floaty campaign", "campaign", "SALib", "scipy")
-    from hil.campaigns.config import find_spec, read_spec
-    from hil.campaigns.report import write_report
-    from hil.campaigns.run import Runner
-    from hil.campaigns.sampling import check_spec, draw, plan_of
+    from hil.research.campaigns.config import find_spec, read_spec
+    from hil.research.campaigns.report import write_report
+    from hil.research.campaigns.run import Runner
+    from hil.research.campaigns.sampling import check_spec, draw, plan_of
 
     file = find_spec(spec)
     read = read_spec(file)
@@ -72,7 +72,7 @@ def campaign(
 
 def _shrink(spec: Spec, drawn: Job) -> int:
     from hil.api import command_of
-    from hil.campaigns.shrink import Reflight, shrink
+    from hil.research.campaigns.shrink import Reflight, shrink
 
     reflight = Reflight(spec, drawn, lambda text: warn(text))
     whole = reflight.request(reflight.whole)

@@ -12,7 +12,7 @@ from hil.errors import reading
 
 if TYPE_CHECKING:
     from hil.pictures.compare import Comparison
-    from hil.studies.two_boards import Seed
+    from hil.research.studies.two_boards import Seed
 
 NAMED = 5  # columns that only one run has
 
@@ -32,10 +32,10 @@ def compare(first: Path, second: Path, out: Path | None, named: str | None) -> i
 
     Exit code 0: the logs are identical; 1: they differ; 2: bad input.
     """
-    from hil.experiments import check_flown, find_experiment, find_shipped, finder_of
+    from hil.laboratory.experiments import check_flown, find_experiment, find_shipped, finder_of
     from hil.pictures.compare import compare as compare_runs
     from hil.pictures.compare import load_flown, write_comparison
-    from hil.studies.two_boards import comparable, seeds_of, two_boards
+    from hil.research.studies.two_boards import comparable, seeds_of, two_boards
 
     given = None if named is None else find_experiment(named)
     with reading(f"{first}, {second}"):

@@ -247,9 +247,9 @@ def doctor(link: str, profile: str, overrides: tuple[str, ...]) -> int:
 
     The board must not fly, and nothing moves. Exit code 0: no defect; 1: a defect; 2: no board answers.
     """
+    from hil.board.real_core import open_real_core
     from hil.config import load_config
     from hil.deploy.doctor import examine
-    from hil.devices.real_core import open_real_core
 
     config = load_config(profile, overrides)
     well = True

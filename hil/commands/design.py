@@ -13,8 +13,8 @@ from hil.commands.options import PATH, say
 from hil.errors import LabError, made_folder, require, writing
 
 if TYPE_CHECKING:
-    from hil.design.analysis import Analysis
-    from hil.design.linear import Point
+    from hil.research.design.analysis import Analysis
+    from hil.research.design.linear import Point
 
 SPEED_MAX = 60.0  # [m/s] the largest that a profile allows
 
@@ -68,7 +68,7 @@ def design(context: click.Context, robot: DesignOptions) -> None:
     require("floaty design", "design", "scipy", "control")
     if context.invoked_subcommand is not None:
         return
-    from hil.design.analysis import analyse, write
+    from hil.research.design.analysis import analyse, write
 
     common.check_profile("--write", robot.write_to)
     point = point_of(robot)
@@ -107,11 +107,11 @@ def design(context: click.Context, robot: DesignOptions) -> None:
 @common.asked_as(Search)
 def optimise(asked: Search) -> None:
     """Find the kink, centre of mass, base plate and strip with the largest figure, at the profile's span, mass and speed."""
-    from hil.design import figures
-    from hil.design import optimise as search
-    from hil.design.bounds import at_bounds
-    from hil.design.claims import robot_lines
     from hil.pictures.drawing import png
+    from hil.research.design import figures
+    from hil.research.design import optimise as search
+    from hil.research.design.bounds import at_bounds
+    from hil.research.design.claims import robot_lines
 
     profile, figure, updrafts = asked.profile, asked.figure, asked.updrafts
     if updrafts[0] >= updrafts[1]:
@@ -142,8 +142,8 @@ def optimise(asked: Search) -> None:
 
 def write_profile(point: "Point", path: Path, about: str, length: float = 1.0) -> None:
     """Write a profile that flies the robot."""
-    from hil.design.gains import gains_of, profile_text
-    from hil.whole_files import write_whole
+    from hil.laboratory.files.whole_files import write_whole
+    from hil.research.design.gains import gains_of, profile_text
 
     text = profile_text(point, gains_of(point.linear), about, length)
     with writing("--write", path):
@@ -154,8 +154,8 @@ def write_profile(point: "Point", path: Path, about: str, length: float = 1.0) -
 def point_of(robot: DesignOptions) -> "Point":
     """Return a profile's robot, or a similar one, in its design hover or at another speed or angle."""
     from hil.config import load_config
-    from hil.design.linear import point_of as own_point_of
-    from hil.design.trim import opening_at, scaled
+    from hil.research.design.linear import point_of as own_point_of
+    from hil.research.design.trim import opening_at, scaled
 
     speed, angle = robot.speed, robot.angle
     config = load_config(robot.profile, robot.overrides)

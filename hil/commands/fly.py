@@ -81,7 +81,7 @@ def fly(
     Exit code 0: all limits hold; 1: a limit fails; 2: bad input; 130: interrupted.
     """
     if options["trace"]:
-        import hil.exports.perfetto  # noqa: F401 - reports a missing package now, not after the flight
+        import hil.pictures.exports.perfetto  # noqa: F401 - reports a missing package now, not after the flight
     from hil.api import request_of
 
     request = request_of(experiment, **options)
@@ -93,7 +93,7 @@ def fly(
     if seeds > 1:
         requests = [replace(request, seed=request.seed + index) for index in range(seeds)]
         return _fly_many(requests, options, out or Path("runs"), (workers, cluster, resume))
-    from hil.laboratory.folder import folder_of, moved, reserved
+    from hil.laboratory.files.folder import folder_of, moved, reserved
 
     folder = out or folder_of(request)
     if out is None and (why := moved(request, folder)):
@@ -137,7 +137,7 @@ def _fly_one(request: Request, folder: Path, target: str | None) -> int:
         progress.update(bar, description="writing recording and report", total=None, now="")
         common.write_pictures(folder, request.experiment)
         if request.bench.trace:
-            from hil.exports.perfetto import write_perfetto
+            from hil.pictures.exports.perfetto import write_perfetto
 
             write_perfetto(folder)
     print_result(result)
@@ -154,9 +154,9 @@ def _fly_many(
     requests: list[Request], options: Options, parent: Path, crew: tuple[int | None, str, bool]
 ) -> int:
     """Fly seeds in parallel processes; print one row per seed and a summary; return the exit code."""
-    from hil.campaigns.jobs import Job
-    from hil.campaigns.run import Runner
-    from hil.laboratory.folder import folder_of, moved
+    from hil.laboratory.files.folder import folder_of, moved
+    from hil.research.campaigns.jobs import Job
+    from hil.research.campaigns.run import Runner
 
     placed = [(request, folder_of(request, parent)) for request in requests]
     jobs = [

@@ -13,9 +13,9 @@ from hil.commands.options import PATH, say, warn
 from hil.errors import LabError, made_folder, reading, require, writing
 
 if TYPE_CHECKING:
-    from hil.design.margins import Margins
-    from hil.identify.identify import Identification
-    from hil.studies.tuning import Round
+    from hil.research.design.margins import Margins
+    from hil.research.identify.identify import Identification
+    from hil.research.studies.tuning import Round
 
 
 @click.command()
@@ -44,11 +44,11 @@ def identify(
     Exit code 0: at least one constant is identified; 1: none; 2: bad input.
     """
     require("floaty identify", "identify", "scipy")
-    from hil.identify.identify import IDENTIFIED, check_held_out
-    from hil.identify.identify import identify as identify_records
-    from hil.identify.pages import write_pages
-    from hil.identify.record import load_record, profile_of
-    from hil.identify.robots import write_profile
+    from hil.research.identify.identify import IDENTIFIED, check_held_out
+    from hil.research.identify.identify import identify as identify_records
+    from hil.research.identify.pages import write_pages
+    from hil.research.identify.record import load_record, profile_of
+    from hil.research.identify.robots import write_profile
 
     common.check_profile("--profile-out", profile_out)
     with reading(", ".join(map(str, (*runs, *filter(None, [validate]))))):
@@ -70,7 +70,7 @@ def identify(
 
 
 def _print_constants(found: "Identification") -> None:
-    from hil.identify.identify import rows_of
+    from hil.research.identify.identify import rows_of
 
     table = Table(title="constants, with the half width of their 95 % interval")
     rows = rows_of(found.constants)
@@ -128,9 +128,9 @@ def tune(
     input, no gains, or a lost robot.
     """
     require("floaty tune", "design", "scipy", "control")
-    from hil.campaigns.run import Runner
     from hil.config import load_config
-    from hil.studies.tuning import TuningFlights, fly_round, rounds, write_tuned
+    from hil.research.campaigns.run import Runner
+    from hil.research.studies.tuning import TuningFlights, fly_round, rounds, write_tuned
 
     common.check_profile("--out", out)
     made_folder("--runs", runs)
@@ -163,7 +163,7 @@ def tune(
 
 def _print_round(one: "Round") -> None:
     """Print a round: gains, margins, predicted and flown motion."""
-    from hil.studies.tuning import rms
+    from hil.research.studies.tuning import rms
 
     tuned = one.tuned
     for table in (_gains(one), _edges(one), _motion(one)):

@@ -15,7 +15,7 @@ from hil.commands.options import PATH, console, say, wide_console
 from hil.errors import LabError, refusing
 
 if TYPE_CHECKING:
-    from hil.laboratory.result import Result
+    from hil.laboratory.files.result import Result
 
 HASH_DIGITS = 12
 
@@ -29,9 +29,9 @@ def list_experiments(file: Path | None, faults: bool) -> None:
     Includes experiments of installed packages, with their package; FILE.py: those of a file, and its faults.
     """
     from hil.config import DEFAULT_PROFILE, profile_names
-    from hil.experiments import EXPERIMENTS
-    from hil.experiments.own import entries, in_package, in_whole_file, package_of
-    from hil.studies.catalogue import STUDIES
+    from hil.laboratory.experiments import EXPERIMENTS
+    from hil.laboratory.experiments.own import entries, in_package, in_whole_file, package_of
+    from hil.research.studies.catalogue import STUDIES
 
     own = in_whole_file(file) if file else {}
     if faults:
@@ -83,8 +83,8 @@ def _list_faults() -> None:
 def runs(folder: Path) -> None:
     """List the run folders below FOLDER [runs], the latest last: date, request, verdict and hash."""
 
-    from hil.laboratory.recorder import EVENTS
-    from hil.laboratory.result import RESULT, read_result
+    from hil.laboratory.files.recorder import EVENTS
+    from hil.laboratory.files.result import RESULT, read_result
 
     with refusing(f"runs {folder}: ", OSError):
         found = [path for name in (EVENTS, RESULT) for path in folder.rglob(name)]

@@ -22,7 +22,7 @@ from hil.errors import LabError
 
 if TYPE_CHECKING:
     from hil.laboratory.experiment import Experiment
-    from hil.laboratory.result import Result
+    from hil.laboratory.files.result import Result
     from hil.live.feed import LiveView
 
 INTERRUPTED = 130
@@ -164,7 +164,7 @@ def check_profile(option: str, path: Path | None) -> None:
 def announce_compilation() -> None:
     """Announce that the first run compiles, which takes a while."""
     from firmware_py.compiling import must_compile
-    from hil.devices.imu import channels
+    from hil.board.imu import channels
 
     if must_compile(channels):
         warn(COMPILING)
@@ -213,7 +213,7 @@ def close_live(view: LiveView | None, result: Result | None = None, say: Callabl
     """Close the picture, and record and report the rows that it missed."""
     if view is None:
         return
-    from hil.laboratory.result import write_result
+    from hil.laboratory.files.result import write_result
     from hil.live.feed import missed_text
 
     missed = view.close()

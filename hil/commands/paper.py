@@ -16,9 +16,9 @@ from hil.commands.options import PATH, say, warn
 from hil.errors import made_folder, require, writing
 
 if TYPE_CHECKING:
-    from hil.studies.paper import Paper
-    from hil.studies.paper_identification import PaperConstant
-    from hil.studies.study import Study
+    from hil.research.studies.paper import Paper
+    from hil.research.studies.paper_identification import PaperConstant
+    from hil.research.studies.study import Study
 
 seeds_option = click.option(
     "--seeds",
@@ -44,8 +44,8 @@ def paper(seeds: int, out: Path, only: str | None, no_studies: bool, **crew: Any
     Exit code 0: all limits hold for the default profile; 1: one fails; 2: bad input; 130: interrupted, with a report
     on the finished flights.
     """
-    from hil.studies.catalogue import STUDIES
-    from hil.studies.paper import select
+    from hil.research.studies.catalogue import STUDIES
+    from hil.research.studies.paper import select
 
     studies = [] if only or no_studies else list(STUDIES.values())
     return _fly(select(only), studies, seeds, out, crew, mounted=not only)
@@ -61,7 +61,7 @@ def study(name: str, seeds: int, out: Path | None, **crew: Any) -> int:
 
     Exit code 0: every outcome is the expected one; 1: one is not; 2: bad input; 130: interrupted.
     """
-    from hil.studies.catalogue import find_study
+    from hil.research.studies.catalogue import find_study
 
     return _fly([], [find_study(name)], seeds, out or Path("runs") / f"study-{name}", crew)
 
@@ -75,14 +75,14 @@ def _fly(
     mounted: bool = False,
 ) -> int:
     require("floaty paper", "design", "scipy")
-    from hil.campaigns.run import Runner
     from hil.config import load_config
-    from hil.design.analysis import analyse
-    from hil.design.linear import point_of
-    from hil.studies import drag_model
-    from hil.studies.paper import fly_paper
-    from hil.studies.paper_identification import fly_identification, fly_scaling
-    from hil.studies.paper_report import write_paper
+    from hil.research.campaigns.run import Runner
+    from hil.research.design.analysis import analyse
+    from hil.research.design.linear import point_of
+    from hil.research.studies import drag_model
+    from hil.research.studies.paper import fly_paper
+    from hil.research.studies.paper_identification import fly_identification, fly_scaling
+    from hil.research.studies.paper_report import write_paper
 
     common.announce_compilation()
     with writing("--out", made_folder("--out", out)), Runner(common.notices, **crew) as runner:
@@ -107,8 +107,8 @@ def _fly(
 
 
 def _print_rows(flown: "Paper") -> None:
-    from hil.studies.catalogue import PROFILES
-    from hil.studies.paper import Spread
+    from hil.research.studies.catalogue import PROFILES
+    from hil.research.studies.paper import Spread
 
     if not flown.rows:
         return
@@ -132,7 +132,7 @@ def _print_rows(flown: "Paper") -> None:
 
 
 def _print_constants(constants: "Sequence[PaperConstant]") -> None:
-    from hil.studies.paper_identification import COLUMNS, WHY
+    from hil.research.studies.paper_identification import COLUMNS, WHY
 
     if not constants:
         return
@@ -164,7 +164,7 @@ def drag_model(seed: int, profile: str, overrides: tuple[str, ...], out: Path) -
     """Measure forces and torques on the mounted robot over flap angles, against the paper's simplified model."""
 
     from hil.config import load_config
-    from hil.studies import drag_model
+    from hil.research.studies import drag_model
 
     config = load_config(profile, overrides)
     config.robot.need_plates(profile, "floaty drag-model")

@@ -57,9 +57,9 @@ def report(run: Path, named: str | None) -> None:
 def export(run: Path, as_csv: bool, as_mcap: bool, as_tlog: bool, as_video: bool, as_gif: bool) -> None:
     """Write RUN, a run folder, in other formats, beside its log."""
     wanted = {
-        "exports.wide_csv.write_csv": as_csv,
-        "exports.mcap.write_mcap": as_mcap,
-        "exports.tlog.write_tlog": as_tlog,
+        "pictures.exports.wide_csv.write_csv": as_csv,
+        "pictures.exports.mcap.write_mcap": as_mcap,
+        "pictures.exports.tlog.write_tlog": as_tlog,
         "pictures.video.write_video": as_video,
         "pictures.video.write_gif": as_gif,
     }

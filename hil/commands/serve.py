@@ -18,8 +18,8 @@ from hil.commands.options import PATH
 from hil.errors import LabError, require
 
 if TYPE_CHECKING:
+    from hil.board.board_firmware import Executor
     from hil.config import LabConfig
-    from hil.devices.board_firmware import Executor
     from hil.live.feed import LiveView
     from hil.servers.motive import VirtualMotive
     from hil.servers.server import Endpoints, OpenEndpoints, Server

@@ -97,7 +97,7 @@ def station(asked: StationOptions) -> int:
     from ground_station.program import Session
     from ground_station.records import INCOMPLETE, STANDARD_OUTPUT, Records
     from hil.config import load_config
-    from hil.experiments import EXPERIMENTS, find_experiment
+    from hil.laboratory.experiments import EXPERIMENTS, find_experiment
 
     config, experiment = load_config(asked.profile, asked.overrides), find_experiment(asked.named)
     _check_files(asked)
@@ -164,7 +164,7 @@ class OperatorConsole:
 
     def note(self, text: str) -> None:
         """Record an action of the operator."""
-        from hil.laboratory.recorder import OPERATOR
+        from hil.laboratory.files.recorder import OPERATOR
 
         if self.flight is not None:
             self.flight.note(OPERATOR, text)
@@ -200,7 +200,7 @@ def _check_files(asked: StationOptions) -> None:
 
 
 def _trajectory_of(name: str) -> Callable[[Goal, int], Trajectory]:
-    from hil.experiments import find_experiment
+    from hil.laboratory.experiments import find_experiment
 
     try:
         return find_experiment(name).trajectory

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from ground_station.latency import budget_line
-from hil.clock import process_age_s
+from hil.board.clock import process_age_s
 from hil.commands.options import console, right, say, wide_console
 
 if TYPE_CHECKING:
-    from hil.campaigns.jobs import Row
-    from hil.laboratory.result import Result
+    from hil.laboratory.files.result import Result
+    from hil.research.campaigns.jobs import Row
 
 SEED_COLUMNS = (
     ("rms x y z [cm]", ("rms_x", "rms_y", "rms_z"), 100.0, 2),
@@ -59,8 +59,8 @@ def print_seeds(rows: list[Row]) -> None:
 
 def print_result(result: Result) -> None:
     """Print one flight's verdicts and files."""
+    from hil.laboratory.files.recorder import SETTINGS, load_events
     from hil.laboratory.metrics import METRICS, short_of
-    from hil.laboratory.recorder import SETTINGS, load_events
 
     title = f"{result.request.title}, profile {result.request.profile}"
     table = Table("metric", *right("value", "limit", "verdict"), title=title)

@@ -3,7 +3,7 @@
 A second flight takes the supervisor through its states, which must be the same in the same order.
 
 The two are never equal bit for bit: boot time, gyro zero, the estimator's phase and the board's microsecond differ
-(`hil.studies.two_boards`). The bounds are about twice the largest difference of ten correct flights: seeds 1 to 5, the app
+(`hil.research.studies.two_boards`). The bounds are about twice the largest difference of ten correct flights: seeds 1 to 5, the app
 compiled by gcc 12.2 and by clang 22. Each is a hover of 4 s with a push and a cut link; the largest differences are 0.96 mm
 of position and 370 servo counts (rms). The first pose after the cut is about as old as the filter's horizon, and the phase
 decides whether it is fused: if one board fuses it and the other waits for the next one, the estimate differs by 5 cm in one
@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from firmware_py.export.boards import C
 from hil.deploy.drill import DRILL
-from hil.experiments.position import HOVER
+from hil.laboratory.experiments.position import HOVER
+from hil.laboratory.files.recorder import load_events
+from hil.laboratory.files.result import Result
 from hil.laboratory.flight import Flight
 from hil.laboratory.metrics import column, free_flight
-from hil.laboratory.recorder import load_events
 from hil.laboratory.request import Options, Request
-from hil.laboratory.result import Result
 from hil.laboratory.run import fly
 from hil.pictures.compare import FlownRun, load_flown
 

@@ -17,12 +17,12 @@ from firmware_py.export.side_by_side import ComparedTarget, SideBySide
 from firmware_py.rtos import TaskError, WatchdogError
 from firmware_py.wire.supervisor import Cause, State
 from ground_station.errors import LinkError
+from hil.board.board_firmware import PythonBoard
 from hil.deploy.drill import DRILL, FAILURE
-from hil.devices.board_firmware import PythonBoard
 from hil.errors import LabError
-from hil.experiments import EXPERIMENTS, find_experiment
-from hil.experiments.position import HOVER
 from hil.laboratory.experiment import Experiment
+from hil.laboratory.experiments import EXPERIMENTS, find_experiment
+from hil.laboratory.experiments.position import HOVER
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Fault, parse
 from hil.laboratory.flight import Flight

@@ -33,9 +33,9 @@ from firmware_py.wire.supervisor import PLATFORM_VERSION, VERSION_FIRMWARE, Stat
 from ground_station.clock import clock_us, wait
 from ground_station.errors import LinkError
 from ground_station.links.core_client import CoreClient, SilenceError
+from hil.board.real_core import RealCore
+from hil.board.sample_window import SampleWindow
 from hil.config import LabConfig
-from hil.devices.real_core import RealCore
-from hil.devices.sample_window import SampleWindow
 
 ROUND_TRIPS = 100
 BURST = 600  # packets

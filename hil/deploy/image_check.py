@@ -18,22 +18,22 @@ from firmware_py.wire.crtp import PORT_PARAMETERS, Packet, decode, encode
 from firmware_py.wire.parameters import CHANNEL_WRITE, encode_ident
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.supervisor import Cause
-from hil.bodies import make_body
+from hil.board.board_firmware import PythonBoard
+from hil.board.image_firmware import ChipImage, ImageFirmware
+from hil.board.imu import VirtualImu
+from hil.board.pins import VirtualBoard
 from hil.config import LabConfig, load_config
 from hil.deploy.beside import fly_beside_python
 from hil.deploy.doctor import Finding
 from hil.deploy.service_programs import PROGRAMS
 from hil.deploy.services import ServiceBench, differences, play_in_copies
-from hil.devices.board import VirtualBoard
-from hil.devices.board_firmware import PythonBoard
-from hil.devices.image_firmware import ChipImage, ImageFirmware
-from hil.devices.imu import VirtualImu
+from hil.emulator.events import EventQueue
+from hil.emulator.stm32f405.image import Image, MemoryUse
 from hil.errors import LabError
-from hil.events import EventQueue
+from hil.laboratory.bodies import make_body
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import image_at
 from hil.laboratory.robot import BENCH_NOISE, Streams
-from hil.stm32f405.image import Image, MemoryUse
 
 FREE_LEAST = 1024  # [bytes]
 APP = "floaty_toc_apply"  # exists in images with the exported app

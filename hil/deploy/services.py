@@ -25,11 +25,11 @@ from firmware_py.wire.log import LogCommand
 from firmware_py.wire.parameters import SetByName, encode_set_by_name
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.supervisor import PLATFORM_APP, State
+from hil.board.board_firmware import BoardFirmware, Executor, PowerOn
+from hil.board.pins import VirtualBoard
 from hil.config import LabConfig, load_config
-from hil.devices.board import VirtualBoard
-from hil.devices.board_firmware import BoardFirmware, Executor, PowerOn
+from hil.emulator.events import EventQueue
 from hil.errors import LabError
-from hil.events import EventQueue
 
 HOME = (0.0, 0.0, 1.15)
 STEP_US = 1_000

@@ -14,7 +14,7 @@ from firmware_py.export.errors import ExportError
 from firmware_py.export.native import build
 from firmware_py.export.usage import EntryLoad
 from firmware_py.logic.loading import translation_of
-from hil.devices.real_core import RealCore, is_link, open_real_core
+from hil.board.real_core import RealCore, is_link, open_real_core
 from hil.errors import LabError
 
 PLAIN, C_O0, C_O2, CORTEX_M4 = TARGETS = ("plain", "c-O0", "c-O2", "cortex-m4")

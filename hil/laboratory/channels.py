@@ -18,10 +18,10 @@ from ground_station.latency import STAGES
 from ground_station.program import StationSession
 from ground_station.tracker import Tracker
 from ground_station.trajectory import Goal, Trajectory
-from hil.devices.board_firmware import BoardFirmware
-from hil.devices.cameras import VirtualMocap
-from hil.devices.radio import VirtualRadio
-from hil.devices.uart import VirtualSerial
+from hil.board.board_firmware import BoardFirmware
+from hil.board.cameras import VirtualMocap
+from hil.board.radio import VirtualRadio
+from hil.board.uart import VirtualSerial
 from hil.laboratory.faults import Fault
 from hil.laboratory.robot import Robot
 from hil.world.battery import Battery

@@ -11,8 +11,8 @@ from typing import Any
 import pyarrow as pa
 
 from ground_station.trajectory import Goal, Hold, Trajectory
-from hil.arguments import checked
 from hil.errors import LabError, blame, refusing
+from hil.laboratory.arguments import checked
 from hil.laboratory.faults import Fault
 from hil.laboratory.metrics import METRICS, Metric, check_limits, free_flight, measure
 from hil.laboratory.robot import Robot

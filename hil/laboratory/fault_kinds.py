@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from functools import cache, partial
 from typing import Literal
 
-from hil.arguments import checked, fits
-from hil.bodies import FAILURES
 from hil.config import DEFAULT_PROFILE
 from hil.errors import LabError, blame, hint, shown
+from hil.laboratory.arguments import checked, fits
+from hil.laboratory.bodies import FAILURES
 from hil.laboratory.robot import LINKS, Robot, attributes_of, probe
 from hil.world.body import Failure
 

@@ -15,11 +15,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hil.arguments import checked
 from hil.config import LabConfig
 from hil.errors import LabError, hint
+from hil.laboratory.arguments import checked
 from hil.laboratory.fault_kinds import KINDS, MARKERS_ON, Kind, Knob
-from hil.laboratory.recorder import release_of, stored_in
+from hil.laboratory.files.recorder import release_of, stored_in
 from hil.laboratory.robot import Robot
 
 _LENGTH_AND_SIZE = r"(?::(?P<duration>[^@:=]+))?(?:=(?P<size>[^@:=]+))?"

@@ -12,13 +12,13 @@ from typing import Protocol
 from firmware_py.signals import COUNTERS
 from firmware_py.wire.supervisor import Cause
 from ground_station.trajectory import Trajectory
-from hil.clock import Clock
-from hil.devices.board_firmware import Executor
-from hil.events import EventQueue
+from hil.board.board_firmware import Executor
+from hil.board.clock import Clock
+from hil.emulator.events import EventQueue
 from hil.laboratory import channels
 from hil.laboratory.faults import Switchboard
+from hil.laboratory.files.recorder import Recorder
 from hil.laboratory.laboratory import Laboratory, Progress
-from hil.laboratory.recorder import Recorder
 from hil.laboratory.request import Request
 from hil.laboratory.robot import PYTHON_BOARD, Robot, Site, Streams
 from hil.laboratory.schedule import WINDOW_US, ScheduleTrace

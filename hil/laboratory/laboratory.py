@@ -7,9 +7,9 @@ samples up to the next other event by itself.
 
 from collections.abc import Callable
 
-from hil.clock import Clock, FreeRunning
+from hil.board.clock import Clock, FreeRunning
+from hil.emulator.events import EndlessInstantError, EventQueue
 from hil.errors import refusing
-from hil.events import EndlessInstantError, EventQueue
 from hil.laboratory.robot import Robot
 
 NEVER_US = 1 << 62

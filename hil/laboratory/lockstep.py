@@ -18,22 +18,22 @@ from ground_station.station import GroundStation, Link
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.tracker import tracker_of
 from ground_station.trajectory import FlightPlan, Goal, Trajectory
-from hil.clock import Clock, FreeRunning, Paced
-from hil.crazyflie.shockburst import Air
-from hil.devices.board_firmware import Executor, Flashed, PythonBoard
-from hil.devices.image_firmware import ChipImage
-from hil.devices.image_settings import APP_PARAMETER, NO_APP, ImageSettings, stock_contents
-from hil.devices.radio import Receiver, VirtualRadio
-from hil.devices.real_core import is_link, real_core
-from hil.devices.uart import VirtualSerial
+from hil.board.board_firmware import Executor, Flashed, PythonBoard
+from hil.board.clock import Clock, FreeRunning, Paced
+from hil.board.image_firmware import ChipImage
+from hil.board.image_settings import APP_PARAMETER, NO_APP, ImageSettings, stock_contents
+from hil.board.radio import Receiver, VirtualRadio
+from hil.board.real_core import is_link, real_core
+from hil.board.uart import VirtualSerial
+from hil.emulator.crazyflie.shockburst import Air
+from hil.emulator.stm32f405.gdb import GdbServer
 from hil.errors import LabError, refusing
 from hil.laboratory.channels import radio_channel, serial_channel, tracker_channel
+from hil.laboratory.files.recorder import SETTINGS
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import Laboratory
-from hil.laboratory.recorder import SETTINGS
 from hil.laboratory.request import MAVLINK, Request
 from hil.laboratory.robot import PYTHON_BOARD, Ports, Robot, Site
-from hil.stm32f405.gdb import GdbServer
 from hil.world.body import Channel
 
 

@@ -17,8 +17,8 @@ from pydantic import BeforeValidator, PlainSerializer
 from firmware_py.geometry import euler_zyx_of
 from firmware_py.signals import REFUSED
 from firmware_py.wire.supervisor import State
-from hil.arguments import checked
 from hil.errors import LabError, hint, shown
+from hil.laboratory.arguments import checked
 
 NEAR = 0.06  # [m] "less than 6 cm over each axis"
 BOX = 0.10  # [m] half of the 20 cm box

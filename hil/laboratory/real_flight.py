@@ -17,16 +17,24 @@ from ground_station.mocap import MocapFrame
 from ground_station.program import StationSession
 from ground_station.records import Records
 from ground_station.telemetry_log import TELEMETRY
-from hil.bodies import make_body
 from hil.config import LabConfig
 from hil.errors import LabError, made_folder, require_empty
 from hil.laboratory.ages import STATION_START
+from hil.laboratory.bodies import make_body
 from hil.laboratory.channels import station_channels
+from hil.laboratory.files.recorder import STREAM, Observer, Recorder, load_log
+from hil.laboratory.files.result import (
+    Outcome,
+    Program,
+    Result,
+    judged,
+    metadata_of,
+    with_resets,
+    write_result,
+)
 from hil.laboratory.flight import RECORD_PERIOD_US
 from hil.laboratory.metrics import check_limits, measure
-from hil.laboratory.recorder import STREAM, Observer, Recorder, load_log
 from hil.laboratory.request import Request, why_left
-from hil.laboratory.result import Outcome, Program, Result, judged, metadata_of, with_resets, write_result
 from hil.laboratory.robot import Streams
 
 

@@ -27,10 +27,10 @@ from firmware_py.export.boards import BOARDS, CORTEX_M4, C
 from ground_station.links.crazyflie_link import FlightTimes, FromFloor
 from ground_station.links.schemes import SCHEMES
 from ground_station.trajectory import Goal, Trajectory
-from hil.arguments import checked
+from hil.board.real_core import is_link
 from hil.config import DEFAULT_PROFILE, LabConfig, Overrides, check_logic, read_config, settings_of
-from hil.devices.real_core import is_link
 from hil.errors import LabError, require
+from hil.laboratory.arguments import checked
 from hil.laboratory.experiment import Experiment, Source, unknown
 from hil.laboratory.faults import Fault, check, parse
 from hil.laboratory.metrics import check_limits, limits_of

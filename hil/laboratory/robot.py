@@ -16,18 +16,18 @@ from typing import Literal
 import numpy as np
 
 from ground_station.mocap import MocapFrame
-from hil.bodies import make_body
+from hil.board.board_firmware import Executor, PowerOn, PythonBoard
+from hil.board.cameras import VirtualMocap
+from hil.board.imu import GYRO_COUNTS, VirtualImu
+from hil.board.markers import Sighting, VirtualMarkers
+from hil.board.pins import CpuLoad, InjectFailure, Requests, VirtualBoard, new_eeprom, unsupported
+from hil.board.uart import VirtualSerial
 from hil.config import LabConfig, load_config
-from hil.crazyflie import syslink
-from hil.crazyflie.shockburst import Air
-from hil.devices.board import CpuLoad, InjectFailure, Requests, VirtualBoard, new_eeprom, unsupported
-from hil.devices.board_firmware import Executor, PowerOn, PythonBoard
-from hil.devices.cameras import VirtualMocap
-from hil.devices.imu import GYRO_COUNTS, VirtualImu
-from hil.devices.markers import Sighting, VirtualMarkers
-from hil.devices.uart import VirtualSerial
+from hil.emulator.crazyflie import syslink
+from hil.emulator.crazyflie.shockburst import Air
+from hil.emulator.events import EventQueue
 from hil.errors import LabError
-from hil.events import EventQueue
+from hil.laboratory.bodies import make_body
 from hil.world.battery import Battery, open_circuit_voltage
 from hil.world.body import Body, Carrier
 

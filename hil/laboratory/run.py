@@ -14,16 +14,12 @@ from pathlib import Path
 from firmware_py.rtos import WatchdogError
 from ground_station.errors import LinkError
 from ground_station.telemetry_log import TELEMETRY
-from hil.clock import Pace
+from hil.board.clock import Pace
 from hil.config import check_logic
 from hil.laboratory.ages import with_goals_sent
-from hil.laboratory.flight import Flight
-from hil.laboratory.folder import replacing_older
-from hil.laboratory.laboratory import Progress
-from hil.laboratory.lockstep import in_lockstep
-from hil.laboratory.recorder import Observer, Recorder, load_log
-from hil.laboratory.request import Request
-from hil.laboratory.result import (
+from hil.laboratory.files.folder import replacing_older
+from hil.laboratory.files.recorder import Observer, Recorder, load_log
+from hil.laboratory.files.result import (
     Outcome,
     Program,
     QueueReport,
@@ -34,6 +30,10 @@ from hil.laboratory.result import (
     with_resets,
     write_result,
 )
+from hil.laboratory.flight import Flight
+from hil.laboratory.laboratory import Progress
+from hil.laboratory.lockstep import in_lockstep
+from hil.laboratory.request import Request
 
 LOADED_US = 250_000  # every part of the core has run by then
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet
 
-from hil.devices.board_firmware import BoardScheduler
+from hil.board.board_firmware import BoardScheduler
 from hil.errors import LabError
-from hil.laboratory.recorder import ARROW_ERRORS
-from hil.whole_files import replacing
+from hil.laboratory.files.recorder import ARROW_ERRORS
+from hil.laboratory.files.whole_files import replacing
 
 FILE = "schedule.parquet"
 WINDOW_US = 50_000

@@ -72,7 +72,7 @@ class Feed:
 
 
 class LiveView:
-    """`hil.laboratory.recorder.Observer` of a picture in another process, which `command` starts.
+    """`hil.laboratory.files.recorder.Observer` of a picture in another process, which `command` starts.
 
     `say` gets lines for the user. Raises `LabError` when the picture reports that it cannot open; a silent one is
     not waited for.

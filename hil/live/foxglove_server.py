@@ -1,4 +1,4 @@
-"""A live flight in Foxglove: a WebSocket server with the topics of `hil.exports.mcap` and, if wanted, the parameters.
+"""A live flight in Foxglove: a WebSocket server with the topics of `hil.pictures.exports.mcap` and, if wanted, the parameters.
 
 Foxglove's own server accepts any page in a browser, so this one speaks its protocol (`foxglove.sdk.v1`); the SDK encodes the
 messages, as MCAP. A client needs the token in the address, and a page must be Foxglove's or of this computer. A parameter
@@ -23,8 +23,8 @@ from foxglove.mcap import MCAPWriteOptions
 from tornado.ioloop import IOLoop
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
-from hil.exports.mcap import log_rows, log_texts
 from hil.live.local_server import Guarded, LocalServer
+from hil.pictures.exports.mcap import log_rows, log_texts
 
 PORT = 8765  # Foxglove's own
 PROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")

@@ -21,15 +21,15 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 from firmware_py.table import OF_PROFILE
 from hil.errors import LabError
 from hil.laboratory.fault_kinds import KINDS
+from hil.laboratory.files.recorder import stored_in
 from hil.laboratory.metrics import body, column
-from hil.laboratory.recorder import stored_in
 from hil.live.local_server import Guarded, LocalServer
 from hil.live.rerun_screen import RerunScreen
 from hil.live.window import LOOPBACK
 from hil.pictures import curves
 from hil.pictures.pages import data_uri, library
 from hil.pictures.video import GOAL_COLUMNS, VideoScene
-from hil.scene import Points, VisualModel
+from hil.world.scene import Points, VisualModel
 
 PORT = 9095
 PAGE = Path(__file__).with_name("panel.html")

@@ -11,11 +11,11 @@ from firmware_py.wire.crtp import PORT_PARAMETERS, Packet, decode
 from ground_station.controls import ControlsError, Dialogue, Exchange, Script
 from ground_station.operator import REACH
 from ground_station.trajectory import Goal, Hold
-from hil.devices.image_settings import board_values
+from hil.board.image_settings import board_values
 from hil.errors import LabError, hint
 from hil.laboratory.faults import parse
+from hil.laboratory.files.recorder import OPERATOR
 from hil.laboratory.flight import RECORD_PERIOD_US, RECORD_PHASE_US, Flight
-from hil.laboratory.recorder import OPERATOR
 from hil.live.feed import LiveView
 
 STEP_MS_MOST = 60_000

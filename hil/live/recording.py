@@ -8,7 +8,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 from hil.errors import LabError
-from hil.laboratory.result import read_result
+from hil.laboratory.files.result import read_result
 from hil.live.window import end, page_of, serve_viewer, show
 from hil.pictures.links import HOST, PORT, key_of
 from hil.pictures.report import REPORT

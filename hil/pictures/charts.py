@@ -7,9 +7,9 @@ import numpy as np
 import pyarrow as pa
 from matplotlib.figure import Figure
 
-from hil.experiments.overload import ROWS_PER_SECOND, thief_load
-from hil.experiments.power import CONVENTIONAL_W_PER_KG, VEHICLES
-from hil.experiments.power import power as mean_power
+from hil.laboratory.experiments.overload import ROWS_PER_SECOND, thief_load
+from hil.laboratory.experiments.power import CONVENTIONAL_W_PER_KG, VEHICLES
+from hil.laboratory.experiments.power import power as mean_power
 from hil.laboratory.metrics import BOX, column, free_flight, position_error
 from hil.pictures import curves
 from hil.pictures.drawing import beside, stack

@@ -15,11 +15,11 @@ import numpy as np
 import pyarrow as pa
 
 from hil.errors import LabError, unlinked, writing
-from hil.experiments import find_shipped
+from hil.laboratory.experiments import find_shipped
+from hil.laboratory.files.recorder import load_log, release_of, stored_in
+from hil.laboratory.files.result import Result, read_result
 from hil.laboratory.metrics import METRICS, SHOWN, column, free_flight, is_real, measure, rows_where
-from hil.laboratory.recorder import load_log, release_of, stored_in
 from hil.laboratory.request import Find
-from hil.laboratory.result import Result, read_result
 from hil.pictures import curves
 from hil.pictures.curves import since_release
 from hil.pictures.drawing import png

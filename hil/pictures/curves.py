@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from firmware_py.signals import REFUSED
 from ground_station.latency import STAGES
 from hil.laboratory.faults import switched_on
+from hil.laboratory.files.recorder import OPERATOR, release_of
 from hil.laboratory.metrics import attitude_error, column, position_error
-from hil.laboratory.recorder import OPERATOR, release_of
 
 ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK, GREY = (
     "#e69f00", "#56b4e9", "#009e73", "#b8a900", "#0072b2", "#d55e00", "#cc79a7", "#888888",

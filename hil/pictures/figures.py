@@ -13,10 +13,10 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from ground_station.latency import STAGES, reported_stages
-from hil.experiments.measures import yaw_and_goal
+from hil.laboratory.experiments.measures import yaw_and_goal
 from hil.laboratory.faults import spans_of
+from hil.laboratory.files.recorder import release_of
 from hil.laboratory.metrics import BOX, body, column, free_flight
-from hil.laboratory.recorder import release_of
 from hil.laboratory.schedule import runs
 from hil.pictures import curves
 from hil.pictures.curves import since_release

@@ -4,7 +4,7 @@ A page opened from disk cannot start a viewer, and rerun's browser viewer reads 
 links lead to this computer, where `floaty view RUN --view web` answers them for their run.
 """
 
-from hil.laboratory.result import Result
+from hil.laboratory.files.result import Result
 
 HOST, PORT = "127.0.0.1", 9877  # beside rerun's own 9876
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from firmware_py.wire.supervisor import State
 from hil.laboratory.faults import spans_of
+from hil.laboratory.files.recorder import release_of, stored_in
 from hil.laboratory.metrics import column, free_flight
-from hil.laboratory.recorder import release_of, stored_in
 from hil.pictures.curves import GREY, MOTORS, Curves, marks_of, since_release
 
 Signal = NDArray[np.float64]  # (N,)

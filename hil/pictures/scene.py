@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 
 from hil.laboratory.metrics import column
-from hil.scene import Part, Points
+from hil.world.scene import Part, Points
 
 
 def normals_of(part: Part) -> Points:

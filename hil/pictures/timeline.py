@@ -17,8 +17,8 @@ from firmware_py.wire.supervisor import State
 from hil.laboratory import metrics
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Span, spans_of
-from hil.laboratory.recorder import release_of, stored_in
-from hil.laboratory.result import Result
+from hil.laboratory.files.recorder import release_of, stored_in
+from hil.laboratory.files.result import Result
 from hil.pictures import curves
 from hil.pictures.curves import Curves, since_release
 from hil.pictures.figures import lanes_of_states, without_a_pose

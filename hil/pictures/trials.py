@@ -10,9 +10,9 @@ from functools import partial
 import numpy as np
 import pyarrow as pa
 
-from hil.experiments import measures, take_off
+from hil.laboratory.experiments import measures, take_off
+from hil.laboratory.files.recorder import stored_in
 from hil.laboratory.metrics import BOX, column, free_flight, position_error
-from hil.laboratory.recorder import stored_in
 from hil.pictures.curves import AXIS_COLOURS, BLUE, GREEN, GREY, ORANGE, SKY
 from hil.pictures.panels import INK, Panel, Plot, Series, Signal, lanes
 

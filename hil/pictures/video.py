@@ -18,13 +18,13 @@ from PIL import Image, ImageDraw
 from firmware_py.extras import install_command
 from firmware_py.geometry import yaw_quaternion
 from hil.errors import LabError, unlinked, writing
+from hil.laboratory.files.recorder import load_log, stored_in
 from hil.laboratory.metrics import BOX, body, column, free_flight, known
-from hil.laboratory.recorder import load_log, stored_in
 from hil.pictures import curves, scene
 from hil.pictures.curves import since_release
 from hil.pictures.drawing import STYLE, figure_of
 from hil.pictures.panels import Plot, marks_of_flight, panel
-from hil.scene import Part, Points, VisualModel
+from hil.world.scene import Part, Points, VisualModel
 
 VIDEO, GIF = "flight.mp4", "flight.gif"
 FRAMES_HZ = 30

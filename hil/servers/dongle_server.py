@@ -6,8 +6,8 @@ sockets are readable. Frames: see `dongle_plugin`.
 
 from collections.abc import Callable, Sequence
 
-from hil.clock import Readers
-from hil.devices.dongle import VirtualDongle
+from hil.board.clock import Readers
+from hil.board.dongle import VirtualDongle
 from hil.errors import LabError
 from hil.servers.dongle_plugin import CONTROL, HEAD_SIZE, PORTS, READ, WRITE, frame
 from hil.servers.tcp_port import Receive, TcpClient, TcpPort, TcpProtocol

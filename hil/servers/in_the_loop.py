@@ -1,6 +1,6 @@
 """A flight with a real board in the loop: the plant's clock follows the board's, everything else is as in lockstep.
 
-The board's own tasks fly on samples of the virtual IMU (`hil.devices.real_firmware`). Cameras, ground station and the
+The board's own tasks fly on samples of the virtual IMU (`hil.board.real_firmware`). Cameras, ground station and the
 modelled radio with its faults are those of a flight in lockstep; corrections pass through them to the board.
 """
 
@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from ground_station.errors import LinkError
-from hil.clock import Clock, Paced
-from hil.devices.real_core import open_real_core
-from hil.devices.real_firmware import RealBoard
+from hil.board.clock import Clock, Paced
+from hil.board.real_core import open_real_core
+from hil.board.real_firmware import RealBoard
 from hil.errors import LabError
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight

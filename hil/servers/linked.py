@@ -17,12 +17,12 @@ from pathlib import Path
 
 from ground_station.links.frame_log import FRAME_LOG
 from ground_station.trajectory import Goal, Trajectory
-from hil.clock import Paced
-from hil.devices.image_settings import to_set
+from hil.board.clock import Paced
+from hil.board.image_settings import to_set
 from hil.errors import LabError
-from hil.experiments import find_again
 from hil.laboratory.ages import STATION_CLOCK
 from hil.laboratory.channels import radio_channel, serial_channel
+from hil.laboratory.experiments import find_again
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import WARM_UP_US, Laboratory
 from hil.laboratory.lockstep import image_at

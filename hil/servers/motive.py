@@ -34,12 +34,12 @@ from ground_station.sources.natnet import (
 )
 from ground_station.sources.natnet_reader import Version
 from ground_station.unused import Reason
-from hil.clock import Readers
-from hil.devices.markers import DIAMETER, NO_POINTS, Sighting
+from hil.board.clock import Readers
+from hil.board.markers import DIAMETER, NO_POINTS, Sighting
 from hil.errors import LabError
-from hil.scene import Points
 from hil.servers.dongle_server import HOST
 from hil.servers.natnet_bytes import encode_frame, encode_models, encode_server_info
+from hil.world.scene import Points
 
 MAX_CLIENTS = 16  # one more replaces the client silent for longest
 MAX_COMMAND = 256  # bytes of a request that are read

@@ -1,6 +1,6 @@
 """The open end of a served board's serial line: a pty, a UDP socket that sends first, or a TCP port.
 
-`hil.devices.uart` is the line itself (baud rate, buffers, bit errors); this file only passes bytes on. Nothing here
+`hil.board.uart` is the line itself (baud rate, buffers, bit errors); this file only passes bytes on. Nothing here
 blocks: bytes that a client does not read are lost, as without flow control, and the board does not notice when a client
 leaves.
 """
@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
-from hil.clock import Readers
+from hil.board.clock import Readers
 from hil.errors import LabError
 from hil.servers.dongle_server import HOST
 from hil.servers.tcp_port import TcpPort, TcpProtocol

@@ -17,23 +17,23 @@ from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation
 from ground_station.tracker import tracker_of
 from ground_station.trajectory import Goal, Hold
-from hil.clock import Readers
+from hil.board.board_firmware import BoardFirmware
+from hil.board.clock import Readers
+from hil.board.dongle import VirtualDongle
+from hil.board.image_settings import APP_PARAMETER, NO_APP, stock_contents
+from hil.board.pins import InjectFailure, new_eeprom, unsupported
+from hil.board.radio import VirtualRadio
+from hil.board.uart import VirtualSerial
 from hil.config import LabConfig
-from hil.crazyflie.nrf51 import RATES, AirSettings, Band, Nrf51, ToPeers
-from hil.crazyflie.radio_line import POLL_PERIOD_US
-from hil.crazyflie.shockburst import Air
-from hil.devices.board import InjectFailure, new_eeprom, unsupported
-from hil.devices.board_firmware import BoardFirmware
-from hil.devices.dongle import VirtualDongle
-from hil.devices.image_settings import APP_PARAMETER, NO_APP, stock_contents
-from hil.devices.radio import VirtualRadio
-from hil.devices.uart import VirtualSerial
+from hil.emulator.crazyflie.nrf51 import RATES, AirSettings, Band, Nrf51, ToPeers
+from hil.emulator.crazyflie.radio_line import POLL_PERIOD_US
+from hil.emulator.crazyflie.shockburst import Air
 from hil.errors import LabError
+from hil.laboratory.files.whole_files import replacing
 from hil.laboratory.robot import Ports, Robot, Site
 from hil.servers.dongle_server import DongleServer
 from hil.servers.serial_server import Address, Endpoint
 from hil.servers.udp_server import UdpServer
-from hil.whole_files import replacing
 
 
 class BoardFile:

@@ -9,11 +9,11 @@ from pathlib import Path
 from firmware_py.rtos import WatchdogError
 from firmware_py.wire.mavlink_numbers import CommandResult
 from ground_station.trajectory import Goal, Hold
-from hil.clock import Paced
+from hil.board.board_firmware import Executor
+from hil.board.clock import Paced
+from hil.board.markers import NO_POINTS
 from hil.config import LabConfig
-from hil.crazyflie.nrf51 import AirSettings, Power, ToPeers
-from hil.devices.board_firmware import Executor
-from hil.devices.markers import NO_POINTS
+from hil.emulator.crazyflie.nrf51 import AirSettings, Power, ToPeers
 from hil.laboratory.channels import (
     battery_channel,
     board_channels,
@@ -23,9 +23,9 @@ from hil.laboratory.channels import (
     serial_channel,
 )
 from hil.laboratory.faults import Fault, Switchboard
+from hil.laboratory.files.recorder import Observer, Recorder
 from hil.laboratory.flight import RECORD_PERIOD_US, RECORD_PHASE_US
 from hil.laboratory.laboratory import NEVER_US, Laboratory
-from hil.laboratory.recorder import Observer, Recorder
 from hil.laboratory.robot import PYTHON_BOARD, Robot, Site, Streams, with_system
 from hil.servers.failures import Failures
 from hil.servers.holder import LaunchClamp

@@ -14,7 +14,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 
 from ground_station.stops import STOPS
-from hil.crazyflie.nrf51 import AirSettings
+from hil.emulator.crazyflie.nrf51 import AirSettings
 from hil.errors import LabError
 from hil.servers.live_faults import LiveFaults
 from hil.servers.motive import VirtualMotive

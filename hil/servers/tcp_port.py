@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
-from hil.clock import Readers
+from hil.board.clock import Readers
 
 CLIENTS_MAX = 32
 REPORT_US = 1_000_000

@@ -12,8 +12,8 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 
-from hil.clock import Readers
-from hil.crazyflie.nrf51 import NULL, NULL_MASK
+from hil.board.clock import Readers
+from hil.emulator.crazyflie.nrf51 import NULL, NULL_MASK
 from hil.errors import LabError
 from hil.servers.dongle_server import HOST
 

@@ -7,11 +7,11 @@ from firmware_py.core_runner import RunnerFactory, default_runner
 from firmware_py.firmware import Firmware
 from firmware_py.geometry import Vector
 from firmware_py.rtos import TaskReport
+from hil.board.imu import ACCEL_COUNTS, COS, COUNTS, GYRO_COUNTS, SIN
+from hil.board.pins import VirtualBoard
 from hil.config import LabConfig
-from hil.devices.board import VirtualBoard
-from hil.devices.imu import ACCEL_COUNTS, COS, COUNTS, GYRO_COUNTS, SIN
+from hil.emulator.events import EventQueue
 from hil.errors import LabError
-from hil.events import EventQueue
 from hil.world.motion import GRAVITY
 
 IMU_PERIOD_US = 1_000

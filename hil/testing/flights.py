@@ -12,9 +12,9 @@ import pytest
 
 from firmware_py.export.boards import BOARDS, runner_of
 from hil.api import Run, command_of, fly, request_of
-from hil.arguments import checked
 from hil.config import Overrides, load_config, settings_of
 from hil.errors import LabError
+from hil.laboratory.arguments import checked
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.request import MAVLINK, RADIO, Options, Request
 from hil.testing.board import BareBoard

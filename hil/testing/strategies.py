@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
 
 from ground_station.trajectory import Along
-from hil.arguments import checked
 from hil.errors import LabError
+from hil.laboratory.arguments import checked
 from hil.laboratory.fault_kinds import KINDS, Kind, times
 from hil.laboratory.faults import Fault, parse
 

@@ -1,6 +1,6 @@
 """The laboratory's interface to a robot's body: timer outputs in; motion, air, supply power, loss and log columns out.
 
-Floaty (`hil.floaty.plant`) is one of them. SI units; frames W (world, z up) and B (body, x forward, y left, z up, origin at
+Floaty (`hil.world.floaty.plant`) is one of them. SI units; frames W (world, z up) and B (body, x forward, y left, z up, origin at
 the centre of mass). Times are the laboratory's, in whole microseconds.
 """
 
@@ -13,8 +13,8 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.scene import Markers, VisualModel
 from hil.world.room import Room
+from hil.world.scene import Markers, VisualModel
 from hil.world.tunnel import Tunnel
 
 Vector = Sequence[float]

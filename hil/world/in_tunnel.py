@@ -2,7 +2,7 @@
 
 The truth is computed per whole millisecond from time 0: `advance(now_us)` does every step that ends at or before
 `now_us`. The same generator and the same inputs give the same bits, however the time is divided into calls. Subclasses
-compute flow and actuators: `hil.floaty.plant`, `hil.world.rigid`.
+compute flow and actuators: `hil.world.floaty.plant`, `hil.world.rigid`.
 """
 
 import math

@@ -14,11 +14,11 @@ import numpy as np
 from firmware_py.compiling import bound
 from firmware_py.core.subset import i32
 from hil.errors import LabError, blame
-from hil.scene import Markers, Part, VisualModel, ball, eight_markers
 from hil.world.body import Channel, Quantity, Setting, Vector
 from hil.world.config import BatteryConfig, PlantConfig, TunnelConfig
 from hil.world.in_tunnel import UPRIGHT, TunnelBody
 from hil.world.motion import accelerate, begin, move, surround, watch
+from hil.world.scene import Markers, Part, VisualModel, ball, eight_markers
 from hil.world.servos import OUTPUTS
 from hil.world.structs import NOISE_ROWS, STEP_US, Rigid
 from hil.world.tunnel import Tunnel

@@ -92,7 +92,7 @@ class Air(Struct):
 
 
 class Flaps(Struct):
-    """Floaty's servos, its nine plates and their identified correction (see hil/floaty/correction.py)."""
+    """Floaty's servos, its nine plates and their identified correction (see hil/world/floaty/correction.py)."""
 
     angle: Annotated[F64s, 4]  # [rad] signed flap angles
     travel: f64  # [rad] all flaps together have turned since the start

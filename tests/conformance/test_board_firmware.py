@@ -13,11 +13,11 @@ import pytest
 from firmware_py.signals import COUNTERS
 from firmware_py.wire.supervisor import Cause, State
 from ground_station.links.core_client import CoreClient
+from hil.board.board_firmware import BoardFirmware, Executor, PowerOn, PythonBoard
+from hil.board.pins import VirtualBoard
+from hil.board.real_firmware import RealBoard
 from hil.config import load_config
-from hil.devices.board import VirtualBoard
-from hil.devices.board_firmware import BoardFirmware, Executor, PowerOn, PythonBoard
-from hil.devices.real_firmware import RealBoard
-from hil.events import EventQueue
+from hil.emulator.events import EventQueue
 from support.app_air import AppAir
 from support.crazyflie_app import App
 from support.stm32_firmware import build
@@ -42,7 +42,7 @@ def has_core(firmware: BoardFirmware) -> bool:
 def image() -> Executor:
     pytest.importorskip("unicorn")
     pytest.importorskip("cffi")
-    from hil.devices.image_firmware import ChipImage
+    from hil.board.image_firmware import ChipImage
 
     return ChipImage.load(build(), None)
 

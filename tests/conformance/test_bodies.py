@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.bodies import BODIES, make_body
 from hil.config import LabConfig, load_config
-from hil.scene import VisualModel
+from hil.laboratory.bodies import BODIES, make_body
 from hil.world.body import Body
+from hil.world.scene import VisualModel
 from support.paths import ROOT
 
 PROFILES = ("crazyflie", "crazyflie-brushless", "floaty")

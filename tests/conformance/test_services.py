@@ -15,9 +15,9 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
+from hil.board.board_firmware import PythonBoard
 from hil.deploy.service_programs import PROGRAMS, STOCK
 from hil.deploy.services import Answers, ServiceBench, differences, play_in_copies
-from hil.devices.board_firmware import PythonBoard
 from support.paths import TESTS
 
 ELF, STOCK_ELF = (os.environ.get(name, "") for name in ("FLOATY_CF2_ELF", "FLOATY_STOCK_ELF"))
@@ -38,7 +38,7 @@ def recorded(name: str) -> dict[str, Answers]:
 def booted(elf: str) -> ServiceBench:
     pytest.importorskip("unicorn")
     pytest.importorskip("cffi")
-    from hil.devices.image_firmware import ChipImage
+    from hil.board.image_firmware import ChipImage
 
     return ServiceBench(ChipImage.load(Path(elf), None))
 

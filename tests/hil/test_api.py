@@ -12,7 +12,7 @@ import pytest
 import hil
 from hil import Along, Experiment, LabError, Metric, Request, fly, load_run
 from hil.api import command_of, request_of
-from hil.experiments import EXPERIMENTS
+from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import KINDS
 from support.command import Cli
 from support.examples import run_examples

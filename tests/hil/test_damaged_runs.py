@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 
 from hil import fly, load_run
 from hil.errors import LabError, reading
-from hil.identify.record import load_record
-from hil.laboratory.recorder import load_events
+from hil.laboratory.files.recorder import load_events
 from hil.laboratory.schedule import load_schedule
 from hil.pictures.viewer.recording import recording_of
+from hil.research.identify.record import load_record
 from support.command import Cli, floaty
 
 Read = Callable[[Path, Path], None]  # reads the first folder; the second is not damaged

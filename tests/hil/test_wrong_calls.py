@@ -39,7 +39,7 @@ from hil import (
 )
 from hil.api import command_of, request_of
 from hil.errors import hint
-from hil.experiments import EXPERIMENTS
+from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import KINDS, add
 from hil.laboratory.robot import attributes_of, probe
 from hil.testing import Flights, Waypoints, faults, trajectories

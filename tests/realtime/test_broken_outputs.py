@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from ground_station.records import INCOMPLETE
-from hil.laboratory.recorder import load_events
+from hil.laboratory.files.recorder import load_events
 from support.full_disk import SMALL_KB, small_disk
 from support.serving import FLOATY, PATIENCE_S, Served, serve, station
 

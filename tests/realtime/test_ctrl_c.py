@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.laboratory.recorder import load_log
+from hil.laboratory.files.recorder import load_log
 from support.own_logic import LAW, make_project
 from support.paths import ROOT
 

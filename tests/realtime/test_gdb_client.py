@@ -13,8 +13,8 @@ import pytest
 pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
-from hil.stm32f405.gdb import GdbServer
-from hil.stm32f405.image import Image
+from hil.emulator.stm32f405.gdb import GdbServer
+from hil.emulator.stm32f405.image import Image
 from support import stm32_firmware
 from support.paths import ROOT
 from support.serving import FLOATY

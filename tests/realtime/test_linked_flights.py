@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hil.laboratory.files.recorder import load_events, load_log
 from hil.laboratory.metrics import column
-from hil.laboratory.recorder import load_events, load_log
 from support.serving import FLOATY, PATIENCE_S, free_port, serve, station
 
 DONGLE = "radio://0/80/2M/E7E7E7E7E7"

@@ -9,8 +9,8 @@ pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 pytest.importorskip("cflib")
 
-from hil.experiments import find_experiment
-from hil.laboratory.recorder import load_events
+from hil.laboratory.experiments import find_experiment
+from hil.laboratory.files.recorder import load_events
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.servers.linked import linked_flight

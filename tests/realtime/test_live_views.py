@@ -5,9 +5,9 @@ import urllib.parse
 import urllib.request
 from pathlib import Path
 
-from hil.experiments import EXPERIMENTS
+from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.faults import parse
-from hil.laboratory.recorder import load_log
+from hil.laboratory.files.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.live.window import LOOPBACK, is_open

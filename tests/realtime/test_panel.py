@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.laboratory.recorder import load_events
+from hil.laboratory.files.recorder import load_events
 from support.browser import BROWSER, Tab, browser
 from support.serving import PATIENCE_S, Served, serve, started, station
 

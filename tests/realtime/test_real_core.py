@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from hil.experiments import find_experiment
-from hil.laboratory.recorder import load_log
+from hil.laboratory.experiments import find_experiment
+from hil.laboratory.files.recorder import load_log
+from hil.laboratory.files.result import read_result
 from hil.laboratory.request import Request
-from hil.laboratory.result import read_result
 from hil.laboratory.run import fly
 from support.app_board import board
 from support.command import Cli

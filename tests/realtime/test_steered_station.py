@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.files.recorder import load_events, load_log
 from support.serving import FLOATY, PATIENCE_S, Served, serve, station
 
 ENDS: dict[str, tuple[str, ...]] = {

@@ -6,7 +6,7 @@ Board and link, with its faults, have a time line of their own. It is the wall c
 from collections.abc import Callable
 
 from firmware_py.wire.core_port import PORT_CORE
-from hil.events import EventQueue
+from hil.emulator.events import EventQueue
 from support.app_packets import AppPackets
 from support.crazyflie_app import App
 

@@ -17,10 +17,10 @@ from pathlib import Path
 
 from firmware_py.board import Board
 from firmware_py.wire.supervisor import Cause, State
-from hil.clock import Paced
+from hil.board.board_firmware import PowerOn
+from hil.board.clock import Paced
 from hil.config import load_config
-from hil.crazyflie.shockburst import syslink_us
-from hil.devices.board_firmware import PowerOn
+from hil.emulator.crazyflie.shockburst import syslink_us
 from hil.laboratory.laboratory import NEVER_US, Laboratory
 from hil.laboratory.robot import Site, Streams
 from hil.servers.dongle_plugin import VARIABLE
@@ -33,7 +33,7 @@ STEP_US = 1000
 
 
 class AppBoard:
-    """Executes the app in place of the firmware: `hil.devices.board_firmware.Executor`."""
+    """Executes the app in place of the firmware: `hil.board.board_firmware.Executor`."""
 
     needs_polls = False
     wire_us = staticmethod(syslink_us)

@@ -6,9 +6,9 @@ import signal
 import time
 from pathlib import Path
 
-from hil.campaigns.config import Spec
-from hil.campaigns.jobs import Job, Row
 from hil.laboratory.metrics import METRICS
+from hil.research.campaigns.config import Spec
+from hil.research.campaigns.jobs import Job, Row
 
 BAD_PUSH = 8.0  # [N] from here on the planted robot fails
 

@@ -17,9 +17,9 @@ from firmware_py.config import parameters_of
 from firmware_py.core.structs import Control, Estimator, Input, Parameters, Report, Sampling, Supervisor
 from firmware_py.core.subset import Block
 from firmware_py.core_runner import CoreBlocks, NativeRunner, PlainRunner, RunnerFactory
+from hil.board.board_firmware import PythonBoard
 from hil.config import load_config
-from hil.devices.board_firmware import PythonBoard
-from hil.experiments.position import HOVER
+from hil.laboratory.experiments.position import HOVER
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
 

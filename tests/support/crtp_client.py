@@ -8,7 +8,7 @@ from firmware_py.wire.parameters import TYPE_EXTENDED, TYPE_READ_ONLY
 from firmware_py.wire.scalars import LOG_SCALARS, PARAMETER_SCALARS
 from ground_station.links.crtp_controls import TocEntry
 from hil.config import load_config
-from hil.events import EventQueue
+from hil.emulator.events import EventQueue
 from support.firmware_bench import FirmwareBench
 
 PARAM, MEM, LOG, LOC, SUPERVISOR, PLATFORM, LINK = 2, 4, 5, 6, 9, 13, 15

@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from hil.crazyflie.decks import Decks
-from hil.stm32f405.chip import StopReason
-from hil.stm32f405.processor import ChipProcessor
+from hil.emulator.crazyflie.decks import Decks
+from hil.emulator.stm32f405.chip import StopReason
+from hil.emulator.stm32f405.processor import ChipProcessor
 from hil.world.body import Carrier
 from hil.world.room import Room
 from support.stm32_bench import Bench

@@ -10,9 +10,9 @@ import click
 
 from hil.commands.app import app
 from hil.config import LabConfig, profile_names
-from hil.experiments import EXPERIMENTS
+from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import KINDS
-from hil.studies.catalogue import STUDIES
+from hil.research.studies.catalogue import STUDIES
 from support.examples import blocks, commands_of
 from support.paths import ROOT
 

@@ -6,9 +6,9 @@ from firmware_py.firmware import Firmware
 from firmware_py.wire import WireError, crtp
 from firmware_py.wire.telemetry import Sample
 from ground_station.links.log_blocks import LogBlocks
+from hil.board.pins import Requests, VirtualBoard
 from hil.config import load_config
-from hil.devices.board import Requests, VirtualBoard
-from hil.events import EventQueue
+from hil.emulator.events import EventQueue
 
 HOVER_COUNTS = [
     21000 + int(sign * 0.436332 * 31290 + 32767 + shift) * 21000 // 65535  # the original's mapping, +-25 deg

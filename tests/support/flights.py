@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from hil.api import Run, column
 from hil.config import load_config
-from hil.crazyflie.log_table import ImageVariable
-from hil.experiments import Experiment, find_experiment
+from hil.emulator.crazyflie.log_table import ImageVariable
+from hil.laboratory.experiments import Experiment, find_experiment
+from hil.laboratory.files.result import Result
 from hil.laboratory.lockstep import image_at
 from hil.laboratory.request import Options, Request
-from hil.laboratory.result import Result
 from hil.laboratory.run import fly
 from hil.servers.server import Server, Service
 

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import serial
 
-from hil.clock import Readers
+from hil.board.clock import Readers
 from hil.servers.serial_server import Address
 from hil.servers.udp_server import UdpServer
 

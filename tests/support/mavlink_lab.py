@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from hil.clock import FreeRunning, Readers
+from hil.board.clock import FreeRunning, Readers
 from hil.config import load_config
 from hil.laboratory.robot import Robot
 from hil.servers.server import Server, Service

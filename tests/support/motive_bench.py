@@ -12,11 +12,11 @@ import pytest
 
 from ground_station.mocap import MocapFrame
 from ground_station.unused import Reason
-from hil.devices.markers import NO_POINTS, Sighting
-from hil.floaty.drawing import marker_places
+from hil.board.markers import NO_POINTS, Sighting
 from hil.servers.dongle_server import Readers
 from hil.servers.motive import Streaming, Up, VirtualMotive
 from hil.world.config import GeometryConfig, NetConfig
+from hil.world.floaty.drawing import marker_places
 from support.serving import PATIENCE_S
 
 FROM_MOTIVE = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # columns: Motive's axes in the world

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from hil.floaty.plant import Plant
 from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
+from hil.world.floaty.plant import Plant
 
 
 def still_plant() -> Plant:

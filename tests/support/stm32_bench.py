@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
-from hil.stm32f405.chip import CYCLES_PER_US, FLASH, RAM, Chip, StopReason, build_machine
+from hil.emulator.stm32f405.chip import CYCLES_PER_US, FLASH, RAM, Chip, StopReason, build_machine
 
 SLEEP = bytes.fromhex("30bffde7")  # wfi; b to it
 PENDING = 0xE000_E200  # of the interrupts, NVIC_ISPR

@@ -8,11 +8,11 @@ import pytest
 pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
-from hil.stm32f405.chip import CYCLES_PER_US, Chip, StopReason, build_machine
-from hil.stm32f405.freertos import FreeRtos
-from hil.stm32f405.gdb import DebuggedChip, GdbServer
-from hil.stm32f405.image import Image
-from hil.stm32f405.processor import ChipProcessor
+from hil.emulator.stm32f405.chip import CYCLES_PER_US, Chip, StopReason, build_machine
+from hil.emulator.stm32f405.freertos import FreeRtos
+from hil.emulator.stm32f405.gdb import DebuggedChip, GdbServer
+from hil.emulator.stm32f405.image import Image
+from hil.emulator.stm32f405.processor import ChipProcessor
 from support.stm32_firmware import build
 
 

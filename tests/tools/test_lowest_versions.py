@@ -22,7 +22,7 @@ for package in (firmware_py, ground_station, hil):
             import_module(module.name)
 """
 LEARN = """
-import gymnasium, hil.learn
+import gymnasium, hil.research.learn
 env = gymnasium.make("floaty/Hover-v0", duration_s=0.5)
 env.reset(seed=1)
 env.step(env.action_space.sample())

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from hil.installation import commit
-from hil.laboratory.result import read_result
+from hil.laboratory.files.installation import commit
+from hil.laboratory.files.result import read_result
 from support.installed_wheel import install, run
 from support.paths import ROOT
 

@@ -6,14 +6,14 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from firmware_py.geometry import from_euler_zyx, yaw_quaternion
-from hil.devices.markers import DIAMETER
+from hil.board.markers import DIAMETER
 from hil.laboratory.faults import parse
+from hil.laboratory.files.recorder import stored_in
 from hil.laboratory.metrics import BOX, body, column
-from hil.laboratory.recorder import stored_in
 from hil.pictures import scene
 from hil.pictures.viewer.track import RecordingTrack, Times, rgba
-from hil.scene import Part, VisualModel
 from hil.world.config import PlantConfig, TunnelConfig
+from hil.world.scene import Part, VisualModel
 
 METRES_PER_NEWTON = 0.15  # length of the drag arrows, and of pushes
 SECONDS_OF_FLOW = 0.02  # length of the flow's arrow: the distance that the air moves in that time

@@ -8,7 +8,7 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
-from hil.laboratory.recorder import RELEASE_US, release_of, stored_in
+from hil.laboratory.files.recorder import RELEASE_US, release_of, stored_in
 
 FROM_RELEASE, FROM_START = "from_release", "from_start"
 Times = NDArray[np.float64]  # (N,) [us] of the log

@@ -20,8 +20,8 @@ from firmware_py.core import entry
 from firmware_py.core.structs import POSE_INVALID, POSE_ON_TIME, Estimator, Parameters
 from firmware_py.core_runner import CoreBlocks, NativeRunner
 from ground_station.trajectory import Goal, Offsets, Sine, Square, Trajectory
-from hil.devices.board_firmware import PythonBoard
-from hil.experiments import Experiment
+from hil.board.board_firmware import PythonBoard
+from hil.laboratory.experiments import Experiment
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
 from support.core_bench import LEVEL, Core, Vector, counts, quaternion, turned

@@ -37,11 +37,11 @@ from firmware_py.wire.crtp import encode_ext_pose
 from firmware_py.wire.supervisor import Cause, State
 from ground_station.errors import LinkError
 from ground_station.links.core_client import CoreClient
+from hil.board.real_core import RealCore
 from hil.config import load_config
 from hil.deploy.check import check_flight
-from hil.devices.real_core import RealCore
 from hil.errors import LabError
-from hil.experiments import find_experiment
+from hil.laboratory.experiments import find_experiment
 from hil.laboratory.faults import parse
 from hil.laboratory.request import Request
 from support.app_packets import AppPackets

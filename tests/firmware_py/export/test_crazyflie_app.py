@@ -27,8 +27,8 @@ from firmware_py.firmware import Firmware
 from firmware_py.geometry import Quaternion, Vector, from_euler_zyx, in_goal_frame, yaw_quaternion
 from firmware_py.wire import crtp, telemetry
 from firmware_py.wire.localisation import EXT_POSE_PACKED
+from hil.board.pins import VirtualBoard
 from hil.config import LabConfig, load_config
-from hil.devices.board import VirtualBoard
 from support.crazyflie_app import LOCALISATION, STUBS, App, Setpoint, build_app
 from support.own_logic import ESTIMATOR, LAW, own_config
 

@@ -19,7 +19,7 @@ import hil
 from firmware_py.extras import EXTRAS, install_command, why_missing
 from hil import fly
 from hil.errors import LabError
-from hil.laboratory.recorder import load_log
+from hil.laboratory.files.recorder import load_log
 from hil.live.window import DISPLAYS
 from support.command import Cli
 from support.serving import FLOATY
@@ -354,8 +354,8 @@ def test_a_command_imports_no_other() -> None:
     ("code", "late"),
     [
         ("import hil", "numpy pydantic hil.api"),
-        ("import hil.experiments", "matplotlib"),
-        ("import hil.studies.catalogue", "scipy.optimize control matplotlib"),
+        ("import hil.laboratory.experiments", "matplotlib"),
+        ("import hil.research.studies.catalogue", "scipy.optimize control matplotlib"),
         ("import hil.testing.plugin", "numpy hil.api hypothesis"),
         pytest.param("import hil; hil.fly", "matplotlib cflib rerun", marks=pytest.mark.long),
     ],

@@ -8,9 +8,9 @@ from xml.etree import ElementTree
 import pytest
 
 import hil
-from hil.experiments import find_experiment
-from hil.laboratory.recorder import load_log
-from hil.laboratory.result import read_result
+from hil.laboratory.experiments import find_experiment
+from hil.laboratory.files.recorder import load_log
+from hil.laboratory.files.result import read_result
 from support.command import Cli
 from support.full_disk import small_files
 from support.installed_wheel import install, run

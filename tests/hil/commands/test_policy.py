@@ -13,7 +13,7 @@ from firmware_py.export.boards import runner_of
 from firmware_py.logic.loading import load_logic
 from firmware_py.policy.reading import read_policy
 from hil.config import load_config
-from hil.laboratory.result import read_result
+from hil.laboratory.files.result import read_result
 from support.command import Cli
 from support.installed_wheel import run
 from support.policies import network, write_onnx

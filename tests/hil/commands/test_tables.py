@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.campaigns.jobs import Job, Row
-from hil.campaigns.run import Runner
 from hil.commands.compare import _print_seeds
 from hil.commands.options import exit_code
 from hil.commands.tables import SEED_COLUMNS, print_result, print_seeds
-from hil.experiments import EXPERIMENTS
+from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.files.result import Result, read_result
 from hil.laboratory.metrics import METRICS, Verdict
 from hil.laboratory.request import Request
-from hil.laboratory.result import Result, read_result
 from hil.laboratory.run import fly
-from hil.studies.two_boards import FirstCount, Seed
+from hil.research.campaigns.jobs import Job, Row
+from hil.research.campaigns.run import Runner
+from hil.research.studies.two_boards import FirstCount, Seed
 from support.command import Cli
 
 

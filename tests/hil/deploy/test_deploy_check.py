@@ -17,10 +17,10 @@ from firmware_py.core import structs
 from firmware_py.core_runner import CoreBlocks, CoreRunner, NativeRunner, RunnerFactory, default_runner
 from firmware_py.export.c99 import translate
 from firmware_py.logic.plugs import CALLS
+from hil.board.board_firmware import PythonBoard
 from hil.commands.deploy import _print_flight, _print_sum
 from hil.deploy.check import Checked, check_flight, plan, reached
-from hil.devices.board_firmware import PythonBoard
-from hil.experiments import EXPERIMENTS
+from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
 from support.command import Cli

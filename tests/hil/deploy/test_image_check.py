@@ -16,16 +16,16 @@ import pytest
 from firmware_py.core.structs import Input, Parameters
 from firmware_py.export.app_toc import AppParameter, app_parameters
 from firmware_py.wire.scalars import PARAMETER_SCALARS, Scalar
+from hil.board.board_firmware import PythonBoard
 from hil.config import load_config
 from hil.deploy import image_check
 from hil.deploy.beside import BOUNDS, Bound, Compared, _ends, compare_flights, compare_states
 from hil.deploy.image_check import TARGET, check_image, check_memory, check_parameters, check_services
 from hil.deploy.service_programs import PROGRAMS
 from hil.deploy.services import Answers, ServiceBench, differences, play_in_copies
-from hil.devices.board_firmware import PythonBoard
+from hil.emulator.stm32f405.image import MemoryUse
 from hil.errors import LabError
-from hil.laboratory.recorder import EVENTS
-from hil.stm32f405.image import MemoryUse
+from hil.laboratory.files.recorder import EVENTS
 from support.crazyflie_app import App
 
 ELF = os.environ.get("FLOATY_CF2_ELF", "")

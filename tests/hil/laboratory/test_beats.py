@@ -9,7 +9,7 @@ import pytest
 from firmware_py.export.compilers import compilers
 from firmware_py.rtos import Kernel
 from firmware_py.tasks import FlightTasks
-from hil.experiments import EXPERIMENTS
+from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import in_lockstep
 from hil.laboratory.request import Options, Request

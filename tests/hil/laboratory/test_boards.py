@@ -7,11 +7,11 @@ import pytest
 
 from hil.config import load_config
 from hil.errors import LabError
-from hil.experiments import EXPERIMENTS
+from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.files.recorder import load_log
+from hil.laboratory.files.result import Result
 from hil.laboratory.lockstep import image_at
-from hil.laboratory.recorder import load_log
 from hil.laboratory.request import Request
-from hil.laboratory.result import Result
 from support.flights import hover
 from support.stm32_firmware import build
 

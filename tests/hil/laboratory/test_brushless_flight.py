@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from hil.api import Request, fly
-from hil.crazyflie.log_table import log_table
+from hil.emulator.crazyflie.log_table import log_table
 from hil.errors import LabError
-from hil.experiments.position import HOVER
+from hil.laboratory.experiments.position import HOVER
 from hil.laboratory.fault_kinds import KINDS
 from support.flights import check_calibrated, check_hover, served_image
 from support.stm32_firmware import build

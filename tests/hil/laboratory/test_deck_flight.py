@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from hil.api import column, fly
-from hil.crazyflie.log_table import log_table
+from hil.emulator.crazyflie.log_table import log_table
 from hil.errors import LabError
-from hil.experiments.position import HOVER
+from hil.laboratory.experiments.position import HOVER
 from hil.laboratory.request import Request
 from support.flights import served_image
 

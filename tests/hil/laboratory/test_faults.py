@@ -20,19 +20,19 @@ from numpy.typing import NDArray
 
 from hil.config import load_config
 from hil.errors import LabError
-from hil.experiments import EXPERIMENTS, Experiment
-from hil.floaty.plant import Plant
+from hil.laboratory.experiments import EXPERIMENTS, Experiment
 from hil.laboratory.fault_kinds import KINDS, MARKERS_ON, Kind
 from hil.laboratory.faults import SWITCHED_ON, Fault, check, parse, spans_of, switched_on, why_not
+from hil.laboratory.files.recorder import load_events, load_log
+from hil.laboratory.files.result import Result, read_result
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import column
-from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import MAVLINK, RADIO, Request
-from hil.laboratory.result import Result, read_result
 from hil.laboratory.run import fly
 from hil.pictures.curves import since_release
 from hil.pictures.report import write_report
 from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig
+from hil.world.floaty.plant import Plant
 from hil.world.tunnel import TunnelConfig
 from support.command import Cli
 from support.flights import hover
@@ -336,7 +336,7 @@ def test_every_kind_has_a_sign() -> None:
     known = {sign.fault.partition("=")[0] for sign in SIGNS}
     assert known | {"battery.sag"} == set(
         OF_FLOATY
-    )  # see below; the Crazyflie's: tests/hil/crazyflie/test_quadrotor.py
+    )  # see below; the Crazyflie's: tests/hil/world/test_quadrotor.py
 
 
 def test_a_sagging_battery_is_what_the_board_reads() -> None:

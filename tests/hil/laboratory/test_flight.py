@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 
 from ground_station.tracker import Quality
-from hil.campaigns.jobs import Job, row_of
 from hil.commands.tables import print_result, print_seeds
 from hil.errors import LabError
-from hil.experiments import EXPERIMENTS, find_again
+from hil.laboratory.experiments import EXPERIMENTS, find_again
+from hil.laboratory.files.recorder import load_events, load_log
+from hil.laboratory.files.result import read_result
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import in_lockstep, lockstep_flight
 from hil.laboratory.metrics import ALWAYS, METRICS, column, judge
-from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import LOCKSTEP, Bench, Request
-from hil.laboratory.result import read_result
 from hil.laboratory.run import fly
 from hil.pictures.report import write_report
+from hil.research.campaigns.jobs import Job, row_of
 from support.flights import explain, flown, hover
 from support.full_disk import small_files
 

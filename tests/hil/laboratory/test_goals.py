@@ -8,7 +8,7 @@ import pytest
 
 from hil import Along, Experiment, Goal, LabError, Request
 from hil.api import request_of
-from hil.experiments import EXPERIMENTS, find_experiment
+from hil.laboratory.experiments import EXPERIMENTS, find_experiment
 
 Place = tuple[float, float, float]
 

@@ -9,13 +9,13 @@ import pytest
 pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
-from hil.devices import image_firmware
-from hil.experiments import find_experiment
+from hil.board import image_firmware
+from hil.laboratory.experiments import find_experiment
+from hil.laboratory.files.recorder import load_events
+from hil.laboratory.files.result import Result, read_result
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import in_lockstep
-from hil.laboratory.recorder import load_events
 from hil.laboratory.request import Request
-from hil.laboratory.result import Result, read_result
 from hil.laboratory.run import fly
 from hil.pictures.report import write_report
 from support.stm32_firmware import build

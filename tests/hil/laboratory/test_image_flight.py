@@ -11,17 +11,17 @@ pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
 from hil.commands.tables import print_result
+from hil.emulator.stm32f405.chip import declared
 from hil.errors import LabError
-from hil.experiments import find_experiment
+from hil.laboratory.experiments import find_experiment
+from hil.laboratory.files.recorder import load_events, load_log
+from hil.laboratory.files.result import Result
 from hil.laboratory.lockstep import image_at
-from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import Request
-from hil.laboratory.result import Result
 from hil.laboratory.run import fly
 from hil.laboratory.schedule import load_schedule, runs
 from hil.pictures.compare import load_flown
-from hil.stm32f405.chip import declared
-from hil.studies.two_boards import two_boards
+from hil.research.studies.two_boards import two_boards
 from support.flights import hover
 
 ELF = os.environ.get("FLOATY_CF2_ELF", "")
@@ -110,7 +110,7 @@ def test_an_experiments_settings_reach_the_image_before_its_release(tmp_path: Pa
 def test_an_image_without_the_app_is_flown_and_recorded_with_its_tasks_and_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from hil.devices import image_firmware
+    from hil.board import image_firmware
     from support.stm32_firmware import build
 
     monkeypatch.setattr(image_firmware, "WARM_UP_US", 20_000)

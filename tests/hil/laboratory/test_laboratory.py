@@ -5,11 +5,11 @@ from collections.abc import Callable
 import pytest
 
 from firmware_py.wire.crtp import PORT_CONSOLE
-from hil.clock import FreeRunning, Paced
+from hil.board.clock import FreeRunning, Paced
+from hil.board.uart import VirtualSerial
 from hil.config import load_config
-from hil.crazyflie import syslink
-from hil.crazyflie.nrf51 import Power
-from hil.devices.uart import VirtualSerial
+from hil.emulator.crazyflie import syslink
+from hil.emulator.crazyflie.nrf51 import Power
 from hil.errors import LabError
 from hil.laboratory.faults import Fault, parse
 from hil.laboratory.laboratory import Laboratory

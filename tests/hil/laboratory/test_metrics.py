@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_py.geometry import from_euler_zyx, in_goal_frame, to_euler_zyx, yaw_quaternion
-from hil.experiments import measures
+from hil.laboratory.experiments import measures
 from hil.laboratory.metrics import (
     ALWAYS,
     METRICS,

@@ -9,10 +9,10 @@ from ground_station.config import CaptureConfig
 from ground_station.mocap import MocapFrame
 from ground_station.sources.alignment import Alignment
 from ground_station.sources.natnet_stream import NatnetStream
-from hil.experiments import EXPERIMENTS
+from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.files.recorder import Recorder, load_log
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import judge, measure
-from hil.laboratory.recorder import Recorder, load_log
 from hil.laboratory.request import Request
 from support import natnet_packets as packets
 

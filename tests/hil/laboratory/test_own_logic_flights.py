@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from firmware_py.wire.supervisor import State
+from hil.laboratory.files.recorder import load_events, load_log
+from hil.laboratory.files.result import Result
 from hil.laboratory.metrics import column
-from hil.laboratory.recorder import load_events, load_log
-from hil.laboratory.result import Result
 from hil.pictures.report import write_report
 from support.flights import hover
 from support.own_logic import AS_BUILT_IN, ESTIMATOR, LAW, make_project

@@ -7,10 +7,10 @@ import pytest
 
 from ground_station.errors import LinkError
 from ground_station.links import packets
-from hil.experiments import find_experiment
-from hil.laboratory.recorder import load_log
+from hil.laboratory.experiments import find_experiment
+from hil.laboratory.files.recorder import load_log
+from hil.laboratory.files.result import read_result
 from hil.laboratory.request import Request
-from hil.laboratory.result import read_result
 from hil.laboratory.run import fly
 from support.app_packets import AppPackets
 from support.command import Cli

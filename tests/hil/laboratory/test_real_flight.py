@@ -27,23 +27,23 @@ from ground_station.station import GroundStation
 from ground_station.trajectory import FlightPlan, Goal
 from hil.config import load_config
 from hil.errors import LabError
-from hil.experiments import EXPERIMENTS
-from hil.exports.mcap import write_mcap
-from hil.exports.tlog import write_tlog
-from hil.exports.wide_csv import write_csv
 from hil.laboratory.ages import ages_in_time_of, reported_ages
 from hil.laboratory.channels import Unwrapped
+from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.files.recorder import Observer, Recorder, load_events, load_log, release_of
+from hil.laboratory.files.result import Result, read_result
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import ALWAYS, body, free_flight, known, measure
 from hil.laboratory.real_flight import RealFlight, why_lost
-from hil.laboratory.recorder import Observer, Recorder, load_events, load_log, release_of
 from hil.laboratory.request import REAL, Bench, Request
-from hil.laboratory.result import Result, read_result
 from hil.laboratory.run import fly
 from hil.pictures import figures
 from hil.pictures.compare import _judged, compare, load_flown
 from hil.pictures.curves import with_marks
 from hil.pictures.drawing import figure_of
+from hil.pictures.exports.mcap import write_mcap
+from hil.pictures.exports.tlog import write_tlog
+from hil.pictures.exports.wide_csv import write_csv
 from hil.pictures.figures import PICTURES
 from hil.pictures.gallery import GALLERY
 from hil.pictures.panels import marks_of_flight

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
 
-from hil.experiments import EXPERIMENTS
+from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.faults import parse
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly

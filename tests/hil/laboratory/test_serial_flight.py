@@ -8,10 +8,10 @@ import pytest
 from pymavlink import mavutil
 
 from hil.errors import LabError
+from hil.laboratory.files.recorder import load_events, load_log
+from hil.laboratory.files.result import Result
 from hil.laboratory.metrics import column
-from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import MAVLINK
-from hil.laboratory.result import Result
 from hil.pictures.figures import PICTURES
 from support.flights import explain, hover
 from support.serving import FLOATY

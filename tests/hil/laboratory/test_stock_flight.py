@@ -9,12 +9,12 @@ import pytest
 
 from firmware_py.wire.supervisor import Cause, State
 from hil.api import Request, column, fly
+from hil.board.image_firmware import stock_signals
 from hil.config import load_config
-from hil.crazyflie.log_table import log_table
-from hil.devices.image_firmware import stock_signals
+from hil.emulator.crazyflie.log_table import log_table
 from hil.errors import LabError
-from hil.experiments import find_experiment
-from hil.experiments.position import HOVER
+from hil.laboratory.experiments import find_experiment
+from hil.laboratory.experiments.position import HOVER
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.request import why_left
 from support.flights import check_calibrated, check_hover, served_image

@@ -9,7 +9,7 @@ import pytest
 
 from firmware_py.geometry import to_euler_zyx
 from hil.config import load_config
-from hil.events import EventQueue
+from hil.emulator.events import EventQueue
 from hil.laboratory.lockstep import image_at
 from hil.laboratory.robot import Ports, Robot, Site, Streams, nobody_listens
 

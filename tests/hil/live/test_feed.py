@@ -9,8 +9,8 @@ import pyarrow as pa
 import pytest
 
 from hil.errors import LabError
-from hil.experiments import EXPERIMENTS
-from hil.laboratory.recorder import Recorder, load_log
+from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.files.recorder import Recorder, load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.live import feed
@@ -191,7 +191,7 @@ def test_nothing_is_imported_while_a_flight_is_recorded_and_shown() -> None:
     program = f"""
 import sys, tempfile
 from pathlib import Path
-from hil.laboratory.recorder import Recorder
+from hil.laboratory.files.recorder import Recorder
 from hil.live.feed import LiveView
 from hil.world.body import Channel, Quantity
 view = LiveView([sys.executable, '-c', {TAKES_ALL!r}], print)

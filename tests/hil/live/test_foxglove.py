@@ -9,12 +9,12 @@ import foxglove
 import pytest
 from tornado.httpclient import HTTPClientError
 
-from hil.experiments import EXPERIMENTS
-from hil.exports.mcap import log_rows
-from hil.laboratory.recorder import load_log
+from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.files.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.live.foxglove_server import FoxgloveScreen
+from hil.pictures.exports.mcap import log_rows
 from support.foxglove_client import FoxgloveClient
 
 

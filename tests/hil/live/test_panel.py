@@ -12,8 +12,8 @@ from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.ioloop import IOLoop
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
-from hil.experiments import EXPERIMENTS
-from hil.laboratory.recorder import load_log
+from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.files.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.live.panel import COMMANDS, LINE_MOST, ROWS_MOST, TEXTS_MOST, PanelScreen, _Socket

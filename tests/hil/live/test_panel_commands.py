@@ -7,13 +7,13 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from hil.experiments import EXPERIMENTS
+from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.faults import spans_of
+from hil.laboratory.files.recorder import load_events, load_log
+from hil.laboratory.files.result import read_result
 from hil.laboratory.flight import Flight
 from hil.laboratory.metrics import column
-from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import Request
-from hil.laboratory.result import read_result
 from hil.laboratory.run import fly
 from hil.live.panel_commands import PanelCommands
 from hil.pictures.curves import since_release, with_marks

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from hil.errors import LabError
-from hil.experiments import EXPERIMENTS
+from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.files.result import read_result
 from hil.laboratory.request import Request
-from hil.laboratory.result import read_result
 from hil.laboratory.run import fly
 from hil.live.recording import Links
 from hil.live.window import free_port

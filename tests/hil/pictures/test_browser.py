@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from hil.experiments import EXPERIMENTS
+from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.faults import parse
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly

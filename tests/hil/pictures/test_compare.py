@@ -13,9 +13,9 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from hil.config import load_config
-from hil.experiments import EXPERIMENTS
+from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.files.recorder import load_log
 from hil.laboratory.metrics import free_flight, measure, position_error
-from hil.laboratory.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.pictures.compare import FlownRun, compare, difference, load_flown, pair, write_comparison

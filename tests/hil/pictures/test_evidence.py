@@ -8,12 +8,12 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from hil.experiments import EXPERIMENTS
+from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.faults import parse
+from hil.laboratory.files.recorder import load_log, stored_in
+from hil.laboratory.files.result import read_result
 from hil.laboratory.metrics import column, free_flight, position_error
-from hil.laboratory.recorder import load_log, stored_in
 from hil.laboratory.request import Request
-from hil.laboratory.result import read_result
 from hil.laboratory.run import fly
 from hil.pictures.curves import BLUE, since_release
 from hil.pictures.figures import course_of, goal_moves

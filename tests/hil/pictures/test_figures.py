@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
-from hil.experiments.overload import loads_that_hurt
+from hil.laboratory.experiments.overload import loads_that_hurt
 from hil.laboratory.schedule import runs
 from hil.pictures import curves, figures
 

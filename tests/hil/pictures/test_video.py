@@ -9,14 +9,14 @@ import pytest
 from PIL import Image
 
 from hil.config import load_config
-from hil.experiments import EXPERIMENTS
-from hil.floaty.drawing import look_of
+from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.files.recorder import load_log
 from hil.laboratory.metrics import free_flight
-from hil.laboratory.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.pictures import curves, video
-from hil.scene import VisualModel
+from hil.world.floaty.drawing import look_of
+from hil.world.scene import VisualModel
 from support.command import Cli
 
 av = pytest.importorskip("av")

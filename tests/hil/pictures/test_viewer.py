@@ -24,14 +24,11 @@ from scipy.spatial.transform import Rotation
 from firmware_py.wire.supervisor import State
 from hil.config import load_config
 from hil.errors import LabError
-from hil.experiments import EXPERIMENTS
-from hil.floaty.drawing import flap_axes, look_of, marker_places, stand_lines
-from hil.floaty.geometry import surfaces
-from hil.floaty.shape import place_plates
+from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import MARKERS_ON
 from hil.laboratory.faults import parse
+from hil.laboratory.files.recorder import load_events, load_log
 from hil.laboratory.metrics import column
-from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.laboratory.schedule import SCHEMA
@@ -43,8 +40,11 @@ from hil.pictures.viewer.plots import PLOTS, rates
 from hil.pictures.viewer.recording import RerunFlight, write_rrd, write_run_rrd
 from hil.pictures.viewer.scene import HIDDEN, METRES_PER_NEWTON, PUSH_SHOWN_US, SEEN
 from hil.pictures.viewer.track import FROM_RELEASE, FROM_START, timeline_of
-from hil.scene import Part, VisualModel, ball, box
 from hil.world.config import GeometryConfig, NetConfig
+from hil.world.floaty.drawing import flap_axes, look_of, marker_places, stand_lines
+from hil.world.floaty.geometry import surfaces
+from hil.world.floaty.shape import place_plates
+from hil.world.scene import Part, VisualModel, ball, box
 from hil.world.structs import Flaps
 
 RELEASE_US = load_config().flight.release_us

@@ -21,7 +21,7 @@ from numpy.polynomial import Polynomial
 from firmware_py.geometry import to_euler_zyx
 from firmware_py.wire.crtp import PORT_MEMORIES, Packet, encode, encode_ext_pose
 from ground_station.mocap import MocapFrame
-from hil.clock import FreeRunning
+from hil.board.clock import FreeRunning
 from hil.config import load_config
 from hil.servers.server import Server, Service
 

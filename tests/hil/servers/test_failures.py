@@ -6,7 +6,7 @@ import pytest
 
 from firmware_py.wire.memories import CONFIG_SIZE, RadioSettings, encode_config
 from hil.config import load_config
-from hil.events import EventQueue
+from hil.emulator.events import EventQueue
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Switchboard, parse
 from hil.laboratory.robot import Ports, Robot, Site, Streams, nobody_listens

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from firmware_py.wire import crtp, high_level
-from hil.clock import FreeRunning
+from hil.board.clock import FreeRunning
 from hil.config import load_config
 from hil.servers.server import Server, Service
 from support.mavlink_client import STATION, codec

@@ -22,15 +22,15 @@ from firmware_py.wire.supervisor import Cause, State
 from ground_station.errors import LinkError
 from ground_station.links import packets
 from ground_station.links.core_client import CoreClient
-from hil.clock import FreeRunning, Paced
-from hil.devices.real_firmware import RealBoard
-from hil.devices.sample_window import WINDOW
-from hil.experiments import find_experiment
+from hil.board.clock import FreeRunning, Paced
+from hil.board.real_firmware import RealBoard
+from hil.board.sample_window import WINDOW
+from hil.laboratory.experiments import find_experiment
 from hil.laboratory.faults import parse
+from hil.laboratory.files.recorder import load_log
+from hil.laboratory.files.result import Result
 from hil.laboratory.flight import Flight
-from hil.laboratory.recorder import load_log
 from hil.laboratory.request import Request
-from hil.laboratory.result import Result
 from hil.laboratory.run import fly
 from hil.pictures.report import write_report
 from hil.servers.in_the_loop import flight_in_the_loop

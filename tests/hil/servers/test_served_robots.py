@@ -5,16 +5,16 @@ import socket
 
 import pytest
 
-from hil.clock import Readers
+from hil.board.clock import Readers
 from hil.config import load_config
+from hil.emulator.events import EventQueue
 from hil.errors import LabError
-from hil.events import EventQueue
+from hil.laboratory.files.recorder import stored_in
 from hil.laboratory.lockstep import image_at
-from hil.laboratory.recorder import stored_in
 from hil.laboratory.robot import Site, Streams
-from hil.scene import VisualModel
 from hil.servers.served_robot import UDP_RETRY_US, ServedRobot
 from hil.servers.server import Server, Service
+from hil.world.scene import VisualModel
 from support.stm32_firmware import build
 from support.watching import Watcher
 

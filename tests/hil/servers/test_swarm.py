@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from firmware_py.firmware import Firmware
+from hil.board.board_firmware import PowerOn, PythonBoard
 from hil.config import load_config
-from hil.crazyflie import syslink
-from hil.devices.board_firmware import PowerOn, PythonBoard
+from hil.emulator.crazyflie import syslink
 from hil.servers.dongle_plugin import CONTROL, VARIABLE, WRITE, Connection, frame
 from hil.servers.dongle_server import AHEAD
 from hil.servers.server import Endpoints, Server, Service

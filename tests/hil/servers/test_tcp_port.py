@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from hil.clock import Paced
+from hil.board.clock import Paced
 from hil.servers.tcp_port import CLIENTS_MAX, REPORT_US, Receive, TcpClient, TcpPort, TcpProtocol
 
 PATIENCE_S = 20.0

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from hil.board.imu import COS, SIN
 from hil.config import load_config
-from hil.devices.imu import COS, SIN
 from hil.testing.board import BareBoard
 from hil.testing.choices import name_of
 from hil.testing.flights import NAME_MAX, SHOWN, Item, folder_of, shown_of

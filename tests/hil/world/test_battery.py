@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from scipy.integrate import quad, solve_ivp
 
 from hil.config import load_config
-from hil.experiments.power import VEHICLES, estimate, until_empty
-from hil.floaty.plant import Plant
+from hil.laboratory.experiments.power import VEHICLES, estimate, until_empty
+from hil.laboratory.files.recorder import load_events, load_log
 from hil.laboratory.metrics import column, free_flight
-from hil.laboratory.recorder import load_events, load_log
 from hil.world.battery import Battery, endurance, open_circuit_voltage
 from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
+from hil.world.floaty.plant import Plant
 from support.flights import flown
 
 CONFIG = BatteryConfig()

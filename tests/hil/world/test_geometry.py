@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from hil.config import load_config
 from hil.errors import LabError
-from hil.floaty.geometry import area_and_centre, surfaces, weigh
-from hil.floaty.plant import Plant
-from hil.floaty.shape import flap_plates
 from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
+from hil.world.floaty.geometry import area_and_centre, surfaces, weigh
+from hil.world.floaty.plant import Plant
+from hil.world.floaty.shape import flap_plates
 from support.geometries import geometries
 
 MIRRORS = {"x": np.diag([-1.0, 1.0, 1.0]), "y": np.diag([1.0, -1.0, 1.0])}

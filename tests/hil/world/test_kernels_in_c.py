@@ -13,12 +13,11 @@ from firmware_py.core.subset import Block
 from firmware_py.export.compilers import Compiler, compilers
 from firmware_py.export.kernels import build, translate
 from firmware_py.export.methods import METHOD
-from hil import demonstrations
-from hil.crazyflie import quadrotor
-from hil.devices import imu
-from hil.learn import agent
-from hil.learn.tasks import PUSH_KINDS, PUSHES
-from hil.world import fixed_order, motion
+from hil.board import imu
+from hil.pictures.exports import demonstrations
+from hil.research.learn import agent
+from hil.research.learn.tasks import PUSH_KINDS, PUSHES
+from hil.world import fixed_order, motion, quadrotor
 from hil.world.structs import GUSTS, NOISE_ROWS, Air, Flaps, Rigid
 from support.other_machine import TARGETS, OtherMachine
 

@@ -12,9 +12,9 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from hil.errors import LabError
-from hil.floaty.correction import OperatingPoint
-from hil.floaty.plant import Plant
 from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
+from hil.world.floaty.correction import OperatingPoint
+from hil.world.floaty.plant import Plant
 from support.paths import VECTORS
 
 VECTORS = json.loads((VECTORS / "plant.json").read_text())

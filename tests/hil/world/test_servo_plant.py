@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from hil.floaty.plant import Plant
 from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
+from hil.world.floaty.plant import Plant
 from hil.world.servos import commanded_angles, next_period_us
 from support.paths import VECTORS
 

@@ -7,8 +7,8 @@ import pytest
 from pydantic import ValidationError
 
 from hil.errors import LabError
-from hil.floaty.plant import Plant
 from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
+from hil.world.floaty.plant import Plant
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 

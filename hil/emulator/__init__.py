@@ -1,0 +1,1 @@
+"""The emulator: a microcontroller that runs any image, and the parts of a Crazyflie around it. It knows no laboratory."""

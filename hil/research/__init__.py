@@ -1,0 +1,1 @@
+"""Questions that many flights answer: campaigns, design, identification, studies, learning."""

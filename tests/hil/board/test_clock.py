@@ -1,0 +1,143 @@
+"""Simulated time against the wall clock, on a wall clock that only moves when it is told to."""
+
+import fcntl
+import math
+import resource
+import socket
+from pathlib import Path
+
+import pytest
+
+from hil.board import clock
+from hil.board.clock import FreeRunning, Paced
+
+
+class Wall:
+    """Stands for the module `time`: sleeping takes exactly as long as asked."""
+
+    def __init__(self) -> None:
+        self.us = 5_000_000
+
+    def monotonic_ns(self) -> int:
+        return self.us * 1000
+
+    def sleep(self, duration_s: float) -> None:
+        self.us += round(duration_s * 1e6)
+
+
+@pytest.fixture
+def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
+    wall = Wall()
+    monkeypatch.setattr(clock, "time", wall)
+    return wall
+
+
+def test_a_paced_instant_happens_when_the_wall_clock_has_reached_it(wall: Wall) -> None:
+    paced, begin_us = Paced(), wall.us
+    for now_us in (0, 10_000, 15_000, 2_000_000):
+        paced.wait_until(now_us)
+        assert wall.us - begin_us == now_us
+    assert paced.stood_still_us == 0
+    assert paced.notices() == []
+
+
+def test_a_little_lateness_is_made_up_for(wall: Wall) -> None:
+    paced = Paced()
+    paced.start(0)
+    wall.us += 19_000
+    paced.wait_until(1000)
+    paced.wait_until(30_000)
+    assert paced.now_us() == 30_000
+    assert (paced.stood_still_us, paced.notices()) == (0, [])
+
+
+def test_after_a_stall_time_continues_from_its_value(wall: Wall) -> None:
+    paced = Paced()
+    paced.start(0)
+    wall.us += 301_000
+    paced.wait_until(1000)
+    assert paced.now_us() == 1000
+    before_us = wall.us
+    paced.wait_until(6000)
+    assert wall.us - before_us == 5000  # no burst
+    assert paced.stood_still_us == 300_000
+    assert paced.notices() == ["this machine was too slow: time stood still for 300 ms"]
+    assert paced.notices() == []
+
+
+@pytest.mark.parametrize("stall_us", [0, 21_000, 77_000, 1_234_567])
+def test_clocks_of_several_processes_are_in_phase_also_after_a_stall(wall: Wall, stall_us: int) -> None:
+    phases = set()
+    for delay_us in (0, 1_234, 19_999):  # between their starts
+        wall.us += delay_us
+        paced = Paced()
+        paced.start(20_000)
+        wall.us += stall_us
+        paced.wait_until(27_000)
+        phases.add((wall.us - paced.now_us()) % Paced.STALL_US)
+    assert phases == {0}
+
+
+def test_input_that_comes_before_time_starts_is_not_in_the_past(wall: Wall) -> None:
+    paced, (reader, writer) = Paced(), socket.socketpair()
+    with reader, writer:
+        heard: list[int] = []
+        paced.readers[reader] = heard.append
+        wall.us += 1
+        paced.start(20_000)
+        writer.send(b"early")
+        paced.serve(paced.wait_until(30_000))
+    assert heard == [20_000]
+
+
+def test_input_of_a_high_descriptor_is_read() -> None:
+    """`select` refuses those above 1023."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, 2048)), hard))
+    paced, (reader, writer), heard = Paced(), socket.socketpair(), []
+    high = socket.socket(fileno=fcntl.fcntl(reader, fcntl.F_DUPFD_CLOEXEC, 1200))
+    with reader, writer, high:
+        paced.readers[high] = heard.append
+        paced.start(20_000)
+        paced.serve(paced.wait_until(20_000))
+        assert heard == []
+        writer.send(b"input")
+        paced.serve(paced.wait_until(10_000_000))
+    assert len(heard) == 1
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_input_does_not_pass_an_event_that_a_task_has_planned_before_the_last_instant(wall: Wall) -> None:
+    paced, (reader, writer) = Paced(), socket.socketpair()
+    with reader, writer:
+        paced.readers[reader] = lambda now_us: None
+        paced.start(20_000)
+        writer.send(b"input")
+        wall.us += 30_000
+        assert paced.wait_until(50_000) == 50_000
+        assert paced.wait_until(40_000) == 40_000
+
+
+def test_a_slow_machine_is_reported_once_per_second_and_every_stall_counts(wall: Wall) -> None:
+    paced, lines = Paced(), []
+    for now_us in range(0, 5_000_000, 50_000):
+        paced.wait_until(now_us)
+        wall.us += 75_000  # what 50 ms cost
+        lines += paced.notices()
+    told_ms = [int(line.split()[-2]) for line in lines]
+    assert 4 <= len(lines) <= 6
+    assert sum(told_ms) == pytest.approx(paced.stood_still_us / 1000, abs=600)
+    assert paced.stood_still_us == pytest.approx(2_500_000, abs=60_000)
+
+
+def test_free_running_time_never_waits() -> None:
+    free = FreeRunning()
+    free.wait_until(10**15)
+    assert (free.stood_still_us, free.notices()) == (0, [])
+
+
+def test_process_age_is_nan_where_unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    first = clock.process_age_s()
+    assert 0.0 < first <= clock.process_age_s()
+    monkeypatch.setattr(clock, "PROCESS", tmp_path / "none")
+    assert math.isnan(clock.process_age_s())

@@ -1,0 +1,53 @@
+"""The parts around the chip by the registers of their data sheets."""
+
+import struct
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("unicorn")
+
+from hil.emulator.crazyflie import syslink
+from hil.emulator.crazyflie.parts import Parts
+from hil.emulator.crazyflie.radio_line import RadioLine
+from support.deck_bench import DeckBench
+from support.stm32_bench import Bench
+
+SYSCFG, EXTI, PORT_C, USART6 = 0x4001_3800, 0x4001_3C00, 2, 0x4001_1400
+
+
+def test_a_sample_is_in_the_bmi088s_registers_when_its_interrupt_comes() -> None:
+    bench = Bench()
+    parts = Parts(bench.chip, np.zeros(8192, np.uint8))
+    bench[SYSCFG + 0x14] = PORT_C << 8  # EXTI14
+    bench[EXTI], bench[EXTI + 8] = 1 << 14, 1 << 14  # IMR, RTSR
+    assert not bench[EXTI + 0x14]
+    parts.sample((1, -2, 300, -4, 500, -6))
+    assert bench[EXTI + 0x14] == 1 << 14
+    assert struct.unpack_from("<3h", parts.gyro, 0x02) == (1, -2, 300)
+    assert struct.unpack_from("<3h", parts.accel, 0x12) == (-4, 500, -6)
+    assert (parts.gyro[0x00], parts.accel[0x00], parts.accel[0x03] >> 7) == (
+        0x0F,
+        0x1E,
+        1,
+    )  # identities, ready
+    assert not parts.accel[0x18:].any()
+
+
+def test_a_frame_that_a_reset_cut_off_costs_no_later_one() -> None:
+    bench, lines = DeckBench(), []
+    outside = SimpleNamespace(
+        debug_write=lines.append, radio_send=lambda data: True, radio_command=lambda kind, data: None
+    )
+    radio = RadioLine(bench.chip, bench.processor, bench.decks, outside, polls=False)  # type: ignore[arg-type]
+    long, frame = syslink.encode(syslink.RAW, bytes(26)), syslink.encode(syslink.RAW, b"\0hello\n")
+    for data in (long[:8], frame):
+        bench[USART6 + 8], bench[USART6 + 0xC] = 84, 1 << 13 | 1 << 3  # BRR, UE and TE
+        for byte in data:
+            bench[USART6 + 4] = byte
+            bench.wait(20)
+        radio.sent()
+        bench.chip.reset(0x1400_0000)
+        radio.reset(bench.chip.now_us)
+    assert lines == ["hello"]

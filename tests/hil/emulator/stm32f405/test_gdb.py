@@ -1,0 +1,403 @@
+"""GDB's remote serial protocol, byte by byte, as its manual describes it (appendix "Remote Protocol")."""
+
+import re
+import socket
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Iterator
+from struct import pack, unpack_from
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+pytest.importorskip("unicorn")
+
+from hil.emulator.stm32f405.chip import CYCLES_PER_US, Chip, StopReason
+from hil.emulator.stm32f405.freertos import FreeRtos
+from hil.emulator.stm32f405.gdb import DebuggedChip, GdbServer
+from hil.emulator.stm32f405.gdb_protocol import (
+    PACKET_SIZE,
+    REGISTERS,
+    SIGINT,
+    SIGTRAP,
+    RemoteProtocol,
+    ResumeRequest,
+    framed,
+)
+from hil.emulator.stm32f405.image import Image
+from hil.errors import LabError
+from support import stm32_firmware
+from support.stm32_machine import FirmwareOnChip
+
+RAM = 0x2000_0000
+ASSERTION = 3  # of `enum planted`
+
+
+@pytest.fixture(scope="module")
+def image() -> Image:
+    return Image(stm32_firmware.build())
+
+
+@pytest.fixture
+def machine() -> Chip:
+    return FirmwareOnChip().chip
+
+
+@pytest.fixture(scope="module")
+def lasting() -> Chip:
+    return FirmwareOnChip().chip
+
+
+@pytest.fixture
+def protocol(machine: Chip) -> RemoteProtocol:
+    return RemoteProtocol(machine)
+
+
+def ask(protocol: RemoteProtocol, payload: bytes) -> bytes:
+    answer = protocol.receive(framed(payload))
+    assert answer[:2] == b"+$", answer
+    assert answer[-3:] == b"#%02x" % (sum(answer[2:-3]) % 256)
+    return re.sub(rb"}(.)", lambda escaped: bytes((escaped[1][0] ^ 0x20,)), answer[2:-3], flags=re.DOTALL)
+
+
+def test_a_packet_has_the_checksum_of_its_bytes() -> None:
+    # The manual's example of an empty answer, and sums by hand.
+    assert framed(b"") == b"$#00"
+    assert framed(b"OK") == b"$OK#9a"
+    assert framed(b"a#b") == b"$a}\x03b#43"
+
+
+@settings(max_examples=25)
+@given(cuts=st.lists(st.integers(1, 20), max_size=12))
+def test_packets_may_arrive_in_pieces(lasting: Chip, cuts: list[int]) -> None:
+    protocol = RemoteProtocol(lasting)
+    stream = b"+" + framed(b"qAttached") + b"+" + framed(b"p0f") + b"+" + framed(b"m20000000,4")
+    answers = b""
+    for cut in cuts:
+        answers += protocol.receive(stream[:cut])
+        stream = stream[cut:]
+    answers += protocol.receive(stream)
+    pc = lasting.register("pc")
+    assert answers == b"+" + framed(b"1") + b"+" + framed(pack("<I", pc).hex().encode()) + b"+" + framed(
+        b"00000000"
+    )
+
+
+def test_a_wrong_checksum_is_asked_for_again_and_an_answer_repeated(protocol: RemoteProtocol) -> None:
+    assert protocol.receive(b"$?#00") == b"-"
+    assert protocol.receive(b"$?#3f") == b"+$T05thread:1;#d7"
+    assert protocol.receive(b"-") == b"$T05thread:1;#d7"
+    assert protocol.receive(b"+") == b""
+
+
+def test_without_acknowledgements_only_answers_are_sent(protocol: RemoteProtocol) -> None:
+    assert ask(protocol, b"QStartNoAckMode") == b"OK"
+    assert protocol.receive(framed(b"?")) == framed(b"T05thread:1;")
+    assert protocol.receive(b"$?#00") == b""
+
+
+def test_unknown_packets_get_an_empty_answer(protocol: RemoteProtocol) -> None:
+    for (
+        packet
+    ) in b"vMustReplyEmpty vCont? X20000000,0: G00 qTStatus R00 b Z5,20000000,4 QPassSignals: _".split():
+        assert ask(protocol, packet) == b""
+
+
+@pytest.mark.parametrize(
+    "packet", [b"m", b"m,", b"m20000000", b"mxyz,4", b"p", b"pff", b"P0", b"P0=12", b"M20000000,4:00",
+               b"M20000000,0:", b"Z0", b"Z1,", b"c-1", b"M20000000,1:zz"],
+)  # fmt: skip
+def test_malformed_packets_do_nothing(protocol: RemoteProtocol, machine: Chip, packet: bytes) -> None:
+    before = ask(protocol, b"g")
+    assert ask(protocol, packet) == b"E01"
+    assert ask(protocol, b"g") == before
+    assert machine.breakpoints == set()
+    assert protocol.request is ResumeRequest.STOP
+
+
+@settings(max_examples=25)
+@given(st.lists(st.binary(max_size=30) | st.sampled_from([b"$", b"#", b"m", b"}"]), max_size=8))
+def test_nothing_that_arrives_raises(lasting: Chip, pieces: list[bytes]) -> None:
+    protocol = RemoteProtocol(lasting)
+    for piece in pieces:
+        protocol.receive(piece)
+        protocol.receive(framed(piece))
+
+
+def test_the_supported_features_are_those_that_are_there(protocol: RemoteProtocol) -> None:
+    features = ask(protocol, b"qSupported:multiprocess+;swbreak+;hwbreak+").split(b";")
+    assert b"PacketSize=%x" % PACKET_SIZE in features
+    assert {b"QStartNoAckMode+", b"qXfer:features:read+"} <= set(features)
+    assert (ask(protocol, b"qfThreadInfo"), ask(protocol, b"qsThreadInfo"), ask(protocol, b"qC")) == (
+        b"m1",
+        b"l",
+        b"QC1",
+    )
+
+
+def test_the_target_description_numbers_the_registers_as_they_are_sent(protocol: RemoteProtocol) -> None:
+    text, piece = b"", b"m"
+    while piece[:1] == b"m":
+        piece = ask(protocol, b"qXfer:features:read:target.xml:%x,64" % len(text))
+        text += piece[1:]
+    root = ElementTree.fromstring(text)
+    registers = [(r.get("name"), int(r.get("bitsize") or 0) // 8) for r in root.iter("reg")]
+    assert registers == list(REGISTERS)
+    assert [f.get("name") for f in root.iter("feature")] == [
+        "org.gnu.gdb.arm.m-profile", "org.gnu.gdb.arm.vfp", "org.gnu.gdb.arm.m-system",
+    ]  # fmt: skip
+    assert [name for name, _ in registers[:17]] == [*(f"r{n}" for n in range(13)), "sp", "lr", "pc", "xpsr"]
+
+
+def test_registers_are_read_together_written_singly(protocol: RemoteProtocol, machine: Chip) -> None:
+    number = {name: index for index, (name, _) in enumerate(REGISTERS)}
+    assert ask(protocol, b"P%x=78563412" % number["r7"]) == b"OK"
+    assert ask(protocol, b"P%x=%s" % (number["d3"], pack("<d", -1.5).hex().encode())) == b"OK"
+    assert (machine.register("r7"), machine.register("d3")) == (
+        0x1234_5678,
+        unpack_from("<Q", pack("<d", -1.5))[0],
+    )
+    assert ask(protocol, b"p%x" % number["r7"]) == b"78563412"
+    everything = bytes.fromhex(ask(protocol, b"g").decode())
+    assert len(everything) == sum(size for _, size in REGISTERS)
+    assert everything[28:32] == bytes.fromhex("78563412")
+
+
+def test_memory_is_read_and_written(protocol: RemoteProtocol) -> None:
+    data = bytes(range(0x20, 0x30)) + b"}}*$#"
+    assert ask(protocol, b"M20000100,%x:%s" % (len(data), data.hex().encode())) == b"OK"
+    assert bytes.fromhex(ask(protocol, b"m20000100,%x" % len(data)).decode()) == data
+
+
+def test_memory_that_is_not_there_is_an_error(protocol: RemoteProtocol) -> None:
+    assert ask(protocol, b"m30000000,4") == b"E0e"
+    assert ask(protocol, b"M30000000,1:00") == b"E0e"
+
+
+def test_code_is_at_the_image_s_address(protocol: RemoteProtocol, image: Image) -> None:
+    assert bytes.fromhex(ask(protocol, b"m8004000,800").decode()) == image.code[:0x800]
+
+
+@pytest.fixture
+def client(machine: Chip) -> Iterator[tuple[GdbServer, socket.socket]]:
+    server = GdbServer(0)
+    server.attach(machine)
+    with socket.create_connection(("127.0.0.1", server.port)) as client:
+        client.settimeout(10.0)
+        yield server, client
+    server.close()
+
+
+def test_a_run_ends_in_front_of_a_breakpoint_and_a_step_behind_one_instruction(
+    client: tuple[GdbServer, socket.socket], machine: Chip, image: Image
+) -> None:
+    server, line = client
+    there = image.reset + 8
+    line.sendall(framed(b"QStartNoAckMode") + framed(b"Z1,%x,2" % there) + framed(b"c"))
+    assert server.hold() is ResumeRequest.RUN
+    assert machine.register("pc") == image.reset
+    line.sendall(framed(b"pf") + framed(b"s") + framed(b"pf") + framed(b"z1,%x,2" % there) + framed(b"D"))
+    assert machine.run(1000 * CYCLES_PER_US) & StopReason.BREAK
+    assert machine.register("pc") == there
+    assert server.hold() is ResumeRequest.STEP
+    machine.step()
+    assert server.hold() is ResumeRequest.DETACH
+    assert machine.register("pc") in (there + 2, there + 4)
+    pcs = [framed(pack("<I", pc).hex().encode()) for pc in (there, machine.register("pc"))]
+    stopped = framed(b"T05thread:1;")
+    assert (
+        line.recv(4096) == b"+" + framed(b"OK") * 2 + stopped + pcs[0] + stopped + pcs[1] + framed(b"OK") * 2
+    )
+
+
+def test_ctrl_c_stops_a_run(client: tuple[GdbServer, socket.socket], machine: Chip) -> None:
+    server, line = client
+    machine.write(RAM + 0x100, bytes.fromhex("fee7"))  # b .
+    machine.set_register("pc", RAM + 0x100)
+    line.sendall(framed(b"QStartNoAckMode") + framed(b"c"))
+    assert server.hold() is ResumeRequest.RUN
+    assert not server.wants_to_stop()
+    line.sendall(b"\x03")
+    assert server.wants_to_stop()
+    line.sendall(framed(b"D"))
+    assert server.hold(SIGINT) is ResumeRequest.DETACH
+    assert line.recv(4096) == b"+" + framed(b"OK") + framed(b"T02thread:1;") + framed(b"OK")
+
+
+def test_after_a_hang_up_the_machine_runs_and_accepts_another(
+    client: tuple[GdbServer, socket.socket], machine: Chip, image: Image
+) -> None:
+    server, line = client
+    line.sendall(framed(b"Z0,%x,2" % image.reset))
+    line.shutdown(socket.SHUT_WR)
+    assert server.hold() is ResumeRequest.DETACH
+    assert machine.breakpoints == set()
+    assert not server.wants_to_stop()
+    with socket.create_connection(("127.0.0.1", server.port)) as other:
+        other.sendall(b"+")
+        assert server.wants_to_stop()
+        other.sendall(framed(b"k"))
+        assert server.hold() is ResumeRequest.KILL
+
+
+def test_what_is_not_a_debugger_is_closed_and_writes_nothing(machine: Chip) -> None:
+    server = GdbServer(0)
+    server.attach(machine)
+    before = machine.read(RAM + 0x100, 4)
+    page, silent, debugger = (socket.create_connection(("127.0.0.1", server.port), 10.0) for _ in range(3))
+    page.sendall(b"POST / HTTP/1.1\r\n\r\n" + framed(b"M20000100,4:deadbeef"))
+    debugger.sendall(framed(b"D"))
+    assert server.hold() is ResumeRequest.DETACH
+    assert machine.read(RAM + 0x100, 4) == before
+    for closed in (page, silent, debugger):
+        closed.close()
+    with socket.create_connection(("127.0.0.1", server.port)) as page:
+        page.sendall(b"GET / HTTP/1.1\r\n")
+        assert not server.wants_to_stop()
+    server.close()
+
+
+def test_leaving_removes_the_breakpoints(protocol: RemoteProtocol, machine: Chip) -> None:
+    for packet in (b"Z0,8005000,2", b"Z0,8007000,2", b"z0,8005000,2", b"z0,8006000,2"):
+        assert ask(protocol, packet) == b"OK"
+    assert machine.breakpoints == {0x0800_7000}
+    assert ask(protocol, b"D") == b"OK"
+    assert machine.breakpoints == set()
+
+
+def test_without_a_scheduler_there_is_one_thread(protocol: RemoteProtocol) -> None:
+    answers = {b"qfThreadInfo": b"m1", b"qsThreadInfo": b"l", b"qC": b"QC1", b"T1": b"OK", b"T2": b"E01", b"Hg2": b"E01",
+               b"Hg1": b"OK", b"Hg0": b"OK", b"Hc-1": b"OK", b"qThreadExtraInfo,1": b""}  # fmt: skip
+    for packet, answer in answers.items():
+        assert ask(protocol, packet) == answer, packet
+
+
+def test_a_ninth_watchpoint_is_refused(protocol: RemoteProtocol) -> None:
+    answers = [ask(protocol, b"Z2,200000%d0,4" % number) for number in range(9)]
+    assert answers == [*8 * [b"OK"], b"E0e"]
+
+
+def test_time_stops_while_gdb_asks(client: tuple[GdbServer, socket.socket], machine: Chip) -> None:
+    server, line = client
+    before = [machine.register(name) for name, _ in REGISTERS]
+    line.sendall(b"".join(framed(b"m20000000,4") for _ in range(50)) + framed(b"c"))
+    assert server.hold(SIGTRAP) is ResumeRequest.RUN
+    assert [machine.register(name) for name, _ in REGISTERS] == before
+
+
+def test_a_port_that_is_taken_is_refused() -> None:
+    server = GdbServer(0)
+    with pytest.raises(LabError, match=rf"--gdb {server.port}: Address already in use"):
+        GdbServer(server.port)
+    server.close()
+
+
+def on_chip(
+    packets: Callable[[Image], list[bytes]], end_us: int, **variables: int
+) -> tuple[FirmwareOnChip, bytes]:
+    """The firmware on the chip after a run with a debugger that sends these packets, and what it was answered."""
+    machine = FirmwareOnChip(**variables)
+    server = GdbServer(0)
+    with socket.create_connection(("127.0.0.1", server.port)) as line:
+        line.sendall(b"".join(map(framed, packets(machine.image))))
+        try:
+            machine.run_debugged(server, end_us)
+            assert machine.chip.now_us >= end_us
+        finally:
+            server.close()
+        answers = b"".join(iter(lambda: line.recv(1 << 16), b""))
+    return machine, answers
+
+
+def contents(answers: bytes) -> list[bytes]:
+    return re.findall(rb"\$([^#]*)#", answers)
+
+
+def test_a_breakpoint_where_crashes_are_reported_stops_for_both() -> None:
+    machine, server = FirmwareOnChip(planted=ASSERTION), GdbServer(0)
+    place = machine.image.symbol("assertFail").address
+    machine.chip.crash_points.add(place)
+    with socket.create_connection(("127.0.0.1", server.port)) as line:
+        line.sendall(
+            b"".join(map(framed, (b"QStartNoAckMode", b"Z0,%x,2" % place, b"c", b"p0f", b"c", b"D")))
+        )
+        chip = DebuggedChip(machine.chip, server)
+        why = StopReason.SERIAL
+        while why in (StopReason.SERIAL, StopReason.COMPARE):
+            why = chip.run(100_000 * CYCLES_PER_US)
+        server.close()
+        answers = contents(b"".join(iter(lambda: line.recv(1 << 16), b"")))
+    assert why == StopReason.BREAK  # the report's
+    assert machine.chip.register("pc") == place
+    assert answers[-2:] == [b"T05thread:1;", pack("<I", place).hex().encode()]
+
+
+@pytest.mark.parametrize(("kind", "name"), [(b"2", "xTickCount"), (b"3", "planted"), (b"4", "planted")])
+def test_a_watchpoint_stops_after_the_access(kind: bytes, name: str) -> None:
+    def packets(image: Image) -> list[bytes]:
+        place = image.symbol(name).address
+        watch = b"%%s%s,%x,4" % (kind, place)
+        # xTickCount is first written when the memory is cleared.
+        return [
+            b"QStartNoAckMode", watch % b"Z", b"c", b"c", b"m%x,4" % place, b"p0f", watch % b"z", b"c", b"D",
+        ]  # fmt: skip
+
+    machine, answers = on_chip(packets, 20_000)
+    said = contents(answers)
+    place = machine.image.symbol(name).address
+    assert re.match(rb"T05watch:%x;thread:[0-9a-f]+;" % place, said[3]), said
+    pc = int.from_bytes(bytes.fromhex(said[5].decode()), "little")
+    assert machine.image.function_at(pc) in {"xTickCount": ("tick",), "planted": ("report", "go_wrong")}[name]
+    if name == "xTickCount":
+        assert said[4] == b"01000000"
+
+
+def test_a_debugger_that_has_left_stops_nothing_any_more() -> None:
+    machine, server = FirmwareOnChip(), GdbServer(0)
+    place = machine.image.symbol("xTickCount").address
+    with socket.create_connection(("127.0.0.1", server.port)) as line:
+        line.sendall(b"".join(map(framed, (b"QStartNoAckMode", b"Z2,%x,4" % place, b"D"))))
+        chip = DebuggedChip(machine.chip, server)
+        assert chip.run(CYCLES_PER_US) == StopReason.TIME
+    for end_us in (2_000, 4_000):  # the chip itself, without its debugger
+        while machine.chip.now_us < end_us:
+            assert machine.chip.run(end_us * CYCLES_PER_US) & StopReason.WATCHPOINT == 0
+    server.close()
+
+
+def test_a_stop_selects_the_running_thread() -> None:
+    machine = FirmwareOnChip()
+    chip, place = machine.chip, machine.image.symbol("vTaskSwitchContext").address
+    machine.run(30_000)
+    kernel = FreeRtos(machine.image, chip.read)
+    protocol = RemoteProtocol(chip, kernel)
+    other = next(task.block for task in kernel.tasks() if task.block != kernel.current_block)
+    assert ask(protocol, b"Z0,%x,2" % place) == ask(protocol, b"Hg%x" % other) == b"OK"
+    assert protocol.receive(framed(b"c")) == b"+"
+    while not chip.run(200_000 * CYCLES_PER_US) & StopReason.BREAK:
+        assert chip.now_us < 200_000
+    protocol.stopped(SIGTRAP)
+    assert ask(protocol, b"p0f") == pack("<I", place).hex().encode()
+
+
+def test_the_chip_waits_for_its_debugger_at_its_first_instruction() -> None:
+    machine, answers = on_chip(lambda _: [b"QStartNoAckMode", b"pf", b"me000ed28,4", b"D"], 2_000)
+    reset = framed(pack("<I", machine.image.reset).hex().encode())
+    assert answers == b"+" + framed(b"OK") + reset + framed(b"00000000") + framed(b"OK")
+
+
+def test_a_breakpoint_of_others_is_theirs() -> None:
+    machine = FirmwareOnChip()
+    place = machine.image.symbol("vTaskSwitchContext").address
+    machine.chip.crash_points.add(place)
+    server = GdbServer(0)
+    with socket.create_connection(("127.0.0.1", server.port)) as line:
+        line.sendall(framed(b"c"))
+        assert DebuggedChip(machine.chip, server).run(5_000 * CYCLES_PER_US) == StopReason.BREAK
+    assert machine.chip.register("pc") == place
+    server.close()
+
+
+def test_kill_ends_the_flight_like_ctrl_c() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        on_chip(lambda _: [b"k"], 2_000)

@@ -1,0 +1,69 @@
+"""The border between Python and the compiled machine: one header, which both sides read."""
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("unicorn")
+pytest.importorskip("cffi")
+
+from hil.emulator.stm32f405 import chip
+from hil.emulator.stm32f405.chip import SOURCES, Chip, StopReason, build_machine, declared
+from hil.errors import LabError
+from support.stm32_bench import Bench
+
+
+def constants(prefix: str) -> dict[str, int]:
+    """The numbers of machine.h whose names begin so, without that."""
+    declarations = declared()
+    library = declarations.dlopen(str(build_machine()))
+    return {
+        name.removeprefix(prefix): getattr(library, name)
+        for name in dir(library)
+        if name.isupper() and name.startswith(prefix)
+    }
+
+
+def test_python_s_reasons_to_stop_are_the_machine_s() -> None:
+    assert {why.name: why.value for why in StopReason if why} == constants("STOP_")
+
+
+def test_python_s_memories_lie_where_the_machine_has_them() -> None:
+    numbers = constants("")
+    for name in ("FLASH", "RAM", "CCM"):
+        assert (getattr(chip, name), getattr(chip, f"{name}_SIZE")) == (
+            numbers[f"{name}_BASE"],
+            numbers[f"{name}_SIZE"],
+        )
+    assert numbers["CLOCK_HZ"] == chip.CYCLES_PER_US * 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("was", "is_now"),
+    [
+        ("uint64_t next_due;", ""),
+        ("uint32_t unknown[16];", "uint32_t unknown[17];"),
+        ("SWITCHES = 4096", "SWITCHES = 4095"),
+    ],
+)
+def test_a_layout_that_is_not_the_compiled_one_is_refused(
+    was: str, is_now: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    library = build_machine()
+    header = (SOURCES / "machine.h").read_text()
+    assert was in header
+    (tmp_path / "machine.h").write_text(header.replace(was, is_now))
+    monkeypatch.setattr(chip, "SOURCES", tmp_path)
+    monkeypatch.setattr(chip, "declared", declared.__wrapped__)
+    with pytest.raises(LabError, match=r"not compiled from the machine\.h"):
+        Chip(bytes(8), chip.FLASH, library)
+
+
+def test_a_number_that_does_not_fit_is_refused_and_not_cut() -> None:
+    bench = Bench()
+    with pytest.raises(OverflowError):
+        bench.chip.run(1 << 64)
+    with pytest.raises(OverflowError):
+        bench.chip.state.pc = 1 << 32
+    with pytest.raises(AttributeError):
+        bench.chip.state.nothing = 0

@@ -1,0 +1,188 @@
+"""The chip's peripherals by their registers, as ST's reference manual RM0090 has them; code only sleeps."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("unicorn")
+
+from hil.emulator.stm32f405.chip import CYCLES_PER_US, FLASH, RAM, StopReason
+from hil.errors import LabError
+from support.stm32_bench import Bench
+
+TIM3, I2C1, IWDG = 0x4000_0400, 0x4000_5400, 0x4000_3000
+USART6, EXTI = 0x4001_1400, 0x4001_3C00
+GPIOA, SYSCFG, CAN1 = 0x4002_0000, 0x4001_3800, 0x4000_6400
+START, STOP, ENABLED = 1 << 8, 1 << 9, 1
+SB, ADDR, BTF, RXNE, TXE = 1, 2, 4, 1 << 6, 1 << 7
+BYTE_US = 10  # of a USART at 1 Mbaud
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_a_compare_register_is_seen_from_outside(bench: Bench) -> None:
+    bench[TIM3 + 0x34] = 25522
+    assert bench.chip.state.compare[2][0] == 25522
+
+
+@pytest.mark.parametrize("pairs", [False, True])
+def test_a_device_reads_back_its_writes(bench: Bench, pairs: bool) -> None:
+    memory = np.zeros(256, np.uint8)
+    bench.chip.add_device(1, 0x50, memory, pairs=pairs)
+    bench[I2C1 + 0x1C] = 35
+    bench[I2C1] = START | ENABLED
+    bench.until(I2C1 + 0x14, SB)
+    bench[I2C1 + 0x10] = 0x50 << 1
+    bench.until(I2C1 + 0x14, ADDR)
+    bench[I2C1 + 0x18]  # clears ADDR
+    for byte in (0x20, 0xAB, 0x30, 0xCD) if pairs else (0x20, 0xAB, 0xCD):
+        bench.until(I2C1 + 0x14, TXE)
+        bench[I2C1 + 0x10] = byte
+    bench.until(I2C1 + 0x14, BTF)
+    assert memory[[0x20, 0x30 if pairs else 0x21]].tolist() == [0xAB, 0xCD]
+    bench[I2C1] = STOP | ENABLED
+    bench.wait(10)
+    assert bench[I2C1 + 0x18] == 0  # no longer master, bus free
+
+
+def test_a_byte_that_is_not_fetched_in_time_is_overrun(bench: Bench) -> None:
+    bench[USART6 + 0x08], bench[USART6 + 0x0C] = 84, 1 << 13 | 4
+    bench.chip.feed(6, b"ab")
+    bench.wait(BYTE_US + 1)
+    assert bench[USART6] & (RXNE >> 1 | 8) == RXNE >> 1
+    bench.wait(BYTE_US)
+    assert bench[USART6] & 8
+    assert bench[USART6 + 4] == ord("a")
+    assert bench[USART6] & 8 == 0
+
+
+@pytest.mark.parametrize(("rising", "falling", "edges"), [(1, 0, (True, False)), (0, 1, (False, True))])
+def test_pins_interrupt_on_edges(bench: Bench, rising: int, falling: int, edges: tuple[bool, bool]) -> None:
+    bench[SYSCFG + 0x14] = 2 << 8  # EXTI14 on port C
+    bench[EXTI], bench[EXTI + 8], bench[EXTI + 12] = 1 << 14, rising << 14, falling << 14
+    seen = []
+    for high in (True, False):
+        bench.chip.pin("C", 14, high)
+        seen.append(bool(bench[EXTI + 0x14] >> 14 & 1))
+        bench[EXTI + 0x14] = 1 << 14
+    assert tuple(seen) == edges
+
+
+@pytest.mark.parametrize("pin", range(16))
+def test_each_pin_has_its_line_its_source_and_its_interrupt(bench: Bench, pin: int) -> None:
+    bench[SYSCFG + 0x08 + pin // 4 * 4] = 2 << pin % 4 * 4  # port C; all other lines are port A's
+    bench[EXTI] = bench[EXTI + 8] = 0xFFFF
+    bench.chip.pin("A", pin, True)
+    assert bench[EXTI + 0x14] == 0
+    bench.chip.pin("C", pin, True)
+    assert bench[EXTI + 0x14] == 1 << pin
+    irq = 6 + pin if pin < 5 else 23 if pin < 10 else 40
+    assert [one for one in (*range(6, 11), 23, 40) if bench.is_pending(one)] == [irq]
+    bench.chip.pin("A", (pin + 1) % 16, True)
+    assert bench[EXTI + 0x14] == 1 << pin | 1 << (pin + 1) % 16
+
+
+def test_where_a_pin_is_set_and_reset_at_once_it_is_set(bench: Bench) -> None:
+    bench[GPIOA + 0x14] = 0b0110
+    bench[GPIOA + 0x18] = 0b1010 << 16 | 0b1001
+    assert bench[GPIOA + 0x14] == 0b1101
+
+
+def test_an_output_is_read_back_and_an_input_is_what_the_pin_has(bench: Bench) -> None:
+    bench[GPIOA] = 1  # pin 0 is an output
+    bench[GPIOA + 0x18] = 3  # both are set
+    bench.chip.pin("A", 1, False)
+    assert bench[GPIOA + 0x10] & 3 == 1
+    bench[GPIOA + 0x18] = 1 << 16
+    assert bench[GPIOA + 0x10] & 1 == 0
+
+
+def test_a_watchdog_that_is_fed_does_not_bite(bench: Bench) -> None:
+    bench[IWDG] = 0x5555
+    bench[IWDG + 4], bench[IWDG + 8] = 0, 31
+    bench[IWDG] = 0xCCCC
+    for _ in range(3):
+        assert bench.wait(3900) == StopReason.TIME
+        bench[IWDG] = 0xAAAA
+    assert bench.wait(3900) == StopReason.TIME
+    assert bench.wait(200) & StopReason.WATCHDOG
+
+
+def test_a_store_into_flash_changes_nothing_and_the_next_instruction_follows() -> None:
+    bench = Bench(
+        bytes.fromhex("c0f80010 0132 0160 0132")
+    )  # str.w r1, [r0]; adds r2, #1; str r1, [r0]; adds r2, #1
+    bench.chip.set_register("r0", FLASH + 0x100)
+    bench.chip.set_register("r1", 0x1234)
+    bench.wait(10)
+    assert [bench.chip.register(name) for name in ("r0", "r1", "r2")] == [FLASH + 0x100, 0x1234, 2]
+    assert bench[FLASH + 0x100] == 0xFFFF_FFFF
+
+
+def test_only_a_jump_that_is_taken_refills_the_pipeline() -> None:
+    def cycles(branch: str) -> int:  # cmp r0, r0; the branch over the nop; nop; subs r1, #1; bne to cmp
+        bench = Bench(bytes.fromhex(f"8042 {branch} 00bf 0139 fad1"))
+        bench.chip.set_register("r1", 100)
+        bench.wait(100)
+        return int(bench.chip.state.now - bench.chip.state.sleeping)
+
+    assert cycles("00d0") - cycles("00d1") == 100 * (3 - 1)  # beq is taken and skips the nop, bne is not
+
+
+def test_an_unknown_peripheral_reads_as_0_and_is_named_once(bench: Bench) -> None:
+    bench[CAN1] = 0x55
+    assert bench[CAN1] == 0
+    assert list(bench.chip.state.unknown[0 : bench.chip.state.unknown_count]) == [CAN1]
+
+
+def test_where_nothing_is_nothing_can_be_read(bench: Bench) -> None:
+    with pytest.raises(LabError, match="0x60000000, 4 bytes: no memory there"):
+        bench.chip.read(0x6000_0000, 4)
+
+
+# TIM2 to TIM5, USART2, I2C1, TIM1, USART6, SPI1, SYSCFG, EXTI, GPIOA to GPIOD, RCC, DMA1, DMA2; SysTick, NVIC, SCB.
+PERIPHERALS = (
+    0x4000_0000, 0x4000_0400, 0x4000_0800, 0x4000_0C00, 0x4000_4400, 0x4000_5400, 0x4001_0000, 0x4001_1400, 0x4001_3000,
+    0x4001_3800, 0x4001_3C00, 0x4002_0000, 0x4002_0400, 0x4002_0800, 0x4002_0C00, 0x4002_3800, 0x4002_6000, 0x4002_6400,
+)  # fmt: skip
+SYSTEM = (0xE000_E010, 0xE000_E100, 0xE000_E200, 0xE000_E400, 0xE000_ED04)
+CORE = (*(f"r{number}" for number in range(13)), "sp", "pc", "primask", "basepri", "faultmask", "control")
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_reset_chip_is_like_a_fresh_one(bench: Bench, seed: int) -> None:
+    """Whatever was written to its registers, and while it runs on."""
+
+    def seen(one: Bench) -> dict[int | str, int]:
+        registers: dict[int | str, int] = {name: one.chip.register(name) for name in CORE}
+        places = [
+            base + 4 * word for base in PERIPHERALS + SYSTEM for word in range(24 if base < SYSTEM[0] else 4)
+        ]
+        return registers | {place: one[place] for place in places}
+
+    rng = np.random.default_rng(seed)
+    fresh = Bench()
+    for base in rng.permutation(PERIPHERALS + SYSTEM[:4]).tolist():
+        for word in rng.integers(0, 24 if base < SYSTEM[0] else 4, 12).tolist():
+            if base + 4 * word != 0x4002_3C00:
+                bench[base + 4 * word] = int(rng.integers(1, 1 << 32) & rng.integers(1, 1 << 32))
+    for name in CORE[:13]:
+        bench.chip.set_register(name, 0x1234)
+    for name, value in (("basepri", 0x10), ("faultmask", 1), ("primask", 1), ("control", 2)):
+        bench.chip.set_register(name, value)
+    bench.chip.run(5 * CYCLES_PER_US)
+    assert seen(bench) != seen(fresh)
+    fresh.chip.run(bench.chip.state.now)
+    for one in (bench, fresh):
+        one.chip.reset(0x0C00_0000)
+    # The manuals' values: VTOR, CCR, status of USART2 and SPI1, reload of TIM2 and TIM3, cause.
+    places = (0xE000_ED08, 0xE000_ED14, 0x4000_4400, 0x4001_3008, 0x4000_002C, 0x4000_042C, 0x4002_3874)
+    values = (FLASH, 0x200, 0xC0, 2, 0xFFFF_FFFF, 0xFFFF, 0x0C00_0000)
+    assert [bench[place] for place in places] == list(values)
+    assert [bench.chip.register(name) for name in CORE] == [*13 * [0], RAM + 0x1000, FLASH + 8, 0, 0, 0, 0]
+    for _ in range(3):
+        assert set(seen(bench).items()) == set(seen(fresh).items())
+        for one in (bench, fresh):
+            one.chip.run(fresh.chip.state.now + 100 * CYCLES_PER_US)

@@ -1,0 +1,484 @@
+"""What the chip refuses, instruction by instruction: ARMv7-M Architecture Reference Manual, and ST's RM0090 and PM0214."""
+
+from struct import pack, unpack
+
+import pytest
+
+from hil.emulator.stm32f405 import chip as chip_module
+from hil.emulator.stm32f405.chip import StopReason
+from hil.errors import LabError
+from support.stm32_bench import FLASH, RAM, Bench
+
+START, VECTORS, DATA = FLASH + 8, RAM + 0x4000, RAM + 0x2000
+VTOR, CCR, SHPR2, SHCSR, CPACR, MPU_CTRL = (
+    0xE000_E000 + offset for offset in (0xD08, 0xD14, 0xD1C, 0xD24, 0xD88, 0xD94)
+)
+GPIOA, TIM3_ARR, APB1ENR = 0x4002_0000, 0x4000_042C, 0x4002_3840
+CCM, NO_MEMORY = 0x1000_0000, 0x3000_0000
+HARD_FAULT, MEM_MANAGE, BUS_FAULT, USAGE_FAULT = 3, 4, 5, 6
+IACCVIOL, IBUSERR, PRECISERR, STKERR, BFARVALID = 1, 1 << 8, 1 << 9, 1 << 12, 1 << 15  # in CFSR
+UNDEFINED, INVSTATE, INVPC, NOCP, UNALIGNED, DIVBYZERO = (1 << bit for bit in (16, 17, 18, 19, 24, 25))
+UNALIGN_TRP, DIV_0_TRP, STKALIGN = 1 << 3, 1 << 4, 1 << 9  # in CCR
+VECTTBL, FORCED, DEBUGEVT = 1 << 1, 1 << 30, 1 << 31  # in HFSR
+HANDLED = 0b111 << 16  # in SHCSR: the three faults have handlers of their own
+FLOATS = 0xF << 20  # in CPACR
+WORDS = bytes(range(0x81, 0xC1))  # in memory, from DATA on
+RUN_US = 10
+
+
+class Strict(Bench):
+    """Instructions on a chip whose exceptions all end in a sleeping handler."""
+
+    def __init__(
+        self, code: str, registers: dict[str, int] | None = None, ccr: int = STKALIGN, cpacr: int = FLOATS
+    ) -> None:
+        instructions = bytes.fromhex(code)
+        super().__init__(instructions)
+        self.handler = START + len(instructions)
+        self.chip.write(VECTORS, pack("<16I", *[self.handler | 1] * 16))
+        self.chip.write(DATA, WORDS)
+        self[VTOR], self[CCR], self[CPACR] = VECTORS, ccr, cpacr
+        for name, value in (registers or {}).items():
+            self.chip.set_register(name, value)
+
+    def run(self) -> int:
+        """Run to the end and return the number of the exception, 0 without one."""
+        self.wait(RUN_US)
+        assert self.chip.register("pc") - self.handler in (0, 2)
+        return self.chip.register("xpsr") & 0x1FF
+
+    @property
+    def stacked_pc(self) -> int:
+        return int(unpack("<I", self.chip.read(self.chip.register("msp") + 24, 4))[0])
+
+    @property
+    def cfsr(self) -> int:
+        return int(self.chip.state.cfsr)
+
+
+ALIGNED = {
+    "ldrd r0, r1, [r4]": "d4e9 0001", "strd r0, r1, [r4, #8]": "c4e9 0201", "ldm r4, {r0, r1}": "94e8 0300",
+    "ldm r4!, {r0, r8}": "b4e8 0101", "stm r4!, {r0, r1}": "03c4", "stmdb r4, {r0, r1}": "04e9 0300",
+    "vldr s0, [r4]": "94ed 000a", "vstr s0, [r4, #4]": "84ed 010a", "vldm r4, {s0-s3}": "94ec 040a",
+    "vstmdb r4!, {s0-s1}": "24ed 020a", "vldr d0, [r4]": "94ed 000b", "vstr d0, [r4, #8]": "84ed 020b",
+    "vldm r4!, {d0-d1}": "b4ec 040b", "vstm r4, {d0}": "84ec 020b", "ldrex r0, [r4]": "54e8 000f",
+    "strex r2, r0, [r4]": "44e8 0002",
+}  # fmt: skip
+HALF_WORDS = {"ldrexh r0, [r4]": "d4e8 5f0f", "strexh r2, r0, [r4]": "c4e8 520f"}
+EVERY = ALIGNED | HALF_WORDS
+
+
+def ids(table: dict[str, str]) -> dict[str, object]:
+    return {"argvalues": list(table.values()), "ids": list(table)}
+
+
+@pytest.mark.parametrize("code", **ids(EVERY))
+@pytest.mark.parametrize("enabled", [False, True], ids=["", "handled"])
+def test_an_unaligned_multiple_floating_or_exclusive_access_is_a_usage_fault(
+    code: str, enabled: bool
+) -> None:
+    bench = Strict(code, {"r4": DATA + 1})
+    bench[SHCSR] = HANDLED if enabled else 0
+    assert bench.run() == (USAGE_FAULT if enabled else HARD_FAULT)
+    assert (bench.cfsr, bench.chip.state.hfsr) == (UNALIGNED, 0 if enabled else FORCED)
+    assert bench.stacked_pc == START
+    assert bench.chip.register("r4") == DATA + 1
+    assert bench.chip.read(DATA, len(WORDS)) == WORDS
+
+
+@pytest.mark.parametrize("code", **ids(ALIGNED))
+def test_a_half_word_is_no_alignment_for_them(code: str) -> None:
+    bench = Strict(code, {"r4": DATA + 2})
+    bench.run()
+    assert bench.cfsr == UNALIGNED
+
+
+@pytest.mark.parametrize("code", **ids(EVERY))
+def test_the_same_accesses_to_aligned_words_pass(code: str) -> None:
+    bench = Strict(code, {"r4": DATA + 20})  # not a multiple of eight
+    assert (bench.run(), bench.cfsr) == (0, 0)
+
+
+def test_an_unaligned_access_that_is_not_executed_is_no_fault() -> None:
+    # cmp r6, #1; ite eq; vldreq d0, [r4]; movne r7, #5
+    bench = Strict("012e 0cbf 94ed 000b 0527", {"r4": DATA + 1})
+    assert bench.run() == 0
+    assert bench.chip.register("r7") == 5
+
+
+@pytest.mark.parametrize("register", ["s0", "d0"])
+def test_an_unaligned_access_in_an_it_block_is_a_fault(register: str) -> None:
+    # cmp r6, #0; itt eq; vldreq [r4]; moveq r7, #5; behind d0 the block is executed to its end, before the fault
+    bench = Strict(f"002e 04bf 94ed 000{'a' if register == 's0' else 'b'} 0527", {"r4": DATA + 1})
+    assert bench.run() == HARD_FAULT
+    assert (bench.cfsr, bench.stacked_pc) == (UNALIGNED, START + 4)
+
+
+def word(offset: int) -> int:
+    return int.from_bytes(WORDS[offset : offset + 4], "little")
+
+
+def half(offset: int) -> int:
+    return int.from_bytes(WORDS[offset : offset + 2], "little")
+
+
+LOADS = {  # with r4 = DATA + 5 and r5 = 2: code, r0, r4
+    "ldr r0, [r4]": ("2068", word(5), 5),
+    "ldr r0, [r4, #8]": ("a068", word(13), 5),
+    "ldr.w r0, [r4, #1]": ("d4f8 0100", word(6), 5),
+    "ldr r0, [r4], #5": ("54f8 050b", word(5), 10),
+    "ldr r0, [r4, #-2]!": ("54f8 020d", word(3), 3),
+    "ldr r0, [r4, r5]": ("6059", word(7), 5),
+    "ldr r0, [r4, r5, lsl #1]": ("54f8 1500", word(9), 5),
+    "ldrt r0, [r4]": ("54f8 000e", word(5), 5),
+    "ldr r4, [r4]": ("2468", None, word(5) - DATA),
+    "ldrh r0, [r4, #2]": ("6088", half(7), 5),
+    "ldrsh r0, [r4, r5]": ("605f", half(7) | 0xFFFF_0000, 5),
+    "ldrsh.w r0, [r4, #2]": ("b4f9 0200", half(7) | 0xFFFF_0000, 5),
+    "ldrh r0, [r4], #2": ("34f8 020b", half(5), 7),
+}
+STORES = {  # with r0 = 0x44332211: code, offset, bytes, r4
+    "str r0, [r4, #4]": ("6060", 9, 4, 5),
+    "str r0, [r4, r5]": ("6051", 7, 4, 5),
+    "str.w r0, [r4, #1]": ("c4f8 0100", 6, 4, 5),
+    "str r0, [r4], #5": ("44f8 050b", 5, 4, 10),
+    "strh r0, [r4, #2]": ("6080", 7, 2, 5),
+    "strh r0, [r4, #-2]": ("24f8 020c", 3, 2, 5),
+}
+
+
+@pytest.mark.parametrize(("code", "loaded", "moved"), LOADS.values(), ids=LOADS.keys())
+def test_an_unaligned_load_of_one_register_is_carried_out(code: str, loaded: int | None, moved: int) -> None:
+    bench = Strict(code, {"r4": DATA + 5, "r5": 2})
+    assert bench.run() == 0
+    assert loaded in (None, bench.chip.register("r0"))
+    assert bench.chip.register("r4") == DATA + moved
+
+
+@pytest.mark.parametrize(("code", "offset", "size", "moved"), STORES.values(), ids=STORES.keys())
+def test_an_unaligned_store_of_one_register_is_carried_out(
+    code: str, offset: int, size: int, moved: int
+) -> None:
+    bench = Strict(code, {"r0": 0x4433_2211, "r4": DATA + 5, "r5": 2})
+    assert bench.run() == 0
+    expected = WORDS[:offset] + pack("<I", 0x4433_2211)[:size] + WORDS[offset + size :]
+    assert bench.chip.read(DATA, len(WORDS)) == expected
+    assert bench.chip.register("r4") == DATA + moved
+
+
+SINGLE = {name: row[0] for name, row in (LOADS | STORES).items()}
+
+
+@pytest.mark.parametrize("code", **ids(SINGLE))
+def test_unalign_trp_forbids_every_unaligned_access(code: str) -> None:
+    bench = Strict(code, {"r4": DATA + 5, "r5": 2}, ccr=STKALIGN | UNALIGN_TRP)
+    assert bench.run() == HARD_FAULT
+    assert (bench.cfsr, bench.stacked_pc) == (UNALIGNED, START)
+
+
+@pytest.mark.parametrize(
+    ("address", "status"),
+    [
+        (GPIOA, UNALIGNED), (0x5000_0000, UNALIGNED), (0xA000_0000, UNALIGNED), (0xC000_0000, UNALIGNED),
+        (0x6000_0000, PRECISERR | BFARVALID), (0x9FFF_FFF0, PRECISERR | BFARVALID),
+    ],
+    ids=hex,
+)  # fmt: skip
+def test_an_unaligned_access_to_a_device_is_a_usage_fault(address: int, status: int) -> None:
+    bench = Strict("2068", {"r4": address + 2})
+    bench.run()
+    assert bench.cfsr == status
+
+
+def test_an_unaligned_access_within_a_block_costs_what_an_aligned_one_costs() -> None:
+    code = "2068 0137 2068 0137"  # ldr r0, [r4]; adds r7, #1; twice
+    benches = [Strict(code, {"r4": DATA + offset}) for offset in (4, 5)]
+    assert [bench.run() for bench in benches] == [0, 0]
+    assert [bench.chip.register("r7") for bench in benches] == [2, 2]
+    states = [bench.chip.state for bench in benches]
+    assert states[0].instructions == states[1].instructions
+    assert states[0].sleeping == states[1].sleeping
+
+
+def test_an_unaligned_load_in_an_it_block_keeps_the_condition_of_the_next() -> None:
+    # cmp r6, #0; itte eq; ldreq r0, [r4]; addeq r7, #5; addne r7, #1
+    bench = Strict("002e 06bf 2068 0537 0137", {"r4": DATA + 5})
+    assert bench.run() == 0
+    assert (bench.chip.register("r0"), bench.chip.register("r7")) == (word(5), 5)
+
+
+def test_a_step_over_an_unaligned_load_ends_after_it() -> None:
+    bench = Strict("2068 2068 0137", {"r4": DATA + 5})
+    bench.chip.step()
+    assert (bench.chip.register("pc"), bench.chip.register("r0")) == (START + 2, word(5))
+    instructions = bench.chip.state.instructions
+    bench.chip.step()
+    assert bench.chip.register("pc") == START + 4
+    assert bench.chip.state.instructions == instructions  # counted at the begin of their block
+
+
+def test_a_step_behind_wfi_wakes_the_processor() -> None:
+    bench = Strict("30bf 4ff0 0500 0137")  # wfi; mov.w r0, #5; adds r7, #1
+    for place in (2, 6):
+        bench.chip.step()
+        assert bench.chip.register("pc") == START + place
+    assert bench.run() == 0
+    assert bench.chip.register("r7") == 1
+
+
+@pytest.mark.parametrize(("code", "kind"), [("2068", 3), ("2060", 2)], ids=["read", "written"])
+def test_a_watchpoint_sees_an_unaligned_access(code: str, kind: int) -> None:
+    bench = Strict(code, {"r4": DATA + 5})
+    bench.chip.watch(kind, DATA + 8, 1, True)
+    assert bench.chip.run(1680) & StopReason.WATCHPOINT
+    assert bench.chip.state.watch_address == DATA + 8
+
+
+def test_masks_are_read_as_they_were_written() -> None:
+    # movs r0, #0x5f; msr basepri_max, r0; mrs r1, basepri; movs r0, #0x70; msr basepri_max, r0; mrs r2, basepri_max
+    # msr basepri, r0; mrs r5, basepri; cpsid f; mrs r3, faultmask; cpsie f; mrs r4, faultmask
+    raised = "5f20 80f3 1288 eff3 1181 7020 80f3 1288 eff3 1282"  # the maximum raises 0 and lowers nothing
+    bench = Strict(f"{raised} 80f3 1188 eff3 1185 71b6 eff3 1383 61b6 eff3 1384")
+    assert bench.run() == 0
+    assert [bench.chip.register(f"r{n}") for n in (1, 2, 5, 3, 4)] == [0x50, 0x50, 0x70, 1, 0]
+
+
+ARMV8_M = {
+    "lda r0, [r4]": "d4e8 af0f",
+    "stl r0, [r4]": "c4e8 af0f",
+    "tt r0, r4": "44e8 00f0",
+    "vseleq.f32 s0, s0, s0": "00fe 000a",
+    "vmaxnm.f32 s0, s0, s0": "80fe 000a",
+    "vrintz.f32 s0, s0": "b6ee c00a",
+}
+
+
+@pytest.mark.parametrize("code", **ids(ARMV8_M))
+def test_an_instruction_of_a_later_core_is_undefined(code: str) -> None:
+    bench = Strict(code, {"r4": DATA})
+    assert bench.run() == HARD_FAULT
+    assert (bench.cfsr, bench.stacked_pc) == (UNDEFINED, START)
+
+
+def test_a_stack_pointer_is_a_multiple_of_four() -> None:
+    bench = Strict("80f3 0888 80f3 0988", {"r0": DATA + 3})  # msr msp, r0; msr psp, r0
+    assert bench.run() == 0
+    assert [bench.chip.register(name) for name in ("msp", "psp")] == [DATA, DATA]
+
+
+def test_an_unknown_unicorn_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(chip_module, "CORTEX_M4_FEATURES", 0x1234_5678_9ABC_DEF0)
+    with pytest.raises(LabError, match="this version of unicorn"):
+        Bench()
+
+
+# Floats, divisions, breakpoints
+
+
+FLOAT_INSTRUCTIONS = {
+    "vldr s0, [r4]": "94ed 000a",
+    "vadd.f32 s0, s0, s0": "30ee 000a",
+    "vmov s0, r0": "00ee 100a",
+    "vpush {d8}": "2ded 028b",
+    "vmrs r0, fpscr": "f1ee 100a",
+}
+
+
+@pytest.mark.parametrize("code", **ids(FLOAT_INSTRUCTIONS))
+def test_floats_before_they_are_enabled_are_a_usage_fault(code: str) -> None:
+    bench = Strict(code, {"r4": DATA}, cpacr=0)
+    assert bench.run() == HARD_FAULT
+    assert (bench.cfsr, bench.stacked_pc) == (NOCP, START)
+    assert Strict(code, {"r4": DATA}).run() == 0
+
+
+def test_floats_are_enabled_and_disabled_by_the_code_itself() -> None:
+    # str r1, [r0]; dsb; isb; vmov s0, r0; str r2, [r0]; dsb; isb; vmov s0, r0
+    barriers = "bff3 4f8f bff3 6f8f"
+    code = f"0160 {barriers} 00ee 100a 0260 {barriers} 00ee 100a"
+    bench = Strict(code, {"r0": CPACR, "r1": FLOATS, "r2": 0}, cpacr=0)
+    assert bench.run() == HARD_FAULT
+    assert (bench.cfsr, bench.stacked_pc) == (NOCP, START + 24)
+
+
+@pytest.mark.parametrize("code", ["91fb f2f0", "b1fb f2f0"], ids=["sdiv", "udiv"])
+def test_a_division_by_zero_is_a_usage_fault_if_the_firmware_wants_it_so(code: str) -> None:
+    bench = Strict(code, {"r1": 7}, ccr=STKALIGN | DIV_0_TRP)
+    assert bench.run() == HARD_FAULT
+    assert (bench.cfsr, bench.stacked_pc) == (DIVBYZERO, START)
+    bench = Strict(code, {"r0": 1, "r1": 7})
+    assert (bench.run(), bench.chip.register("r0")) == (0, 0)
+
+
+def test_a_breakpoint_holds_each_arrival_once() -> None:
+    bench = Strict("0137 fde7")  # adds r7, #1; b to it
+    chip = bench.chip
+    chip.breakpoints = {START}
+    for moves_pc, counted in ((True, 0), (True, 0), (False, 1), (False, 2)):
+        if moves_pc:
+            chip.set_register("pc", START + 2)
+        assert chip.run(chip.state.now + 1000) & StopReason.BREAK
+        assert (chip.register("pc"), chip.register("r7")) == (START, counted)
+    chip.set_register("pc", START + 2)
+    chip.step()  # onto it
+    assert chip.run(chip.state.now + 1000) & StopReason.BREAK
+    assert (chip.register("pc"), chip.register("r7")) == (START, 3)
+
+
+def test_a_breakpoint_instruction_without_a_debugger_is_a_hard_fault() -> None:
+    bench = Strict("00be")
+    assert bench.run() == HARD_FAULT
+    assert (bench.cfsr, bench.chip.state.hfsr, bench.stacked_pc) == (0, DEBUGEVT, START)
+
+
+# Memory
+
+
+@pytest.mark.parametrize(
+    ("target", "exception", "status"),
+    [
+        (GPIOA, MEM_MANAGE, IACCVIOL),
+        (0x5000_0000, MEM_MANAGE, IACCVIOL),
+        (0xA000_0000, MEM_MANAGE, IACCVIOL),
+        (0xE000_E000, MEM_MANAGE, IACCVIOL),
+        (0xFFFF_FFF8, MEM_MANAGE, IACCVIOL),  # as a return from an exception, outside of one
+        (CCM, BUS_FAULT, IBUSERR),
+        (NO_MEMORY, BUS_FAULT, IBUSERR),
+        (0x6000_0000, BUS_FAULT, IBUSERR),
+    ],
+    ids=hex,
+)
+def test_no_code_is_fetched_from_devices_and_from_where_no_bus_leads(
+    target: int, exception: int, status: int
+) -> None:
+    bench = Strict("2047", {"r4": target | 1})  # bx r4
+    bench[SHCSR] = HANDLED
+    assert bench.run() == exception
+    assert (bench.cfsr, bench.stacked_pc) == (status, target)
+
+
+@pytest.mark.parametrize("code", ["2068", "2060"], ids=["read", "written"])
+@pytest.mark.parametrize(
+    "address", [NO_MEMORY, RAM + 0x2_0000, 0x4008_0000, 0x6000_0000, 0xC000_0000], ids=hex
+)
+def test_an_access_to_where_nothing_is_is_a_bus_fault_with_its_address(code: str, address: int) -> None:
+    bench = Strict(code, {"r4": address})
+    bench[SHCSR] = HANDLED
+    assert bench.run() == BUS_FAULT
+    assert (bench.cfsr, bench.chip.state.bfar, bench.stacked_pc) == (PRECISERR | BFARVALID, address, START)
+
+
+def test_a_store_to_locked_flash_has_no_effect() -> None:
+    bench = Strict("2060", {"r4": FLASH + 0x8000})
+    assert bench.run() == 0
+    assert bench.chip.read(FLASH + 0x8000, 4) == b"\xff" * 4
+
+
+def test_a_bit_of_memory_is_a_word_of_its_own() -> None:
+    # str r1, [r4]; ldr r0, [r5]: bit 6 of WORDS[2] = 0x83 is set, bit 7 of WORDS[1] = 0x82 is read
+    alias = 0x2200_0000 + (DATA - RAM) * 32
+    bench = Strict("2160 2868", {"r1": 1, "r4": alias + 2 * 32 + 6 * 4, "r5": alias + 32 + 7 * 4})
+    assert bench.run() == 0
+    assert bench.chip.read(DATA, 4) == bytes((0x81, 0x82, 0xC3, 0x84))
+    assert bench.chip.register("r0") == 1
+
+
+def test_a_bit_of_a_peripheral_is_a_word_of_its_own() -> None:
+    bench = Strict(
+        "2160 2868", {"r1": 1, "r4": 0x4200_0000 + (APB1ENR - 0x4000_0000) * 32 + 4, "r5": APB1ENR}
+    )
+    assert bench.run() == 0
+    assert bench.chip.register("r0") == 2
+
+
+def test_a_peripheral_without_a_clock_reads_as_zero_and_keeps_nothing() -> None:
+    for clocks, expected in ((0, 0), (1 << 1, 100)):
+        bench = Strict("2160 2068", {"r0": 1, "r1": 100, "r4": TIM3_ARR})  # str r1, [r4]; ldr r0, [r4]
+        bench[APB1ENR] = clocks
+        assert bench.run() == 0
+        assert bench.chip.register("r0") == expected
+        assert bench.chip.state.unknown_count == (0 if clocks else 1)
+
+
+def test_a_memory_protection_unit_is_reported_as_missing() -> None:
+    bench = Strict("2160", {"r1": 1, "r4": MPU_CTRL})
+    assert bench.run() == 0
+    assert bench.chip.state.unknown[0] == MPU_CTRL
+
+
+# Exceptions
+
+
+def with_handler(code: str, handler: str, **registers: int) -> Strict:
+    """`svc #0` and its handler, which follows `code`; the other exceptions sleep."""
+    bench = Strict(f"{code} 00df fee7 {handler}", registers)  # fee7: b to itself
+    bench.chip.write(VECTORS + 4 * 11, pack("<I", (START + len(bytes.fromhex(code)) + 4) | 1))
+    bench[SHCSR] = HANDLED
+    return bench
+
+
+INVALID_RETURNS = {  # handlers
+    "to a handler that did not run": ("8ef0 080e 7047", INVPC),  # eor lr, #8
+    "to nothing": ("8ef0 020e 7047", INVPC),  # eor lr, #2
+    "with a frame of a handler": (
+        "0798 0330 0790 7047",
+        INVPC,
+    ),  # ldr r0, [sp, #28]; adds r0, #3; str r0, [sp, #28]
+    "with a frame of no Thumb code": ("0020 0790 7047", INVSTATE),  # movs r0, #0; str r0, [sp, #28]
+}
+
+
+@pytest.mark.parametrize(("handler", "status"), INVALID_RETURNS.values(), ids=INVALID_RETURNS.keys())
+def test_an_invalid_return_from_an_exception_is_a_usage_fault(handler: str, status: int) -> None:
+    bench = with_handler("", handler)
+    assert bench.run() == USAGE_FAULT
+    assert bench.cfsr == status
+
+
+@pytest.mark.parametrize(("ccr", "padding"), [(STKALIGN, 4), (0, 0)])
+def test_a_frame_is_aligned_to_eight_bytes_unless_that_is_switched_off(ccr: int, padding: int) -> None:
+    bench = Strict("01b4 00df", ccr=ccr)  # push {r0}; svc
+    before = bench.chip.register("msp") - 4
+    assert bench.run() == 11
+    frame = bench.chip.register("msp")
+    assert before - frame == 0x20 + padding
+    assert bench[frame + 28] >> 9 & 1 == (padding == 4)
+
+
+@pytest.mark.parametrize(
+    ("code", "priority", "exception"),
+    [("72b6 00df", 0, HARD_FAULT), ("81f3 1188 00df", 0x60, HARD_FAULT), ("81f3 1188 00df", 0x40, 11)],
+    ids=["primask", "basepri", "more urgent"],
+)
+def test_a_supervisor_call_where_it_may_not_interrupt_is_a_hard_fault(
+    code: str, priority: int, exception: int
+) -> None:
+    bench = Strict(code, {"r1": 0x50})  # cpsid i, or msr basepri, r1
+    bench[SHPR2] = priority << 24
+    assert bench.run() == exception
+    assert bench.chip.state.hfsr == (FORCED if exception == HARD_FAULT else 0)
+
+
+def test_a_fault_while_interrupts_are_masked_is_a_hard_fault() -> None:
+    bench = Strict("72b6 00de")  # cpsid i; udf
+    bench[SHCSR] = HANDLED
+    assert bench.run() == HARD_FAULT
+    assert (bench.cfsr, bench.chip.state.hfsr) == (UNDEFINED, FORCED)
+
+
+@pytest.mark.parametrize("code", ["71b6 00de", "71b6 00df"], ids=["udf", "svc"])
+def test_a_fault_while_faults_are_masked_locks_up(code: str) -> None:
+    assert Strict(code).wait(RUN_US) & StopReason.LOCKUP  # cpsid f
+
+
+def test_a_vector_table_without_memory_locks_up() -> None:
+    bench = Strict("00df")
+    bench[VTOR] = NO_MEMORY
+    assert bench.wait(RUN_US) & StopReason.LOCKUP
+    assert bench.chip.state.hfsr & VECTTBL
+
+
+def test_an_exception_whose_frame_has_no_memory_is_a_hard_fault() -> None:
+    bench = Strict("00df", {"msp": RAM + 0x10})
+    assert bench.run() == HARD_FAULT
+    assert (bench.cfsr, bench.chip.state.hfsr) == (STKERR, FORCED)

@@ -1,0 +1,232 @@
+"""DMA and the lines that it serves by their registers, as RM0090 has them (chapters 10, 27 and 30)."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("unicorn")
+
+from hil.emulator.stm32f405.chip import CCM, RAM
+from support.stm32_bench import Bench
+
+DMAS = (0x4002_6000, 0x4002_6400)
+DMA_IRQS = ((11, 12, 13, 14, 15, 16, 17, 47), (56, 57, 58, 59, 60, 68, 69, 70))
+COMPLETE_BITS = (5, 11, 21, 27)  # of four streams in a register of flags
+ENABLED, ERROR_IE, COMPLETE_IE, TO_PERIPHERAL, CIRCULAR, INCREMENT = 1, 4, 16, 64, 256, 1024
+CR, NDTR, PAR, M0AR = 0x00, 0x04, 0x08, 0x0C
+# Address, interrupt, whether its clock is APB2's, 84 MHz, or APB1's, 42 MHz.
+USARTS = {
+    1: (0x4001_1000, 37, True), 2: (0x4000_4400, 38, False), 3: (0x4000_4800, 39, False),
+    4: (0x4000_4C00, 52, False), 5: (0x4000_5000, 53, False), 6: (0x4001_1400, 71, True),
+}  # fmt: skip
+USART6 = USARTS[6][0]
+SR, DR, BRR, CR1, CR3 = 0x00, 0x04, 0x08, 0x0C, 0x14
+ORE, RXNE, TC, TXE = 8, 32, 64, 128
+RECEIVING, SENDING, BY_DMA = 1 << 13 | 4, 1 << 13 | 8, 1 << 6
+BYTE_US = 10
+I2C1 = 0x4000_5400
+BUFFER = RAM + 0x2000
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def stream_of(dma: int, number: int) -> int:
+    return DMAS[dma] + 0x10 + 0x18 * number
+
+
+def receive_by_dma(bench: Bench, size: int, control: int, stream: int = stream_of(1, 1)) -> None:
+    bench[stream + NDTR], bench[stream + PAR], bench[stream + M0AR] = size, USART6 + DR, BUFFER
+    bench[stream + CR] = ENABLED | control
+    bench[USART6 + BRR], bench[USART6 + CR1], bench[USART6 + CR3] = 84, RECEIVING, BY_DMA
+
+
+# DMA
+
+
+def test_a_circular_transfer_begins_again_where_it_began_and_interrupts_each_round(bench: Bench) -> None:
+    stream = stream_of(1, 1)
+    receive_by_dma(bench, 4, CIRCULAR | INCREMENT | COMPLETE_IE)
+    for fed, left, memory in ((b"abc", 1, b"abc\0"), (b"d", 4, b"abcd"), (b"efg", 1, b"efgd")):
+        bench.chip.feed(6, fed)
+        bench.wait(BYTE_US * len(fed) + 1)
+        assert (bench[stream + NDTR], bench.chip.read(BUFFER, 4)) == (left, memory)
+    assert bench[stream + CR] & ENABLED
+    assert bench[DMAS[1]] >> 11 & 1
+    assert bench.is_pending(57)
+    bench[DMAS[1] + 8] = 1 << 11
+    assert bench[DMAS[1]] == 0
+    bench.chip.feed(6, b"hij")
+    bench.wait(BYTE_US * 3 + 1)
+    assert (bench[stream + NDTR], bench.chip.read(BUFFER, 8)) == (2, b"ijgh\0\0\0\0")
+    assert bench[DMAS[1]] >> 11 & 1
+
+
+def test_a_transfer_that_is_not_circular_ends(bench: Bench) -> None:
+    stream = stream_of(1, 1)
+    receive_by_dma(bench, 2, INCREMENT)
+    bench.chip.feed(6, b"abc")
+    bench.wait(BYTE_US * 3 + 1)
+    assert (bench[stream + CR] & ENABLED, bench[stream + NDTR]) == (0, 0)
+    assert bench.chip.read(BUFFER, 3) == b"ab\0"
+    assert bench[USART6 + SR] & RXNE
+    assert bench[USART6 + DR] == ord("c")
+    assert not bench.is_pending(57), "without TCIE"
+
+
+def test_without_increment_all_bytes_go_to_one_place(bench: Bench) -> None:
+    receive_by_dma(bench, 3, 0)
+    bench.chip.feed(6, b"abc")
+    bench.wait(BYTE_US * 3 + 1)
+    assert bench.chip.read(BUFFER, 3) == b"c\0\0"
+
+
+@pytest.mark.parametrize("dma", [0, 1])
+@pytest.mark.parametrize("number", range(8))
+def test_each_stream_has_its_flag_and_its_interrupt(bench: Bench, dma: int, number: int) -> None:
+    receive_by_dma(bench, 1, COMPLETE_IE, stream_of(dma, number))
+    other = stream_of(dma, (number + 1) % 8)  # complete, too: it is switched off before its end
+    bench[other + NDTR], bench[other + PAR], bench[other + CR] = 1, 0x4000_0000, ENABLED
+    bench[other + CR] = 0
+    bench.chip.feed(6, b"a")
+    bench.wait(BYTE_US + 1)
+    places = {DMAS[dma] + at // 4 * 4: 0 for at in (number, (number + 1) % 8)}
+    for at in (number, (number + 1) % 8):
+        places[DMAS[dma] + at // 4 * 4] |= 1 << COMPLETE_BITS[at % 4]
+    assert {place: bench[place] for place in places} == places
+    assert [irq for irqs in DMA_IRQS for irq in irqs if bench.is_pending(irq)] == [DMA_IRQS[dma][number]]
+    mine = DMAS[dma] + number // 4 * 4
+    bench[mine + 8] = 1 << COMPLETE_BITS[number % 4]
+    assert bench[mine] == places[mine] & ~(1 << COMPLETE_BITS[number % 4]), "the other one's stays"
+
+
+def test_a_stream_that_was_never_enabled_completes_nothing(bench: Bench) -> None:
+    bench[stream_of(1, 1) + CR] = INCREMENT
+    assert bench[DMAS[1]] == 0
+
+
+@pytest.mark.parametrize(("control", "pending"), [(ERROR_IE, True), (COMPLETE_IE, False)])
+def test_a_transfer_into_nothing_ends_with_an_error(bench: Bench, control: int, pending: bool) -> None:
+    receive_by_dma(bench, 2, control)
+    bench[stream_of(1, 1) + CR] = 0
+    bench[DMAS[1] + 8] = 1 << 11
+    bench[stream_of(1, 1) + M0AR] = 0x1000_0000  # the core-coupled memory is out of its reach
+    bench[stream_of(1, 1) + CR] = ENABLED | control
+    bench.chip.feed(6, b"a")
+    bench.wait(BYTE_US + 1)
+    assert bench[stream_of(1, 1) + CR] & ENABLED == 0
+    assert bench[DMAS[1]] == 1 << 9
+    assert bench.is_pending(57) is pending
+
+
+# USART
+
+
+@pytest.mark.parametrize("number", USARTS)
+def test_each_usart_has_its_clock_and_its_interrupt(bench: Bench, number: int) -> None:
+    base, irq, fast = USARTS[number]
+    bench[base + SR], bench[base + BRR] = 0, 84 if fast else 42
+    bench[base + CR1] = SENDING | TC  # TCIE has TC's place
+    bench[base + DR] = ord("x")
+    bench.wait(BYTE_US - 1)
+    assert bench[base + SR] & TC == 0
+    assert not [one for _, one, _ in USARTS.values() if bench.is_pending(one)]
+    bench.wait(2)
+    assert bench[base + SR] & TC
+    assert [one for _, one, _ in USARTS.values() if bench.is_pending(one)] == [irq]
+    assert bench.chip.sent(number) == b"x"
+
+
+def test_sending_is_complete_when_the_last_byte_has_left(bench: Bench) -> None:
+    bench[USART6 + BRR], bench[USART6 + CR1] = 84, SENDING
+    bench[USART6 + DR] = ord("a")
+    assert bench[USART6 + SR] & (TXE | TC) == TXE, "the register is free again: a is in the shifter"
+    bench[USART6 + DR] = ord("b")
+    assert bench[USART6 + SR] & (TXE | TC) == 0
+    bench.wait(BYTE_US + 1)
+    assert bench[USART6 + SR] & (TXE | TC) == TXE
+    bench.wait(BYTE_US)
+    assert bench[USART6 + SR] & (TXE | TC) == TXE | TC
+    assert bench.chip.sent(6) == b"ab"
+
+
+def test_writing_the_status_clears_only_what_software_may_clear(bench: Bench) -> None:
+    bench[USART6 + BRR], bench[USART6 + CR1] = 84, RECEIVING | SENDING
+    bench.chip.feed(6, b"ab")
+    bench.wait(2 * BYTE_US + 1)
+    assert bench[USART6 + SR] == TXE | TC | RXNE | ORE
+    bench[USART6 + SR] = ~TC & 0xFFFF_FFFF
+    assert bench[USART6 + SR] == TXE | RXNE | ORE
+    bench[USART6 + SR] = 0
+    assert bench[USART6 + SR] == TXE | ORE
+
+
+# I2C
+
+
+def address(bench: Bench, device: int) -> None:
+    bench[I2C1] = 1 << 10 | 1 << 8 | 1  # ACK, START
+    bench.until(I2C1 + 0x14, 1)
+    bench[I2C1 + 0x10] = device
+
+
+@pytest.mark.parametrize(
+    ("clock", "bit_us"), [(210, 10.0), (0x8000 | 35, 2.5), (0xC000 | 4, 100 / 42)], ids=["standard", "fast", "16/9"]
+)  # fmt: skip
+def test_a_bit_lasts_as_the_clock_register_sets(bench: Bench, clock: int, bit_us: float) -> None:
+    bench.chip.add_device(1, 0x50, np.zeros(256, np.uint8))
+    bench[I2C1 + 0x1C], bench[I2C1] = clock, 1
+    address(bench, 0x50 << 1)
+    bench.wait(int(9 * bit_us) - 1)
+    assert bench[I2C1 + 0x14] & 2 == 0
+    bench.wait(3)
+    assert bench[I2C1 + 0x14] & 2
+
+
+def test_the_last_byte_by_dma_is_not_acknowledged_and_no_other_follows(bench: Bench) -> None:
+    bench.chip.add_device(1, 0x50, np.arange(256, dtype=np.uint8))
+    stream = stream_of(0, 0)
+    bench[stream + NDTR], bench[stream + PAR], bench[stream + M0AR] = 3, I2C1 + 0x10, BUFFER
+    bench[stream + CR] = ENABLED | INCREMENT
+    bench[I2C1 + 0x1C], bench[I2C1 + 4] = 35, 1 << 12 | 1 << 11  # LAST, DMAEN
+    address(bench, 0x50 << 1 | 1)
+    bench.until(I2C1 + 0x14, 2)
+    bench[I2C1 + 0x18]  # clears ADDR
+    bench.wait(200)
+    assert bench.chip.read(BUFFER, 4) == bytes([0, 1, 2, 0])
+    assert bench[I2C1 + 0x14] & (1 << 6 | 4) == 0, "neither RXNE nor BTF"
+
+
+@pytest.mark.parametrize(("control", "pending"), [(1 << 9, False), (1 << 10 | 1 << 9, True)])
+def test_empty_registers_interrupt_only_if_buffered(bench: Bench, control: int, pending: bool) -> None:
+    bench.chip.add_device(1, 0x50, np.zeros(256, np.uint8))
+    bench[I2C1 + 0x1C], bench[I2C1] = 35, 1
+    address(bench, 0x50 << 1)
+    bench.until(I2C1 + 0x14, 2)
+    bench[I2C1 + 0x18]  # clears ADDR: TXE
+    bench[I2C1 + 4] = control
+    assert bench[I2C1 + 0x14] & 1 << 7
+    assert bench.is_pending(31) is pending
+
+
+def test_a_missing_acknowledgement_is_cleared_by_writing_0_and_nothing_else_is(bench: Bench) -> None:
+    bench[I2C1 + 0x1C], bench[I2C1] = 35, 1
+    address(bench, 0x41 << 1)
+    bench.wait(100)
+    bench[I2C1] = 1 << 8 | 1  # a start: SB
+    bench.until(I2C1 + 0x14, 1)
+    assert bench[I2C1 + 0x14] == 1 << 10 | 1
+    bench[I2C1 + 0x14] = 0
+    assert bench[I2C1 + 0x14] == 1
+
+
+def test_dma_cannot_reach_the_core_coupled_memory(bench: Bench) -> None:
+    stream = stream_of(1, 1)
+    receive_by_dma(bench, 4, INCREMENT)
+    bench[stream + M0AR] = CCM
+    bench.chip.feed(6, b"a")
+    bench.wait(BYTE_US + 1)
+    assert not bench[stream + CR] & ENABLED
+    assert bench[DMAS[1]] == 1 << 9  # TEIF1
+    assert bench.chip.read(CCM, 1) == b"\0"

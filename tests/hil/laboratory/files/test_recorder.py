@@ -1,0 +1,139 @@
+"""The recorder: what was written is what was read, whatever ends the flight."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from hil.errors import LabError
+from hil.laboratory.files.recorder import (
+    BATCHES_PER_PIECE,
+    ROWS_PER_BATCH,
+    Observer,
+    Recorder,
+    forget_read_columns,
+    load_events,
+    load_log,
+)
+from hil.world.body import Channel, Quantity
+from support.watching import Watcher
+
+
+def make(folder: Path, values: np.ndarray, observer: Observer | None = None) -> Recorder:
+    return Recorder(
+        folder,
+        (
+            Channel("float64", lambda: values, (Quantity(("a.x",), "m", "W"), Quantity(("a.y",), "m", "W"))),
+            Channel("int32", lambda: int(values[0]), (Quantity(("n",), ""),)),
+        ),
+        {"seed": "7"},
+        observer,
+    )
+
+
+def test_rows_survive_the_way_to_parquet(tmp_path: Path) -> None:
+    values = np.zeros(2)
+    recorder = make(tmp_path, values)
+    for row in range(250):
+        values[:] = row, -row
+        recorder.row(row * 10)
+    recorder.close()
+    table = load_log(tmp_path)
+    assert table.column("t").to_pylist() == list(range(0, 2500, 10))
+    assert table.column("a.y").to_pylist() == [-row for row in range(250)]
+    assert table.column("n").to_pylist() == list(range(250))
+    assert table.schema.metadata[b"seed"] == b"7"
+    assert not (tmp_path / "log.arrows").exists()
+
+
+@pytest.mark.parametrize("writable", [True, False])
+def test_a_long_log_is_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writable: bool) -> None:
+    rows = 2 * ROWS_PER_BATCH * BATCHES_PER_PIECE + 7
+    recorder = make(tmp_path, np.ones(2))
+    for row in range(rows):
+        recorder.row(row)
+    recorder.close()
+    whole, files = load_log(tmp_path), sorted(tmp_path.iterdir())
+    monkeypatch.setattr("hil.laboratory.files.recorder.PIECES_IN_MEMORY", 1)
+    monkeypatch.setattr("os.access", lambda path, mode: writable)
+    before = pa.total_allocated_bytes()
+    mapped = load_log(tmp_path)
+    assert pa.total_allocated_bytes() - before < whole.nbytes / 10
+    assert mapped.equals(whole, check_metadata=True)
+    assert sorted(tmp_path.iterdir()) == files
+
+
+def test_rows_that_an_observer_keeps_stay_as_they_were_recorded(tmp_path: Path) -> None:
+    watcher, values = Watcher(), np.zeros(2)
+    recorder = make(tmp_path, values, watcher)
+    for row in range(250):
+        values[:] = row, -row
+        recorder.row(row)
+    recorder.close()
+    assert pa.Table.from_batches(watcher.batches).equals(load_log(tmp_path))
+    assert watcher.notes == []
+
+
+def test_a_long_log_is_readable_with_freed_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = 20 * ROWS_PER_BATCH * BATCHES_PER_PIECE
+    recorder = make(tmp_path, np.ones(2))
+    for row in range(rows):
+        recorder.row(row)
+    recorder.close()
+    monkeypatch.setattr("hil.laboratory.files.recorder.PIECES_IN_MEMORY", 1)
+    log = load_log(tmp_path)
+    total, before = log.column("t").to_numpy().sum(), mapped_bytes()
+    forget_read_columns()
+    assert mapped_bytes() < before - 0.9 * 8 * rows
+    assert log.column("t").to_numpy().sum() == total == rows * (rows - 1) / 2
+
+
+def mapped_bytes() -> int:
+    """Return how much of mapped files is in this process's memory."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("RssFile:"))
+
+
+def killed(folder: Path, lost_bytes: int = 0) -> Path:
+    """What lies on disk of a run of 250 rows when the process dies, and when the disk lost the last bytes."""
+    (folder / "run").mkdir()
+    recorder = make(folder / "run", np.zeros(2))
+    for row in range(250):
+        recorder.row(row)
+    recorder.note(5, "lab", "half way")
+    left = folder / "left"
+    shutil.copytree(folder / "run", left)
+    recorder.close()
+    stream = left / "log.arrows"
+    stream.write_bytes(stream.read_bytes()[: -lost_bytes or None])
+    return left
+
+
+def test_a_killed_process_leaves_all_complete_seconds(tmp_path: Path) -> None:
+    left = killed(tmp_path)
+    assert load_log(left).num_rows == 200
+    assert load_events(left) == [{"t_us": 5, "source": "lab", "text": "half way"}]
+
+
+def test_a_batch_cut_in_the_middle_is_dropped(tmp_path: Path) -> None:
+    assert load_log(killed(tmp_path, lost_bytes=500)).num_rows == 100
+
+
+def test_hash_depends_on_values_and_names_only(tmp_path: Path) -> None:
+    digests = []
+    for name, value in (("a", 1.0), ("b", 1.0), ("c", 1.0 + 2**-52)):
+        (tmp_path / name).mkdir()
+        recorder = make(tmp_path / name, np.array([value, 0.0]))
+        recorder.row(0)
+        digests.append(recorder.close())
+    assert digests[0] == digests[1] != digests[2]
+
+
+def test_a_folder_without_a_log_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(LabError, match=r"no log\.parquet"):
+        load_log(tmp_path)
+    (tmp_path / "log.arrows").write_bytes(b"not arrow at all")
+    with pytest.raises(LabError, match="not a flight log"):
+        load_log(tmp_path)

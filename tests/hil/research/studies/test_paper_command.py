@@ -1,0 +1,198 @@
+"""`floaty paper`: every row is flown on both profiles, judged by the experiments' limits, and told in one report."""
+
+import dataclasses
+import json
+import re
+import statistics
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hil.config import load_config
+from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.metrics import METRICS
+from hil.laboratory.request import Options
+from hil.pictures.panels import Instant
+from hil.research.campaigns.jobs import Job, Row, fly_job
+from hil.research.design.analysis import analyse
+from hil.research.design.linear import point_of
+from hil.research.studies.catalogue import PROFILES
+from hil.research.studies.paper import Paper, Trials
+from hil.research.studies.paper_report import write_paper
+from hil.research.studies.paper_rows import OUTSIDE, ROWS, MetricClaim, PaperRow
+from hil.research.studies.study import Curve, Expected, Study, StudyResult, Variant, VariantOutcome
+from support.command import Cli, floaty
+from support.html_page import Page
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seeds of the hover on both profiles."""
+    folder = tmp_path_factory.mktemp("paper") / "out"
+    assert floaty("paper", "--only", "hov*", "--seeds", "2", "--out", folder) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Row:
+    folder = tmp_path_factory.mktemp("flown") / "hover-1"
+    return fly_job(Job(0, "hover", Options(duration_s=0.3), {}, folder))
+
+
+def content(folder: Path) -> dict[str, Any]:
+    told: dict[str, Any] = json.loads((folder / "result.json").read_text())
+    return told
+
+
+def test_every_experiment_is_a_row_or_known_not_to_be_the_papers() -> None:
+    assert set(EXPERIMENTS) == set(ROWS) | set(OUTSIDE)
+    assert not set(ROWS) & set(OUTSIDE)
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_a_row_shows_existing_metrics_with_the_paper_s_source(name: str) -> None:
+    assert set(ROWS[name].claims) <= set(METRICS)
+    assert ROWS[name].claim
+    assert ROWS[name].place
+
+
+@pytest.mark.long
+def test_every_flight_keeps_its_log_and_nothing_big_besides(flown: Path) -> None:
+    folders = {path.name for path in flown.iterdir() if path.is_dir()}
+    flights = {f"hover-{profile}-{seed}" for profile in PROFILES for seed in (1, 2)}
+    assert folders == flights | {"campaigns"}
+    for name in flights:
+        assert {path.name for path in (flown / name).iterdir()} == {
+            "log.parquet",
+            "events.jsonl",
+            "result.json",
+        }
+
+
+@pytest.mark.long
+def test_the_table_is_the_mean_and_deviation_of_the_flights(flown: Path) -> None:
+    (row,) = content(flown)["rows"]
+    for profile in PROFILES:
+        flights = [
+            json.loads((flown / f"hover-{profile}-{seed}" / "result.json").read_text()) for seed in (1, 2)
+        ]
+        rms = [100 * flight["metrics"]["rms_y"] for flight in flights]
+        told = row["profiles"][profile]["metrics"]["rms_y"]
+        assert told["mean"] == pytest.approx(statistics.mean(rms))
+        assert told["deviation"] == pytest.approx(statistics.stdev(rms))
+        assert (told["low"], told["high"]) == pytest.approx((min(rms), max(rms)))
+        assert (told["unit"], told["count"]) == ("cm", 2)
+        assert [flight["hash"] for flight in row["profiles"][profile]["flights"]] == [
+            f["hash"] for f in flights
+        ]
+
+
+@pytest.mark.long
+def test_a_flight_of_the_paper_is_the_flight_that_fly_flies(cli: Cli, flown: Path, tmp_path: Path) -> None:
+    cli("fly", "hover", "--profile", "as-flown", "--seed", "2", "--out", str(tmp_path / "run"))
+    alone = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert content(flown)["rows"][0]["profiles"]["as-flown"]["flights"][1]["hash"] == alone["hash"]
+
+
+@pytest.mark.long
+def test_the_report_has_the_papers_value_and_ours(flown: Path) -> None:
+    page = Page((flown / "report.html").read_text(encoding="utf-8"))
+    rows = {row[0]: row[1:] for row in page.tables["paper"]}
+    told = content(flown)["rows"][0]["profiles"]
+    cells = rows[METRICS["attitude_max"].meaning]
+    assert cells[0] == ROWS["hover"].claims["attitude_max"].text
+    for cell, profile in zip(cells[1:], PROFILES, strict=True):
+        assert float(cell.split()[0]) == pytest.approx(
+            told[profile]["metrics"]["attitude_max"]["mean"], rel=0.01
+        )
+        assert cell.endswith(" deg")
+    assert rows["limits held"][1:] == ["2 of 2", "2 of 2"]
+    assert page.links == ["hover.html"] * 2, "in the contents and in the table"
+    figures = Page((flown / "hover.html").read_text(encoding="utf-8"))
+    for profile in PROFILES:
+        assert f"{profile}-errors" in figures.plots
+    assert len(figures.pictures) == len(PROFILES), "the track"
+    assert all(plot["alone"] for plot in figures.plots.values())
+    assert {plot["marks"] for plot in figures.plots.values()} == {0, 1}, "each profile's flight has its own"
+    assert figures.links == ["report.html"]
+
+
+def trials(result: Row, *passed: bool) -> Trials:
+    """Flights of which some failed a limit."""
+    flights = (dataclasses.replace(result, passed=one, holds={"max_x": one}) for one in passed)
+    return Trials("floaty", tuple(flights))
+
+
+def test_every_seed_of_the_default_profile_must_hold(result: Row) -> None:
+    row = ROWS["hover"]
+    good, bad = trials(result, True, True), trials(result, True, False)
+    assert Paper((("hover", row, (good, bad)),), (), False).holds, "the other profile shows what it shows"
+    assert not Paper((("hover", row, (bad, good)),), (), False).holds
+    assert not Paper((("hover", row, (good, good)),), (), True).holds, "interrupted"
+    assert not Paper((("hover", row, (Trials("floaty", ()), good)),), (), False).holds, "nothing was flown"
+    assert bad.failed == ["max_x 1×"]
+
+
+@pytest.mark.long
+def test_the_badges_name_their_kind_of_verdict(result: Row, tmp_path: Path) -> None:
+    good = trials(result, True, True)
+    marks = (Instant("paper", 0.5, "paper: settled"),)
+    row = PaperRow("t", "c", "p", {"rms_x": MetricClaim("0", 0.0)}, "why", marks=marks)
+    study = StudyResult(
+        Study("s", "q", "a", "", (0.0, 1.0), ()),
+        (
+            Curve(
+                Variant("v", lambda size: Options(), Expected(holds_to=1.0)),
+                (VariantOutcome(0.0, ("degrades",), (0.1,)),),
+            ),
+        ),
+    )
+    for paper, badges in (
+        (
+            Paper((("t", row, (good, good)),), (study,), False),
+            ["limits of floaty: all hold", "the paper's values: 2 missed", "studies: 1 expectation failed"],
+        ),
+        (
+            Paper((("t", PaperRow("t", "c", "p", {}), (trials(result, False),)),), (), True),
+            ["interrupted", "limits of floaty: some fail", "the paper's values: none missed"],
+        ),
+    ):
+        page = write_paper(tmp_path, paper).read_text(encoding="utf-8")
+        (_, shown, _), *_ = paper.rows
+        of_one = (tmp_path / "t.html").read_text(encoding="utf-8")
+        assert ('"paper: settled"' in of_one) == bool(shown.marks)
+        assert re.findall(r'class="verdict \w+">([^<]+)<', page) == badges
+        assert (
+            Page(page).links[: 1 + len(paper.studies)] == ["t.html", "studies.html"][: 1 + len(paper.studies)]
+        )
+    studies = Page((tmp_path / "studies.html").read_text(encoding="utf-8"))
+    assert len(studies.pictures) == 1
+    assert studies.links == ["report.html", "t.html"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["paper", "--only", "fly-to-the-moon"], "--only fly-to-the-moon: no row matches; there are hover"),
+        (["paper", "--seeds", "0"], "--seeds"),
+        (["paper", "--only", "hover", "--out", "/proc/floaty"], "--out /proc/floaty: cannot be written"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: list[str], message: str) -> None:
+    assert message in cli.refusal(*arguments)
+
+
+@pytest.mark.long
+def test_every_claim_of_the_design_is_in_the_report_with_its_reason(tmp_path: Path) -> None:
+    shape = analyse(point_of(load_config()))
+    assert {claim.verdict for claim in shape.claims} == {"agrees", "differs"}
+    assert [claim.title for claim in shape.claims if claim.verdict == "differs" and not claim.why] == []
+    page = write_paper(tmp_path, Paper((), (), False), (), shape).read_text(encoding="utf-8")
+    for claim in shape.claims:
+        assert page.count(claim.ours.replace("'", "&#39;")) >= 1, claim.title
+    assert 'href="design/design.html"' in page
+    pictures = (tmp_path / "design" / "design.html").read_text(encoding="utf-8")
+    assert pictures.count('src="data:image/png') == len(shape.pictures)
+    assert content(tmp_path)["design"] == [dataclasses.asdict(claim) for claim in shape.claims]
+    assert (tmp_path / "design" / "stability.png").exists()

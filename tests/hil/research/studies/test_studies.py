@@ -1,0 +1,145 @@
+"""Studies: every one can be flown, outcomes are told apart, expectations are judged, the predictor's cliff is there."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from hil.config import load_config
+from hil.laboratory.request import Options
+from hil.pictures.drawing import png
+from hil.research.campaigns.jobs import fly_job
+from hil.research.studies.catalogue import STUDIES
+from hil.research.studies.paper_report import study_picture
+from hil.research.studies.study import (
+    OUTCOMES,
+    Curve,
+    Expected,
+    Study,
+    StudyResult,
+    Variant,
+    VariantOutcome,
+    flights_of,
+    outcome_of,
+    summarise,
+)
+from support.command import Cli
+
+
+@pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
+def test_every_flight_of_every_study_can_be_asked_for(study: Study) -> None:
+    flights = list(flights_of(study, 1))
+    assert len(flights) == len(study.variants) * len(study.sizes)
+    for job in flights:
+        request = job.request()
+        assert request.config == load_config(job.options["profile"], request.overrides)
+        assert request.duration_s == study.duration_s, job.values
+
+
+@pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
+def test_something_is_expected_of_every_variant_and_only_of_sizes_that_are_flown(study: Study) -> None:
+    for variant in study.variants:
+        said = set(dataclasses.astuple(variant.expected)) - {None}
+        assert said, variant.name
+        assert said <= set(study.sizes), variant.name
+
+
+@pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
+def test_sizes_of_a_study_change_the_flight(study: Study) -> None:
+    for variant in study.variants:
+        changes = {str(variant.change(size)) for size in study.sizes}
+        assert len(changes) == len(study.sizes), "no two sizes are the same"
+
+
+def test_a_model_error_scales_the_constants_of_its_part_and_no_other() -> None:
+    study = STUDIES["model-error"]
+    (variant,) = (v for v in study.variants if v.name == "floaty, inputs +")
+    cell = {"study": "model-error", "variant": variant.name, "size": 30.0}
+    (request,) = (job.request() for job in flights_of(study, 1) if job.values == cell)
+    right, wrong = load_config().model.model_dump(), request.config.model.model_dump()
+    ratio = {name: wrong[name] / right[name] for name in right}
+    inputs = {name for name in right if name[-2:] in ("u1", "u2", "u3", "u4")}
+    assert len(inputs) == 6
+    assert {name: ratio[name] for name in inputs} == pytest.approx(dict.fromkeys(inputs, 1.3))
+    assert {ratio[name] for name in right if name not in inputs} == {1.0}
+    assert request.config.plant == load_config().plant, "the world stays right"
+
+
+def unchanged(size: float) -> Options:
+    return Options()
+
+
+def judged(expected: Expected, *cells: str) -> list[str]:
+    """What surprises in the cells of sizes 1, 2, 3; a letter per seed: Holds, Degrades, Failsafe, Lost."""
+    words = {name[0]: name for name in OUTCOMES}
+    variant = Variant("a", unchanged, expected)
+    study = Study("s", "?", "size", "m", (1.0, 2.0, 3.0), (variant,))
+    flown = [
+        VariantOutcome(size, tuple(words[letter] for letter in seeds), ())
+        for size, seeds in zip(study.sizes, cells, strict=False)
+    ]
+    result = StudyResult(study, (Curve(variant, tuple(flown)),))
+    assert result.holds == (len(cells) == 3 and not result.surprises(result.curves[0]))
+    return result.surprises(result.curves[0])
+
+
+@pytest.mark.parametrize(
+    ("expected", "cells", "surprises"),
+    [
+        (Expected(holds_to=2), ("hh", "hh", "ll"), []),
+        (Expected(holds_to=2), ("hh", "hd", "hh"), ["2 m: 1 holds, 1 degrades"]),
+        (Expected(holds_to=1), ("hh", "ll", "ll"), []),
+        (Expected(flies_to=2), ("dd", "fh", "ll"), []),
+        (Expected(flies_to=2), ("dd", "hl", "ll"), ["2 m: 1 holds, 1 lost"]),
+        (Expected(lost_from=2), ("hh", "ll", "ll"), []),
+        (Expected(lost_from=2), ("hh", "ll", "lf"), ["3 m: 1 failsafe, 1 lost"]),
+        (Expected(lost_from=2), ("hh", "ee", "ll"), ["2 m: 2 error"]),
+        (Expected(failsafe_from=2), ("hh", "ff", "fl"), []),
+        (Expected(failsafe_from=2), ("hh", "fd", "ll"), ["2 m: 1 degrades, 1 failsafe"]),
+        (Expected(holds_to=1, lost_from=3), ("hh", "dl"), []),
+    ],
+)
+def test_surprises_are_reported(expected: Expected, cells: tuple[str, ...], surprises: list[str]) -> None:
+    assert judged(expected, *cells) == surprises
+
+
+def test_the_typical_outcome_is_the_median_and_the_worse_of_two() -> None:
+    assert VariantOutcome(1.0, ("lost", "holds", "holds"), ()).typical == "holds"
+    assert VariantOutcome(1.0, ("lost", "holds"), ()).typical == "lost"
+    assert VariantOutcome(1.0, ("failsafe", "degrades", "lost"), ()).typical == "failsafe"
+
+
+@pytest.mark.long
+def test_the_predictors_cliff() -> None:
+    """The author's gains at 40 ms: lost without the predictor, not with it (a prototype: 20 of 20, 0)."""
+    cells = {
+        (job.values["variant"], job.options["seed"]): outcome_of(fly_job(job))
+        for job in flights_of(STUDIES["latency"], 3)
+        if job.values["variant"] in ("as-flown, no predictor", "as-flown, measured age")
+        and job.values["size"] == 40
+    }
+    assert len(cells) == 6
+    for (name, seed), outcome in cells.items():
+        assert outcome == ("lost" if "no predictor" in str(name) else "holds"), (name, seed)
+
+
+@pytest.mark.long
+def test_a_study_that_was_cut_short_has_a_picture_and_does_not_hold() -> None:
+    study = STUDIES["loss"]
+    job = next(flights_of(study, 1))
+    result = summarise(study, [(job, fly_job(job))])
+    assert [len(curve.cells) for curve in result.curves] == [1]
+    assert not result.holds
+    assert png(lambda: study_picture(result)).startswith(b"\x89PNG")
+
+
+@pytest.mark.long
+def test_a_study_can_be_flown_alone(cli: Cli, tmp_path: Path) -> None:
+    assert cli("study", "loss", "--seeds", "1", "--out", tmp_path / "out") == 0
+    names = "campaigns report.html result.json studies.html study-loss.png"
+    assert " ".join(sorted(path.name for path in (tmp_path / "out").iterdir())) == names
+    (told,) = json.loads((tmp_path / "out" / "result.json").read_text())["studies"]
+    assert told["as_expected"] is True
+    assert [len(variant["cells"]) for variant in told["variants"]] == [7, 7]
+    assert told["variants"][0]["cells"][0]["outcomes"] == ["holds"]

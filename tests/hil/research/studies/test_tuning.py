@@ -1,0 +1,169 @@
+"""`floaty tune`: what it refuses, and a whole round from the author's gains and the plate model."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.commands.identify import _edges, _gains, _motion
+from hil.config import load_config
+from hil.laboratory.experiments import find_experiment
+from hil.laboratory.request import Options, Request
+from hil.laboratory.robot import Streams
+from hil.laboratory.run import fly
+from hil.research.campaigns.jobs import Job, Row
+from hil.research.design.axes import DELAY, ROLL, gains_in, robot_of
+from hil.research.design.loop import FREQUENCIES, Timing, build
+from hil.research.design.margins import margins, pose_delay_margin, worst
+from hil.research.design.tune import Flow, GainTask, judged, motion
+from hil.research.studies import tuning
+from hil.research.studies.tuning import Round, TuningFlights, rms
+from hil.world.floaty.plant import Plant
+from support.command import Cli
+
+
+def test_the_profile_cad_has_the_plate_model_on_board() -> None:
+    config = load_config("floaty", ["plant.variant=plate"])
+    plant = Plant(config.geometry, config.plant, config.tunnel, config.actuators, Streams.of_seed(1).gusts)
+    cad = load_config("cad")
+    assert cad.model.model_dump() == pytest.approx(asdict(plant.linearise()) | {"flap_rate": 20.0}, rel=1e-4)
+    assert cad.controller == load_config("as-flown").controller
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--profile", "nobody"], "neither the name of a profile"),
+        (["--profile", "lqr"], "tune makes gains for the built-in control law"),
+        (["--profile", "lqr", "--repeat", "1"], "tune makes gains for the built-in control law"),
+        (["--profile", "crazyflie"], "not for the Crazyflie's own firmware"),
+        (["--out", "gains.txt"], "--out gains.txt: a profile's name ends in .toml"),
+        (["--repeat", "0"], "--repeat"),
+        (["--board", "abacus"], "--board abacus: no such file; expected c, python"),
+        (["--runs", "/proc/floaty"], "--runs /proc/floaty: cannot be written"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: list[str], message: str) -> None:
+    assert message in cli.refusal("tune", *arguments)
+
+
+def test_an_axis_is_judged_by_old_and_new_gains_for_its_robot_and_by_the_worst_of_all() -> None:
+    config = load_config()
+    timing, old = Timing.of(config, 0.04), gains_in(config, ROLL)
+    robots, new = [robot_of(config), robot_of(config) | {DELAY: 0.014}], 0.9 * old
+    loops = [build(ROLL, robot, config, timing) for robot in robots]
+    white = 1e-3 * np.stack([np.eye(2, dtype=complex)] * len(FREQUENCIES))
+    task = GainTask(ROLL, Flow(white, 0.0, 0.0), config, timing, 0.0)
+    one, each = judged(task, robots, loops, old, new), [margins(loop, new) for loop in loops]
+    late = [pose_delay_margin(ROLL, robot, config, timing, new) for robot in robots]
+    assert late[1] < late[0]
+    assert (one.late, one.least_late) == tuple(late)
+    assert (one.old_margins, one.margins, one.least) == (margins(loops[0], old), each[0], worst(each))
+    assert (one.old_motion, one.motion) == tuple(motion(loops[0], task, gains) for gains in (old, new))
+    assert (one.old.tolist(), one.new.tolist()) == (old.tolist(), new.tolist())
+    tuned: Any = SimpleNamespace(axes=(one,), robots=SimpleNamespace(drawn=robots[1:]), before=hovered(0.02))
+    flown = hovered(0.03), hovered(0.05, "lost"), hovered(0.04)
+    tables = [table(Round(tuned, flown, "given", Path("tuned"))) for table in (_gains, _motion, _edges)]
+    gains, moved, shown = ({one.header: [*one.cells] for one in table.columns} for table in tables)
+    assert [gains[f"gains, {name}"][0][-20:] for name in ("old", "new")] == [
+        ", ".join(f"{gain:.4g}" for gain in own)[-20:] for own in (old, new)
+    ]
+    predicted = [f"{100 * found.main:.2f} cm" for found in (one.old_motion, one.motion)]
+    cells = [predicted[0], "1.20 cm", predicted[1], "1.80 cm", "lost, 2.40 cm"]
+    assert [*moved.values()][1:] == [[cell] for cell in cells], "of y"
+    assert shown["late poses"] == ["", *(f"{1e3 * one:.0f} ms" for one in late)]
+    delays = [found.delay for found in (one.old_margins, one.margins, one.least)]
+    assert shown["delay"] == [f"{1e3 * delay:.0f} ms" for delay in delays]
+
+
+def hovered(rms_m: float, outcome: str = "completed") -> Row:
+    metrics = {"rms_x": 0.48 * rms_m, "rms_y": 0.6 * rms_m, "rms_z": 0.64 * rms_m}
+    return Row(Job(0, "hover", Options(), {}, Path("run")), outcome, "", True, "", metrics, {})
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "better", "another"),
+    [
+        (hovered(0.02), hovered(0.018), True, True),
+        (hovered(0.02), hovered(0.0195), True, False),
+        (hovered(0.02), hovered(0.02), True, False),
+        (hovered(0.02), hovered(0.021), False, False),
+        (hovered(0.02), hovered(0.01, "lost"), False, False),
+    ],
+)
+def test_new_gains_are_judged_against_the_old_ones(old: Row, new: Row, better: bool, another: bool) -> None:
+    one = Round(SimpleNamespace(before=old), (new,), "given.toml", Path("tuned.toml"))  # type: ignore[arg-type]
+    assert (one.better, one.worth_another) == (better, another)
+    assert one.profile == ("tuned.toml" if better else "given.toml")
+    assert rms(old) == pytest.approx(0.02)
+
+
+def test_a_round_begins_with_the_gains_of_the_one_before_and_other_seeds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    flown: list[tuple[Path, int, str]] = []
+    hovers = iter([(0.04, 0.03), (0.03, 0.0299), (0.03, 0.03)])
+
+    def log(name: str, flights: Any, folder: Path) -> list[Row]:
+        flown.extend((folder, options["seed"], options["profile"]) for _, options in flights.values())
+        return [hovered(0.02)]
+
+    def fly_round(model: str, own: TuningFlights, count: int) -> Round:
+        old, new = map(hovered, next(hovers))
+        return Round(SimpleNamespace(before=old), (new,), model, own.folder / "tuned.toml")  # type: ignore[arg-type]
+
+    for name in ("load_record", "identify", "write_profile", "_tunable"):
+        monkeypatch.setattr(tuning, name, lambda *_: None)
+    monkeypatch.setattr(tuning, "fly_round", fly_round)
+    own = TuningFlights(5, "c", Path("out"), SimpleNamespace(log=log))  # type: ignore[arg-type]
+    given = [one.given for one in tuning.rounds("floaty", own, 3, 9)]
+    assert given == [f"out/round-{number}/model.toml" for number in (1, 2)]
+    begun = ((1, 5, "floaty"), (2, 15, "out/round-1/tuned.toml"))
+    assert flown == [
+        (Path(f"out/round-{n}"), seed + one, base) for n, seed, base in begun for one in range(4)
+    ]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [([], "its own gains lose the robot"), (["--repeat", "2"], "round 1 ends: identify-u1 lost the robot: ")],
+)
+def test_a_lost_robot_ends_in_one_line(cli: Cli, tmp_path: Path, arguments: list[str], message: str) -> None:
+    profile = tmp_path / "bad.toml"
+    profile.write_text('base = "cad"\n[controller]\ngain_y = 3.5\n')
+    assert cli("tune", "--profile", profile, "--runs", tmp_path / "runs", *arguments) == 2
+    assert message in cli.err
+
+
+@pytest.mark.long
+def test_tuning_from_the_authors_gains_hovers_like_the_default_profile(cli: Cli, tmp_path: Path) -> None:
+    out = tmp_path / "mine.toml"
+    arguments = (
+        "--profile", "cad", "--repeat", "1", "--out", out, "--runs", tmp_path / "runs", "--robots", "10",
+    )  # fmt: skip
+    assert cli("tune", *arguments) == 0
+    shown = cli.out
+    assert "least of 11" in shown
+    assert "round 1" in shown
+    for name, folder in (("floaty", "usual"), (str(out), "tuned")):
+        cli("fly", "hover", "--profile", name, "--seed", "7", "--out", tmp_path / folder)
+    usual, tuned = (
+        json.loads((tmp_path / name / "result.json").read_text())["metrics"] for name in ("usual", "tuned")
+    )
+    for axis in ("rms_x", "rms_y"):
+        assert tuned[axis] < 1.15 * usual[axis], axis
+
+
+@pytest.mark.long
+def test_an_excitation_has_the_same_telemetry_on_every_board_so_gains_are_the_same(tmp_path: Path) -> None:
+    logs = set()
+    for board in ("python", "c", "cortex-m4"):
+        request = Request.of(find_experiment("identify-u3"), board=board, duration_s=6.0)
+        fly(request, tmp_path / board)
+        logs.add((tmp_path / board / "telemetry.csv").read_bytes())
+    assert len(logs) == 1

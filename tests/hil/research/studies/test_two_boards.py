@@ -1,0 +1,188 @@
+"""Why two boards fly one seed differently: what was put into a log as a difference is told, with its size."""
+
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from numpy.typing import NDArray
+
+from hil.errors import LabError
+from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.files.result import read_result, write_result
+from hil.laboratory.metrics import column
+from hil.laboratory.request import REAL, Bench, Request
+from hil.laboratory.run import fly
+from hil.laboratory.schedule import SCHEMA
+from hil.pictures.compare import FlownRun, load_flown
+from hil.research.studies.two_boards import CLOCK, RATES, comparable, seeds_of, two_boards
+from support.command import Cli
+
+Columns = dict[str, NDArray[np.generic]]
+RELEASE, FLOWN = 100, 30  # rows
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("boards") / "hover-1"
+    fly(Request.of(EXPERIMENTS["hover"], duration_s=FLOWN / 100), folder)
+    return folder
+
+
+def other(flown: Path, folder: Path, change: Callable[[Columns], None], board: str = "cf2.elf") -> FlownRun:
+    """The same flight by a board whose log is changed."""
+    shutil.copytree(flown, folder)
+    log = load_flown(folder).log
+    columns = {name: log.column(name).to_numpy().copy() for name in log.column_names}
+    change(columns)
+    pq.write_table(pa.table(columns).replace_schema_metadata(log.schema.metadata), folder / "log.parquet")
+    result = read_result(folder)
+    write_result(replace(result, request=replace(result.request, bench=Bench(board=board))))
+    return load_flown(folder)
+
+
+def bumped(columns: Columns) -> None:
+    """From the sample after the release on the counts are others, and so is what the gyro then sees."""
+    columns["motor.m3"][RELEASE + 1 :] += 1
+    columns["imu.gx"][RELEASE + 2 :] += 1
+
+
+def test_a_board_that_closes_its_loop_earlier_differs_by_its_boot_time(flown: Path, tmp_path: Path) -> None:
+    def change(columns: Columns) -> None:
+        state = columns["supervisor.state"]
+        begin = int(np.argmax(state == 2))
+        state[begin - 4 : begin] = 2
+        columns["motor.m2"][begin - 4] += 7
+        columns["cpu.IDLE"] += 3_100_000
+
+    a, b = load_flown(flown), other(flown, tmp_path / "b", change)
+    begin = int(np.argmax(a.log.column("supervisor.state").to_numpy() == 2))
+    found = two_boards(a, b)
+    assert found.first is not None
+    assert (found.first.row, found.first.servo, found.first.why) == (begin - 4, "motor.m2", "boot time")
+    assert found.first.counts[1] - found.first.counts[0] == 7
+    (cause,) = found.causes
+    assert cause.startswith("boot time: the loops are closed at ")
+    assert "0.000 | 3.100 s when the record began" in cause
+
+
+def test_another_gyro_zero_is_measured_before_the_flights_part(flown: Path, tmp_path: Path) -> None:
+    def change(columns: Columns) -> None:
+        bumped(columns)
+        for name, offset in zip(RATES, (-4e-4, -1e-4, 0.0), strict=True):
+            columns[name] += np.float32(offset)
+            columns[name][RELEASE + 2 :] += np.float32(0.5)  # what comes of the other counts is no cause
+
+    found = two_boards(load_flown(flown), other(flown, tmp_path / "b", change))
+    assert found.first is not None
+    assert (found.first.row, found.first.why) == (RELEASE + 1, "sensor start")
+    assert any("-0.400 -0.100 +0.000 mrad/s (p q r)" in cause for cause in found.causes)
+
+
+def test_an_estimator_that_begins_later_differs_by_its_phase(flown: Path, tmp_path: Path) -> None:
+    def change(columns: Columns) -> None:
+        bumped(columns)
+        columns["estimator.pose_age_us"][columns["estimator.fused"] > 0] += 500
+
+    b = other(flown, tmp_path / "b", change)
+    rows = [(10_000 * step + 3_000 + us, event, who, 0, 0) for step in range(5) for us, event, who in
+            ((0, "IN", "STABILIZE"), (700, "IN", "IDLE"))]  # fmt: skip
+    columns = [
+        pa.array(values, field.type) for values, field in zip(zip(*rows, strict=True), SCHEMA, strict=True)
+    ]
+    pq.write_table(pa.table(columns, schema=SCHEMA), b.result.folder / "schedule.parquet")
+    found = two_boards(load_flown(flown), b)
+    assert found.first is not None
+    assert found.first.why == "task phases"
+    (cause,) = (cause for cause in found.causes if cause.startswith("task phases"))
+    assert "| 3000 us into its ten ms" in cause
+    first, second = (float(text) for text in cause.split("takes poses ")[1].split(" ms")[0].split(" | "))
+    assert second - first == pytest.approx(0.5, abs=0.011)
+
+
+def test_a_clock_with_long_microseconds_is_measured_through_its_carries(flown: Path, tmp_path: Path) -> None:
+    def change(columns: Columns) -> None:
+        bumped(columns)
+        columns[CLOCK] = (3_100_000 + columns["t"] * 84 / 85).astype(np.int64)
+        columns[CLOCK][40] -= 1 << 16  # read while the timer carried
+
+    found = two_boards(load_flown(flown), other(flown, tmp_path / "b", change))
+    assert found.first is not None
+    assert found.first.why == "long microsecond"
+    assert found.causes == ("long microsecond: a microsecond of the boards' clocks lasts 1.0000 | 1.0119 us",)
+
+
+def test_an_unexplained_difference_is_reported(flown: Path, tmp_path: Path) -> None:
+    found = two_boards(load_flown(flown), other(flown, tmp_path / "b", bumped))
+    assert found.first is not None
+    assert found.first.why == "none of the known causes"
+    assert found.causes == ()
+
+
+def test_boards_with_the_same_counts_need_no_cause(flown: Path, tmp_path: Path) -> None:
+    found = two_boards(load_flown(flown), other(flown, tmp_path / "b", lambda columns: None, "c"))
+    assert (found.first, found.causes) == (None, ())
+
+
+def test_only_equal_requests_on_two_boards_are_comparable(flown: Path, tmp_path: Path) -> None:
+    a = load_flown(flown)
+    b = other(flown, tmp_path / "b", lambda columns: None)
+    assert comparable(a, b)
+    assert not comparable(a, a)
+    changes: list[dict[str, Any]] = [{"seed": 2}, {"overrides": ("a.b=1",)}, {"faults": ("push.y@1=1",)}]
+    for change in changes:
+        assert not comparable(
+            a, FlownRun(b.log, replace(b.result, request=replace(b.result.request, **change)))
+        )
+    assert not comparable(other(flown, tmp_path / "real", lambda columns: None, REAL), b)
+
+
+@pytest.mark.long
+def test_two_folders_of_runs_are_a_row_per_seed(cli: Cli, flown: Path, tmp_path: Path) -> None:
+    """The second body is 12.3 mm beside the first, and its board fuses three poses more."""
+
+    def beside(columns: Columns) -> None:
+        bumped(columns)
+        columns["truth.x"] += 0.0123
+        columns["estimator.fused"] += 3
+
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+    for seed in (10, 2):
+        shutil.copytree(flown, tmp_path / "first" / f"hover-{seed}")
+        other(flown, tmp_path / "second" / f"hover-{seed}", beside)
+        for name in ("first", "second"):
+            folder = tmp_path / name / f"hover-{seed}"
+            result = read_result(folder)
+            write_result(replace(result, request=replace(result.request, seed=seed)))
+    shutil.copytree(flown, tmp_path / "first" / "hover-3")  # has no partner
+    found = seeds_of(tmp_path / "first", tmp_path / "second")
+    assert [one.seed for one in found] == [2, 10]
+    assert all(one.first is not None and one.first.row == RELEASE + 1 for one in found)
+    assert cli("compare", tmp_path / "first", tmp_path / "second") == 1
+    free = load_flown(flown).log.slice(RELEASE)
+    x, y, z = (column(free, f"truth.{axis}") - column(free, f"goal.{axis}") for axis in "xyz")
+    rms = [100 * np.sqrt((error**2).mean()) for error in (x, y, z, x + 0.0123)]
+    row = next(line for line in cli.out.splitlines() if "101" not in line and " 10 " in line)
+    assert [float(number) for number in re.findall(r"\d+\.\d+", row)] == pytest.approx(
+        [*rms[:3], rms[3], *rms[1:3], 12.3, 0.01], abs=0.01
+    )
+    fused = int(column(free, "estimator.fused")[-1])
+    assert f"{fused} | {fused + 3}" in row
+    worst = 100 * abs(rms[3] / rms[0] - 1)
+    assert f"2 seeds: rms errors within {worst:.1f} % of the first's, bodies within 12.30 mm" in cli.out
+    with pytest.raises(LabError, match="neither two runs nor folders with runs of the same names"):
+        seeds_of(tmp_path / "first", flown.parent)
+    shutil.copytree(flown, tmp_path / "alone")
+    result = read_result(tmp_path / "alone")
+    write_result(replace(result, request=replace(result.request, seed=2)))
+    assert cli("compare", tmp_path / "alone", tmp_path / "second" / "hover-2") == 1
+    assert "first servo count: row 101" in cli.out
+    page = (tmp_path / "second" / "hover-2" / "compare.html").read_text(encoding="utf-8")
+    assert "<li>first servo count: row 101" in page
