@@ -5,6 +5,7 @@ first use.
 """
 
 # ruff: noqa: F403, F405 - the names are those of `hil.api`
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,35 @@ __all__ = [
 ]  # fmt: skip
 
 
+MOVED = {  # former rooms by the wing where they are now
+    "board": ("devices", "clock"),
+    "emulator": ("stm32f405", "crazyflie", "events"),
+    "laboratory": ("arguments", "bodies", "experiments"),
+    "laboratory.files": ("installation", "own_files", "whole_files"),
+    "pictures": ("exports",),
+    "pictures.exports": ("demonstrations",),
+    "research": ("campaigns", "design", "identify", "learn", "studies"),
+    "world": ("floaty", "scene"),
+}
+
+
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module("hil.api"), name)
+
+
+class _Moved:
+    """Tells who imports a former room where it is now."""
+
+    @staticmethod
+    def find_spec(name: str, _path: object = None, _target: object = None) -> None:
+        package, _, path = name.partition(".")
+        room, _, rest = path.partition(".")
+        for wing, rooms in MOVED.items():
+            if package == "hil" and room in rooms:
+                now = ".".join(filter(None, (package, wing, room * (room != "devices"), rest)))
+                raise ModuleNotFoundError(f"{name} is {now} now", name=name)
+
+
+sys.meta_path.insert(0, _Moved)  # first: a room that was left empty would be found as a package

@@ -1,7 +1,7 @@
 """A Crazyradio dongle: vendor requests in, one packet and its acknowledgement per exchange, a board within reach.
 
-The host is real software, so every exchange is simulated, including empty polls. `hil.emulator.crazyflie.shockburst` models radio
-loss. With acknowledgements off, a packet is sent once and the host reads nothing. A board on its channel takes a
+The host is real software, so every exchange is simulated, including empty polls; `hil.emulator.crazyflie.shockburst` loses
+packets. With acknowledgements off, a packet is sent once and the host reads nothing. A board on its channel takes a
 broadcast packet and does not answer.
 """
 

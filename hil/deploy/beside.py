@@ -3,11 +3,11 @@
 A second flight takes the supervisor through its states, which must be the same in the same order.
 
 The two are never equal bit for bit: boot time, gyro zero, the estimator's phase and the board's microsecond differ
-(`hil.research.studies.two_boards`). The bounds are about twice the largest difference of ten correct flights: seeds 1 to 5, the app
-compiled by gcc 12.2 and by clang 22. Each is a hover of 4 s with a push and a cut link; the largest differences are 0.96 mm
-of position and 370 servo counts (rms). The first pose after the cut is about as old as the filter's horizon, and the phase
-decides whether it is fused: if one board fuses it and the other waits for the next one, the estimate differs by 5 cm in one
-row of 400, which is 2.7 mm rms.
+(`hil.research.studies.two_boards`). The bounds are about twice the largest difference of ten correct flights: seeds 1 to 5,
+the app compiled by gcc 12.2 and by clang 22. Each is a hover of 4 s with a push and a cut link; the largest differences are
+0.96 mm of position and 370 servo counts (rms). The first pose after the cut is about as old as the filter's horizon, and the
+phase decides whether it is fused: if one board fuses it and the other waits for the next one, the estimate differs by 5 cm
+in one row of 400, which is 2.7 mm rms.
 """
 
 from collections.abc import Callable, Iterator

@@ -1,1 +1,1 @@
-"""The emulator: a microcontroller that runs any image, and the parts of a Crazyflie around it. It knows no laboratory."""
+"""Emulates a microcontroller that runs any image, and the parts of a Crazyflie around it; it knows no laboratory."""

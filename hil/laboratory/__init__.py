@@ -1,1 +1,1 @@
-"""Assembles robot, cameras, links and time line for every flight: in lockstep, paced over a real link, or served."""
+"""Makes every flight: request, robot, cameras, links, time line, faults, recorder, metrics; and the experiments."""

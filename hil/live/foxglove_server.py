@@ -1,4 +1,4 @@
-"""A live flight in Foxglove: a WebSocket server with the topics of `hil.pictures.exports.mcap` and, if wanted, the parameters.
+"""A live flight in Foxglove: a WebSocket server with the topics of `hil.pictures.exports.mcap`, and parameters if wanted.
 
 Foxglove's own server accepts any page in a browser, so this one speaks its protocol (`foxglove.sdk.v1`); the SDK encodes the
 messages, as MCAP. A client needs the token in the address, and a page must be Foxglove's or of this computer. A parameter

@@ -1,1 +1,1 @@
-"""Makes pictures from a run folder: report, figures, scene, exports; reads only logs."""
+"""Makes pictures and other files from a run folder: report, figures, scene, recording, exports; reads only logs."""

@@ -1,1 +1,1 @@
-"""Questions that many flights answer: campaigns, design, identification, studies, learning."""
+"""Answers questions with many flights or none: campaigns, design, identification, studies, learning; commands call it."""

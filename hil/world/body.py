@@ -1,7 +1,7 @@
 """The laboratory's interface to a robot's body: timer outputs in; motion, air, supply power, loss and log columns out.
 
-Floaty (`hil.world.floaty.plant`) is one of them. SI units; frames W (world, z up) and B (body, x forward, y left, z up, origin at
-the centre of mass). Times are the laboratory's, in whole microseconds.
+Floaty (`hil.world.floaty.plant`) is one of them. SI units; frames W (world, z up) and B (body, x forward, y left, z up,
+origin at the centre of mass). Times are the laboratory's, in whole microseconds.
 """
 
 from __future__ import annotations

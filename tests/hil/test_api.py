@@ -4,6 +4,7 @@ import json
 import math
 import subprocess
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -184,3 +185,14 @@ def test_a_plot_has_one_axis_per_unit_and_refuses_what_the_log_lacks() -> None:
     ]  # fmt: skip
     with pytest.raises(LabError, match=r"column 'truth\.yy': the log has none"):
         run.plot("truth.yy")
+
+
+def test_a_former_module_names_its_place() -> None:
+    formers = [f"hil.{room}" for rooms in hil.MOVED.values() for room in rooms] + ["hil.devices.imu"]
+    for former in formers:
+        with pytest.raises(ModuleNotFoundError) as told:
+            import_module(former)
+        name, _, now, _ = str(told.value).split()
+        assert name in former
+        import_module(now)
+        assert hil.__file__ != import_module(now).__file__

@@ -1,7 +1,7 @@
 """The runner of many flights: workers, a dataset, progress, Ctrl-C and the decision when to stop.
 
-A campaign, a study, the paper, seeds and tuning are plans (`hil.research.campaigns.jobs`); each is evaluated from its rows. Rows
-arrive in any order; decisions use the flights in the order of their numbers, so they do not depend on the number of
+A campaign, a study, the paper, seeds and tuning are plans (`hil.research.campaigns.jobs`); each is evaluated from its rows.
+Rows arrive in any order; decisions use the flights in the order of their numbers, so they do not depend on the number of
 workers.
 """
 

@@ -1,8 +1,8 @@
 """Tunes the gains of the law for one axis: least motion in the measured flow, within the margins, for every robot.
 
-The design model is `hil.research.design.loop`, with estimator, predictor, lag and delays inside. The search (Nelder-Mead) starts
-at the axis' linear quadratic regulator and at the old gains, and adds the worst of the drawn robots to its set until no
-robot is worse. A robot that moves too much for the box or the flaps, or a loop without its margins, costs more than any
+The design model is `hil.research.design.loop`, with estimator, predictor, lag and delays inside. The search (Nelder-Mead)
+starts at the axis' linear quadratic regulator and at the old gains, and adds the worst of the drawn robots to its set until
+no robot is worse. A robot that moves too much for the box or the flaps, or a loop without its margins, costs more than any
 motion.
 """
 

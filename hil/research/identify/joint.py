@@ -1,7 +1,7 @@
 """The two estimates that use the excitation: instrumental variables, and the joint fit of all axes.
 
-Both use the cross spectra with the excitation (`hil.research.identify.spectra`), which the disturbance does not bias, and weight
-each line by the disturbance's covariance there, not by that of white noise.
+Both use the cross spectra with the excitation (`hil.research.identify.spectra`), which the disturbance does not bias, and
+weight each line by the disturbance's covariance there, not by that of white noise.
 
 Instrumental variables: the axes' equations are linear in their constants; lag and delay are taken from the profile, and
 their uncertainty is part of the intervals. Joint fit: all axes at once with one servo lag and one delay, by the errors of

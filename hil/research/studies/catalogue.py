@@ -5,8 +5,8 @@ unless stated otherwise. Expectations were measured over at least 5 seeds and ar
 latency and jitter other seeds were flown as well.
 
 The last two studies fly three designs side by side: flat flaps with the centre of mass in their plane, the paper's, an
-optimised one. All are isolated plates of one drag coefficient, with gains by `hil.research.design.gains`. At another updraft the
-hover angle on board is the one that carries the robot there; gains and model remain the design's.
+optimised one. All are isolated plates of one drag coefficient, with gains by `hil.research.design.gains`. At another updraft
+the hover angle on board is the one that carries the robot there; gains and model remain the design's.
 """
 
 from collections.abc import Callable
