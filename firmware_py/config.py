@@ -185,7 +185,9 @@ class LogicConfig(BaseModel):
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
     __pydantic_extra__: dict[str, float] = Field(init=False)
 
-    controller: str = Field("", description="file with the control law; empty: the core's")
+    controller: str = Field(
+        "", description="file with the control law, or the name of one that ships; empty: the core's"
+    )
     estimator: str = Field("", description="file with the estimator; empty: the core's")
 
     @property

@@ -17,6 +17,7 @@ from pydantic_core import ErrorDetails
 
 from firmware_py.config import FirmwareConfig, LogicConfig
 from firmware_py.errors import FirmwareError
+from firmware_py.logic.laws import SHIPPED_LAWS
 from firmware_py.logic.loading import load_logic
 from firmware_py.section import Section, number
 from ground_station.config import CaptureConfig, GroundConfig, PilotConfig, StationConfig, TrackerConfig
@@ -207,7 +208,9 @@ def _locate_files(tree: dict[str, Any], folder: Path) -> None:
         section: Any = tree.get(name)
         for key in model.model_fields.keys() & section.keys() if isinstance(section, dict) else ():
             value = section[key]
-            if isinstance(value, str) and value and (name == "logic" or value.endswith(".py")):
+            if isinstance(value, str) and key == "controller" and value in SHIPPED_LAWS:
+                section[key] = SHIPPED_LAWS[value]
+            elif isinstance(value, str) and value and (name == "logic" or value.endswith(".py")):
                 section[key] = str((folder / value).resolve())
 
 

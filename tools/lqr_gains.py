@@ -1,4 +1,4 @@
-"""Computes the gains of profiles/lqr.py from the model of a profile: python tools/lqr_gains.py [PROFILE].
+"""Computes the gains of firmware_py/logic/laws/lqr.py from the model of a profile: python tools/lqr_gains.py [PROFILE].
 
 One regulator per axis, on its states and on the input that its flaps have reached. The axes are decoupled, so the four
 are the optimum of all 16 states. The weights are Bryson's: one accepted error counts as one unit.

@@ -20,6 +20,7 @@ from firmware_py.export.reading import read_modules
 from firmware_py.export.syntax import ENTRY, OWN
 from firmware_py.logic.budget import ARGUMENT, budgeted
 from firmware_py.logic.entry import GUARD, compose
+from firmware_py.logic.laws import SHIPPED_LAWS
 from firmware_py.logic.plugs import GROUP, POINTS, Plug, read_plug
 from firmware_py.table import CoreParameter, CoreVariable
 
@@ -89,7 +90,9 @@ def load_logic(config: LogicConfig) -> Logic | None:
         try:
             texts.append((name, file, Path(file).read_text(encoding="utf-8")))
         except (OSError, UnicodeDecodeError) as error:
-            raise LogicError(f"logic.{name} = {file}: {getattr(error, 'strerror', None) or error}") from None
+            reason = getattr(error, "strerror", None) or error
+            near = "" if file.endswith(".py") else f"; laws that ship: {', '.join(SHIPPED_LAWS)}"
+            raise LogicError(f"logic.{name} = {file}: {reason}{near}") from None
     loaded = _load(tuple(texts))
     return Logic(loaded, _values(config.values, loaded.parameters))
 

@@ -279,6 +279,8 @@ def test_a_file_that_is_not_there_is_one_line_and_exit_code_two(cli: Cli, tmp_pa
     assert cli("fly", "hover", "--profile", profile) == 2
     said = cli.err
     assert said == f"floaty: logic.controller = {tmp_path / 'controller.py'}: No such file or directory\n"
+    assert cli("fly", "hover", "--set", "logic.controller=lqrr") == 2
+    assert cli.err.endswith("lqrr: No such file or directory; laws that ship: lqr, original\n")
 
 
 def test_a_wrong_module_is_one_line_always(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -305,6 +307,7 @@ def test_paths_begin_at_the_profile_that_names_them(monkeypatch: pytest.MonkeyPa
     monkeypatch.chdir(project)
     assert load_config(overrides=["logic.controller=controller.py"]).logic == config.logic
     assert load_config("profile.toml", ["logic.controller=''"]).logic.controller == ""
+    assert load_config("profile.toml", ["logic.controller=lqr"]).logic == load_config("lqr").logic
 
 
 @pytest.mark.long

@@ -16,6 +16,7 @@ from firmware_py.core import model
 from firmware_py.core.structs import MODE_FLY
 from firmware_py.core_runner import CoreBlocks, CoreRunner, default_runner
 from firmware_py.export.side_by_side import SideBySide
+from firmware_py.logic.laws import SHIPPED_LAWS
 from firmware_py.logic.loading import Logic, load_logic, translation_of
 from hil.config import load_config
 from support.command import Cli
@@ -117,7 +118,7 @@ def test_the_original_law_is_the_original_firmwares_with_both_integrators_and_wi
 
 
 def matrix(gains: dict[str, float]) -> np.ndarray:
-    """Return K of u = -K x from the 16 numbers of profiles/lqr.py."""
+    """Return K of u = -K x from the 16 numbers of the shipped law `lqr`."""
     K = np.zeros((4, 16))
     for row, names in enumerate((
         {1: "gain_y", 4: "gain_vy", 6: "gain_roll", 9: "gain_p"}, {0: "gain_x", 3: "gain_vx", 7: "gain_pitch", 10: "gain_q"},
@@ -186,7 +187,7 @@ def test_the_lqr_feeds_all_16_states_back(roll: float) -> None:
 @pytest.mark.long
 def test_mypy_knows_the_types_in_a_module_of_the_users(tmp_path: Path) -> None:
     (tmp_path / "controller.py").write_text(LAW, encoding="utf-8")
-    files = [tmp_path / "controller.py", ROOT / "profiles" / "original.py", ROOT / "profiles" / "lqr.py"]
+    files = [tmp_path / "controller.py", *map(Path, SHIPPED_LAWS.values())]
     for file in files:
         done = subprocess.run(
             (sys.executable, "-m", "mypy", "--strict", "--config-file=", file), cwd=tmp_path, capture_output=True, text=True,
