@@ -32,6 +32,7 @@ COMMANDS = {
     "view": "pictures.view",
     "report": "pictures.report",
     "export": "pictures.export",
+    "import": "pictures.import_",
     "serve": "serve.serve",
     "station": "station.station",
     "param": "param.param",

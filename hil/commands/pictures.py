@@ -1,13 +1,20 @@
-"""`floaty view | report | export`: the pictures of a run, and its export for other programs."""
+"""`floaty view | report | export | import`: the pictures of a run, its export for other programs, and foreign logs."""
 
 from importlib import import_module
+from math import isfinite, nan
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+from rich.markup import escape
+from rich.table import Table
 
-from hil.commands.options import code_option, run_folder, say
-from hil.errors import LabError, reading, writing
+from hil.commands.options import FILE, PATH, code_option, right, run_folder, say, warn, wide_console
+from hil.errors import LabError, reading, require_empty, writing
 from hil.live.window import show
+
+if TYPE_CHECKING:
+    from hil.laboratory.files.imported import Imported
 
 
 @click.command()
@@ -70,3 +77,48 @@ def export(run: Path, as_csv: bool, as_mcap: bool, as_tlog: bool, as_video: bool
         with writing("RUN", run), reading(run):
             file = getattr(import_module(f"hil.{module}"), write)(run)
         say(f"  {file}")
+
+
+@click.command("import")
+@click.argument("files", metavar="FILE...", type=FILE, nargs=-1, required=True)
+@click.option(
+    "--map", "chosen", metavar="MAP.toml", type=FILE, help="Which column of the file gives which of the log."
+)
+@click.option("--out", type=PATH, metavar="DIR", help="Run folder [runs/NAME of the first file].")
+def import_(files: tuple[Path, ...], chosen: Path | None, out: Path | None) -> None:
+    """Make a run folder of a foreign log: CSV, Parquet, or a Crazyflie's micro-SD file.
+
+    Columns and units are guessed from their names, shown, and stored in map.toml of the run folder: correct a copy and
+    import again with --map. Files with clocks of their own are joined on the rows of the first one. What is missing is
+    unknown. The run can be reported, compared, viewed and exported like a real flight.
+    """
+    from hil.api import Run
+    from hil.laboratory.files.imported import Map, import_log
+
+    given = None if chosen is None else Map.read(chosen)
+    folder = out or Path("runs") / files[0].stem
+    require_empty("--out", folder)
+    with writing("--out", folder):
+        done = import_log(files, folder, given)
+        _print_map(done)
+        for note in done.notes:
+            warn(note)
+        say(f"  {Run(done.result).write_report()}")
+
+
+def _print_map(done: "Imported") -> None:
+    log, table = done.log, Table("column", "from", *right("least", "largest"), "unit")
+    for name, source in done.map.columns.items():
+        if str(source).partition(" [")[0] == name:
+            continue  # it keeps its name
+        known, unit = [], ""
+        if name in log.column_names:
+            known = [value for value in log.column(name).to_pylist() if isfinite(value)]
+            unit = log.schema.field(name).metadata[b"unit"].decode()
+        least, largest = (f"{value:.4g}" for value in (min(known, default=nan), max(known, default=nan)))
+        table.add_row(name, escape(str(source)), least if known else "", largest if known else "", unit)
+    wide_console(100).print(table)
+    seconds = 1e-6 * (log.column("t")[-1].as_py() - log.column("t")[0].as_py())
+    say(
+        f"{log.num_rows} rows, {seconds:.3f} s, profile {done.map.profile}; to correct it: --map, a copy of map.toml"
+    )

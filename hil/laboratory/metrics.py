@@ -209,7 +209,10 @@ def known(table: pa.Table) -> pa.Table:
     """Return the rows with a pose and an estimate; in a real flight the cameras or the board may not report them."""
     if not is_real(table):
         return table
-    return rows_where(table, np.isfinite(column(table, "cameras.x") + column(table, "estimate.x")))
+    seen = _seen(table)
+    if "estimate.x" in table.column_names:
+        seen &= np.isfinite(column(table, "estimate.x"))
+    return rows_where(table, seen)
 
 
 @checked
@@ -303,8 +306,9 @@ def measure(table: pa.Table, lost: bool, resets: int | None = None) -> dict[str,
     values["attitude_max"] = float(np.abs(attitude_error(flight)).max())
     values["y_over_x"] = float(rms[1] / rms[0]) if rms[0] > 0 else float("nan")
     values["age_mean"] = _mean_age(flight)
-    values["resets"] = float(_boots(table) if resets is None else resets)
-    values["failsafe"], values["uncontrolled"] = _without_control(table)
+    if (column(flight, "supervisor.state") <= max(State)).any():  # it was reported
+        values["resets"] = float(_boots(table) if resets is None else resets)
+        values["failsafe"], values["uncontrolled"] = _without_control(table)
     if "serial.up_busy" in table.schema.names:
         busy = column(flight, "serial.up_busy", "serial.down_busy")
         values["line_up"], values["line_down"] = (busy[-1] - busy[0]) / (times[-1] - times[0])
@@ -316,7 +320,7 @@ def measure(table: pa.Table, lost: bool, resets: int | None = None) -> dict[str,
         values["loop_stood"] = float(column(flight, "loop.stood")[-1]) * 1e-6
         for name in ("held", "late", "lost", "doubled"):
             values[f"samples_{name}"] = float(column(flight, f"loop.{name}")[-1])
-    if is_real(table):
+    if "estimator.rejected" in table.schema.names:  # of a real flight
         values["poses_refused"] = float(column(flight, "estimator.rejected")[-1])
     elif "estimator.refused" in table.schema.names:
         refused = column(flight, *(f"estimator.{name}" for name in REFUSED)).sum(axis=1)

@@ -148,14 +148,25 @@ _XYZ, _RPY = ("x", "y", "z"), ("roll", "pitch", "yaw")
 POSITION = Curves(_XYZ, AXIS_COLOURS, "cm", lambda rows: 100 * position_error(rows))
 ATTITUDE = Curves(_RPY, AXIS_COLOURS, "deg", lambda rows: np.degrees(attitude_error(rows)))
 POSITION_ESTIMATE = Curves(
-    _XYZ, AXIS_COLOURS, "cm", lambda rows: 100 * column(rows, "estimate.x", "estimate.y", "estimate.z")
+    _XYZ,
+    AXIS_COLOURS,
+    "cm",
+    lambda rows: 100 * column(rows, "estimate.x", "estimate.y", "estimate.z"),
+    needs="estimate.x",
 )
-ATTITUDE_ESTIMATE = Curves(_RPY, AXIS_COLOURS, "deg", _degrees(*(f"estimate.{name}" for name in _RPY)))
+ATTITUDE_ESTIMATE = Curves(
+    _RPY, AXIS_COLOURS, "deg", _degrees(*(f"estimate.{name}" for name in _RPY)), needs="estimate.roll"
+)
 POSITION_MISS = Curves(
-    _XYZ, AXIS_COLOURS, "cm", lambda rows: POSITION_ESTIMATE.read(rows) - POSITION.read(rows)
+    _XYZ,
+    AXIS_COLOURS,
+    "cm",
+    lambda rows: POSITION_ESTIMATE.read(rows) - POSITION.read(rows),
+    needs="estimate.x",
 )
 ATTITUDE_MISS = Curves(
-    _RPY, AXIS_COLOURS, "deg", lambda rows: (ATTITUDE_ESTIMATE.read(rows) - ATTITUDE.read(rows) + 180) % 360 - 180
+    _RPY, AXIS_COLOURS, "deg", lambda rows: (ATTITUDE_ESTIMATE.read(rows) - ATTITUDE.read(rows) + 180) % 360 - 180,
+    needs="estimate.roll",
 )  # fmt: skip
 FLAPS = Curves(_four("flap "), FLAP_COLOURS, "deg", _flaps, needs="truth.flap_1 telemetry.flap_1")
 ROTORS = logged(_four("M"), FLAP_COLOURS, "mN", *_four("rotor.thrust_"), scale=1e3)

@@ -248,6 +248,7 @@ PICTURES = (
         "Estimate",
         "The board's estimate less the truth, in the goal frame; of a real flight, less the cameras' poses.",
         curves_of((curves.POSITION_MISS, "position"), (curves.ATTITUDE_MISS, "attitude"), height=1.8),
+        needs=curves.POSITION_MISS.needs,
         question=KNOWN,
     ),
     Picture(

@@ -245,6 +245,8 @@ def _plot(rows: pa.Table, window_s: tuple[float, float]) -> Plot:
 
 def _with(curve: Curves, other: Curves, name: str, rows: pa.Table, label: str) -> Panel:
     """Return a panel of curves, with others dashed in the same colours; the first of those names them."""
+    if not other.fits(rows.column_names):  # of an imported log
+        return panel(curve, rows, label)
     times, values = since_release(rows), other.read(rows)
     dashed = (
         Series(name if index == 0 else "", colour, times, values[:, index], dashed=True)

@@ -90,24 +90,28 @@ def _metadata(log: pa.Table) -> dict[str, str]:
 
 def _write_poses(log: pa.Table, context: foxglove.Context) -> None:
     eyes = "cameras" if is_real(log) else "truth"
+    estimated = "estimate.x" in log.column_names
     shown = {
         name: channels.PoseInFrameChannel(f"/{name}/pose", context=context)
-        for name in (eyes, "goal", "estimate")
+        for name in (eyes, "goal", *(["estimate"] if estimated else []))
     }
     tf = channels.FrameTransformsChannel("/tf", context=context)
     for us, truth, goal, estimate in _places(log):
         time, log_time = _timestamp(us), NS_PER_US * us
         for name, frame, place in ((eyes, WORLD, truth), ("goal", WORLD, goal), ("estimate", GOAL, estimate)):
+            if name not in shown:
+                continue
             pose = messages.Pose(position=_vector(place), orientation=_turn(place))
             shown[name].log(
                 messages.PoseInFrame(timestamp=time, frame_id=frame, pose=pose), log_time=log_time
             )
+        frames = ((WORLD, BODY, truth), (WORLD, GOAL, goal), (GOAL, ESTIMATE, estimate))
         transforms = [
             messages.FrameTransform(
                 timestamp=time, parent_frame_id=parent, child_frame_id=child,
                 translation=_vector(place), rotation=_turn(place),
             )
-            for parent, child, place in ((WORLD, BODY, truth), (WORLD, GOAL, goal), (GOAL, ESTIMATE, estimate))
+            for parent, child, place in frames[: 2 + estimated]
         ]  # fmt: skip
         tf.log(messages.FrameTransforms(transforms=transforms), log_time=log_time)
 
@@ -117,7 +121,8 @@ def _places(log: pa.Table) -> Iterator[tuple[int, Place, Place, Place]]:
     log = known(log)
     truth = body(log, "x", "y", "z", "qw", "qx", "qy", "qz").tolist()
     goal = column(log, "goal.x", "goal.y", "goal.z", "goal.yaw").tolist()
-    estimate = column(log, *(f"estimate.{name}" for name in ("x", "y", "z", "roll", "pitch", "yaw"))).tolist()
+    names = [f"estimate.{name}" for name in ("x", "y", "z", "roll", "pitch", "yaw")]
+    estimate = column(log, *names).tolist() if names[0] in log.column_names else [[0.0] * 6] * log.num_rows
     for us, p, g, e in zip(log.column("t").to_pylist(), truth, goal, estimate, strict=True):
         yield us, (p[:3], p[3:]), (g[:3], yaw_quaternion(g[3])), (e[:3], from_euler_zyx(*e[3:]))
 

@@ -63,10 +63,11 @@ class Scene:
         self._place(
             "goal", times, goal_of(rows), np.array([yaw_quaternion(yaw) for yaw in column(rows, "goal.yaw")])
         )
-        pose = column(rows, *(f"estimate.{name}" for name in ("x", "y", "z", "roll", "pitch", "yaw")))
-        known = np.isfinite(pose).all(axis=1)  # a real board may not have reported it yet
-        q_GE = [from_euler_zyx(*angles) for angles in pose[known, 3:].tolist()]
-        self._place("goal/estimate", times[known], pose[known, :3], np.array(q_GE).reshape(-1, 4))
+        if "estimate.x" in rows.column_names:
+            pose = column(rows, *(f"estimate.{name}" for name in ("x", "y", "z", "roll", "pitch", "yaw")))
+            known = np.isfinite(pose).all(axis=1)  # a real board may not have reported it yet
+            q_GE = [from_euler_zyx(*angles) for angles in pose[known, 3:].tolist()]
+            self._place("goal/estimate", times[known], pose[known, :3], np.array(q_GE).reshape(-1, 4))
         if "flow.x" in rows.column_names:  # of a real flight neither flow nor forces are known
             self._add_flow(rows, p_WB)
         if self._forced:

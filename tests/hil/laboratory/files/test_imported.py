@@ -1,0 +1,275 @@
+"""Foreign logs as runs: `floaty import`."""
+
+import json
+import struct
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hil import LabError, fly, load_run
+from hil.laboratory.files.imported import Map, import_log
+from hil.pictures.viewer.recording import recording_of
+from support.command import Cli
+
+ROWS = 40
+T = 0.02 * np.arange(ROWS)  # [s]
+PLACE = np.stack((0.1 * np.sin(T), 0.2 * np.cos(T), 1.0 + T), axis=1)  # [m]
+ANGLES = np.stack((0.1 * T, -0.2 * T, 0.3 + T), axis=1)  # roll, pitch, yaw [rad]
+QUATERNIONS = Rotation.from_euler("ZYX", ANGLES[:, ::-1]).as_quat(scalar_first=True)
+DEGREES = np.degrees(ANGLES)
+
+
+def csv(path: Path, columns: Mapping[str, Any], delimiter: str = ",", decimal: str = ".") -> Path:
+    lines = [delimiter.join(columns)]
+    for row in zip(*columns.values(), strict=True):
+        lines.append(
+            delimiter.join(one if isinstance(one, str) else f"{one:.9f}".replace(".", decimal) for one in row)
+        )
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def place(x: str, y: str, z: str, scale: float = 1.0) -> dict[str, Any]:
+    return dict(zip((x, y, z), scale * PLACE.T, strict=True))
+
+
+STOCK = {
+    "Timestamp": 1e3 * T + 5000, **place("stateEstimate.x", "stateEstimate.y", "stateEstimate.z"),
+    "stateEstimate.roll": DEGREES[:, 0], "stateEstimate.pitch": -DEGREES[:, 1], "stateEstimate.yaw": DEGREES[:, 2],
+    "pm.vbat": np.full(ROWS, 3.9),
+}  # fmt: skip
+FOREIGN: Mapping[str, Mapping[str, Any]] = {
+    "cfclient": STOCK,
+    "units in brackets": {
+        "time [us]": 1e6 * T, **place("x [mm]", "y [mm]", "z [mm]", 1e3),
+        "roll (deg)": DEGREES[:, 0], "pitch (deg)": DEGREES[:, 1], "yaw (deg)": DEGREES[:, 2],
+    },
+    "units in names": {
+        "t_ns": 1e9 * T, **place("pos_x_cm", "pos_y_cm", "pos_z_cm", 100.0),
+        "roll_rad": ANGLES[:, 0], "pitch_rad": ANGLES[:, 1], "yaw_rad": ANGLES[:, 2],
+    },
+    "neither, by size": {
+        "elapsed time": 1e3 * T, **place("px", "py", "pz", 1e3 * 30), "phi": 10 * DEGREES[:, 0],
+        "theta": DEGREES[:, 1], "psi": DEGREES[:, 2],
+    },
+    "measured beside estimated": {
+        "timestamp": 1e6 * T, **place("stateEstimate.x", "stateEstimate.y", "stateEstimate.z", 2.0),
+        **place("mocap.pos.x", "mocap.pos.y", "mocap.pos.z"),
+        **{f"mocap.q{part}": QUATERNIONS[:, index] for index, part in enumerate("wxyz")},
+    },
+    "a quaternion": {
+        "time": T, **place("position.x", "position.y", "position.z"),
+        **{f"orientation.{part}": QUATERNIONS[:, index] for index, part in enumerate("wxyz")},
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_names_units_and_sizes_give_time_place_and_attitude(name: str, tmp_path: Path) -> None:
+    done = import_log([csv(tmp_path / "log.csv", FOREIGN[name])], tmp_path)
+    log, factor = load_run(tmp_path).log.to_pydict(), 30.0 if name == "neither, by size" else 1.0
+    assert np.array(log["t"]) == pytest.approx(1e6 * T, abs=1)
+    assert np.stack([log[f"cameras.{axis}"] for axis in "xyz"], axis=1) == pytest.approx(
+        factor * PLACE, abs=1e-6
+    )
+    turned = np.stack([log[f"cameras.q{part}"] for part in "wxyz"], axis=1)
+    if name == "neither, by size":
+        turned, expected = turned[:1], QUATERNIONS[:1]
+    else:
+        expected = QUATERNIONS
+    assert turned == pytest.approx(expected, abs=1e-7)
+    assert done.map.profile == ("crazyflie" if "stateEstimate.x" in FOREIGN[name] else "floaty")
+    assert done.result.verdicts == ()
+
+
+def test_a_table_of_this_laboratory_is_its_log_again(cli: Cli, tmp_path: Path) -> None:
+    run = fly("hover", tmp_path / "run", duration_s=0.3)
+    assert cli("export", tmp_path / "run", "--csv") == 0
+    assert cli("import", tmp_path / "run" / "flight.csv", "--out", tmp_path / "again") == 0
+    again = load_run(tmp_path / "again")
+    assert again.log.column_names == run.log.column_names
+    for name in run.log.column_names[1:]:
+        assert again.log.column(name).to_numpy() == pytest.approx(
+            run.log.column(name).to_numpy(), rel=1e-6
+        ), name
+    assert again.units == run.units
+    assert again.free.num_rows == run.free.num_rows
+    assert again.metrics["rms_x"] == pytest.approx(run.metrics["rms_x"])
+
+
+def test_other_delimiters_decimal_commas_marks_and_words_are_read(tmp_path: Path) -> None:
+    columns = {"time": T, **place("x", "y", "z"), "note": ["fine"] * ROWS}
+    path = csv(tmp_path / "log.csv", columns, ";", ",")
+    path.write_bytes(b"\xef\xbb\xbf# " + path.read_bytes())
+    done = import_log([path], tmp_path)
+    assert done.log.column("cameras.z").to_numpy() == pytest.approx(PLACE[:, 2])
+    assert "columns without numbers are left out: note" in done.notes
+
+
+def test_what_is_missing_is_unknown_or_said(tmp_path: Path) -> None:
+    done = import_log(
+        [csv(tmp_path / "log.csv", {"t": T, **place("x", "y", "z"), "fan [rpm]": 900 + T})], tmp_path
+    )
+    log, goal = done.log, np.round(PLACE.mean(axis=0), 3)
+    assert np.isnan(log.column("cameras.qw").to_numpy()).all()
+    assert [log.column(f"goal.{axis}")[0].as_py() for axis in "xyz"] == pytest.approx(goal)
+    assert Map.read(tmp_path / "map.toml") == done.map
+    assert [name for name in done.map.columns if name.startswith("goal")] == [
+        "goal.x",
+        "goal.y",
+        "goal.z",
+        "goal.yaw",
+    ]
+    assert ("mean of the flight" in " ".join(done.notes), "attitude is unknown" in " ".join(done.notes)) == (
+        True,
+        True,
+    )
+    assert log.schema.field("robot.fan").metadata[b"unit"] == b"rpm"
+    run = load_run(tmp_path)
+    assert all(
+        np.isnan(run.metrics[name]) for name in ("failsafe", "uncontrolled", "poses_refused", "attitude_max")
+    )
+
+
+def test_a_map_chooses_scales_turns_and_releases(tmp_path: Path) -> None:
+    path = csv(
+        tmp_path / "log.csv", {"clock": 10 + T, "a": PLACE[:, 0], "b": 1e3 * PLACE[:, 1], "c": -PLACE[:, 2]}
+    )
+    (tmp_path / "mine.toml").write_text(
+        'profile = "floaty"\nrelease_s = 10.2\n[columns]\nt = "clock [s]"\n"cameras.x" = "a [m]"\n'
+        '"cameras.y" = "b [mm]"\n"cameras.z" = "-c [m]"\n"goal.x" = 0.25\n',
+        encoding="utf-8",
+    )
+    log = import_log([path], tmp_path, Map.read(tmp_path / "mine.toml")).log
+    assert np.stack([log.column(f"cameras.{axis}").to_numpy() for axis in "xyz"], axis=1) == pytest.approx(
+        PLACE
+    )
+    assert log.column("goal.x")[3].as_py() == 0.25
+    assert log.column("flight.free").to_numpy().tolist() == [0] * 10 + [1] * (ROWS - 10)
+    assert log.schema.metadata[b"release_us"] == b"200000"
+
+
+def test_files_are_joined_on_the_rows_of_the_first(tmp_path: Path) -> None:
+    first = csv(tmp_path / "a.csv", {"t": T, **place("x", "y", "z")})
+    slow = {
+        "Timestamp [ms]": [100.0, 400.0, 300.0, 500.0],
+        "battery.voltage [mV]": [4000.0, 3900.0, 1.0, 3800.0],
+        "x": [1.0] * 4,
+    }
+    done = import_log([first, csv(tmp_path / "b.csv", slow)], tmp_path)
+    volts = done.log.column("battery.voltage").to_numpy()
+    expected = np.select([T >= 0.5, T >= 0.4, T >= 0.1], [3.8, 3.9, 4.0], np.nan)
+    assert volts == pytest.approx(expected, nan_ok=True)
+    assert "1 rows whose Timestamp does not advance are left out" in done.notes
+    assert done.log.column("robot.x.2").to_numpy()[-1] == 1.0
+
+
+def micro_sd(version: int) -> bytes:
+    """Return a log of two kinds of events, as tools/usdlog of the firmware reads it."""
+    stamp, step = ("<HI", 20) if version == 1 else ("<HQ", 20_000)
+    data = b"\xbc" + struct.pack("<HH", version, 2)
+    data += struct.pack("<H", 0) + b"fixedFrequency\0" + struct.pack("<H", 3)
+    data += b"stateEstimate.x(f)\0stateEstimate.y(f)\0stateEstimate.z(f)\0"
+    data += struct.pack("<H", 7) + b"estTDOA\0" + struct.pack("<H", 2) + b"idA(B)\0difference(f)\0"
+    for row, p in enumerate(PLACE):
+        data += struct.pack(stamp, 0, row * step) + struct.pack("<3f", *p)
+        if row == 5:
+            data += struct.pack(stamp, 7, row * step) + struct.pack("<Bf", 3, 0.5)
+    return data + struct.pack("<I", zlib.crc32(data))
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_micro_sd_log_is_read(version: int, tmp_path: Path) -> None:
+    (tmp_path / "log00").write_bytes(micro_sd(version))
+    log = import_log([tmp_path / "log00"], tmp_path).log
+    assert log.column("t").to_numpy() == pytest.approx(1e6 * T, abs=1)
+    assert log.column("cameras.z").to_numpy() == pytest.approx(PLACE[:, 2], abs=1e-6)
+    assert log.column("robot.idA").to_numpy()[[4, 5, -1]] == pytest.approx([np.nan, 3, 3], nan_ok=True)
+
+
+def test_parquet_with_time_stamps_is_read(tmp_path: Path) -> None:
+    stamps = pa.array((1_700_000_000_000_000_000 + 1e9 * T).astype(np.int64), pa.timestamp("ns"))
+    pa.parquet.write_table(pa.table({"time": stamps, **place("x", "y", "z")}), tmp_path / "log.parquet2")
+    log = import_log([tmp_path / "log.parquet2"], tmp_path).log
+    assert log.column("t").to_numpy() == pytest.approx(1e6 * T, abs=1)
+
+
+GOOD = {"t": T, **place("x", "y", "z")}
+FORMATS = "expected CSV, Parquet, or a Crazyflie's micro-SD log"
+PLACES = "cameras.x, cameras.y, cameras.z"
+BAD: Mapping[str, tuple[Mapping[str, Any] | bytes, str, str]] = {
+    "no clock": ({name: GOOD[name] for name in "xyz"}, "", 'no column of times among x, y, z; name it in a map: t = "NAME'),
+    "no place": ({"t": T, "thrust": T}, "", f'nothing gives {PLACES}; name it in a map: "cameras.x" = "NAME [m]"'),
+    "no such column": (GOOD, '"cameras.x" = "xx"', "cameras.x = 'xx': no such column; did you mean x?"),
+    "no such unit": (GOOD, '"cameras.x" = "x [deg]"', "cameras.x = 'x': unit 'deg'; expected m, cm, mm"),
+    "no unit": (GOOD, '"cameras.x" = "x"', "cameras.x = 'x': unit ''; expected m, cm, mm"),
+    "no quaternion": ({**GOOD, "qw": T, "qx": T, "qy": T, "qz": T + 2}, "", "cameras.qw to qz: a quaternion of length"),
+    "text": (b"t\nhello\n", "", f"no rows with numbers; {FORMATS}"),
+    "binary": (b"\1\0\2", "", FORMATS),
+    "empty": (b"", "", FORMATS),
+    "ragged": (b"t,x,y,z\n1,2,3,4\n1,2\n", "", f"{FORMATS}: "),
+    "half a Parquet": (b"PAR1abc", "", "damaged Parquet: "),
+    "a changed micro-SD log": (micro_sd(2)[:-5] + b"12345", "", "a damaged micro-SD log: its checksum is wrong"),
+    "a newer micro-SD log": (micro_sd(3), "", "version 3 of the micro-SD log; expected 1 or 2"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_cannot_be_imported_is_one_line_and_leaves_nothing(name: str, cli: Cli, tmp_path: Path) -> None:
+    content, mapped, reason = BAD[name]
+    path, options = tmp_path / "log.csv", list[str | Path]()
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        csv(path, content)
+    if mapped:
+        rest = "".join(f'"cameras.{axis}" = "{axis} [m]"\n' for axis in "yz")
+        (tmp_path / "map.toml").write_text(f'[columns]\nt = "t [s]"\n{rest}{mapped}\n', encoding="utf-8")
+        options = ["--map", tmp_path / "map.toml"]
+    assert cli("import", path, "--out", tmp_path / "run", *options) == 2
+    assert f"floaty: {path}: {reason}" in cli.err
+    assert cli.err.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("colums = 1", "colums = 1: extra inputs are not permitted"),
+        ('release_s = "soon"', "release_s = 'soon': input should be a valid number"),
+        ("=", "invalid"),
+        (None, "No such file"),
+    ],
+)
+def test_a_wrong_map_is_refused(text: str | None, reason: str, tmp_path: Path) -> None:
+    if text is not None:
+        (tmp_path / "map.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(LabError) as told:
+        Map.read(tmp_path / "map.toml")
+    assert str(told.value).startswith(f"--map {tmp_path / 'map.toml'}: ")
+    assert reason.lower() in str(told.value).lower()
+
+
+@pytest.mark.parametrize("name", ["cfclient", "without attitude"])
+def test_an_imported_run_is_shown_compared_and_exported(name: str, cli: Cli, tmp_path: Path) -> None:
+    path = csv(tmp_path / "log.csv", GOOD if name == "without attitude" else STOCK)
+    run = tmp_path / "run"
+    assert cli("import", path, "--out", run) == 0
+    assert (run / "report.html").is_file()
+    assert 'class="verdict' not in (run / "report.html").read_text(encoding="utf-8")
+    assert cli("export", run, "--csv", "--mcap") == 0
+    assert recording_of(run).is_file()
+    fly("hover", tmp_path / "simulated", duration_s=0.5)
+    assert cli("compare", tmp_path / "simulated", run) == 1
+    assert "distance" in cli.out
+    assert cli("import", path, "--out", run) == 2
+    assert "exists and is not empty" in cli.err
+    events = [json.loads(line) for line in (run / "events.jsonl").read_text(encoding="utf-8").splitlines()]
+    assert events[0]["text"] == f"imported from {path}"
