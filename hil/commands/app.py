@@ -33,6 +33,7 @@ COMMANDS = {
     "report": "pictures.report",
     "export": "pictures.export",
     "import": "pictures.import_",
+    "replay": "fly.replay_run",
     "serve": "serve.serve",
     "station": "station.station",
     "param": "param.param",

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import pi
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
 
 import click
+from click.core import ParameterSource
 from rich.progress import TextColumn, TimeRemainingColumn
+from rich.table import Table
 
 from hil.commands import options as common
 from hil.commands.options import PATH, say, warn
 from hil.commands.tables import print_result, print_seeds
-from hil.errors import LabError, writing
+from hil.errors import LabError, require_empty, writing
 
 if TYPE_CHECKING:
     from hil.laboratory.flight import Flight
@@ -173,3 +176,41 @@ def _fly_many(
         warn(f"interrupted: {len(rows)} of {len(requests)} seeds are complete")
         return common.INTERRUPTED
     return 0 if all(row.passed for row in rows) else 1
+
+
+@click.command("replay")
+@common.run_folder
+@common.profile_option
+@common.set_option
+@click.option("--out", type=common.PATH, metavar="DIR", help="Run folder [RUN-replay].")
+@common.code_option
+def replay_run(
+    run: Path, profile: str, overrides: tuple[str, ...], out: Path | None, named: str | None
+) -> None:
+    """Replay RUN, a simulated flight, through the core of another profile, beside the one that flew, open loop.
+
+    The flight is flown again, bit for bit. The second core gets the same gyro samples, poses and flap commands; its estimate
+    and commands are logged as replay.* and shown in the report. Without --profile it has that of the flight.
+    """
+    from hil.api import load_run
+    from hil.config import load_config
+    from hil.laboratory.replay import misses, replay
+
+    loaded = load_run(run, named)
+    request, folder = loaded.request, out or run.with_name(f"{run.name}-replay")
+    usual = click.get_current_context().get_parameter_source("profile") is ParameterSource.DEFAULT
+    replayed = load_config(request.profile if usual else profile, (*request.overrides, *overrides))
+    require_empty("--out", folder)
+    with writing("--out", folder):
+        replay(request, loaded.hash, replayed, folder)
+        common.write_pictures(folder, request.experiment)
+    table = Table("estimate less truth", *common.right("flown", "replayed"), "unit")
+    flown, other = misses(folder)
+    for what, name, scale, unit in (
+        ("position, rms", "position", 100.0, "cm"), ("position, largest", "position_max", 100.0, "cm"),
+        ("attitude, rms", "attitude", 180.0 / pi, "deg"), ("attitude, largest", "attitude_max", 180.0 / pi, "deg"),
+        ("poses fused", "fused", 1, ""), ("poses refused", "refused", 1, ""),
+    ):  # fmt: skip
+        table.add_row(what, *(f"{getattr(one, name) * scale:.4g}" for one in (flown, other)), unit)
+    common.console.print(table)
+    say(f"  {folder / 'report.html'}")

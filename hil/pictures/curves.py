@@ -168,6 +168,19 @@ ATTITUDE_MISS = Curves(
     _RPY, AXIS_COLOURS, "deg", lambda rows: (ATTITUDE_ESTIMATE.read(rows) - ATTITUDE.read(rows) + 180) % 360 - 180,
     needs="estimate.roll",
 )  # fmt: skip
+REPLAYED_POSITION_MISS = Curves(
+    _XYZ, AXIS_COLOURS, "cm",
+    lambda rows: 100 * column(rows, "replay.x", "replay.y", "replay.z") - POSITION.read(rows), needs="replay.x",
+)  # fmt: skip
+REPLAYED_ATTITUDE_MISS = Curves(
+    _RPY, AXIS_COLOURS, "deg",
+    lambda rows: (_degrees(*(f"replay.{name}" for name in _RPY))(rows) - ATTITUDE.read(rows) + 180) % 360 - 180,
+    needs="replay.roll",
+)  # fmt: skip
+REPLAYED_REFUSALS = Curves(
+    tuple(f"{name}, {how}" for name in REFUSED for how in ("replayed", "flown")), SERIES_COLOURS[:6], "so far",
+    plain(*(f"{group}.{name}" for name in REFUSED for group in ("replay", "estimator"))), needs="replay.refused",
+)  # fmt: skip
 FLAPS = Curves(_four("flap "), FLAP_COLOURS, "deg", _flaps, needs="truth.flap_1 telemetry.flap_1")
 ROTORS = logged(_four("M"), FLAP_COLOURS, "mN", *_four("rotor.thrust_"), scale=1e3)
 MOTORS = Curves(

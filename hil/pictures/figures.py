@@ -252,6 +252,21 @@ PICTURES = (
         question=KNOWN,
     ),
     Picture(
+        "Replay",
+        "What the replayed core computed beside the flight: the other estimate less the truth, above that of the flight; the "
+        "poses that each refused, by reason.",
+        curves_of(
+            (curves.REPLAYED_POSITION_MISS, "position, replayed"),
+            (curves.POSITION_MISS, "position, flown"),
+            (curves.REPLAYED_ATTITUDE_MISS, "attitude, replayed"),
+            (curves.ATTITUDE_MISS, "attitude, flown"),
+            (curves.REPLAYED_REFUSALS, "poses refused"),
+            height=1.5,
+        ),
+        needs=curves.REPLAYED_POSITION_MISS.needs,
+        question=KNOWN,
+    ),
+    Picture(
         "Age",
         "Age of the pose when the estimator takes it, and the horizon of its predictor (0: it is switched off); the longest "
         "time since a fused pose, which grows while none comes or each is refused (a real board has the age only).",

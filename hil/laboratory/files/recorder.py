@@ -234,6 +234,13 @@ def finish_log(
     stream.unlink()
 
 
+def finish_table(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
+    """Replace a log by what `change` makes of it, whole or not at all."""
+    table = change(pa.parquet.read_table(path))
+    with replacing(path) as partial:
+        pa.parquet.write_table(table, partial, compression="zstd", use_dictionary=False)
+
+
 def load_log(folder: Path) -> pa.Table:
     """Return the log of a run folder; a run whose process died is read up to its last complete second.
 

@@ -1,0 +1,86 @@
+"""Flights through another core, open loop: `floaty replay`."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil import LabError, Run, fly, load_run
+from hil.config import load_config
+from hil.laboratory.replay import misses, replay
+from support.command import Cli
+
+STATES = [*"xyz", "vx", "vy", "vz", "roll", "pitch", "yaw", *"pqr", *(f"flap_{n}" for n in (1, 2, 3, 4))]
+COUNTS = ["fused", "refused", "jumps", "too_old", "invalid", "bounded", "resets"]
+FAULTS = (
+    "mocap.outlier@0.3",
+    "mocap.dropout@0.5:0.1",
+    "imu.bias.r@0.2:0.4=10",
+    "push.y@0.6=2",
+    "imu.silent@0.9:0.1",
+)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return fly("hover", tmp_path_factory.mktemp("replay") / "run", duration_s=1.6, faults=FAULTS)
+
+
+def replayed(run: Run, folder: Path, *overrides: str, profile: str = "floaty") -> Run:
+    replay(run.request, run.hash, load_config(profile, (*run.request.overrides, *overrides)), folder)
+    return load_run(folder)
+
+
+def test_the_core_that_flew_is_replayed_exactly(flown: Run, tmp_path: Path) -> None:
+    run = replayed(flown, tmp_path / "again")
+    assert run.hash == flown.hash
+    log = {name: run.log.column(name).to_numpy() for name in run.log.column_names}
+    known = np.isfinite(log["replay.x"])
+    assert (~known).sum() < 3
+    for names, group in ((STATES, "estimate"), (COUNTS, "estimator"), (["u1", "u2", "u3", "u4"], "control")):
+        for name in names:
+            assert (log[f"replay.{name}"] == log[f"{group}.{name}"])[known].all(), name
+    assert log["replay.fused"].max() > 30
+    assert run.units["replay.vx"] == "m/s"
+    assert misses(run.folder)[0] == misses(run.folder)[1]
+
+
+def test_another_core_gets_the_inputs_of_the_flight_and_moves_nothing(flown: Run, tmp_path: Path) -> None:
+    strict = replayed(flown, tmp_path / "strict", "estimator.gate_sigma=1")
+    original = {name: flown.log.column(name) for name in flown.log.column_names}
+    assert all(strict.log.column(name).equals(values) for name, values in original.items())
+    by, of_strict = misses(strict.folder)
+    assert (by.refused, of_strict.refused > 5) == (
+        misses(replayed(flown, tmp_path / "same").folder)[0].refused,
+        True,
+    )
+    assert of_strict.fused < by.fused
+    lqr = replayed(flown, tmp_path / "lqr", "logic.controller=lqr")
+    assert misses(lqr.folder)[0] == misses(lqr.folder)[1]  # the commands that flew moved the flaps
+    assert not np.array_equal(lqr.log.column("replay.u1"), lqr.log.column("control.u1"))
+
+
+def test_the_command_shows_both_and_the_report_draws_them(flown: Run, cli: Cli, tmp_path: Path) -> None:
+    assert cli("replay", flown.folder, "--set", "predictor.enabled=false", "--out", tmp_path / "late") == 0
+    assert "Replay" in (tmp_path / "late" / "report.html").read_text(encoding="utf-8")
+    flew, other = misses(tmp_path / "late")
+    assert f"{100 * flew.position:.4g}" in cli.out
+    assert f"{100 * other.position:.4g}" in cli.out
+    assert flew.attitude < other.attitude  # the predictor was worth it
+    assert cli("replay", flown.folder, "--out", tmp_path / "late") == 2
+    assert "exists and is not empty" in cli.err
+
+
+def test_what_is_not_flown_again_is_refused(flown: Run, cli: Cli, tmp_path: Path) -> None:
+    with pytest.raises(LabError, match=r"flown again, its hash is \w{16}, not 0{16}: another version"):
+        replay(flown.request, "0" * 64, load_config(), tmp_path / "other")
+    result = json.loads((flown.folder / "result.json").read_text(encoding="utf-8"))
+    copy = tmp_path / "real"
+    copy.mkdir()
+    (copy / "log.parquet").write_bytes((flown.folder / "log.parquet").read_bytes())
+    (copy / "result.json").write_text(json.dumps({**result, "board": "real"}), encoding="utf-8")
+    assert cli("replay", copy) == 2
+    assert "only flights in lockstep on c or python are replayed" in cli.err
+    assert cli("replay", flown.folder, "--set", "predictor.enabeld=true") == 2
+    assert "did you mean" in cli.err
