@@ -253,7 +253,7 @@ PICTURES = (
     ),
     Picture(
         "Replay",
-        "What the replayed core computed beside the flight: the other estimate less the truth, above that of the flight; the "
+        "What the replayed core computed beside the flight: its estimate less the truth, above that of the flight; the "
         "poses that each refused, by reason.",
         curves_of(
             (curves.REPLAYED_POSITION_MISS, "position, replayed"),
