@@ -329,7 +329,8 @@ def _explain(tree: Mapping[str, Any], detail: ErrorDetails) -> str:
     if detail["type"] == "extra_forbidden":
         allowed = keys_at(LabConfig, location[:-1])
         return f"{name} = {value!r}: unknown key{f' ({hint(location[-1], allowed)})' if allowed else ''}"
-    return f"{name} = {value!r}: {detail['msg'][0].lower()}{detail['msg'][1:]}"
+    advice = "; still air is tunnel.fan_factor = 0" if name == "tunnel.speed" and value == 0 else ""
+    return f"{name} = {value!r}: {detail['msg'][0].lower()}{detail['msg'][1:]}{advice}"
 
 
 def keys_at(model: Any, location: list[str]) -> list[str]:

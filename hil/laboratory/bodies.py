@@ -18,6 +18,7 @@ from hil.world.floaty.plant import SERVO_FAILURES, Plant
 from hil.world.quadrotor import MOTOR_FAILURES, Quadrotor
 
 Make = Callable[[LabConfig, np.random.Generator, Vector], Body]
+MOTORS, TIMERS = 4, 14  # outputs of the board, timers of its microcontroller
 OWN = "Robot"  # what a file defines: a class or function that is called as a `Make`
 SIZES = {
     "state": 13,
@@ -96,6 +97,11 @@ def _check(body: Any) -> None:
         value = getattr(body, name)
         if not (isinstance(value, np.ndarray) and value.shape == (size,) and value.dtype == np.float64):
             raise LabError(f"{kind}.{name} = {value!r}: expected an array of {size} float64")
+    if not _are_outputs(body.outputs):
+        raise LabError(
+            f"{kind}.outputs = {body.outputs!r}: expected four (timer, channel), of the board's M1 to M4; more or "
+            "fewer actuators are mixed from their counts in `actuate`"
+        )
     body.draw(0, open_circuit_voltage(1.0))
     columns = [
         name for channel in body.channels() for quantity in channel.quantities for name in quantity.names
@@ -108,3 +114,14 @@ def _check(body: Any) -> None:
         channel.read()
     if body.lost is not None:
         raise LabError(body.lost)
+
+
+def _are_outputs(outputs: Any) -> bool:
+    """Whether these are four different channels of the microcontroller's timers, counted from 0."""
+    try:
+        pairs = [(int(timer), int(channel)) for timer, channel in outputs]
+    except (TypeError, ValueError):
+        return False
+    return len(set(pairs)) == len(pairs) == MOTORS and all(
+        t in range(TIMERS) and c in range(4) for t, c in pairs
+    )

@@ -63,6 +63,11 @@ def test_an_override_reaches_its_value(override: str, value: object) -> None:
             "controller.gain_y=1e9",
             r"controller\.gain_y = 1000000000\.0: .*less than or equal to 20",
         ),
+        (
+            "floaty",
+            "tunnel.speed=0",
+            r"tunnel\.speed = 0: .*greater than 0; still air is tunnel\.fan_factor = 0",
+        ),
         ("floaty", "tunnel.speed=-1", r"tunnel\.speed = -1: .*greater than 0"),
         ("floaty", "servo.trim[1]=99999", r"servo\.trim\[1\] = 99999: .*12000"),
         ("floaty", "servo.trim[7]=0", r"no element \[7\]"),

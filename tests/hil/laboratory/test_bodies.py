@@ -15,6 +15,7 @@ from hil.laboratory.files.result import Result
 from hil.laboratory.metrics import column, free_flight
 from hil.pictures import video
 from hil.pictures.report import write_report
+from hil.pictures.scene import turn_of
 from hil.research.identify.record import profile_of
 from hil.world.scene import VisualModel
 from support.flights import hover
@@ -130,6 +131,10 @@ def test_a_torque_turns_it_and_a_push_moves_it(tmp_path: Path) -> None:
         (FLOATING + "\n    def power(self):\n        return 'much'\n", "Robot.power is 'much': expected a number"),
         (FLOATING + "\n    logged = {'mass': ('a b', '')}\n", "Robot.mass is 0.1: expected 2 numbers"),
         (FLOATING + "\n    logged = {'mass': ('a', ''), 'radius': ('a', '')}\n", "Robot logs robot.a 2 times"),
+        (FLOATING + "\n    outputs = ((1, 1), (1, 3))\n", "Robot.outputs = ((1, 1), (1, 3)): expected four"),
+        (FLOATING + "\n    outputs = ((1, 1),) * 4\n", "Robot.outputs = ((1, 1), (1, 1), (1, 1), (1, 1)): expected four"),
+        (FLOATING + "\n    outputs = ((1, 4), (1, 1), (1, 2), (1, 3))\n", "Robot.outputs = ((1, 4),"),
+        (FLOATING + "\n    outputs = 6\n", "Robot.outputs = 6: expected four (timer, channel), of the board's M1 to M4"),
         (FLOATING + "\n    parts = 3\n", "Robot.parts = 3: expected (ball(..), box(..), Part(..))"),
         (FLOATING + "\n    logged = {'spin': ('a', '')}\n", "'Robot' object has no attribute 'spin'"),
     ],
@@ -213,3 +218,24 @@ def test_its_report_and_scene_show_what_it_describes(flown: Result) -> None:
     assert [part.name for part in look.parts] == ["ball"]
     picture = np.asarray(next(video.frames(load_log(flown.folder))))
     assert (picture[:, : video.SIDE] == (200, 204, 208)).all(axis=2).sum() > 1000  # the ball, pale
+
+
+TILTING = """
+    parts = (
+        replace(box((0.02, 0.2, 0.02)), name="nacelle", place=(0.15, 0.0, 0.0), axis=(0.0, 1.0, 0.0), angle="robot.tilt"),
+    )
+    logged = {"tilt": ("tilt", "rad")}
+    tilt = 0.0
+    def actuate(self, duration):
+        self.tilt += 2.0 * duration
+"""
+
+
+def test_a_part_with_an_angle_turns_with_its_column(tmp_path: Path) -> None:
+    head = "from dataclasses import replace\nfrom hil.world.scene import box\n"
+    run = hover(tmp_path / "run", profile=project(tmp_path, head + FLOATING + TILTING), duration_s=0.5)
+    log = load_log(run.folder)
+    (part,) = VisualModel.read(stored_in(log.schema.metadata, "look")).parts
+    tilt = column(log, "robot.tilt")
+    assert tilt[-1] - tilt[0] == pytest.approx(2e-6 * (column(log, "t")[-1] - column(log, "t")[0]), abs=0.01)
+    assert turn_of(part, log)[-1] == pytest.approx([np.cos(tilt[-1] / 2), 0.0, np.sin(tilt[-1] / 2), 0.0])
