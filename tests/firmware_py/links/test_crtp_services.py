@@ -65,6 +65,7 @@ def test_a_client_finds_the_crazyflie_protocol_version_12(client: CrtpClient) ->
     assert client.one(LINK, 1, b"\0") == b"Bitcraze Crazyflie".ljust(30, b"\0")
     assert client.one(PLATFORM, 1, b"\0") == b"\0\x0c\0\0\0"
     assert client.one(PLATFORM, 1, b"\2") == b"\2C21F\0"
+    assert client.one(PLATFORM, 0, b"\3\1") == b"\3\1"  # the notice of a program's beginning comes back whole
     assert client.ask(LINK, 2, b"swallowed") == client.ask(LINK, 3, b"") == []
 
 
@@ -210,13 +211,16 @@ def test_rows_end_a_second_after_silence_and_the_next_gets_none(client: CrtpClie
     assert client.packets(LOG, 2)
 
 
-def test_without_polls_a_packet_per_second_keeps_rows_coming(client: CrtpClient, logs) -> None:
+@pytest.mark.parametrize("broadcast", [False, True])
+def test_without_polls_a_packet_per_second_keeps_rows_coming(
+    client: CrtpClient, logs, broadcast: bool
+) -> None:
     assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
     assert client.one(LOG, 1, bytes((3, 1, 1))) == bytes((3, 1, 0))
     client.polling = False
     for _ in range(3):
         client.run(client.now_us + 990_000)
-        client.firmware.radio_received(b"\xff\0")
+        client.firmware.radio_received(b"\xff\0", broadcast)
     client.sent.clear()
     client.run(client.now_us + 2_000_000)
     assert 99 <= len(client.packets(LOG, 2)) <= 101
@@ -572,6 +576,14 @@ def test_memory_access_outside_fails(client: CrtpClient, number: int, address: i
     if length < 25:  # more is none of a write's
         assert client.one(MEM, 2, head + bytes(length)) == head + bytes((errno.EIO,))
     assert client.eeprom == before
+
+
+@pytest.mark.parametrize(("number", "version"), [(3, 3), (4, 1)])
+def test_the_memory_of_decks_that_are_not_there_has_a_version_before_its_zeros(
+    client: CrtpClient, number: int, version: int
+) -> None:
+    for address, expected in ((0, bytes((version, 0, 0, 0))), (1, bytes(4))):
+        assert client.one(MEM, 1, struct.pack("<BIB", number, address, 4))[5:] == b"\0" + expected
 
 
 def test_24_bytes_are_read_at_once_up_to_the_last_one(client: CrtpClient) -> None:

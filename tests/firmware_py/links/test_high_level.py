@@ -118,6 +118,18 @@ def test_a_stream_that_stops_without_the_notice_is_reported_before_the_board_loc
     )
 
 
+def test_only_the_notice_0_hands_the_lead_back_and_other_channels_have_none(absolute: Flyer) -> None:
+    absolute.post(absolute.low_level.send_position_setpoint, *HERE, 0.0)
+    assert absolute.order(absolute.commander.takeoff, 2.0, 0.2) == 0
+    for port, channel, data in ((7, 1, b"\1" + bytes(4)), (7, 2, bytes(5)), (3, 1, bytes(14)), (3, 3, b"")):
+        absolute.send(port, channel, data)
+        absolute.wait(0.05)
+    assert (absolute.goal(), absolute.firmware.link.malformed) == (pytest.approx(HERE), 0)
+    absolute.post(absolute.low_level.send_notify_setpoint_stop)
+    absolute.wait(0.2)
+    assert absolute.goal()[2] == pytest.approx(2.0)
+
+
 def test_take_off_go_to_and_land_move_the_goal_and_the_estimator_gets_the_error(absolute: Flyer) -> None:
     assert absolute.order(absolute.commander.takeoff, 1.0, 2.0) == 0
     absolute.wait(2.2)

@@ -19,7 +19,7 @@ from firmware_py.wire.mavlink import POSES
 from firmware_py.wire.mavlink_dialect import NUMBERS
 from firmware_py.wire.supervisor import Cause, State
 from support.firmware_bench import LEVEL, FirmwareBench
-from support.mavlink_client import GYRO_ZERO_US, STREAMS, MavlinkClient, codec, count
+from support.mavlink_client import GYRO_ZERO_US, HOME, STREAMS, MavlinkClient, codec, count
 
 DENIED, UNSUPPORTED, TEMPORARILY_REJECTED = 2, 3, 1
 IGNORE_POSITION, IGNORE_YAW, IGNORE_REST = 0x7, 0x400, 0x9F8
@@ -330,6 +330,7 @@ def test_an_interval_is_set_read_switched_off_and_reset(client: MavlinkClient) -
     assert (
         client.command(510, 3)[1].interval_us == client.command(510, 65_535)[1].interval_us == 0
     )  # never sent
+    assert client.command(510, 0)[1].interval_us == 1_000_000  # of heartbeats
     assert client.command(510, 65_536)[0].result == DENIED
 
 
@@ -391,11 +392,20 @@ def test_a_time_of_day_after_the_year_2200_is_refused(
     assert (client.of("SYSTEM_TIME")[-1].time_unix_usec == 0) == refused
 
 
-def test_the_goals_heading_is_reported_within_half_a_turn(client: MavlinkClient) -> None:
-    target(client, (0.0, 0.0, -1.2), math.radians(530))
-    client.messages.clear()
-    client.command(512, 85)
-    assert client.of("POSITION_TARGET_LOCAL_NED")[-1].yaw == pytest.approx(math.radians(170))
+def test_headings_of_goal_and_robot_are_reported_within_half_a_turn(client: MavlinkClient) -> None:
+    target(client, (0.0, 0.0, -1.15), math.radians(530))
+    north_to_back = (
+        math.cos(math.radians(85)),
+        0.0,
+        0.0,
+        math.sin(math.radians(85)),
+    )  # 20 deg beyond the goal
+    for at_us in range(GYRO_ZERO_US, 1_000_000, 20_000):
+        client.events.at(at_us, lambda now_us: client.pose((HOME[0], north_to_back), now_us))
+    client.run(1_000_000)
+    for kind, heading in (("POSITION_TARGET_LOCAL_NED", 170), ("ATTITUDE", -170)):
+        client.command(512, NUMBERS[kind])
+        assert client.of(kind)[-1].yaw == pytest.approx(math.radians(heading), abs=0.02)
 
 
 @pytest.mark.parametrize(
@@ -956,7 +966,7 @@ def test_counters_are_log_variables(client: MavlinkClient) -> None:
 def test_each_counter_and_deviation_has_its_own_place_in_the_messages(client: MavlinkClient) -> None:
     counters, estimator = client.stack.counters, client.firmware._core.estimator.fields
     counters.frames, counters.lost, counters.bad_crc = 80, 20, 7
-    client.stack.refused, client.stack._transmit.dropped, client.uart_overruns = 20, 40, 3
+    client.stack.refused, client.stack._transmit.dropped, client.uart_overruns = 50, 40, 3
     estimator.refused, estimator.too_old, estimator.invalid = 100, 200, 400
     for frozen, deviations in ((0, (0.2, 0.3, 0.4)), (1, (0.3, 0.2, 0.1))):
         client.firmware._core.sampling.fields.recovering = 1000 * frozen
@@ -969,7 +979,7 @@ def test_each_counter_and_deviation_has_its_own_place_in_the_messages(client: Ma
                 named = {one.name: one.value for one in found if one.name != "age_ms"}
                 assert named == {"refused": 700, "up_lost": 20, "tx_dropped": 40, "overruns": 3}
             elif number == "SYS_STATUS":
-                assert found[-1].errors_comm == 7 + 20 + 3
+                assert found[-1].errors_comm == 7 + 50 + 3
                 gyro = found[-1].onboard_control_sensors_health & dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
                 assert bool(gyro) == (not frozen)
                 assert 1800 < found[-1].drop_rate_comm <= 2000, "20 of 100, and the requests that came since"

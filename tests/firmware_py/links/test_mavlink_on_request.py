@@ -155,6 +155,9 @@ def test_the_hud_shows_speed_over_ground_heading_height_and_climb(moving: Mavlin
 
 def test_the_time_of_day_is_that_of_a_station_which_knows_it(moving: MavlinkClient) -> None:
     unix_us = 1_700_000_000_000_000
+    moving.send(
+        "system_time", unix_us - 3_600_000_000, 76
+    )  # another one's, or the same before its clock was set
     moving.send("system_time", unix_us, 77)
     sent_us = moving.now_us
     moving.send("system_time", 0, 78)  # this one does not

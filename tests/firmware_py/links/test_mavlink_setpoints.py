@@ -73,7 +73,7 @@ def test_unserved_requests_are_reported_once_then_seldom(client: MavlinkClient, 
     assert texts(client, name, *UNSERVED[name]) == [f"{line} (100 more before)"]
     assert client.stack.unserved == 102  # 1 + 100 + 1
     client.run(client.now_us + 10_000_000)
-    assert texts(client, name, *UNSERVED[name]) == [line]
+    assert [texts(client, name, *UNSERVED[name]) for _ in range(2)] == [[line], []]  # seldom again
 
 
 def test_every_sender_is_answered(client: MavlinkClient) -> None:
