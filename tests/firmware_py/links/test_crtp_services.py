@@ -23,7 +23,7 @@ from firmware_py.links.console import pieces
 from firmware_py.links.crtp_stack import PORT_QUEUE
 from firmware_py.links.parameters import ParameterStorage
 from firmware_py.wire import crtp, telemetry
-from firmware_py.wire.localisation import unpack_quaternion
+from firmware_py.wire.localisation import pack_quaternion, unpack_quaternion
 from firmware_py.wire.scalars import LOG_SCALARS, Scalar
 from firmware_py.wire.toc import Toc
 from hil.config import load_config
@@ -315,7 +315,9 @@ def test_a_block_that_the_processor_kept_waiting_returns_to_its_grid(client: Crt
 
 
 @given(
-    st.sampled_from(sorted(C_TYPES, key=lambda scalar: scalar.log_number)), st.integers(-(2**31), 2**32 - 1)
+    st.sampled_from(sorted(C_TYPES, key=lambda scalar: scalar.log_number)),
+    st.integers(-(2**31), 2**32 - 1)
+    | st.sampled_from([2**bits - less for bits in (7, 8, 15, 16, 31) for less in (0, 1)]),
 )
 def test_integers_are_cast_as_in_c(scalar: Scalar, value: int) -> None:
     assert scalar.cast(value) == C_TYPES[scalar](value).value
@@ -601,8 +603,9 @@ unit = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(x * x for x in q)
 @given(unit)
 def test_packed_quaternion_is_cflibs(xyzw: tuple[float, ...]) -> None:
     q = np.array(xyzw) / np.linalg.norm(xyzw)
-    w, x, y, z = unpack_quaternion(compress_quaternion(xyzw))
-    assert abs(np.dot((x, y, z, w), q)) > 1 - 2e-5
+    for packed in (compress_quaternion(xyzw), pack_quaternion((q[3], *q[:3]))):
+        w, x, y, z = unpack_quaternion(packed)
+        assert abs(np.dot((x, y, z, w), q)) > 1 - 2e-5
 
 
 def test_packed_pose_with_our_address_is_flown_and_others_are_not(client: CrtpClient, logs) -> None:

@@ -222,7 +222,9 @@ def test_an_impossible_correction_only_reports(relative: Flyer, place: tuple[flo
 
 
 def send_full_state(flyer: Flyer, x: float, y: float, z: float, yaw_deg: float) -> None:
-    q = Rotation.from_euler("z", yaw_deg, degrees=True).as_quat().tolist()
+    q = (
+        Rotation.from_euler("ZYX", (yaw_deg, 25, 20), degrees=True).as_quat().tolist()
+    )  # its tilt is not flown
     nothing = (0.0, 0.0, 0.0)
     flyer.post(flyer.low_level.send_full_state_setpoint, (x, y, z), nothing, nothing, q, 0.0, 0.0, 0.0)
 

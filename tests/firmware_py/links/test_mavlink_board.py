@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.links.parameters import Parameter, ParameterStorage
 from firmware_py.signals import COUNTERS
-from firmware_py.wire import telemetry
+from firmware_py.wire import crtp, telemetry
 from firmware_py.wire.mavlink import POSES
 from firmware_py.wire.mavlink_dialect import NUMBERS
 from firmware_py.wire.supervisor import Cause, State
@@ -487,6 +487,29 @@ def test_a_new_goal_does_not_move_the_robot() -> None:
     assert attitude.yaw == pytest.approx(0.0, abs=0.01)
 
 
+@pytest.mark.parametrize("absolute", [False, True])
+def test_place_and_goal_are_those_in_the_world_whatever_the_poses_over_crtp_are(absolute: bool) -> None:
+    home, away = np.array((0.2, -0.1, 1.15)), np.array((0.06, 0.03, -0.04))
+    client = MavlinkClient(*WIDE, f"mavlink.home={home.tolist()}")
+    client.ask("param_set", 1, 1, b"EXTPOSE_ABSOLUTE", float(absolute), 9)
+    data = crtp.encode_ext_pose(tuple(away + home * absolute), LEVEL, 20_000)
+    for at_us in range(GYRO_ZERO_US, 2_000_000, 20_000):
+        client.events.at(at_us, lambda now_us: client.firmware.radio_received(data))
+
+    def reported(kind: str) -> Any:
+        client.command(512, NUMBERS[kind])
+        found = client.of(kind)[-1]
+        return pytest.approx((found.x, -found.y, -found.z), abs=0.01)
+
+    client.run(1_000_000)
+    assert tuple(home + away) == reported("LOCAL_POSITION_NED")
+    target(client, (0.25, 0.3, -1.3), -0.5)
+    client.run(1_500_000)
+    assert reported("POSITION_TARGET_LOCAL_NED") == (0.25, -0.3, 1.3)
+    assert client.of("POSITION_TARGET_LOCAL_NED")[-1].yaw == pytest.approx(-0.5)
+    assert tuple(home + away) == reported("LOCAL_POSITION_NED")
+
+
 def test_the_flight_array_holds_the_telemetry_blocks() -> None:
     client = MavlinkClient()
     client.command(511, 350, 20_000)
@@ -515,15 +538,31 @@ def test_counters_in_the_flight_array_wrap_as_those_of_the_log_do(client: Mavlin
     assert array.data[names.index("locSrv.poses")] == 7
 
 
-def test_the_older_request_sets_groups_of_streams(client: MavlinkClient) -> None:
-    client.send("request_data_stream", 1, 1, dialect.MAV_DATA_STREAM_EXTRA1, 10, 1)
-    client.send("request_data_stream", 1, 1, dialect.MAV_DATA_STREAM_POSITION, 5, 0)
-    client.run(client.now_us + 2000)
-    client.messages.clear()
-    client.run(client.now_us + 1_000_000)
-    counts = count(message for _, message in client.messages)
-    assert (counts["ATTITUDE"], counts["ATTITUDE_QUATERNION"]) == (10, 10)
-    assert "LOCAL_POSITION_NED" not in counts
+STATUS = ("SYS_STATUS", "BATTERY_STATUS", "ESTIMATOR_STATUS")
+GROUPS = {  # of MAV_DATA_STREAM
+    "EXTENDED_STATUS": STATUS, "RC_CHANNELS": ("SERVO_OUTPUT_RAW",), "POSITION": ("LOCAL_POSITION_NED",),
+    "EXTRA1": ("ATTITUDE", "ATTITUDE_QUATERNION"), "EXTRA3": 5 * ("NAMED_VALUE_FLOAT",), "RAW_SENSORS": (),
+}  # fmt: skip
+GROUPS["ALL"] = tuple(name for group in GROUPS.values() for name in group)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_the_older_request_sets_groups_of_streams(client: MavlinkClient, group: str) -> None:
+    for start, times in ((1, 10), (0, 0)):
+        client.send("request_data_stream", 1, 1, getattr(dialect, f"MAV_DATA_STREAM_{group}"), 10, start)
+        client.run(client.now_us + 2000)
+        client.messages.clear()
+        client.run(client.now_us + 1_000_000)
+        counts = count(message for _, message in client.messages)
+        for name in GROUPS["ALL"]:
+            expected = times * GROUPS[group].count(name)
+            assert (counts.get(name, 0) == expected) == (name in GROUPS[group]), (name, counts)
+
+
+@pytest.mark.parametrize(("rate_hz", "interval_us"), [(60, 17_000), (70, 14_000)])
+def test_the_interval_of_a_rate_is_the_nearest_whole_tick(rate_hz: int, interval_us: int) -> None:
+    client = MavlinkClient(f"mavlink.rates.attitude={rate_hz}")
+    assert client.command(510, NUMBERS["ATTITUDE"])[1].interval_us == interval_us
 
 
 def test_on_a_full_line_replies_wait_and_streams_are_dropped(client: MavlinkClient) -> None:
