@@ -224,6 +224,27 @@ def test_a_landing_ends_idle_and_everything_else_goes_on() -> None:
     assert planner.phase is Phase.IDLE
 
 
+@pytest.mark.parametrize(
+    ("phase", "command", "status"),
+    [
+        (Phase.IDLE, 7, 0),
+        (Phase.IDLE, 8, 0),
+        (Phase.FLYING, 7, 1),
+        (Phase.FLYING, 8, 0),
+        (Phase.LANDING, 7, 1),
+        (Phase.LANDING, 8, 1),
+    ],
+)
+def test_only_at_rest_it_takes_off_and_only_once_it_lands(phase: Phase, command: int, status: int) -> None:
+    """By plan_takeoff and plan_land of planner.c."""
+    board = SimpleNamespace(estimate=lambda: REST, admits=lambda places: True)
+    commander = HighLevelCommander(board, lambda kind, text: None)
+    commander.block(False)
+    if phase is not Phase.IDLE:
+        commander.planner.follow(straight_up(REST, 1.0, 0.0, 2.0), 0.0, landing=phase is Phase.LANDING)
+    assert commander.execute(struct.pack("<BBff?f", command, 0, 0.5, 0.0, True, 2.0), 1.0) == status
+
+
 @pytest.mark.parametrize("relative", [False, True])
 @pytest.mark.parametrize("velocity", [0.0, -1.0])
 def test_without_a_velocity_a_take_off_and_a_landing_have_each_their_own(
