@@ -90,13 +90,16 @@ def test_a_client_that_is_gone_makes_room_at_once(board: Board, clients: list[so
     assert board.said == []
 
 
-def test_a_prober_is_answered_and_changes_nothing(board: Board, clients: list[socket.socket]) -> None:
+@pytest.mark.parametrize("null", [b"\xff", b"\xf3"])
+def test_a_prober_is_answered_and_changes_nothing(
+    board: Board, clients: list[socket.socket], null: bytes
+) -> None:
     first, prober, _ = clients
     first.send(b"\xf0a")
     board.read(0)
-    prober.send(b"\xff")
+    prober.send(null)
     board.read(1)
-    assert prober.recv(64) == b"\xff"
+    assert prober.recv(64) == null
     assert (board.received, board.server.ignored, board.said) == ([b"\xf0a"], 0, [])
 
 
