@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.geometry import from_euler_zyx
 from firmware_py.wire import crtp, telemetry
-from ground_station.config import StationConfig, TrackerConfig
+from ground_station.config import GroundConfig, StationConfig, TrackerConfig
 from ground_station.corrections import correct
 from ground_station.links.log_blocks import START_ORDER
 from ground_station.links.loopback import LoopbackLink
@@ -252,6 +252,18 @@ def test_telemetry_is_asked_for_at_the_first_frame_and_after_half_a_second_witho
         assert bench.requests == []
         bench.station.on_frame(MocapFrame(now_us + late_us, HOME.p_WG, UPRIGHT, True), now_us + late_us)
     assert len(bench.requests) == 1
+
+
+@pytest.mark.parametrize(
+    ("period_us", "wanted_hz", "hz"), [(5000, 50, 50), (50_000, 50, 20), (50_000, 10, 10)]
+)
+def test_a_link_expects_as_many_poses_as_are_wanted_and_seen(period_us, wanted_hz, hz):
+    settings = GroundConfig(
+        station=StationConfig(corrections_hz=wanted_hz, link_latency_us=1300),
+        frame_period_us=period_us,
+        baud=57_600,
+    ).links()
+    assert (settings.corrections_hz, settings.latency_us, settings.baud) == (hz, 1300, 57_600)
 
 
 def telemetry_packets(timestamp_ms, blocks=START_ORDER):
