@@ -371,17 +371,19 @@ def test_log_on_disk_is_never_much_more_than_a_second_old(tmp_path):
     for timestamp_ms in range(0, 10_000, 500):  # few bytes: no buffer is ever full
         for data in telemetry_packets(timestamp_ms):
             bench.hear(timestamp_ms * 1000, data)
-    # not closed, as after a crash
-    assert int(rows(tmp_path / "telemetry.csv")[-1]["board.t [ms]"]) >= 8000
+        # not closed, as after a crash
+        written = [int(row["board.t [ms]"]) for row in rows(tmp_path / "telemetry.csv")]
+        assert timestamp_ms - max(written, default=0) <= 1500
     log.close()
 
 
 def test_hold_holds_and_offsets_begin_at_their_start():
     assert Hold(HOME).at(0) == Hold(HOME).at(10**9) == HOME
-    trajectory = Offsets(HOME, 1_000_000, y=Square(0.05, -0.05, 0.1), z=Sine(0.2, 0.05), yaw=Step(1.5))
-    assert trajectory.at(999_999) == HOME
-    assert trajectory.at(1_000_000) == Goal((0.0, 0.05, 1.15), 1.5)
+    home = Goal((0.25, 0.0, 1.15), 0.5)
+    trajectory = Offsets(home, 1_000_000, y=Square(0.05, -0.05, 0.1), z=Sine(0.2, 0.05), yaw=Step(1.5))
+    assert trajectory.at(999_999) == home
+    assert trajectory.at(1_000_000) == Goal((0.25, 0.05, 1.15), 2.0)
     assert trajectory.at(5_999_999).p_WG[1] == 0.05
     assert trajectory.at(6_000_000).p_WG[1] == -0.05
     assert trajectory.at(6_000_000).p_WG[2] == pytest.approx(1.35)
-    assert trajectory.at(11_000_000).p_WG == pytest.approx((0.0, 0.05, 1.15))
+    assert trajectory.at(11_000_000).p_WG == pytest.approx((0.25, 0.05, 1.15))

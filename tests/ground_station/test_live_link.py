@@ -118,7 +118,9 @@ def test_a_muted_link_sends_nothing_until_it_is_opened_again():
     board.open(lambda: False)
     board.put(2)
     wait_for(board, 1)
+    board.supervisor_state = 2
     board.mute()
+    assert board.supervisor_state is None
     board.put(3)
     wait_for(board, 1)
     board.close()
