@@ -142,6 +142,17 @@ def test_a_supervisor_calibrates_first_and_has_no_cause(bench: Bench) -> None:
     assert supervisor.cause in Cause
 
 
+def test_poses_are_counted_and_the_last_one_has_its_age_in_microseconds(bench: Bench) -> None:
+    if not has_core(bench.firmware):
+        return
+    bench.run(1_000_000)  # the gyro's zero is found
+    for _ in range(10):
+        bench.run(20_000, [POSE + bytes((2 * 30,))])  # 30 ms old on arrival
+    counters = dict(zip(COUNTERS, bench.firmware.signals.counters.tolist(), strict=True))
+    assert (8 <= counters["fused"] <= 10, counters["refused"]) == (True, 0)
+    assert 30_000 <= counters["pose_age_us"] <= 45_000  # at the estimator's next step
+
+
 def test_variables_have_names_of_their_own_and_numbers_of_their_types(bench: Bench) -> None:
     bench.run(50_000)
     names = [variable.name for variable in bench.firmware.variables]

@@ -504,6 +504,18 @@ def test_a_line_has_the_reasons_of_a_tenth_of_the_poses_and_none_of_fewer(few: i
     assert unused.counts == {Reason.FROZEN: 100 - few, Reason.NOT_A_NUMBER: few}
 
 
+def test_a_line_has_the_largest_deviations_and_the_latest_of_other_values() -> None:
+    unused = UnusedPoses()
+    for number, (distance, angle) in enumerate(((0.1, 5.0), (0.3, 2.0), (0.2, 9.0))):
+        unused.note(1000 * number, 0, (Reason.DEVIATES, (distance, angle)))
+        unused.note(1000 * number, 0, (Reason.QUATERNION, (distance,)))
+    unused.note(500_000, 0, None)
+    assert unused.due() == [
+        "motion capture: 3 poses refused, up to 0.30 m and 9 deg from the prediction; "
+        "3 poses unusable: a quaternion of length 0.20, not 1"
+    ]
+
+
 def test_a_reason_is_reported_again_after_five_seconds_each_time_and_a_lost_track_each_time():
     unused, lines = UnusedPoses(), []
     for now_us in range(0, 18_000_000, 100_000):
