@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from cflib.crazyflie.mem.trajectory_memory import CompressedSegment, CompressedStart, Poly4D
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
@@ -25,6 +26,8 @@ from firmware_py.crazyflie.planner import (
     spiral,
     straight_up,
 )
+from firmware_py.crazyflie.trajectories import COMPRESSED, LOCATION_MEMORY, POLYNOMIALS, decode_trajectory
+from firmware_py.wire.high_level import Define
 
 NUMBERS = st.floats(-2.0, 2.0)
 VECTORS = st.tuples(NUMBERS, NUMBERS, NUMBERS)
@@ -68,6 +71,32 @@ def test_a_bezier_curve_is_scipys(points: list[float], duration: float) -> None:
     ours, theirs = Polynomial(bezier(points, duration)), BPoly(np.array(points)[:, None], [0.0, duration])
     for t in np.linspace(0.0, duration, 9):
         assert ours(t) == pytest.approx(float(theirs(t)), abs=1e-7)
+
+
+def test_trajectories_are_read_as_cflib_packs_them_at_any_place_of_the_memory() -> None:
+    rng, memory = np.random.default_rng(2), bytearray(4096)
+    axes = rng.normal(size=(2, 4, 8)).astype(np.float32).tolist()
+    packed = b"".join(Poly4D(0.5 + n, *map(Poly4D.Poly, axes[n])).pack() for n in (0, 1))
+    memory[132 : 132 + len(packed)] = packed
+    path = decode_trajectory(memory, Define(1, LOCATION_MEMORY, POLYNOMIALS, 132, 2))
+    for t, number, begin in ((0.3, 0, 0.0), (1.7, 1, 0.5)):
+        expected = [Polynomial(axis)(t - begin) for axis in axes[number]]
+        assert (*path.at(t).position, path.at(t).yaw) == pytest.approx(expected)
+    parts = [
+        CompressedStart(0.1, -0.2, 0.3, 0.5),
+        CompressedSegment(1.0, [0.2], [-0.2, 0.0, 0.0], [], [1.5]),
+        CompressedSegment(0.5, [], [], [0.4] * 7, []),
+        CompressedSegment(0.0, [], [], [], []),
+    ]
+    packed = b"".join(part.pack() for part in parts)
+    memory[40 : 40 + len(packed)] = packed
+    path = decode_trajectory(memory, Define(2, LOCATION_MEMORY, COMPRESSED, 40, 2))
+    assert path.duration == pytest.approx(1.5)
+    for t, place in (
+        (0.5, (0.15, -0.1, 0.3, 1.0)),
+        (1.49999, (0.2, 0.0, 0.4, 1.5)),
+    ):  # a Bezier curve's middle, the end
+        assert (*path.at(t).position, path.at(t).yaw) == pytest.approx(place, abs=1e-3)
 
 
 def wavy(pieces: int = 3) -> Path:

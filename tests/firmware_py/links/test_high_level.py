@@ -7,16 +7,14 @@ from types import SimpleNamespace
 import pytest
 from cflib.crazyflie.commander import Commander
 from cflib.crazyflie.high_level_commander import HighLevelCommander
-from cflib.crazyflie.mem.trajectory_memory import CompressedSegment, CompressedStart, Poly4D
 from cflib.crazyflie.supervisor import BIT_HL_CONTROL_ACTIVE, BIT_HL_CONTROL_DISABLED, BIT_HL_TRAJ_FINISHED
-from numpy.polynomial import Polynomial
 from scipy.spatial.transform import Rotation
 
 from firmware_py.signals import COUNTERS
 from firmware_py.wire import crtp
-from support.crtp_client import LOG, MEM, PARAM, SUPERVISOR, CrtpClient
+from support.crtp_client import LOG, PARAM, SUPERVISOR, CrtpClient
 
-HIGH_LEVEL, TRAJECTORIES = 8, 1
+HIGH_LEVEL = 8
 ENOEXEC = 8
 HERE = (0.3, -0.2, 1.4)
 
@@ -75,12 +73,6 @@ class Flyer(CrtpClient):
     @property
     def state(self) -> str:
         return self.firmware.signals.supervisor.state.name
-
-    def upload(self, data: bytes, offset: int = 0) -> None:
-        for start in range(0, len(data), 24):
-            piece = data[start : start + 24]
-            head = struct.pack("<BI", TRAJECTORIES, offset + start)
-            assert self.one(MEM, 2, head + piece)[5] == 0
 
 
 @pytest.fixture
@@ -148,44 +140,6 @@ def test_take_off_go_to_and_land_move_the_goal_and_the_estimator_gets_the_error(
     absolute.wait(1.1)
     assert absolute.goal() == pytest.approx([0.1, 0.1, 0.4])
     assert absolute.state == "FLYING"  # it stays where it has landed
-
-
-def test_a_trajectory_of_polynomials_is_flown_from_where_the_goal_is(absolute: Flyer) -> None:
-    x = Polynomial([0.0, 0.0, 0.5, 0.0, -0.2])
-    pieces = [
-        Poly4D(0.5, Poly4D.Poly([*x.coef, 0, 0, 0])),
-        Poly4D(1.5, Poly4D.Poly([x(0.5)] + [0] * 7), z=Poly4D.Poly([0, 0.1] + [0] * 6)),
-    ]
-    absolute.upload(b"".join(piece.pack() for piece in pieces), 132)
-    define = absolute.commander.define_trajectory
-    assert absolute.order(define, 1, 132, 2) == 0
-    absolute.order(absolute.commander.takeoff, 1.0, 0.5)
-    absolute.wait(1.0)
-    assert absolute.order(absolute.commander.start_trajectory, 1, 2.0, relative_position=True) == 0
-    absolute.wait(0.6 - 0.003)
-    assert absolute.goal()[0] == pytest.approx(0.3 + x(0.3), abs=5e-3)
-    absolute.wait(4.0)
-    assert absolute.goal() == pytest.approx([0.3 + x(0.5), -0.2, 1.15], abs=1e-4)
-
-
-def test_a_compressed_trajectory_is_flown(absolute: Flyer) -> None:
-    parts = [
-        CompressedStart(0.0, 0.0, 0.0, 0.0),
-        CompressedSegment(1.0, [0.1], [0.0, 0.2, 0.2], [], [1.0]),
-        CompressedSegment(0.5, [], [], [0.1] * 7, []),
-        CompressedSegment(0.0, [], [], [], []),
-    ]
-    absolute.upload(b"".join(part.pack() for part in parts))
-    assert absolute.order(absolute.commander.define_trajectory, 2, 0, 2, 1) == 0
-    absolute.order(absolute.commander.takeoff, 1.0, 0.1)
-    absolute.wait(0.5)
-    assert absolute.order(absolute.commander.start_trajectory, 2, 1.0, True) == 0
-    absolute.wait(0.487)
-    x, y, z = absolute.goal()
-    assert (x, y, z) == pytest.approx((0.35, -0.2 + 0.1, 1.0), abs=3e-3)  # a Bezier curve's middle
-    absolute.wait(2.0)
-    assert absolute.goal() == pytest.approx([0.4, 0.0, 1.1], abs=1e-3)
-    assert absolute.log(absolute.logs, "controller.yaw") == pytest.approx([57.3], abs=0.1)
 
 
 @pytest.fixture
