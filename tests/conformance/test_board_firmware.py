@@ -82,6 +82,7 @@ class Bench:
     def boot(self) -> BoardFirmware:
         self.booted_us = self.now_us
         self.pins.boot(self.now_us)
+        assert self.pins.now_us == self.now_us  # until the new processor has a clock
         self.firmware = self.executor.boot(PowerOn(self.pins, CONFIG, False, False, None))
         self.pins.run_on(self.firmware.kernel, self.events)
         return self.firmware
@@ -151,6 +152,9 @@ def test_poses_are_counted_and_the_last_one_has_its_age_in_microseconds(bench: B
     counters = dict(zip(COUNTERS, bench.firmware.signals.counters.tolist(), strict=True))
     assert (8 <= counters["fused"] <= 10, counters["refused"]) == (True, 0)
     assert 30_000 <= counters["pose_age_us"] <= 45_000  # at the estimator's next step
+    shown = {variable.name: variable.read for variable in bench.firmware.variables}
+    if "loop.added" in shown:
+        assert shown["loop.added"]() == pytest.approx(3000, abs=1000)  # the link's way, each way
 
 
 def test_variables_have_names_of_their_own_and_numbers_of_their_types(bench: Bench) -> None:

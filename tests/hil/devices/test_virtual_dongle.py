@@ -179,6 +179,13 @@ def test_a_broadcast_reaches_a_board_on_its_channel_once_unanswered(channel: int
     assert bench.stm.packets == answers == []
 
 
+def test_a_packet_that_is_to_be_answered_is_one_and_cut_at_32_bytes() -> None:
+    bench = DongleAndBoard()
+    bench.exchange(b"\x10" + bytes(60))
+    bench.wait(5000)
+    assert bench.stm.packets == [b"\x10" + bytes(31)]
+
+
 def test_a_broadcast_does_not_count_in_the_conversation_with_one_board() -> None:
     bench = DongleAndBoard()
     host = cflib_host(bench)
