@@ -57,7 +57,7 @@ def test_memories_are_found_and_read_in_pieces() -> None:
             head = struct.pack("<BH", number, len(memory))
             size = min(29, 112 - len(memory))
             answer = decks.answer(syslink.READ_MEMORY, head + bytes(size))
-            assert answer[:3] == head
+            assert (answer[:3], len(answer)) == (head, 3 + size)
             memory += answer[3:]
         assert struct.unpack_from("<BIBB", memory) == (0xEB, 0, 0xBC, product)
         assert memory[10:12] + memory[12 : 12 + len(name)] == bytes((1, len(name))) + name
