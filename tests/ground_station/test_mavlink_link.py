@@ -219,6 +219,7 @@ def test_a_status_does_not_put_off_that_missing_telemetry_is_asked_for():
     station.on_packet(400_000, status(3_900, 250).pack(bench.codec))
     bench.sent.clear()
     station.on_frame(MocapFrame(500_000, HOME.p_WG, UPRIGHT, True), 540_000)
+    station.on_frame(MocapFrame(520_000, HOME.p_WG, UPRIGHT, True), 560_000)  # not with every frame
     assert [message.param1 for _, message in bench.of(COMMAND)] == [ARRAY]
 
 

@@ -232,6 +232,7 @@ def test_block_at_ten_milliseconds_comes_at_a_hundred_hertz(client: CrtpClient, 
     names = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "pm.vbat")
     assert client.create(7, *(logs[name][::-1] for name in names)) == 0
     assert client.one(LOG, 1, bytes((3, 7, 1))) == bytes((3, 7, 0))
+    assert client.packets(LOG, 2) == []  # the first one comes after a period
     client.sent.clear()
     client.run(client.now_us + 1_000_000)
     rows = client.packets(LOG, 2)
@@ -611,7 +612,7 @@ def test_packed_quaternion_is_cflibs(xyzw: tuple[float, ...]) -> None:
 def test_packed_pose_with_our_address_is_flown_and_others_are_not(client: CrtpClient, logs) -> None:
     client.run(610_000)
     upright = compress_quaternion((0, 0, 0, 1))
-    theirs = struct.pack("<BhhhI", 0x01, 900, 900, 900, upright)
+    theirs = struct.pack("<BhhhI", 0x01, 120, 90, -60, upright)
     for at_us in range(620_000, 900_000, 20_000):
         client.run(at_us)
         client.send(LOC, 1, b"\x09" + struct.pack("<BhhhI", 0xE7, 20, -30, 40, upright) + theirs)
@@ -674,11 +675,14 @@ def test_console_pieces_are_whole_characters_of_at_most_thirty_bytes(text: str) 
 
 def test_console_tells_on_the_radio_what_it_tells_on_the_debug_pins(client: CrtpClient) -> None:
     def talk():
-        for size in (199, 200, 201):
+        for size in (199, 200, 201, *37 * [150]):  # more than the radio's queue holds
             client.firmware._console.write("x" * size)
         yield from ()
 
     client.firmware.kernel.create_task("TALK", 1, talk)
+    client.radio_open = False
+    client.run(100_000)
+    client.radio_open = True
     client.run(700_000)
     text = b"".join(client.packets(0, 0)).decode()
     assert text.splitlines() == [line[:200] for line in client.console]

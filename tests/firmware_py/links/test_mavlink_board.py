@@ -758,6 +758,8 @@ def test_every_command_is_acknowledged_to_its_sender(client: MavlinkClient, kind
         (ack,) = [answer for answer in answers if answer.get_type() == "COMMAND_ACK"]
         assert (ack.command, ack.target_system, ack.target_component) == (number, 255, 190)
         assert (ack.result == UNSUPPORTED) == (number in (420, 16, 22, 179, 1, 0, 65535))
+        refused, client.stack.refused = client.stack.refused, 0
+        assert refused == (ack.result != 0)
 
 
 @pytest.mark.parametrize("target", [(2, 1), (1, 2), (7, 0)])

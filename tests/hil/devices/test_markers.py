@@ -226,6 +226,8 @@ def test_swapped_markers_are_refused_unless_the_limit_is_wide() -> None:
             assert Rotation.from_quat(sighting.pose[1], scalar_first=True).magnitude() == pytest.approx(
                 turned
             )
+        here.hidden = 1.0  # marker 1, which has label 3
+        assert np.flatnonzero(~here.look(HOME, LEVEL).seen).tolist() == [2]
 
 
 def test_share_of_mislabelled_frames_is_the_configured_one_and_leaves_the_others_as_they_were() -> None:

@@ -141,6 +141,7 @@ def test_the_hosts_jitter_delays_answers_and_stays_within_its_bound() -> None:
 def test_no_board_answers_on_another_channel_rate_or_address(setting: tuple[int, int, bytes]) -> None:
     bench = DongleAndBoard()
     bench.tune(*setting)
+    bench.dongle.control(0x03, 3, b"")  # no rate: it stays
     assert bench.exchange(b"\x10hello") == b"\x00"
     bench.wait(1000)
     assert bench.stm.packets == []
@@ -368,6 +369,8 @@ def test_other_commands_to_the_radio_chip_do_nothing(command: bytes) -> None:
 def test_power_switch() -> None:
     bench = DongleAndBoard()
     board, stm = bench.board, bench.stm
+    bench.exchange(b"\xf3\xfe\x03")
+    assert stm.starts == []  # it is on
     bench.exchange(b"\xf3\xfe\x02")
     assert (board.power, len(stm.stops), len(stm.starts)) == (Power.RADIO_ONLY, 1, 0)
     assert bench.exchange(b"\x10lost")[0] & 1  # the radio chip still answers

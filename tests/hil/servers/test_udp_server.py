@@ -75,6 +75,7 @@ def test_a_client_that_is_silent_for_long_loses_the_board(board: Board, clients:
     board.read(SESSION_TIMEOUT_US + 1)
     assert board.received == [b"\xf0a", b"\xf0c"]
     assert board.said[-1].endswith("1 packets of others were ignored")
+    assert board.server.has_session(2 * SESSION_TIMEOUT_US)
     board.server.end_session()
     assert (len(board.said), board.server.ignored) == (2, 0), "none of the second session"
 
