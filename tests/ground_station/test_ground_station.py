@@ -19,7 +19,7 @@ from ground_station.links.log_blocks import START_ORDER
 from ground_station.links.loopback import LoopbackLink
 from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation, Slots
-from ground_station.telemetry_log import TelemetryLog
+from ground_station.telemetry_log import AGE_COLUMNS, TelemetryLog
 from ground_station.tracker import Quality, Tracker
 from ground_station.trajectory import Goal, Hold, Offsets, Sine, Square, Step
 from support.log_board import TABLE, LogBoard, data_packet
@@ -313,6 +313,9 @@ def test_ages_count_to_the_sending_and_the_logged_goal_is_that_of_the_packet_s_a
     log.close()
     (row,) = rows(tmp_path / "telemetry.csv")
     assert float(row["goal.x [m]"]) == 0.5
+    assert [float(row[title]) for title in AGE_COLUMNS] == pytest.approx(
+        [1e-6 * us for us in bench.station.budget.last()]
+    )
 
 
 def test_times_are_to_the_microsecond_on_a_computer_that_has_run_for_days(tmp_path):

@@ -323,8 +323,9 @@ def test_an_interval_is_set_read_switched_off_and_reset(client: MavlinkClient) -
     assert (interval(), attitudes()) == (-1, 0)
     assert client.command(511, 30, 0)[0].result == 0
     assert (interval(), attitudes()) == (250_000, 4)
-    assert client.command(511, 30, 1)[0].result == 0  # faster than a tick
-    assert interval() == 1000
+    for wish_us, given_us in ((1, 1000), (1400, 1000), (1600, 2000)):  # whole ticks
+        assert client.command(511, 30, wish_us)[0].result == 0
+        assert interval() == given_us
     assert client.command(511, 30, 4e9)[0].result == 0  # longer than the report's field can state
     assert interval() == 1_000_000_000
     assert (
@@ -767,6 +768,15 @@ def test_a_command_for_another_system_is_ignored(client: MavlinkClient, target: 
     assert client.command(400, 0, target=target) == []
     assert client.stack.unserved == 1
     assert client.firmware.signals.supervisor.armed
+
+
+@pytest.mark.parametrize(
+    ("target", "armed"), [((3, 25), False), ((3, 1), True), ((1, 25), True), ((3, 0), False)]
+)
+def test_a_board_has_the_address_of_its_profile(target: tuple[int, int], armed: bool) -> None:
+    client = MavlinkClient("mavlink.system=3", "mavlink.component=25")
+    client.command(400, 0, target=target)
+    assert client.firmware.signals.supervisor.armed == armed
 
 
 @pytest.mark.parametrize("target", [(0, 0), (1, 0), (0, 1)])
