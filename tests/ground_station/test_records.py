@@ -1,6 +1,7 @@
 """The outputs of a real flight: a write that fails ends its output and nothing else."""
 
 import contextlib
+import errno
 import os
 import sys
 from pathlib import Path
@@ -106,6 +107,23 @@ def test_a_standard_output_that_fails_is_one_line_and_nothing_raises(
     line = f"{STANDARD_OUTPUT}: {why}; no more is written to it"
     assert records.notices() == [line]
     assert capsys.readouterr().err == f"{line}\n"
+
+
+def test_nothing_is_written_behind_a_gap_but_an_output_is_still_closed() -> None:
+    records, written = Records(), []
+
+    def write(number: int) -> None:
+        if number == 1:
+            raise OSError(errno.ENOSPC, "full")
+        written.append(number)
+
+    for number in range(4):
+        records.write("file", write, number)
+    records.attempt("file", write, 9)
+    assert (written, records.notices()) == (
+        [0, 9],
+        ["file: No space left on device; no more is written to it"],
+    )
 
 
 def test_a_standard_output_that_nobody_reads_stops_no_flight_and_its_lines_are_counted(
