@@ -168,16 +168,6 @@ def test_the_clock_is_asked_ten_times_a_second_until_five_answers_or_five_second
     assert times == asked_ms
 
 
-@pytest.mark.parametrize("lag_us", [600_000, -20_000])
-def test_an_impossible_age_is_unknown(lag_us: int) -> None:
-    client = MavlinkClient()
-    client.clock_ahead_us = 5_000_000
-    client.poses(GYRO_ZERO_US, 2_000_000, lag_us=lag_us)
-    client.run(2_100_000)
-    assert [m.value for m in client.of("NAMED_VALUE_FLOAT") if m.name == "age_ms"][-1] == -1.0
-    assert client.firmware.signals.supervisor.state is State.FLYING
-
-
 def test_poses_that_are_too_old_are_counted_and_named() -> None:
     client = MavlinkClient()
     client.clock_ahead_us = 5_000_000

@@ -219,13 +219,6 @@ def test_an_unsupported_target_is_refused(frame: int, mask: int, x: float) -> No
         mavlink.read_target(over_the_wire(message))
 
 
-def test_a_masked_part_may_hold_anything() -> None:
-    message = dialect.MAVLink_set_position_target_local_ned_message(
-        0, 1, 1, 1, NO_YAW, *V, nan, nan, nan, nan, nan, nan, nan, nan
-    )
-    assert mavlink.read_target(over_the_wire(message)) == mavlink.Target((1.0, -2.0, -3.0), None)
-
-
 BESIDE = {"vx": 8, "vy": 16, "vz": 32, "afx": 64, "afy": 128, "afz": 256, "yaw_rate": 2048}  # and their masks
 GROUPS = ({"vx", "vy", "vz"}, {"afx", "afy", "afz"}, {"yaw_rate"})
 
