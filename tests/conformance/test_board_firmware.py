@@ -82,6 +82,7 @@ class Bench:
     def boot(self) -> BoardFirmware:
         self.booted_us = self.now_us
         self.pins.boot(self.now_us)
+        assert self.pins.now_us == self.now_us  # until the new processor has a clock
         self.firmware = self.executor.boot(PowerOn(self.pins, CONFIG, False, False, None))
         self.pins.run_on(self.firmware.kernel, self.events)
         return self.firmware
@@ -140,6 +141,25 @@ def test_a_supervisor_calibrates_first_and_has_no_cause(bench: Bench) -> None:
     bench.run(30_000)
     assert supervisor.state in State
     assert supervisor.cause in Cause
+
+
+def test_poses_are_counted_and_the_last_one_has_its_age_in_microseconds(bench: Bench) -> None:
+    if not has_core(bench.firmware):
+        return
+    bench.run(1_000_000)  # the gyro's zero is found
+    place, ages_us = COUNTERS.index("pose_age_us"), []
+    for _ in range(10):
+        bench.run(
+            21_000, [POSE + bytes((2 * 30,))]
+        )  # 30 ms old on arrival, at every phase of the estimator's steps
+        ages_us.append(bench.firmware.signals.counters[place])
+    counters = dict(zip(COUNTERS, bench.firmware.signals.counters.tolist(), strict=True))
+    assert (8 <= counters["fused"] <= 10, counters["refused"]) == (True, 0)
+    shown = {variable.name: variable.read for variable in bench.firmware.variables}
+    added_us = shown["loop.added"]() if "loop.added" in shown else 0
+    assert added_us == pytest.approx(3000 * ("loop.added" in shown), abs=1000)  # the link's way
+    assert min(ages_us[1:]) == pytest.approx(30_000 + added_us, abs=1200)
+    assert max(ages_us[1:]) == pytest.approx(40_000 + added_us, abs=1200)
 
 
 def test_variables_have_names_of_their_own_and_numbers_of_their_types(bench: Bench) -> None:

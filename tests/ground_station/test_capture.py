@@ -136,6 +136,9 @@ def test_a_stream_of_another_rate_is_reported_once() -> None:
     assert len(told(*[5501] * 3000)) == len(told(*[4499] * 3000)) == 1
     assert told(*[400] * 280, 1_400_000, *[5000] * 3000) == []  # a burst and a stall
     assert len(told(*[10_000] * 1000)) == len(told(*[4000] * 3000)) == 1
+    assert told(*[22_000] * 300, expected_us=22_000) == []  # a tenth fewer than the corrections
+    (slower,) = told(*[23_000] * 300, expected_us=23_000)
+    assert slower == "motion capture: a frame every 23.0 ms: 43, not 50 corrections leave per second"
     (faster,) = told(*[10_000] * 1000)
     assert "every 10.0 ms, not every 5.0 ms as set by mocap.period_us: 50 corrections leave" in faster
     (slower,) = told(*[40_000] * 1000)

@@ -17,7 +17,7 @@ from ground_station.config import PilotConfig
 from ground_station.links.crazyflie_link import CrazyflieLink, FlightTimes, FromFloor, smooth
 from ground_station.links.crtp_controls import TocEntry
 from ground_station.mocap import MocapFrame
-from ground_station.trajectory import Goal, Hold, Offsets, Step
+from ground_station.trajectory import Goal, Hold, Offsets, Square, Step
 
 PERIOD_US = 10_000
 HOME = Goal((0.0, 0.0, 1.0), 0.0)
@@ -122,7 +122,8 @@ def test_parameters_arming_take_off_landing_and_stop_come_in_their_order() -> No
 
 
 def test_a_goal_that_leaves_home_is_sent_until_the_landing() -> None:
-    steps = Offsets(HOME, 8_000_000, y=Step(0.2), yaw=Step(radians(30)))
+    y, yaw = (Square(size, 0.0, 1 / 1.5) for size in (0.2, radians(30)))  # and back, and away at the end
+    steps = Offsets(HOME, 8_000_000, y=y, yaw=yaw)
     flown = Flown(steps, 13.0)
     *places, (last_us, end) = flown.of(crtp.PORT_GENERIC_SETPOINT)
     assert places[0][0] == 8_000_000

@@ -2,15 +2,19 @@
 
 import re
 import threading
+from itertools import pairwise
 from types import SimpleNamespace
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from firmware_py.wire.crtp import PORT_CONSOLE, Packet, encode
 from ground_station.clock import clock_us
 from ground_station.config import LinkSettings
 from ground_station.errors import LinkError
 from ground_station.latency import LinkLatency, budget_of, columns_of
+from ground_station.links.core_client import runs
 from ground_station.links.crazyradio import ECHO, OWN_ECHO, CrazyradioLink
 from ground_station.links.live_link import MAX_AGE_US, PIECES, LiveLink
 from ground_station.mocap import MocapFrame
@@ -69,6 +73,19 @@ class Board(LiveLink):
         self.send(now_us, MocapFrame(now_us - age_us, (number, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), True), HOME)
 
 
+@given(st.sets(st.integers(0, 300)), st.integers(1, 30))
+def test_pieces_cover_the_changed_places_of_a_core_s_memory_and_each_fits_a_packet(places, longest):
+    pieces = list(runs(sorted(places), longest))
+    assert all(1 <= size <= longest for _, size in pieces)
+    assert all(offset in places and offset + size - 1 in places for offset, size in pieces)
+    covered = [place for offset, size in pieces for place in range(offset, offset + size)]
+    assert covered == sorted(set(covered))
+    assert places <= set(covered)
+    assert all(
+        later - offset >= longest for (offset, _), (later, _) in pairwise(pieces)
+    )  # as few as possible
+
+
 def opened(**options):
     board = Board(**options)
     board.open(lambda: False)
@@ -118,7 +135,9 @@ def test_a_muted_link_sends_nothing_until_it_is_opened_again():
     board.open(lambda: False)
     board.put(2)
     wait_for(board, 1)
+    board.supervisor_state = 2
     board.mute()
+    assert board.supervisor_state is None
     board.put(3)
     wait_for(board, 1)
     board.close()

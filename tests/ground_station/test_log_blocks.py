@@ -104,6 +104,21 @@ def test_a_missing_variable_costs_only_its_block_and_is_reported():
     assert line.logs.notices == ["the board has no system.load: without these blocks of telemetry"]
 
 
+def test_a_block_whose_creation_was_answered_in_vain_is_there_once_and_the_script_goes_on():
+    line, now_us = Line(), 0
+    line.logs.request(0)
+    while line.waiting:
+        if crtp.decode(line.waiting[0]).data[0] == log.LogCommand.CREATE:
+            line.board.answer(line.waiting.pop())  # its answer is lost
+            now_us += REPEAT_US
+            line.logs.repeat(now_us)
+        line.logs.receive(now_us, crtp.decode(line.board.answer(line.waiting.pop())))
+    assert line.board.periods == {block.id: block.period_ms // 10 for block in ALL_BLOCKS}
+    assert [len(line.board.blocks[block.id]) for block in ALL_BLOCKS] == [
+        len(b.variables) for b in ALL_BLOCKS
+    ]
+
+
 def test_a_refusal_is_reported_and_ends_the_script():
     line = Line()
     line.logs.request(0)

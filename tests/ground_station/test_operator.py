@@ -213,7 +213,9 @@ def test_a_value_has_flown_well_after_five_seconds_within_ten_centimetres(bench,
 
 
 def test_stop_waits_for_nothing_and_lasts_until_a_reboot(bench):
-    bench.type("params", *["mark x"] * 3, "stop", wait_us=300_000)  # the firmware locks in its steps of 40 ms
+    bench.type(
+        "params", *["mark x"] * 3, " stop ", wait_us=300_000
+    )  # the firmware locks in its steps of 40 ms
     assert bench.firmware.signals.supervisor.stopped
     assert bench.noted == ["stop", "stopped"]
     bench.type("arm", "params", wait_us=100_000)

@@ -1,6 +1,7 @@
 """The outputs of a real flight: a write that fails ends its output and nothing else."""
 
 import contextlib
+import errno
 import os
 import sys
 from pathlib import Path
@@ -108,25 +109,44 @@ def test_a_standard_output_that_fails_is_one_line_and_nothing_raises(
     assert capsys.readouterr().err == f"{line}\n"
 
 
+def test_nothing_is_written_behind_a_gap_but_an_output_is_still_closed() -> None:
+    records, written = Records(), []
+
+    def write(number: int) -> None:
+        if number == 1:
+            raise OSError(errno.ENOSPC, "full")
+        written.append(number)
+
+    for number in range(4):
+        records.write("file", write, number)
+    records.attempt("file", write, 9)
+    assert (written, records.notices()) == (
+        [0, 9],
+        ["file: No space left on device; no more is written to it"],
+    )
+
+
 def test_a_standard_output_that_nobody_reads_stops_no_flight_and_its_lines_are_counted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     read, write = os.pipe()
-    os.set_blocking(write, False)
-    with contextlib.suppress(BlockingIOError):
-        while os.write(write, bytes(4096)):
-            pass
-    os.set_blocking(write, True)
     os.set_blocking(read, False)
     with os.fdopen(read, "rb", buffering=0) as reader, os.fdopen(write, "w") as output:
         monkeypatch.setattr(sys, "stdout", output)
         records = Records()
-        for number in range(3):
-            records.say(f"line {number}")
-        while reader.read(65536):
-            pass
-        records.say("line 3")
-        assert reader.read(1000) == b"3 lines are missing here: nobody read the output\nline 3\n"
+        for count in (3, 2):
+            os.set_blocking(write, False)
+            with contextlib.suppress(BlockingIOError):
+                while os.write(write, bytes(4096)):
+                    pass
+            os.set_blocking(write, True)
+            for _ in range(count):
+                records.say("unread")
+            while reader.read(65536):
+                pass
+            records.say("read")
+            missing = b"%d lines are missing here: nobody read the output\n" % count
+            assert reader.read(1000) == missing + b"read\n"
     assert records.incomplete
     assert records.notices() == []
 

@@ -94,18 +94,22 @@ def test_a_replay_hands_on_each_frame_when_it_is_due_by_its_own_clock(timeout_s:
         patch.setattr("ground_station.sources.replay.wait", wait)
         path = Path(folder) / "frames.csv"
         record(path, []).close()
-        rows = [f"{100_000 + 20_000 * n},{93_000 + 20_000 * n},1,2,3,1,0,0,0,1\n" for n in range(10)]
+        rows = [
+            f"{100_000 + 20_000 * n},{93_000 + 20_000 * n},1,2,3,1,0,0,0,{n % 3 % 2}\n" for n in range(10)
+        ]
         path.write_text(path.read_text() + "".join(rows))
         source = ReplaySource(path)
         for _ in range(2):
             source.open()
-            arrivals, begun_us = [], now_us[0]
+            arrivals, valid, begun_us = [], [], now_us[0]
             while not source.over:
                 if (frame := source.receive(timeout_s)) is not None:
                     arrivals.append((now_us[0] - begun_us, frame.t_us - begun_us))
+                    valid.append(frame.valid)
             assert source.receive(timeout_s) is None
             assert source.notices()[-1] == "the recording is over: 10 frames"
             assert [t_us for _, t_us in arrivals] == [20_000 * n - 7_000 for n in range(10)]
+            assert valid == [n % 3 == 1 for n in range(10)]
             due = [20_000 * n for n in range(10)]
             assert [arrival_us for arrival_us, _ in arrivals] == pytest.approx(due, abs=20)
 

@@ -169,6 +169,23 @@ def test_variances_are_those_of_the_plain_filter_before_the_pose() -> None:
             one.update(seen.p_WB, (0.0, 0.0, 0.0))
 
 
+def test_a_filter_that_begins_again_is_a_new_one() -> None:
+    noise = 0.005, 0.0005, 0.004, CONFIG.acceleration, CONFIG.angular_acceleration
+    used, new = PoseFilter(*noise), PoseFilter(*noise)
+    used.begin((0.0, 0.0, 0.0), UPRIGHT)
+    for number in range(1, 20):
+        used.predict(1, widen=True)
+        used.update((0.01 * number, 0.02, -0.01 * number), (0.02, 0.01, -0.03))
+    used.predict(3, widen=True)  # and no pose after it
+    found = []
+    for one in (used, new):
+        one.begin((1.0, 2.0, 3.0), HALF_TURN)
+        one.predict(2, widen=True)
+        deviation = one.deviation((1.01, 2.0, 3.0), HALF_TURN)
+        found.append((one.variances, one.pose, deviation, one.update((1.01, 2.0, 3.0), deviation[2])))
+    assert found[0] == found[1]
+
+
 def test_the_attitude_is_of_unit_length_from_the_first_pose_on_and_however_long_the_robot_turns() -> None:
     one = PoseFilter(0.005, 0.0005, 0.004, CONFIG.acceleration, CONFIG.angular_acceleration)
     one.begin((0.0, 0.0, 0.0), (0.95, 0.0, 0.0, 0.0))
@@ -473,6 +490,30 @@ def test_a_profile_may_do_without() -> None:
 def test_bad_configuration_is_refused(change: dict[str, float]) -> None:
     with pytest.raises(ValidationError):
         TrackerConfig(**change)
+
+
+@pytest.mark.parametrize(("few", "parts"), [(10, 2), (9, 1)])
+def test_a_line_has_the_reasons_of_a_tenth_of_the_poses_and_none_of_fewer(few: int, parts: int) -> None:
+    unused = UnusedPoses()
+    for number in range(100):
+        reason = Reason.FROZEN if number >= few else Reason.NOT_A_NUMBER
+        unused.note(5000 * number, 5000 * number, (reason, ()))
+    unused.note(500_000, 500_000, None)
+    (line,) = unused.due()
+    assert line.count("unusable") == parts
+    assert unused.counts == {Reason.FROZEN: 100 - few, Reason.NOT_A_NUMBER: few}
+
+
+def test_a_line_has_the_largest_deviations_and_the_latest_of_other_values() -> None:
+    unused = UnusedPoses()
+    for number, (distance, angle) in enumerate(((0.1, 5.0), (0.3, 2.0), (0.2, 9.0))):
+        unused.note(1000 * number, 0, (Reason.DEVIATES, (distance, angle)))
+        unused.note(1000 * number, 0, (Reason.QUATERNION, (distance,)))
+    unused.note(500_000, 0, None)
+    assert unused.due() == [
+        "motion capture: 3 poses refused, up to 0.30 m and 9 deg from the prediction; "
+        "3 poses unusable: a quaternion of length 0.20, not 1"
+    ]
 
 
 def test_a_reason_is_reported_again_after_five_seconds_each_time_and_a_lost_track_each_time():

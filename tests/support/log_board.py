@@ -24,14 +24,15 @@ class LogBoard:
             return None
         self.requests.append(packet.data)
         command, number, rest = packet.data[0], packet.data[1] if len(packet.data) > 1 else 0, packet.data[2:]
+        is_there = command == log.LogCommand.CREATE and number in self.blocks
         if command == log.LogCommand.RESET:
             self.blocks, self.periods = {}, {}
-        elif command in (log.LogCommand.CREATE, log.LogCommand.APPEND):
+        elif command in (log.LogCommand.CREATE, log.LogCommand.APPEND) and not is_there:
             items = [log.ITEM.unpack_from(rest, offset) for offset in range(0, len(rest), log.ITEM.size)]
             self.blocks.setdefault(number, []).extend((kind, NAMES[index]) for kind, index in items)
         elif command == log.LogCommand.START:
             self.periods[number] = rest[0]
-        return encode(Packet(PORT_LOG, log.CHANNEL_CONTROL, bytes((command, number, 0))))
+        return encode(Packet(PORT_LOG, log.CHANNEL_CONTROL, bytes((command, number, log.EEXIST * is_there))))
 
 
 def data_packet(block: TelemetryBlock, timestamp_ms: int, values: Sequence[float]) -> bytes:

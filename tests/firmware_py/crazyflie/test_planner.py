@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from cflib.crazyflie.mem.trajectory_memory import CompressedSegment, CompressedStart, Poly4D
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
@@ -25,6 +26,8 @@ from firmware_py.crazyflie.planner import (
     spiral,
     straight_up,
 )
+from firmware_py.crazyflie.trajectories import COMPRESSED, LOCATION_MEMORY, POLYNOMIALS, decode_trajectory
+from firmware_py.wire.high_level import Define
 
 NUMBERS = st.floats(-2.0, 2.0)
 VECTORS = st.tuples(NUMBERS, NUMBERS, NUMBERS)
@@ -68,6 +71,32 @@ def test_a_bezier_curve_is_scipys(points: list[float], duration: float) -> None:
     ours, theirs = Polynomial(bezier(points, duration)), BPoly(np.array(points)[:, None], [0.0, duration])
     for t in np.linspace(0.0, duration, 9):
         assert ours(t) == pytest.approx(float(theirs(t)), abs=1e-7)
+
+
+def test_trajectories_are_read_as_cflib_packs_them_at_any_place_of_the_memory() -> None:
+    rng, memory = np.random.default_rng(2), bytearray(4096)
+    axes = rng.normal(size=(2, 4, 8)).astype(np.float32).tolist()
+    packed = b"".join(Poly4D(0.5 + n, *map(Poly4D.Poly, axes[n])).pack() for n in (0, 1))
+    memory[132 : 132 + len(packed)] = packed
+    path = decode_trajectory(memory, Define(1, LOCATION_MEMORY, POLYNOMIALS, 132, 2))
+    for t, number, begin in ((0.3, 0, 0.0), (1.7, 1, 0.5)):
+        expected = [Polynomial(axis)(t - begin) for axis in axes[number]]
+        assert (*path.at(t).position, path.at(t).yaw) == pytest.approx(expected)
+    parts = [
+        CompressedStart(0.1, -0.2, 0.3, 0.5),
+        CompressedSegment(1.0, [0.2], [-0.2, 0.0, 0.0], [], [1.5]),
+        CompressedSegment(0.5, [], [], [0.4] * 7, []),
+        CompressedSegment(0.0, [], [], [], []),
+    ]
+    packed = b"".join(part.pack() for part in parts)
+    memory[40 : 40 + len(packed)] = packed
+    path = decode_trajectory(memory, Define(2, LOCATION_MEMORY, COMPRESSED, 40, 2))
+    assert path.duration == pytest.approx(1.5)
+    for t, place in (
+        (0.5, (0.15, -0.1, 0.3, 1.0)),
+        (1.49999, (0.2, 0.0, 0.4, 1.5)),
+    ):  # a Bezier curve's middle, the end
+        assert (*path.at(t).position, path.at(t).yaw) == pytest.approx(place, abs=1e-3)
 
 
 def wavy(pieces: int = 3) -> Path:
@@ -222,6 +251,27 @@ def test_a_landing_ends_idle_and_everything_else_goes_on() -> None:
     assert planner.phase is Phase.LANDING
     assert planner.goal(11.0) is None
     assert planner.phase is Phase.IDLE
+
+
+@pytest.mark.parametrize(
+    ("phase", "command", "status"),
+    [
+        (Phase.IDLE, 7, 0),
+        (Phase.IDLE, 8, 0),
+        (Phase.FLYING, 7, 1),
+        (Phase.FLYING, 8, 0),
+        (Phase.LANDING, 7, 1),
+        (Phase.LANDING, 8, 1),
+    ],
+)
+def test_only_at_rest_it_takes_off_and_only_once_it_lands(phase: Phase, command: int, status: int) -> None:
+    """By plan_takeoff and plan_land of planner.c."""
+    board = SimpleNamespace(estimate=lambda: REST, admits=lambda places: True)
+    commander = HighLevelCommander(board, lambda kind, text: None)
+    commander.block(False)
+    if phase is not Phase.IDLE:
+        commander.planner.follow(straight_up(REST, 1.0, 0.0, 2.0), 0.0, landing=phase is Phase.LANDING)
+    assert commander.execute(struct.pack("<BBff?f", command, 0, 0.5, 0.0, True, 2.0), 1.0) == status
 
 
 @pytest.mark.parametrize("relative", [False, True])

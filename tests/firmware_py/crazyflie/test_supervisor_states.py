@@ -130,6 +130,17 @@ def test_a_robot_that_is_disarmed_in_flight_is_reset_and_arms_itself_again(flyin
     ]  # fmt: skip
 
 
+def test_disarming_resets_a_robot_that_has_landed_and_is_no_excuse_for_a_crash(flying: Bench) -> None:
+    landed = ready()
+    assert [landed.look(tick, turning=tick == TAKE_OFF_AT) for tick in (TAKE_OFF_AT, 2500)][
+        -1
+    ] is State.LANDED
+    for bench, force_g, state in ((landed, UPRIGHT, State.RESET), (flying, (0.0, 1.0, 0.0), State.CRASHED)):
+        bench.look(2540, turning=bench is flying, force_g=force_g)
+        assert bench.supervisor.request_arming(False)
+        assert bench.look(3541, turning=bench is flying, force_g=force_g) is state
+
+
 def test_the_bits_are_in_the_order_of_the_firmware(flying: Bench) -> None:
     """Can be armed, armed, arms itself, can fly, flies, tumbled, locked, crashed."""
     found = [flying.supervisor.bits]

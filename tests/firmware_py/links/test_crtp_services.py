@@ -23,7 +23,7 @@ from firmware_py.links.console import pieces
 from firmware_py.links.crtp_stack import PORT_QUEUE
 from firmware_py.links.parameters import ParameterStorage
 from firmware_py.wire import crtp, telemetry
-from firmware_py.wire.localisation import unpack_quaternion
+from firmware_py.wire.localisation import pack_quaternion, unpack_quaternion
 from firmware_py.wire.scalars import LOG_SCALARS, Scalar
 from firmware_py.wire.toc import Toc
 from hil.config import load_config
@@ -65,6 +65,7 @@ def test_a_client_finds_the_crazyflie_protocol_version_12(client: CrtpClient) ->
     assert client.one(LINK, 1, b"\0") == b"Bitcraze Crazyflie".ljust(30, b"\0")
     assert client.one(PLATFORM, 1, b"\0") == b"\0\x0c\0\0\0"
     assert client.one(PLATFORM, 1, b"\2") == b"\2C21F\0"
+    assert client.one(PLATFORM, 0, b"\3\1") == b"\3\1"  # the notice of a program's beginning comes back whole
     assert client.ask(LINK, 2, b"swallowed") == client.ask(LINK, 3, b"") == []
 
 
@@ -210,13 +211,16 @@ def test_rows_end_a_second_after_silence_and_the_next_gets_none(client: CrtpClie
     assert client.packets(LOG, 2)
 
 
-def test_without_polls_a_packet_per_second_keeps_rows_coming(client: CrtpClient, logs) -> None:
+@pytest.mark.parametrize("broadcast", [False, True])
+def test_without_polls_a_packet_per_second_keeps_rows_coming(
+    client: CrtpClient, logs, broadcast: bool
+) -> None:
     assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
     assert client.one(LOG, 1, bytes((3, 1, 1))) == bytes((3, 1, 0))
     client.polling = False
     for _ in range(3):
         client.run(client.now_us + 990_000)
-        client.firmware.radio_received(b"\xff\0")
+        client.firmware.radio_received(b"\xff\0", broadcast)
     client.sent.clear()
     client.run(client.now_us + 2_000_000)
     assert 99 <= len(client.packets(LOG, 2)) <= 101
@@ -228,6 +232,7 @@ def test_block_at_ten_milliseconds_comes_at_a_hundred_hertz(client: CrtpClient, 
     names = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "pm.vbat")
     assert client.create(7, *(logs[name][::-1] for name in names)) == 0
     assert client.one(LOG, 1, bytes((3, 7, 1))) == bytes((3, 7, 0))
+    assert client.packets(LOG, 2) == []  # the first one comes after a period
     client.sent.clear()
     client.run(client.now_us + 1_000_000)
     rows = client.packets(LOG, 2)
@@ -311,7 +316,9 @@ def test_a_block_that_the_processor_kept_waiting_returns_to_its_grid(client: Crt
 
 
 @given(
-    st.sampled_from(sorted(C_TYPES, key=lambda scalar: scalar.log_number)), st.integers(-(2**31), 2**32 - 1)
+    st.sampled_from(sorted(C_TYPES, key=lambda scalar: scalar.log_number)),
+    st.integers(-(2**31), 2**32 - 1)
+    | st.sampled_from([2**bits - less for bits in (7, 8, 15, 16, 31) for less in (0, 1)]),
 )
 def test_integers_are_cast_as_in_c(scalar: Scalar, value: int) -> None:
     assert scalar.cast(value) == C_TYPES[scalar](value).value
@@ -574,6 +581,14 @@ def test_memory_access_outside_fails(client: CrtpClient, number: int, address: i
     assert client.eeprom == before
 
 
+@pytest.mark.parametrize(("number", "version"), [(3, 3), (4, 1)])
+def test_the_memory_of_decks_that_are_not_there_has_a_version_before_its_zeros(
+    client: CrtpClient, number: int, version: int
+) -> None:
+    for address, expected in ((0, bytes((version, 0, 0, 0))), (1, bytes(4))):
+        assert client.one(MEM, 1, struct.pack("<BIB", number, address, 4))[5:] == b"\0" + expected
+
+
 def test_24_bytes_are_read_at_once_up_to_the_last_one(client: CrtpClient) -> None:
     client.eeprom[8167:8191] = bytes(range(24))
     head = struct.pack("<BI", 0, 8191 - 24)
@@ -589,14 +604,15 @@ unit = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(x * x for x in q)
 @given(unit)
 def test_packed_quaternion_is_cflibs(xyzw: tuple[float, ...]) -> None:
     q = np.array(xyzw) / np.linalg.norm(xyzw)
-    w, x, y, z = unpack_quaternion(compress_quaternion(xyzw))
-    assert abs(np.dot((x, y, z, w), q)) > 1 - 2e-5
+    for packed in (compress_quaternion(xyzw), pack_quaternion((q[3], *q[:3]))):
+        w, x, y, z = unpack_quaternion(packed)
+        assert abs(np.dot((x, y, z, w), q)) > 1 - 2e-5
 
 
 def test_packed_pose_with_our_address_is_flown_and_others_are_not(client: CrtpClient, logs) -> None:
     client.run(610_000)
     upright = compress_quaternion((0, 0, 0, 1))
-    theirs = struct.pack("<BhhhI", 0x01, 900, 900, 900, upright)
+    theirs = struct.pack("<BhhhI", 0x01, 120, 90, -60, upright)
     for at_us in range(620_000, 900_000, 20_000):
         client.run(at_us)
         client.send(LOC, 1, b"\x09" + struct.pack("<BhhhI", 0xE7, 20, -30, 40, upright) + theirs)
@@ -659,11 +675,14 @@ def test_console_pieces_are_whole_characters_of_at_most_thirty_bytes(text: str) 
 
 def test_console_tells_on_the_radio_what_it_tells_on_the_debug_pins(client: CrtpClient) -> None:
     def talk():
-        for size in (199, 200, 201):
+        for size in (199, 200, 201, *37 * [150]):  # more than the radio's queue holds
             client.firmware._console.write("x" * size)
         yield from ()
 
     client.firmware.kernel.create_task("TALK", 1, talk)
+    client.radio_open = False
+    client.run(100_000)
+    client.radio_open = True
     client.run(700_000)
     text = b"".join(client.packets(0, 0)).decode()
     assert text.splitlines() == [line[:200] for line in client.console]

@@ -7,16 +7,14 @@ from types import SimpleNamespace
 import pytest
 from cflib.crazyflie.commander import Commander
 from cflib.crazyflie.high_level_commander import HighLevelCommander
-from cflib.crazyflie.mem.trajectory_memory import CompressedSegment, CompressedStart, Poly4D
 from cflib.crazyflie.supervisor import BIT_HL_CONTROL_ACTIVE, BIT_HL_CONTROL_DISABLED, BIT_HL_TRAJ_FINISHED
-from numpy.polynomial import Polynomial
 from scipy.spatial.transform import Rotation
 
 from firmware_py.signals import COUNTERS
 from firmware_py.wire import crtp
-from support.crtp_client import LOG, MEM, PARAM, SUPERVISOR, CrtpClient
+from support.crtp_client import LOG, PARAM, SUPERVISOR, CrtpClient
 
-HIGH_LEVEL, TRAJECTORIES = 8, 1
+HIGH_LEVEL = 8
 ENOEXEC = 8
 HERE = (0.3, -0.2, 1.4)
 
@@ -76,12 +74,6 @@ class Flyer(CrtpClient):
     def state(self) -> str:
         return self.firmware.signals.supervisor.state.name
 
-    def upload(self, data: bytes, offset: int = 0) -> None:
-        for start in range(0, len(data), 24):
-            piece = data[start : start + 24]
-            head = struct.pack("<BI", TRAJECTORIES, offset + start)
-            assert self.one(MEM, 2, head + piece)[5] == 0
-
 
 @pytest.fixture
 def absolute() -> Flyer:
@@ -118,6 +110,18 @@ def test_a_stream_that_stops_without_the_notice_is_reported_before_the_board_loc
     )
 
 
+def test_only_the_notice_0_hands_the_lead_back_and_other_channels_have_none(absolute: Flyer) -> None:
+    absolute.post(absolute.low_level.send_position_setpoint, *HERE, 0.0)
+    assert absolute.order(absolute.commander.takeoff, 2.0, 0.2) == 0
+    for port, channel, data in ((7, 1, b"\1" + bytes(4)), (7, 2, bytes(5)), (3, 1, bytes(14)), (3, 3, b"")):
+        absolute.send(port, channel, data)
+        absolute.wait(0.05)
+    assert (absolute.goal(), absolute.firmware.link.malformed) == (pytest.approx(HERE), 0)
+    absolute.post(absolute.low_level.send_notify_setpoint_stop)
+    absolute.wait(0.2)
+    assert absolute.goal()[2] == pytest.approx(2.0)
+
+
 def test_take_off_go_to_and_land_move_the_goal_and_the_estimator_gets_the_error(absolute: Flyer) -> None:
     assert absolute.order(absolute.commander.takeoff, 1.0, 2.0) == 0
     absolute.wait(2.2)
@@ -136,44 +140,6 @@ def test_take_off_go_to_and_land_move_the_goal_and_the_estimator_gets_the_error(
     absolute.wait(1.1)
     assert absolute.goal() == pytest.approx([0.1, 0.1, 0.4])
     assert absolute.state == "FLYING"  # it stays where it has landed
-
-
-def test_a_trajectory_of_polynomials_is_flown_from_where_the_goal_is(absolute: Flyer) -> None:
-    x = Polynomial([0.0, 0.0, 0.5, 0.0, -0.2])
-    pieces = [
-        Poly4D(0.5, Poly4D.Poly([*x.coef, 0, 0, 0])),
-        Poly4D(1.5, Poly4D.Poly([x(0.5)] + [0] * 7), z=Poly4D.Poly([0, 0.1] + [0] * 6)),
-    ]
-    absolute.upload(b"".join(piece.pack() for piece in pieces), 132)
-    define = absolute.commander.define_trajectory
-    assert absolute.order(define, 1, 132, 2) == 0
-    absolute.order(absolute.commander.takeoff, 1.0, 0.5)
-    absolute.wait(1.0)
-    assert absolute.order(absolute.commander.start_trajectory, 1, 2.0, relative_position=True) == 0
-    absolute.wait(0.6 - 0.003)
-    assert absolute.goal()[0] == pytest.approx(0.3 + x(0.3), abs=5e-3)
-    absolute.wait(4.0)
-    assert absolute.goal() == pytest.approx([0.3 + x(0.5), -0.2, 1.15], abs=1e-4)
-
-
-def test_a_compressed_trajectory_is_flown(absolute: Flyer) -> None:
-    parts = [
-        CompressedStart(0.0, 0.0, 0.0, 0.0),
-        CompressedSegment(1.0, [0.1], [0.0, 0.2, 0.2], [], [1.0]),
-        CompressedSegment(0.5, [], [], [0.1] * 7, []),
-        CompressedSegment(0.0, [], [], [], []),
-    ]
-    absolute.upload(b"".join(part.pack() for part in parts))
-    assert absolute.order(absolute.commander.define_trajectory, 2, 0, 2, 1) == 0
-    absolute.order(absolute.commander.takeoff, 1.0, 0.1)
-    absolute.wait(0.5)
-    assert absolute.order(absolute.commander.start_trajectory, 2, 1.0, True) == 0
-    absolute.wait(0.487)
-    x, y, z = absolute.goal()
-    assert (x, y, z) == pytest.approx((0.35, -0.2 + 0.1, 1.0), abs=3e-3)  # a Bezier curve's middle
-    absolute.wait(2.0)
-    assert absolute.goal() == pytest.approx([0.4, 0.0, 1.1], abs=1e-3)
-    assert absolute.log(absolute.logs, "controller.yaw") == pytest.approx([57.3], abs=0.1)
 
 
 @pytest.fixture
@@ -210,7 +176,9 @@ def test_an_impossible_correction_only_reports(relative: Flyer, place: tuple[flo
 
 
 def send_full_state(flyer: Flyer, x: float, y: float, z: float, yaw_deg: float) -> None:
-    q = Rotation.from_euler("z", yaw_deg, degrees=True).as_quat().tolist()
+    q = (
+        Rotation.from_euler("ZYX", (yaw_deg, 25, 20), degrees=True).as_quat().tolist()
+    )  # its tilt is not flown
     nothing = (0.0, 0.0, 0.0)
     flyer.post(flyer.low_level.send_full_state_setpoint, (x, y, z), nothing, nothing, q, 0.0, 0.0, 0.0)
 

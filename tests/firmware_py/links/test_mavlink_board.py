@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.links.parameters import Parameter, ParameterStorage
 from firmware_py.signals import COUNTERS
-from firmware_py.wire import telemetry
+from firmware_py.wire import crtp, telemetry
 from firmware_py.wire.mavlink import POSES
 from firmware_py.wire.mavlink_dialect import NUMBERS
 from firmware_py.wire.supervisor import Cause, State
 from support.firmware_bench import LEVEL, FirmwareBench
-from support.mavlink_client import GYRO_ZERO_US, STREAMS, MavlinkClient, codec, count
+from support.mavlink_client import GYRO_ZERO_US, HOME, STREAMS, MavlinkClient, codec, count
 
 DENIED, UNSUPPORTED, TEMPORARILY_REJECTED = 2, 3, 1
 IGNORE_POSITION, IGNORE_YAW, IGNORE_REST = 0x7, 0x400, 0x9F8
@@ -168,16 +168,6 @@ def test_the_clock_is_asked_ten_times_a_second_until_five_answers_or_five_second
     assert times == asked_ms
 
 
-@pytest.mark.parametrize("lag_us", [600_000, -20_000])
-def test_an_impossible_age_is_unknown(lag_us: int) -> None:
-    client = MavlinkClient()
-    client.clock_ahead_us = 5_000_000
-    client.poses(GYRO_ZERO_US, 2_000_000, lag_us=lag_us)
-    client.run(2_100_000)
-    assert [m.value for m in client.of("NAMED_VALUE_FLOAT") if m.name == "age_ms"][-1] == -1.0
-    assert client.firmware.signals.supervisor.state is State.FLYING
-
-
 def test_poses_that_are_too_old_are_counted_and_named() -> None:
     client = MavlinkClient()
     client.clock_ahead_us = 5_000_000
@@ -323,13 +313,15 @@ def test_an_interval_is_set_read_switched_off_and_reset(client: MavlinkClient) -
     assert (interval(), attitudes()) == (-1, 0)
     assert client.command(511, 30, 0)[0].result == 0
     assert (interval(), attitudes()) == (250_000, 4)
-    assert client.command(511, 30, 1)[0].result == 0  # faster than a tick
-    assert interval() == 1000
+    for wish_us, given_us in ((1, 1000), (1400, 1000), (1600, 2000)):  # whole ticks
+        assert client.command(511, 30, wish_us)[0].result == 0
+        assert interval() == given_us
     assert client.command(511, 30, 4e9)[0].result == 0  # longer than the report's field can state
     assert interval() == 1_000_000_000
     assert (
         client.command(510, 3)[1].interval_us == client.command(510, 65_535)[1].interval_us == 0
     )  # never sent
+    assert client.command(510, 0)[1].interval_us == 1_000_000  # of heartbeats
     assert client.command(510, 65_536)[0].result == DENIED
 
 
@@ -391,11 +383,20 @@ def test_a_time_of_day_after_the_year_2200_is_refused(
     assert (client.of("SYSTEM_TIME")[-1].time_unix_usec == 0) == refused
 
 
-def test_the_goals_heading_is_reported_within_half_a_turn(client: MavlinkClient) -> None:
-    target(client, (0.0, 0.0, -1.2), math.radians(530))
-    client.messages.clear()
-    client.command(512, 85)
-    assert client.of("POSITION_TARGET_LOCAL_NED")[-1].yaw == pytest.approx(math.radians(170))
+def test_headings_of_goal_and_robot_are_reported_within_half_a_turn(client: MavlinkClient) -> None:
+    target(client, (0.0, 0.0, -1.15), math.radians(530))
+    north_to_back = (
+        math.cos(math.radians(85)),
+        0.0,
+        0.0,
+        math.sin(math.radians(85)),
+    )  # 20 deg beyond the goal
+    for at_us in range(GYRO_ZERO_US, 1_000_000, 20_000):
+        client.events.at(at_us, lambda now_us: client.pose((HOME[0], north_to_back), now_us))
+    client.run(1_000_000)
+    for kind, heading in (("POSITION_TARGET_LOCAL_NED", 170), ("ATTITUDE", -170)):
+        client.command(512, NUMBERS[kind])
+        assert client.of(kind)[-1].yaw == pytest.approx(math.radians(heading), abs=0.02)
 
 
 @pytest.mark.parametrize(
@@ -477,6 +478,29 @@ def test_a_new_goal_does_not_move_the_robot() -> None:
     assert attitude.yaw == pytest.approx(0.0, abs=0.01)
 
 
+@pytest.mark.parametrize("absolute", [False, True])
+def test_place_and_goal_are_those_in_the_world_whatever_the_poses_over_crtp_are(absolute: bool) -> None:
+    home, away = np.array((0.2, -0.1, 1.15)), np.array((0.06, 0.03, -0.04))
+    client = MavlinkClient(*WIDE, f"mavlink.home={home.tolist()}")
+    client.ask("param_set", 1, 1, b"EXTPOSE_ABSOLUTE", float(absolute), 9)
+    data = crtp.encode_ext_pose(tuple(away + home * absolute), LEVEL, 20_000)
+    for at_us in range(GYRO_ZERO_US, 2_000_000, 20_000):
+        client.events.at(at_us, lambda now_us: client.firmware.radio_received(data))
+
+    def reported(kind: str) -> Any:
+        client.command(512, NUMBERS[kind])
+        found = client.of(kind)[-1]
+        return pytest.approx((found.x, -found.y, -found.z), abs=0.01)
+
+    client.run(1_000_000)
+    assert tuple(home + away) == reported("LOCAL_POSITION_NED")
+    target(client, (0.25, 0.3, -1.3), -0.5)
+    client.run(1_500_000)
+    assert reported("POSITION_TARGET_LOCAL_NED") == (0.25, -0.3, 1.3)
+    assert client.of("POSITION_TARGET_LOCAL_NED")[-1].yaw == pytest.approx(-0.5)
+    assert tuple(home + away) == reported("LOCAL_POSITION_NED")
+
+
 def test_the_flight_array_holds_the_telemetry_blocks() -> None:
     client = MavlinkClient()
     client.command(511, 350, 20_000)
@@ -505,15 +529,31 @@ def test_counters_in_the_flight_array_wrap_as_those_of_the_log_do(client: Mavlin
     assert array.data[names.index("locSrv.poses")] == 7
 
 
-def test_the_older_request_sets_groups_of_streams(client: MavlinkClient) -> None:
-    client.send("request_data_stream", 1, 1, dialect.MAV_DATA_STREAM_EXTRA1, 10, 1)
-    client.send("request_data_stream", 1, 1, dialect.MAV_DATA_STREAM_POSITION, 5, 0)
-    client.run(client.now_us + 2000)
-    client.messages.clear()
-    client.run(client.now_us + 1_000_000)
-    counts = count(message for _, message in client.messages)
-    assert (counts["ATTITUDE"], counts["ATTITUDE_QUATERNION"]) == (10, 10)
-    assert "LOCAL_POSITION_NED" not in counts
+STATUS = ("SYS_STATUS", "BATTERY_STATUS", "ESTIMATOR_STATUS")
+GROUPS = {  # of MAV_DATA_STREAM
+    "EXTENDED_STATUS": STATUS, "RC_CHANNELS": ("SERVO_OUTPUT_RAW",), "POSITION": ("LOCAL_POSITION_NED",),
+    "EXTRA1": ("ATTITUDE", "ATTITUDE_QUATERNION"), "EXTRA3": 5 * ("NAMED_VALUE_FLOAT",), "RAW_SENSORS": (),
+}  # fmt: skip
+GROUPS["ALL"] = tuple(name for group in GROUPS.values() for name in group)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_the_older_request_sets_groups_of_streams(client: MavlinkClient, group: str) -> None:
+    for start, times in ((1, 10), (0, 0)):
+        client.send("request_data_stream", 1, 1, getattr(dialect, f"MAV_DATA_STREAM_{group}"), 10, start)
+        client.run(client.now_us + 2000)
+        client.messages.clear()
+        client.run(client.now_us + 1_000_000)
+        counts = count(message for _, message in client.messages)
+        for name in GROUPS["ALL"]:
+            expected = times * GROUPS[group].count(name)
+            assert (counts.get(name, 0) == expected) == (name in GROUPS[group]), (name, counts)
+
+
+@pytest.mark.parametrize(("rate_hz", "interval_us"), [(60, 17_000), (70, 14_000)])
+def test_the_interval_of_a_rate_is_the_nearest_whole_tick(rate_hz: int, interval_us: int) -> None:
+    client = MavlinkClient(f"mavlink.rates.attitude={rate_hz}")
+    assert client.command(510, NUMBERS["ATTITUDE"])[1].interval_us == interval_us
 
 
 def test_on_a_full_line_replies_wait_and_streams_are_dropped(client: MavlinkClient) -> None:
@@ -709,6 +749,8 @@ def test_every_command_is_acknowledged_to_its_sender(client: MavlinkClient, kind
         (ack,) = [answer for answer in answers if answer.get_type() == "COMMAND_ACK"]
         assert (ack.command, ack.target_system, ack.target_component) == (number, 255, 190)
         assert (ack.result == UNSUPPORTED) == (number in (420, 16, 22, 179, 1, 0, 65535))
+        refused, client.stack.refused = client.stack.refused, 0
+        assert refused == (ack.result != 0)
 
 
 @pytest.mark.parametrize("target", [(2, 1), (1, 2), (7, 0)])
@@ -716,6 +758,15 @@ def test_a_command_for_another_system_is_ignored(client: MavlinkClient, target: 
     assert client.command(400, 0, target=target) == []
     assert client.stack.unserved == 1
     assert client.firmware.signals.supervisor.armed
+
+
+@pytest.mark.parametrize(
+    ("target", "armed"), [((3, 25), False), ((3, 1), True), ((1, 25), True), ((3, 0), False)]
+)
+def test_a_board_has_the_address_of_its_profile(target: tuple[int, int], armed: bool) -> None:
+    client = MavlinkClient("mavlink.system=3", "mavlink.component=25")
+    client.command(400, 0, target=target)
+    assert client.firmware.signals.supervisor.armed == armed
 
 
 @pytest.mark.parametrize("target", [(0, 0), (1, 0), (0, 1)])
@@ -956,7 +1007,7 @@ def test_counters_are_log_variables(client: MavlinkClient) -> None:
 def test_each_counter_and_deviation_has_its_own_place_in_the_messages(client: MavlinkClient) -> None:
     counters, estimator = client.stack.counters, client.firmware._core.estimator.fields
     counters.frames, counters.lost, counters.bad_crc = 80, 20, 7
-    client.stack.refused, client.stack._transmit.dropped, client.uart_overruns = 20, 40, 3
+    client.stack.refused, client.stack._transmit.dropped, client.uart_overruns = 50, 40, 3
     estimator.refused, estimator.too_old, estimator.invalid = 100, 200, 400
     for frozen, deviations in ((0, (0.2, 0.3, 0.4)), (1, (0.3, 0.2, 0.1))):
         client.firmware._core.sampling.fields.recovering = 1000 * frozen
@@ -969,7 +1020,7 @@ def test_each_counter_and_deviation_has_its_own_place_in_the_messages(client: Ma
                 named = {one.name: one.value for one in found if one.name != "age_ms"}
                 assert named == {"refused": 700, "up_lost": 20, "tx_dropped": 40, "overruns": 3}
             elif number == "SYS_STATUS":
-                assert found[-1].errors_comm == 7 + 20 + 3
+                assert found[-1].errors_comm == 7 + 50 + 3
                 gyro = found[-1].onboard_control_sensors_health & dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
                 assert bool(gyro) == (not frozen)
                 assert 1800 < found[-1].drop_rate_comm <= 2000, "20 of 100, and the requests that came since"

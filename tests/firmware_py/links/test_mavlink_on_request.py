@@ -27,7 +27,7 @@ def moving() -> MavlinkClient:
     client = MavlinkClient("box.radius=1")
     client.command(400, 0)  # disarmed: no flap moves the model elsewhere than the poses go
     client.send(
-        "set_position_target_local_ned", 0, 1, 1, 1, 0x9F8, 0.1, -0.2, -1.15, 0, 0, 0, 0, 0, 0, -0.4, 0
+        "set_position_target_local_ned", 0, 1, 1, 1, 0x9F8, 0.1, -0.2, -1.3, 0, 0, 0, 0, 0, 0, -0.4, 0
     )
     x, y, z, w = R_WB.as_quat()
     for at_us in range(100_000, 2_000_000, 20_000):
@@ -130,7 +130,7 @@ def test_slow_streams_come_within_five_seconds_with_right_values(moving: Mavlink
     assert heard["SYSTEM_TIME"].time_unix_usec == 0  # nobody has said what time of day it is
     assert heard["SYSTEM_TIME"].time_boot_ms % 5000 == 0
     target = heard["POSITION_TARGET_LOCAL_NED"]
-    assert (target.x, target.y, target.z, target.yaw) == pytest.approx((0.1, -0.2, -1.15, -0.4))
+    assert (target.x, target.y, target.z, target.yaw) == pytest.approx((0.1, -0.2, -1.3, -0.4))
     assert (target.coordinate_frame, target.type_mask) == (dialect.MAV_FRAME_LOCAL_NED, 0x9F8)
     outputs, servos = heard["ACTUATOR_OUTPUT_STATUS"], moving.of("SERVO_OUTPUT_RAW")[-1]
     assert outputs.active == 0b1111
@@ -155,6 +155,9 @@ def test_the_hud_shows_speed_over_ground_heading_height_and_climb(moving: Mavlin
 
 def test_the_time_of_day_is_that_of_a_station_which_knows_it(moving: MavlinkClient) -> None:
     unix_us = 1_700_000_000_000_000
+    moving.send(
+        "system_time", unix_us - 3_600_000_000, 76
+    )  # another one's, or the same before its clock was set
     moving.send("system_time", unix_us, 77)
     sent_us = moving.now_us
     moving.send("system_time", 0, 78)  # this one does not

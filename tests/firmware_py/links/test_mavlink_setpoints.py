@@ -73,19 +73,13 @@ def test_unserved_requests_are_reported_once_then_seldom(client: MavlinkClient, 
     assert texts(client, name, *UNSERVED[name]) == [f"{line} (100 more before)"]
     assert client.stack.unserved == 102  # 1 + 100 + 1
     client.run(client.now_us + 10_000_000)
-    assert texts(client, name, *UNSERVED[name]) == [line]
-
-
-def test_every_sender_is_answered(client: MavlinkClient) -> None:
-    for sender in (STATION, OTHER):
-        client.messages.clear()
-        by(client, sender, "set_attitude_target", *UNSERVED["set_attitude_target"])
-        assert client.texts() == ["SET_ATTITUDE_TARGET is not served"]
+    assert [texts(client, name, *UNSERVED[name]) for _ in range(2)] == [[line], []]  # seldom again
 
 
 def test_a_thousand_senders_get_no_thousand_texts(client: MavlinkClient) -> None:
     for number in range(1, 1001):
-        by(client, (2 + number % 250, number % 7), "set_attitude_target", *UNSERVED["set_attitude_target"])
+        sender = 2 + number % 5, 1 + number % 250
+        by(client, sender, "set_attitude_target", *UNSERVED["set_attitude_target"])
     assert len(client.texts()) == 64 + 1
     assert client.texts()[-1] == "requests of further kinds or senders refused"
 

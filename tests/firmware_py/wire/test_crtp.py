@@ -11,7 +11,8 @@ from cflib.crtp.crtpstack import CRTPPacket
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_py.wire import WireError, crtp, log, telemetry
+from firmware_py.wire import WireError, crtp, high_level, log, telemetry
+from firmware_py.wire.high_level import PathCommand
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.toc import Toc
 
@@ -89,6 +90,26 @@ def test_a_position_outside_of_any_tunnel_is_invalid():
     for x in (1000.5, -1001.0, 3e38):
         with pytest.raises(WireError, match="within 1000 m"):
             crtp.decode_ext_pose(crtp.encode_ext_pose((x, 0, 0), Q, 0)[1:])
+
+
+@pytest.mark.parametrize("length", [0.91, 1.09])
+def test_a_quaternion_s_length_may_be_off_by_a_tenth(length):
+    assert crtp.decode_ext_pose(crtp.encode_ext_pose((0, 0, 0), (0, length, 0, 0), 0)[1:]).age_us == 0
+
+
+@pytest.mark.parametrize(
+    ("older", "newer"),
+    [
+        ((PathCommand.TAKE_OFF_1, 1, 2.0, 3.0), (PathCommand.TAKE_OFF, 1, 2.0, 0.0, False, 3.0)),
+        ((PathCommand.LAND_1, 1, 2.0, 3.0), (PathCommand.LAND, 1, 2.0, 0.0, False, 3.0)),
+        ((PathCommand.GO_TO_1, 1, True, *range(2, 7)), (PathCommand.GO_TO, 1, True, False, *range(2, 7))),
+        ((PathCommand.START_1, 1, True, True, 5, 2.0), (PathCommand.START, 1, True, False, True, 5, 2.0)),
+    ],
+)
+def test_an_older_command_is_the_newer_one_without_what_it_lacks(older, newer):
+    read = [high_level.decode(crtp.decode(high_level.encode(*command)).data) for command in (older, newer)]
+    assert [command for command, _ in read] == [older[0], newer[0]]
+    assert read[0][1] == read[1][1]
 
 
 @given(st.binary(max_size=40))

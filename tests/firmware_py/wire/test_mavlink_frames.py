@@ -235,8 +235,13 @@ def test_a_board_without_a_calendar_learns_the_time_from_a_genuine_frame() -> No
     theirs = peer(KEY)
     with pytest.raises(dialect.MAVError, match="signature"):
         theirs.decode(bytearray(sender.encode(0, services.timesync(0, 1))))
-    receiver.feed(0, golden(peer(KEY), [services.timesync(0, 1)])[0])
-    assert theirs.decode(bytearray(sender.encode(0, services.timesync(0, 2)))).ts1 == 2
+    newest, behind = peer(KEY), peer(KEY, system=8)  # whose clock is almost a minute slow
+    behind.signing.timestamp -= 5_900_000
+    for codec in (newest, behind):
+        assert receiver.feed(0, golden(codec, [services.timesync(0, 1)])[0])
+    frame = sender.encode(0, services.timesync(0, 2))
+    assert theirs.decode(bytearray(frame)).ts1 == 2
+    assert int.from_bytes(frame[-12:-6], "little") >= newest.signing.timestamp
 
 
 def test_a_cut_signature_costs_only_its_frame() -> None:
@@ -271,9 +276,21 @@ def count(order: Iterable[int]) -> tuple[int, int, int]:
         ([number for number in range(1000) if number % 100 not in (55, 56, 57)], (970, 30, 0)),
         ((0, 2, 1, 3, 4), (5, 1, 1)),
         ((0, 1, 1, 2, 3), (5, 0, 1)),
+        ((0, 128), (2, 127, 0)),
+        ((0, 129), (2, 0, 1)),
+        ((100, 10, 11, 12, 101, 13, 102), (7, 0, 4)),
         ((*range(100), *range(200)), (300, 0, 4)),
     ],
-    ids=["over the wrap", "gaps", "a reordered pair", "a repeated frame", "a sender that begins anew"],
+    ids=[
+        "over the wrap",
+        "gaps",
+        "a reordered pair",
+        "a repeated frame",
+        "half ahead",
+        "more is behind",
+        "late ones apart",
+        "a sender that begins anew",
+    ],
 )
 def test_lost_and_late_frames_are_counted(order: Iterable[int], counted: tuple[int, int, int]) -> None:
     frames, lost, late = count(order)

@@ -219,11 +219,32 @@ def test_an_unsupported_target_is_refused(frame: int, mask: int, x: float) -> No
         mavlink.read_target(over_the_wire(message))
 
 
-def test_a_masked_part_may_hold_anything() -> None:
-    message = dialect.MAVLink_set_position_target_local_ned_message(
-        0, 1, 1, 1, NO_YAW, *V, nan, nan, nan, nan, nan, nan, nan, nan
-    )
-    assert mavlink.read_target(over_the_wire(message)) == mavlink.Target((1.0, -2.0, -3.0), None)
+BESIDE = {"vx": 8, "vy": 16, "vz": 32, "afx": 64, "afy": 128, "afz": 256, "yaw_rate": 2048}  # and their masks
+GROUPS = ({"vx", "vy", "vz"}, {"afx", "afy", "afz"}, {"yaw_rate"})
+
+
+@pytest.mark.parametrize("name", BESIDE)
+def test_each_part_beside_position_and_yaw_is_seen_unless_its_group_is_masked(name: str) -> None:
+    group = next(sum(BESIDE[one] for one in group) for group in GROUPS if name in group)
+    for value, ignored, moves in ((1.0, 0, True), (nan, 0, False), (0.0, 0, False), (1.0, group, False)):
+        fields = {one: value * (one == name) for one in BESIDE} | {name: value}
+        mask = (sum(BESIDE.values()) - group) | ignored
+        message = dialect.MAVLink_set_position_target_local_ned_message(
+            0,
+            1,
+            1,
+            1,
+            mask,
+            *V,
+            **{one: fields[one] for one in list(BESIDE)[:6]},
+            yaw=0.5,
+            yaw_rate=fields["yaw_rate"],
+        )
+        assert mavlink.read_target(over_the_wire(message)).moves == moves
+        message.type_mask |= X | Y | Z
+        if not ignored:
+            with pytest.raises(WireError, match="no position"):
+                mavlink.read_target(over_the_wire(message))
 
 
 def test_command_pads_its_parameters() -> None:

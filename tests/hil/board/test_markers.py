@@ -30,11 +30,11 @@ from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
-from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig
 from hil.world.floaty.drawing import marker_places, markers_of
 from hil.world.floaty.geometry import axis_of
-from hil.world.floaty.plant import Plant
 from hil.world.floaty.shape import MIRRORS
+from support.still_plant import still_plant
 
 ON = MarkersConfig(enabled=True)
 EXACT = MarkersConfig(enabled=True, noise=0.0)
@@ -226,6 +226,8 @@ def test_swapped_markers_are_refused_unless_the_limit_is_wide() -> None:
             assert Rotation.from_quat(sighting.pose[1], scalar_first=True).magnitude() == pytest.approx(
                 turned
             )
+        here.hidden = 1.0  # marker 1, which has label 3
+        assert np.flatnonzero(~here.look(HOME, LEVEL).seen).tolist() == [2]
 
 
 def test_share_of_mislabelled_frames_is_the_configured_one_and_leaves_the_others_as_they_were() -> None:
@@ -316,11 +318,7 @@ def test_ghosts_lie_near_the_body_have_no_label_and_do_not_change_its_pose() -> 
 
 
 def frames(count: int, seed: int = 1, **knobs: float) -> list[tuple[MocapFrame, Sighting | None]]:
-    plant = Plant(
-        GEOMETRY, PlantConfig(), TunnelConfig(turbulence="none"), PlantServoConfig(), np.random.default_rng(1)
-    )
-    plant.hold()
-    mocap = VirtualMocap(MocapConfig(), np.random.default_rng(seed), markers(seed=seed))
+    plant, mocap = still_plant(), VirtualMocap(MocapConfig(), np.random.default_rng(seed), markers(seed=seed))
     for name, value in knobs.items():
         setattr(mocap, name, value)
     return [(mocap.expose(5000 * i, plant)[0], mocap.sighting) for i in range(count)]
@@ -344,6 +342,12 @@ def test_faults_of_whole_poses_act_on_those_of_markers_too() -> None:
     assert 30 < sum(not frame.valid for frame, _ in lost) < 90
     for frame, (got, _) in zip(plain, frames(200, wrong_by=0.3), strict=True):
         assert math.dist(frame.p_WB, got.p_WB) == pytest.approx(0.3)
+    plant, mocap = still_plant(), VirtualMocap(MocapConfig(), np.random.default_rng(1), markers())
+    seen = []
+    for mocap.frozen in (0.0, 1.0, 1.0, 0.0):
+        mocap.expose(5000 * len(seen), plant)
+        seen.append(mocap.sighting)
+    assert seen[0] is seen[1] is seen[2] is not seen[3] is not None  # markers freeze with the pose
 
 
 def test_markers_leave_all_other_randomness_as_it_was() -> None:

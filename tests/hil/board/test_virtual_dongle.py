@@ -141,6 +141,7 @@ def test_the_hosts_jitter_delays_answers_and_stays_within_its_bound() -> None:
 def test_no_board_answers_on_another_channel_rate_or_address(setting: tuple[int, int, bytes]) -> None:
     bench = DongleAndBoard()
     bench.tune(*setting)
+    bench.dongle.control(0x03, 3, b"")  # no rate: it stays
     assert bench.exchange(b"\x10hello") == b"\x00"
     bench.wait(1000)
     assert bench.stm.packets == []
@@ -177,6 +178,13 @@ def test_a_broadcast_reaches_a_board_on_its_channel_once_unanswered(channel: int
         bench.wait(5000)
     assert bench.stm.broadcasts == ([b"\x6d\x08pose", first, second] if hears else [])
     assert bench.stm.packets == answers == []
+
+
+def test_a_packet_that_is_to_be_answered_is_one_and_cut_at_32_bytes() -> None:
+    bench = DongleAndBoard()
+    bench.exchange(b"\x10" + bytes(60))
+    bench.wait(5000)
+    assert bench.stm.packets == [b"\x10" + bytes(31)]
 
 
 def test_a_broadcast_does_not_count_in_the_conversation_with_one_board() -> None:
@@ -361,6 +369,8 @@ def test_other_commands_to_the_radio_chip_do_nothing(command: bytes) -> None:
 def test_power_switch() -> None:
     bench = DongleAndBoard()
     board, stm = bench.board, bench.stm
+    bench.exchange(b"\xf3\xfe\x03")
+    assert stm.starts == []  # it is on
     bench.exchange(b"\xf3\xfe\x02")
     assert (board.power, len(stm.stops), len(stm.starts)) == (Power.RADIO_ONLY, 1, 0)
     assert bench.exchange(b"\x10lost")[0] & 1  # the radio chip still answers

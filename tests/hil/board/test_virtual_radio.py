@@ -238,6 +238,13 @@ def test_dead_air_bounds_both_queues_and_the_newest_corrections_survive():
     assert numbers(bench.on_board)[-4:] == [46, 47, 48, 49]
     assert len(bench.on_board) <= 5  # and the one that was under way
     assert numbers(bench.on_ground) == list(range(8))
+    longest_us = radio.up.latency_max_us, radio.down.latency_max_us
+    assert min(longest_us) > 900_000
+    for arrive in (radio.uplink, radio.downlink):
+        arrive(2_000_000, bytes(TELEMETRY))
+    bench.events.run(2_100_000)
+    assert (radio.up.queue_high_water, radio.down.queue_high_water) == (4, 8)
+    assert (radio.up.latency_max_us, radio.down.latency_max_us) == longest_us
 
 
 def test_uplink_jitter_delays_within_its_bound_and_can_be_switched_in_flight():

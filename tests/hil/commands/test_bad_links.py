@@ -41,6 +41,7 @@ def without_a_dongle(monkeypatch: pytest.MonkeyPatch, empty_folder: Path) -> Non
         ("mavlink:", f"mavlink:: {EXPECTED}"),
         ("mavlink", f"mavlink: {EXPECTED}"),
         ("mavlink:carrier-pigeon://coop", EXPECTED),
+        ("mavlink:socket://127.0.0.1:0", EXPECTED),
         ("mavlink:socket://127.0.0.1", EXPECTED),
         ("mavlink:socket://127.0.0.1:99999", EXPECTED),
         ("mavlink:socket://127.0.0.1:9", "mavlink:socket://127.0.0.1:9: Connection refused"),

@@ -57,6 +57,9 @@ def test_a_robot_flies_in_its_holder_for_a_second_before_each_release() -> None:
     lost_s, released_s = heard_s("it is put back"), heard_s("released")
     assert released_s - lost_s == pytest.approx(2.0, abs=0.03)
     assert sum("supervisor" in text for text in bench.said) == 1
+    assert not any(
+        "it is put back" in text for text in bench.fly(1.0)
+    )  # the fault was that of the first release
 
 
 @pytest.mark.long
@@ -110,6 +113,10 @@ def test_power_off_stops_a_board_which_boots_with_its_memories_and_a_new_clock()
     assert bytes(robot.board.eeprom[100:103]) == b"abc"
     assert 0 < robot.firmware.kernel.now_us <= 60_000
     assert robot.booted_us > 3 * SECOND_US
+    served.nrf51.hear(bench.server.lab.now_us, b"\xff\xfe\x01")  # all off
+    for duration_s, power in ((4.95, Power.OFF), (0.1, Power.RUNNING)):  # until somebody presses the button
+        bench.fly(duration_s)
+        assert served.nrf51.power is power
 
 
 def test_a_processor_that_hangs_is_reset_by_its_watchdog_and_goes_on_under_the_same_load() -> None:

@@ -74,7 +74,8 @@ def test_one_flap_of_four_fails(lab: MavlinkLab) -> None:
     assert lab.faults == {"servo.stuck.2": 0.0, "servo.slow.4": 0.5}
     assert lab.command(INJECT, SERVO, OK, 2) == ACCEPTED
     assert lab.faults == {"servo.slow.4": 0.5}
-    assert lab.command(INJECT, SERVO, OK) == ACCEPTED
+    assert lab.command(INJECT, SERVO, OK, math.nan) == ACCEPTED  # unused: all of them
+    assert lab.faults == {}
 
 
 @pytest.mark.parametrize(

@@ -199,6 +199,8 @@ def test_with_z_up_markers_and_model_are_in_the_world_s_axes(start) -> None:
     lab.expose()
     frame = decode(client.hear(), (4, 1))
     assert np.array([marker.p for marker in frame.labelled]) == pytest.approx(sighted(1).points, abs=1e-6)
+    occluded = [bool(marker.parameters & 1) for marker in frame.labelled]  # NatNet's bit 0
+    assert occluded == [not seen for seen in sighted(1).seen]
     lab.expose()
     frame = decode(client.hear(), (4, 1))
     assert np.array(frame.unlabelled) == pytest.approx(sighted(2).ghosts, abs=1e-6)

@@ -75,6 +75,7 @@ def test_a_client_that_is_silent_for_long_loses_the_board(board: Board, clients:
     board.read(SESSION_TIMEOUT_US + 1)
     assert board.received == [b"\xf0a", b"\xf0c"]
     assert board.said[-1].endswith("1 packets of others were ignored")
+    assert board.server.has_session(2 * SESSION_TIMEOUT_US)
     board.server.end_session()
     assert (len(board.said), board.server.ignored) == (2, 0), "none of the second session"
 
@@ -90,13 +91,16 @@ def test_a_client_that_is_gone_makes_room_at_once(board: Board, clients: list[so
     assert board.said == []
 
 
-def test_a_prober_is_answered_and_changes_nothing(board: Board, clients: list[socket.socket]) -> None:
+@pytest.mark.parametrize("null", [b"\xff", b"\xf3"])
+def test_a_prober_is_answered_and_changes_nothing(
+    board: Board, clients: list[socket.socket], null: bytes
+) -> None:
     first, prober, _ = clients
     first.send(b"\xf0a")
     board.read(0)
-    prober.send(b"\xff")
+    prober.send(null)
     board.read(1)
-    assert prober.recv(64) == b"\xff"
+    assert prober.recv(64) == null
     assert (board.received, board.server.ignored, board.said) == ([b"\xf0a"], 0, [])
 
 

@@ -179,6 +179,7 @@ def test_battery_gives_what_electronics_and_thrust_take() -> None:
     [
         ((0.0, 0.0, 1.0), {}, "hit the floor at 4."),
         ((2.5, 0.0, 1.0), {}, "left the room: 2.50 m"),
+        ((1.0, -2.5, 1.0), {}, "left the room: 2.50 m"),
         ((0.0, 0.0, 3.5), {}, "hit the ceiling at 3.50 m"),
         ((0.0, 0.0, 2.0), {"omega_B": (20.0, 0.0, 0.0)}, "tumbled: tilt 1.5"),
     ],

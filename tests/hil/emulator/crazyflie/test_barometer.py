@@ -43,13 +43,14 @@ def test_noise_is_that_of_the_data_sheet_with_the_filter_for_drones() -> None:
     assert np.std(pressures[20:]) == pytest.approx(0.11 * 11.69, rel=0.05)
 
 
-def test_the_filter_has_the_step_response_of_its_coefficient() -> None:
-    registers = np.zeros(256, np.uint8)
-    registers[CONFIG] = DRONE
+@pytest.mark.parametrize(("config", "coefficient"), [(0, 0), (DRONE, 3), (0b1000, 15)])
+def test_the_filter_has_the_step_response_of_its_coefficient(config: int, coefficient: int) -> None:
+    registers, stays = np.zeros(256, np.uint8), coefficient / (coefficient + 1)
+    registers[CONFIG] = config
     barometer = Barometer(registers)
     barometer.measure(0.0, 0.0)
     start, shares = compensated(registers)[0], []
     for _ in range(3):
         barometer.measure(1.0, 0.0)
         shares.append((start - compensated(registers)[0]) / 11.69)
-    assert shares == pytest.approx([1 - 0.75, 1 - 0.75**2, 1 - 0.75**3], abs=0.002)
+    assert shares == pytest.approx([1 - stays, 1 - stays**2, 1 - stays**3], abs=0.002)

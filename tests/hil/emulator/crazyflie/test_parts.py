@@ -14,7 +14,7 @@ from hil.emulator.crazyflie.radio_line import RadioLine
 from support.deck_bench import DeckBench
 from support.stm32_bench import Bench
 
-SYSCFG, EXTI, PORT_C, USART6 = 0x4001_3800, 0x4001_3C00, 2, 0x4001_1400
+SYSCFG, EXTI, PORT_C, USART6, GPIOA_IDR = 0x4001_3800, 0x4001_3C00, 2, 0x4001_1400, 0x4002_0010
 
 
 def test_a_sample_is_in_the_bmi088s_registers_when_its_interrupt_comes() -> None:
@@ -35,6 +35,30 @@ def test_a_sample_is_in_the_bmi088s_registers_when_its_interrupt_comes() -> None
     assert not parts.accel[0x18:].any()
 
 
+def send(bench: DeckBench, data: bytes) -> None:
+    """Let the microcontroller write to its radio chip."""
+    bench[USART6 + 8], bench[USART6 + 0xC] = 84, 1 << 13 | 1 << 3  # BRR, UE and TE
+    for byte in data:
+        bench[USART6 + 4] = byte
+        bench.wait(20)
+
+
+def test_the_radio_chip_is_busy_while_its_queue_is_full() -> None:
+    bench, sent, room = DeckBench(), [], []
+    outside = SimpleNamespace(
+        debug_write=print,
+        radio_send=lambda data: bool(room and [sent.append(data)]),
+        radio_command=lambda *_: None,
+    )
+    radio = RadioLine(bench.chip, bench.processor, bench.decks, outside, polls=False)  # type: ignore[arg-type]
+    send(bench, syslink.encode(syslink.RAW, b"\x30hello"))
+    radio.sent()
+    assert (bench[GPIOA_IDR] >> 4 & 1, sent) == (1, [])
+    room.append(True)
+    radio.received(syslink.EMPTY)
+    assert (bench[GPIOA_IDR] >> 4 & 1, sent) == (0, [b"\x30hello"])
+
+
 def test_a_frame_that_a_reset_cut_off_costs_no_later_one() -> None:
     bench, lines = DeckBench(), []
     outside = SimpleNamespace(
@@ -43,10 +67,7 @@ def test_a_frame_that_a_reset_cut_off_costs_no_later_one() -> None:
     radio = RadioLine(bench.chip, bench.processor, bench.decks, outside, polls=False)  # type: ignore[arg-type]
     long, frame = syslink.encode(syslink.RAW, bytes(26)), syslink.encode(syslink.RAW, b"\0hello\n")
     for data in (long[:8], frame):
-        bench[USART6 + 8], bench[USART6 + 0xC] = 84, 1 << 13 | 1 << 3  # BRR, UE and TE
-        for byte in data:
-            bench[USART6 + 4] = byte
-            bench.wait(20)
+        send(bench, data)
         radio.sent()
         bench.chip.reset(0x1400_0000)
         radio.reset(bench.chip.now_us)

@@ -1,5 +1,7 @@
 """Syslink frames: their sums, streams in pieces, and what noise does to them."""
 
+import pytest
+
 from hil.emulator.crazyflie.syslink import Decoder, encode
 
 
@@ -22,9 +24,11 @@ def test_frames_are_found_in_whatever_pieces_they_come() -> None:
         assert decoder.broken == 0
 
 
-def test_a_frame_with_a_wrong_bit_is_counted_and_the_next_one_is_found() -> None:
+@pytest.mark.parametrize(("place", "bit"), [(5, 1), (3, 1), (3, 8), (2, 16), (9, 2)])
+def test_a_frame_with_a_wrong_bit_is_counted_and_the_next_ones_are_found(place: int, bit: int) -> None:
+    """Also in the length, which then reaches into the next frame."""
     broken = bytearray(encode(0, b"abcd"))
-    broken[5] ^= 1
+    broken[place] ^= bit
     decoder = Decoder()
-    assert list(decoder.take(bytes(broken) + encode(1, b"x"))) == [(1, b"x")]
+    assert list(decoder.take(bytes(broken) + encode(1, b"x") + encode(2, b"y"))) == [(1, b"x"), (2, b"y")]
     assert decoder.broken == 1
