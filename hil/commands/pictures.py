@@ -86,7 +86,7 @@ def export(run: Path, as_csv: bool, as_mcap: bool, as_tlog: bool, as_video: bool
 )
 @click.option("--out", type=PATH, metavar="DIR", help="Run folder [runs/NAME of the first file].")
 def import_(files: tuple[Path, ...], chosen: Path | None, out: Path | None) -> None:
-    """Make a run folder of a foreign log: CSV, Parquet, or a Crazyflie's micro-SD file.
+    """Make a run folder of a foreign log: CSV, Parquet, a tlog, or a Crazyflie's micro-SD file.
 
     Columns and units are guessed from their names, shown, and stored in map.toml of the run folder: correct a copy and
     import again with --map. Files with clocks of their own are joined on the rows of the first one. What is missing is
@@ -117,7 +117,7 @@ def _print_map(done: "Imported") -> None:
             unit = log.schema.field(name).metadata[b"unit"].decode()
         least, largest = (f"{value:.4g}" for value in (min(known, default=nan), max(known, default=nan)))
         table.add_row(name, escape(str(source)), least if known else "", largest if known else "", unit)
-    wide_console(100).print(table)
+    wide_console(120).print(table)
     seconds = 1e-6 * (log.column("t")[-1].as_py() - log.column("t")[0].as_py())
     say(
         f"{log.num_rows} rows, {seconds:.3f} s, profile {done.map.profile}; to correct it: --map, a copy of map.toml"

@@ -35,6 +35,7 @@ from hil.laboratory.request import REAL, Bench, Request
 
 MAP = "map.toml"  # in the run folder
 EXPERIMENT = "imported"
+MANY = 16  # columns that a log of ours has not
 OWN = {"flight.free", "goal.x", "supervisor.state"}  # columns of this laboratory's own logs
 
 LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -60,10 +61,14 @@ _PLACE = r"(?:pos(?:ition)?|p|translation|pose|p\.wb)"
 _TURN = r"(?:q|quat(?:ernion)?|orientation|rotation|q\.wb)"
 _WANTED = r"(?:goal|target|setpoint|ctrltarget|reference|ref|desired|command(?:ed)?)"
 
+_ASKED = r"set\.position\.target\.local\.ned"
+_BATTERY = (r"pm\.vbat", r"(?:battery\.)?(?:vbat|voltage)", r"battery", r"sys\.status\.voltage\.battery")
+
 
 def _of_axis(axis: str) -> tuple[str, ...]:
     return (
         rf"{_SEEN}\.(?:{_PLACE}\.)?{axis}", rf"(?:{_PLACE}\.?)?{axis}", rf"stateestimate\.{axis}", rf"kalman\.state{axis}",
+        rf"local\.position\.ned\.{axis}",
     )  # fmt: skip
 
 
@@ -72,7 +77,10 @@ def _of_part(part: str) -> tuple[str, ...]:
 
 
 def _of_angle(angle: str, letter: str) -> tuple[str, ...]:
-    return rf"{_SEEN}\.{angle}", rf"{angle}|{letter}", rf"stateestimate\.{angle}", rf"stabilizer\.{angle}"
+    return (
+        rf"{_SEEN}\.{angle}", rf"{angle}|{letter}", rf"stateestimate\.{angle}", rf"stabilizer\.{angle}",
+        rf"attitude\.{angle}",
+    )  # fmt: skip
 
 
 TARGETS: Mapping[str, Target] = {
@@ -82,14 +90,22 @@ TARGETS: Mapping[str, Target] = {
         f"cameras.{angle}": Target(ANGLE, _of_angle(angle, letter), unit="rad")
         for angle, letter in (("roll", "phi"), ("pitch", "theta"), ("yaw", "psi"))
     },
-    **{f"goal.{axis}": Target(LENGTH, (rf"{_WANTED}\.?(?:{_PLACE}\.)?{axis}",), unit="m") for axis in "xyz"},
-    "goal.yaw": Target(ANGLE, (rf"{_WANTED}\.?yaw",), unit="rad"),
-    "battery.voltage": Target(VOLTS, (r"pm\.vbat", r"(?:battery\.)?(?:vbat|voltage)", r"battery"), "", "V"),
+    **{
+        f"goal.{axis}": Target(
+            LENGTH, (rf"{_WANTED}\.?(?:{_PLACE}\.)?{axis}", rf"{_ASKED}\.{axis}"), unit="m"
+        )
+        for axis in "xyz"
+    },
+    "goal.yaw": Target(ANGLE, (rf"{_WANTED}\.?yaw", rf"{_ASKED}\.yaw"), unit="rad"),
+    "battery.voltage": Target(VOLTS, _BATTERY, "", "V"),
 }
 CLOCK = r"t|time|timestamp|time\.stamp|seconds?|tick|time\.from\.the\.release|elapsed(?:\.time)?"
-# Bitcraze's firmware logs angles in degrees, its state's pitch with the sign of the old frame.
+# Bitcraze's firmware logs angles in degrees.
 STOCK = re.compile(r"(?:stateestimate|stabilizer|ctrltarget|controller|gyro)\.")
-STOCK_PITCH = re.compile(r"(?:stateestimate|stabilizer)\.pitch")
+# Its state's pitch has the sign of its old frame; MAVLink's local frame is north, east, down.
+TURNED = re.compile(
+    rf"(?:stateestimate|stabilizer)\.pitch|(?:local\.position\.ned|{_ASKED})\.[yz]|{_ASKED}\.yaw|attitude\.(?:pitch|yaw)"
+)
 
 
 class Map(BaseModel):
@@ -285,10 +301,18 @@ def _guess(joined: _Joined) -> Map:
         if found is not None:
             sources[column] = _source(column, target, found, joined)
     taken = {Source.of(text).name for text in sources.values() if isinstance(text, str)}
-    for name in names:
-        if name not in taken:
-            unit = joined.units[name] or _unit_in(name)
-            sources[f"robot.{re.sub(r'[^0-9A-Za-z_.]+', '_', name)}"] = f"{name} [{unit}]" if unit else name
+    others = [name for name in names if name not in taken]
+    if len(others) > MANY:
+        changing = [
+            name
+            for name in others
+            if len(np.unique(joined.columns[name][np.isfinite(joined.columns[name])])) > 1
+        ]
+        joined.notes.append(f"{len(others) - len(changing)} further columns that do not change are left out")
+        others = changing
+    for name in others:
+        unit = joined.units[name] or _unit_in(name)
+        sources[f"robot.{re.sub(r'[^0-9A-Za-z_.]+', '_', name)}"] = f"{name} [{unit}]" if unit else name
     stock = any(STOCK.match(word) for word in words.values())
     return Map(profile="crazyflie" if stock else DEFAULT_PROFILE, columns=sources)
 
@@ -307,7 +331,7 @@ def _source(column: str, target: Target, name: str, joined: _Joined) -> str:
             unit = "mV" if largest > 100.0 else "V"
         else:
             unit = ""
-    sign = "-" if STOCK_PITCH.match(words) else ""
+    sign = "-" if TURNED.fullmatch(words) else ""
     return f"{sign}{name} [{unit}]" if unit else f"{sign}{name}"
 
 

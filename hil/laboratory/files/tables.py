@@ -1,4 +1,4 @@
-"""Reads tables of other programs: CSV, Parquet, and the micro-SD logs of a Crazyflie."""
+"""Reads tables of other programs: CSV, Parquet, MAVLink telemetry logs, and the micro-SD logs of a Crazyflie."""
 
 import struct
 import zlib
@@ -13,12 +13,20 @@ import pyarrow.csv
 import pyarrow.parquet
 from numpy.typing import NDArray
 
-from hil.errors import LabError, refusing
+from hil.errors import LabError, refusing, require
 
 USD_MAGIC, PARQUET_MAGIC = b"\xbc", b"PAR1"
 USD_UNITS = {1: "ms", 2: "us"}  # of the time stamps, by the version of the format
-FORMATS = "CSV, Parquet, or a Crazyflie's micro-SD log"
+FORMATS = "CSV, Parquet, a tlog, or a Crazyflie's micro-SD log"
+MAVLINK_HEADS = {0xFD: 12, 0xFE: 8}  # bytes of a frame without its payload, by its first one, version 2 or 1
+SIGNATURE = 13  # bytes behind a signed frame
+MAVLINK_POSES = (
+    "LOCAL_POSITION_NED",
+    "ODOMETRY",
+    "VISION_POSITION_ESTIMATE",
+)  # the best first: its rows are the log's
 TIME = "timestamp"
+STAMP = 8  # bytes of a tlog's time stamps
 ARROW = (pa.ArrowException, OSError, ValueError)
 
 Values = NDArray[np.float64]
@@ -38,6 +46,8 @@ def read_tables(path: Path) -> list[Table]:
         content = path.read_bytes()
     if content.startswith(USD_MAGIC):
         return _micro_sd(path, content)
+    if content[8:9] in (b"\xfd", b"\xfe") and (tables := _tlog(path, content)):
+        return tables
     if content.startswith(PARQUET_MAGIC):
         with refusing(f"{path}: damaged Parquet: ", *ARROW):
             return [_numbers(path, pa.parquet.read_table(pa.BufferReader(content)))]
@@ -80,6 +90,36 @@ def _numbers(path: Path, table: pa.Table) -> Table:
     if not columns or not table.num_rows:
         raise LabError(f"{path}: no rows with numbers; expected {FORMATS}, with the names in the first line")
     return Table(columns, tuple(left_out))
+
+
+def _tlog(path: Path, content: bytes) -> list[Table]:
+    """Return a table for each kind of message in a MAVLink telemetry log; frames that cannot be read are left out."""
+    require(str(path), "mavlink", "pymavlink")
+    from firmware_py.wire.mavlink_frames import FrameReceiver
+
+    rows, place = dict[str, list[dict[str, float]]](), 0
+    while place + STAMP < len(content):
+        head = MAVLINK_HEADS.get(content[place + STAMP])
+        if head is None or place + STAMP + 3 > len(content):
+            place += 1
+            continue
+        size = head + content[place + STAMP + 1] + SIGNATURE * (head == 12 and content[place + STAMP + 2] & 1)
+        frame = content[place + STAMP : place + STAMP + size]
+        stamp = int.from_bytes(content[place : place + STAMP], "big")
+        messages = FrameReceiver().feed(0, frame)
+        for message in messages:
+            fields = message.to_dict()
+            kind = fields.pop("mavpackettype")
+            numbers = {f"{kind}.{name}": one for name, one in fields.items() if isinstance(one, int | float)}
+            rows.setdefault(kind, []).append({f"{TIME} [us]": stamp, **numbers})
+        place += (
+            STAMP + size if messages or content[place + 2 * STAMP + size :][:1] in (b"\xfd", b"\xfe") else 1
+        )
+    first = {kind: -order for order, kind in enumerate(MAVLINK_POSES[::-1], 1)}
+    return [
+        Table({name: np.array([row[name] for row in rows[kind]], np.float64) for name in rows[kind][0]})
+        for kind in sorted(rows, key=lambda kind: first.get(kind, 0))
+    ]
 
 
 def _micro_sd(path: Path, content: bytes) -> list[Table]:

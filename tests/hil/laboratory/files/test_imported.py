@@ -104,6 +104,26 @@ def test_a_table_of_this_laboratory_is_its_log_again(cli: Cli, tmp_path: Path) -
     assert again.metrics["rms_x"] == pytest.approx(run.metrics["rms_x"])
 
 
+def test_a_telemetry_log_of_mavlink_is_in_the_world_s_frame(cli: Cli, tmp_path: Path) -> None:
+    run = fly("hover", tmp_path / "run", duration_s=0.4, overrides={"flight.home": (0.02, 0.03, 1.15)})
+    assert cli("export", tmp_path / "run", "--tlog") == 0
+    tlog = tmp_path / "run" / "flight.tlog"
+    tlog.write_bytes(tlog.read_bytes() + b"\0" * 7 + b"\xfd\x05")  # cut off while it was written
+    log = import_log([tlog], tmp_path / "again").log
+    first_us = run.log.column("t")[0].as_py()
+    sent = run.log.take(np.searchsorted(run.log.column("t"), log.column("t").to_numpy() + first_us))
+    for axis, goal in {"x": 0.02, "y": 0.03, "z": 1.15}.items():
+        expected = sent.column(f"estimate.{axis}").to_numpy() + goal
+        assert log.column(f"cameras.{axis}").to_numpy() == pytest.approx(expected, abs=1e-6)
+        assert log.column(f"goal.{axis}").to_numpy()[-1] == pytest.approx(goal)
+    turned = np.stack([log.column(f"cameras.q{part}").to_numpy() for part in "wxyz"], axis=1)[-20:]
+    angles = Rotation.from_quat(turned, scalar_first=True).as_euler("ZYX")[:, ::-1]
+    names = [f"estimate.{name}" for name in ("roll", "pitch", "yaw")]
+    assert angles == pytest.approx(
+        np.stack([sent.column(name).to_numpy() for name in names], axis=1)[-20:], abs=1e-6
+    )
+
+
 def test_other_delimiters_decimal_commas_marks_and_words_are_read(tmp_path: Path) -> None:
     columns = {"time": T, **place("x", "y", "z"), "note": ["fine"] * ROWS}
     path = csv(tmp_path / "log.csv", columns, ";", ",")
@@ -202,7 +222,7 @@ def test_parquet_with_time_stamps_is_read(tmp_path: Path) -> None:
 
 
 GOOD = {"t": T, **place("x", "y", "z")}
-FORMATS = "expected CSV, Parquet, or a Crazyflie's micro-SD log"
+FORMATS = "expected CSV, Parquet, a tlog, or a Crazyflie's micro-SD log"
 PLACES = "cameras.x, cameras.y, cameras.z"
 BAD: Mapping[str, tuple[Mapping[str, Any] | bytes, str, str]] = {
     "no clock": ({name: GOOD[name] for name in "xyz"}, "", 'no column of times among x, y, z; name it in a map: t = "NAME'),
