@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import textwrap
+from collections.abc import Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 TEMPLATES = Path(__file__).parent / "project"  # NAME.in
 POLICY_TEMPLATES = Path(__file__).parent / "policy_project"
 ROBOT_TEMPLATES = Path(__file__).parent / "robot_project"
+TILT_ROTOR = Path(__file__).parent / "tilt_rotor_project"  # instead of the other's robot.py
 NAMED = {"gitignore": ".gitignore"}  # files that would affect the template itself
 TOLERANCE = 1e-4  # of an action, -1..1
 ROOM = 0.9  # of the control slot: the cycles are from one compiler, for some states
@@ -35,9 +37,11 @@ ROOM = 0.9  # of the control slot: the cycles are from one compiler, for some st
 @click.option(
     "--robot", is_flag=True, help="A robot of your own: robot.py, its controller, profile and tests."
 )
-def new(folder: Path, robot: bool) -> None:
+@click.option("--tilt-rotor", is_flag=True, help="The same with two rotors that tilt.")
+def new(folder: Path, robot: bool, tilt_rotor: bool) -> None:
     """Make a project in DIR, a new or empty folder: controller.py, profile.toml, experiments.py, tests, README.md."""
-    write_project("new", ROBOT_TEMPLATES if robot else TEMPLATES, folder, name=project_name("new", folder))
+    templates = (ROBOT_TEMPLATES, TILT_ROTOR) if tilt_rotor else (ROBOT_TEMPLATES if robot else TEMPLATES,)
+    write_project("new", templates, folder, name=project_name("new", folder))
     say(f"cd {folder}; floaty fly hover --profile profile.toml; pytest; see README.md for more")  # fmt: skip
 
 
@@ -69,7 +73,7 @@ def policy(file: Path, folder: Path) -> None:
         try:
             values["policy"] = network = read_policy(file)
             write_project(
-                "policy", POLICY_TEMPLATES, Path(scratch), **values, figures=LawFigures(0, 0, 0, 0.0)
+                "policy", (POLICY_TEMPLATES,), Path(scratch), **values, figures=LawFigures(0, 0, 0, 0.0)
             )
             figures = measure(load_config(f"{scratch}/profile.toml"), network)
         except (FirmwareError, LabError) as error:
@@ -81,7 +85,7 @@ def policy(file: Path, folder: Path) -> None:
     if not figures.difference <= TOLERANCE:
         text = f"the law's actions differ by {figures.difference:.2g} from the file's: at most {TOLERANCE:g}"
         raise LabError(f"policy {file}: {text}")
-    write_project("policy", POLICY_TEMPLATES, folder, **values, figures=figures)
+    write_project("policy", (POLICY_TEMPLATES,), folder, **values, figures=figures)
     say(f"{network.shape}, {network.numbers} constants: {figures}")
     say(f"largest difference from {file.name}: {figures.difference:.1e} of an action")
     say(f"floaty fly hover --profile {folder / 'profile.toml'}")
@@ -95,8 +99,8 @@ def project_name(command: str, folder: Path) -> str:
     return name
 
 
-def write_project(command: str, templates: Path, folder: Path, **values: object) -> None:
-    """Write a folder's templates, filled with the values, into a new or empty folder."""
+def write_project(command: str, templates: Iterable[Path], folder: Path, **values: object) -> None:
+    """Write the templates of folders, the last one's of each name, filled with the values, into a new or empty folder."""
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(
@@ -106,8 +110,9 @@ def write_project(command: str, templates: Path, folder: Path, **values: object)
     with refusing(f"{command} {folder}: ", OSError):
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=folder, prefix=".") as scratch:  # all files or none
-            for template in sorted(templates.rglob("*.in")):
-                place = template.relative_to(templates).with_suffix("")
+            known = {path.relative_to(source): path for source in templates for path in source.rglob("*.in")}
+            for name, template in sorted(known.items()):
+                place = name.with_suffix("")
                 path = Path(scratch) / NAMED.get(str(place), place)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 text = environment.from_string(template.read_text(encoding="utf-8")).render(values)

@@ -80,15 +80,17 @@ def test_after_a_full_disk_the_same_folder_can_be_written(cli: Cli, command: tup
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("kind", ["--robot", "--tilt-rotor"])
 def test_a_project_of_a_robot_flies_and_its_tests_pass(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    kind: str, cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    assert cli("new", "--robot", "ball") == 0
+    assert cli("new", kind, "ball") == 0
     assert files_in(Path("ball")) == sorted({*FILES, "robot.py"} - {"experiments.py", "pyproject.toml"})
     monkeypatch.chdir("ball")
     assert cli("fly", "hover", "--profile", "profile.toml", "--duration", "3") == 0
     assert read_result(Path("runs/hover-1")).program.robot  # the hash of the robot that flew
     assert Path("runs/hover-1/report.html").is_file()
+    assert ("robot.tilt_left" in load_log(Path("runs/hover-1")).column_names) == (kind == "--tilt-rotor")
     assert "2 passed" in run(tmp_path / "ball", sys.executable, "-m", "pytest").stdout
 
 
