@@ -3,7 +3,9 @@
 import hashlib
 import math
 import re
+import shlex
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Unpack
@@ -12,10 +14,11 @@ import pytest
 
 from firmware_py.export.boards import BOARDS, runner_of
 from hil.api import Run, command_of, fly, request_of
-from hil.config import Overrides, load_config, settings_of
+from hil.config import DEFAULT_PROFILE, Overrides, load_config, settings_of
 from hil.errors import LabError
 from hil.laboratory.arguments import checked
 from hil.laboratory.experiment import Experiment
+from hil.laboratory.metric_pairs import REL
 from hil.laboratory.request import MAVLINK, RADIO, Options, Request
 from hil.testing.board import BareBoard
 from hil.testing.choices import why_no_board
@@ -39,23 +42,26 @@ class Item:
     """One test: its choice, folder and flights."""
 
     name: str  # pytest's
+    home: Path  # of the test file
     folder: Path
     choice: Options  # default options of its flights
     flown: list[Flown] = field(default_factory=list)
+    written: list[str] = field(default_factory=list)  # baselines
     failed: bool = False
 
 
 class Flights:
     """The fixture `floaty`. `seed`, `profile` and `target`, the board, are the test's."""
 
-    def __init__(self, home: Path, folder: Path) -> None:
+    def __init__(self, home: Path, folder: Path, update: bool = False) -> None:
         self.home = home  # pytest's root folder: paths of profiles and experiments are relative to it
         self._folder = folder  # of all tests' runs
+        self._update = update  # the baselines
         self._item: Item | None = None
 
-    def begin(self, name: str, choice: Options) -> Item:
-        """Start flying for a test."""
-        self._item = Item(name, self._folder / folder_of(name), choice)
+    def begin(self, name: str, file: Path, choice: Options) -> Item:
+        """Start flying for a test of a file."""
+        self._item = Item(name, file.parent, self._folder / folder_of(name), choice)
         shutil.rmtree(self._item.folder, ignore_errors=True)
         return self._item
 
@@ -112,6 +118,44 @@ class Flights:
         config = load_config(self._placed(profile or self.profile), settings_of(overrides))
         return BareBoard(config, runner_of(self.target, config.logic), link == MAVLINK)
 
+    @checked
+    def baseline(self, name: str, rel: float = REL, metrics: Sequence[str] = ()) -> None:
+        """Compare the flights of the test with `baselines/NAME.json` beside its file; `--floaty-update` writes it.
+
+        Fails with the metrics of both and the first row that differs when an outcome has changed or a metric has left
+        `rel` of the baseline's, for better or worse. `metrics` are those that count; by default all. Another seed,
+        profile or link of the test has a file of its own; boards share one. Raises `LabError` for a missing baseline.
+        """
+        __tracebackhide__ = True
+        from hil.testing import baselines
+
+        item = self._item
+        assert item is not None
+        if not item.flown:
+            raise LabError(f"baseline {name!r}: this test has not flown yet")
+        for metric in metrics:
+            item.flown[-1].run.unit_of(metric)  # raises for an unknown one
+        path = baselines.file_of(item.home, "-".join([name, *_other_than_usual(item.choice)]))
+        shown = path.relative_to(self.home) if path.is_relative_to(self.home) else path
+        if self._update:
+            baselines.write(path, [baselines.Pinned.of(one.run) for one in item.flown])
+            item.written.append(str(shown))
+            return
+        command = f"pytest --floaty-update {shlex.quote(item.name)}"
+        if not path.is_file():
+            raise LabError(f"baseline {shown}: there is none; `{command}` writes it, then commit it")
+        kept = baselines.read(path)
+        if len(kept) != len(item.flown):
+            raise LabError(
+                f"baseline {shown}: of {len(kept)} flights, now {len(item.flown)}; `{command}` writes it again"
+            )
+        pairs = zip(kept, item.flown, strict=True)
+        lines = [line for old, one in pairs for line in baselines.difference(old, one.run, rel, metrics)]
+        if lines:
+            raise AssertionError(
+                "\n".join([f"baseline {shown}:", *lines, f"accept the new flights: {command}"])
+            )
+
     def _need(self, board: str) -> None:
         if board in BOARDS and (reason := why_no_board(board)):
             pytest.skip(f"floaty: {reason}")
@@ -122,6 +166,13 @@ class Flights:
         placed = self.home / (path + end.rstrip(":"))
         is_path = placed.suffix in (".py", ".toml") and placed.is_file()
         return f"{self.home / path}{end}{variable}" if is_path else name
+
+
+def _other_than_usual(choice: Options) -> list[str]:
+    """Return the parts of a choice that make another flight than usual, as parts of a file's name."""
+    link = "" if choice["link"] == RADIO else choice["link"].partition(":")[0]
+    profile = "" if choice["profile"] == DEFAULT_PROFILE else Path(choice["profile"]).stem
+    return list(filter(None, (profile, link, f"seed{choice['seed']}" if choice["seed"] != 1 else "")))
 
 
 def folder_of(name: str) -> str:

@@ -26,6 +26,7 @@ KEEP = ("failed", "all", "none")
 FOLDER = "runs/pytest"  # in pytest's root folder
 FLIGHTS = pytest.StashKey["Flights"]()
 ITEM = pytest.StashKey["Item"]()
+WRITTEN = "floaty.baseline"  # the property of a test that wrote one
 FIRST = pytest.StashKey[dict[str, str]]()  # the first test failed by a user's error, by the error's text
 ALL = pytest.StashKey[list["Item"]]()  # of this process
 MARK = (
@@ -55,6 +56,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--floaty-link", default="radio", metavar="LINK",
         help="radio or mavlink: in lockstep [radio]; radio://…, udp://… or mavlink:pty: over a real link, in real time",
     )  # fmt: skip
+    group.addoption(
+        "--floaty-update",
+        action="store_true",
+        help="write the baselines of `floaty.baseline` instead of comparing",
+    )
     parser.addini("floaty_profile", "the default profile of tests, a name or a path", default="")
 
 
@@ -101,7 +107,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     choice: Options = parameters.get(CHOICE) or choices_of(marked, _wanted(item.config))[0]
     if reason := why_not(choice, marked.needs):
         pytest.skip(f"floaty: {reason}")
-    item.stash[ITEM] = _flights(item.config).begin(item.nodeid, choice)
+    item.stash[ITEM] = _flights(item.config).begin(item.nodeid, item.path, choice)
     item.config.stash[ALL].append(item.stash[ITEM])
 
 
@@ -119,6 +125,7 @@ def pytest_runtest_makereport(
 
     if call.when == "call":
         item.user_properties.extend(properties_of(flown))
+        item.user_properties.extend((WRITTEN, path) for path in flown.written)
     report = _in_one_line(item, call, (yield))
     keep = item.config.getoption("floaty_keep")
     if report.failed:
@@ -145,7 +152,12 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """Report skipped flights, also without -rs."""
+    """Report written baselines, and skipped flights also without -rs."""
+    passed = terminalreporter.stats.get("passed", [])
+    for path in sorted(
+        {str(path) for report in passed for name, path in report.user_properties if name == WRITTEN}
+    ):
+        terminalreporter.write_line(f"floaty: wrote {path}")
     reasons: dict[str, int] = {}
     for report in terminalreporter.stats.get("skipped", []):
         text = str(report.longrepr[2]) if isinstance(report.longrepr, tuple) else str(report.longrepr)
@@ -159,7 +171,10 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
 def _flights(config: pytest.Config) -> Flights:
     from hil.testing.flights import Flights
 
-    return config.stash.setdefault(FLIGHTS, Flights(config.rootpath, config.rootpath / FOLDER))
+    if FLIGHTS not in config.stash:
+        update = config.getoption("floaty_update")
+        config.stash[FLIGHTS] = Flights(config.rootpath, config.rootpath / FOLDER, update)
+    return config.stash[FLIGHTS]
 
 
 def _in_one_line(

@@ -17,7 +17,7 @@ import pytest
 
 import hil
 from firmware_py.extras import EXTRAS, install_command, why_missing
-from hil import fly
+from hil import fly, load_run
 from hil.errors import LabError
 from hil.laboratory.files.recorder import load_log
 from hil.live.window import DISPLAYS
@@ -45,6 +45,20 @@ def test_fly_writes_everything_and_prints_where(cli: Cli, tmp_path: Path) -> Non
     assert "runs/hover-5/report.html" in shown
     assert re.search(r"completed; \d+ times real time; \d+\.\d s from start to end; hash \w{16}\n", shown)
     assert json.loads((folder / "result.json").read_text())["passed"] is True
+
+
+def test_a_flight_that_leaves_its_baseline_is_compared_with_it(cli: Cli) -> None:
+    fly_it = ("fly", "hover", "--duration", "0.4")
+    fly("hover", "before", duration_s=0.4)
+    assert cli(*fly_it, "--baseline", "before", "--out", "same") == 0
+    assert cli.out.endswith("within 10 % of before\n")
+    assert cli(*fly_it, "--baseline", "before", "--out", "pushed", "--fault", "push.y@0.1=0.3") == 1
+    assert load_run("pushed").passed
+    assert re.search(
+        r"rms_y .* cm .*first difference: row .*left before by more than 10 %: rms_y", cli.out, re.DOTALL
+    )
+    for wrong in (("--baseline", "nowhere"), ("--baseline", "before", "--seeds", "2")):
+        assert wrong[1] in cli.refusal(*fly_it, *wrong)
 
 
 UDP = ("--link", "udp://127.0.0.1:1")

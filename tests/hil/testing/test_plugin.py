@@ -149,6 +149,46 @@ def test_hypothesis_shrinks_a_failing_flight_without_a_word_about_fixtures(pytes
     assert re.findall(r"again +floaty fly hover .*--fault (\S+)", shown) == ["push.y@0=2.4"]
 
 
+# Baselines
+
+PINNED = """
+def test_it(floaty):
+    floaty.fly(duration_s=0.4, faults=["push.y@0.15=SIZE"])
+    floaty.baseline("push"METRICS)
+"""
+
+
+def test_a_baseline_is_made_kept_and_left(pytester: pytest.Pytester) -> None:
+    test = pytester.path / "tests" / "test_push.py"
+    test.parent.mkdir()
+
+    def ran(size: float, *options: str, metrics: str = "") -> str:
+        test.write_text(PINNED.replace("SIZE", str(size)).replace("METRICS", metrics))
+        return pytester.runpytest_inprocess(*options).stdout.str()
+
+    again = "pytest --floaty-update tests/test_push.py::test_it"
+    missing = f"test_push.py:4: baseline tests/baselines/push.json: there is none; `{again}` writes it"
+    assert missing in ran(0.5)
+    assert "floaty: wrote tests/baselines/push.json" in ran(0.5, "--floaty-update")
+    assert "1 passed" in ran(0.5)
+    assert "1 passed" in ran(0.5, "--floaty-board=python"), "boards share a baseline"
+    assert "push-seed2.json: there is none" in ran(0.5, "--floaty-seeds=2")
+    shown = ran(2.0)
+    line = re.search(r"max_y +([\d.]+) +([\d.]+) +([\d.]+)  cm", shown)
+    assert line is not None
+    before, now, difference = map(float, line.groups())
+    assert now - before == pytest.approx(difference, rel=0.01)
+    assert re.search(
+        r"metrics are equal\.\nE +first difference: row at 0\.20 s from the release, truth\.", shown
+    )
+    assert f"accept the new flights: {again}" in shown
+    assert "arguments.py" not in shown
+    assert "1 passed" in ran(2.0, metrics=", metrics=['age_mean']")
+    assert "1 passed" in ran(2.0, metrics=", rel=1000.0")
+    (pytester.path / "tests/baselines/push.json").write_text("{}")
+    assert "push.json: not a baseline: " in ran(0.5)
+
+
 # What is kept
 
 
@@ -407,4 +447,5 @@ def test_the_examples_of_the_page_work(
         else:
             exec(compile(text, PAGE, "exec"), names)
     assert 3.0 < names["smallest"].size < 6.0  # type: ignore[attr-defined]
-    pytester.runpytest_inprocess("tests").assert_outcomes(passed=13)
+    pytester.runpytest_inprocess("tests", "--floaty-update").assert_outcomes(passed=14)
+    pytester.runpytest_inprocess("tests/test_pinned.py").assert_outcomes(passed=1)
