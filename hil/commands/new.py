@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 TEMPLATES = Path(__file__).parent / "project"  # NAME.in
 POLICY_TEMPLATES = Path(__file__).parent / "policy_project"
 ROBOT_TEMPLATES = Path(__file__).parent / "robot_project"
+ANY_TEMPLATES = Path(__file__).parent / "any_project"  # what each of them has as well
 NAMED = {"gitignore": ".gitignore"}  # files that would affect the template itself
 TOLERANCE = 1e-4  # of an action, -1..1
 ROOM = 0.9  # of the control slot: the cycles are from one compiler, for some states
@@ -106,8 +107,9 @@ def write_project(command: str, templates: Path, folder: Path, **values: object)
     with refusing(f"{command} {folder}: ", OSError):
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=folder, prefix=".") as scratch:  # all files or none
-            for template in sorted(templates.rglob("*.in")):
-                place = template.relative_to(templates).with_suffix("")
+            every = [(part, file) for part in (templates, ANY_TEMPLATES) for file in part.rglob("*.in")]
+            for part, template in every:
+                place = template.relative_to(part).with_suffix("")
                 path = Path(scratch) / NAMED.get(str(place), place)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 text = environment.from_string(template.read_text(encoding="utf-8")).render(values)

@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+import os
 import re
 import shlex
 import shutil
@@ -51,7 +52,7 @@ class Item:
 
 
 class Flights:
-    """The fixture `floaty`. `seed`, `profile` and `target`, the board, are the test's."""
+    """The fixture `floaty`. `seed`, `profile`, `link`, `faults` and `target`, the board, are the test's."""
 
     def __init__(self, home: Path, folder: Path, update: bool = False) -> None:
         self.home = home  # pytest's root folder: paths of profiles and experiments are relative to it
@@ -86,16 +87,28 @@ class Flights:
         """The runner of the flight core: c, python or cortex-m4."""
         return self.choice["board"]
 
+    @property
+    def link(self) -> str:
+        """The link between station and board."""
+        return self.choice["link"]
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """The faults of the mark, which act on every flight of the test."""
+        return tuple(map(str, self.choice.get("faults", ())))
+
     @checked
     def fly(self, experiment: Experiment | str = "hover", **options: Unpack[Options]) -> Run:
         """Fly once; the test's mark and the command line give the default options.
 
-        Options are those of `hil.fly`. A failed limit is not an error: the test reads `passed`, `metrics`, `verdicts`.
+        Options are those of `hil.fly`; `faults` are added to the mark's. A failed limit is not an error: the test reads
+        `passed`, `metrics`, `verdicts`.
         Skips the test when a board is not available here. Raises `LabError` for bad input.
         """
         item = self._item
         assert item is not None
         chosen: Options = {**item.choice, **options}
+        chosen["faults"] = (*self.faults, *options.get("faults", ()))
         chosen["profile"] = self._placed(chosen["profile"])
         self._need(chosen["board"])
         if isinstance(experiment, str):
@@ -172,7 +185,10 @@ def _other_than_usual(choice: Options) -> list[str]:
     """Return the parts of a choice that make another flight than usual, as parts of a file's name."""
     link = "" if choice["link"] == RADIO else choice["link"].partition(":")[0]
     profile = "" if choice["profile"] == DEFAULT_PROFILE else Path(choice["profile"]).stem
-    return list(filter(None, (profile, link, f"seed{choice['seed']}" if choice["seed"] != 1 else "")))
+    faults = (re.sub(r"[^\w.-]+", "-", str(fault)) for fault in choice.get("faults", ()))
+    return list(
+        filter(None, (*faults, profile, link, f"seed{choice['seed']}" if choice["seed"] != 1 else ""))
+    )
 
 
 def folder_of(name: str) -> str:
@@ -188,8 +204,11 @@ def shown_of(item: Item) -> list[Flown]:
     return item.flown if len(item.flown) <= SHOWN else item.flown[-1:]
 
 
-def text_of(item: Item, kept: bool, options: str) -> str:
-    """Return the text on a failed test's flights; `options` are the pytest options that chose the flights."""
+def text_of(item: Item, kept: bool, options: str, root: Path) -> str:
+    """Return the text on a failed test's flights, with paths relative to pytest's root folder.
+
+    `options` are the pytest options that chose the flights.
+    """
     texts = []
     for one in shown_of(item):
         request, result = one.request, one.run.result
@@ -206,20 +225,38 @@ def text_of(item: Item, kept: bool, options: str) -> str:
             lines += [f"  machine  was too slow: time stood still for {result.stood_still_ms:.0f} ms"]
         again = command_of(request) or f"pytest {options}'{item.name}'"
         texts.append("\n".join([*lines, f"  again    {again}"]))
-    more = len(item.flown) - len(texts)
-    return "\n".join([*texts, f"({more} flights before that are not shown)"] if more else texts)
+    if more := len(item.flown) - len(texts):
+        texts.append(f"({more} flights before that are not shown)")
+    return _below(root, "\n".join(texts))
 
 
-def properties_of(item: Item) -> list[tuple[str, str]]:
-    """Return a test's properties for a JUnit file: hash, command, and every metric with a value, in its unit."""
+def _below(root: Path, text: str) -> str:
+    return text.replace(f"{root}{os.sep}", "")
+
+
+def without_deleted(item: Item, kept: bool, text: str) -> str:
+    """Return a text on a test without the folders of flights that are deleted."""
+    shown = {one.number for one in shown_of(item)} if kept else set()
+    for one in item.flown:
+        if one.number not in shown:
+            text = text.replace(f"; {one.run.folder}>", ">")
+    return text
+
+
+def properties_of(item: Item, kept: bool, root: Path) -> list[tuple[str, str]]:
+    """Return a test's properties for a JUnit file: hash, command, folder if it is kept, and every metric with a value.
+
+    A metric is a number, in the unit that its name ends with, like `floaty.rms_x [m]`.
+    """
     found = []
     shown = shown_of(item)
     for one in shown:
         prefix = "floaty." if len(shown) == 1 else f"floaty.{one.number}."
-        values = {"hash": one.run.hash, "outcome": one.run.outcome, "folder": str(one.run.folder)}
-        values["again"] = command_of(one.request) or ""
+        values = {"hash": one.run.hash, "outcome": one.run.outcome}
+        values |= {"folder": _below(root, str(one.run.folder))} if kept else {}
+        values["again"] = _below(root, command_of(one.request) or "")
         values |= {
-            name: f"{value:.9g} {one.run.unit_of(name)}".rstrip()
+            f"{name} [{unit}]" if (unit := one.run.unit_of(name)) else name: f"{value:.9g}"
             for name, value in one.run.metrics.items()
             if math.isfinite(value)
         }
