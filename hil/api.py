@@ -271,15 +271,17 @@ class Run:
         return f"<{self.request.title}: {self.outcome}, {how}; {self.folder}>"
 
     def _repr_html_(self) -> str:
-        """Return the HTML that a notebook shows."""
+        """Return the HTML that a notebook shows: verdict, metrics with their limits, and path."""
+        how, _, _ = repr(self)[1:-1].rpartition("; ")
+        verdict = "passed" if self.passed else "failed"
+        head = "".join(f"<th>{name}</th>" for name in ("metric", "value", "limit", "verdict"))
         rows = "".join(
-            f"<tr><td>{escape(verdict.metric)}</td><td>{escape(str(verdict))}</td>"
-            f"<td>{'holds' if verdict.holds else '<b>fails</b>'}</td></tr>"
-            for verdict in self.verdicts
+            f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in self.result.rows
         )
-        report = self.paths.get("report.html")
-        link = f'<p><a href="{escape(str(report))}">{escape(str(report))}</a></p>' if report else ""
-        return f"<p>{escape(repr(self)[1:-1])}</p><table>{rows}</table>{link}"
+        place = escape(str(self.folder))
+        if report := self.paths.get("report.html"):
+            place = f'<a href="{escape(str(report))}">{escape(str(report))}</a>'
+        return f"<p><b>{verdict}</b>: {escape(how)}</p><table><tr>{head}</tr>{rows}</table><p>{place}</p>"
 
 
 @checked

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import subprocess
 from dataclasses import replace
 from importlib import import_module
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 
 import hil
-from hil import Along, Experiment, LabError, Metric, Request, fly, load_run
+from hil import Along, Experiment, Kind, LabError, Metric, Request, fly, knob, load_run
 from hil.api import command_of, request_of
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import KINDS
@@ -81,7 +82,11 @@ def test_what_a_run_shows_names_the_failed_limit_and_the_folder() -> None:
     run = fly(replace(EXPERIMENTS["hover"], limits={"rms_x": 1e-9, "lost": 0.0}), duration_s=SHORT)
     assert "rms_x = " in repr(run)
     assert "(limit <= 1e-07 cm); runs/hover-1>" in repr(run)
-    assert "<b>fails</b>" in run._repr_html_()
+    shown = run._repr_html_()
+    assert "<b>failed</b>: hover, seed 1: completed, " in shown
+    assert re.search(r"<td>rms_x</td><td>[\d.]+ cm</td><td>&lt;= 1e-07 cm</td><td>FAILS</td>", shown)
+    assert "<td>max_x</td>" in shown, "a metric without a limit"
+    assert "<p>runs/hover-1</p>" in shown
     assert "report.html" not in run._repr_html_()
     run.paths["result.json"].with_name("report.html").touch()
     assert 'href="runs/hover-1/report.html"' in run._repr_html_()
@@ -172,6 +177,17 @@ def test_the_notebook_flies_sweeps_and_plots() -> None:
     assert moved_cm[-1] > 10 > moved_cm[0]
     (line, _) = names["figure"].axes[0].lines
     assert line.get_ydata() == pytest.approx(moved_cm)
+
+
+def test_names_and_values_are_short_in_a_notebook() -> None:
+    assert dir(hil) == sorted(hil.__all__)
+    kind = Kind("late", "s", 0.02, 0.0, 0.5, (knob(lambda robot: robot.mocap, "more_latency_us", max),))
+    request = Request.of(EXPERIMENTS["hover"], faults=["push.y@1=0.5"], duration_s=2.0)
+    assert repr(request) == "<Request hover, seed 1, duration 2.0 s, fault push.y@1=0.5>"
+    assert repr(request.experiment).startswith("<Experiment hover, ")
+    for value in (request.experiment, kind, hil.Goal((0.0, 0.0, 1.0), 0.0), hil.Metric("m", "max", "far")):
+        assert len(repr(value)) < 160
+        assert " at 0x" not in repr(value)
 
 
 def test_a_plot_has_one_axis_per_unit_and_refuses_what_the_log_lacks() -> None:
