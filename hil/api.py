@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, Literal, Unpack
 
 import pyarrow as pa
 
@@ -32,7 +32,7 @@ from hil.laboratory.files.recorder import config_of, load_events, load_log
 from hil.laboratory.files.result import Outcome, Result, read_result
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import in_lockstep
-from hil.laboratory.metrics import METRICS, Metric, Verdict, column, free_flight, position_error
+from hil.laboratory.metrics import METRICS, Metric, Verdict, column, free_flight, position_error, with_angles
 from hil.laboratory.request import RADIO, Options, Request
 from hil.laboratory.run import MakeFlight
 from hil.laboratory.run import fly as fly_into
@@ -198,8 +198,11 @@ class Run:
 
     @cached_property
     def log(self) -> pa.Table:
-        """One row per 10 ms; `t` [us], all other columns with `unit` and `frame` in the metadata of their fields."""
-        return load_log(self.folder)
+        """One row per 10 ms; `t` [us], all other columns with `unit` and `frame` in the metadata of their fields.
+
+        `truth.roll`, `truth.pitch` and `truth.yaw` are computed here from the recorded quaternion.
+        """
+        return with_angles(load_log(self.folder))
 
     @property
     def free(self) -> pa.Table:
@@ -243,15 +246,22 @@ class Run:
         return Known("file", {path.name: path for path in sorted(self.folder.iterdir())})
 
     @checked
-    def plot(self, *columns: str) -> Any:
+    def plot(
+        self,
+        *columns: str,
+        size: tuple[float, float] | None = None,
+        units: Literal["SI", "customary"] | None = None,
+    ) -> Any:
         """Return a matplotlib figure of columns of the log, one axis per unit; of errors and flaps if none is named.
 
+        `size` is its width and height [in]. `units` are those of the whole figure: SI, the default of named columns, or
+        customary (cm, deg, ms, %), the default of errors and flaps. The `rcParams` of matplotlib that you have set are kept.
         The flight's faults and events are marked as in the report. Raises `LabError` for a column that the log lacks.
         """
         from hil.pictures.drawing import plotted
 
         with reading(self.folder):
-            return plotted(self.log, columns)
+            return plotted(self.log, columns, units or ("SI" if columns else "customary"), size)
 
     def write_report(self) -> Path:
         """Write `report.html` with all figures, and return its path.
