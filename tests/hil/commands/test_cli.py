@@ -18,6 +18,7 @@ import pytest
 import hil
 from firmware_py.extras import EXTRAS, install_command, why_missing
 from hil import fly, load_run
+from hil.commands.app import COMMANDS, GROUPS
 from hil.errors import LabError
 from hil.laboratory.files.recorder import load_log
 from hil.live.window import DISPLAYS
@@ -100,17 +101,28 @@ UDP = ("--link", "udp://127.0.0.1:1")
         (["serve", "--baud", "9600"], "--baud: now --set serial.baud=N"),
         (["deploy", "export", "app"], "deploy export: now floaty deploy write DIR"),
         (["fly", "hover", "--out", "runs/\udcff"], "b'runs/\\xff': expected a name in UTF-8"),
-        (["fly"], "Missing argument"),
+        (["fly"], "Missing argument 'EXPERIMENT': `floaty list` names them"),
+        (["study"], "`floaty list` names them"),
         (["report", "nowhere"], "nowhere"),
         (["report", "\x1b]0;x\x07"], r"\x1b]0;x\x07"),
         (["view", "nowhere"], "nowhere"),
         (["view", __file__], "expected a run folder"),
-        (["flyy"], "No such command"),
+        (["flyy"], "flyy: no such command; did you mean fly?"),
+        (["zzzzzz"], "zzzzzz: no such command; see floaty --help"),
         (["study", "latensy"], "study 'latensy': unknown; did you mean latency?"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: list[str], message: str) -> None:
     assert message in cli.refusal(*arguments)
+
+
+def test_the_help_lists_daily_commands_before_rare_ones(cli: Cli) -> None:
+    assert cli("--help") == 0
+    headings = [line for line in cli.out.splitlines() if re.fullmatch(r"\w.*:", line)]
+    assert headings == ["Options:", *(f"{heading}:" for heading in GROUPS)], "every command is in a group"
+    listed = re.findall(r"^  ([\w-]+)  ", cli.out.partition("Every day:")[2], re.MULTILINE)
+    assert sorted(listed) == sorted(COMMANDS)
+    assert listed[0] == "fly"
 
 
 def test_list_names_experiments_and_profiles(cli: Cli) -> None:
