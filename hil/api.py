@@ -1,6 +1,6 @@
 """The laboratory for users' programs: fly, read the results, define experiments.
 
-`docs/howto/python.md` has an example of each. Lengths are in m, angles in rad, forces in N, times in s, except a log's own
+`floaty docs python` shows an example of each. Lengths are in m, angles in rad, forces in N, times in s, except a log's own
 clock, `t`, which counts microseconds; frames are W (world, z up) and B (body, x forward, y left, z up).
 """
 

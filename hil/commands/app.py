@@ -26,6 +26,7 @@ from hil.laboratory.files.installation import describe
 COMMANDS = {
     "fly": "fly.fly",
     "new": "new.new",
+    "docs": "listing.docs",
     "policy": "new.policy",
     "list": "listing.list_experiments",
     "runs": "listing.runs",
@@ -128,7 +129,10 @@ def _print_version(context: click.Context, option: click.Parameter, wanted: bool
     help="Show version, commit, packages and programs found, and exit.",
 )
 def app() -> None:
-    """Floaty virtual laboratory: firmware, ground station and wind tunnel, connected by real bytes."""
+    """Floaty virtual laboratory: firmware, ground station and wind tunnel, connected by real bytes.
+
+    `floaty COMMAND --help` shows its options, `floaty docs` the documentation.
+    """
 
 
 class Output:

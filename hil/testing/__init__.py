@@ -1,6 +1,6 @@
 """Tests of user logic with pytest: the fixture `floaty`, a board without a world, and faults and paths for Hypothesis.
 
-`docs/howto/tests.md` has examples. pytest finds the plugin by itself; `faults` and `trajectories` need Hypothesis and are
+`floaty docs tests` shows examples. pytest finds the plugin by itself; `faults` and `trajectories` need Hypothesis and are
 loaded at first use.
 """
 

@@ -13,6 +13,7 @@ from importlib.metadata import packages_distributions
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import click
 import pytest
 
 import hil
@@ -114,6 +115,24 @@ UDP = ("--link", "udp://127.0.0.1:1")
 )
 def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: list[str], message: str) -> None:
     assert message in cli.refusal(*arguments)
+
+
+def test_pages_are_found_by_topic_and_by_words(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert cli("docs") == 0
+    assert re.search(r"^tests +Your own tests$", cli.out, re.MULTILINE)
+    assert cli("docs", "howto/tests.md") == 0
+    page = cli.out
+    assert page == (ROOT / "docs/howto/tests.md").read_text("utf-8")
+    assert cli("docs", "own", "logic") == 0
+    assert cli.out.startswith("# Your own logic\n")
+    assert cli("docs", "Hypothesis", "shrink") == 0
+    assert re.match(r"tests  Your own tests\n    .*\n    .* Sizes shrink ", cli.out)
+    assert cli("docs", "air-time") == 0, "hyphens are spaces"
+    assert "did you mean tests?" in cli.refusal("docs", "tesst")
+    launched: list[str] = []
+    monkeypatch.setattr(click, "launch", lambda path: launched.append(path) or len(launched) - 1)
+    assert (cli("docs", "tests", "--open"), cli.out) == (0, "")
+    assert "no program opens it here" in cli.refusal("docs", "tests", "--open")
 
 
 def test_the_help_lists_daily_commands_before_rare_ones(cli: Cli) -> None:
