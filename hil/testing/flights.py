@@ -54,9 +54,12 @@ class Item:
 class Flights:
     """The fixture `floaty`. `seed`, `profile`, `link`, `faults` and `target`, the board, are the test's."""
 
-    def __init__(self, home: Path, folder: Path, update: bool = False) -> None:
+    def __init__(
+        self, home: Path, folder: Path, usual_profile: str = DEFAULT_PROFILE, update: bool = False
+    ) -> None:
         self.home = home  # pytest's root folder: paths of profiles and experiments are relative to it
         self._folder = folder  # of all tests' runs
+        self._usual_profile = usual_profile  # of pytest's configuration
         self._update = update  # the baselines
         self._item: Item | None = None
 
@@ -137,7 +140,7 @@ class Flights:
 
         Fails with the metrics of both and the first row that differs when an outcome has changed or a metric has left
         `rel` of the baseline's, for better or worse. `metrics` are those that count; by default all. Another seed,
-        profile or link of the test has a file of its own; boards share one. Raises `LabError` for a missing baseline.
+        profile, link or fault of the mark has a file of its own; boards share one. Raises `LabError` for a missing baseline.
         """
         __tracebackhide__ = True
         from hil.testing import baselines
@@ -148,7 +151,7 @@ class Flights:
             raise LabError(f"baseline {name!r}: this test has not flown yet")
         for metric in metrics:
             item.flown[-1].run.unit_of(metric)  # raises for an unknown one
-        path = baselines.file_of(item.home, "-".join([name, *_other_than_usual(item.choice)]))
+        path = baselines.file_of(item.home, "-".join([name, *self._unusual(item.choice)]))
         shown = path.relative_to(self.home) if path.is_relative_to(self.home) else path
         if self._update:
             baselines.write(path, [baselines.Pinned.of(one.run) for one in item.flown])
@@ -169,6 +172,14 @@ class Flights:
                 "\n".join([f"baseline {shown}:", *lines, f"accept the new flights: {command}"])
             )
 
+    def _unusual(self, choice: Options) -> list[str]:
+        """Return the parts of a choice that make another flight than usual, as parts of a file's name."""
+        link = "" if choice["link"] == RADIO else choice["link"].partition(":")[0]
+        profile = "" if choice["profile"] == self._usual_profile else Path(choice["profile"]).stem
+        faults = (re.sub(r"[^\w.-]+", "-", str(fault)) for fault in choice.get("faults", ()))
+        seed = "" if choice["seed"] == 1 else f"seed{choice['seed']}"
+        return list(filter(None, (*faults, profile, link, seed)))
+
     def _need(self, board: str) -> None:
         if board in BOARDS and (reason := why_no_board(board)):
             pytest.skip(f"floaty: {reason}")
@@ -179,16 +190,6 @@ class Flights:
         placed = self.home / (path + end.rstrip(":"))
         is_path = placed.suffix in (".py", ".toml") and placed.is_file()
         return f"{self.home / path}{end}{variable}" if is_path else name
-
-
-def _other_than_usual(choice: Options) -> list[str]:
-    """Return the parts of a choice that make another flight than usual, as parts of a file's name."""
-    link = "" if choice["link"] == RADIO else choice["link"].partition(":")[0]
-    profile = "" if choice["profile"] == DEFAULT_PROFILE else Path(choice["profile"]).stem
-    faults = (re.sub(r"[^\w.-]+", "-", str(fault)) for fault in choice.get("faults", ()))
-    return list(
-        filter(None, (*faults, profile, link, f"seed{choice['seed']}" if choice["seed"] != 1 else ""))
-    )
 
 
 def folder_of(name: str) -> str:

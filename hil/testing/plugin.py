@@ -193,8 +193,8 @@ def _flights(config: pytest.Config) -> Flights:
     from hil.testing.flights import Flights
 
     if FLIGHTS not in config.stash:
-        update = config.getoption("floaty_update")
-        config.stash[FLIGHTS] = Flights(config.rootpath, config.rootpath / FOLDER, update)
+        update, usual = config.getoption("floaty_update"), _wanted(config).usual_profile
+        config.stash[FLIGHTS] = Flights(config.rootpath, config.rootpath / FOLDER, usual, update)
     return config.stash[FLIGHTS]
 
 
