@@ -180,7 +180,7 @@ class MavlinkConfig(Section):
 
 
 class LogicConfig(BaseModel):
-    """The user's own modules in the core, and values of their parameters (docs/howto/own-logic.md)."""
+    """The user's own modules in the core, and values of their parameters (`floaty docs own-logic`)."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
     __pydantic_extra__: dict[str, float] = Field(init=False)

@@ -36,6 +36,10 @@ def __getattr__(name: str) -> Any:
     return getattr(import_module("hil.api"), name)
 
 
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
 class _Moved:
     """Tells who imports a former room where it is now."""
 

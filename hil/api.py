@@ -1,6 +1,6 @@
 """The laboratory for users' programs: fly, read the results, define experiments.
 
-`docs/howto/python.md` has an example of each. Lengths are in m, angles in rad, forces in N, times in s, except a log's own
+`floaty docs python` shows an example of each. Lengths are in m, angles in rad, forces in N, times in s, except a log's own
 clock, `t`, which counts microseconds; frames are W (world, z up) and B (body, x forward, y left, z up).
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, Literal, Unpack
 
 import pyarrow as pa
 
@@ -32,7 +32,7 @@ from hil.laboratory.files.recorder import config_of, load_events, load_log
 from hil.laboratory.files.result import Outcome, Result, read_result
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import in_lockstep
-from hil.laboratory.metrics import METRICS, Metric, Verdict, column, free_flight, position_error
+from hil.laboratory.metrics import METRICS, Metric, Verdict, column, free_flight, position_error, with_angles
 from hil.laboratory.request import RADIO, Options, Request
 from hil.laboratory.run import MakeFlight
 from hil.laboratory.run import fly as fly_into
@@ -198,8 +198,11 @@ class Run:
 
     @cached_property
     def log(self) -> pa.Table:
-        """One row per 10 ms; `t` [us], all other columns with `unit` and `frame` in the metadata of their fields."""
-        return load_log(self.folder)
+        """One row per 10 ms; `t` [us], all other columns with `unit` and `frame` in the metadata of their fields.
+
+        `truth.roll`, `truth.pitch` and `truth.yaw` are computed here from the recorded quaternion.
+        """
+        return with_angles(load_log(self.folder))
 
     @property
     def free(self) -> pa.Table:
@@ -243,15 +246,22 @@ class Run:
         return Known("file", {path.name: path for path in sorted(self.folder.iterdir())})
 
     @checked
-    def plot(self, *columns: str) -> Any:
+    def plot(
+        self,
+        *columns: str,
+        size: tuple[float, float] | None = None,
+        units: Literal["SI", "customary"] | None = None,
+    ) -> Any:
         """Return a matplotlib figure of columns of the log, one axis per unit; of errors and flaps if none is named.
 
+        `size` is its width and height [in]. `units` are those of the whole figure: SI, the default of named columns, or
+        customary (cm, deg, ms, %), the default of errors and flaps. The `rcParams` of matplotlib that you have set are kept.
         The flight's faults and events are marked as in the report. Raises `LabError` for a column that the log lacks.
         """
         from hil.pictures.drawing import plotted
 
         with reading(self.folder):
-            return plotted(self.log, columns)
+            return plotted(self.log, columns, units or ("SI" if columns else "customary"), size)
 
     def write_report(self) -> Path:
         """Write `report.html` with all figures, and return its path.
@@ -271,15 +281,17 @@ class Run:
         return f"<{self.request.title}: {self.outcome}, {how}; {self.folder}>"
 
     def _repr_html_(self) -> str:
-        """Return the HTML that a notebook shows."""
+        """Return the HTML that a notebook shows: verdict, metrics with their limits, and path."""
+        how, _, _ = repr(self)[1:-1].rpartition("; ")
+        verdict = "passed" if self.passed else "failed"
+        head = "".join(f"<th>{name}</th>" for name in ("metric", "value", "limit", "verdict"))
         rows = "".join(
-            f"<tr><td>{escape(verdict.metric)}</td><td>{escape(str(verdict))}</td>"
-            f"<td>{'holds' if verdict.holds else '<b>fails</b>'}</td></tr>"
-            for verdict in self.verdicts
+            f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in self.result.rows
         )
-        report = self.paths.get("report.html")
-        link = f'<p><a href="{escape(str(report))}">{escape(str(report))}</a></p>' if report else ""
-        return f"<p>{escape(repr(self)[1:-1])}</p><table>{rows}</table>{link}"
+        place = escape(str(self.folder))
+        if report := self.paths.get("report.html"):
+            place = f'<a href="{escape(str(report))}">{escape(str(report))}</a>'
+        return f"<p><b>{verdict}</b>: {escape(how)}</p><table><tr>{head}</tr>{rows}</table><p>{place}</p>"
 
 
 @checked

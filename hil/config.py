@@ -64,7 +64,7 @@ class RobotConfig(Section):
 
     body: str = Field(
         "floaty",
-        description="floaty, crazyflie, or the file with a body of your own (docs/tutorials/your-own-robot.md)",
+        description="floaty, crazyflie, or the file with a body of your own (`floaty docs your-own-robot`)",
     )
     decks: tuple[Literal["flow2", "multiranger"], ...] = Field(
         (),

@@ -81,6 +81,7 @@ def test_every_command_exists_with_its_options_and_values(page: Path) -> None:
         ("floaty fly hover --profile flaoty", "no profile flaoty"),
         ("floaty fly hover --fault psh.y@2", "no kind of fault psh.y"),
         ("floaty fly hover --set predictor.enabeld=true", "no key predictor.enabeld=true"),
+        ("floaty docs pyhton", "unknown: pyhton"),
         ("floaty deploy chekc", "no command 'chekc'"),
     ],
 )

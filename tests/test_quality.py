@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import yaml
 
+from support.examples import blocks
 from support.paths import ROOT
 
 
@@ -40,6 +41,48 @@ def test_workflows_run_targets_of_make_and_programs_of_the_project_on_admitted_p
     assert os.access(ROOT / commands[1][1], os.X_OK)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     assert project["requires-python"] == f">={jobs['test']['strategy']['matrix']['python'][0]}"
+
+
+CI_PAGE = ROOT / "docs" / "tutorials" / "hil-test-in-ci.md"
+OURS = ROOT / ".github" / "workflows" / "tests.yml"
+
+
+@pytest.mark.parametrize(
+    ("place", "schema"),
+    [("tests.yml", "github-workflows"), ("fly.yml", "github-workflows"), (".gitlab-ci.yml", "gitlab-ci")],
+)
+def test_files_for_ci_agree_with_their_published_schema(place: str, schema: str, tmp_path: Path) -> None:
+    shown = [text for language, text in blocks(CI_PAGE) if language == "yaml"]
+    named = {text.partition("\n")[0].rpartition("/")[2].removeprefix("# "): text for text in shown}
+    text = {"tests.yml": OURS.read_text("utf-8"), **named}[place]
+    (tmp_path / place).write_text(text, encoding="utf-8")
+    command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", f"vendor.{schema}", place]
+    command += ["--data-transform", "gitlab-ci"] if schema == "gitlab-ci" else []
+    ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    (tmp_path / place).write_text(
+        text.replace("timeout", "tiemout").replace("runs-on:", "run-on:"), encoding="utf-8"
+    )
+    assert subprocess.run(command, cwd=tmp_path, capture_output=True, check=False).returncode == 1
+
+
+def test_the_files_for_ci_on_the_page_fly_alike_with_options_of_pytest() -> None:
+    lines = [
+        re.sub(r"\$\{\{ matrix.board \}\}|\$BOARD", "BOARD", line)
+        for language, text in blocks(CI_PAGE)
+        if language == "yaml"
+        for line in re.findall(r"- (?:run: )?((?:pytest|pip) .*)", text)
+    ]
+    assert lines[:2] == lines[2:]
+    known = subprocess.run(
+        [sys.executable, "-m", "pytest", "--help"], capture_output=True, text=True, check=True
+    ).stdout
+    assert {"-n", "--floaty-board", "--floaty-seeds", "--junitxml"} == set(
+        re.findall(r" (-[\w-]+)", lines[1])
+    )
+    assert all(
+        option in known for option in re.findall(r" (--[\w-]+)", lines[1].replace("junitxml", "junit-xml"))
+    )
 
 
 def test_hooks_before_a_commit_are_tools_of_the_environment_without_settings() -> None:

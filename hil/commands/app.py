@@ -19,13 +19,14 @@ import click
 from firmware_py.extras import why_missing
 from ground_station.stops import stopped_like_ctrl_c
 from hil.commands.options import INTERRUPTED, warn
-from hil.errors import LabError, OutputError
+from hil.errors import LabError, OutputError, hint
 from hil.laboratory.files.installation import describe
 
-# File and function of each command, in the order of the help.
+# File and function of each command.
 COMMANDS = {
     "fly": "fly.fly",
     "new": "new.new",
+    "docs": "listing.docs",
     "policy": "new.policy",
     "list": "listing.list_experiments",
     "runs": "listing.runs",
@@ -50,6 +51,16 @@ COMMANDS = {
 }
 
 
+# The help lists the commands in this order; those that are not here, last.
+GROUPS = {
+    "Every day": "fly list report view runs compare export import new check docs",
+    "Programs and real flights": "serve station param",
+    "Boards": "deploy board policy",
+    "Studies": "replay paper study campaign identify tune design drag-model",
+}
+NAMED_BY_LIST = ("fly", "study")  # commands whose argument `floaty list` names
+
+
 # Replacements of removed options and commands.
 MOVED = {
     "deploy export": "floaty deploy write DIR",
@@ -68,7 +79,32 @@ class LazyGroup(click.Group):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names in the order of the help."""
-        return list(COMMANDS)
+        return [name for _, names in self._groups() for name in names]
+
+    @staticmethod
+    def _groups() -> list[tuple[str, list[str]]]:
+        """Return the headings of the help and the names below each."""
+        groups = [(heading, [n for n in names.split() if n in COMMANDS]) for heading, names in GROUPS.items()]
+        listed = [name for _, names in groups for name in names]
+        return [*groups, ("More", [name for name in COMMANDS if name not in listed])]
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands in groups."""
+        limit = formatter.width - 6 - max(map(len, COMMANDS))
+        for heading, names in self._groups():
+            commands = [(name, self.get_command(ctx, name)) for name in names]
+            rows = [(name, one.get_short_help_str(limit)) for name, one in commands if one is not None]
+            if rows:
+                with formatter.section(heading):
+                    formatter.write_dl(rows, col_max=max(map(len, COMMANDS)), col_spacing=2)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the command that the arguments name. Raises `LabError` with the nearest name for an unknown one."""
+        if args[0] not in COMMANDS and not args[0].startswith("-") and " ".join(args[:2]) not in MOVED:
+            raise LabError(f"{args[0]}: no such command; {hint(args[0], COMMANDS, 'see floaty --help')}")
+        return super().resolve_command(ctx, args)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return a command; None for an unknown name."""
@@ -95,7 +131,10 @@ def _print_version(context: click.Context, option: click.Parameter, wanted: bool
     help="Show version, commit, packages and programs found, and exit.",
 )
 def app() -> None:
-    """Floaty virtual laboratory: firmware, ground station and wind tunnel, connected by real bytes."""
+    """Floaty virtual laboratory: firmware, ground station and wind tunnel, connected by real bytes.
+
+    `floaty COMMAND --help` shows its options, `floaty docs` the documentation.
+    """
 
 
 class Output:
@@ -167,8 +206,10 @@ def main() -> None:
         sys.exit(2)
     except click.ClickException as error:
         typed = error.option_name if isinstance(error, click.NoSuchOption) else " ".join(sys.argv[1:3])
-        moved = MOVED.get(typed)
-        sys.exit(_refuse(f"{typed}: now {moved}" if moved else error.format_message()))
+        moved, text = MOVED.get(typed), error.format_message()
+        if isinstance(error, click.MissingParameter) and error.ctx and error.ctx.info_name in NAMED_BY_LIST:
+            text = f"{text.rstrip('.')}: `floaty list` names them"
+        sys.exit(_refuse(f"{typed}: now {moved}" if moved else text))
     except (click.Abort, KeyboardInterrupt):
         sys.exit(INTERRUPTED)
     sys.exit(code if isinstance(code, int) else 0)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 def campaign(
     spec: str, out: Path | None, workers: int | None, cluster: str, resume: bool, shrink: int | None
 ) -> int:
-    """Fly the campaign SPEC into a dataset, and report what breaks the robot (docs/howto/campaigns.md).
+    """Fly the campaign SPEC into a dataset, and report what breaks the robot (see `floaty docs campaigns`).
 
     SPEC is a TOML file, or `table`: every robot that the paper's Table allows.
 

@@ -1,6 +1,5 @@
 """`floaty compare`: the first difference of two flights, their metrics side by side, both in one picture."""
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,7 +48,7 @@ def compare(first: Path, second: Path, out: Path | None, named: str | None) -> i
         boards = two_boards(a, b) if comparable(a, b) else None
         why = () if boards is None else (str(boards.first or "no servo count differs"), *boards.causes)
         page = write_comparison(out or second, a, b, comparison, why)
-        _print_comparison(first, second, comparison)
+        print_comparison(first, second, comparison)
     for line in why:
         say(line)
     for reference in comparison.unmeasured:
@@ -61,18 +60,19 @@ def compare(first: Path, second: Path, out: Path | None, named: str | None) -> i
     return 0 if comparison.identical else 1
 
 
-def _print_comparison(first: Path, second: Path, comparison: "Comparison") -> None:
-    table = Table("metric", *right("first", "second", "difference"), "unit", title=f"{first} | {second}")
-    differing = [pair for pair in comparison.metrics if pair.difference != 0]
-    for pair in differing:
-        numbers = (*pair.values, pair.difference)
-        shown = ("–" if math.isnan(number) else f"{number:.4g}" for number in numbers)
-        table.add_row(pair.name, *shown, pair.unit)
+def print_comparison(first: Path, second: Path, comparison: "Comparison") -> None:
+    """Print settings, metrics and first difference of two runs."""
+    from hil.laboratory.metric_pairs import HEADINGS, differing
+
+    table = Table(HEADINGS[0], *right(*HEADINGS[1:-1]), HEADINGS[-1], title=f"{first} | {second}")
+    unequal = differing(comparison.metrics)
+    for pair in unequal:
+        table.add_row(*pair.cells)
     for name, x, y in comparison.settings:
         say(f"{name}: {x} | {y}")
-    if differing:
+    if unequal:
         console.print(table)
-    say(f"{len(comparison.metrics) - len(differing)} metrics are equal. {comparison.span}")
+    say(f"{len(comparison.metrics) - len(unequal)} metrics are equal. {comparison.span}")
     if comparison.apart:
         title = "distance at the same time since the release"
         apart = Table("", *right("rms", "largest"), "unit", title=title)

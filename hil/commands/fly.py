@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import pi
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 from click.core import ParameterSource
@@ -15,12 +15,14 @@ from rich.table import Table
 from hil.commands import options as common
 from hil.commands.options import PATH, say, warn
 from hil.commands.tables import print_result, print_seeds
-from hil.errors import LabError, require_empty, writing
+from hil.errors import LabError, reading, require_empty, writing
 
 if TYPE_CHECKING:
+    from hil.laboratory.experiment import Experiment
     from hil.laboratory.flight import Flight
     from hil.laboratory.request import Options, Request
     from hil.live.panel_commands import PanelCommands
+    from hil.pictures.compare import FlownRun
 
 SEEDS_MAX = 10_000
 
@@ -68,41 +70,77 @@ SEEDS_MAX = 10_000
     metavar="DIR",
     help="Run folder [runs/EXPERIMENT-SEED; -2, -3, … is added if that holds another flight].",
 )
+@click.option(
+    "--baseline", type=PATH, metavar="RUN",
+    help="Compare with an earlier run: exit code 1 and the comparison when a metric leaves 10 % of that run's.",
+)  # fmt: skip
 @common.runner_options
 def fly(
     experiment: str,
     seeds: int,
     target: str | None,
     out: Path | None,
-    workers: int | None,
-    cluster: str,
-    resume: bool,
-    **options: Unpack[Options],
+    baseline: Path | None,
+    **given: Any,
 ) -> int:
     """Fly EXPERIMENT (see `floaty list`) in the virtual laboratory.
 
-    Exit code 0: all limits hold; 1: a limit fails; 2: bad input; 130: interrupted.
+    Exit code 0: all limits hold; 1: a limit fails, or a metric leaves the baseline's; 2: bad input; 130: interrupted.
     """
+    if baseline is not None and seeds > 1:
+        raise LabError(f"--baseline {baseline}: is for one seed")
+    crew = {name: given.pop(name) for name in ("workers", "cluster", "resume")}
+    options = cast("Options", given)
     if options["trace"]:
         import hil.pictures.exports.perfetto  # noqa: F401 - reports a missing package now, not after the flight
     from hil.api import request_of
 
     request = request_of(experiment, **options)
+    before = None if baseline is None else _flown(baseline)
     if seeds > 1:
         _check_seeds(seeds, request, target)
-    elif workers or cluster or resume:
+    elif any(crew.values()):
         raise LabError("--workers, --cluster and --resume are for several --seeds")
     common.announce_compilation()
     if seeds > 1:
         requests = [replace(request, seed=request.seed + index) for index in range(seeds)]
-        return _fly_many(requests, options, out or Path("runs"), (workers, cluster, resume))
+        return _fly_many(requests, options, out or Path("runs"), crew)
     from hil.laboratory.files.folder import folder_of, moved, reserved
 
     folder = out or folder_of(request)
     if out is None and (why := moved(request, folder)):
         warn(why)
     with reserved(request, folder):
-        return _fly_one(request, folder, target)
+        code = _fly_one(request, folder, target)
+    if before is None or code == common.INTERRUPTED:
+        return code
+    return max(code, _left(before, folder, request.experiment))
+
+
+def _flown(folder: Path) -> FlownRun:
+    """Return the baseline, read before the flight may replace it."""
+    from hil.pictures.compare import load_flown
+
+    with reading(folder):
+        return load_flown(folder)
+
+
+def _left(before: FlownRun, folder: Path, experiment: Experiment) -> int:
+    """Print the comparison with the baseline if the flight has left it; return the exit code."""
+    from hil.commands.compare import print_comparison
+    from hil.laboratory.experiments import finder_of
+    from hil.laboratory.metric_pairs import REL
+    from hil.pictures.compare import compare, load_flown
+
+    comparison, name = compare(before, now := load_flown(folder, finder_of(experiment))), before.result.folder
+    left = [pair.name for pair in comparison.metrics if not pair.within(REL)]
+    if before.result.outcome == now.result.outcome and not left:
+        say(f"within {100 * REL:g} % of {name}")
+        return 0
+    print_comparison(name, folder, comparison)
+    ended = f"outcome {before.result.outcome} | {now.result.outcome}"
+    say(f"left {name} by more than {100 * REL:g} %: {', '.join(left) or ended}")
+    return 1
 
 
 def _check_seeds(seeds: int, request: Request, target: str | None) -> None:
@@ -153,9 +191,7 @@ def _fly_one(request: Request, folder: Path, target: str | None) -> int:
     return common.exit_code(result)
 
 
-def _fly_many(
-    requests: list[Request], options: Options, parent: Path, crew: tuple[int | None, str, bool]
-) -> int:
+def _fly_many(requests: list[Request], options: Options, parent: Path, crew: dict[str, Any]) -> int:
     """Fly seeds in parallel processes; print one row per seed and a summary; return the exit code."""
     from hil.laboratory.files.folder import folder_of, moved
     from hil.research.campaigns.jobs import Job
@@ -169,7 +205,7 @@ def _fly_many(
     if whys := [why for one in placed if (why := moved(*one))]:
         warn(whys[0] + (f", and so on: {len(whys)} of {len(jobs)}" if whys[1:] else ""))
     name = f"{requests[0].experiment.name}-{requests[0].seed}-{requests[-1].seed}"
-    with Runner(common.notices, *crew) as runner:
+    with Runner(common.notices, **crew) as runner:
         rows = runner.fly(name, jobs, parent)
     print_seeds(rows)
     if runner.interrupted:

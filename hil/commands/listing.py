@@ -1,8 +1,9 @@
-"""`floaty list`: the experiments; `floaty runs`: the past flights."""
+"""`floaty list`: the experiments; `floaty runs`: the past flights; `floaty docs`: the pages of the documentation."""
 
 from __future__ import annotations
 
 import math
+import re
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,12 +13,16 @@ from rich.markup import escape
 from rich.table import Table
 
 from hil.commands.options import PATH, console, say, wide_console
-from hil.errors import LabError, refusing
+from hil.errors import LabError, hint, refusing
 
 if TYPE_CHECKING:
     from hil.laboratory.files.result import Result
 
 HASH_DIGITS = 12
+# The pages: in the wheel, or in the clone.
+FOLDERS = (Path(__file__).parents[1] / "docs", Path(__file__).parents[2] / "docs")
+PARTS = ("tutorials", "howto", "explanation", "reference")
+LINES = 3  # shown of a page that has the words
 
 
 @click.command("list")
@@ -121,3 +126,62 @@ def verdict_of(result: Result) -> str:
     if result.outcome != "completed":
         return result.outcome
     return f"fails: {', '.join(failed)}" if failed else "ok"
+
+
+@click.command()
+@click.argument("topic", nargs=-1)
+@click.option("--open", "opened", is_flag=True, help="Open the page in the program for its files instead.")
+def docs(topic: tuple[str, ...], opened: bool) -> None:
+    """Print the page TOPIC of the documentation, or list the pages that have its words; without TOPIC all pages."""
+    pages = pages_of(next(folder for folder in FOLDERS if folder.is_dir()))
+    name = "-".join(topic).lower().removesuffix(".md").rpartition("/")[2]
+    if page := pages.get(name):
+        if opened and click.launch(str(page)) != 0:
+            raise LabError(f"--open {page}: no program opens it here")
+        for line in [] if opened else page.read_text(encoding="utf-8").splitlines():
+            say(line)
+        return
+    if topic:
+        _list_found(pages, topic)
+        return
+    for name, page in pages.items():
+        say(f"{name:{max(map(len, pages))}}  {_title(page)}")
+    say("")
+    say("floaty docs TOPIC prints a page; floaty docs WORD WORD finds pages")
+
+
+def pages_of(folder: Path) -> dict[str, Path]:
+    """Return the pages by their topics, the first ones to read first."""
+    return {page.stem: page for part in PARTS for page in sorted((folder / part).glob("*.md"))}
+
+
+def _list_found(pages: dict[str, Path], topic: tuple[str, ...]) -> None:
+    """List the pages that have all words, those whose lines have all of them first."""
+    words = _plain(" ".join(topic)).split()
+    found = []
+    for name, page in pages.items():
+        text = page.read_text(encoding="utf-8")
+        if not all(word in _plain(text) for word in words):
+            continue
+        lines = text.splitlines()
+        shares = {index: sum(word in _plain(line) for word in words) for index, line in enumerate(lines)}
+        best = sorted((index for index in shares if shares[index]), key=lambda index: (-shares[index], index))
+        found.append(
+            (shares[best[0]], sum(shares.values()), name, [lines[index] for index in sorted(best[:LINES])])
+        )
+    if not found:
+        near = hint("-".join(topic), pages, "floaty docs lists all pages")
+        raise LabError(f"docs {' '.join(topic)}: neither a page nor words of one; {near}")
+    for _, _, name, lines in sorted(found, key=lambda one: (-one[0], -one[1])):
+        say(f"{name}  {_title(pages[name])}")
+        for line in lines:
+            say(f"    {line.strip()}")
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"[\s-]+", " ", text.lower())
+
+
+def _title(page: Path) -> str:
+    with page.open(encoding="utf-8") as lines:
+        return next(lines).removeprefix("# ").strip()

@@ -27,6 +27,7 @@ TEMPLATES = Path(__file__).parent / "project"  # NAME.in
 POLICY_TEMPLATES = Path(__file__).parent / "policy_project"
 ROBOT_TEMPLATES = Path(__file__).parent / "robot_project"
 TILT_ROTOR = Path(__file__).parent / "tilt_rotor_project"  # instead of the other's robot.py
+ANY_TEMPLATES = Path(__file__).parent / "any_project"  # what each of them has as well
 NAMED = {"gitignore": ".gitignore"}  # files that would affect the template itself
 TOLERANCE = 1e-4  # of an action, -1..1
 ROOM = 0.9  # of the control slot: the cycles are from one compiler, for some states
@@ -110,7 +111,11 @@ def write_project(command: str, templates: Iterable[Path], folder: Path, **value
     with refusing(f"{command} {folder}: ", OSError):
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=folder, prefix=".") as scratch:  # all files or none
-            known = {path.relative_to(source): path for source in templates for path in source.rglob("*.in")}
+            known = {
+                path.relative_to(source): path
+                for source in (ANY_TEMPLATES, *templates)
+                for path in source.rglob("*.in")
+            }
             for name, template in sorted(known.items()):
                 place = name.with_suffix("")
                 path = Path(scratch) / NAMED.get(str(place), place)

@@ -60,21 +60,11 @@ def print_seeds(rows: list[Row]) -> None:
 def print_result(result: Result) -> None:
     """Print one flight's verdicts and files."""
     from hil.laboratory.files.recorder import SETTINGS, load_events
-    from hil.laboratory.metrics import METRICS, short_of
 
     title = f"{result.request.title}, profile {result.request.profile}"
     table = Table("metric", *right("value", "limit", "verdict"), title=title)
-    verdicts = {verdict.metric: verdict for verdict in result.verdicts}
-    for name, value in result.metrics.items():
-        if math.isnan(value) and name not in verdicts:
-            continue
-        metric = result.own_metrics.get(name) or METRICS[name]
-        limit = mark = ""
-        if name in verdicts:
-            limit = f"{'<=' if metric.bound == 'max' else '>='} {metric.show(verdicts[name].bound)}"
-            mark = verdicts[name].mark
-        over = short_of(metric, value, result.metrics["flown"], result.request.duration_s)
-        table.add_row(name, metric.show(value) + over, limit, mark)
+    for row in result.rows:
+        table.add_row(*row)
     console.print(table)
     cause = f": {result.cause}" if result.cause else ""
     speed = "" if math.isnan(result.real_time_factor) else f"{result.real_time_factor:.0f} times real time; "

@@ -56,6 +56,7 @@ def _guarded(function: Checked, name: str) -> Checked:
 
     @wraps(function)
     def call(*values: Any, **options: Any) -> Any:
+        __tracebackhide__ = True  # a failure shows the caller's line
         kinds = expected()
         for option in options.keys() - kinds.keys():
             raise LabError(f"{name}: unknown argument {option!r}; {hint(option, kinds)}")

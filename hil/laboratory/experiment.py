@@ -77,6 +77,9 @@ class Experiment:
     draw: Callable[[pa.Table], Any] | None = None
     source: Source | None = None  # None: it ships, or is in no file
 
+    def __repr__(self) -> str:
+        return f"<Experiment {self.name}, {self.duration_s:g} s: {self.summary}>"
+
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
             raise LabError(

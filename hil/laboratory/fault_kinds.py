@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import Literal
 
@@ -61,7 +61,7 @@ class Kind:
     size: float  # default
     low: float
     high: float
-    knobs: tuple[Knob, ...]
+    knobs: tuple[Knob, ...] = field(repr=False)
     outcome: Outcome = ""
     scale: float = 1.0  # from the unit to SI
     duration_s: float = math.inf  # default; inf: to the end of the flight

@@ -233,6 +233,22 @@ def attitude_error(table: pa.Table) -> NDArray[np.float64]:
     return angles
 
 
+ANGLES = ("roll", "pitch", "yaw")
+
+
+def with_angles(table: pa.Table) -> pa.Table:
+    """Return a log with roll, pitch and yaw [rad] of the body's quaternions, which the recorded log does not have."""
+    for source in ("truth", "cameras"):
+        if f"{source}.qw" not in table.column_names:
+            continue
+        angles = euler_zyx_of(column(table, *(f"{source}.{name}" for name in ("qw", "qx", "qy", "qz"))))
+        for name, values in zip(ANGLES, angles.T, strict=True):
+            described = {"unit": "rad", "frame": "W"}
+            field = pa.field(f"{source}.{name}", pa.float64(), metadata=described)
+            table = table.append_column(field, pa.array(np.ascontiguousarray(values)))
+    return table
+
+
 def free_flight(table: pa.Table) -> pa.Table:
     """Return the rows after the release; of a real flight, those in which the cameras saw the robot."""
     return rows_where(table, _free(table) & (_seen(table) if is_real(table) else True))

@@ -19,9 +19,9 @@ from ground_station.records import Records
 from ground_station.telemetry_log import TELEMETRY
 from hil.config import LabConfig
 from hil.errors import LabError, made_folder, require_empty
-from hil.laboratory.ages import STATION_START
 from hil.laboratory.bodies import make_body
 from hil.laboratory.channels import station_channels
+from hil.laboratory.files.ages import STATION_START
 from hil.laboratory.files.recorder import STREAM, Observer, Recorder, load_log
 from hil.laboratory.files.result import (
     Outcome,

@@ -16,7 +16,7 @@ from ground_station.errors import LinkError
 from ground_station.telemetry_log import TELEMETRY
 from hil.board.clock import Pace
 from hil.config import check_logic
-from hil.laboratory.ages import with_goals_sent
+from hil.laboratory.files.ages import with_goals_sent
 from hil.laboratory.files.folder import replacing_older
 from hil.laboratory.files.recorder import Observer, Recorder, load_log
 from hil.laboratory.files.result import (

@@ -5,7 +5,6 @@ different times of their logs, real ones and those over a real link, share no ro
 release then shows what the model lacks.
 """
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +17,8 @@ from hil.errors import LabError, unlinked, writing
 from hil.laboratory.experiments import find_shipped
 from hil.laboratory.files.recorder import load_log, release_of, stored_in
 from hil.laboratory.files.result import Result, read_result
-from hil.laboratory.metrics import METRICS, SHOWN, column, free_flight, is_real, measure, rows_where
+from hil.laboratory.metric_pairs import MetricPair, pairs_of
+from hil.laboratory.metrics import column, free_flight, is_real, measure, rows_where
 from hil.laboratory.request import Find
 from hil.pictures import curves
 from hil.pictures.curves import since_release
@@ -53,20 +53,6 @@ class FirstDifference:
     def __str__(self) -> str:
         a, b = ("the log has ended" if value is None else f"{value!r}" for value in self.values)
         return f"row {self.row}, {self.t_s:.6f} s from the release, {self.column}: {a} | {b}"
-
-
-@dataclass(frozen=True, slots=True)
-class MetricPair:
-    """A metric of both flights, in the displayed unit."""
-
-    name: str
-    unit: str
-    values: tuple[float, float]  # NaN: none
-
-    @property
-    def difference(self) -> float:
-        """Second less first."""
-        return self.values[1] - self.values[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +99,7 @@ def compare(a: FlownRun, b: FlownRun) -> Comparison:
     names_a, names_b = a.log.column_names, b.log.column_names
     common = [name for name in names_a if name in names_b]
     flown_s = tuple(_flown_s(run) for run in (a, b))
+    first, second = (_up_to(run, min(flown_s)).metrics for run in (a, b))
     return Comparison(
         _first_difference(a.log, b.log, common),
         (
@@ -120,7 +107,7 @@ def compare(a: FlownRun, b: FlownRun) -> Comparison:
             tuple(name for name in names_a if name not in common),
         ),
         _span(*flown_s),
-        tuple(_metric_pairs(*(_up_to(run, min(flown_s)) for run in (a, b)))),
+        tuple(pairs_of(first, second, {**a.result.own_metrics, **b.result.own_metrics})),
         tuple(_apart(a.log, b.log)),
         is_real(a.log) != is_real(b.log),
         tuple(_differing_settings(a, b)),
@@ -281,16 +268,6 @@ def _up_to(run: FlownRun, end_s: float) -> Result:
     if experiment.is_known and (free := free_flight(log)).num_rows > 1:
         metrics.update(experiment.measured(free))
     return replace(run.result, metrics=metrics)
-
-
-def _metric_pairs(a: Result, b: Result) -> list[MetricPair]:
-    pairs = []
-    for name, metric in {**METRICS, **a.own_metrics, **b.own_metrics}.items():
-        scale, unit = SHOWN.get(metric.unit, (1.0, metric.unit))
-        first, second = (result.metrics.get(name, math.nan) * scale for result in (a, b))
-        if not (math.isnan(first) and math.isnan(second)):
-            pairs.append(MetricPair(name, unit, (first, second)))
-    return pairs
 
 
 def _differing_settings(a: FlownRun, b: FlownRun) -> list[tuple[str, str, str]]:

@@ -5,15 +5,19 @@ dotted blue: an operator's action; black: the flight was lost.
 """
 
 import io
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import matplotlib
 import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
-from hil.laboratory.metrics import column
+from hil.laboratory.metrics import SHOWN, column
 from hil.pictures import curves, panels
 from hil.pictures.panels import INK, Marks, Panel, Plot, Series, marks_of_flight
 
@@ -21,6 +25,10 @@ MARK_LENGTH = 28  # letters
 WIDTH, DPI = 9.2, 115  # [in], 1/in
 INTERVAL_COLOURS = {"held": curves.GREY, "fault": curves.RED, "failsafe": curves.PINK, "limit": curves.YELLOW}
 INSTANT_COLOURS = {"operator": curves.BLUE, "lost": INK}
+KINDS = {
+    "held": "held", "fault": "fault", "failsafe": "failsafe", "limit": "command at its limit", "operator": "operator",
+    "lost": "lost",
+}  # fmt: skip
 SHADE = 0.18  # opacity
 STRIP = 0.04  # of the axes' height: commands at their limits
 STYLE: Any = {
@@ -48,19 +56,75 @@ def png(draw: Callable[..., Plot | Figure], *flights: pa.Table) -> bytes:
     return file.getvalue()
 
 
-def plotted(log: pa.Table, names: Sequence[str]) -> Figure:
-    """Return a figure of columns of a log, a panel for each unit; without names, of errors and flaps."""
-    shown = () if names else curves.errors_and_actuators(log)
+SI = {
+    "cm": (1e-2, "m"), "deg": (math.radians(1.0), "rad"), "us": (1e-6, "s"), "ms": (1e-3, "s"), "%": (1e-2, ""),
+    "mN": (1e-3, "N"),
+}  # fmt: skip
+UNITS = {"SI": SI, "customary": {**SHOWN, "us": (1e-3, "ms")}}
+QUANTITIES = {
+    "m": "position", "cm": "position", "m/s": "velocity", "rad": "angle", "deg": "angle", "rad/s": "angular rate",
+    "deg/s": "angular rate", "s": "time", "ms": "time", "N": "force", "V": "voltage", "W": "power", "counts": "counts",
+    "": "value",
+}  # fmt: skip
+
+
+def plotted(
+    log: pa.Table, names: Sequence[str], units: str = "customary", size: tuple[float, float] | None = None
+) -> Figure:
+    """Return a figure of columns of a log, a panel for each unit; without names, of errors and actuators.
+
+    `units` is a key of UNITS; `size` [in]. What the caller has changed in matplotlib's rcParams is kept.
+    """
+    own = {name for name, value in matplotlib.rcParams.items() if value != matplotlib.rcParamsDefault[name]}
+    colours: Sequence[str] = curves.SERIES_COLOURS
+    if "axes.prop_cycle" in own:
+        colours = matplotlib.rcParams["axes.prop_cycle"].by_key().get("color", colours)
     times, by_unit = curves.since_release(log), dict[str, list[Series]]()
     for index, name in enumerate(names):
         values = column(log, name)  # raises for a name that the log lacks
         unit = (log.schema.field(name).metadata or {}).get(b"unit", b"").decode()
-        line = Series(name, curves.SERIES_COLOURS[index % len(curves.SERIES_COLOURS)], times, values)
-        by_unit.setdefault(unit, []).append(line)
-    chosen = [Panel(f"[{unit or '1'}]", tuple(lines), height=2.2) for unit, lines in by_unit.items()]
-    standard = [panels.panel(curve, log, label, height=1.9) for label, curve in shown]
-    with matplotlib.rc_context(STYLE):
-        return figure_of(Plot((*chosen, *standard)), marks_of_flight(log))
+        scale, shown = UNITS[units].get(unit, (1.0, unit))
+        line = Series(name, colours[index % len(colours)], times, scale * values)
+        by_unit.setdefault(shown, []).append(line)
+    chosen = [
+        Panel(f"{QUANTITIES.get(unit, 'value')} [{unit or '1'}]", tuple(lines), height=2.2)
+        for unit, lines in by_unit.items()
+    ]
+    if not names:
+        for label, curve in curves.errors_and_actuators(log):
+            scale, shown = UNITS[units].get(curve.unit, (1.0, curve.unit))
+            drawn = panels.panel(curve, log, label, height=1.9)
+            lines = tuple(replace(one, values=scale * one.values) for one in drawn.series)
+            chosen.append(replace(drawn, label=f"{label} [{shown or '1'}]", series=lines))
+    with matplotlib.rc_context({name: value for name, value in STYLE.items() if name not in own}):
+        width = matplotlib.rcParams["lines.linewidth"]
+        thick = [
+            replace(one, series=tuple(replace(line, width=width) for line in one.series)) for one in chosen
+        ]
+        marks = marks_of_flight(log)
+        figure = figure_of(Plot(tuple(thick)), marks)
+        if size is not None or "figure.figsize" in own:
+            figure.set_size_inches(*(size or matplotlib.rcParams["figure.figsize"]))
+        name_marks(figure, marks)
+    return figure
+
+
+def name_marks(figure: Figure, marks: Marks) -> None:
+    """Add the legend of the marks that a figure has, below it."""
+    shown = [
+        Patch(color=INTERVAL_COLOURS[kind], alpha=0.9 if kind == "limit" else SHADE, label=KINDS[kind])
+        if kind in INTERVAL_COLOURS
+        else Line2D(
+            [],
+            [],
+            color=INSTANT_COLOURS[kind],
+            linestyle=":" if kind == "operator" else "-",
+            label=KINDS[kind],
+        )
+        for kind in marks.kinds
+    ]
+    if shown:
+        figure.legend(handles=shown, loc="outside lower center", ncols=len(shown))
 
 
 def figure_of(plot: Plot, marks: Marks) -> Figure:
@@ -129,7 +193,7 @@ def draw_marks(axes: Sequence[Axes], marks: Marks) -> None:
     for begins, text, colour in faults:
         short = text if len(text) <= MARK_LENGTH else f"{text[: MARK_LENGTH - 1]}…"
         axes[0].text(
-            begins, 0.98, short, transform=axes[0].get_xaxis_transform(), color=colour, fontsize=6.5,
+            begins, 0.98, short, transform=axes[0].get_xaxis_transform(), color=colour, fontsize="x-small",
             rotation=90, ha="left", va="top", clip_on=True,
         )  # fmt: skip
 

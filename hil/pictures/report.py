@@ -13,11 +13,11 @@ from pathlib import Path
 import pyarrow as pa
 
 from firmware_py.rtos.statistics import LATENCY_BOUNDS_US
-from hil.laboratory.ages import ages_in_time_of
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.experiments import find_shipped
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Span, spans_of
+from hil.laboratory.files.ages import ages_in_time_of
 from hil.laboratory.files.recorder import forget_read_columns, load_events, load_log, release_of, stored_in
 from hil.laboratory.files.result import Result, read_result
 from hil.laboratory.metrics import METRICS, SHOWN, short_of

@@ -20,9 +20,9 @@ from ground_station.trajectory import Goal, Trajectory
 from hil.board.clock import Paced
 from hil.board.image_settings import to_set
 from hil.errors import LabError
-from hil.laboratory.ages import STATION_CLOCK
 from hil.laboratory.channels import radio_channel, serial_channel
 from hil.laboratory.experiments import find_again
+from hil.laboratory.files.ages import STATION_CLOCK
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import WARM_UP_US, Laboratory
 from hil.laboratory.lockstep import image_at

@@ -1,4 +1,4 @@
-"""Seeds, boards and profiles of a test, from its mark or the command line, and their availability."""
+"""Seeds, boards, profiles, links and faults of a test, from its mark or the command line, and their availability."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from firmware_py.export.boards import BOARDS, C, runner_of
 from firmware_py.export.errors import ExportError
 from hil.config import DEFAULT_PROFILE
 from hil.errors import LabError, hint
-from hil.laboratory.request import LOCKSTEP, RADIO, Options
+from hil.laboratory.faults import parse
+from hil.laboratory.request import LOCKSTEP, MAVLINK, RADIO, Options
 
 PACKAGES = {"mavlink": "pymavlink", "radio": "cflib"}  # capabilities that a package provides
 LOCKSTEP_ONLY = "lockstep"
 CAPABILITIES = (*BOARDS, *PACKAGES, LOCKSTEP_ONLY)
-WORDS = ("seeds", "boards", "profiles", "needs")
+WORDS = ("seeds", "boards", "profiles", "links", "faults", "needs")
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +30,7 @@ class Wanted:
     seeds: int = 0
     boards: tuple[str, ...] = ()
     profiles: tuple[str, ...] = ()
-    link: str = RADIO
+    link: str = ""
     usual_profile: str = DEFAULT_PROFILE
 
 
@@ -41,10 +42,16 @@ class Marked:
     boards: tuple[str, ...] = ()
     profiles: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
+    links: tuple[str, ...] = ()
+    faults: tuple[tuple[str, ...], ...] = ()  # each of the tuples acts on flights of its own
 
     @classmethod
     def of(cls, words: Mapping[str, Any]) -> Marked:
-        """Check the mark's arguments: `seeds` is a number of seeds from 1 on, or the seeds themselves."""
+        """Check the mark's arguments.
+
+        `seeds` is a number of seeds from 1 on, or the seeds themselves; `faults` a list of faults, each as text, a `Fault`
+        or a list of several that act together.
+        """
         for word in words:
             if word not in WORDS:
                 raise LabError(f"{word}: {hint(word, WORDS)}")
@@ -53,18 +60,22 @@ class Marked:
             if seeds < 1:
                 raise LabError(f"seeds = {seeds}: expected 1 or more, or a list of seeds")
             seeds = range(1, seeds + 1)
-        needs = words.get("needs", ())
-        marked = cls(
-            tuple(seeds), tuple(words.get("boards", ())), tuple(words.get("profiles", ())),
-            (needs,) if isinstance(needs, str) else tuple(needs),
-        )  # fmt: skip
+        boards, profiles, links, needs = (
+            _listed(words.get(name, ())) for name in ("boards", "profiles", "links", "needs")
+        )
+        faults = tuple(
+            tuple(str(parse(str(fault))) for fault in _listed(together))
+            for together in _listed(words.get("faults", ()))
+        )
+        marked = cls(tuple(seeds), boards, profiles, needs, links, faults)
         _check("boards", marked.boards, BOARDS)
+        _check("links", marked.links, LOCKSTEP)
         _check("needs", marked.needs, CAPABILITIES)
         return marked
 
 
 def choices_of(marked: Marked, wanted: Wanted) -> list[Options]:
-    """Return the seeds, boards, profiles and link of a test as the default options of its flights.
+    """Return the seeds, boards, profiles, links and faults of a test as the default options of its flights.
 
     The command line overrides the mark; without either, a board that the test needs is used.
     """
@@ -72,20 +83,26 @@ def choices_of(marked: Marked, wanted: Wanted) -> list[Options]:
     seeds = tuple(range(1, wanted.seeds + 1)) or marked.seeds or (1,)
     boards = wanted.boards or marked.boards or needed or (C,)
     profiles = wanted.profiles or marked.profiles or (wanted.usual_profile,)
-    return [
-        {"seed": seed, "board": board, "profile": profile, "link": wanted.link}
-        for profile, board, seed in product(profiles, boards, seeds)
+    links = (wanted.link,) if wanted.link else marked.links or (RADIO,)
+    chosen: list[Options] = [
+        {"seed": seed, "board": board, "profile": profile, "link": link}
+        for link, profile, board, seed in product(links, profiles, boards, seeds)
     ]
+    if not marked.faults:
+        return chosen
+    return [{**one, "faults": faults} for faults, one in product(marked.faults, chosen)]
 
 
 def name_of(choice: Options, choices: Sequence[Options]) -> str:
     """Return the text that distinguishes a choice in a test's name."""
-    parts = {
-        choice["profile"]: len({one["profile"] for one in choices}),
-        choice["board"]: len({one["board"] for one in choices}),
-        f"seed{choice['seed']}": len({one["seed"] for one in choices}),
-    }
-    return "-".join(part for part, many in parts.items() if many > 1)
+    texts = [_parts(one) for one in choices]
+    many = [len(set(part)) > 1 for part in zip(*texts, strict=True)]
+    return "-".join(part for part, differs in zip(_parts(choice), many, strict=True) if differs)
+
+
+def _parts(choice: Options) -> tuple[str, ...]:
+    faults = "+".join(map(str, choice.get("faults", ()))) or "no-fault"
+    return faults, choice["link"], choice["profile"], choice["board"], f"seed{choice['seed']}"
 
 
 def why_not(choice: Options, needs: Iterable[str]) -> str:
@@ -101,6 +118,8 @@ def why_not(choice: Options, needs: Iterable[str]) -> str:
             return f"needs lockstep: this flies over {link}"
         if need in PACKAGES and importlib.util.find_spec(PACKAGES[need]) is None:
             return f"needs {need}: {PACKAGES[need]} is not installed"
+    if link.startswith(MAVLINK) and importlib.util.find_spec(PACKAGES["mavlink"]) is None:
+        return f"link {link}: {PACKAGES['mavlink']} is not installed"
     return why_no_board(board)
 
 
@@ -112,6 +131,11 @@ def why_no_board(board: str) -> str:
     except ExportError as error:
         return f"board {board} is not available here: {error}"
     return ""
+
+
+def _listed(value: Any) -> tuple[Any, ...]:
+    """Return a list's elements, or one element for what is no list."""
+    return tuple(value) if isinstance(value, list | tuple | set) else (value,)
 
 
 def _check(word: str, values: tuple[str, ...], allowed: Sequence[str]) -> None:

@@ -2,8 +2,11 @@
 
 import hashlib
 import math
+import os
 import re
+import shlex
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Unpack
@@ -12,10 +15,11 @@ import pytest
 
 from firmware_py.export.boards import BOARDS, runner_of
 from hil.api import Run, command_of, fly, request_of
-from hil.config import Overrides, load_config, settings_of
+from hil.config import DEFAULT_PROFILE, Overrides, load_config, settings_of
 from hil.errors import LabError
 from hil.laboratory.arguments import checked
 from hil.laboratory.experiment import Experiment
+from hil.laboratory.metric_pairs import REL
 from hil.laboratory.request import MAVLINK, RADIO, Options, Request
 from hil.testing.board import BareBoard
 from hil.testing.choices import why_no_board
@@ -39,23 +43,29 @@ class Item:
     """One test: its choice, folder and flights."""
 
     name: str  # pytest's
+    home: Path  # of the test file
     folder: Path
     choice: Options  # default options of its flights
     flown: list[Flown] = field(default_factory=list)
+    written: list[str] = field(default_factory=list)  # baselines
     failed: bool = False
 
 
 class Flights:
-    """The fixture `floaty`. `seed`, `profile` and `target`, the board, are the test's."""
+    """The fixture `floaty`. `seed`, `profile`, `link`, `faults` and `target`, the board, are the test's."""
 
-    def __init__(self, home: Path, folder: Path) -> None:
+    def __init__(
+        self, home: Path, folder: Path, usual_profile: str = DEFAULT_PROFILE, update: bool = False
+    ) -> None:
         self.home = home  # pytest's root folder: paths of profiles and experiments are relative to it
         self._folder = folder  # of all tests' runs
+        self._usual_profile = usual_profile  # of pytest's configuration
+        self._update = update  # the baselines
         self._item: Item | None = None
 
-    def begin(self, name: str, choice: Options) -> Item:
-        """Start flying for a test."""
-        self._item = Item(name, self._folder / folder_of(name), choice)
+    def begin(self, name: str, file: Path, choice: Options) -> Item:
+        """Start flying for a test of a file."""
+        self._item = Item(name, file.parent, self._folder / folder_of(name), choice)
         shutil.rmtree(self._item.folder, ignore_errors=True)
         return self._item
 
@@ -80,16 +90,28 @@ class Flights:
         """The runner of the flight core: c, python or cortex-m4."""
         return self.choice["board"]
 
+    @property
+    def link(self) -> str:
+        """The link between station and board."""
+        return self.choice["link"]
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """The faults of the mark, which act on every flight of the test."""
+        return tuple(map(str, self.choice.get("faults", ())))
+
     @checked
     def fly(self, experiment: Experiment | str = "hover", **options: Unpack[Options]) -> Run:
         """Fly once; the test's mark and the command line give the default options.
 
-        Options are those of `hil.fly`. A failed limit is not an error: the test reads `passed`, `metrics`, `verdicts`.
+        Options are those of `hil.fly`; `faults` are added to the mark's. A failed limit is not an error: the test reads
+        `passed`, `metrics`, `verdicts`.
         Skips the test when a board is not available here. Raises `LabError` for bad input.
         """
         item = self._item
         assert item is not None
         chosen: Options = {**item.choice, **options}
+        chosen["faults"] = (*self.faults, *options.get("faults", ()))
         chosen["profile"] = self._placed(chosen["profile"])
         self._need(chosen["board"])
         if isinstance(experiment, str):
@@ -111,6 +133,52 @@ class Flights:
         self._need(self.target)
         config = load_config(self._placed(profile or self.profile), settings_of(overrides))
         return BareBoard(config, runner_of(self.target, config.logic), link == MAVLINK)
+
+    @checked
+    def baseline(self, name: str, rel: float = REL, metrics: Sequence[str] = ()) -> None:
+        """Compare the flights of the test with `baselines/NAME.json` beside its file; `--floaty-update` writes it.
+
+        Fails with the metrics of both and the first row that differs when an outcome has changed or a metric has left
+        `rel` of the baseline's, for better or worse. `metrics` are those that count; by default all. Another seed,
+        profile, link or fault of the mark has a file of its own; boards share one. Raises `LabError` for a missing baseline.
+        """
+        __tracebackhide__ = True
+        from hil.testing import baselines
+
+        item = self._item
+        assert item is not None
+        if not item.flown:
+            raise LabError(f"baseline {name!r}: this test has not flown yet")
+        for metric in metrics:
+            item.flown[-1].run.unit_of(metric)  # raises for an unknown one
+        path = baselines.file_of(item.home, "-".join([name, *self._unusual(item.choice)]))
+        shown = path.relative_to(self.home) if path.is_relative_to(self.home) else path
+        if self._update:
+            baselines.write(path, [baselines.Pinned.of(one.run) for one in item.flown])
+            item.written.append(str(shown))
+            return
+        command = f"pytest --floaty-update {shlex.quote(item.name)}"
+        if not path.is_file():
+            raise LabError(f"baseline {shown}: there is none; `{command}` writes it, then commit it")
+        kept = baselines.read(path)
+        if len(kept) != len(item.flown):
+            raise LabError(
+                f"baseline {shown}: of {len(kept)} flights, now {len(item.flown)}; `{command}` writes it again"
+            )
+        pairs = zip(kept, item.flown, strict=True)
+        lines = [line for old, one in pairs for line in baselines.difference(old, one.run, rel, metrics)]
+        if lines:
+            raise AssertionError(
+                "\n".join([f"baseline {shown}:", *lines, f"accept the new flights: {command}"])
+            )
+
+    def _unusual(self, choice: Options) -> list[str]:
+        """Return the parts of a choice that make another flight than usual, as parts of a file's name."""
+        link = "" if choice["link"] == RADIO else choice["link"].partition(":")[0]
+        profile = "" if choice["profile"] == self._usual_profile else Path(choice["profile"]).stem
+        faults = (re.sub(r"[^\w.-]+", "-", str(fault)) for fault in choice.get("faults", ()))
+        seed = "" if choice["seed"] == 1 else f"seed{choice['seed']}"
+        return list(filter(None, (*faults, profile, link, seed)))
 
     def _need(self, board: str) -> None:
         if board in BOARDS and (reason := why_no_board(board)):
@@ -137,8 +205,11 @@ def shown_of(item: Item) -> list[Flown]:
     return item.flown if len(item.flown) <= SHOWN else item.flown[-1:]
 
 
-def text_of(item: Item, kept: bool, options: str) -> str:
-    """Return the text on a failed test's flights; `options` are the pytest options that chose the flights."""
+def text_of(item: Item, kept: bool, options: str, root: Path) -> str:
+    """Return the text on a failed test's flights, with paths relative to pytest's root folder.
+
+    `options` are the pytest options that chose the flights.
+    """
     texts = []
     for one in shown_of(item):
         request, result = one.request, one.run.result
@@ -155,20 +226,38 @@ def text_of(item: Item, kept: bool, options: str) -> str:
             lines += [f"  machine  was too slow: time stood still for {result.stood_still_ms:.0f} ms"]
         again = command_of(request) or f"pytest {options}'{item.name}'"
         texts.append("\n".join([*lines, f"  again    {again}"]))
-    more = len(item.flown) - len(texts)
-    return "\n".join([*texts, f"({more} flights before that are not shown)"] if more else texts)
+    if more := len(item.flown) - len(texts):
+        texts.append(f"({more} flights before that are not shown)")
+    return _below(root, "\n".join(texts))
 
 
-def properties_of(item: Item) -> list[tuple[str, str]]:
-    """Return a test's properties for a JUnit file: hash, command, and every metric with a value, in its unit."""
+def _below(root: Path, text: str) -> str:
+    return text.replace(f"{root}{os.sep}", "")
+
+
+def without_deleted(item: Item, kept: bool, text: str) -> str:
+    """Return a text on a test without the folders of flights that are deleted."""
+    shown = {one.number for one in shown_of(item)} if kept else set()
+    for one in item.flown:
+        if one.number not in shown:
+            text = text.replace(f"; {one.run.folder}>", ">")
+    return text
+
+
+def properties_of(item: Item, kept: bool, root: Path) -> list[tuple[str, str]]:
+    """Return a test's properties for a JUnit file: hash, command, folder if it is kept, and every metric with a value.
+
+    A metric is a number, in the unit that its name ends with, like `floaty.rms_x [m]`.
+    """
     found = []
     shown = shown_of(item)
     for one in shown:
         prefix = "floaty." if len(shown) == 1 else f"floaty.{one.number}."
-        values = {"hash": one.run.hash, "outcome": one.run.outcome, "folder": str(one.run.folder)}
-        values["again"] = command_of(one.request) or ""
+        values = {"hash": one.run.hash, "outcome": one.run.outcome}
+        values |= {"folder": _below(root, str(one.run.folder))} if kept else {}
+        values["again"] = _below(root, command_of(one.request) or "")
         values |= {
-            name: f"{value:.9g} {one.run.unit_of(name)}".rstrip()
+            f"{name} [{unit}]" if (unit := one.run.unit_of(name)) else name: f"{value:.9g}"
             for name, value in one.run.metrics.items()
             if math.isfinite(value)
         }

@@ -26,11 +26,13 @@ KEEP = ("failed", "all", "none")
 FOLDER = "runs/pytest"  # in pytest's root folder
 FLIGHTS = pytest.StashKey["Flights"]()
 ITEM = pytest.StashKey["Item"]()
+WRITTEN = "floaty.baseline"  # the property of a test that wrote one
 FIRST = pytest.StashKey[dict[str, str]]()  # the first test failed by a user's error, by the error's text
 ALL = pytest.StashKey[list["Item"]]()  # of this process
 MARK = (
-    "floaty(seeds=20, boards=[...], profiles=[...], needs=...): choices of the fixture `floaty`. seeds: how many, or "
-    "which; boards: of c, python, cortex-m4; needs: boards, mavlink, radio or lockstep, without which the test is skipped."
+    "floaty(seeds=20, boards=[...], profiles=[...], links=[...], faults=[...], needs=...): choices of the fixture `floaty`. "
+    "seeds: how many, or which; boards: of c, python, cortex-m4; links: radio, mavlink; faults: as of `fly --fault`; "
+    "needs: boards, mavlink, radio or lockstep, without which the test is skipped."
 )
 
 
@@ -52,9 +54,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         help="whose run folders are kept, in runs/pytest/ [failed]",
     )  # fmt: skip
     group.addoption(
-        "--floaty-link", default="radio", metavar="LINK",
-        help="radio or mavlink: in lockstep [radio]; radio://…, udp://… or mavlink:pty: over a real link, in real time",
+        "--floaty-link", default="", metavar="LINK",
+        help="radio or mavlink: in lockstep; radio://…, udp://… or mavlink:pty: over a real link, in real time; overrides "
+        "the marks [radio]",
     )  # fmt: skip
+    group.addoption(
+        "--floaty-update",
+        action="store_true",
+        help="write the baselines of `floaty.baseline` instead of comparing",
+    )
     parser.addini("floaty_profile", "the default profile of tests, a name or a path", default="")
 
 
@@ -101,7 +109,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     choice: Options = parameters.get(CHOICE) or choices_of(marked, _wanted(item.config))[0]
     if reason := why_not(choice, marked.needs):
         pytest.skip(f"floaty: {reason}")
-    item.stash[ITEM] = _flights(item.config).begin(item.nodeid, choice)
+    item.stash[ITEM] = _flights(item.config).begin(item.nodeid, item.path, choice)
     item.config.stash[ALL].append(item.stash[ITEM])
 
 
@@ -115,19 +123,39 @@ def pytest_runtest_makereport(
         return (yield)
     if not flown.flown:
         return _in_one_line(item, call, (yield))
-    from hil.testing.flights import draw, properties_of, text_of, trim
+    from hil.testing.flights import draw, properties_of, text_of, trim, without_deleted
 
-    if call.when == "call":
-        item.user_properties.extend(properties_of(flown))
     report = _in_one_line(item, call, (yield))
-    keep = item.config.getoption("floaty_keep")
+    keep, root = item.config.getoption("floaty_keep"), item.config.rootpath
+    kept = keep == "all" or (keep == "failed" and report.failed)
+    if call.when == "call":
+        found = [*properties_of(flown, kept, root), *((WRITTEN, path) for path in flown.written)]
+        item.user_properties.extend(found)  # those of the next report
+        report.user_properties.extend(found)
     if report.failed:
+        if (text := without_deleted(flown, kept, report.longreprtext)) != report.longreprtext:
+            report.longrepr = text
         if keep != "none" and not flown.failed:
             draw(flown)
         flown.failed = True
-        report.sections.append(("floaty flights", text_of(flown, keep != "none", _options(item.config))))
+        text = text_of(flown, kept, _options(item.config), root)
+        if item.config.invocation_params.dir != root:
+            text += f"\n(paths are relative to {root})"
+        report.sections.append(("floaty flights", text))
     if call.when == "teardown":
         trim(flown, keep == "all")
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """Show why a test file cannot be read in one line, where a package or the user's input is the cause."""
+    report = yield
+    found = report.call.excinfo if report.failed and report.call is not None else None
+    if found is not None and (line := _line_of(found.value.__cause__ or found.value)):
+        report.longrepr = f"{collector.path.name}: {line}"
     return report
 
 
@@ -145,7 +173,12 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """Report skipped flights, also without -rs."""
+    """Report written baselines, and skipped flights also without -rs."""
+    passed = terminalreporter.stats.get("passed", [])
+    for path in sorted(
+        {str(path) for report in passed for name, path in report.user_properties if name == WRITTEN}
+    ):
+        terminalreporter.write_line(f"floaty: wrote {path}")
     reasons: dict[str, int] = {}
     for report in terminalreporter.stats.get("skipped", []):
         text = str(report.longrepr[2]) if isinstance(report.longrepr, tuple) else str(report.longrepr)
@@ -159,34 +192,45 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
 def _flights(config: pytest.Config) -> Flights:
     from hil.testing.flights import Flights
 
-    return config.stash.setdefault(FLIGHTS, Flights(config.rootpath, config.rootpath / FOLDER))
+    if FLIGHTS not in config.stash:
+        update, usual = config.getoption("floaty_update"), _wanted(config).usual_profile
+        config.stash[FLIGHTS] = Flights(config.rootpath, config.rootpath / FOLDER, usual, update)
+    return config.stash[FLIGHTS]
 
 
 def _in_one_line(
     item: pytest.Item, call: pytest.CallInfo[None], report: pytest.TestReport
 ) -> pytest.TestReport:
     """Show a user's error without a traceback, and only once when it fails many tests."""
-    from hil.errors import LabError
-
-    if call.excinfo is None or not isinstance(error := call.excinfo.value, LabError):
+    if call.excinfo is None or not (text := _line_of(error := call.excinfo.value)):
         return report
-    first = item.config.stash.setdefault(FIRST, {}).setdefault(str(error), item.nodeid)
+    first = item.config.stash.setdefault(FIRST, {}).setdefault(text, item.nodeid)
     own = [entry for entry in call.excinfo.traceback if entry.path == item.path]
     place = f"{item.path.name}:{own[-1].lineno + 1}: " if own else ""
-    line = f"{place}{error}" if first == item.nodeid else f"as in {first}"
+    line = f"{place}{text}" if first == item.nodeid else f"as in {first}"
     report.longrepr = "\n".join([line, *getattr(error, "__notes__", ())])
     return report
+
+
+def _line_of(error: BaseException) -> str:
+    """Return the line for a user's error or a missing package of an extra; empty for others."""
+    from firmware_py.extras import why_missing
+    from hil.errors import LabError
+
+    if isinstance(error, ImportError):
+        return why_missing(error)
+    return str(error) if isinstance(error, LabError) else ""
 
 
 def _marked(item: pytest.Item) -> Marked:
     """Return the arguments of the nearest mark."""
     from hil.errors import LabError
-    from hil.testing.choices import Marked
+    from hil.testing.choices import WORDS, Marked
 
     mark = item.get_closest_marker("floaty")
     if mark is None:
         return Marked()
-    wrong = f"{mark.args}: expected seeds=, boards=, profiles=, needs="
+    wrong = f"{mark.args}: expected {', '.join(f'{word}=' for word in WORDS)}"
     if not mark.args:
         try:
             return Marked.of(mark.kwargs)

@@ -2,19 +2,24 @@
 
 import json
 import math
+import re
 import subprocess
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import matplotlib
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import hil
-from hil import Along, Experiment, LabError, Metric, Request, fly, load_run
+from hil import Along, Experiment, Kind, LabError, Metric, Request, fly, knob, load_run
 from hil.api import command_of, request_of
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import KINDS
+from hil.laboratory.files.recorder import load_log
 from support.command import Cli
 from support.examples import run_examples
 
@@ -33,6 +38,8 @@ def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def test_the_examples_of_the_page_work(monkeypatch: pytest.MonkeyPatch) -> None:
     names = run_examples(PAGE, monkeypatch)
     assert set(names["late"]) == {0, 60}
+    assert Path("push.pdf").read_bytes().startswith(b"%PDF")
+    assert b"/Type3" not in Path("push.pdf").read_bytes()
     assert Path("runs/figure-eight-1/report.html").stat().st_size > 10_000
     late = json.loads(Path("later/result.json").read_text())
     assert late["faults"] == ["mocap.slow@0.5:3=0.02", "mocap.slow@2:1=0.05"]
@@ -81,7 +88,11 @@ def test_what_a_run_shows_names_the_failed_limit_and_the_folder() -> None:
     run = fly(replace(EXPERIMENTS["hover"], limits={"rms_x": 1e-9, "lost": 0.0}), duration_s=SHORT)
     assert "rms_x = " in repr(run)
     assert "(limit <= 1e-07 cm); runs/hover-1>" in repr(run)
-    assert "<b>fails</b>" in run._repr_html_()
+    shown = run._repr_html_()
+    assert "<b>failed</b>: hover, seed 1: completed, " in shown
+    assert re.search(r"<td>rms_x</td><td>[\d.]+ cm</td><td>&lt;= 1e-07 cm</td><td>FAILS</td>", shown)
+    assert "<td>max_x</td>" in shown, "a metric without a limit"
+    assert "<p>runs/hover-1</p>" in shown
     assert "report.html" not in run._repr_html_()
     run.paths["result.json"].with_name("report.html").touch()
     assert 'href="runs/hover-1/report.html"' in run._repr_html_()
@@ -174,17 +185,51 @@ def test_the_notebook_flies_sweeps_and_plots() -> None:
     assert line.get_ydata() == pytest.approx(moved_cm)
 
 
+def test_names_and_values_are_short_in_a_notebook() -> None:
+    assert dir(hil) == sorted(hil.__all__)
+    kind = Kind("late", "s", 0.02, 0.0, 0.5, (knob(lambda robot: robot.mocap, "more_latency_us", max),))
+    request = Request.of(EXPERIMENTS["hover"], faults=["push.y@1=0.5"], duration_s=2.0)
+    assert repr(request) == "<Request hover, seed 1, duration 2.0 s, fault push.y@1=0.5>"
+    assert repr(request.experiment).startswith("<Experiment hover, ")
+    for value in (request.experiment, kind, hil.Goal((0.0, 0.0, 1.0), 0.0), hil.Metric("m", "max", "far")):
+        assert len(repr(value)) < 160
+        assert " at 0x" not in repr(value)
+
+
 def test_a_plot_has_one_axis_per_unit_and_refuses_what_the_log_lacks() -> None:
-    run = fly("hover", duration_s=0.5)
-    position, speed = run.plot("truth.y", "truth.vy", "goal.y").axes
+    run = fly("hover", duration_s=0.5, faults=["push.y@0.1=1"])
+    figure = run.plot("truth.y", "truth.vy", "goal.y", "estimator.pose_age_us", size=(4.0, 5.0))
+    position, speed, age = figure.axes
+    assert tuple(figure.get_size_inches()) == (4.0, 5.0)
     assert [line.get_label() for line in position.lines[:2]] == ["truth.y", "goal.y"]
     assert position.lines[0].get_ydata() == pytest.approx(run.log.column("truth.y").to_numpy())
-    assert speed.get_ylabel() == "[m/s]"
-    assert [axes.get_ylabel() for axes in run.plot().axes] == [
-        "position error [cm]", "attitude error [deg]", "flaps [deg]",
-    ]  # fmt: skip
+    labels = [axes.get_ylabel() for axes in (position, speed, age)]
+    assert labels == ["position [m]", "velocity [m/s]", "time [s]"]
+    assert {"held", "fault"} <= {text.get_text() for text in figure.legends[0].get_texts()}
+    (customary,) = run.plot("truth.y", units="customary").axes
+    assert customary.lines[0].get_ydata() == pytest.approx(100 * position.lines[0].get_ydata())
+    for units, names in (("customary", ("cm", "deg", "deg")), ("SI", ("m", "rad", "rad"))):
+        shown = [axes.get_ylabel() for axes in run.plot(units=units).axes]
+        parts = ("position error", "attitude error", "flaps")
+        assert shown == [f"{part} [{unit}]" for part, unit in zip(parts, names, strict=True)]
+    with matplotlib.rc_context({"lines.linewidth": 3.0, "figure.figsize": (2.0, 3.0), "axes.grid": False}):
+        thick = run.plot("truth.y")
+    assert thick.axes[0].lines[0].get_linewidth() == 3.0
+    assert tuple(thick.get_size_inches()) == (2.0, 3.0)
     with pytest.raises(LabError, match=r"column 'truth\.yy': the log has none"):
         run.plot("truth.yy")
+
+
+def test_angles_are_columns_although_the_log_has_quaternions() -> None:
+    run = fly("hover", duration_s=0.5, faults=["push.y@0.1=3"])
+    w, x, y, z = (run.log.column(f"truth.q{name}").to_numpy() for name in "wxyz")
+    expected = Rotation.from_quat(np.stack((x, y, z, w), axis=1)).as_euler("ZYX")[:, ::-1]
+    angles = [run.log.column(f"truth.{name}").to_numpy() for name in ("roll", "pitch", "yaw")]
+    assert np.abs(expected).max() > 0.05
+    assert np.stack(angles, axis=1) == pytest.approx(expected, abs=1e-9)
+    assert run.units["truth.roll"] == "rad"
+    assert "truth.roll" not in load_log(run.folder).column_names
+    assert run.plot("truth.roll").axes[0].get_ylabel() == "angle [rad]"
 
 
 def test_a_former_module_names_its_place() -> None:

@@ -54,7 +54,7 @@ TABLE = pa.table({"t": [0, 1], **{name: [0.0, 0.0] for name in ("goal.x", "truth
 def flights() -> Flights:
     """Return the pytest fixture for a test here."""
     found = Flights(Path(), Path("runs"))
-    found.begin("test", choice())
+    found.begin("test", Path("test.py"), choice())
     return found
 
 
@@ -78,6 +78,7 @@ CALLS = (
     Call(request_of, {"experiment": "hover", **OPTIONS}),
     Call(Flights.fly, {"experiment": "hover", **OPTIONS}),
     Call(Flights.board, {"link": "radio", "profile": "floaty", "overrides": ()}),
+    Call(Flights.baseline, {"name": "mine", "rel": 0.1, "metrics": ["rms_y"]}),
     Call(Request.of, {"experiment": HOVER, **{k: v for k, v in OPTIONS.items() if k not in ("trajectory", "faults")},
                       "faults": [fault("push.y@0")], "elf": None}),
     Call(load_run, {"folder": "nowhere"}),
@@ -111,7 +112,7 @@ def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 def called(call: Call, arguments: dict[str, Any]) -> object:
     """Call a public function; a method of the fixture with the fixture."""
-    is_method = call.function in (Flights.fly, Flights.board)
+    is_method = call.function in (Flights.fly, Flights.board, Flights.baseline)
     return call.function(*([flights()] if is_method else []), **arguments)
 
 
@@ -183,7 +184,7 @@ def test_any_other_call_returns_or_is_refused(data: st.DataObject) -> None:
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @example(positional=[], call=CALLS[0])
 def test_any_positional_call_returns_or_is_refused(positional: list[object], call: Call) -> None:
-    if call.function in (Flights.fly, Flights.board):
+    if call.function in (Flights.fly, Flights.board, Flights.baseline):
         positional = [flights(), *(positional or [None])]
     if call.function is fly:
         positional = positional[:1]

@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from hil.commands.app import app
+from hil.commands.listing import pages_of
 from hil.config import LabConfig, profile_names
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import KINDS
@@ -47,6 +48,7 @@ NOT_RUN = (
     (r"floaty fly hover --profile tuned\.toml", DEAR),
 )  # fmt: skip
 
+TOPICS = pages_of(ROOT / "docs")
 PLACEHOLDER = re.compile(r"[A-Z][A-Z_]*\d?(\.\w+)?|.*…")
 
 
@@ -123,8 +125,8 @@ def _lacks_its_value(words: list[str], error: click.UsageError) -> bool:
 
 def _wrong(command: str, shown: Mapping[str, list[str]]) -> Iterator[str]:
     """Yield what is no experiment, study, profile, kind of fault or key."""
-    known = {"fly": EXPERIMENTS, "study": STUDIES, "check": EXPERIMENTS}.get(command)
-    for name in [*shown.get("experiment", []), *shown.get("name", [])]:
+    known = {"docs": TOPICS, "fly": EXPERIMENTS, "study": STUDIES, "check": EXPERIMENTS}.get(command)
+    for name in [*shown.get("experiment", []), *shown.get("name", []), *shown.get("topic", [])]:
         if known is not None and name not in known and ".py:" not in name and not PLACEHOLDER.fullmatch(name):
             yield f"unknown: {name}"
     for profile in shown.get("--profile", []):

@@ -50,7 +50,8 @@ def test_sdist_and_wheel_are_complete_and_the_wheel_flies_from_an_empty_folder(t
         assert archive.read(COMMIT).decode().strip() == commit()
         [licence] = [member for member in archive.namelist() if member.endswith("/LICENSE")]
         assert archive.read(licence) == (ROOT / "LICENSE").read_bytes()
-    assert packed == tracked(*PACKAGES) | {f"hil/{path}" for path in tracked("profiles")} | {COMMIT}
+    beside = tracked("profiles", "docs/tutorials", "docs/howto", "docs/explanation", "docs/reference")
+    assert packed == tracked(*PACKAGES) | {f"hil/{path}" for path in beside} | {COMMIT}
 
     programs, packages = install(wheel, tmp_path)
     (packages / "rerun.py").write_text("raise ImportError('no rerun')")
@@ -61,6 +62,7 @@ def test_sdist_and_wheel_are_complete_and_the_wheel_flies_from_an_empty_folder(t
     flies = "C" if any(map(shutil.which, ("gcc", "clang", "cc"))) else "plain Python"
     assert first == f"floaty, version {VERSION}, {flies}"
     assert ["commit", commit()] in [line.split() for line in others]
+    assert run(empty, floaty, "docs", "tests").stdout == (ROOT / "docs/howto/tests.md").read_text("utf-8")
     run(empty, floaty, "fly", "hover", "--duration", "2")
     flown = read_result(empty / "runs" / "hover-1")
     assert (flown.passed, flown.program.commit) == (True, commit())

@@ -30,7 +30,7 @@ from pydantic import ValidationError
 from ground_station.records import Records
 from hil.config import LabConfig
 from hil.errors import LabError, refusing
-from hil.laboratory.ages import at_exposure
+from hil.laboratory.files.ages import at_exposure
 from hil.laboratory.files.whole_files import replacing
 from hil.world.body import Channel, Quantity
 

@@ -22,13 +22,13 @@ from ground_station.latency import Stage
 from hil.board.board_firmware import ImageReport
 from hil.config import LabConfig
 from hil.errors import LabError, reading, refusing
-from hil.laboratory.ages import ages_of, reported_ages
 from hil.laboratory.bodies import digest_of_body
 from hil.laboratory.experiment import unknown
+from hil.laboratory.files.ages import ages_of, reported_ages
 from hil.laboratory.files.installation import commit, versions
 from hil.laboratory.files.recorder import load_log, stored_in
 from hil.laboratory.files.whole_files import write_whole
-from hil.laboratory.metrics import Figure, Metric, Verdict, judge, measure
+from hil.laboratory.metrics import METRICS, Figure, Metric, Verdict, judge, measure, short_of
 from hil.laboratory.request import Find, Request, StoredRequest
 from hil.world.scene import VisualModel
 
@@ -104,6 +104,23 @@ class Result:
         return self.outcome in ("completed", "reset", "lost") and all(
             verdict.holds for verdict in self.verdicts
         )
+
+    @property
+    def rows(self) -> tuple[tuple[str, str, str, str], ...]:
+        """Every metric that the flight has, and every one with a limit: name, value, limit and verdict as text."""
+        verdicts, found = {verdict.metric: verdict for verdict in self.verdicts}, []
+        for name, value in self.metrics.items():
+            verdict, metric = verdicts.get(name), self.own_metrics.get(name) or METRICS[name]
+            if verdict is None and math.isnan(value):
+                continue
+            over = short_of(metric, value, self.metrics["flown"], self.request.duration_s)
+            bound = (
+                ""
+                if verdict is None
+                else f"{'<=' if metric.bound == 'max' else '>='} {metric.show(verdict.bound)}"
+            )
+            found.append((name, metric.show(value) + over, bound, "" if verdict is None else verdict.mark))
+        return tuple(found)
 
     @property
     def failed(self) -> tuple[Verdict, ...]:

@@ -14,7 +14,7 @@ import rerun as rr
 from rerun_bindings import CatalogClientInternal
 
 from hil.errors import LabError, unlinked
-from hil.laboratory.ages import ages_in_time_of
+from hil.laboratory.files.ages import ages_in_time_of
 from hil.laboratory.files.recorder import OPERATOR, load_events, log_pieces, stored_in
 from hil.laboratory.schedule import load_schedule
 from hil.pictures.links import HOST

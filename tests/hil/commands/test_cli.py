@@ -13,11 +13,13 @@ from importlib.metadata import packages_distributions
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import click
 import pytest
 
 import hil
 from firmware_py.extras import EXTRAS, install_command, why_missing
-from hil import fly
+from hil import fly, load_run
+from hil.commands.app import COMMANDS, GROUPS
 from hil.errors import LabError
 from hil.laboratory.files.recorder import load_log
 from hil.live.window import DISPLAYS
@@ -45,6 +47,20 @@ def test_fly_writes_everything_and_prints_where(cli: Cli, tmp_path: Path) -> Non
     assert "runs/hover-5/report.html" in shown
     assert re.search(r"completed; \d+ times real time; \d+\.\d s from start to end; hash \w{16}\n", shown)
     assert json.loads((folder / "result.json").read_text())["passed"] is True
+
+
+def test_a_flight_that_leaves_its_baseline_is_compared_with_it(cli: Cli) -> None:
+    fly_it = ("fly", "hover", "--duration", "0.4")
+    fly("hover", "before", duration_s=0.4)
+    assert cli(*fly_it, "--baseline", "before", "--out", "same") == 0
+    assert cli.out.endswith("within 10 % of before\n")
+    assert cli(*fly_it, "--baseline", "before", "--out", "pushed", "--fault", "push.y@0.1=0.3") == 1
+    assert load_run("pushed").passed
+    assert re.search(
+        r"rms_y .* cm .*first difference: row .*left before by more than 10 %: rms_y", cli.out, re.DOTALL
+    )
+    for wrong in (("--baseline", "nowhere"), ("--baseline", "before", "--seeds", "2")):
+        assert wrong[1] in cli.refusal(*fly_it, *wrong)
 
 
 UDP = ("--link", "udp://127.0.0.1:1")
@@ -86,17 +102,46 @@ UDP = ("--link", "udp://127.0.0.1:1")
         (["serve", "--baud", "9600"], "--baud: now --set serial.baud=N"),
         (["deploy", "export", "app"], "deploy export: now floaty deploy write DIR"),
         (["fly", "hover", "--out", "runs/\udcff"], "b'runs/\\xff': expected a name in UTF-8"),
-        (["fly"], "Missing argument"),
+        (["fly"], "Missing argument 'EXPERIMENT': `floaty list` names them"),
+        (["study"], "`floaty list` names them"),
         (["report", "nowhere"], "nowhere"),
         (["report", "\x1b]0;x\x07"], r"\x1b]0;x\x07"),
         (["view", "nowhere"], "nowhere"),
         (["view", __file__], "expected a run folder"),
-        (["flyy"], "No such command"),
+        (["flyy"], "flyy: no such command; did you mean fly?"),
+        (["zzzzzz"], "zzzzzz: no such command; see floaty --help"),
         (["study", "latensy"], "study 'latensy': unknown; did you mean latency?"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: list[str], message: str) -> None:
     assert message in cli.refusal(*arguments)
+
+
+def test_pages_are_found_by_topic_and_by_words(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert cli("docs") == 0
+    assert re.search(r"^tests +Your own tests$", cli.out, re.MULTILINE)
+    assert cli("docs", "howto/tests.md") == 0
+    page = cli.out
+    assert page == (ROOT / "docs/howto/tests.md").read_text("utf-8")
+    assert cli("docs", "own", "logic") == 0
+    assert cli.out.startswith("# Your own logic\n")
+    assert cli("docs", "Hypothesis", "shrink") == 0
+    assert re.match(r"tests  Your own tests\n    .*\n    .* Sizes shrink ", cli.out)
+    assert cli("docs", "air-time") == 0, "hyphens are spaces"
+    assert "did you mean tests?" in cli.refusal("docs", "tesst")
+    launched: list[str] = []
+    monkeypatch.setattr(click, "launch", lambda path: launched.append(path) or len(launched) - 1)
+    assert (cli("docs", "tests", "--open"), cli.out) == (0, "")
+    assert "no program opens it here" in cli.refusal("docs", "tests", "--open")
+
+
+def test_the_help_lists_daily_commands_before_rare_ones(cli: Cli) -> None:
+    assert cli("--help") == 0
+    headings = [line for line in cli.out.splitlines() if re.fullmatch(r"\w.*:", line)]
+    assert headings == ["Options:", *(f"{heading}:" for heading in GROUPS)], "every command is in a group"
+    listed = re.findall(r"^  ([\w-]+)  ", cli.out.partition("Every day:")[2], re.MULTILINE)
+    assert sorted(listed) == sorted(COMMANDS)
+    assert listed[0] == "fly"
 
 
 def test_list_names_experiments_and_profiles(cli: Cli) -> None:

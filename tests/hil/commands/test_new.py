@@ -1,5 +1,6 @@
 """`floaty new`: what it makes flies and tests at once, in the clone and where the package is installed as a wheel."""
 
+import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -19,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
 
 ROOT = Path(hil.__file__).parent.parent
 FILES = [
-    ".gitignore", "README.md", "controller.py", "experiments.py", "profile.toml", "pyproject.toml",
+    ".gitignore", "README.md", "conftest.py", "controller.py", "experiments.py", "profile.toml", "pyproject.toml",
     "tests/test_flight.py",
 ]  # fmt: skip
 
@@ -38,6 +39,17 @@ def test_a_project_has_everything_that_a_flight_and_a_test_need(cli: Cli) -> Non
     assert about["dependencies"] == [], "a requirement by a name that anybody may register"
     assert all("{{" not in (project / name).read_text(encoding="utf-8") for name in FILES)
     assert find_experiment(f"{project}/experiments.py:figure_eight").duration_s == 12.0
+
+
+def test_pytest_without_the_laboratory_is_one_line(cli: Cli) -> None:
+    assert cli("new", "law") == 0
+    code = "import sys; sys.modules['firmware_py'] = None; import pytest; sys.exit(pytest.main(['-p', 'no:floaty']))"
+    ran = subprocess.run([sys.executable, "-c", code], cwd="law", capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stdout) == (pytest.ExitCode.USAGE_ERROR, "")
+    assert ran.stderr.strip().startswith(
+        f"ERROR: {sys.executable} has no laboratory (floaty-hil): run the pytest of"
+    )
+    assert ran.stderr.strip().count("\n") == 0
 
 
 def test_an_empty_folder_becomes_a_project(cli: Cli) -> None:

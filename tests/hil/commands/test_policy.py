@@ -21,7 +21,7 @@ from support.policies import network, write_onnx
 pytest.importorskip("onnx")
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
-FILES = ["README.md", "controller.py", "profile.toml", "tests/test_policy.py"]
+FILES = ["README.md", "conftest.py", "controller.py", "profile.toml", "tests/test_policy.py"]
 
 
 def files_in(folder: Path) -> list[str]:

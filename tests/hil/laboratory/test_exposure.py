@@ -5,7 +5,7 @@ import pyarrow as pa
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hil.laboratory.ages import at_exposure
+from hil.laboratory.files.ages import at_exposure
 
 NAMES = ("x", "y", "z", "vx", "vy", "vz", "p", "q", "r")
 PERIOD_US, FRAME_US, AGE_US = 10_000, 5_000, 38_000

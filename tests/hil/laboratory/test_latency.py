@@ -23,8 +23,8 @@ from ground_station.latency import (
 )
 from ground_station.mocap import MocapFrame
 from ground_station.telemetry_log import AGE_COLUMNS, TELEMETRY, TIME_COLUMN
-from hil.laboratory.ages import STATION_CLOCK, ages_in_time_of, ages_of, reported_ages, with_goals_sent
 from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.files.ages import STATION_CLOCK, ages_in_time_of, ages_of, reported_ages, with_goals_sent
 from hil.laboratory.files.recorder import load_log
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import MAVLINK, RADIO, Request

@@ -9,6 +9,7 @@ import pytest
 
 from hil.board.imu import COS, SIN
 from hil.config import load_config
+from hil.laboratory.request import Options
 from hil.testing.board import BareBoard
 from hil.testing.choices import name_of
 from hil.testing.flights import NAME_MAX, SHOWN, Item, folder_of, shown_of
@@ -22,12 +23,14 @@ def test_a_name_tells_only_what_differs_between_the_choices() -> None:
     boards = [choice(1, "c"), choice(1, "python")]
     assert [name_of(one, boards) for one in boards] == ["c", "python"]
     assert name_of(choice(), [choice()]) == ""
+    faulty: list[Options] = [{**choice(), "faults": ("push.y@1=1", "push.x@2=1")}, {**choice(), "faults": ()}]
+    assert [name_of(one, faulty) for one in faulty] == ["push.y@1=1+push.x@2=1", "no-fault"]
 
 
 @pytest.mark.parametrize("count", [1, SHOWN, SHOWN + 1])
 def test_of_a_few_flights_all_are_shown_and_of_more_the_last(count: int) -> None:
     flown: Any = [SimpleNamespace(number=number) for number in range(count)]
-    shown = [one.number for one in shown_of(Item("x", Path(), choice(), flown))]
+    shown = [one.number for one in shown_of(Item("x", Path(), Path(), choice(), flown))]
     assert shown == (list(range(count)) if count <= SHOWN else [count - 1])
 
 

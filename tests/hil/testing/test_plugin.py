@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
@@ -9,6 +10,8 @@ from xml.etree import ElementTree
 import pytest
 
 import hil
+import hil.pictures.report  # here, because pytester forgets what a session loads first
+import hil.testing
 from firmware_py.export.errors import ExportError
 from hil.api import load_run
 from hil.errors import LabError
@@ -109,7 +112,11 @@ def test_a_failure_shows_limit_value_folder_picture_and_the_command_that_flies_i
     assert Path(picture).read_bytes().startswith(b"\x89PNG")
     run = load_run(folder)
     assert float(value[1]) == pytest.approx(100 * run.metrics["rms_x"], rel=1e-3)
-    monkeypatch.chdir(strict.mkdir("elsewhere"))
+    assert (
+        "--profile strict.toml" in again,
+        str(strict.path) in shown.partition("short test summary")[0],
+    ) == (True, False)
+    monkeypatch.chdir(strict.path)
     assert cli(*again.split(), "--out", "again") == 1
     assert load_run("again").hash == run.hash
 
@@ -149,6 +156,46 @@ def test_hypothesis_shrinks_a_failing_flight_without_a_word_about_fixtures(pytes
     assert re.findall(r"again +floaty fly hover .*--fault (\S+)", shown) == ["push.y@0=2.4"]
 
 
+# Baselines
+
+PINNED = """
+def test_it(floaty):
+    floaty.fly(duration_s=0.4, faults=["push.y@0.15=SIZE"])
+    floaty.baseline("push"METRICS)
+"""
+
+
+def test_a_baseline_is_made_kept_and_left(pytester: pytest.Pytester) -> None:
+    test = pytester.path / "tests" / "test_push.py"
+    test.parent.mkdir()
+
+    def ran(size: float, *options: str, metrics: str = "") -> str:
+        test.write_text(PINNED.replace("SIZE", str(size)).replace("METRICS", metrics))
+        return pytester.runpytest_inprocess(*options).stdout.str()
+
+    again = "pytest --floaty-update tests/test_push.py::test_it"
+    missing = f"test_push.py:4: baseline tests/baselines/push.json: there is none; `{again}` writes it"
+    assert missing in ran(0.5)
+    assert "floaty: wrote tests/baselines/push.json" in ran(0.5, "--floaty-update")
+    assert "1 passed" in ran(0.5)
+    assert "1 passed" in ran(0.5, "--floaty-board=python"), "boards share a baseline"
+    assert "push-seed2.json: there is none" in ran(0.5, "--floaty-seeds=2")
+    shown = ran(2.0)
+    line = re.search(r"max_y +([\d.]+) +([\d.]+) +([\d.]+)  cm", shown)
+    assert line is not None
+    before, now, difference = map(float, line.groups())
+    assert now - before == pytest.approx(difference, rel=0.01)
+    assert re.search(
+        r"metrics are equal\.\nE +first difference: row at 0\.20 s from the release, truth\.", shown
+    )
+    assert f"accept the new flights: {again}" in shown
+    assert "arguments.py" not in shown
+    assert "1 passed" in ran(2.0, metrics=", metrics=['age_mean']")
+    assert "1 passed" in ran(2.0, metrics=", rel=1000.0")
+    (pytester.path / "tests/baselines/push.json").write_text("{}")
+    assert "push.json: not a baseline: " in ran(0.5)
+
+
 # What is kept
 
 
@@ -165,7 +212,7 @@ def test_run_folders_are_kept_as_asked(pytester: pytest.Pytester, keep: str, num
     result = pytester.runpytest_inprocess(f"--floaty-keep={keep}")
     result.assert_outcomes(passed=1, failed=1)
     assert re.findall(r"test_(\d)-\w+/1", " ".join(kept(pytester))) == numbers
-    assert ("folder  " in result.stdout.str()) == (keep != "none")
+    assert ("runs/pytest" in result.stdout.str()) == (keep != "none")
     assert (pytester.path / "runs" / "pytest").is_dir() == bool(numbers)
 
 
@@ -234,6 +281,16 @@ def test_flights_take_what_the_mark_says_and_options_go_before_it(pytester: pyte
         ({"seeds": [5, 3]}, Wanted(), [choice(5), choice(3)]),
         ({"seeds": 20, "boards": ["c"]}, Wanted(1, ("c", "python")), [choice(1), choice(1, "python")]),
         ({"needs": "cortex-m4"}, Wanted(), [choice(1, "cortex-m4")]),
+        ({"links": ["radio", "mavlink"]}, Wanted(), [choice(), choice(link="mavlink")]),
+        ({"links": ["mavlink"]}, Wanted(link="radio"), [choice()]),
+        (
+            {"faults": ["push.y@1", ["push.x@1=2", "mocap.dropout@2"], []]},
+            Wanted(),
+            [
+                {**choice(), "faults": faults}
+                for faults in (("push.y@1=2",), ("push.x@1=2", "mocap.dropout@2=1"), ())
+            ],
+        ),
         ({"needs": ["lockstep"]}, Wanted(link="udp://x:1"), [choice(link="udp://x:1")]),
         ({}, Wanted(usual_profile="as-flown"), [choice(profile="as-flown")]),
         ({"profiles": ["floaty"]}, Wanted(usual_profile="as-flown"), [choice()]),
@@ -311,11 +368,35 @@ def test_a_package_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -
     assert why_not(choice(), ("mavlink",)) == "needs mavlink: pymavlink_is_not_here is not installed"
 
 
+def test_a_package_that_a_test_file_needs_is_one_line(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    monkeypatch.setattr(hil.testing, "find_spec", lambda name: None)
+    pytester.makepyfile(
+        test_learn="import hil.research.learn",
+        test_any="from hil.testing import faults",
+        test_late="def test_it(floaty):\n    import gymnasium",
+    )
+    result = pytester.runpytest_inprocess("--continue-on-collection-errors")
+    result.assert_outcomes(failed=1, errors=2)
+    shown = result.stdout.str()
+    for place, package in (
+        ("learn.py", ".*gymnasium"),
+        ("any.py", ".*hypothesis"),
+        ("late.py:2", "gymnasium"),
+    ):
+        assert re.search(rf"^test_{place}: {package} is missing: .* -m pip install ", shown, re.MULTILINE)
+    assert "Traceback" not in shown
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
         ({"sedes": 2}, "sedes: did you mean seeds?"),
-        ({"colour": 2}, "colour: there are seeds, boards, profiles, needs"),
+        ({"colour": 2}, "colour: there are seeds, boards, profiles, links, faults, needs"),
+        ({"links": ["udp://x:1"]}, "links = 'udp://x:1': expected radio, mavlink"),
+        ({"faults": ["psh.y@1"]}, "fault 'psh.y@1': unknown kind 'psh.y'; did you mean push.y?"),
         ({"seeds": 0}, "seeds = 0: expected 1 or more"),
         ({"boards": ["arm"]}, "boards = 'arm': expected c, python, cortex-m4"),
         ({"needs": "wings"}, "needs = 'wings': expected c, python, cortex-m4, mavlink, radio, lockstep"),
@@ -365,9 +446,10 @@ def test_the_junit_file_has_hash_command_and_metrics(pytester: pytest.Pytester) 
     flown = json.loads((pytester.path / "runs" / "pytest" / folder / "result.json").read_text())
     assert properties["floaty.hash"] == flown["hash"]
     assert properties["floaty.again"] == "floaty fly hover --seed 1 --duration 0.3"
-    value, unit = properties["floaty.rms_x"].split()
-    assert (float(value), unit) == (pytest.approx(flown["metrics"]["rms_x"]), "m")
-    assert "floaty.settle" not in properties
+    assert float(properties["floaty.rms_x [m]"]) == pytest.approx(flown["metrics"]["rms_x"])
+    assert float(properties["floaty.lost"]) == 0.0
+    assert not any(name.startswith("floaty.settle") for name in properties)
+    assert properties["floaty.folder"] == f"runs/pytest/{folder}"
 
 
 @pytest.mark.long
@@ -407,4 +489,5 @@ def test_the_examples_of_the_page_work(
         else:
             exec(compile(text, PAGE, "exec"), names)
     assert 3.0 < names["smallest"].size < 6.0  # type: ignore[attr-defined]
-    pytester.runpytest_inprocess("tests").assert_outcomes(passed=13)
+    pytester.runpytest_inprocess("tests", "--floaty-update").assert_outcomes(passed=20)
+    pytester.runpytest_inprocess("tests/test_pinned.py").assert_outcomes(passed=1)
