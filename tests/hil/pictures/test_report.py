@@ -19,8 +19,8 @@ from firmware_py.wire.supervisor import State
 from ground_station.latency import STAGES
 from ground_station.telemetry_log import TELEMETRY
 from hil.config import load_config
-from hil.laboratory import ages
 from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.files import ages
 from hil.laboratory.files.recorder import load_log
 from hil.laboratory.files.result import read_result, write_result
 from hil.laboratory.metrics import ALWAYS, METRICS, judge
