@@ -27,6 +27,7 @@ COMMANDS = {
     "fly": "fly.fly",
     "new": "new.new",
     "policy": "new.policy",
+    "check": "new.check",
     "list": "listing.list_experiments",
     "runs": "listing.runs",
     "view": "pictures.view",
