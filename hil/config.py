@@ -17,13 +17,14 @@ from pydantic_core import ErrorDetails
 
 from firmware_py.config import FirmwareConfig, LogicConfig
 from firmware_py.errors import FirmwareError
+from firmware_py.export.errors import ExportError
 from firmware_py.logic.laws import SHIPPED_LAWS
 from firmware_py.logic.loading import load_logic
 from firmware_py.section import Section, number
 from ground_station.config import CaptureConfig, GroundConfig, PilotConfig, StationConfig, TrackerConfig
 from hil.board.config import ImuConfig, MarkersConfig, MocapConfig, SerialConfig
 from hil.emulator.crazyflie.config import RadioConfig
-from hil.errors import LabError, hint, shown
+from hil.errors import LabError, RefusedFileError, hint, shown
 from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 from hil.world.floaty.geometry import check
 from hil.world.floaty.shape import check_hover
@@ -174,9 +175,11 @@ def load_config(profile: str = DEFAULT_PROFILE, overrides: Iterable[str] = ()) -
 
 
 def check_logic(config: LabConfig) -> None:
-    """Execute the modules of `[logic]`. Raises `LabError` for one that cannot fly."""
+    """Execute the modules of `[logic]`. Raises `LabError` for those that cannot fly, a line for each refusal."""
     try:
         load_logic(config.logic)
+    except ExportError as error:
+        raise RefusedFileError(str(error)) from None
     except FirmwareError as error:
         raise LabError(str(error)) from None
 

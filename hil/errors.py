@@ -17,6 +17,20 @@ PYTHON = Path(traceback.__file__).parent
 class LabError(Exception):
     """A user's request is invalid; the text has the key, the value, and what is allowed."""
 
+    @property
+    def lines(self) -> list[str]:
+        """The text as the command line shows it: one line."""
+        return [" ".join(str(self).split())]
+
+
+class RefusedFileError(LabError):
+    """A file of the user is refused at several places: a line of the text for each."""
+
+    @property
+    def lines(self) -> list[str]:
+        """The text, line by line."""
+        return str(self).splitlines()
+
 
 class OutputError(OSError):
     """The standard output cannot be written, unlike the file that a command writes meanwhile."""

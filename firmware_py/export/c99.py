@@ -11,7 +11,7 @@ import ast
 import dataclasses
 import hashlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
@@ -86,6 +86,20 @@ def translate(texts: Mapping[str, str] | None = None, own: Mapping[str, str] = N
     header = _header(modules, [printers[kernel.c_name] for kernel in public], version)
     entries = {one.c_name.removeprefix(CORE): (len(one.arguments), one.result != VOID) for one in public}
     return Translation(header, _source(modules, printed, used), version, entries)
+
+
+def check(modules: list[Module], hooks: Iterable[str]) -> None:
+    """Print the kernels that the hooks of the user's module, the last one, reach: its `refusals` have all that cannot."""
+    for module in modules:
+        for kernel in module.defined:
+            if isinstance(kernel, Signature):
+                find_writes(kernel)
+    kernels = [thing for thing in modules[-1].defined if isinstance(thing, Signature)]
+    roots = [kernel for kernel in kernels if kernel.node.name in hooks]
+    reached = {kernel.c_name for kernel in roots}.union(*(kernel.calls for kernel in roots))
+    for kernel in reversed(kernels):  # callers first: they show the shapes of array arguments
+        if kernel.c_name in reached:
+            FunctionPrinter(kernel).check()
 
 
 def _rename_equal_constants(modules: list[Module]) -> None:

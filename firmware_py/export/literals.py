@@ -32,9 +32,13 @@ def array_literal(path: str, node: ast.Call, name: str, rows: Sequence[ast.expr]
     lines = [row.elts if isinstance(row, ast.Tuple) and matrix else [row] for row in rows]
     for line, row in zip(lines, rows, strict=True):
         if len(line) != len(lines[0]):
-            raise refusal(path, row, f"{name}: a row of {len(line)} numbers; the first has {len(lines[0])}")
+            raise refusal(
+                path,
+                row,
+                f"{name}: a row of {len(line)} numbers; the first has {len(lines[0])}: write as many",
+            )
     if not lines or not lines[0]:
-        raise refusal(path, node, f"{name}: an array without numbers")
+        raise refusal(path, node, f"{name}: an array without numbers: write constant(0.5, 1.0)")
     texts = [[_float_element(path, name, element) for element in line] for line in lines]
     if not matrix:
         return ValueType("f32", 1, (len(lines),)), f"{{{', '.join(line[0] for line in texts)}}}"
@@ -47,7 +51,7 @@ def _float_element(path: str, name: str, node: ast.expr) -> str:
     value = _float(number)
     if value is None:
         what = "is no number" if number is None else "is no finite float32"
-        raise refusal(path, node, f"{name}: {ast.unparse(node)} {what}")
+        raise refusal(path, node, f"{name}: {ast.unparse(node)} {what}: write one there")
     return float_literal(value)
 
 

@@ -219,8 +219,6 @@ class LivePrinter(FunctionPrinter):
                 self._write(node, depth, f"while ({test.text}) {{")
                 self._block(node.body, depth + 1)
                 self._lines.append(f"{'    ' * depth}}}")
-            case ast.Break():
-                self._write(node, depth, "break;")
             case _:
                 super()._statement(node, depth)
 

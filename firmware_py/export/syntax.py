@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Union
 
 from firmware_py.core.subset import Logged, Settable, Tunable
+from firmware_py.export.errors import Refusals
 
 PACKAGE = "firmware_py.core"
 SUBSET = f"{PACKAGE}.subset"
@@ -37,6 +38,7 @@ class ValueType:
 
 
 F32, I32, BOOL, VOID = ValueType("f32"), ValueType("i32"), ValueType("bool"), ValueType("void")
+BROKEN = ValueType("?")  # of what was refused where it is defined
 F64, I64 = ValueType("f64"), ValueType("i64")  # of the laboratory alone: see `live_reading.py`
 SCALARS = {"f32": F32, "i32": I32, "Integer": I32, "bool": BOOL}
 ARRAYS = {"F32s": "f32", "I32s": "i32"}
@@ -80,6 +82,8 @@ class StructType:
     name: str
     doc: str
     fields: Mapping[str, StructField]
+    shown: str = ""  # its name in the text
+    broken: frozenset[str] = frozenset()  # fields that were refused
 
 
 @dataclass(slots=True)
@@ -95,6 +99,7 @@ class Signature:
     scope: "Module"
     writes: set[str] = field(default_factory=set)  # arguments and array names through which it writes
     calls: set[str] = field(default_factory=set)  # C names
+    lost: set[str] = field(default_factory=set)  # names whose definition in the body was refused
 
 
 Named = Constant | StructType | Signature
@@ -111,6 +116,8 @@ class Module:
     names: dict[str, "Named | Module"] = field(default_factory=dict)
     builtins: set[str] = field(default_factory=set)  # names imported from the subset
     defined: list[Named] = field(default_factory=list)  # here, in order
+    broken: set[str] = field(default_factory=set)  # names whose definition was refused
+    refusals: Refusals = field(default_factory=Refusals)
     trailing: dict[int, str] = field(default_factory=dict)
     standing: dict[int, str] = field(default_factory=dict)  # comments on separate lines
 

@@ -21,7 +21,7 @@ SLOW, STEP, CALL = 14, 4, 4  # cycles
 CHARGE = 24  # cycles of the call before a loop
 ARGUMENT = "loop_budget"
 STRUCT = "LoopBudget"
-ALLOWED = f"a call has {CALL_CYCLES} ({CALL_CYCLES // CLOCK_MHZ // 1000} ms of a Cortex-M4)"
+ALLOWED = f"a call has {CALL_CYCLES} ({CALL_CYCLES // CLOCK_MHZ // 1000} ms of a Cortex-M4): write a part for each tick"
 Edit = tuple[tuple[int, int], tuple[int, int], str]  # begin, end, text there; (line, byte of the line)
 
 
@@ -46,7 +46,7 @@ class Budgeted:
 def budgeted(text: str, modules: Sequence[Module]) -> Budgeted:
     """Return the last of the modules, whose text this is, with charged loops.
 
-    Raises `ExportError` for a kernel that exceeds the budget in any case.
+    Its `refusals` have the kernels that exceed the budget in any case.
     """
     counted: dict[str, Counted] = {}
     kernels = [thing for module in modules for thing in module.defined if isinstance(thing, Signature)]
@@ -73,16 +73,20 @@ class _Counter:
     def count(self) -> Counted:
         """Return the cycles and edits."""
         found, node = self._found, self._found.kernel.node
-        found.cycles = self._block(node.body)
-        self._check(found.cycles, node, node.name)
+        found.cycles = self._checked(self._block(node.body), node, node.name)
         if found.charged:
             begin = (node.lineno, node.col_offset)
             found.edits.append((begin, begin, f"{ARGUMENT}: {STRUCT}{', ' if node.args.args else ''}"))
         return found
 
-    def _check(self, cycles: int, node: ast.AST, what: str) -> None:
+    def _checked(self, cycles: int, node: ast.AST, what: str) -> int:
+        """Return cycles that a call has; 0 after the refusal of others."""
         if self._own and cycles > CALL_CYCLES:
-            raise refusal(self._found.kernel.path, node, f"{what} takes at least {cycles} cycles: {ALLOWED}")
+            with self._found.kernel.scope.refusals.note():
+                reason = f"{what} takes at least {cycles} cycles: {ALLOWED}"
+                raise refusal(self._found.kernel.path, node, reason)
+            return 0
+        return cycles
 
     def _block(self, body: list[ast.stmt]) -> int:
         return sum(map(self._statement, body))
@@ -100,23 +104,22 @@ class _Counter:
         return self._cost(node)
 
     def _loop(self, node: ast.For, name: str, limits: list[ast.expr]) -> int:
-        start = limits[0] if len(limits) == 2 else None
-        reach = self._print.loop(start, limits[-1])
+        ranges = self._print.ranges
+        reach = ranges.loop(limits)
         if reach:
-            self._print.loops[name] = reach
+            ranges.known[name] = reach
         self._print.names[name] = I32
         step = self._block(node.body) + STEP
-        self._print.loops.pop(name, None)
+        ranges.known.pop(name, None)
         del self._print.names[name]
         header = sum(map(self._cost, limits))
         if reach:
-            cycles = (reach[1] - reach[0] + 1) * step
-            self._check(cycles, node, f"for {name} in {ast.unparse(node.iter)}")
-            return header + cycles
+            cycles = ((reach[1] - reach[0]) // abs(ranges.step(limits)) + 1) * step  # `break` may save some
+            return header + self._checked(cycles, node, f"for {name} in {ast.unparse(node.iter)}")
         if not self._own:
             return header + step  # its length is bounded by the core's own limits
         self._found.charged = True
-        begin, end = ast.unparse(start) if start else "0", ast.unparse(limits[-1])
+        begin, end = ast.unparse(limits[0]) if len(limits) == 2 else "0", ast.unparse(limits[-1])
         charged = f"range({begin}, charged_end({ARGUMENT}, {begin}, {end}, {step}, {node.lineno}))"
         self._found.edits.append((_begin(node.iter), _end(node.iter), charged))
         return header + CHARGE
@@ -126,11 +129,18 @@ class _Counter:
         cycles = 0
         for part in ast.walk(node):
             match part:
-                case ast.BinOp(op=ast.Div()):
+                case ast.BinOp(op=ast.Div()) | ast.AugAssign(op=ast.Div()):
                     cycles += SLOW
                 case ast.Call(func=ast.Name(id=name)):
                     cycles += self._call(part, name, alone and part is node)
-                case ast.BinOp() | ast.Compare() | ast.BoolOp() | ast.UnaryOp() | ast.Subscript():
+                case (
+                    ast.BinOp()
+                    | ast.AugAssign()
+                    | ast.Compare()
+                    | ast.BoolOp()
+                    | ast.UnaryOp()
+                    | ast.Subscript()
+                ):
                     cycles += 1
         return cycles
 
@@ -142,7 +152,8 @@ class _Counter:
         if callee.charged:
             if not alone:
                 reason = f"{name} has a loop whose length depends on data: write x = {name}(..) on a line of its own"
-                raise refusal(self._found.kernel.path, node, reason)
+                with self._found.kernel.scope.refusals.note():
+                    raise refusal(self._found.kernel.path, node, reason)
             self._found.charged = True
             begin = _end(node.func)
             self._found.edits.append((begin, begin, f"{ARGUMENT}{', ' if node.args else ''}"))

@@ -3,6 +3,7 @@
 import builtins
 import difflib
 import hashlib
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -15,13 +16,14 @@ from firmware_py.core.budget import CALL_CYCLES, LoopBudget
 from firmware_py.core.guard import Guard
 from firmware_py.core.subset import Block, Struct
 from firmware_py.errors import LogicError
-from firmware_py.export.c99 import Translation, core_texts, translate
+from firmware_py.export.c99 import Translation, check, core_texts, translate
+from firmware_py.export.errors import ExportError, RefusalError
 from firmware_py.export.reading import read_modules
 from firmware_py.export.syntax import ENTRY, OWN
 from firmware_py.logic.budget import ARGUMENT, budgeted
 from firmware_py.logic.entry import GUARD, compose
 from firmware_py.logic.laws import SHIPPED_LAWS
-from firmware_py.logic.plugs import GROUP, POINTS, Plug, read_plug
+from firmware_py.logic.plugs import GROUP, POINTS, Plug, PlugPoint, read_plug
 from firmware_py.table import CoreParameter, CoreVariable
 
 
@@ -97,6 +99,22 @@ def load_logic(config: LogicConfig) -> Logic | None:
     return Logic(loaded, _values(config.values, loaded.parameters))
 
 
+def check_file(file: Path) -> Loaded:
+    """Return a controller or an estimator that is ready to fly; its hooks show which of both it is.
+
+    Raises `LogicError` for a file that cannot be used, `ExportError` with a line for each refusal.
+    """
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise LogicError(f"{file}: {getattr(error, 'strerror', None) or error}") from None
+    functions = set(re.findall(r"^def (\w+)", text, re.MULTILINE))
+    if "@kernel" not in text:
+        raise LogicError(f"{file}:1: no control law and no estimator: write @kernel def control_law(..)")
+    point = max(POINTS, key=lambda point: len(functions & point.hooks.keys()))
+    return _load(((point.name, str(file), text),))
+
+
 def translation_of(config: LogicConfig) -> Translation:
     """Return the core as C, with the logic of a profile in it. Raises as `load_logic` does."""
     logic = load_logic(config)
@@ -130,11 +148,10 @@ def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
     """Load modules, each given as plug point, file and text."""
     texts = core_texts() | {f"own_{name}": text for name, _, text in modules}
     shown = {f"own_{name}": _shown(file) for name, file, _ in modules}
-    plugs = tuple(
-        read_plug(point, read_modules(texts, shown, f"own_{point.name}")[-1])
-        for point in POINTS
-        if f"own_{point.name}" in texts
-    )
+    lines: list[str] = []
+    plugs = tuple(_checked(point, texts, shown, lines) for point in POINTS if f"own_{point.name}" in texts)
+    if lines:
+        raise ExportError("\n".join(lines))
     _check_names(plugs, shown)
     digest = hashlib.sha256(repr([(name, text) for name, _, text in modules]).encode()).hexdigest()
     translation = translate(texts | {"entry": compose(plugs).text}, shown)
@@ -161,6 +178,23 @@ def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
             structs[plug.block(ARGUMENT)] = LoopBudget
     run = _run(ENTRY, entry.text, f"{ENTRY}.py", own)
     return Loaded(plugs, digest, entry.calls, run, translation, structs, files)
+
+
+def _checked(point: PlugPoint, texts: Mapping[str, str], shown: Mapping[str, str], lines: list[str]) -> Plug:
+    """Return what a module provides, and add its refusals to the lines."""
+    name = f"own_{point.name}"
+    empty = Plug(point, {}, {}, (), (), {})
+    try:
+        modules = read_modules(texts, shown, name)
+        plug = read_plug(point, modules[-1])
+        check(modules, plug.hooks)
+        if not modules[-1].refusals.found:
+            budgeted(texts[name], modules)
+    except RefusalError as error:  # no Python, or no part of the core
+        lines.append(str(error))
+        return empty
+    lines += modules[-1].refusals.lines()
+    return plug
 
 
 def _run(name: str, text: str, file: str, own: SimpleNamespace) -> ModuleType:

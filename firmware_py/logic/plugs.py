@@ -18,9 +18,9 @@ import numpy as np
 from firmware_py import table
 from firmware_py.core import entry
 from firmware_py.core.subset import Logged, Tunable
-from firmware_py.export.errors import ExportError
+from firmware_py.export.errors import RefusalError
 from firmware_py.export.locals import find_writes
-from firmware_py.export.syntax import I32, VOID, Module, Signature, StructType, ValueType
+from firmware_py.export.syntax import BROKEN, I32, VOID, Module, Signature, StructField, StructType, ValueType
 from firmware_py.table import SCALARS, CoreParameter, CoreVariable, Place
 from firmware_py.wire.toc import MAX_NAME
 
@@ -75,31 +75,45 @@ class Plug:
 
 
 def read_plug(point: PlugPoint, module: Module) -> Plug:
-    """Return what a module provides. Raises `ExportError` with file, line and what is expected."""
+    """Return what a module provides; its `refusals` have what does not fit, with file, line and what is expected."""
     hooks: dict[str, tuple[str, ...]] = {}
     structs: dict[str, StructType] = {}
     kernels = [thing for thing in module.defined if isinstance(thing, Signature)]
     for kernel in kernels:
         find_writes(kernel)
         if kernel.node.name in point.hooks:
-            _check_signature(point, kernel, structs)
+            with module.refusals.note():
+                _check_signature(point, kernel, structs)
             hooks[kernel.node.name] = tuple(kernel.arguments)
     for name in point.hooks:
         if name not in hooks and not (name == "reset_law" and MEMORY not in structs):
             there = ", ".join(kernel.node.name for kernel in kernels) or "none"
-            raise _refusal(module, 1, f"no function {name}; functions there: {there}")
-    parameters = tuple(_parameters(point, module, structs))
-    return Plug(point, hooks, structs, parameters, tuple(_variables(point, module, structs)), {})
+            with module.refusals.note():
+                if name not in module.broken:
+                    raise _refusal(
+                        module, 1, f"no function {name}; functions there: {there}: write def {name}"
+                    )
+    parameters: list[CoreParameter] = []
+    variables: list[CoreVariable] = []
+    for field in structs[OWN].fields.values() if OWN in structs else ():
+        with module.refusals.note():
+            parameters.append(_parameter(point, module, field))
+    for field in structs[MEMORY].fields.values() if MEMORY in structs else ():
+        with module.refusals.note():
+            variables += _variables(point, module, field)
+    return Plug(point, hooks, structs, tuple(parameters), tuple(variables), {})
 
 
-def _refusal(module: Module, line: int, reason: str) -> ExportError:
-    return ExportError(f"{module.path}:{line}: {reason}")
+def _refusal(module: Module, line: int, reason: str) -> RefusalError:
+    return RefusalError(module.path, line, reason)
 
 
 def _check_signature(point: PlugPoint, kernel: Signature, structs: dict[str, StructType]) -> None:
     """Check what a hook takes and writes, and note the module's own structs."""
     name, module, line = kernel.node.name, kernel.scope, kernel.node.lineno
-    for argument, kind in kernel.arguments.items():
+    for argument, kind in list(kernel.arguments.items()):
+        if kind == BROKEN:
+            continue
         fits = kind.base == CORE_STRUCTS.get(argument)
         if argument in (OWN, MEMORY) and any(kind.struct is thing for thing in module.defined):
             assert kind.struct is not None
@@ -107,57 +121,62 @@ def _check_signature(point: PlugPoint, kernel: Signature, structs: dict[str, Str
         if not fits:
             known = ", ".join(f"{key}: {value}" for key, value in CORE_STRUCTS.items())
             text = f"{name}: argument {argument}: expected any of {known}, own and memory, one struct of this file each"
-            raise _refusal(module, line, text)
-        if argument in kernel.writes and argument not in point.writes:
-            raise _refusal(
-                module, line, f"{name} writes {argument}: it may write {' and '.join(sorted(point.writes))}"
-            )
-    if kernel.result != point.hooks[name]:
+            with module.refusals.note():
+                kernel.arguments[argument] = BROKEN
+                raise _refusal(module, line, text)
+        elif argument in kernel.writes and argument not in point.writes:
+            with module.refusals.note():
+                may = " and ".join(sorted(point.writes))
+                raise _refusal(
+                    module, line, f"{name} writes {argument}: it may write {may}: write to a field of memory"
+                )
+    if kernel.result not in (BROKEN, point.hooks[name]):
         result = {"void": "None"}.get(point.hooks[name].base, point.hooks[name].base)
+        kernel.result = BROKEN
         raise _refusal(module, line, f"{name}: expected -> {result}")
 
 
-def _parameters(
-    point: PlugPoint, module: Module, structs: Mapping[str, StructType]
-) -> Iterator[CoreParameter]:
-    for field in structs[OWN].fields.values() if OWN in structs else ():
-        name, mark = field.name, field.mark
-        if not isinstance(mark, Tunable) or field.kind.rank:
-            form = 'Annotated[f32, Tunable(default, "unit", low=.., high=..)]'
-            raise _refusal(module, field.line, f"{name}: a parameter is {form}")
-        scalar = SCALARS[field.kind.base]
-        for number in (mark.default, mark.low, mark.high):
-            held = scalar.cast(number)
-            if not isfinite(held) or not (scalar.is_float or held == number):
-                kind = "finite" if scalar.is_float else "whole"
-                raise _refusal(module, field.line, f"{name}: {number:g}: expected a {kind} number of 32 bits")
-        if not mark.low <= mark.default <= mark.high:
-            text = f"{name}: default {mark.default:g} is outside {mark.low:g}..{mark.high:g}"
-            raise _refusal(module, field.line, text)
-        if any(point.name == name for point in POINTS):
-            raise _refusal(module, field.line, f"{name}: this name exists already, as a key of [logic]")
-        if len(name) > PARAMETER_ROOM:
-            text = f"{name}: {len(name)} characters; MAVLink leaves a parameter's name {PARAMETER_ROOM}"
-            raise _refusal(module, field.line, text)
-        yield CoreParameter(
-            f"{GROUP}.{name}", scalar, mark.unit, Place(f"{point.name}_{OWN}", name, scalar),
-            low=mark.low, high=mark.high, default=mark.default,
-        )  # fmt: skip
+def _parameter(point: PlugPoint, module: Module, field: StructField) -> CoreParameter:
+    name, mark = field.name, field.mark
+    if not isinstance(mark, Tunable) or field.kind.rank:
+        form = 'Annotated[f32, Tunable(default, "unit", low=.., high=..)]'
+        raise _refusal(module, field.line, f"{name}: a parameter is {form}")
+    scalar = SCALARS[field.kind.base]
+    for number in (mark.default, mark.low, mark.high):
+        held = scalar.cast(number)
+        if not isfinite(held) or not (scalar.is_float or held == number):
+            kind = "finite" if scalar.is_float else "whole"
+            raise _refusal(module, field.line, f"{name}: {number:g}: expected a {kind} number of 32 bits")
+    if not mark.low <= mark.default <= mark.high:
+        text = f"{name}: default {mark.default:g} is outside {mark.low:g}..{mark.high:g}: write one inside"
+        raise _refusal(module, field.line, text)
+    if any(point.name == name for point in POINTS):
+        raise _refusal(
+            module, field.line, f"{name}: this name exists already, as a key of [logic]: write another name"
+        )
+    if len(name) > PARAMETER_ROOM:
+        text = f"{name}: {len(name)} characters; MAVLink leaves a parameter's name {PARAMETER_ROOM}: write a shorter name"
+        raise _refusal(module, field.line, text)
+    return CoreParameter(
+        f"{GROUP}.{name}", scalar, mark.unit, Place(f"{point.name}_{OWN}", name, scalar),
+        low=mark.low, high=mark.high, default=mark.default,
+    )  # fmt: skip
 
 
-def _variables(point: PlugPoint, module: Module, structs: Mapping[str, StructType]) -> Iterator[CoreVariable]:
-    for field in structs[MEMORY].fields.values() if MEMORY in structs else ():
-        mark, kind = field.mark, field.kind
-        if mark is None:
-            continue
-        if not isinstance(mark, Logged) or kind.rank == 2:
-            text = f"{field.name}: in the memory numbers and lists of them may be Logged; parameters stand in `own`"
+def _variables(point: PlugPoint, module: Module, field: StructField) -> Iterator[CoreVariable]:
+    mark, kind = field.mark, field.kind
+    if mark is None:
+        return
+    if not isinstance(mark, Logged) or kind.rank == 2:
+        text = (
+            f"{field.name}: in the memory numbers and lists of them may be Logged; parameters stand in `own`"
+        )
+        raise _refusal(module, field.line, text)
+    for index in np.ndindex(kind.shape):
+        name = "".join((field.name, *(str(number + 1) for number in index)))
+        if len(name) > VARIABLE_ROOM:
+            text = f"{name}: {len(name)} characters; a log variable's name has at most {VARIABLE_ROOM}: write a shorter name"
             raise _refusal(module, field.line, text)
-        for index in np.ndindex(kind.shape):
-            name = "".join((field.name, *(str(number + 1) for number in index)))
-            if len(name) > VARIABLE_ROOM:
-                text = f"{name}: {len(name)} characters; a log variable's name has at most {VARIABLE_ROOM}"
-                raise _refusal(module, field.line, text)
-            scalar = SCALARS[kind.base]
-            place = Place(f"{point.name}_{MEMORY}", field.name, scalar, index)
-            yield CoreVariable(f"{GROUP}.{name}", scalar, mark.unit, place)
+        scalar = SCALARS[kind.base]
+        place = Place(f"{point.name}_{MEMORY}", field.name, scalar, index)
+        yield CoreVariable(f"{GROUP}.{name}", scalar, mark.unit, place)

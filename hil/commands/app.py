@@ -1,7 +1,7 @@
 """`floaty`: the command group.
 
-Bad input ends in one line on standard error and exit code 2; a failed limit in 1; Ctrl-C, SIGTERM
-and SIGHUP in 130 with the log kept.
+Bad input ends in one line on standard error, of a refused file one for each refusal, and exit code 2; a failed limit in
+1; Ctrl-C, SIGTERM and SIGHUP in 130 with the log kept.
 """
 
 import atexit
@@ -28,6 +28,7 @@ COMMANDS = {
     "new": "new.new",
     "docs": "listing.docs",
     "policy": "new.policy",
+    "check": "new.check",
     "list": "listing.list_experiments",
     "runs": "listing.runs",
     "view": "pictures.view",
@@ -195,7 +196,7 @@ def main() -> None:
         with stopped_like_ctrl_c(), _printing():
             code = app.main(standalone_mode=False)
     except LabError as error:
-        sys.exit(_refuse(str(error)))
+        sys.exit(_refuse(*error.lines))
     except ImportError as error:
         if not (missing := why_missing(error)):
             raise
@@ -224,9 +225,10 @@ def _check_names(arguments: list[str]) -> None:
             raise LabError(f"{os.fsencode(argument)!r}: expected a name in UTF-8") from None
 
 
-def _refuse(text: str) -> int:
+def _refuse(*lines: str) -> int:
     try:
-        warn(f"floaty: {' '.join(text.split())}")
+        for text in lines:
+            warn(f"floaty: {' '.join(text.split())}")
     except OSError:  # only the exit code is left
         _silence(sys.stderr)
     return 2

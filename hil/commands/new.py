@@ -1,7 +1,7 @@
-"""`floaty new` and `floaty policy`: make folders with a control law, profile and tests, ready to fly.
+"""`floaty new` and `floaty policy`: make folders with a control law, profile and tests, ready to fly; `floaty check`.
 
 The first has a small control law with experiments, or a robot, for the user to change; the second has a trained network
-as its law.
+as its law. The last one checks such laws without a flight.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from firmware_py.errors import FirmwareError
-from hil.commands.options import FILE, PATH, say
+from hil.commands.options import FILE, PATH, say, warn
 from hil.errors import LabError, refusing, require, require_empty
 
 if TYPE_CHECKING:
@@ -137,3 +137,32 @@ def _constant(values: NDArray[np.float32]) -> str:
 def _wrapped(text: str) -> str:
     lines = textwrap.wrap(text, 116, break_on_hyphens=False, break_long_words=False)
     return "".join(f"\n    {line}" for line in lines) + "\n" * (not text.endswith(","))
+
+
+@click.command()
+@click.argument("files", nargs=-1, required=True, type=FILE, metavar="FILE...")
+def check(files: tuple[Path, ...]) -> int:
+    """Check own control laws and estimators without a flight.
+
+    Print one line for each FILE that can fly. Otherwise print each refusal to standard error, as FILE:LINE: what: repair,
+    and end with exit code 2. The hooks in a FILE show whether it is a controller or an estimator.
+    """
+    from firmware_py.logic.loading import check_file
+
+    refused = 0
+    for file in files:
+        try:
+            loaded = check_file(file)
+        except FirmwareError as error:
+            refused += 1
+            for line in str(error).splitlines():
+                warn(line)
+            continue
+        (plug,) = loaded.plugs
+        hooks = ", ".join(plug.hooks)
+        say(f"{file}: ok ({plug.point.name}: {hooks}; {_counted(len(plug.parameters), 'parameter')})")
+    return 2 if refused else 0
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

@@ -90,7 +90,7 @@ def test_a_known_loop_beyond_the_budget_is_refused(tmp_path: Path, body: str, be
     with pytest.raises(LabError) as error:
         own_config(tmp_path, text)
     assert str(error.value).startswith(f"{tmp_path / 'controller.py'}:{line_of(text, at)}: for ")
-    assert str(error.value).endswith("cycles: a call has 672000 (4 ms of a Cortex-M4)")
+    assert str(error.value).endswith(": a call has 672000 (4 ms of a Cortex-M4): write a part for each tick")
 
 
 def test_a_call_of_exactly_the_budget_is_admitted_and_one_more_cycle_is_not(tmp_path: Path) -> None:

@@ -1,0 +1,241 @@
+"""Small laws as users write them: accepted, with the same bits in Python and C, or refused with what to write instead."""
+
+from pathlib import Path
+from textwrap import indent
+
+import numpy as np
+import pytest
+
+from firmware_py.config import parameters_of
+from firmware_py.core.structs import MODE_FLY
+from firmware_py.core_runner import CoreBlocks
+from firmware_py.export.boards import runner_of
+from firmware_py.export.compilers import Compiler, compilers
+from firmware_py.export.native import STRICT, build
+from firmware_py.logic.loading import load_logic
+from hil.config import LabConfig
+from hil.errors import LabError
+from support.command import Cli
+from support.own_logic import own_config
+
+HEAD = '''"""Small laws."""
+
+from typing import Annotated
+
+from firmware_py.core.maths import ZERO, clamp
+from firmware_py.core.structs import Control, Estimator, Input
+from firmware_py.core.subset import F32s, I32s, Logged, Struct, Tunable, constant, f32, i32, kernel, sqrt
+
+TABLE = constant(0.5, -1.25, 3.0, 0.1)
+DT = f32(0.01)
+MANY = 40
+
+
+class Gains(Struct):
+    gain_z: Annotated[f32, Tunable(3.0, "rad/m", low=0.0, high=10.0)]
+
+
+class Memory(Struct):
+    ticks: i32
+    mode: i32
+    integral: Annotated[f32, Logged("m s")]
+    errors: Annotated[F32s, 4]
+    counts: Annotated[I32s, 3]
+    answers: Annotated[F32s, MANY]
+
+
+'''
+LAW = """@kernel
+def law_{name}(estimator: Estimator, own: Gains, memory: Memory) -> f32:
+{body}
+
+"""
+HOOKS = """@kernel
+def reset_law(data: Input, memory: Memory) -> None:
+    memory.ticks = i32(0)
+
+
+@kernel
+def control_law(data: Input, estimator: Estimator, control: Control, own: Gains, memory: Memory) -> None:
+{calls}"""
+SUM = "total = ZERO\n    for k in range(4):\n        total = total + memory.errors[k] * f32(i + 1)\n"
+CLAMPED = "if i < 0:\n    i = i32(0)\nif i > 3:\n    i = i32(3)\nreturn TABLE[i]"
+ACCEPTED = [
+    "return ZERO",  # no argument is used
+    f"for i in range(2):\n    {SUM}    memory.integral = total\nfor i in range(3):\n    {SUM}"
+    "    memory.errors[i] = total * DT\nreturn memory.integral",
+    "if memory.ticks > 2:\n    a = own.gain_z\nelse:\n    a = -own.gain_z\nreturn a",
+    "if memory.ticks > 2:\n    a = ZERO\nelif memory.mode == 1:\n    a = DT\nelse:\n    return own.gain_z\nreturn a",
+    "for i in range(4):\n    last = memory.errors[i]\nreturn last",
+    "for i in range(4):\n    if memory.errors[i] > ZERO:\n        low = TABLE[i]\n    else:\n        low = DT\n"
+    "    memory.errors[i] = low\nlow = own.gain_z\nreturn low",
+    "near = memory.ticks > 1\nif near:\n    near = memory.mode == 0\nif near:\n    return DT\nreturn ZERO",
+    "found = i32(-1)\nfor i in range(4):\n    if memory.errors[i] > own.gain_z:\n        found = i32(i)\n        break\n"
+    "return f32(found)",
+    "total = ZERO\nfor i in range(4):\n    if memory.errors[i] < ZERO:\n        continue\n    total += memory.errors[i]\n"
+    "return total",
+    "for i in range(3, 0, -1):\n    memory.errors[i] = memory.errors[i - 1]\nmemory.errors[0] = estimator.now[2]\n"
+    "return memory.errors[3]",
+    "total = ZERO\nfor i in range(0, 4, 2):\n    total = total * f32(3.0) + TABLE[i]\nreturn total",
+    "total = ZERO\nfor i in range(4):\n    for k in range(i, -1, -1):\n        total = total + TABLE[k]\nreturn total",
+    "memory.ticks += 1\nmemory.integral -= own.gain_z * DT\nmemory.errors[1] *= f32(0.5)\nmemory.counts[2] //= 2\n"
+    "return memory.integral / memory.errors[1]",
+    f"i = memory.ticks\n{CLAMPED}",
+    f"i = i32(estimator.now[2] * f32(10.0))\n{CLAMPED}",
+    "return TABLE[min(max(memory.ticks - 1, 0), 3)]",
+    "return min(own.gain_z, memory.errors[0]) + max(memory.errors[1], memory.errors[2])",
+    "if 0 <= memory.mode and memory.mode < 4:\n    return TABLE[memory.mode]\nreturn ZERO",
+    "i = memory.ticks\nif i < 0 or i >= 4:\n    return DT\nreturn TABLE[i]",
+    "n = min(memory.ticks, 4)\ntotal = ZERO\nfor i in range(n):\n    total = total + TABLE[i]\nreturn total",
+    "if memory.mode != 0:\n    pass\nelse:\n    memory.mode = i32(1)\nreturn f32(memory.mode)",
+    "i = 0\nfor k in range(4):\n    if memory.errors[k] > memory.errors[min(max(i, 0), 3)]:\n        i = k\n"
+    "return f32(i) * sqrt(abs(clamp(memory.errors[0], -own.gain_z, own.gain_z)))",
+]  # fmt: skip
+# A law, and what is to be written instead.
+REFUSED = [
+    ("if memory.mode:\n    return DT\nreturn ZERO", "write memory.mode != 0"),
+    ("total = ZERO\nfor g in TABLE:\n    total = total + g\nreturn total", "write for k in range(4): and TABLE[k] for g"),
+    ("for i in range(len(TABLE)):\n    memory.errors[i] = ZERO\nreturn ZERO", "write 4"),
+    ("return f32(round(own.gain_z))", "write i32(x), which cuts off towards zero"),
+    ("half = memory.ticks / 2\nreturn f32(half)", "write f32(memory.ticks) / f32(2), or memory.ticks // 2"),
+    ("memory.mode = memory.mode | 2\nreturn ZERO", "write an i32 field for each flag"),
+    ("if (memory.mode == 1) | (memory.ticks == 2):\n    return DT\nreturn ZERO",
+     "write memory.mode == 1 or memory.ticks == 2"),
+    ("for i in range(memory.ticks, 0, -1):\n    memory.errors[0] = DT\nreturn ZERO",
+     "write for k in range(memory.ticks): and i = memory.ticks - k inside"),
+    ("if memory.ticks > 2:\n    a = DT\nreturn a", "a is read before it has a value: write a = f32(0.0) before line"),
+    ("for i in range(memory.ticks):\n    n = n + 1\nreturn f32(n)", "n is read before it has a value: write n ="),
+    ("for i in range(4):\n    if memory.mode == i:\n        break\n    a = DT\nreturn a", "write a = f32(0.0) before line"),
+    ("i = memory.ticks\nif i > 3:\n    i = i32(3)\nreturn TABLE[i]", "write min(max(i, 0), 3)"),
+    ("if 0 <= memory.mode and memory.mode < 4:\n    memory.mode += 1\n    return TABLE[memory.mode]\nreturn ZERO",
+     "index memory.mode, which is 1..4: f32 array of 4 has 0..3: write min(max(memory.mode, 0), 3)"),
+    ("return memory.integrl", "write memory.integral"),
+    ("return own.gain_x * memori.integral", "write own.gain_z"),
+    ("return memori.integral", "write memory.integral"),
+    ("return TABEL[0]", "write TABLE"),
+    ("return clmap(DT, ZERO, DT)", "write clamp"),
+    ("return estimator.now[VELOCITY]", "write from firmware_py.core.structs import VELOCITY at the top of the file"),
+    ("return own.gain_z if memory.ticks > 2 else ZERO", "a if .. else b: write an if on lines of its own"),
+    ("i = 0\nwhile i < 4:\n    i = i + 1\nreturn f32(i)", "while: write a loop over range(..)"),
+    ("e: f32 = DT\nreturn e", "type of a local: write x = value, without the type"),
+    ("return own.gain_z * 2", "write f32(2)"),
+    ("memory.ticks = own.gain_z\nreturn ZERO", "write i32(own.gain_z)"),
+    ("return ZERO < own.gain_z < DT", "write ZERO < own.gain_z and own.gain_z < DT"),
+    ("for i in range(4):\n    memory.errors[i] = DT\nreturn f32(i)", "write last = i inside, and read last"),
+]  # fmt: skip
+# Lines at the top of the file, and what is to be written instead.
+AT_THE_TOP = [
+    ("from enum import IntEnum\n\n\nclass Mode(IntEnum):\n    WAIT = 0",
+     ["import from enum: write MODE_A = 0", "class Mode is not a Struct: write MODE_WAIT = 0"]),
+    ("@kernel\ndef since(a: i32, b: i32) -> i32:\n    return elapsed(a, b)", ["write from firmware_py.core.subset import"]),
+    ("K = (0.5, 1.0)", ["write K = constant(0.5, 1.0)"]),
+    ("K = [[1.0, 2.0], [3.0, 4.0]]", ["write K = constant((1.0, 2.0), (3.0, 4.0))"]),
+    ("RATE: float = 0.5", ["type of a constant at the top of a module: write RATE = f32(0.5)"]),
+    ("class A(Struct):\n    n: int\n    x: float\n    a: F32s\n    b: f32 = 0.0",
+     ["write n: i32", "write x: f32", "write a: Annotated[F32s, n] with its size", "write b: f32, and its"]),
+    ("@kernel\ndef twice(x: int, e: Estimatr) -> float:\n    return x + e.y",
+     ["write x: i32", "write e: Estimator", "write -> f32"]),
+    ("import numpy as np\n\nK = constant(np.pi)", ["np.pi is outside the subset: write PI, from firmware_py.core.maths"]),
+    ("from firmware_py.core.math import sin", ["cannot import math: not a module of the core, or in a circle: write "
+     "firmware_py.core.maths"]),
+]  # fmt: skip
+
+
+def law_of(bodies: list[str], top: str = "") -> str:
+    laws = "".join(LAW.format(name=n, body=indent(body, "    ")) for n, body in enumerate(bodies))
+    calls = [f"    memory.answers[{n}] = law_{n}(estimator, own, memory)\n" for n in range(len(bodies))]
+    return f"{HEAD}{top}\n\n{laws}\n{HOOKS.format(calls=''.join(calls) or '    return')}"
+
+
+@pytest.fixture(scope="module")
+def accepted(tmp_path_factory: pytest.TempPathFactory) -> LabConfig:
+    return own_config(tmp_path_factory.mktemp("laws"), law_of(ACCEPTED))
+
+
+def test_accepted_laws_compute_the_same_bits_in_python_and_in_c(accepted: LabConfig) -> None:
+    logic = load_logic(accepted.logic)
+    flown, beside = (
+        CoreBlocks(parameters_of(accepted), runner_of(board, accepted.logic), logic)
+        for board in ("c", "python")
+    )
+    rng = np.random.default_rng(5)
+    for ticks in (0, 2, 5, -7, 3):
+        errors, now = rng.normal(0, 2, 4).astype(np.float32), rng.normal(0, 1, 16).astype(np.float32)
+        for blocks in (flown, beside):
+            blocks.data.fields.mode = MODE_FLY
+            blocks.estimator.fields.now[:] = now
+            memory = blocks.named["controller_memory"].fields
+            memory.ticks, memory.errors[:], memory.counts[:] = ticks, errors, (-5, 6, 7)
+            blocks.run.call("control")
+        assert memory.answers[: len(ACCEPTED)].any()
+        for name in ("control", "controller_memory", "guard"):
+            assert flown.named[name].bytes() == beside.named[name].bytes(), (name, ticks)
+
+
+@pytest.mark.parametrize(
+    "compiler", [one for one in compilers() if one.name != "cc"], ids=lambda one: str(one.name)
+)
+def test_strict_compilers_accept_the_laws_without_a_warning(accepted: LabConfig, compiler: Compiler) -> None:
+    logic = load_logic(accepted.logic)
+    assert logic is not None
+    build(logic.loaded.translation, compiler, "-Os", (*STRICT, "-std=c99"))
+
+
+@pytest.mark.parametrize("board", ["c", "python"])
+def test_a_loop_that_the_data_bounds_keeps_the_bounds_of_its_indices(accepted: LabConfig, board: str) -> None:
+    law = ACCEPTED.index(next(body for body in ACCEPTED if body.startswith("n = min(")))
+    blocks = CoreBlocks(parameters_of(accepted), runner_of(board, accepted.logic), load_logic(accepted.logic))
+    blocks.data.fields.mode = MODE_FLY
+    memory = blocks.named["controller_memory"].fields
+    for ticks, total in ((-3, 0.0), (1, 0.5), (900, 2.35)):
+        memory.ticks = ticks - 1  # another law counts
+        blocks.run.call("control")
+        assert float(memory.answers[law]) == pytest.approx(total)
+
+
+def test_all_refusals_come_at_once_in_the_order_of_their_lines(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = law_of([body for body, _ in REFUSED], "\n\n".join(top for top, _ in AT_THE_TOP))
+    Path("controller.py").write_text(text, encoding="utf-8")
+    Path("good.py").write_text(law_of(ACCEPTED[:2]), encoding="utf-8")
+    assert cli("check", "controller.py", "good.py") == 2
+    lines = cli.err.splitlines()
+    places = [line.split(":")[:2] for line in lines]
+    assert all(file == "controller.py" for file, _ in places)
+    assert [int(line) for _, line in places] == sorted(int(line) for _, line in places)
+    assert cli.out == "good.py: ok (controller: reset_law, control_law; 1 parameter)\n"
+    expected = [repair for _, repair in REFUSED] + [repair for _, repairs in AT_THE_TOP for repair in repairs]
+    assert not [repair for repair in expected if repair not in cli.err]
+    assert len(lines) == len(expected)
+    (tmp_path / "profile.toml").write_text('base = "floaty"\n[logic]\ncontroller = "controller.py"\n')
+    assert cli("fly", "hover", "--profile", "profile.toml") == 2
+    assert cli.err.splitlines() == [f"floaty: {line}" for line in lines]
+
+
+@pytest.mark.parametrize(("body", "repair"), REFUSED, ids=[repair for _, repair in REFUSED])
+def test_a_refused_law_names_its_repair(tmp_path: Path, body: str, repair: str) -> None:
+    with pytest.raises(LabError) as error:
+        own_config(tmp_path, law_of([body]))
+    (line,) = str(error.value).splitlines()
+    assert repair in line
+    assert not [name for name in ("Assign", "Expr", "If", "For", "Op", "Comp") if name in line]
+
+
+@pytest.mark.parametrize(("top", "repairs"), AT_THE_TOP, ids=[repairs[0] for _, repairs in AT_THE_TOP])
+def test_a_refused_line_at_the_top_names_its_repair(tmp_path: Path, top: str, repairs: list[str]) -> None:
+    with pytest.raises(LabError) as error:
+        own_config(tmp_path, law_of([], top))
+    lines = str(error.value).splitlines()
+    assert [repair in line for repair, line in zip(repairs, lines, strict=True)] == [True] * len(lines), lines
+
+
+def test_a_file_that_is_no_law_is_refused(cli: Cli, tmp_path: Path) -> None:
+    assert cli("check", tmp_path / "missing.py") == 2
+    assert cli.err == f"{tmp_path / 'missing.py'}: No such file or directory\n"
+    (tmp_path / "test_it.py").write_text("def test_it():\n    pass\n")
+    assert cli("check", tmp_path / "test_it.py") == 2
+    assert cli.err.endswith(
+        "test_it.py:1: no control law and no estimator: write @kernel def control_law(..)\n"
+    )
