@@ -374,7 +374,7 @@ def test_a_package_that_a_test_file_needs_is_one_line(
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     monkeypatch.setattr(hil.testing, "find_spec", lambda name: None)
     pytester.makepyfile(
-        test_learn="import hil.research.learn",
+        test_learn="import gymnasium",
         test_any="from hil.testing import faults",
         test_late="def test_it(floaty):\n    import gymnasium",
     )
@@ -382,7 +382,7 @@ def test_a_package_that_a_test_file_needs_is_one_line(
     result.assert_outcomes(failed=1, errors=2)
     shown = result.stdout.str()
     for place, package in (
-        ("learn.py", ".*gymnasium"),
+        ("learn.py", "gymnasium"),
         ("any.py", ".*hypothesis"),
         ("late.py:2", "gymnasium"),
     ):
