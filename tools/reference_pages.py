@@ -58,8 +58,8 @@ LEADS = {
 }
 # Pages of a long reference: title, and commands or sections. One on no page, or on two, ends the build.
 COMMANDS = {
-    "cli": ("Command line", "list fly new policy runs view report compare export docs"),
-    "cli-studies": ("Command line: studies", "paper study drag-model campaign identify tune design"),
+    "cli": ("Command line", "list fly new check policy runs view report compare export import docs"),
+    "cli-studies": ("Command line: studies", "replay paper study drag-model campaign identify tune design"),
     "cli-programs": ("Command line: programs and real flights", "serve station param"),
     "cli-boards": ("Command line: boards", "board deploy"),
 }
