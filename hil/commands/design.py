@@ -1,5 +1,6 @@
 """`floaty design`: the robot of a profile as a design."""
 
+import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +30,7 @@ class DesignOptions:
     angle: float | None = None  # [deg]
     length: float = 1.0
     mass: float = 1.0
+    as_json: bool = False
     write_to: Path | None
     out: Path
 
@@ -60,6 +62,9 @@ out_option = click.option("--out", type=PATH, default=Path("runs/design"), show_
 @click.option(
     "--mass", type=common.Number(0.01, 100), default=1.0, help="The similar robot: masses times this."
 )
+@click.option(
+    "--json", "as_json", is_flag=True, help="Print only the model on board: states, A and B of each axis."
+)
 @write_option
 @out_option
 @common.asked_as(DesignOptions)
@@ -67,6 +72,10 @@ def design(context: click.Context, robot: DesignOptions) -> None:
     """Compute trim, constants, poles, authority and sweeps of a profile's robot, and compare the paper's claims."""
     require("floaty design", "design", "scipy", "control")
     if context.invoked_subcommand is not None:
+        return
+    if robot.as_json:
+        for line in _model_on_board(robot).splitlines():
+            say(line)
         return
     from hil.research.design.analysis import analyse, write
 
@@ -138,6 +147,23 @@ def optimise(asked: Search) -> None:
     for line in (*at_bounds(best.point.geometry), *search.exercise(found, *updrafts)):
         say(line)
     say(f"picture  {picture}")
+
+
+def _model_on_board(robot: DesignOptions) -> str:
+    """Return the axes of `[model]` as JSON: x' = A x + B u in continuous time, in SI units."""
+    from hil.config import load_config
+    from hil.research.design.axes import AXES, FLAP, UNITS_OF_STATES, dynamics, robot_of
+
+    constants = robot_of(load_config(robot.profile, robot.overrides))
+    axes = []
+    for axis in AXES:
+        flow, columns = dynamics(axis, constants)
+        states = [f"{name} [{UNITS_OF_STATES[name]}]" for name in (*axis.states, FLAP)]
+        axes.append({
+            "axis": axis.label, "input": f"u{axis.input + 1} [rad]", "states": states,
+            "A": flow.tolist(), "B": columns[:, :1].tolist(),
+        })  # fmt: skip
+    return json.dumps({"axes": axes}, indent=2)
 
 
 def write_profile(point: "Point", path: Path, about: str, length: float = 1.0) -> None:

@@ -36,6 +36,13 @@ UNITS: Mapping[tuple[str, str], str] = {
     (VELOCITY, VELOCITY): "1/s",
     (VELOCITY, RATE): "m/s/rad",
 }
+UNITS_OF_STATES: Mapping[str, str] = {
+    POSITION: "m",
+    VELOCITY: "m/s",
+    ANGLE: "rad",
+    RATE: "rad/s",
+    FLAP: "rad",
+}
 NUISANCES = ("y_rate", "x_rate")
 
 

@@ -300,3 +300,15 @@ def test_the_worst_of_several_loops_has_the_least_of_each_margin() -> None:
     one, two = Margins(True, 2.0, 0.5, 0.6, 0.01, 1.5), Margins(True, 3.0, 0.7, 0.4, 0.02, 1.2)
     assert worst([one, two]) == worst([two, one]) == Margins(True, 2.0, 0.7, 0.4, 0.01, 1.5)
     assert not worst([one, Margins(False, 1.0, 1.0, 0.0, 0.0, np.inf)]).stable
+
+
+def test_the_model_on_board_is_printed_for_other_tools(cli: Cli, tmp_path: Path) -> None:
+    assert cli("design", "--json", "--set", "model.z_vz=-2.5", "--out", tmp_path / "none") == 0
+    axes = {axis["axis"]: axis for axis in json.loads(cli.out)["axes"]}
+    assert list(axes) == ["roll, y", "pitch, x", "yaw", "height"]
+    height, model = axes["height"], load_config().model
+    assert height["states"] == ["position [m]", "velocity [m/s]", "flap [rad]"]
+    rate = model.flap_rate
+    assert height["A"] == [[0.0, 1.0, 0.0], [0.0, -2.5, model.z_u4], [0.0, 0.0, -rate]]
+    assert height["B"] == [[0.0], [0.0], [rate]]
+    assert not (tmp_path / "none").exists()
