@@ -222,15 +222,10 @@ def import_log(files: Sequence[Path], folder: Path, given: Map | None = None) ->
 
 def _join(what: str, tables: Sequence[Table], clock: str | float | None) -> _Joined:
     """Return all columns on the rows of the first table: of the others the newest value, none before their first."""
-    clocks = [_clock_of(table, clock) for table in tables]
-    if None in clocks:
-        names = ", ".join(list(tables[clocks.index(None)].columns)[:12])
-        named = "" if clock is None else f" like {clock!r}"
-        raise LabError(f'{what}: no column of times{named} among {names}; name it in a map: t = "NAME [ms]"')
-    joined = _Joined(np.empty(0), {}, {}, clocks[0] or "")
-    for number, (table, name) in enumerate(zip(tables, clocks, strict=True)):
-        source = Source.of(name or "")
-        times = _values(table, source.name) * _unit_of_clock(what, table, source)
+    joined = _Joined(np.empty(0), {}, {}, "")
+    for number, table in enumerate(tables):
+        source = _clock_of(what, table, clock if isinstance(clock, str) else None, number == 0)
+        times = _values(table, source.name) * TIME[source.unit]
         advances = np.isfinite(times) & (times > np.fmax.accumulate(np.concatenate(([-np.inf], times[:-1]))))
         if not advances.all():
             joined.notes.append(f"{(~advances).sum()} rows whose {source.name} does not advance are left out")
@@ -239,7 +234,7 @@ def _join(what: str, tables: Sequence[Table], clock: str | float | None) -> _Joi
             raise LabError(f"{what}: {source.name}: no row with a time")
         rows = np.arange(len(times))
         if number == 0:
-            joined.t_us = times
+            joined.t_us, joined.clock = times, f"{source.name} [{source.unit}]"
         else:
             rows = np.searchsorted(times, joined.t_us, "right") - 1
         for title, values in table.columns.items():
@@ -258,21 +253,27 @@ def _values(table: Table, name: str) -> Values:
     return next(values for title, values in table.columns.items() if Source.of(title).name == name)
 
 
-def _clock_of(table: Table, wanted: str | float | None) -> str | None:
-    """Return the source of a table's times, None without."""
+def _clock_of(what: str, table: Table, wanted: str | None, is_first: bool) -> Source:
+    """Return the source of a table's times, with its unit; only the first table must have the wanted one.
+
+    Without a stated unit it is the one in which a usual step is 0.5 ms to 0.5 s. Raises `LabError`.
+    """
     titles = {Source.of(title).name: title for title in table.columns}
-    if isinstance(wanted, str):
-        return wanted if Source.of(wanted).name in titles else None
-    return next((titles[name] for name in titles if re.fullmatch(CLOCK, _words(name))), None)
-
-
-def _unit_of_clock(what: str, table: Table, source: Source) -> float:
-    """Return the microseconds of a unit of time; without a unit the one in which a step is 0.5 ms to 0.5 s."""
+    named = wanted is not None and (is_first or Source.of(wanted).name in titles)
+    found = (
+        wanted if named else next((titles[one] for one in titles if re.fullmatch(CLOCK, _words(one))), None)
+    )
+    if found is None or Source.of(found).name not in titles:
+        like, names = f" like {found!r}" if found else "", ", ".join([*titles][:12])
+        raise LabError(f'{what}: no column of times{like} among {names}; name it in a map: t = "NAME [ms]"')
+    source = Source.of(found)
     if source.unit:
-        return _scale(what, "t", source, TIME)
+        _scale(what, "t", source, TIME)
+        return source
     steps = np.diff(_values(table, source.name))
     step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
-    return next((scale for scale in TIME.values() if 500.0 <= step * scale <= 5e5), TIME["s"])
+    unit = next((unit for unit, scale in TIME.items() if 500.0 <= step * scale <= 5e5), "s")
+    return replace(source, unit=unit)
 
 
 def _words(name: str) -> str:
@@ -311,8 +312,10 @@ def _guess(joined: _Joined) -> Map:
         joined.notes.append(f"{len(others) - len(changing)} further columns that do not change are left out")
         others = changing
     for name in others:
-        unit = joined.units[name] or _unit_in(name)
-        sources[f"robot.{re.sub(r'[^0-9A-Za-z_.]+', '_', name)}"] = f"{name} [{unit}]" if unit else name
+        unit, column = joined.units[name] or _unit_in(name), f"robot.{re.sub(r'[^0-9A-Za-z_.]+', '_', name)}"
+        while column in sources:  # names that differ in what a column's name has not
+            column += "_"
+        sources[column] = f"{name} [{unit}]" if unit else name
     stock = any(STOCK.match(word) for word in words.values())
     return Map(profile="crazyflie" if stock else DEFAULT_PROFILE, columns=sources)
 

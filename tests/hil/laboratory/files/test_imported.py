@@ -85,6 +85,8 @@ def test_names_units_and_sizes_give_time_place_and_attitude(name: str, tmp_path:
     else:
         expected = QUATERNIONS
     assert turned == pytest.approx(expected, abs=1e-7)
+    clocks = ("Timestamp [ms]", "time [us]", "t_ns [ns]", "elapsed time [ms]", "timestamp [us]", "time [s]")
+    assert done.map.columns["t"] in clocks
     assert done.map.profile == ("crazyflie" if "stateEstimate.x" in FOREIGN[name] else "floaty")
     assert done.result.verdicts == ()
 
@@ -179,6 +181,8 @@ def test_a_map_chooses_scales_turns_and_releases(tmp_path: Path) -> None:
 def test_files_are_joined_on_the_rows_of_the_first(tmp_path: Path) -> None:
     first = csv(tmp_path / "a.csv", {"t": T, **place("x", "y", "z")})
     slow = {
+        "x!": [2.0] * 4,
+        "x?": [3.0] * 4,
         "Timestamp [ms]": [100.0, 400.0, 300.0, 500.0],
         "battery.voltage [mV]": [4000.0, 3900.0, 1.0, 3800.0],
         "x": [1.0] * 4,
@@ -188,7 +192,14 @@ def test_files_are_joined_on_the_rows_of_the_first(tmp_path: Path) -> None:
     expected = np.select([T >= 0.5, T >= 0.4, T >= 0.1], [3.8, 3.9, 4.0], np.nan)
     assert volts == pytest.approx(expected, nan_ok=True)
     assert "1 rows whose Timestamp does not advance are left out" in done.notes
-    assert done.log.column("robot.x.2").to_numpy()[-1] == 1.0
+    assert [done.log.column(f"robot.{name}").to_numpy()[-1] for name in ("x.2", "x_", "x__")] == [
+        1.0,
+        2.0,
+        3.0,
+    ]
+    given = Map(columns={**done.map.columns, "t": "t [s]"})  # the clock of the first file
+    again = import_log([first, tmp_path / "b.csv"], tmp_path / "again", given).log
+    assert again.to_pydict().keys() == done.log.to_pydict().keys()
 
 
 def micro_sd(version: int) -> bytes:
