@@ -84,8 +84,11 @@ def export(run: Path, as_csv: bool, as_mcap: bool, as_tlog: bool, as_video: bool
 @click.option(
     "--map", "chosen", metavar="MAP.toml", type=FILE, help="Which column of the file gives which of the log."
 )
+@click.option(
+    "--like", type=PATH, metavar="RUN", help="Set the release where the path fits that of RUN best."
+)
 @click.option("--out", type=PATH, metavar="DIR", help="Run folder [runs/NAME of the first file].")
-def import_(files: tuple[Path, ...], chosen: Path | None, out: Path | None) -> None:
+def import_(files: tuple[Path, ...], chosen: Path | None, like: Path | None, out: Path | None) -> None:
     """Make a run folder of a foreign log: CSV, Parquet, a tlog, or a Crazyflie's micro-SD file.
 
     Columns and units are guessed from their names, shown, and stored in map.toml of the run folder: correct a copy and
@@ -93,13 +96,15 @@ def import_(files: tuple[Path, ...], chosen: Path | None, out: Path | None) -> N
     unknown. The run can be reported, compared, viewed and exported like a real flight.
     """
     from hil.api import Run
-    from hil.laboratory.files.imported import Map, import_log
+    from hil.laboratory.files.imported import import_log
+    from hil.laboratory.files.log_map import Map
+    from hil.laboratory.files.recorder import load_log
 
     given = None if chosen is None else Map.read(chosen)
     folder = out or Path("runs") / files[0].stem
     require_empty("--out", folder)
     with writing("--out", folder):
-        done = import_log(files, folder, given)
+        done = import_log(files, folder, given, None if like is None else load_log(like))
         _print_map(done)
         for note in done.notes:
             warn(note)

@@ -14,7 +14,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hil import LabError, fly, load_run
-from hil.laboratory.files.imported import Map, import_log
+from hil.laboratory.files.imported import import_log
+from hil.laboratory.files.log_map import Map
 from hil.pictures.viewer.recording import recording_of
 from support.command import Cli
 
@@ -104,6 +105,24 @@ def test_a_table_of_this_laboratory_is_its_log_again(cli: Cli, tmp_path: Path) -
     assert again.units == run.units
     assert again.free.num_rows == run.free.num_rows
     assert again.metrics["rms_x"] == pytest.approx(run.metrics["rms_x"])
+
+
+def test_the_release_is_where_the_path_fits_that_of_another_flight(cli: Cli, tmp_path: Path) -> None:
+    run = fly("yaw-step", tmp_path / "run", duration_s=2.0, faults=("push.x@0.5=2",))
+    rows = run.log.slice(60, 200).to_pydict()  # 0.4 s before the release and 1.6 s after it
+    columns = {
+        "clock": 1e-6 * np.array(rows["t"]) + 7.0,
+        **{a: np.array(rows[f"truth.{a}"]) + 0.5 for a in "xyz"},
+    }
+    path = csv(
+        tmp_path / "log.csv", {"t" if name == "clock" else name: values for name, values in columns.items()}
+    )
+    assert cli("import", path, "--like", tmp_path / "run", "--out", tmp_path / "again") == 0
+    released_s = Map.read(tmp_path / "again" / "map.toml").release_s
+    assert released_s == pytest.approx(7.0 + 1e-6 * run.free.column("t")[0].as_py(), abs=0.004)
+    assert "where both paths fit best" in cli.err
+    assert cli("import", path, "--like", tmp_path / "none", "--out", tmp_path / "more") == 2
+    assert "there is no such run folder" in cli.err
 
 
 def test_a_telemetry_log_of_mavlink_is_in_the_world_s_frame(cli: Cli, tmp_path: Path) -> None:
