@@ -115,7 +115,7 @@
   }
 
   function readable(value) {
-    return value == null ? "–" : Math.abs(value) >= 1000 ? value.toFixed(0) : String(Number(value.toPrecision(3)));
+    return value == null ? "" : Math.abs(value) >= 1000 ? value.toFixed(0) : String(Number(value.toPrecision(3)));
   }
 
   function optionsOf(figure, panel, data, first, last, key, whole) {
@@ -132,7 +132,10 @@
         sync: { key, setSeries: false },
         bind: { dblclick: (u) => () => { move(u, ...whole); return null; } },
       },
-      legend: { show: lines.length > 0, live: true },
+      legend: {
+        show: lines.length > 0, live: true,
+        markers: { dash: (u, index) => (lines[index - 1]?.dashed ? "dashed" : "solid") },
+      },
       scales: {
         x: { time: false, range: (u, low, high) => (low == null || low === high ? whole : [low, high]) },
         y: {
@@ -151,7 +154,7 @@
           values: lanes.length ? () => lanes : undefined },
       ],
       series: [
-        { label: "s", value: (u, value) => (value == null ? "–" : value.toFixed(2)) },
+        { label: "s", class: "time", value: (u, value) => (value == null ? "" : value.toFixed(2)) },
         ...lines.map((line, index) => ({
           label: line.name || " ",
           class: line.name ? "named" : "unnamed",

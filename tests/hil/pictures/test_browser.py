@@ -29,6 +29,9 @@ addEventListener("load", async () => {
   await pause();
   document.querySelector("#story a[data-begin='0.5']").click();
   await pause();
+  const legends = [...document.querySelectorAll(".u-legend .u-value")].map((value) => value.textContent).join("");
+  const marked = [...document.querySelectorAll("#close-up-1 tr.named")].map((one) =>
+    [one.textContent.trim(), getComputedStyle(one.querySelector(".u-marker")).borderTopStyle]);
   const [over] = document.querySelectorAll("#errors .u-over"), box = over.getBoundingClientRect();
   const middle = { clientX: box.left + box.width / 2, clientY: box.top + 20, bubbles: true };
   over.dispatchEvent(new MouseEvent("mouseenter", middle));
@@ -40,7 +43,7 @@ addEventListener("load", async () => {
       const time = chart.querySelector(".u-legend .u-series .u-value");
       return { place: place.id, left: edge.left, right: edge.right, time: time ? time.textContent : null };
     }));
-  document.body.dataset.shown = JSON.stringify({ shown, width: document.body.scrollWidth });
+  document.body.dataset.shown = JSON.stringify({ shown, legends, marked, width: document.body.scrollWidth });
 });
 </script>
 </body>"""
@@ -79,6 +82,9 @@ def test_every_panel_is_drawn_with_aligned_edges_and_one_zoom_and_cursor(tmp_pat
     assert len({(one["left"], one["right"]) for one in told["shown"]}) == 1
     assert told["shown"][0]["right"] > width - 70
     assert told["width"] <= width, "nothing stands over the edge of the page"
+    assert told["legends"] == "", "no value without a cursor"
+    assert {how for name, how in told["marked"] if name in ("estimate", "command")} == {"dashed"}
+    assert {how for name, how in told["marked"] if name in ("x", "flap 1")} == {"solid"}
     moved = [one["time"] for one in told["shown"] if one["place"] not in SELDOM and one["time"]]
     assert len(moved) > 10
     # the story's link shows 0.5 s before the moment to 1.5 s after it
