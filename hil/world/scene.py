@@ -6,18 +6,21 @@ Lengths in m, in B or in the frame F of a part, which is parallel to B while its
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.elementary import cos, sin
+from hil.errors import LabError, refusing
 
 Points = NDArray[np.float64]
 Three = tuple[float, float, float]
 CENTRE: Three = (0.0, 0.0, 0.0)
 UP: Three = (0.0, 0.0, 1.0)
 PALE = "#c8ccd0"
+TRIANGLES_MAX = 5000  # of a mesh
 AROUND, DOWN = 12, 6  # faces of a ball along its equator, and from pole to pole
 
 
@@ -104,6 +107,56 @@ def box(size: Three, centre: Three = CENTRE, colour: str = PALE) -> Part:
     high = [(a, b, z) for a, b, _ in low]
     sides = [(low[i], low[i - 3], high[i - 3], high[i]) for i in range(4)]
     return Part("box", _halved([tuple(low[::-1]), tuple(high), *sides]), colour, centre, closed=True)
+
+
+def cylinder(radius: float, length: float, centre: Three = CENTRE, colour: str = PALE) -> Part:
+    """Return a cylinder along z."""
+    low, high = (_circle(radius, z) for z in (-0.5 * length, 0.5 * length))
+    sides = [(low[i - 1], low[i], high[i], high[i - 1]) for i in range(AROUND)]
+    ends = [
+        ((0.0, 0.0, z), a, b)
+        for z, ring in ((-0.5 * length, low[::-1]), (0.5 * length, high))
+        for a, b in _pairs(ring)
+    ]
+    return Part("cylinder", np.concatenate([_halved(sides), np.array(ends)]), colour, centre, closed=True)
+
+
+def disc(radius: float, centre: Three = CENTRE, colour: str = PALE) -> Part:
+    """Return a disc without thickness, flat in x and y."""
+    return Part("disc", np.array([(CENTRE, a, b) for a, b in _pairs(_circle(radius, 0.0))]), colour, centre)
+
+
+def mesh(path: Path | str, scale: float = 1.0, centre: Three = CENTRE, colour: str = PALE) -> Part:
+    """Return the triangles of an STL file, binary or text, times `scale`: 0.001 for one in mm.
+
+    Raises `LabError` for another file, or for more triangles than every log should carry.
+    """
+    with refusing(f"{path}: ", OSError):
+        content = Path(path).read_bytes()
+    count = int.from_bytes(content[80:84], "little")
+    if len(content) == 84 + 50 * count > 84:
+        words = np.frombuffer(content, np.uint8)[84:].reshape(count, 50)[:, 12:48]
+        triangles = np.ascontiguousarray(words).view("<f4").reshape(-1, 3, 3).astype(np.float64)
+    else:
+        lines = [line.split()[1:] for line in content.splitlines() if line.split()[:1] == [b"vertex"]]
+        with refusing(f"{path}: not an STL file: ", ValueError):
+            triangles = np.array(lines, np.float64).reshape(-1, 3, 3)
+    if not (len(triangles) and np.isfinite(triangles).all()):
+        raise LabError(f"{path}: not an STL file: no triangles of finite numbers in it")
+    if len(triangles) > TRIANGLES_MAX:
+        raise LabError(
+            f"{path}: {len(triangles)} triangles; at most {TRIANGLES_MAX}, because every log has them: simplify it"
+        )
+    return Part(Path(path).stem, scale * triangles, colour, centre, closed=True)
+
+
+def _circle(radius: float, z: float) -> list[Three]:
+    turns = (2.0 * math.pi * turn / AROUND for turn in range(AROUND))
+    return [(radius * cos(turn), radius * sin(turn), z) for turn in turns]
+
+
+def _pairs(ring: list[Three]) -> list[tuple[Three, Three]]:
+    return [(ring[i - 1], ring[i]) for i in range(len(ring))]
 
 
 def _halved(quads: Sequence[tuple[Three, ...]]) -> Points:
