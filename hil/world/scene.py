@@ -144,9 +144,8 @@ def mesh(path: Path | str, scale: float = 1.0, centre: Three = CENTRE, colour: s
     if not (len(triangles) and np.isfinite(triangles).all()):
         raise LabError(f"{path}: not an STL file: no triangles of finite numbers in it")
     if len(triangles) > TRIANGLES_MAX:
-        raise LabError(
-            f"{path}: {len(triangles)} triangles; at most {TRIANGLES_MAX}, because every log has them: simplify it"
-        )
+        text = f"{len(triangles)} triangles; at most {TRIANGLES_MAX}: every log has them, so simplify it"
+        raise LabError(f"{path}: {text}")
     return Part(Path(path).stem, scale * triangles, colour, centre, closed=True)
 
 

@@ -28,10 +28,8 @@ def binary(triangles: Points) -> bytes:
 
 def text(triangles: Points) -> bytes:
     corner = "      vertex {:.9e} {:.9e} {:.9e}\n".format
-    facets = "".join(
-        f"facet normal 0 0 0\n  outer loop\n{''.join(corner(*p) for p in one)}  endloop\nendfacet\n"
-        for one in triangles
-    )
+    loops = (f"  outer loop\n{''.join(corner(*p) for p in one)}  endloop\n" for one in triangles)
+    facets = "".join(f"facet normal 0 0 0\n{loop}endfacet\n" for loop in loops)
     return f"solid hull\n{facets}endsolid hull\n".encode()
 
 
