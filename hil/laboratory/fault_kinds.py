@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
+from pathlib import Path
 from typing import Literal
 
 from hil.config import DEFAULT_PROFILE
@@ -67,7 +68,9 @@ class Kind:
     duration_s: float = math.inf  # default; inf: to the end of the flight
     link: Literal["", "radio", "mavlink"] = ""  # the only link that it affects
     markers: bool = False  # affects markers: only with `markers.enabled`
-    body: str = ""  # the only body with the part that fails, also the name of its profile
+    body: str = (
+        ""  # the only body with the part that fails, also the name of its profile; or of the file of a user's
+    )
 
     @property
     def sized(self) -> bool:
@@ -77,13 +80,20 @@ class Kind:
     @property
     def needs(self) -> str:
         """The requirements on the flight, as options of `floaty fly`; empty: none."""
+        if self.is_of_file:
+            return f"[robot] body = {self.body}"
         if self.body not in ("", DEFAULT_PROFILE):
             return f"--profile {self.body}"
         return f"--link {self.link}" if self.link else f"--set {MARKERS_ON}" if self.markers else ""
 
     def acts_on(self, body: str) -> bool:
         """Whether a robot with this body has the part that fails."""
-        return self.body in ("", body)
+        return self.body in ("", body) or (self.is_of_file and self.body == Path(body).name)
+
+    @property
+    def is_of_file(self) -> bool:
+        """Whether its body is a user's."""
+        return self.body.endswith(".py")
 
 
 def add(value: float, size: float) -> float:
@@ -342,7 +352,8 @@ def declare(name: str, kind: Kind) -> Kind:
             f"fault kind {name}: size {kind.size:g} in {kind.low:g}..{kind.high:g}, {len(kind.knobs)} knobs: expected the "
             "size within its bounds, and a knob"
         )
-    _try(name, kind)
+    if not kind.is_of_file:  # whose robot is not known here: its flight tries the knobs
+        _try(name, kind)
     KINDS[name] = kind
     return kind
 

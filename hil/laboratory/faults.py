@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.config import LabConfig
-from hil.errors import LabError, hint
+from hil.errors import LabError, blame, hint
 from hil.laboratory.arguments import checked
 from hil.laboratory.fault_kinds import KINDS, MARKERS_ON, Kind, Knob
 from hil.laboratory.files.recorder import release_of, stored_in
@@ -168,7 +168,10 @@ class Switchboard:
             kind = KINDS[fault.kind]
             if not self._why_not(kind):
                 for knob in kind.knobs:
-                    knob.read(self._robot)
+                    try:
+                        knob.read(self._robot)
+                    except Exception as error:  # of a user's own
+                        raise LabError(f"fault {fault.kind}: {blame(error)}") from error
 
     def plan(self, faults: Iterable[Fault], release_us: int, end_us: int) -> None:
         """Plan begin and end of faults that begin before `end_us`; skip those that cannot act on the robot."""

@@ -31,7 +31,9 @@ from hil.board.real_core import is_link
 from hil.config import DEFAULT_PROFILE, LabConfig, Overrides, check_logic, read_config, settings_of
 from hil.errors import LabError, require
 from hil.laboratory.arguments import checked
+from hil.laboratory.bodies import digest_of_body
 from hil.laboratory.experiment import Experiment, Source, unknown
+from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Fault, check, parse
 from hil.laboratory.metrics import check_limits, limits_of
 
@@ -171,14 +173,23 @@ class Request:
         trajectory, duration_s = options.get("trajectory"), options.get("duration_s")
         if trajectory is not None:
             experiment = dataclasses.replace(experiment, trajectory=trajectory)
+        profile, overrides = (
+            options.get("profile", DEFAULT_PROFILE),
+            settings_of(options.get("overrides", ())),
+        )
+        faults = options.get("faults", ())
+        if any(isinstance(one, str) and one.partition("@")[0] not in KINDS for one in faults):
+            digest_of_body(
+                read_config(profile, (*experiment.settings, *overrides))
+            )  # its file may declare them
         bench: Mapping[str, Any] = {name: value for name, value in options.items() if name in _OF_BENCH}
         request = cls(
             experiment,
-            options.get("profile", DEFAULT_PROFILE),
-            (*experiment.settings, *settings_of(options.get("overrides", ()))),
+            profile,
+            (*experiment.settings, *overrides),
             options.get("seed", 1),
             experiment.duration_s if duration_s is None else duration_s,
-            tuple(map(str, (*experiment.faults, *_parsed(options.get("faults", ()))))),
+            tuple(map(str, (*experiment.faults, *_parsed(faults)))),
             Bench(**bench),
         )
         request.check()

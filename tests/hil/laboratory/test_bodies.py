@@ -18,6 +18,7 @@ from hil.pictures.report import write_report
 from hil.pictures.scene import turn_of
 from hil.research.identify.record import profile_of
 from hil.world.scene import VisualModel
+from support.command import Cli
 from support.flights import hover
 from support.paths import ROOT
 
@@ -239,3 +240,37 @@ def test_a_part_with_an_angle_turns_with_its_column(tmp_path: Path) -> None:
     tilt = column(log, "robot.tilt")
     assert tilt[-1] - tilt[0] == pytest.approx(2e-6 * (column(log, "t")[-1] - column(log, "t")[0]), abs=0.01)
     assert turn_of(part, log)[-1] == pytest.approx([np.cos(tilt[-1] / 2), 0.0, np.sin(tilt[-1] / 2), 0.0])
+
+
+WEAK = """
+    strength = 1.0
+    logged = {"strength": ("strength", "")}
+
+declare("own.weak", Kind("factor on the lift", "", 0.8, 0.0, 1.5, (
+    Knob(lambda robot: robot.body.strength, lambda robot, value: setattr(robot.body, "strength", value), lambda a, b: a * b),
+), body="robot.py"))
+"""
+
+
+def test_a_robot_s_own_fault_acts_on_it_alone(cli: Cli, tmp_path: Path) -> None:
+    robot = (
+        "from hil import Kind, Knob, declare\n" + FLOATING.replace("0.981)", "0.981 * self.strength)") + WEAK
+    )
+    profile = project(tmp_path, robot)
+    fault = ("--fault", "own.weak@0.1:0.2=0.9", "--out", tmp_path / "run")
+    assert cli("fly", "hover", "--profile", profile, "--duration", "0.5", *fault) == 0
+    log = load_log(tmp_path / "run")
+    since = 1e-6 * (column(log, "t") - column(log, "t")[column(log, "flight.free") > 0.5][0])
+    during = (since > 0.11) & (since < 0.29)
+    assert set(column(log, "robot.strength")[during]) == {0.9}
+    assert set(column(log, "robot.strength")[(since < 0.09) | (since > 0.31)]) == {1.0}
+    assert cli("fly", "hover", "--duration", "0.5", "--fault", "own.weak@0.1") == 2
+    assert "acts on a part of robot.py only; this flight is one of floaty" in cli.err
+    (tmp_path / "robot.py").write_text(
+        robot.replace("robot.body.strength,", "robot.body.strenght,"), encoding="utf-8"
+    )
+    assert (
+        cli("fly", "hover", "--profile", profile, "--fault", "own.weak@0.1", "--out", tmp_path / "wrong") == 2
+    )
+    assert "fault own.weak: robot.py:" in cli.err
+    assert "no attribute 'strenght'" in cli.err
