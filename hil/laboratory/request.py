@@ -178,10 +178,8 @@ class Request:
             settings_of(options.get("overrides", ())),
         )
         faults = options.get("faults", ())
-        if any(isinstance(one, str) and one.partition("@")[0] not in KINDS for one in faults):
-            digest_of_body(
-                read_config(profile, (*experiment.settings, *overrides))
-            )  # its file may declare them
+        if _has_unknown(faults):
+            digest_of_body(read_config(profile, (*experiment.settings, *overrides)))
         bench: Mapping[str, Any] = {name: value for name, value in options.items() if name in _OF_BENCH}
         request = cls(
             experiment,
@@ -237,7 +235,9 @@ class Request:
 
     @cached_property
     def planned_faults(self) -> tuple[Fault, ...]:
-        """The faults of the flight. Raises `LabError` for an unknown kind."""
+        """The faults of the flight; the file of the user's own robot may declare their kinds. Raises `LabError`."""
+        if _has_unknown(self.faults):
+            digest_of_body(self.config)
         return _parsed(self.faults)
 
     @cached_property
@@ -310,6 +310,11 @@ def _nested(values: Mapping[str, Any]) -> Mapping[str, Any]:
 StoredRequest = Annotated[Request, BeforeValidator(_nested), PlainSerializer(Request.stored)]
 _STORED: TypeAdapter[Request] = TypeAdapter(StoredRequest)
 _OF_BENCH = tuple(field.name for field in fields(Bench))
+
+
+def _has_unknown(faults: Sequence[Fault | str]) -> bool:
+    """Whether a text names a kind that nobody has declared yet."""
+    return any(isinstance(one, str) and one.partition("@")[0] not in KINDS for one in faults)
 
 
 def _parsed(faults: Sequence[Fault | str]) -> tuple[Fault, ...]:
