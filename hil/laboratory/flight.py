@@ -5,6 +5,7 @@ same time line, `hil.servers.linked` connects the robot to a ground station in a
 """
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -104,17 +105,20 @@ class Flight:
         self._next_drop_note_us = 0
         site = Site(request.config, self.events, Streams.of_seed(request.seed), self.note, executor)
         self.line = line_of(request, site, self.lab)
-        self.robot = self.line.robot
-        self.lab.add(self.robot)
-        self.switchboard = Switchboard(self.robot)
-        request.experiment.prepare(self.robot)
-        self.switchboard.prepare(self.faults)
-        self.schedule = ScheduleTrace(self.robot.firmware.scheduler)
-        self._recorded = self.robot.firmware
-        self._resets_before = 0  # the release
-        self.line.begin(self._plan)
-        self.robot.watch(0)
-        self.events.every(RECORD_PERIOD_US, RECORD_PHASE_US, self._record)
+        with ExitStack() as failing:
+            failing.callback(self.line.close)  # which has opened files
+            self.robot = self.line.robot
+            self.lab.add(self.robot)
+            self.switchboard = Switchboard(self.robot)
+            request.experiment.prepare(self.robot)
+            self.switchboard.prepare(self.faults)
+            self.schedule = ScheduleTrace(self.robot.firmware.scheduler)
+            self._recorded = self.robot.firmware
+            self._resets_before = 0  # the release
+            self.line.begin(self._plan)
+            self.robot.watch(0)
+            self.events.every(RECORD_PERIOD_US, RECORD_PHASE_US, self._record)
+            failing.pop_all()
 
     @property
     def events(self) -> EventQueue:
