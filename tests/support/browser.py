@@ -88,6 +88,7 @@ def browser(profile: Path, *options: str) -> Iterator[Tab]:
     ]  # fmt: skip
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     loop = asyncio.new_event_loop()
+    asyncio.set_event_loop(loop)  # tornado's messages ask for it, and another test's may be closed
     try:
         port_file, deadline = profile / "DevToolsActivePort", time.monotonic() + PATIENCE_S
         while not (port_file.is_file() and "\n" in port_file.read_text()):
