@@ -41,15 +41,16 @@ def __dir__() -> list[str]:
 
 
 class _Moved:
-    """Tells who imports a former room where it is now."""
+    """Refuses the import of a module that has moved, and names its new place."""
 
     @staticmethod
     def find_spec(name: str, _path: object = None, _target: object = None) -> None:
-        package, _, path = name.partition(".")
-        room, _, rest = path.partition(".")
+        if not name.startswith("hil."):  # asked for every import of the process
+            return
+        room, _, rest = name.removeprefix("hil.").partition(".")
         for wing, rooms in MOVED.items():
-            if package == "hil" and room in rooms:
-                now = ".".join(filter(None, (package, wing, room * (room != "devices"), rest)))
+            if room in rooms:
+                now = ".".join(filter(None, ("hil", wing, room * (room != "devices"), rest)))
                 raise ModuleNotFoundError(f"{name} is {now} now", name=name)
 
 

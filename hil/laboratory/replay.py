@@ -59,13 +59,15 @@ class Shadowed:
 
     def call(self, name: str) -> int:
         """Execute an entry point on both; the estimator of the second one gets the commands that flew."""
-        shadow, own = self._shadow, self._shadow.control.memory.copy()
+        shadow = self._shadow
         shadow.data.memory[:] = self._blocks.data.memory
         if name == "estimate":
+            own = shadow.control.memory.copy()
             shadow.control.memory[:] = self._blocks.control.memory
-        shadow.run.call(name)
-        if name == "estimate":
+            shadow.run.call(name)
             shadow.control.memory[:] = own
+        else:
+            shadow.run.call(name)
         if name == "control":
             estimator, u = shadow.estimator.memory, shadow.control.memory["u"][0]
             now_us = int(self._blocks.data.fields.now_us) % WRAP_US

@@ -157,26 +157,26 @@ POSITION_ESTIMATE = Curves(
 ATTITUDE_ESTIMATE = Curves(
     _RPY, AXIS_COLOURS, "deg", _degrees(*(f"estimate.{name}" for name in _RPY)), needs="estimate.roll"
 )
-POSITION_MISS = Curves(
-    _XYZ,
-    AXIS_COLOURS,
-    "cm",
-    lambda rows: POSITION_ESTIMATE.read(rows) - POSITION.read(rows),
-    needs="estimate.x",
-)
-ATTITUDE_MISS = Curves(
-    _RPY, AXIS_COLOURS, "deg", lambda rows: (ATTITUDE_ESTIMATE.read(rows) - ATTITUDE.read(rows) + 180) % 360 - 180,
-    needs="estimate.roll",
-)  # fmt: skip
-REPLAYED_POSITION_MISS = Curves(
-    _XYZ, AXIS_COLOURS, "cm",
-    lambda rows: 100 * column(rows, "replay.x", "replay.y", "replay.z") - POSITION.read(rows), needs="replay.x",
-)  # fmt: skip
-REPLAYED_ATTITUDE_MISS = Curves(
-    _RPY, AXIS_COLOURS, "deg",
-    lambda rows: (_degrees(*(f"replay.{name}" for name in _RPY))(rows) - ATTITUDE.read(rows) + 180) % 360 - 180,
-    needs="replay.roll",
-)  # fmt: skip
+
+
+def _misses(group: str) -> tuple[Curves, Curves]:
+    """Return an estimate less the truth, position and attitude, by the group of its columns, in G."""
+
+    def position(rows: pa.Table) -> NDArray[np.float64]:
+        return np.asarray(100 * column(rows, f"{group}.x", f"{group}.y", f"{group}.z") - POSITION.read(rows))
+
+    def attitude(rows: pa.Table) -> NDArray[np.float64]:
+        angles = _degrees(*(f"{group}.{name}" for name in _RPY))(rows)
+        return np.asarray((angles - ATTITUDE.read(rows) + 180) % 360 - 180)
+
+    return (
+        Curves(_XYZ, AXIS_COLOURS, "cm", position, needs=f"{group}.x"),
+        Curves(_RPY, AXIS_COLOURS, "deg", attitude, needs=f"{group}.roll"),
+    )
+
+
+POSITION_MISS, ATTITUDE_MISS = _misses("estimate")
+REPLAYED_POSITION_MISS, REPLAYED_ATTITUDE_MISS = _misses("replay")
 REPLAYED_REFUSALS = Curves(
     tuple(f"{name}, {how}" for name in REFUSED for how in ("replayed", "flown")), SERIES_COLOURS[:6], "so far",
     plain(*(f"{group}.{name}" for name in REFUSED for group in ("replay", "estimator"))), needs="replay.refused",
