@@ -195,7 +195,7 @@ class Expressions:
         return Value(text, ValueType(array.kind.base))
 
     def _missing_argument(self, node: ast.Attribute, name: str) -> str:
-        """Return ": write ..." for a field of what is no argument."""
+        """Return the repair, ": write ...", for a field of a name that is not an argument."""
         if name == "self":
             return f": write memory.{node.attr}, a field of the memory struct"
         if name[:1].isupper():
@@ -337,7 +337,7 @@ class Expressions:
         return Value(f"{kernel.c_name}({', '.join(texts)})", kernel.result)
 
     def _function(self, node: ast.Call, name: str) -> str:
-        """Return ": write ..." for a call of what is no kernel."""
+        """Return the repair, ": write ...", for a call of a function that is not a kernel."""
         if name in self.module.broken:
             raise FollowUpError(name)
         if name == "len" and len(node.args) == 1 and (shape := self.value(node.args[0]).kind.shape):

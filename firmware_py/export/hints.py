@@ -151,7 +151,7 @@ def word(node: ast.AST) -> str:
 
 
 def nearest(name: str, known: Iterable[str], before: str = "") -> str:
-    """Return ": write ..." with the nearest of the known names, or all of them; `before` stands in front of a name."""
+    """Return the repair, ": write ...", with the nearest known name or all of them; `before` is a prefix like "own."."""
     names = [one for one in known if one != name and one.isidentifier()]
     home = HOMES.get(name)
     if home and not before:

@@ -47,7 +47,7 @@ _FILE = TypeAdapter(tuple[Pinned, ...])
 
 
 def file_of(home: Path, name: str) -> Path:
-    """Return the file of a baseline beside the test file in `home`. Raises `LabError` for what is no name."""
+    """Return the file of a baseline beside the test file in `home`. Raises `LabError` for an invalid name."""
     if not re.fullmatch(r"\w[\w.-]*", name):
         raise LabError(f"baseline {name!r}: expected a name of letters, digits, '.', '-' and '_'")
     return home / FOLDER / f"{name}.json"

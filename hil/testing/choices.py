@@ -134,7 +134,7 @@ def why_no_board(board: str) -> str:
 
 
 def _listed(value: Any) -> tuple[Any, ...]:
-    """Return a list's elements, or one element for what is no list."""
+    """Return the elements of a list, or a single value as the only element."""
     return tuple(value) if isinstance(value, list | tuple | set) else (value,)
 
 

@@ -139,8 +139,8 @@ class Flights:
         """Compare the flights of the test with `baselines/NAME.json` beside its file; `--floaty-update` writes it.
 
         Fails with the metrics of both and the first row that differs when an outcome has changed or a metric has left
-        `rel` of the baseline's, for better or worse. `metrics` are those that count; by default all. Another seed,
-        profile, link or fault of the mark has a file of its own; boards share one. Raises `LabError` for a missing baseline.
+        `rel` of the baseline's, for better or worse. `metrics` are those that count; by default all. Flights with
+        another seed, profile, link or fault of the mark have their own file; boards share one. Raises `LabError` without it.
         """
         __tracebackhide__ = True
         from hil.testing import baselines
