@@ -1,9 +1,9 @@
 """The board's pins as the firmware sees them: raw counts and bytes, nothing in SI."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
-from firmware_py.core.subset import I32s
+from firmware_py.core.subset import F32s, I32s
 from firmware_py.wire.mavlink_numbers import CommandResult
 
 # Gyro x y z, accelerometer x y z, int16, sensor frame.
@@ -17,6 +17,10 @@ class Board(Protocol):
 
     eeprom: bytearray  # (8192,) survives power cycles; all 0xFF when new
     imu: I32s  # (6,) the registers of the BMI088, as `ImuCounts`
+
+    @property
+    def sensors(self) -> Mapping[str, F32s]:
+        """The last samples of the robot's own sensors, by name; NaN: there is none."""
 
     def read_imu(self) -> ImuCounts:
         """Return the registers of the BMI088 as they are now."""

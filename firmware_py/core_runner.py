@@ -4,7 +4,7 @@ The tasks call the core through a `CoreRunner` on the memory of `CoreBlocks`: th
 machine; under `firmware_py.export` also its plain Python, and machine code of a Cortex-M4.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import ClassVar, Protocol, runtime_checkable
@@ -16,7 +16,7 @@ from firmware_py.compiling import PLAIN, SUFFIX, bound_in, fall_back, hash_of, k
 from firmware_py.config import CpuConfig
 from firmware_py.core import entry
 from firmware_py.core.structs import Control, Estimator, Input, Parameters, Report, Sampling, Supervisor
-from firmware_py.core.subset import Block, Struct
+from firmware_py.core.subset import Block, F32s, Struct
 from firmware_py.export.c99 import translate
 from firmware_py.export.compilers import Compiler, by_first_that_works
 from firmware_py.export.errors import CompilerError
@@ -79,6 +79,11 @@ class CoreBlocks:
             "sampling": self.sampling, "supervisor": self.supervisor, "report": self.report,
         }  # fmt: skip
         self.named = core | own
+        self.sensed: Mapping[str, F32s] = {}  # what own logic sees of the robot's own sensors, by name
+        self._fields = [
+            (own[field.block].memory[field.name], field.name)
+            for field in (() if logic is None else logic.sensed)
+        ]
         self.run: CoreRunner = runner(self)
 
     def entry(self, name: str) -> Callable[[], int]:
@@ -89,8 +94,16 @@ class CoreBlocks:
     def inputs(self) -> frozenset[str]:
         """The blocks that code outside the core writes, too."""
         return frozenset(
-            name for name in self.named if name in ("parameters", "data") or name.endswith("_own")
+            name
+            for name in self.named
+            if name in ("parameters", "data") or name.endswith(("_own", "_sensed"))
         )
+
+    def sense(self, samples: Mapping[str, F32s]) -> None:
+        """Let own logic see these samples of the robot's own sensors."""
+        self.sensed = {name: sample.copy() for name, sample in samples.items()}
+        for memory, name in self._fields:
+            memory[:] = samples[name]
 
 
 class NativeRunner:

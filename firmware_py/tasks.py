@@ -284,6 +284,7 @@ class FlightTasks:
 
     def _decide(self) -> None:
         now_us = self._kernel.now_us
+        self._core.sense(self._board.sensors)
         self._pilot.step(now_us)
         self._supervisor.update(now_us)
 

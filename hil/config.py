@@ -22,7 +22,7 @@ from firmware_py.logic.laws import SHIPPED_LAWS
 from firmware_py.logic.loading import load_logic
 from firmware_py.section import Section, number
 from ground_station.config import CaptureConfig, GroundConfig, PilotConfig, StationConfig, TrackerConfig
-from hil.board.config import ImuConfig, MarkersConfig, MocapConfig, SerialConfig
+from hil.board.config import ImuConfig, MarkersConfig, MocapConfig, SensorConfig, SerialConfig
 from hil.emulator.crazyflie.config import RadioConfig
 from hil.errors import LabError, RefusedFileError, hint, shown
 from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
@@ -103,6 +103,10 @@ class LabConfig(FirmwareConfig):
     battery: BatteryConfig = Field(default_factory=BatteryConfig)
     tunnel: TunnelConfig = Field(default_factory=TunnelConfig)
     imu: ImuConfig = Field(default_factory=ImuConfig)
+    sensors: dict[str, SensorConfig] = Field(
+        default_factory=dict,
+        description="of your own robot, by the name in its `sensed`: `noise` in its unit, `delay_us`, `dropout` (a share)",
+    )
     mocap: MocapConfig = Field(default_factory=MocapConfig)
     markers: MarkersConfig = Field(default_factory=MarkersConfig)
     radio: RadioConfig = Field(default_factory=RadioConfig)

@@ -108,6 +108,16 @@ class Logged(Served):
 
 
 @dataclass(frozen=True, slots=True)
+class Sensed:
+    """Marks a field as what a sensor of the user's own robot measures, in a unit: `Annotated[f32, Sensed("m")]`.
+
+    NaN without a sample. It is a log variable as well.
+    """
+
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
 class Settable(Served):
     """Marks a field of the core as a parameter, within inclusive bounds: a profile sets it, clients may change it.
 

@@ -4,7 +4,7 @@ import ast
 from collections.abc import Mapping
 from typing import Any
 
-from firmware_py.core.subset import Logged, Settable, Tunable
+from firmware_py.core.subset import Logged, Sensed, Settable, Tunable
 from firmware_py.export import hints
 from firmware_py.export.errors import FollowUpError, RefusalError, refusal
 from firmware_py.export.syntax import (
@@ -19,8 +19,8 @@ from firmware_py.export.syntax import (
     ValueType,
 )
 
-MARKS: Mapping[str, type[Any]] = {"Tunable": Tunable, "Logged": Logged, "Settable": Settable}
-MARK_FORM = 'Tunable(default, "unit", low=.., high=..) of a parameter, or Logged("unit") of the memory'
+MARKS: Mapping[str, type[Any]] = {mark.__name__: mark for mark in (Tunable, Logged, Sensed, Settable)}
+MARK_FORM = 'Tunable(default, "unit", low=.., high=..) of a parameter, Logged("unit") of memory, Sensed("unit") of a sensor'
 
 
 class Annotations:
@@ -85,7 +85,9 @@ class Annotations:
             mark: Mark = MARKS[name](*given, **named)
             numbers = (mark.default, mark.low, mark.high) if isinstance(mark, Tunable) else ()
             typed = isinstance(mark.unit, str) and all(type(number) in (int, float) for number in numbers)
-            if not self._module.own or (typed and (numbers or mark == Logged(mark.unit))):
+            if not self._module.own or (
+                typed and (numbers or mark in (Logged(mark.unit), Sensed(mark.unit)))
+            ):
                 return mark
         except (KeyError, TypeError, ValueError):
             pass

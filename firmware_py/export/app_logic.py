@@ -4,12 +4,16 @@ The default core has none; then only the calls remain.
 """
 
 from collections.abc import Iterable, Mapping
+from math import isfinite
+from typing import Any
+
+import numpy as np
 
 from firmware_py.config import LogicConfig
 from firmware_py.export.literals import literal
 from firmware_py.logic.budget import ARGUMENT, STRUCT
 from firmware_py.logic.loading import Logic, load_logic
-from firmware_py.logic.plugs import ANSWERING, BLOCKS, CALLS, OWN
+from firmware_py.logic.plugs import ANSWERING, BLOCKS, CALLS, OWN, SENSED
 
 CALLS_HEADER = """\
 /* How the app enters the core: every call with the memory that it takes. Written by `floaty deploy`. */
@@ -20,6 +24,10 @@ CALLS_HEADER = """\
 
 {memory}
 {calls}
+/* Let own logic see what the robot's own sensors measure: own_sensors.c. */
+{prototypes}static inline void call_sense(void) {{
+{sense}}}
+
 /* The counts of the hover angles, on memory of its own: for any task. */
 static inline void call_hover(FloatyControl *control) {{
   static const FloatyInput input; /* mode 0 */
@@ -41,6 +49,20 @@ static inline {result} call_{name}(void) {{
   {returns}floaty_core_{name}({arguments});
 }}
 """
+SENSORS = """\
+/* Reads the robot's own sensors, before each control step, 100 times a second. This file is yours: it is written once. A
+ * field stays as it is until you set it, NAN at the start; set it to NAN when there is no sample. A step has 10 ms: do
+ * not wait for a sensor here, but read it in a task of its own. */
+#include <math.h>
+
+#include "floaty_calls.h"
+{functions}"""
+SENSE = """
+void floaty_sense_{name}({kind} *sensed) {{
+  /* sensed->{field} = ..; */
+  (void)sensed;
+}}
+"""
 CORE_TYPES = {name: f"Floaty{struct}" for name, struct in BLOCKS.items()}
 
 
@@ -56,6 +78,26 @@ def own_types(logic: Logic | None) -> dict[str, str]:
     return types
 
 
+def sensed_types(logic: Logic | None) -> dict[str, str]:
+    """Return the C types of the blocks with what own logic reads of the robot's own sensors, by name."""
+    return {name: kind for name, kind in own_types(logic).items() if name.endswith(f"_{SENSED}")}
+
+
+def sensors_source(config: LogicConfig) -> str:
+    """Return the C file in which the user reads sensors; empty when own logic has none."""
+    logic = load_logic(config)
+    fields = {} if logic is None else {field.block: field.name for field in logic.sensed}
+    functions = (
+        SENSE.format(name=_point(name), kind=kind, field=fields[name])
+        for name, kind in sensed_types(logic).items()
+    )
+    return SENSORS.format(functions="".join(functions)) if fields else ""
+
+
+def _point(block: str) -> str:
+    return block.removesuffix(f"_{SENSED}")
+
+
 def calls_header(config: LogicConfig) -> str:
     """Return the header with the app's calls into the core."""
     logic = load_logic(config)
@@ -63,11 +105,16 @@ def calls_header(config: LogicConfig) -> str:
     places = {"data": "&floaty_input"} | {
         name: f"&floaty_{name}" for name in (*BLOCKS, *types) if name != "data"
     }
+    sensed = sensed_types(logic)
     calls = CALLS if logic is None else logic.loaded.calls
     scratch = [name for name in calls["control"] if name in types and not name.endswith(f"_{OWN}")]
     alone = places | {"data": "&input", "control": "control"} | {name: f"&{name}" for name in scratch}
     return CALLS_HEADER.format(
         memory="".join(f"extern {kind} floaty_{name};\n" for name, kind in types.items()),
+        prototypes="".join(
+            f"void floaty_sense_{_point(name)}({kind} *sensed);\n\n" for name, kind in sensed.items()
+        ),
+        sense="".join(f"  floaty_sense_{_point(name)}(&floaty_{name});\n" for name in sensed),
         scratch="".join(f"  static {types[name]} {name};\n" for name in scratch),
         hover=_listed(calls["control"], alone),
         members="".join(f"  {kind} {name};\n" for name, kind in {**CORE_TYPES, **types}.items()),
@@ -96,13 +143,21 @@ def own_memory(config: LogicConfig) -> str:
     lines = []
     blocks = logic.allocate()
     for name, kind in own_types(logic).items():
-        if not name.endswith(f"_{OWN}"):
+        if not name.endswith((f"_{OWN}", f"_{SENSED}")):
             lines.append(f"{kind} floaty_{name};")
             continue
         memory = blocks[name].memory
-        values = [f"    .{field} = {literal(memory[field][0])}," for field in memory.dtype.names or ()]
+        values = [f"    .{field} = {_initial(memory[field][0])}," for field in memory.dtype.names or ()]
         lines.append("\n".join((f"{kind} floaty_{name} = {{", *values, "};")))
     return "\n/* What own logic needs. */\n" + "\n".join(lines) + "\n"
+
+
+def _initial(value: Any) -> str:
+    """Return the initialiser of a parameter; of sensors, which have no sample yet."""
+    numbers = [
+        literal(number) if isfinite(number) else '__builtin_nanf("")' for number in np.atleast_1d(value)
+    ]
+    return numbers[0] if np.ndim(value) == 0 else f"{{{', '.join(numbers)}}}"
 
 
 def own_bytes(config: LogicConfig) -> bytes:

@@ -7,7 +7,7 @@ table of parameters are written into their places here. `app/README.md` describe
 from pathlib import Path
 
 from firmware_py.config import FirmwareConfig
-from firmware_py.export.app_logic import calls_header
+from firmware_py.export.app_logic import calls_header, sensors_source
 from firmware_py.export.app_toc import toc_source
 from firmware_py.export.app_wire import wire_header
 from firmware_py.export.errors import ExportError
@@ -15,6 +15,7 @@ from firmware_py.export.profile_c import profile_source
 from firmware_py.logic.loading import translation_of
 
 TEMPLATES = Path(__file__).parent / "app"
+OWN_SENSORS = Path("src") / "own_sensors.c"  # the user's: written once
 MARKER = Path("src") / "floaty_app.c"  # a folder with this file is an app and may be written over
 
 
@@ -33,6 +34,9 @@ def app_files(config: FirmwareConfig, profile: str) -> dict[str, str]:
     files["src/floaty_calls.h"] = calls_header(config.logic)
     files["src/floaty_wire.h"] = wire_header()
     files["src/floaty_toc.c"] = toc_source(config)
+    if sensors := sensors_source(config.logic):
+        files[str(OWN_SENSORS)] = sensors
+        files["src/Kbuild"] += f"obj-y += {OWN_SENSORS.stem}.o\n"
     return files
 
 
@@ -45,6 +49,8 @@ def write_app(config: FirmwareConfig, profile: str, folder: Path) -> tuple[Path,
         # The marker first: an app that was not written to its end may be written again.
         for name, text in sorted(files.items(), key=lambda file: file[0] != str(MARKER)):
             path = folder / name
+            if name == str(OWN_SENSORS) and path.exists():
+                continue
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, "utf-8")
     except OSError as error:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Union
 
-from firmware_py.core.subset import Logged, Settable, Tunable
+from firmware_py.core.subset import Logged, Sensed, Settable, Tunable
 from firmware_py.export.errors import Refusals
 
 PACKAGE = "firmware_py.core"
@@ -55,7 +55,7 @@ class Constant:
     shared: bool
 
 
-Mark = Tunable | Logged | Settable
+Mark = Tunable | Logged | Sensed | Settable
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,9 +4,10 @@ import builtins
 import difflib
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from math import nan
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 from firmware_py.config import LogicConfig
 from firmware_py.core.budget import CALL_CYCLES, LoopBudget
 from firmware_py.core.guard import Guard
-from firmware_py.core.subset import Block, Struct
+from firmware_py.core.subset import Block, Sensed, Struct
 from firmware_py.errors import LogicError
 from firmware_py.export.c99 import Translation, check, core_texts, translate
 from firmware_py.export.errors import ExportError, RefusalError
@@ -23,7 +24,7 @@ from firmware_py.export.syntax import ENTRY, OWN
 from firmware_py.logic.budget import ARGUMENT, budgeted
 from firmware_py.logic.entry import GUARD, compose
 from firmware_py.logic.laws import SHIPPED_LAWS
-from firmware_py.logic.plugs import GROUP, POINTS, Plug, PlugPoint, read_plug
+from firmware_py.logic.plugs import GROUP, POINTS, SENSED, Plug, PlugPoint, read_plug
 from firmware_py.table import CoreParameter, CoreVariable
 
 
@@ -45,7 +46,22 @@ class Loaded:
 
     @property
     def variables(self) -> tuple[CoreVariable, ...]:
-        return tuple(variable for plug in self.plugs for variable in plug.variables)
+        named: dict[str, CoreVariable] = {}  # both modules may read one sensor
+        for plug in self.plugs:
+            for variable in plug.variables:
+                named.setdefault(variable.name, variable)
+        return tuple(named.values())
+
+
+@dataclass(frozen=True, slots=True)
+class SensedField:
+    """A field that own logic reads of a sensor: where it stands, its block and name, the array's shape, its unit."""
+
+    place: str
+    block: str
+    name: str
+    shape: tuple[int, ...]
+    unit: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +70,15 @@ class Logic:
 
     loaded: Loaded
     values: Mapping[str, float]  # of every parameter
+
+    @property
+    def sensed(self) -> Iterator[SensedField]:
+        """What its modules read of the robot's own sensors."""
+        for plug in self.loaded.plugs:
+            for field in plug.structs[SENSED].fields.values() if SENSED in plug.structs else ():
+                assert isinstance(field.mark, Sensed)
+                place = f"{_shown(self.loaded.files[plug.point.name])}:{field.line}"
+                yield SensedField(place, plug.block(SENSED), field.name, field.kind.shape, field.mark.unit)
 
     def overrun(self, blocks: Mapping[str, Block[Struct]]) -> str:
         """Return the first loop that exceeded the budget of its call, as one line; empty: none."""
@@ -66,8 +91,10 @@ class Logic:
         return ""
 
     def allocate(self) -> dict[str, Block[Struct]]:
-        """Return the memory, with the parameters in it."""
+        """Return the memory, with the parameters in it; sensors have no sample yet."""
         blocks = {name: kind.allocate() for name, kind in self.loaded.structs.items()}
+        for field in self.sensed:
+            blocks[field.block].memory[field.name] = nan
         for parameter in self.loaded.parameters:
             place = parameter.place
             blocks[place.block].memory[place.field] = self.values[place.field]
@@ -230,9 +257,12 @@ def _check_names(plugs: tuple[Plug, ...], shown: Mapping[str, str]) -> None:
             for thing in getattr(plug, kind):
                 name = thing.name.removeprefix(f"{GROUP}.")
                 key = name.upper()  # MAVLink has no small letters
-                if key in seen:
+                if key in seen and not (
+                    thing.place.block.endswith(SENSED) and seen[key].startswith(f"{SENSED}.")
+                ):
                     raise LogicError(f"{path}: {name}: this name exists already: {seen[key]}")
-                seen[key] = f"{name} in {path}"
+                of_sensor = f"{SENSED}." if thing.place.block.endswith(SENSED) else ""
+                seen[key] = f"{of_sensor}{name} in {path}"
 
 
 def _shown(file: str) -> str:

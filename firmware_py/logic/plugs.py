@@ -5,6 +5,7 @@ A hook is a kernel with a fixed name. It takes those of these arguments that it 
     parameters: Parameters, data: Input, estimator: Estimator, control: Control     of the core
     own: a struct whose fields are all Tunable                                      the module's parameters
         memory: a struct                                                                its state; fields may be Logged
+        sensed: a struct whose fields are all Sensed                                    the robot's own sensors
 """
 
 from collections.abc import Iterator, Mapping
@@ -17,7 +18,7 @@ import numpy as np
 
 from firmware_py import table
 from firmware_py.core import entry
-from firmware_py.core.subset import Logged, Tunable
+from firmware_py.core.subset import Logged, Sensed, Tunable
 from firmware_py.export.errors import RefusalError
 from firmware_py.export.locals import find_writes
 from firmware_py.export.syntax import BROKEN, I32, VOID, Module, Signature, StructField, StructType, ValueType
@@ -31,7 +32,7 @@ BLOCKS = {name: kind.__name__ for name, kind in table.BLOCKS.items()}  # of the 
 CORE_STRUCTS = {
     name: BLOCKS[name] for name in ("parameters", "data", "estimator", "control")
 }  # that hooks may take
-OWN, MEMORY = "own", "memory"
+OWN, MEMORY, SENSED = "own", "memory", "sensed"
 _SIGNATURES = {
     name: signature(function)
     for name, function in vars(entry).items()
@@ -64,7 +65,7 @@ class Plug:
 
     point: PlugPoint
     hooks: Mapping[str, tuple[str, ...]]  # the arguments of those that it has
-    structs: Mapping[str, StructType]  # by argument: own, memory
+    structs: Mapping[str, StructType]  # by argument: own, memory, sensed
     parameters: tuple[CoreParameter, ...]
     variables: tuple[CoreVariable, ...]
     charged: Mapping[str, int]  # cycles of the hooks in which loops are charged
@@ -98,9 +99,10 @@ def read_plug(point: PlugPoint, module: Module) -> Plug:
     for field in structs[OWN].fields.values() if OWN in structs else ():
         with module.refusals.note():
             parameters.append(_parameter(point, module, field))
-    for field in structs[MEMORY].fields.values() if MEMORY in structs else ():
-        with module.refusals.note():
-            variables += _variables(point, module, field)
+    for argument in (MEMORY, SENSED):
+        for field in structs[argument].fields.values() if argument in structs else ():
+            with module.refusals.note():
+                variables += _variables(point, argument, module, field)
     return Plug(point, hooks, structs, tuple(parameters), tuple(variables), {})
 
 
@@ -115,12 +117,12 @@ def _check_signature(point: PlugPoint, kernel: Signature, structs: dict[str, Str
         if kind == BROKEN:
             continue
         fits = kind.base == CORE_STRUCTS.get(argument)
-        if argument in (OWN, MEMORY) and any(kind.struct is thing for thing in module.defined):
+        if argument in (OWN, MEMORY, SENSED) and any(kind.struct is thing for thing in module.defined):
             assert kind.struct is not None
             fits = structs.setdefault(argument, kind.struct) is kind.struct
         if not fits:
             known = ", ".join(f"{key}: {value}" for key, value in CORE_STRUCTS.items())
-            text = f"{name}: argument {argument}: expected any of {known}, own and memory, one struct of this file each"
+            text = f"{name}: argument {argument}: expected any of {known}; own, memory, sensed: a struct of this file each"
             with module.refusals.note():
                 kernel.arguments[argument] = BROKEN
                 raise _refusal(module, line, text)
@@ -163,11 +165,14 @@ def _parameter(point: PlugPoint, module: Module, field: StructField) -> CorePara
     )  # fmt: skip
 
 
-def _variables(point: PlugPoint, module: Module, field: StructField) -> Iterator[CoreVariable]:
+def _variables(point: PlugPoint, argument: str, module: Module, field: StructField) -> Iterator[CoreVariable]:
     mark, kind = field.mark, field.kind
+    if argument == SENSED and (not isinstance(mark, Sensed) or kind.base != "f32" or kind.rank == 2):
+        form = 'Annotated[f32, Sensed("unit")], or Annotated[F32s, n, Sensed("unit")]'
+        raise _refusal(module, field.line, f"{field.name}: what a sensor measures is {form}")
     if mark is None:
         return
-    if not isinstance(mark, Logged) or kind.rank == 2:
+    if not isinstance(mark, Sensed if argument == SENSED else Logged) or kind.rank == 2:
         text = (
             f"{field.name}: in the memory numbers and lists of them may be Logged; parameters stand in `own`"
         )
@@ -178,5 +183,5 @@ def _variables(point: PlugPoint, module: Module, field: StructField) -> Iterator
             text = f"{name}: {len(name)} characters; a log variable's name has at most {VARIABLE_ROOM}: write a shorter name"
             raise _refusal(module, field.line, text)
         scalar = SCALARS[kind.base]
-        place = Place(f"{point.name}_{MEMORY}", field.name, scalar, index)
+        place = Place(f"{point.name}_{argument}", field.name, scalar, index)
         yield CoreVariable(f"{GROUP}.{name}", scalar, mark.unit, place)

@@ -28,6 +28,14 @@ class ImuConfig(Section):
 Probability = Annotated[float, Field(ge=0, le=1)]
 
 
+class SensorConfig(Section):
+    """A sensor of your own robot (`floaty docs your-own-robot`): the errors of its samples at 100 Hz."""
+
+    noise: float = number(0.0, "[0, 1e6]", "white, per number [the sensor's unit]")
+    delay_us: int = number(0, "[0, 1_000_000]", "from the measurement to the board [us]")
+    dropout: Probability = Field(0.0, description="share of samples that are missing")
+
+
 class MocapConfig(Section):
     """Cameras, their computer and the network to the ground station."""
 

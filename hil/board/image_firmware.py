@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from firmware_py.board import ImuCounts
 from firmware_py.config import FirmwareConfig, parameters_of
+from firmware_py.logic.loading import Logic, load_logic
 from firmware_py.rtos import TaskReport
 from firmware_py.signals import CONTROL, ESTIMATOR, INPUT, Signals
 from firmware_py.wire.supervisor import LOCKED, Cause, State
@@ -120,14 +121,18 @@ class ChipImage:
         return 0  # the chip simulates its serial line itself
 
     def boot(self, start: PowerOn) -> ImageFirmware:
-        return ImageFirmware(self, start.board, start.rest, not start.polled, start.outputs, start.carrier)
+        logic = load_logic(start.config.logic)
+        return ImageFirmware(
+            self, start.board, start.rest, not start.polled, start.outputs, start.carrier, logic
+        )
 
 
 class ImageFirmware:
     """An image at power-on. `rest` gives the IMU's counts while the robot is at rest, before the laboratory's time begins.
 
     `polls`: whether empty radio packets arrive by themselves, as from a host that only listens. `outputs`: the timer
-    outputs that drive the robot, by default the servos'.
+    outputs that drive the robot, by default the servos'. `logic` is that of the profile: what it reads of the robot's own
+    sensors is written into the app's memory.
     """
 
     usage: ClassVar[None] = None
@@ -143,6 +148,7 @@ class ImageFirmware:
         polls: bool = True,
         outputs: Sequence[tuple[int, int]] = OUTPUTS,
         carrier: Carrier | None = None,
+        logic: Logic | None = None,
     ) -> None:
         self._crazyflie = Crazyflie(
             flashed.image, flashed.library, board, polls, flashed.debugger, outputs, carrier
@@ -154,6 +160,19 @@ class ImageFirmware:
         self.variables = [one for name, one in self._table.items() if name.startswith("excite.")]
         self.log_numbers = log_numbers(self.image, self.chip)
         self.parameters = parameter_table(self.image, self.chip)
+        self._sensed = (
+            [
+                (
+                    self._struct(f"floaty_{field.block}", logic.loaded.structs[field.block].dtype)[
+                        field.name
+                    ],
+                    field.name,
+                )
+                for field in logic.sensed
+            ]
+            if logic is not None
+            else []
+        )
         self._app = self._signals_of_app() if self.image.has("floaty_estimator") else None
         if rest is not None:
             for now_us in range(IMU_PERIOD_US, WARM_UP_US + 1, IMU_PERIOD_US):
@@ -185,12 +204,18 @@ class ImageFirmware:
         own = bool(config.logic.controller or config.logic.estimator)
         if own != self.image.has(OWN_LOGIC):
             found.append("control law, the profile has " + ("one of the user's" if own else "the core's"))
+        logic = load_logic(config.logic)
+        for block in sorted({field.block for field in (() if logic is None else logic.sensed)}):
+            if not self.image.has(f"floaty_{block}"):
+                found.append(f"own sensors, the image has no floaty_{block}")
         return "; ".join(found)
 
     # Interrupts and time
 
     def imu_ready(self) -> None:
         self.parts.sample(self._board.read_imu())
+        for field, name in self._sensed:
+            field[:] = self._board.sensors[name]
 
     def radio_received(self, data: bytes, broadcast: bool = False) -> None:
         self._crazyflie.radio.received(data, broadcast)

@@ -1,13 +1,13 @@
 """The board's pins, connected to the virtual world: IMU registers, servo timers, radio chip, UART, debug console."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from firmware_py.board import EEPROM_SIZE, ImuCounts
-from firmware_py.core.subset import I32s, i32
+from firmware_py.core.subset import F32s, I32s, i32
 from firmware_py.rtos import TICK_US
 from firmware_py.wire.mavlink_numbers import CommandResult
 from hil.board.board_firmware import Processor
@@ -53,6 +53,7 @@ class Requests:
 
 
 NO_REQUESTS = Requests()
+NO_SENSORS: Mapping[str, F32s] = {}
 
 
 class VirtualBoard:
@@ -69,7 +70,9 @@ class VirtualBoard:
         uart: Uart | None = None,
         requests: Requests = NO_REQUESTS,
         eeprom: bytearray | None = None,
+        sensors: Mapping[str, F32s] = NO_SENSORS,
     ) -> None:
+        self.sensors = sensors
         self.imu = np.array(STILL, i32)
         self.battery_mv = 3900
         self.eeprom = new_eeprom() if eeprom is None else eeprom

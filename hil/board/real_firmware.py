@@ -45,6 +45,7 @@ from hil.board.clock import Paced
 from hil.board.sample_window import SampleWindow
 from hil.emulator.crazyflie.log_table import ImageVariable
 from hil.emulator.crazyflie.shockburst import syslink_us
+from hil.errors import LabError
 
 SAMPLE_US = 1000
 SILENCE_US = 1_000_000
@@ -82,6 +83,10 @@ class RealBoard:
 
     def boot(self, start: PowerOn) -> RealFirmware:
         """Switch the board to the loop. Raises `LinkError` when it does not answer."""
+        if start.board.sensors:
+            raise LabError(
+                "--hil: the samples of the robot's own sensors do not reach a real board; --board URI lets its core fly"
+            )
         return RealFirmware(self, start.board)
 
     def leave(self) -> None:

@@ -31,8 +31,8 @@ SIZES = {
     "vibration": 2,
 }
 PARTS = (
-    "outputs", "tunnel", "settings", "room", "escs", "look", "markers", "lost", "advance", "set_counts", "draw", "hold",
-    "release", "put_back", "push", "channels",
+    "outputs", "tunnel", "settings", "sensors", "room", "escs", "look", "markers", "lost", "advance", "set_counts", "draw",
+    "hold", "release", "put_back", "push", "channels",
 )  # fmt: skip
 
 
@@ -106,9 +106,12 @@ def _check(body: Any) -> None:
     columns = [
         name for channel in body.channels() for quantity in channel.quantities for name in quantity.names
     ]
+    columns += [f"sensor.{name}" for sensor in body.sensors.values() for name in sensor.names]
     for name, count in Counter(columns).items():
         if count > 1:
             raise LabError(f"{kind} logs {name} {count} times: expected different names")
+    for sensor in body.sensors.values():
+        sensor.read()
     body.look.stored()
     for channel in body.channels():
         channel.read()

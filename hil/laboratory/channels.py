@@ -214,6 +214,7 @@ def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]
         Channel("int8", lambda: (robot.free, firmware.signals.supervisor.state), STATES),
         Channel("float64", _view(body.state), TRUTH),
         *body.channels(),
+        *robot.sensors.channels(),
         Channel("float32", _view(body.flow_W), (quantity("flow", "x y z", "m/s", "W"),)),
         Channel("float64", lambda: _coordinates(trajectory.at(board.now_us)), GOAL),
         *(

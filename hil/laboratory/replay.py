@@ -61,6 +61,8 @@ class Shadowed:
         """Execute an entry point on both; the estimator of the second one gets the commands that flew."""
         shadow = self._shadow
         shadow.data.memory[:] = self._blocks.data.memory
+        if self._blocks.sensed:
+            shadow.sense(self._blocks.sensed)
         if name == "estimate":
             own = shadow.control.memory.copy()
             shadow.control.memory[:] = self._blocks.control.memory

@@ -15,11 +15,14 @@ from typing import Literal
 
 import numpy as np
 
+from firmware_py.logic.loading import load_logic
 from ground_station.mocap import MocapFrame
 from hil.board.board_firmware import Executor, PowerOn, PythonBoard
 from hil.board.cameras import VirtualMocap
 from hil.board.imu import GYRO_COUNTS, VirtualImu
 from hil.board.markers import Sighting, VirtualMarkers
+from hil.board.own_sensors import PERIOD_US as SENSORS_US
+from hil.board.own_sensors import OwnSensors
 from hil.board.pins import CpuLoad, InjectFailure, Requests, VirtualBoard, new_eeprom, unsupported
 from hil.board.uart import VirtualSerial
 from hil.config import LabConfig, load_config
@@ -54,11 +57,12 @@ class Streams:
     serial: np.random.Generator
     markers: np.random.Generator
     board: np.random.Generator  # of its sensors besides the IMU
+    sensors: np.random.Generator  # of a user's own robot
 
     @classmethod
     def of_seed(cls, seed: int) -> Streams:
         """Split a seed."""
-        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(7)))
+        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(8)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +120,8 @@ class Robot:
         seen = (config.markers, self.body.markers, streams.markers)
         markers = VirtualMarkers(*seen) if config.markers.enabled else None
         self.mocap = VirtualMocap(config.mocap, streams.mocap, markers)
+        self.sensors = OwnSensors(self.body.sensors, config.sensors, streams.sensors)
+        self.sensors.check(load_logic(config.logic))
         self.air, self.uart = ports.air, ports.uart
         self.executor = site.executor
         self._ports = ports
@@ -131,6 +137,7 @@ class Robot:
             self.uart,
             Requests(self._reset, ports.radio_command or self._radio_command, ports.fail),
             ports.eeprom,
+            self.sensors.samples,
         )
         self.board.supply(self.battery.millivolts)
         self.boot(0)
@@ -172,6 +179,8 @@ class Robot:
         """Start IMU and cameras, which run for ever."""
         self.events.set_beat(IMU_PERIOD_US, start_us + IMU_PERIOD_US, self._sample)
         self.events.every(self.config.mocap.period_us, start_us + MOCAP_PHASE_US, self._expose)
+        if self.body.sensors:
+            self.events.every(SENSORS_US, start_us + SENSORS_US, self._sense)
 
     def seen_by(self, see: See) -> None:
         """Pass every camera frame to `see` when the cameras' computer has it."""
@@ -275,6 +284,10 @@ class Robot:
         if not self.imu.silent:
             self.board.measure(self.imu.count)
         return not self.imu.silent
+
+    def _sense(self, now_us: int) -> None:
+        self.body.advance(now_us)
+        self.sensors.sample(now_us, self.events)
 
     def _expose(self, now_us: int) -> None:
         self.body.advance(now_us)

@@ -41,6 +41,15 @@ class Channel:
 
 
 @dataclass(frozen=True, slots=True)
+class OwnSensor:
+    """A sensor of a user's body, for own logic: the names of its numbers, their unit, and what it measures now."""
+
+    names: tuple[str, ...]
+    unit: str
+    read: Callable[[], Sequence[float]]
+
+
+@dataclass(frozen=True, slots=True)
 class Setting:
     """A number of a body that a fault changes in flight."""
 
@@ -154,6 +163,10 @@ class Body(Motion, Protocol):
     @property
     def settings(self) -> Mapping[str, Setting]:
         """The settings that faults may change, besides `push` and `tunnel`, by name."""
+
+    @property
+    def sensors(self) -> Mapping[str, OwnSensor]:
+        """The sensors of its own, whose samples own logic reads, by name."""
 
     @property
     def lost(self) -> str | None:

@@ -15,7 +15,7 @@ import numpy as np
 from firmware_py.core.subset import Block, i32
 from firmware_py.elementary import cos
 from hil.errors import LabError
-from hil.world.body import Setting, Vector, View
+from hil.world.body import OwnSensor, Setting, Vector, View
 from hil.world.config import PlantConfig
 from hil.world.fixed_order import normal
 from hil.world.motion import FELL, LEFT_SIDEWAYS, ROSE, TETHER_TAUT, TUMBLED
@@ -45,6 +45,7 @@ class TunnelBody:
     _evaluate: Callable[[], object]
     _advance: Callable[[], object]
     escs: View | None = None  # the outputs drive no ESCs
+    sensors: Mapping[str, OwnSensor] = {}
 
     def __init__(
         self, body: Block[Rigid], tunnel: Tunnel, config: PlantConfig, rng_gust: np.random.Generator

@@ -14,7 +14,7 @@ import numpy as np
 from firmware_py.compiling import bound
 from firmware_py.core.subset import i32
 from hil.errors import LabError, blame
-from hil.world.body import Channel, Quantity, Setting, Vector
+from hil.world.body import Channel, OwnSensor, Quantity, Setting, Vector
 from hil.world.config import BatteryConfig, PlantConfig, TunnelConfig
 from hil.world.in_tunnel import UPRIGHT, TunnelBody
 from hil.world.motion import accelerate, begin, move, surround, watch
@@ -56,6 +56,7 @@ class RigidBody(TunnelBody):
     settings: Mapping[str, Setting] = {}
     parts: tuple[Part, ...] = (ball(0.05),)
     logged: Mapping[str, tuple[str, str]] = {}  # by attribute: names of its numbers, and their unit
+    sensed: Mapping[str, tuple[str, str]] = {}  # likewise, of sensors that own logic reads
     radius: float = 0.1  # [m] of the ball with the cameras' markers
 
     def __init__(self, world: World, rng_gust: np.random.Generator, p_WB: Vector) -> None:
@@ -101,6 +102,22 @@ class RigidBody(TunnelBody):
             )
             for name, (names, unit) in self.logged.items()
         )
+
+    @property
+    def sensors(self) -> Mapping[str, OwnSensor]:  # type: ignore[override]
+        """The attributes or methods in `sensed`: what they give at 100 Hz reaches own logic, and columns `sensor.NAME`."""
+        return {
+            name: OwnSensor(
+                tuple(names.split()),
+                unit,
+                partial(self._given, name, partial(self._measured, name), len(names.split())),
+            )
+            for name, (names, unit) in self.sensed.items()
+        }
+
+    def _measured(self, name: str) -> Any:
+        value = getattr(self, name)
+        return value() if callable(value) else value
 
     @property
     def time_s(self) -> float:

@@ -145,7 +145,7 @@ def _wrong(command: str, shown: Mapping[str, list[str]]) -> Iterator[str]:
 def _is_key(key: str) -> bool:
     model = LabConfig
     section, *rest = key.split(".")
-    if section in ("logic", "limits"):
+    if section in ("logic", "limits", "sensors"):
         return True
     field = model.model_fields.get(section)
     fields = getattr(field.annotation, "model_fields", {}) if field is not None else {}

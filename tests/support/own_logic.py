@@ -12,7 +12,7 @@ from firmware_py.core.controller import feedback
 from firmware_py.core.guard import allocate
 from firmware_py.core.maths import ZERO, clamp, sin
 from firmware_py.core.structs import POSITION, Control, Estimator, Input, Parameters
-from firmware_py.core.subset import F32s, Logged, Struct, Tunable, f32, i32, kernel, sqrt
+from firmware_py.core.subset import F32s, Logged, Sensed, Struct, Tunable, f32, i32, kernel, sqrt
 
 '''
 AS_BUILT_IN = (

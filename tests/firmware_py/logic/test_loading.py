@@ -194,6 +194,7 @@ MISTAKES = [
         ),
         "firmware_py.core.maths has no tan: there is none: put it together",
     ),
+    (*("hidden: f32", 'hidden: Annotated[f32, Sensed("m")]', "    hidden", "hidden: in the memory"),),
     (IMPORTS, f"{IMPORTS}from os import path\n", "from os", "import from os"),
     (
         *(GUARD, GUARD.replace("guard", "controller"), GUARD.replace("guard", "controller")),

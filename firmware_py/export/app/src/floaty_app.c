@@ -305,6 +305,7 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
   floaty_observed.followed = call_follow();
   if (controlled) {
     floaty_input.connected = crtpIsConnected();
+    call_sense();
     call_supervise();
     call_control();
     if (floaty_hil_mode != FLOATY_HIL_STILL) {
