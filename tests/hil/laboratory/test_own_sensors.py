@@ -123,7 +123,10 @@ WRONG = (
         (), "sensed.range: 2 in m; the robot measures 1 in m",
     ),
     ((), (('Annotated[f32, Sensed("m")]', "f32"),), (), "range: what a sensor measures is Annotated[f32, Sensed("),
-    ((), (('f32, Sensed("m")', 'i32, Sensed("m")'), ("f32, kernel", "f32, i32, kernel")), (), "range: what a sensor measures is Annotated[f32, Sensed("),
+    (
+        (), (('f32, Sensed("m")', 'i32, Sensed("m")'), ("f32, kernel", "f32, i32, kernel")), (),
+        "range: what a sensor measures is Annotated[f32, Sensed(",
+    ),
     ((), (("    allocate(", "    sensed.range = f32(0.0)\n    allocate("),), (), "control_law writes sensed"),
     ((("def range", "def rang"),), (), (), "no attribute 'range'"),
     ((("return self.p_WB[2] - self.room.floor", "return self.p_WB"),), (), (), "Robot.range is"),
