@@ -1,6 +1,7 @@
 """`floaty identify` and `floaty tune`: the model's constants from flights, and gains from the constants."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from math import degrees, inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -90,6 +91,33 @@ def _print_constants(found: "Identification") -> None:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Tuning:
+    """What `floaty tune` is asked for."""
+
+    profile: str
+    repeat: int | None
+    robots: int
+    vary: tuple[str, ...]
+    metric: str
+    experiment: str
+    duration: float | None
+    flights: int
+    seeds: int
+    seed: int
+    board: str
+    out: Path | None
+    runs: Path
+    workers: int | None
+    cluster: str
+    resume: bool
+
+    @property
+    def crew(self) -> dict[str, Any]:
+        """Who flies."""
+        return {"workers": self.workers, "cluster": self.cluster, "resume": self.resume}
+
+
 @click.command()
 @common.profile_option
 @click.option(
@@ -100,6 +128,31 @@ def _print_constants(found: "Identification") -> None:
     "--robots", type=click.IntRange(0, 1000), default=100, show_default=True, metavar="N",
     help="Number of robots drawn from the intervals of the model; all must be stable.",
 )  # fmt: skip
+@click.option(
+    "--vary", multiple=True, metavar="KEY=LOW..HIGH",
+    help="Instead: search numbers of the profile, as logic.gain_y=-3..-0.5, that make --metric best; repeatable.",
+)  # fmt: skip
+@click.option("--metric", default="distance", show_default=True, metavar="NAME", help="Of --vary.")
+@click.option(
+    "--experiment", default="hover", show_default=True, metavar="NAME|FILE.py:NAME", help="Of --vary."
+)
+@click.option("--duration", type=click.FloatRange(0.5, 600.0), metavar="S", help="Of each flight of --vary.")
+@click.option(
+    "--flights",
+    type=click.IntRange(10, 100_000),
+    default=120,
+    show_default=True,
+    metavar="N",
+    help="Of --vary.",
+)
+@click.option(
+    "--seeds",
+    type=click.IntRange(1, 100),
+    default=1,
+    show_default=True,
+    metavar="N",
+    help="Flights for each choice.",
+)
 @common.seed_option
 @click.option("--board", metavar="BOARD", default="c", show_default=True, help="As for `floaty fly`.")
 @click.option(
@@ -112,40 +165,36 @@ def _print_constants(found: "Identification") -> None:
     "--runs", type=PATH, default=Path("runs/tune"), show_default=True, metavar="DIR", help="Of all flights."
 )  # fmt: skip
 @common.runner_options
-def tune(
-    profile: str,
-    repeat: int | None,
-    robots: int,
-    seed: int,
-    board: str,
-    out: Path | None,
-    runs: Path,
-    **crew: Any,
-) -> int:
+@common.asked_as(Tuning)
+def tune(asked: Tuning) -> int:
     """Compute gains of the paper's control law for the profile's model, and fly them in lockstep with its plant.
+
+    With --vary, search the numbers of any profile, also of own logic, that make a metric of an experiment best.
 
     Exit code 0: the new gains hover at least as well as the old ones; 1: they do not, and the old ones are kept; 2: bad
     input, no gains, or a lost robot.
     """
+    if asked.vary:
+        return _search(asked)
     require("floaty tune", "design", "scipy", "control")
     from hil.config import load_config
     from hil.research.campaigns.run import Runner
     from hil.research.studies.tuning import TuningFlights, fly_round, rounds, write_tuned
 
-    common.check_profile("--out", out)
-    made_folder("--runs", runs)
+    common.check_profile("--out", asked.out)
+    made_folder("--runs", asked.runs)
     common.announce_compilation()
     best: Round | None = None
-    with Runner(common.notices, **crew) as runner:
-        flights = TuningFlights(seed, board, runs, runner)
+    with Runner(common.notices, **asked.crew) as runner:
+        flights = TuningFlights(asked.seed, asked.board, asked.runs, runner)
         flown: Iterable[Round] = (
-            [fly_round(profile, flights, robots)]
-            if repeat is None
-            else rounds(profile, flights, robots, repeat)
+            [fly_round(asked.profile, flights, asked.robots)]
+            if asked.repeat is None
+            else rounds(asked.profile, flights, asked.robots, asked.repeat)
         )
         try:
             for number, one in enumerate(flown, 1):
-                if repeat is not None:
+                if asked.repeat is not None:
                     say(f"round {number}")
                 _print_round(one)
                 if best is None or one.better:
@@ -155,10 +204,53 @@ def tune(
                 raise
             warn(f"{error}; the best earlier round counts")
     assert best is not None
-    if out is not None:
-        write_tuned(out, profile, load_config(best.profile), "Model and gains by floaty tune.")
-        say(f"  {out}   (floaty fly hover --profile {out})")
-    return 0 if repeat is not None or best.better else 1
+    if asked.out is not None:
+        write_tuned(asked.out, asked.profile, load_config(best.profile), "Model and gains by floaty tune.")
+        say(f"  {asked.out}   (floaty fly hover --profile {asked.out})")
+    return 0 if asked.repeat is not None or best.better else 1
+
+
+def _search(asked: "Tuning") -> int:
+    """Search the numbers of a profile by flights; write those that were better."""
+    require("floaty tune --vary", "design", "scipy")
+    from hil.config import base_name
+    from hil.laboratory.files.whole_files import write_whole
+    from hil.laboratory.request import Options
+    from hil.research.campaigns.run import Runner
+    from hil.research.design.gains import toml_text
+    from hil.research.studies.search import Aim, intervals, search
+
+    common.check_profile("--out", asked.out)
+    made_folder("--runs", asked.runs)
+    varied = intervals(asked.vary, asked.profile)
+    options = Options(profile=asked.profile, duration_s=asked.duration, board=asked.board)
+    seeds = tuple(range(asked.seed, asked.seed + asked.seeds))
+    aim = Aim(asked.experiment, options, asked.metric, seeds, asked.flights)
+    common.announce_compilation()
+
+    def report(number: int, rounds: int, best: float) -> None:
+        say(f"round {number} of {rounds}: {aim.metric} {aim.show(best)}")
+
+    with Runner(common.notices, **asked.crew) as runner:
+        found = search(varied, aim, runner, asked.runs, report)
+    table = Table("", "before", "found", title=f"{aim.metric} of {aim.experiment}, on other seeds")
+    for one, value in zip(varied, found.values, strict=True):
+        table.add_row(one.key, f"{one.given:g}", f"{value:g}")
+    table.add_row(aim.metric, aim.show(found.before), aim.show(found.after))
+    common.wide_console().print(table)
+    if not found.better:
+        say("not better than before: nothing is written")
+        return 1
+    if asked.out is not None:
+        sections: dict[str, dict[str, Any]] = {}
+        for one, value in zip(varied, found.values, strict=True):
+            section, _, key = one.key.partition(".")
+            sections.setdefault(section, {})[key] = value
+        with writing("--out", asked.out):
+            about = f"By floaty tune --vary: {aim.metric} of {aim.experiment}."
+            write_whole(asked.out, toml_text(about, base_name(asked.profile), sections))
+        say(f"  {asked.out}   (floaty fly {aim.experiment} --profile {asked.out})")
+    return 0
 
 
 def _print_round(one: "Round") -> None:

@@ -1,0 +1,136 @@
+"""`floaty tune --vary`: what it refuses, and that it finds what is known to be best, and judges it on other seeds."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hil.config import load_config
+from hil.errors import LabError
+from hil.laboratory.request import Options
+from hil.research.campaigns.jobs import Job, Row
+from hil.research.studies.search import LOST, UNSEEN, Aim, Interval, intervals, search
+from support.command import Cli
+from support.own_logic import LAW
+
+VARIED = (Interval("controller.gain_y", -4.0, -1.0, -1.5), Interval("controller.gain_z", 1.0, 5.0, 4.0))
+
+
+class Runner:
+    """Flies a bowl: the metric is the distance from known numbers, worse on odd seeds."""
+
+    interrupted = False
+
+    def __init__(self, best: tuple[float, float] = (-2.5, 3.0), lost_below: float = -9.0) -> None:
+        self._best, self._lost_below = best, lost_below
+        self.flown: list[tuple[str, list[int]]] = []
+
+    def fly(self, name: str, jobs: Sequence[Job], out: Path) -> list[Row]:
+        self.flown.append((name, [job.options["seed"] for job in jobs]))
+        return [self._row(job) for job in jobs]
+
+    def _row(self, job: Job) -> Row:
+        y, z = job.values.values()
+        value = (y - self._best[0]) ** 2 + (z - self._best[1]) ** 2 + 0.01 * (job.options["seed"] % 2)
+        outcome = "lost" if y < self._lost_below else "completed"
+        return Row(job, outcome, "", True, "", {"rms_z": value, "in_box": 1.0 - value}, {})
+
+
+def aim(metric: str, seeds: tuple[int, ...] = (1,), flights: int = 400) -> Aim:
+    return Aim("hover", Options(profile="floaty"), metric, seeds, flights)
+
+
+def found(runner: Any, asked: Aim, tmp_path: Path, rounds: list[Any] | None = None) -> Any:
+    return search(VARIED, asked, runner, tmp_path, lambda *round_: (rounds or []).append(round_))
+
+
+@pytest.mark.parametrize("metric", ["rms_z", "in_box"])  # smallest is best, largest is best
+def test_it_finds_the_best_numbers_and_judges_them_on_other_seeds(tmp_path: Path, metric: str) -> None:
+    runner = Runner()
+    best = found(runner, aim(metric, seeds=(3, 4)), tmp_path)
+    assert best.values == pytest.approx((-2.5, 3.0), abs=0.1)
+    assert best.better
+    assert best.before - best.after == pytest.approx(1.0 + 1.0, abs=0.03)
+    *rounds, (name, seeds) = runner.flown
+    assert {seed for _, seeds in rounds for seed in seeds} == {3, 4}
+    assert (name, seeds) == ("judgement", [3 + UNSEEN, 4 + UNSEEN] * 2)
+    assert sum(len(seeds) for _, seeds in rounds) <= 400
+
+
+def test_the_given_numbers_are_the_first_that_fly_and_the_search_repeats(tmp_path: Path) -> None:
+    runs = [Runner(), Runner()]
+    results = [found(runner, aim("rms_z", flights=100), tmp_path) for runner in runs]
+    assert results[0] == results[1]
+    assert runs[0].flown == runs[1].flown
+
+
+def test_a_lost_flight_is_worse_than_any_other(tmp_path: Path) -> None:
+    best = found(Runner(best=(-3.9, 3.0), lost_below=-3.0), aim("rms_z"), tmp_path)
+    assert -3.0 <= best.values[0] < -2.9
+    assert aim("rms_z").show(LOST) == "lost"
+    assert aim("rms_z").show(0.012) == "1.2 cm"
+    assert aim("in_box").show(-0.5) == "50 %"
+
+
+def test_numbers_no_better_than_before_are_not_called_better(tmp_path: Path) -> None:
+    best = found(Runner(best=(-1.5, 4.0)), aim("rms_z"), tmp_path)
+    assert not best.better
+
+
+def test_whole_numbers_stay_whole(tmp_path: Path) -> None:
+    (tmp_path / "p.toml").write_text('base = "floaty"\n[logic]\ncontroller = "law.py"\n', encoding="utf-8")
+    (tmp_path / "law.py").write_text(LAW, encoding="utf-8")
+    after, gain = intervals(("logic.after=5..9", "logic.gain_iy=-1..1.5"), str(tmp_path / "p.toml"))
+    assert (after.value(7.6), after.given) == (8, 1_000_000)
+    assert (gain.value(0.123456789), gain.given) == (0.12346, pytest.approx(-0.4))
+    assert isinstance(after.value(7.6), int)
+
+
+@pytest.mark.parametrize(
+    ("vary", "told"),
+    [
+        ("logic.gain=1..2", "--vary logic.gain=1..2: logic.gain is no number of profile floaty"),
+        ("controller.gain_y", "--vary controller.gain_y: expected KEY=LOW..HIGH"),
+        ("controller.gain_y=2..1", "expected KEY=LOW..HIGH"),
+        ("controller.gain_y=a..b", "expected KEY=LOW..HIGH"),
+        ("controller.gain_y=nan..1", "expected KEY=LOW..HIGH"),
+        ("predictor.enabled=0..1", "predictor.enabled is no number"),
+        ("controller=0..1", "expected KEY=LOW..HIGH"),
+        ("tunnel.speed=0..11", "tunnel.speed = 0.0: "),
+    ],
+)
+def test_what_cannot_vary_is_refused(vary: str, told: str) -> None:
+    with pytest.raises(LabError, match=r".") as refused:
+        intervals((vary,), "floaty")
+    assert told in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("--metric", "rsm_z"), "--metric rsm_z: did you mean rms_z?"),
+        (
+            ("--metric", "settle", "--flights", "10", "--duration", "0.5"),
+            "--metric settle: hover does not measure it",
+        ),
+        (("--experiment", "hoover"), "experiment 'hoover': unknown"),
+        (("--out", "found.txt"), "a profile's name ends in .toml"),
+    ],
+)
+def test_bad_input_is_one_line(cli: Cli, tmp_path: Path, arguments: tuple[str, ...], told: str) -> None:
+    line = cli.refusal(
+        "tune", "--vary", "controller.gain_y=-3..-1", "--workers", "1", "--runs", str(tmp_path), *arguments
+    )
+    assert told in line
+
+
+def test_the_profile_that_it_writes_flies_with_what_it_found(cli: Cli, tmp_path: Path) -> None:
+    out = tmp_path / "found.toml"
+    flights = ("--flights", "10", "--duration", "0.5", "--workers", "1", "--runs", str(tmp_path / "runs"))
+    code = cli(
+        "tune", "--vary", "tunnel.gust_scale=0.1..0.9", "--metric", "rms_z", *flights, "--out", str(out)
+    )
+    assert code == 0
+    assert "rms_z of hover, on other seeds" in cli.out
+    assert 0.1 <= load_config(str(out)).tunnel.gust_scale <= 0.9
