@@ -8,8 +8,9 @@ from pathlib import Path
 # Extras of the modules that are imported only where they are needed. Several have scipy.
 EXTRAS = {
     "cflib": "radio", "pymavlink": "mavlink", "serial": "mavlink", "motioncapture": "mocap", "tornado": "view",
-    "rerun": "view", "perfetto": "view", "google": "view", "foxglove": "export", "av": "export", "scipy": "design",
-    "control": "design", "ziglang": "deploy", "unicorn": "deploy", "elftools": "deploy", "cffi": "deploy", "onnx": "policy",
+    "rerun": "view", "perfetto": "view", "google": "view", "mcap": "mcap", "mcap_protobuf": "mcap",
+    "mcap_ros2": "mcap", "foxglove": "export", "av": "export", "scipy": "design", "control": "design",
+    "ziglang": "deploy", "unicorn": "deploy", "elftools": "deploy", "cffi": "deploy", "onnx": "policy",
     "safetensors": "policy", "distributed": "campaign", "SALib": "campaign", "gymnasium": "learn",
 }  # fmt: skip
 PROJECT = "floaty-hil"  # on no package index, so messages name an extra's packages one by one

@@ -89,7 +89,7 @@ def export(run: Path, as_csv: bool, as_mcap: bool, as_tlog: bool, as_video: bool
 )
 @click.option("--out", type=PATH, metavar="DIR", help="Run folder [runs/NAME of the first file].")
 def import_(files: tuple[Path, ...], chosen: Path | None, like: Path | None, out: Path | None) -> None:
-    """Make a run folder of a foreign log: CSV, Parquet, a tlog, or a Crazyflie's micro-SD file.
+    """Make a run folder of a foreign log: CSV, Parquet, MCAP, a tlog, or a Crazyflie's micro-SD file.
 
     Columns and units are guessed from their names, shown, and stored in map.toml of the run folder: correct a copy and
     import again with --map. Files with clocks of their own are joined on the rows of the first one. What is missing is

@@ -41,6 +41,12 @@ _PLACE = r"(?:pos(?:ition)?|p|translation|pose|p\.wb)"
 _TURN = r"(?:q|quat(?:ernion)?|orientation|rotation|q\.wb)"
 _WANTED = r"(?:goal|target|setpoint|ctrltarget|reference|ref|desired|command(?:ed)?)"
 
+# Messages of ROS and Foxglove behind a topic: PoseStamped, PoseWithCovariance, Odometry, TransformStamped, PoseInFrame.
+_ROS_PLACE, _ROS_TURN = (
+    r"(?:pose|transform)\.(?:position|translation)",
+    r"(?:pose|transform)\.(?:orientation|rotation)",
+)
+_OF_SEEN, _OF_ANY = rf"(?:.*\.)?{_SEEN}(?:\..*)?\.", rf"(?!.*{_WANTED}\.)(?:.*\.)?"
 _ASKED = r"set\.position\.target\.local\.ned"
 _BATTERY = (r"pm\.vbat", r"(?:battery\.)?(?:vbat|voltage)", r"battery", r"sys\.status\.voltage\.battery")
 
@@ -48,12 +54,15 @@ _BATTERY = (r"pm\.vbat", r"(?:battery\.)?(?:vbat|voltage)", r"battery", r"sys\.s
 def _of_axis(axis: str) -> tuple[str, ...]:
     return (
         rf"{_SEEN}\.(?:{_PLACE}\.)?{axis}", rf"(?:{_PLACE}\.?)?{axis}", rf"stateestimate\.{axis}", rf"kalman\.state{axis}",
-        rf"local\.position\.ned\.{axis}",
+        rf"local\.position\.ned\.{axis}", rf"{_OF_SEEN}{_ROS_PLACE}\.{axis}", rf"{_OF_ANY}{_ROS_PLACE}\.{axis}",
     )  # fmt: skip
 
 
 def _of_part(part: str) -> tuple[str, ...]:
-    return rf"{_SEEN}\.(?:{_TURN}\.?)?q?{part}", rf"{_TURN}\.?{part}", rf"stateestimate\.q{part}"
+    return (
+        rf"{_SEEN}\.(?:{_TURN}\.?)?q?{part}", rf"{_TURN}\.?{part}", rf"stateestimate\.q{part}",
+        rf"{_OF_SEEN}{_ROS_TURN}\.{part}", rf"{_OF_ANY}{_ROS_TURN}\.{part}",
+    )  # fmt: skip
 
 
 def _of_angle(angle: str, letter: str) -> tuple[str, ...]:
@@ -72,7 +81,13 @@ TARGETS: Mapping[str, Target] = {
     },
     **{
         f"goal.{axis}": Target(
-            LENGTH, (rf"{_WANTED}\.?(?:{_PLACE}\.)?{axis}", rf"{_ASKED}\.{axis}"), unit="m"
+            LENGTH,
+            (
+                rf"{_WANTED}\.?(?:{_PLACE}\.)?{axis}",
+                rf"{_ASKED}\.{axis}",
+                rf"(?:.*\.)?{_WANTED}(?:\..*)?\.{_ROS_PLACE}\.{axis}",
+            ),
+            unit="m",
         )
         for axis in "xyz"
     },

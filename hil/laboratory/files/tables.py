@@ -1,4 +1,4 @@
-"""Reads tables of other programs: CSV, Parquet, MAVLink telemetry logs, and the micro-SD logs of a Crazyflie."""
+"""Reads tables of other programs: CSV, Parquet, MCAP, MAVLink telemetry logs, and the micro-SD logs of a Crazyflie."""
 
 import struct
 import zlib
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from hil.errors import LabError, refusing, require
 
-USD_MAGIC, PARQUET_MAGIC = b"\xbc", b"PAR1"
+USD_MAGIC, PARQUET_MAGIC, MCAP_MAGIC = b"\xbc", b"PAR1", b"\x89MCAP0\r\n"
 USD_UNITS = {1: "ms", 2: "us"}  # of the time stamps, by the version of the format
-FORMATS = "CSV, Parquet, a tlog, or a Crazyflie's micro-SD log"
+FORMATS = "CSV, Parquet, MCAP, a tlog, or a Crazyflie's micro-SD log"
 MAVLINK_HEADS = {0xFD: 12, 0xFE: 8}  # bytes of a frame without its payload, by its first one, version 2 or 1
 SIGNATURE = 13  # bytes behind a signed frame
 MAVLINK_POSES = (
@@ -51,6 +51,10 @@ def read_tables(path: Path) -> list[Table]:
     if content.startswith(PARQUET_MAGIC):
         with refusing(f"{path}: damaged Parquet: ", *ARROW):
             return [_numbers(path, pa.parquet.read_table(pa.BufferReader(content)))]
+    if content.startswith(MCAP_MAGIC):
+        from hil.laboratory.files.mcap_tables import mcap_tables
+
+        return mcap_tables(path, content)
     return [_numbers(path, _csv(path, content))]
 
 

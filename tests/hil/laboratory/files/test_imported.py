@@ -11,9 +11,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
+from mcap_ros2.writer import Writer as Ros2Writer
 from scipy.spatial.transform import Rotation
 
-from hil import LabError, fly, load_run
+from hil import LabError, column, fly, load_run
 from hil.laboratory.files.imported import import_log
 from hil.laboratory.files.log_map import Map
 from hil.pictures.viewer.recording import recording_of
@@ -244,6 +245,75 @@ def test_a_micro_sd_log_is_read(version: int, tmp_path: Path) -> None:
     assert log.column("robot.idA").to_numpy()[[4, 5, -1]] == pytest.approx([np.nan, 3, 3], nan_ok=True)
 
 
+ROS_POSE = """\
+std_msgs/Header header
+geometry_msgs/Pose pose
+===
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+===
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+===
+MSG: geometry_msgs/Pose
+geometry_msgs/Point position
+geometry_msgs/Quaternion orientation
+===
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+===
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+"""
+
+
+def ros_bag(path: Path) -> Path:
+    """Write an MCAP file of ROS 2: poses of a goal and of a robot, and a picture's topic in an unknown encoding."""
+    with path.open("wb") as file:
+        writer = Ros2Writer(file)
+        pose = writer.register_msgdef("geometry_msgs/msg/PoseStamped", ROS_POSE.replace("===", 80 * "="))
+        text = writer.register_msgdef("std_msgs/msg/String", "string data")
+        for number in range(200):
+            ns = 5_000_000_000 + number * 10_000_000
+            for topic, x in (("/command/pose", 0.5), ("/vrpn/floaty/pose", 0.01 * number)):
+                turn = {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}
+                place = {"position": {"x": x, "y": -0.5, "z": 1.1}, "orientation": turn}
+                stamp = {"sec": 5, "nanosec": 0}
+                writer.write_message(
+                    topic, pose, {"header": {"stamp": stamp, "frame_id": "map"}, "pose": place}, ns, ns
+                )
+            writer.write_message("/said", text, {"data": "hello"}, ns, ns)
+        writer.finish()
+    return path
+
+
+def test_an_mcap_file_of_ros_2_gives_pose_and_goal(cli: Cli, tmp_path: Path) -> None:
+    assert cli("import", ros_bag(tmp_path / "bag.mcap"), "--out", tmp_path / "run") == 0
+    log = load_run(tmp_path / "run").log
+    assert np.allclose(np.diff(column(log, "t")), 10_000.0)
+    assert np.allclose(column(log, "cameras.x"), 0.01 * np.arange(200))
+    assert set(column(log, "goal.x")) == {0.5}
+    assert column(log, "cameras.yaw")[0] == pytest.approx(2 * np.arcsin(0.6))
+    assert "left out: /said" in cli.err
+    assert not [name for name in log.column_names if "stamp" in name]
+
+
+def test_our_own_mcap_file_has_the_log_s_path_again(cli: Cli, tmp_path: Path) -> None:
+    flown = fly("hover", tmp_path / "flown", duration_s=0.5)
+    assert cli("export", flown.folder, "--mcap") == 0
+    assert cli("import", flown.folder / "flight.mcap", "--out", tmp_path / "run") == 0
+    log = load_run(tmp_path / "run").log
+    for name in ("x", "y", "z", "qw", "qx", "qy", "qz"):
+        assert column(log, f"cameras.{name}") == pytest.approx(column(flown.log, f"truth.{name}"), abs=1e-6)
+
+
 def test_parquet_with_time_stamps_is_read(tmp_path: Path) -> None:
     stamps = pa.array((1_700_000_000_000_000_000 + 1e9 * T).astype(np.int64), pa.timestamp("ns"))
     pa.parquet.write_table(pa.table({"time": stamps, **place("x", "y", "z")}), tmp_path / "log.parquet2")
@@ -252,7 +322,7 @@ def test_parquet_with_time_stamps_is_read(tmp_path: Path) -> None:
 
 
 GOOD = {"t": T, **place("x", "y", "z")}
-FORMATS = "expected CSV, Parquet, a tlog, or a Crazyflie's micro-SD log"
+FORMATS = "expected CSV, Parquet, MCAP, a tlog, or a Crazyflie's micro-SD log"
 PLACES = "cameras.x, cameras.y, cameras.z"
 BAD: Mapping[str, tuple[Mapping[str, Any] | bytes, str, str]] = {
     "no clock": ({name: GOOD[name] for name in "xyz"}, "", 'no column of times among x, y, z; name it in a map: t = "NAME'),
@@ -267,6 +337,7 @@ BAD: Mapping[str, tuple[Mapping[str, Any] | bytes, str, str]] = {
     "ragged": (b"t,x,y,z\n1,2,3,4\n1,2\n", "", f"{FORMATS}: "),
     "half a Parquet": (b"PAR1abc", "", "damaged Parquet: "),
     "a changed micro-SD log": (micro_sd(2)[:-5] + b"12345", "", "a damaged micro-SD log: its checksum is wrong"),
+    "half an MCAP file": (b"\x89MCAP0\r\n" + bytes(40), "", "damaged MCAP: "),
     "a newer micro-SD log": (micro_sd(3), "", "version 3 of the micro-SD log; expected 1 or 2"),
 }  # fmt: skip
 
