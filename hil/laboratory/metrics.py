@@ -1,10 +1,12 @@
 """Computes metrics and verdicts from a flight log after the release: from the truth, never from the estimate.
 
 The truth of a real flight is unknown, so the cameras' poses replace it: errors and shares cover the time `flown`, in
-which the robot was seen; the metric `unseen` is the rest. A lost flight fails all limits, unless its limit on `lost`
-admits the loss.
+which the robot was seen; the metric `unseen` is the rest. Errors and shares of a flight from floor to floor cover its
+hold; take-off and landing have their own metrics. A lost flight fails all limits, unless its limit on `lost` admits the
+loss.
 """
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -17,6 +19,7 @@ from pydantic import BeforeValidator, PlainSerializer
 from firmware_py.geometry import euler_zyx_of
 from firmware_py.signals import REFUSED
 from firmware_py.wire.supervisor import State
+from ground_station.links.crazyflie_link import FlightTimes
 from hil.errors import LabError, hint, shown
 from hil.laboratory.arguments import checked
 
@@ -24,6 +27,9 @@ NEAR = 0.06  # [m] "less than 6 cm over each axis"
 BOX = 0.10  # [m] half of the 20 cm box
 UNDER_WAY_US = 100_000  # at the end of a real flight: its last poses are in flight
 STEADY = tuple(f"estimate.{name}" for name in "xyzpqr")  # a running estimator changes them in every step
+PHASES = "phases"  # in the metadata of a log: the `FlightTimes` of a flight from floor to floor, as JSON
+CLEAR = 0.02  # [m] above the net or the floor: in the air
+TOUCHING_ROWS = 10  # 0.1 s
 SHORT_S = 0.1  # a shorter missing part of the flight is not reported
 
 # Limits of every flight; an experiment may override them.
@@ -68,6 +74,11 @@ def show(value: float, unit: str) -> str:
 METRICS: Mapping[str, Metric] = {
     "lost": Metric("", "max", "1 when the flight ended as a crash"),
     "flown": Metric("s", "min", "free flight in which the robot was seen: what errors and shares are of"),
+    "held": Metric(
+        "s",
+        "min",
+        "of a flight from floor to floor, between take-off and landing: what errors and shares are of",
+    ),
     "rms_x": Metric("m", "max", "root mean square of the x error, goal frame"),
     "rms_y": Metric("m", "max", "root mean square of the y error"),
     "rms_z": Metric("m", "max", "root mean square of the z error"),
@@ -80,7 +91,7 @@ METRICS: Mapping[str, Metric] = {
     "in_box": Metric(
         "share", "min", "share of the time inside the 20 cm box around the goal", over_time=True
     ),
-    "attitude_max": Metric("rad", "max", "largest roll, pitch or yaw error"),
+    "attitude_max": Metric("rad", "max", "largest roll, pitch or yaw error, also in take-off and landing"),
     "y_over_x": Metric("", "min", "rms of y over rms of x"),
     "settle": Metric("s", "max", "from a step of the goal until the error stays within 5 % of it"),
     "rise": Metric("s", "max", "from a step of the goal to 90 % of it, the slowest"),
@@ -143,13 +154,16 @@ METRICS: Mapping[str, Metric] = {
     "endurance": Metric("min", "min", "flight until the supervisor finds the battery empty"),
     "lift_off": Metric("s", "max", "from the controller's start until the robot is 2 cm above the net"),
     "reached_box": Metric(
-        "s", "max", "from the start of the flight speed until the robot is in the 20 cm box"
+        "s", "max", "from the start of the flight speed or of a take-off until the robot is in the 20 cm box"
     ),
     "hover_in_box": Metric("share", "min", "from then to the landing speed: share of the time in that box"),
     "touch_down_speed": Metric(
-        "m/s", "max", "fastest descent in the last 0.1 s before the feet touch the net"
+        "m/s", "max", "fastest descent in the last 0.1 s before the feet touch the net or the floor"
     ),
-    "landed_off_axis": Metric("m", "max", "distance from the tunnel's axis at the end"),
+    "landed_off_axis": Metric(
+        "m", "max", "distance at the end from the tunnel's axis, or from the place where it was to land"
+    ),
+    "off_path": Metric("m", "max", "largest sideways error in take-off and landing, on an axis"),
 }
 
 
@@ -310,17 +324,15 @@ def measure(table: pa.Table, lost: bool, resets: int | None = None) -> dict[str,
     values["flown"] = 0.0
     if flight.num_rows < 2:
         return values
-    error = np.abs(position_error(flight))
-    times = column(flight, "t")
-    rms = np.sqrt((error**2).mean(axis=0))
-    for index, axis in enumerate("xyz"):
-        values[f"rms_{axis}"] = float(rms[index])
-        values[f"max_{axis}"] = float(error[:, index].max())
-        values[f"within_6cm_{axis}"] = float((error[:, index] < NEAR).mean())
+    times, phases = column(flight, "t"), _phases(table)
+    judged = rows_where(flight, held_rows(flight))
+    if phases is not None:
+        values["held"] = judged.num_rows * float(np.median(np.diff(times))) * 1e-6
+        values.update(_floor_to_floor(flight, phases))
+    if judged.num_rows > 1:
+        values.update(_errors(judged))
     values["flown"], values["unseen"] = _time_seen(table)
-    values["in_box"] = float((error <= BOX).all(axis=1).mean())
     values["attitude_max"] = float(np.abs(attitude_error(flight)).max())
-    values["y_over_x"] = float(rms[1] / rms[0]) if rms[0] > 0 else float("nan")
     values["age_mean"] = _mean_age(flight)
     if (column(flight, "supervisor.state") <= max(State)).any():  # it was reported
         values["resets"] = float(_boots(table) if resets is None else resets)
@@ -343,6 +355,62 @@ def measure(table: pa.Table, lost: bool, resets: int | None = None) -> dict[str,
         values["poses_refused"] = float(refused[-1])
     if "tracker.refused" in table.schema.names:
         values["frames_refused"] = float(column(flight, "tracker.refused")[-1])
+    return values
+
+
+def _errors(rows: pa.Table) -> dict[str, float]:
+    """Return errors and shares of these rows."""
+    error = np.abs(position_error(rows))
+    rms = np.sqrt((error**2).mean(axis=0))
+    values = {}
+    for index, axis in enumerate("xyz"):
+        values[f"rms_{axis}"] = float(rms[index])
+        values[f"max_{axis}"] = float(error[:, index].max())
+        values[f"within_6cm_{axis}"] = float((error[:, index] < NEAR).mean())
+    values["in_box"] = float((error <= BOX).all(axis=1).mean())
+    values["y_over_x"] = float(rms[1] / rms[0]) if rms[0] > 0 else float("nan")
+    return values
+
+
+def _phases(table: pa.Table) -> FlightTimes | None:
+    """Return the instants of a flight from floor to floor; None for another. Raises `LabError` for damaged ones."""
+    stored = (table.schema.metadata or {}).get(PHASES.encode())
+    if stored is None:
+        return None
+    try:
+        return FlightTimes(**{name: int(us) for name, us in json.loads(stored).items()})
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        raise LabError(f"{PHASES} in the log's schema = {stored[:80]!r}: expected instants [us]") from None
+
+
+def held_rows(flight: pa.Table) -> NDArray[np.bool_]:
+    """Return which rows after the release errors and shares cover, (N,): those between take-off and landing, or all."""
+    times, phases = column(flight, "t"), _phases(flight)
+    if phases is None:
+        return np.ones(len(times), np.bool_)
+    return np.asarray((times >= phases.begin_us) & (times < phases.land_us))
+
+
+def _floor_to_floor(flight: pa.Table, phases: FlightTimes) -> dict[str, float]:
+    """Return the metrics of take-off and landing; NaN for what did not occur."""
+    names = ("reached_box", "touch_down_speed", "landed_off_axis", "off_path")
+    values, times = dict.fromkeys(names, float("nan")), column(flight, "t")
+    held = held_rows(flight)
+    sideways = np.abs(position_error(flight)[:, :2])
+    if not held.all():
+        values["off_path"] = float(sideways[~held].max())
+    if held.any():
+        first = int(np.argmax(held))
+        home = column(flight, "goal.x", "goal.y", "goal.z")[first]
+        inside = (np.abs(body(flight, "x", "y", "z") - home) <= BOX).all(axis=1)
+        if inside.any():
+            values["reached_box"] = float(times[np.argmax(inside)] - phases.take_off_us) * 1e-6
+    z, climb = body(flight, "z", "vz").T
+    down = np.flatnonzero((times > phases.land_us) & (z < z[0] + CLEAR))
+    if len(down):
+        before = slice(max(int(down[0]) - TOUCHING_ROWS, 0), int(down[0]) + 1)
+        values["touch_down_speed"] = float(-climb[before].min())
+        values["landed_off_axis"] = float(np.hypot(*sideways[-1]))
     return values
 
 
@@ -378,8 +446,10 @@ def judge(
     return verdicts
 
 
-def short_of(metric: Metric, value: float, flown_s: float, duration_s: float) -> str:
-    """Return the text after a share of time: the time it covers, if less than the flight's duration."""
+def short_of(metric: Metric, value: float, values: Mapping[str, float], duration_s: float) -> str:
+    """Return the text after a share of time: the time it covers, by `values`, if less than the flight's duration."""
+    flown_s, held_s = (values.get(name, np.nan) for name in ("flown", "held"))
+    flown_s = flown_s if np.isnan(held_s) else held_s
     short = metric.over_time and np.isfinite(value) and flown_s < duration_s - SHORT_S
     return f" of {flown_s:.4g} s" if short else ""
 

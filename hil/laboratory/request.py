@@ -42,6 +42,7 @@ LOCKSTEP = (RADIO, MAVLINK)  # links that are fully simulated
 REAL = "real"  # the board of a flight recorded only by its ground station
 DURATION_MAX_S = 86_400.0
 SEED_MAX = 2**62
+HELD_LEAST_US = 100_000  # of a flight from floor to floor, whose errors are judged
 USUAL = {"profile": DEFAULT_PROFILE, "link": RADIO, "board": C}  # of `Request.parts`
 
 InLoop = Literal["still", "moving"] | None
@@ -222,10 +223,11 @@ class Request:
                 f"profile {self.profile}: its robot flies with the Crazyflie's own firmware over the radio; "
                 "--board FILE: the image, an ELF file"
             )
-        if times.land_us < times.begin_us:
+        if times.land_us - times.begin_us < HELD_LEAST_US:
             least = self.duration_s - 1e-6 * (times.land_us - times.begin_us)
             raise LabError(
-                f"--duration {self.duration_s:g}: take-off and landing alone take {least:g} s (profile {self.profile})"
+                f"--duration {self.duration_s:g}: take-off and landing alone take {least:g} s (profile {self.profile}); "
+                f"expected {least + 1e-6 * HELD_LEAST_US:g} s or more"
             )
 
     @cached_property

@@ -138,7 +138,7 @@ def metric_rows(result: Result) -> list[MetricRow]:
         sign = "≤" if metric.bound == "max" else "≥"
         limit = "" if verdict is None else f"{sign} {verdict.bound * scale:.4g}"
         text = "–" if math.isnan(value) else "never" if math.isinf(value) else f"{value * scale:.4g}"
-        unit += short_of(metric, value, result.metrics.get("flown", math.nan), result.request.duration_s)
+        unit += short_of(metric, value, result.metrics, result.request.duration_s)
         rows.append(
             MetricRow(name, metric.meaning, text, unit, limit, None if verdict is None else verdict.mark)
         )

@@ -98,7 +98,8 @@ def _first(wrong: NDArray[np.bool_]) -> int:
 
 def _passed(flight: pa.Table, result: Result) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """Yield the limits that failed and have an instant at which they were passed, and the rows beyond them."""
-    error, times = np.abs(metrics.position_error(flight)), since_release(flight)
+    times, held = since_release(flight), metrics.held_rows(flight)
+    error = np.where(held[:, None], np.abs(metrics.position_error(flight)), 0.0)
     open_loop = metrics.column(flight, "supervisor.state") != State.FLYING
     beyond: Mapping[str, tuple[NDArray[np.float64], float | None]] = {
         **{f"max_{axis}": (error[:, index], None) for index, axis in enumerate("xyz")},

@@ -18,11 +18,10 @@ import pyarrow as pa
 from firmware_py.wire.crtp import PORT_PLATFORM, Packet, encode
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.flight import Flight
-from hil.laboratory.metrics import BOX, body, column, position_error
+from hil.laboratory.metrics import BOX, CLEAR, TOUCHING_ROWS, body, column, position_error
 
 TAKE_OFF, FLIGHT, LANDING = 0.93, 1.0, 0.88  # of the flight speed
 STANDING_Z = 0.049  # [m] of the centre of mass: the feet's height minus their depth in the net
-CLEAR = 0.02  # [m] above the net
 
 # After the release [s]; waits and stages as in the menu
 SPIN_UP = 1.0
@@ -94,7 +93,7 @@ def measure(flight: pa.Table) -> Mapping[str, float]:
     down = np.flatnonzero((times > LANDING_FROM) & ~airborne)
     if len(down):
         touched = int(down[0])
-        before = slice(max(touched - 10, 0), touched + 1)  # 0.1 s
+        before = slice(max(touched - TOUCHING_ROWS, 0), touched + 1)
         values["touch_down_speed"] = float(-climb[before].min())
         values["landed_off_axis"] = float(np.hypot(x[-1], y[-1]))
     return values

@@ -28,7 +28,7 @@ from hil.laboratory.files.ages import ages_of, reported_ages
 from hil.laboratory.files.installation import commit, versions
 from hil.laboratory.files.recorder import load_log, stored_in
 from hil.laboratory.files.whole_files import write_whole
-from hil.laboratory.metrics import METRICS, Figure, Metric, Verdict, judge, measure, short_of
+from hil.laboratory.metrics import METRICS, PHASES, Figure, Metric, Verdict, judge, measure, short_of
 from hil.laboratory.request import Find, Request, StoredRequest
 from hil.world.scene import VisualModel
 
@@ -66,11 +66,13 @@ class Program:
 
 def metadata_of(request: Request, program: Program, look: VisualModel) -> dict[str, str]:
     """Return a flight's origin and its robot's look as text for the log's schema."""
+    times = None if request.is_real else request.times
     return {
         "request": json.dumps(request.stored()),
         "program": json.dumps(asdict(program)),
         "config": request.config.model_dump_json(),
         "look": json.dumps(look.stored()),
+        **({} if times is None else {PHASES: json.dumps(asdict(times))}),
     }
 
 
@@ -110,10 +112,10 @@ class Result:
         """Every metric that the flight has, and every one with a limit: name, value, limit and verdict as text."""
         verdicts, found = {verdict.metric: verdict for verdict in self.verdicts}, []
         for name, value in self.metrics.items():
-            verdict, metric = verdicts.get(name), self.own_metrics.get(name) or METRICS[name]
-            if verdict is None and math.isnan(value):
+            verdict, metric = verdicts.get(name), self.own_metrics.get(name) or METRICS.get(name)
+            if metric is None or (verdict is None and math.isnan(value)):  # None: of another version
                 continue
-            over = short_of(metric, value, self.metrics["flown"], self.request.duration_s)
+            over = short_of(metric, value, self.metrics, self.request.duration_s)
             bound = (
                 ""
                 if verdict is None

@@ -1,5 +1,6 @@
 """The errors that metrics are made of are those that the board flies on; metrics count from the release to the end."""
 
+import json
 from math import pi, radians
 
 import numpy as np
@@ -9,10 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_py.geometry import from_euler_zyx, in_goal_frame, to_euler_zyx, yaw_quaternion
+from hil.errors import LabError
 from hil.laboratory.experiments import measures
 from hil.laboratory.metrics import (
     ALWAYS,
     METRICS,
+    PHASES,
     _time_seen,
     attitude_error,
     limits_of,
@@ -89,6 +92,32 @@ def test_metrics_count_from_the_release_to_the_end() -> None:
         "lost": 1.0,
         "flown": 0.0,
     }
+
+
+def test_a_flight_from_floor_to_floor_is_judged_by_its_phases() -> None:
+    """Rows every 0.1 s: on the floor, up to 1 m in 1 s, there until 3 s, down in 1 s; the goal is always 1 s ahead."""
+    times = np.arange(51) * 100_000
+    height = np.interp(times * 1e-6, [0.0, 1.0, 3.0, 4.0], [0.02, 1.0, 1.0, 0.02])
+    goal = np.interp(times * 1e-6, [0.0, 1.0, 2.0, 3.0], [1.0, 1.0, 1.0, 0.0])
+    log = {
+        "t": times, "flight.free": np.ones(51), "truth.z": height, "goal.z": goal, "truth.qw": np.ones(51),
+        "truth.vz": np.gradient(height, 0.1), "truth.y": 0.3 * (times == 500_000) + 0.04 * (times == 5_000_000),
+        "supervisor.state": 2 * np.ones(51), **{f"estimate.{name}": times for name in "xyzpqr"},
+    }  # fmt: skip
+    zero = ("truth.x", "goal.x", "goal.y", "goal.yaw", "truth.qx", "truth.qy", "truth.qz")
+    table = pa.table({**log, **{name: np.zeros(51) for name in zero}})
+    phases = {"take_off_us": 0, "begin_us": 1_500_000, "land_us": 2_000_000, "landed_us": 4_000_000}
+    values = measure(table.replace_schema_metadata({PHASES: json.dumps(phases)}), lost=False)
+    assert (values["max_z"], values["rms_z"], values["in_box"]) == (0.0, 0.0, 1.0)
+    assert values["held"] == pytest.approx(0.5)
+    assert values["reached_box"] == pytest.approx(0.9)
+    assert values["touch_down_speed"] == pytest.approx(0.98)
+    assert values["off_path"] == pytest.approx(0.3)
+    assert values["landed_off_axis"] == pytest.approx(0.04)
+    assert measure(table, lost=False)["max_z"] == pytest.approx(1.0), "all of a flight without phases"
+    for damaged in ("[]", "{}", "nothing", '{"take_off_us": "soon"}'):
+        with pytest.raises(LabError, match=r"^phases in the log's schema = .*: expected instants"):
+            measure(table.replace_schema_metadata({PHASES: damaged}), lost=False)
 
 
 @pytest.mark.parametrize(

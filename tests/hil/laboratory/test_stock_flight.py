@@ -4,6 +4,7 @@ import os
 from math import degrees, radians
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -31,7 +32,7 @@ def test_flight_too_short_for_take_off_and_landing_is_refused(tmp_path: Path) ->
     image.write_bytes(b"")
     with pytest.raises(LabError, match=r"^--duration 6: take-off and landing alone take 7.3 s"):
         Request.of(HOVER, profile=PROFILE, board=str(image), duration_s=6.0)
-    assert Request.of(HOVER, profile=PROFILE, board=str(image), duration_s=7.5).times is not None
+    assert Request.of(HOVER, profile=PROFILE, board=str(image), duration_s=7.4).times is not None
 
 
 @pytest.mark.parametrize(
@@ -113,6 +114,25 @@ def test_takes_off_holds_and_lands_with_each_controller(controller: int, tmp_pat
 def test_follows_steps_and_a_figure_of_eight_within_its_limits(experiment: str, tmp_path: Path) -> None:
     result = fly(experiment, tmp_path / "run", profile=PROFILE, board=ELF).result
     assert [str(verdict) for verdict in result.verdicts if not verdict.holds] == []
+
+
+@needs_image
+@pytest.mark.parametrize(
+    ("options", "failed"),
+    [
+        ({"duration_s": 8.0}, set()),
+        ({"duration_s": 9.5, "overrides": {"pilot.take_off_s": 4.0}}, {"reached_box"}),
+        ({"duration_s": 8.0, "faults": ["push.y@5.4:5.9=0.1"]}, {"off_path", "landed_off_axis"}),
+    ],
+    ids=["healthy", "slow take-off", "pushed while landing"],
+)
+def test_a_short_hover_is_judged_by_its_phases(
+    options: dict[str, Any], failed: set[str], tmp_path: Path
+) -> None:
+    verdicts = fly("hover", tmp_path / "run", profile=PROFILE, board=ELF, **options).result.verdicts
+    broken = {verdict.metric for verdict in verdicts if not verdict.holds}
+    assert broken - {"attitude_max", "touch_down_speed"} == failed
+    assert failed or not broken
 
 
 @needs_image
