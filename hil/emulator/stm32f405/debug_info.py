@@ -170,7 +170,8 @@ class DebugInfo:
             state = entry.state
             if state is None:
                 continue
-            if before is not None and FLASH_FROM <= before.address < FLASH_TO:
+            is_empty = before is not None and state.end_sequence and before.address == state.address
+            if before is not None and not is_empty and FLASH_FROM <= before.address < FLASH_TO:
                 path = paths[before.file - first] if 0 <= before.file - first < len(paths) else ""
                 yield LineRow(before.address, state.address, path, before.line, bool(before.is_stmt))
             before = None if state.end_sequence else state

@@ -48,7 +48,7 @@ def check_coverage(out: Path, image: str) -> None:
     counts, info = file_of(out, COUNTS), file_of(out, INFO)
     if not base_of(out).name or out.is_dir():
         raise LabError(f"{OPTION} {out}: a folder; expected the name of a file, with or without {INFO}")
-    if counts.exists():
+    if counts.exists() and counts.stat().st_size:  # empty: a process was killed while it made it
         _check_image(out, image, read_executed(out))
     elif info.exists():
         raise LabError(f"{OPTION} {out}: {info} exists without its {counts.name}: choose another name")

@@ -96,8 +96,9 @@ def write_coverage(out: Path) -> tuple[Shares, Path, Path]:
     info, page = file_of(out, INFO), file_of(out, PAGE)
     with writing(OPTION, out):
         write_whole(info, "".join(f"{line}\n" for line in tracefile(files, executed.image, sources)))
-        shared = _shared_folder([file.path for file in files])
-        covered = [_covered(file, sources[file.path], shared) for file in files]
+        shared = _shared_folder([file.path for file in files if sources[file.path]])
+        there = sorted(files, key=lambda file: sources[file.path] is None)  # libraries last
+        covered = [_covered(file, sources[file.path], shared) for file in there]
         folders: dict[str, list[Covered]] = {}
         for one in covered:
             folders.setdefault(str(Path(one.path).parent), []).append(one)
