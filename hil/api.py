@@ -36,6 +36,7 @@ from hil.laboratory.metrics import METRICS, Metric, Verdict, column, free_flight
 from hil.laboratory.request import RADIO, Options, Request
 from hil.laboratory.run import MakeFlight
 from hil.laboratory.run import fly as fly_into
+from hil.pictures.exports.coverage import write_coverage
 from hil.pictures.exports.demonstrations import Demonstrations, demonstrations_of
 from hil.world.rigid import RigidBody
 
@@ -83,6 +84,8 @@ def fly(
     An earlier flight of the same request is replaced there. A flight of another request is kept: by default the folder is
     then `runs/EXPERIMENT-SEED-2` and so on; a `folder` with one is refused without `replace`.
 
+    `coverage` adds to the coverage of the image that flies, and writes it (`floaty docs coverage`).
+
     `flown` is an experiment, the name of one, FILE.py:NAME, or a `Request`, which takes no options. `progress` shows the
     time in flight on standard error, or is called with the completed share of the flight. `report` writes `report.html`.
 
@@ -108,6 +111,8 @@ def fly(
         run = Run(result)
         if report:
             run.write_report()
+    if request.bench.coverage is not None:
+        write_coverage(request.bench.coverage)
     return run
 
 

@@ -3,6 +3,7 @@
 import ast
 import importlib.util
 import re
+import shutil
 import subprocess
 import tomllib
 from pathlib import Path
@@ -11,6 +12,7 @@ from types import ModuleType
 import pytest
 
 from ground_station.unused import Reason
+from support import stm32_firmware
 from support.documentation import (
     NOT_RUN,
     commands_in_blocks,
@@ -130,6 +132,8 @@ def test_every_reason_why_a_command_is_not_run_is_needed() -> None:
 @pytest.mark.parametrize("page", RUN, ids=name_of)
 def test_commands_print_what_pages_show(page: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
+    if "--board firmware.elf" in page.read_text(encoding="utf-8"):
+        shutil.copy(stm32_firmware.build(flags=("-g", "-DCALM")), "firmware.elf")
     run_examples(page, monkeypatch, why_not_run)
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.board import Board, ImuCounts
@@ -166,6 +167,10 @@ class Flashed(Protocol):
     @property
     def known_findings(self) -> Sequence[str]:
         """Harmless mistakes that its makers' firmware is known for, each as one line."""
+
+    @property
+    def passages(self) -> NDArray[np.uint64]:
+        """How often its blocks were executed, as of `Chip.passages`; empty where that is not counted."""
 
     def differences(self, config: FirmwareConfig) -> str:
         """Return the differences between its core and a profile in one line; empty if none."""

@@ -9,7 +9,6 @@ firmware's own estimate (in W), motors and supervisor; missing values are empty.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -110,6 +109,7 @@ class ChipImage:
     image: Image
     library: Path
     debugger: GdbServer | None = None
+    is_recorded: bool = False  # count the executed blocks
     needs_polls: ClassVar[bool] = True
 
     @classmethod
@@ -155,6 +155,8 @@ class ImageFirmware:
         )
         self.image, self.chip, self.parts = flashed.image, self._crazyflie.chip, self._crazyflie.parts
         self.kernel = self.scheduler = self._crazyflie.processor
+        if flashed.is_recorded:
+            self.chip.record()
         self._board = board
         self._table = {variable.name: variable for variable in log_table(self.image, self.chip)}
         self.variables = [one for name, one in self._table.items() if name.startswith("excite.")]
@@ -190,6 +192,10 @@ class ImageFirmware:
             )
             for task, run_time_us, activations in counted
         ]  # fmt: skip
+
+    @property
+    def passages(self) -> NDArray[np.uint64]:
+        return self.chip.passages
 
     def differences(self, config: FirmwareConfig) -> str:
         if not self.image.has("floaty_parameters"):
@@ -257,8 +263,7 @@ class ImageFirmware:
             if kernel is not None and kernel.running:
                 stacks = {task.name: task.stack_free_bytes for task in kernel.tasks()}
         free, least = (None, None) if kernel is None else kernel.heap_bytes
-        code = hashlib.sha256(self.image.code).hexdigest()
-        return ImageReport(code, stacks, free, least, resets[WATCHDOG], resets[SOFTWARE])
+        return ImageReport(self.image.sha256, stacks, free, least, resets[WATCHDOG], resets[SOFTWARE])
 
     # Values read from the app
 

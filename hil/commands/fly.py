@@ -59,6 +59,7 @@ SEEDS_MAX = 10_000
     "--elf", type=PATH, metavar="FILE", help="With a .bin as --board: the ELF that it was made from."
 )
 @common.gdb_option
+@common.coverage_option
 @click.option(
     "--hil", "in_loop", type=click.Choice(["still", "moving"]), is_flag=False, flag_value="still",
     help="Let the board of --board fly by its own tasks and clock, with the gyro samples of the virtual IMU; its servos "
@@ -104,7 +105,9 @@ def fly(
     common.announce_compilation()
     if seeds > 1:
         requests = [replace(request, seed=request.seed + index) for index in range(seeds)]
-        return _fly_many(requests, options, out or Path("runs"), crew)
+        code = _fly_many(requests, options, out or Path("runs"), crew)
+        _cover(request)
+        return code
     from hil.laboratory.files.folder import folder_of, moved, reserved
 
     folder = out or folder_of(request)
@@ -112,9 +115,16 @@ def fly(
         warn(why)
     with reserved(request, folder):
         code = _fly_one(request, folder, target)
+    _cover(request)
     if before is None or code == common.INTERRUPTED:
         return code
     return max(code, _left(before, folder, request.experiment))
+
+
+def _cover(request: Request) -> None:
+    """Write the files of --coverage."""
+    if request.bench.coverage is not None:
+        common.print_coverage(request.bench.coverage)
 
 
 def _flown(folder: Path) -> FlownRun:
@@ -145,7 +155,11 @@ def _left(before: FlownRun, folder: Path, experiment: Experiment) -> int:
 
 def _check_seeds(seeds: int, request: Request, target: str | None) -> None:
     """Raise `LabError` for a request that can only fly one seed at a time."""
+    from hil.pictures.exports.coverage import check_image_coverage
+
     bench = request.bench
+    if bench.coverage is not None:
+        check_image_coverage(bench.coverage, bench.board, bench.elf)
     if bench.realtime or target or bench.trace:
         raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
     if bench.gdb is not None:

@@ -115,6 +115,10 @@ gdb_option = click.option(
     "--gdb", type=click.IntRange(0, 65535), metavar="PORT",
     help="With an image as --board: wait for GDB on this port of 127.0.0.1 (0: any); time stands still at its breakpoints.",
 )  # fmt: skip
+coverage_option = click.option(
+    "--coverage", type=PATH, metavar="OUT",
+    help="With an image as --board: add which of its functions, lines and branches ran to OUT.info (lcov) and OUT.html.",
+)  # fmt: skip
 
 
 def profile_options(command: Command) -> Command:
@@ -135,6 +139,16 @@ def runner_options(command: Command) -> Command:
     ):  # fmt: skip
         command = option(command)
     return command
+
+
+def print_coverage(out: Path) -> None:
+    """Write the files of --coverage from what was added, and print their totals."""
+    from hil.pictures.exports.coverage import write_coverage
+
+    shares, info, page = write_coverage(out)
+    say(f"coverage: {shares}")
+    say(f"  {info}")
+    say(f"  {page}")
 
 
 COMPILING = "first run on this machine: compiling flight core and plant, once, some seconds"

@@ -3,6 +3,7 @@
 import shlex
 from collections.abc import Callable
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -29,10 +30,11 @@ from hil.emulator.crazyflie.shockburst import Air
 from hil.emulator.stm32f405.gdb import GdbServer
 from hil.errors import LabError, refusing
 from hil.laboratory.channels import radio_channel, serial_channel, tracker_channel
+from hil.laboratory.files.coverage import check_coverage
 from hil.laboratory.files.recorder import SETTINGS
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import Laboratory
-from hil.laboratory.request import MAVLINK, Request
+from hil.laboratory.request import MAVLINK, Bench, Request
 from hil.laboratory.robot import PYTHON_BOARD, Ports, Robot, Site
 from hil.world.body import Channel
 
@@ -181,7 +183,7 @@ def _executor(request: Request, stack: ExitStack) -> Executor:
     if is_link(bench.board):
         return PythonBoard(real_core(bench.board, stack))
     if bench.is_image:
-        return image_at(bench.board, bench.elf, debugger(bench.gdb, bench.elf or Path(bench.board), stack))
+        return image_of(bench, debugger(bench.gdb, bench.elf or Path(bench.board), stack))
     with refusing(f"--board {bench.board}: ", FirmwareError):
         return PythonBoard(runner_of(bench.board, request.config.logic))
 
@@ -190,6 +192,15 @@ def image_at(board: str, elf: Path | None, debugger: GdbServer | None = None) ->
     """Return the image that `--board` and `--elf` name. Raises `LabError` if it cannot run here."""
     with refusing(f"--board {board}: ", FirmwareError):
         return ChipImage.load(Path(board), elf, debugger)
+
+
+def image_of(bench: Bench, debugger: GdbServer | None = None) -> ChipImage:
+    """Return the image of a flight. Raises `LabError` if it cannot run here, or its coverage has no place."""
+    image = image_at(bench.board, bench.elf, debugger)
+    if bench.coverage is None:
+        return image
+    check_coverage(bench.coverage, image.image.sha256)
+    return replace(image, is_recorded=True)
 
 
 def debugger(port: int | None, image: Path, stack: ExitStack) -> GdbServer | None:

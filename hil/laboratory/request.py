@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypedDict, Unpack
@@ -63,6 +63,7 @@ class Bench:
     gdb: int | None = None  # port on which an image waits for a debugger; 0: any
     realtime: bool = False  # pace the flight to the wall clock
     trace: bool = False  # record the schedule of the whole flight, not only 50 ms
+    coverage: Path | None = field(default=None, compare=False)  # where an image's executed blocks are added
 
     @property
     def is_image(self) -> bool:
@@ -84,6 +85,8 @@ class Bench:
             raise LabError(f"--elf {self.elf}: goes with an image as --board, not with {self.board}")
         if self.gdb is not None and not self.is_image:
             raise LabError(f"--gdb {self.gdb}: needs one flight with an image as --board")
+        if self.coverage is not None and not self.is_image:
+            raise LabError(f"--coverage {self.coverage}: needs an image as --board, not {self.board}")
         if self.in_loop and not (is_link(self.board) and self.link == RADIO):
             raise LabError(
                 f"--hil: --board {self.board} --link {self.link}: expected the link to a real board as --board"
@@ -129,6 +132,7 @@ class Options(TypedDict, total=False):
     gdb: int | None
     realtime: bool
     trace: bool
+    coverage: Path | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,13 +299,18 @@ class Request:
             "pictures": self.experiment.pictures, "draws": self.experiment.draw is not None,
             "profile": self.profile, "overrides": self.overrides, "seed": None if self.is_real else self.seed,
             "duration_s": self.duration_s, "faults": self.faults,
-            **asdict(self.bench), "elf": None if elf is None else str(elf),
+            **_stored_bench(self.bench), "elf": None if elf is None else str(elf),
         }  # fmt: skip
 
     @staticmethod
     def read(values: Mapping[str, Any], find: Find = unknown) -> Request:
         """Return a stored request; `find` returns its experiment. Raises pydantic's `ValidationError`."""
         return _STORED.validate_python(values, context=find)
+
+
+def _stored_bench(bench: Bench) -> dict[str, Any]:
+    """Return what of a bench makes the flight: not where else its observations are added."""
+    return {name: value for name, value in asdict(bench).items() if name != "coverage"}
 
 
 def _nested(values: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -311,7 +320,7 @@ def _nested(values: Mapping[str, Any]) -> Mapping[str, Any]:
 
 StoredRequest = Annotated[Request, BeforeValidator(_nested), PlainSerializer(Request.stored)]
 _STORED: TypeAdapter[Request] = TypeAdapter(StoredRequest)
-_OF_BENCH = tuple(field.name for field in fields(Bench))
+_OF_BENCH = tuple(one.name for one in fields(Bench))
 
 
 def _has_unknown(faults: Sequence[Fault | str]) -> bool:

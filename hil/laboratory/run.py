@@ -17,6 +17,7 @@ from ground_station.telemetry_log import TELEMETRY
 from hil.board.clock import Pace
 from hil.config import check_logic
 from hil.laboratory.files.ages import with_goals_sent
+from hil.laboratory.files.coverage import Executed, add_executed
 from hil.laboratory.files.folder import replacing_older
 from hil.laboratory.files.recorder import Observer, Recorder, load_log
 from hil.laboratory.files.result import (
@@ -92,6 +93,10 @@ def fly(
         image=None if firmware.flashed is None else firmware.flashed.report(),
     )
     write_result(result)
+    bench = request.bench
+    if bench.coverage is not None and firmware.flashed is not None and result.image is not None:
+        flown = Executed(result.image.sha256, 1, firmware.flashed.passages, bench.board, bench.elf)
+        add_executed(bench.coverage, flown)
     return result
 
 

@@ -25,7 +25,7 @@ from hil.laboratory.experiments import find_again
 from hil.laboratory.files.ages import STATION_CLOCK
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import WARM_UP_US, Laboratory
-from hil.laboratory.lockstep import image_at
+from hil.laboratory.lockstep import image_of
 from hil.laboratory.request import Request
 from hil.laboratory.robot import PYTHON_BOARD, Site
 from hil.servers.dongle_plugin import VARIABLE
@@ -227,7 +227,7 @@ def linked_flight(request: Request, telemetry: Path | None, stack: ExitStack) ->
         )
     arguments = ["--profile", request.profile, *(f"--set={override}" for override in request.overrides)]
     bench = request.bench
-    executor = image_at(bench.board, bench.elf) if bench.is_image else PYTHON_BOARD
+    executor = image_of(bench) if bench.is_image else PYTHON_BOARD
     assert telemetry is not None
     return Flight(request, Paced(), partial(StationProcess, telemetry, arguments), executor)
 

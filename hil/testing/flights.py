@@ -14,13 +14,15 @@ from typing import Unpack
 import pytest
 
 from firmware_py.export.boards import BOARDS, runner_of
-from hil.api import Run, command_of, fly, request_of
+from hil.api import Run, command_of, maker_of, request_of
 from hil.config import DEFAULT_PROFILE, Overrides, load_config, settings_of
 from hil.errors import LabError
 from hil.laboratory.arguments import checked
 from hil.laboratory.experiment import Experiment
+from hil.laboratory.files.folder import reserved
 from hil.laboratory.metric_pairs import REL
 from hil.laboratory.request import MAVLINK, RADIO, Options, Request
+from hil.laboratory.run import fly
 from hil.testing.board import BareBoard
 from hil.testing.choices import why_no_board
 
@@ -55,12 +57,18 @@ class Flights:
     """The fixture `floaty`. `seed`, `profile`, `link`, `faults` and `target`, the board, are the test's."""
 
     def __init__(
-        self, home: Path, folder: Path, usual_profile: str = DEFAULT_PROFILE, update: bool = False
+        self,
+        home: Path,
+        folder: Path,
+        usual_profile: str = DEFAULT_PROFILE,
+        update: bool = False,
+        coverage: Path | None = None,
     ) -> None:
         self.home = home  # pytest's root folder: paths of profiles and experiments are relative to it
         self._folder = folder  # of all tests' runs
         self._usual_profile = usual_profile  # of pytest's configuration
         self._update = update  # the baselines
+        self._coverage = coverage  # where flights of images add theirs
         self._item: Item | None = None
 
     def begin(self, name: str, file: Path, choice: Options) -> Item:
@@ -114,11 +122,15 @@ class Flights:
         chosen["faults"] = (*self.faults, *options.get("faults", ()))
         chosen["profile"] = self._placed(chosen["profile"])
         self._need(chosen["board"])
+        if self._coverage is not None and chosen["board"] not in BOARDS:
+            chosen["coverage"] = self._coverage
         if isinstance(experiment, str):
             experiment = self._placed(experiment)
         request = request_of(experiment, **chosen)
         number = len(item.flown) + 1
-        run = fly(request, item.folder / str(number))
+        place = item.folder / str(number)
+        with reserved(request, place):  # not `hil.fly`, which writes the coverage after every flight
+            run = Run(fly(request, place, flight_of=maker_of(request)))
         item.flown.append(Flown(number, request, run))
         return run
 

@@ -11,6 +11,7 @@ import shutil
 import sys
 from collections.abc import Generator
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -63,6 +64,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="store_true",
         help="write the baselines of `floaty.baseline` instead of comparing",
     )
+    group.addoption(
+        "--floaty-coverage", type=Path, metavar="OUT",
+        help="add the coverage of the firmware image that flies to OUT.info (lcov) and OUT.html",
+    )  # fmt: skip
     parser.addini("floaty_profile", "the default profile of tests, a name or a path", default="")
 
 
@@ -179,6 +184,7 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
         {str(path) for report in passed for name, path in report.user_properties if name == WRITTEN}
     ):
         terminalreporter.write_line(f"floaty: wrote {path}")
+    _write_coverage(terminalreporter)
     reasons: dict[str, int] = {}
     for report in terminalreporter.stats.get("skipped", []):
         text = str(report.longrepr[2]) if isinstance(report.longrepr, tuple) else str(report.longrepr)
@@ -189,12 +195,38 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
         terminalreporter.write_line(f"floaty: {count} not flown: {reason}", yellow=True)
 
 
+def _coverage(config: pytest.Config) -> Path | None:
+    """Return the absolute path of --floaty-coverage."""
+    out: Path | None = config.getoption("floaty_coverage")
+    return out if out is None else config.invocation_params.dir / out
+
+
+def _write_coverage(terminal: Any) -> None:
+    out = _coverage(terminal.config)
+    if out is None:
+        return
+    from hil.errors import LabError
+    from hil.laboratory.files.coverage import COUNTS, file_of
+    from hil.pictures.exports.coverage import write_coverage
+
+    if not file_of(out, COUNTS).exists():
+        terminal.write_line(f"floaty: no image flew: {out} is not written", yellow=True)
+        return
+    try:
+        shares, info, page = write_coverage(out)
+    except LabError as error:
+        terminal.write_line(f"floaty: {error}", red=True)
+    else:
+        terminal.write_line(f"floaty: coverage: {shares}: {info}, {page}")
+
+
 def _flights(config: pytest.Config) -> Flights:
     from hil.testing.flights import Flights
 
     if FLIGHTS not in config.stash:
         update, usual = config.getoption("floaty_update"), _wanted(config).usual_profile
-        config.stash[FLIGHTS] = Flights(config.rootpath, config.rootpath / FOLDER, usual, update)
+        coverage = _coverage(config)
+        config.stash[FLIGHTS] = Flights(config.rootpath, config.rootpath / FOLDER, usual, update, coverage)
     return config.stash[FLIGHTS]
 
 

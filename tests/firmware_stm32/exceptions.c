@@ -4,7 +4,7 @@
  */
 #include "registers.h"
 
-enum scenario { FRAMES = 1, MASKING, ORDER, SYSTICK, SLEEP, IT_BLOCKS, CODE_IN_RAM };
+enum scenario { FRAMES = 1, MASKING, ORDER, SYSTICK, SLEEP, IT_BLOCKS, CODE_IN_RAM, MEASURED };
 
 #define NUMBERS "0,1,2,3,4,5,6,7,8,9,10,11,12"
 #define FP_NUMBERS NUMBERS ",13,14,15,16,17,18,19,20,21,22,23,24,25,26,27,28,29,30,31"
@@ -12,7 +12,7 @@ enum scenario { FRAMES = 1, MASKING, ORDER, SYSTICK, SLEEP, IT_BLOCKS, CODE_IN_R
 volatile uint32_t record[256], recorded, finished, ticks, ticks_in_it_blocks;
 uint32_t process_stack[64] __attribute__((aligned(8)));
 static volatile uint32_t nesting;
-extern const char masked_until_here[], masked_until_there[];
+extern const char masked_until_here[], masked_until_there[]; void measured(void);
 
 static void note(uint32_t value) { record[recorded++] = value; }
 
@@ -219,7 +219,7 @@ static void code_in_ram(void) {
 void run_scenario(uint32_t number) {
   static void (*const scenarios[])(void) = {
       [FRAMES] = frames, [MASKING] = masking, [ORDER] = order, [SYSTICK] = systick, [SLEEP] = sleep, [IT_BLOCKS] = it_blocks,
-      [CODE_IN_RAM] = code_in_ram,
+      [CODE_IN_RAM] = code_in_ram, [MEASURED] = measured,
   };
   scenarios[number]();
   finished = 1;

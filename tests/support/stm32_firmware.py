@@ -15,7 +15,7 @@ from support.paths import ROOT, TESTS
 
 SOURCES = TESTS / "firmware_stm32"
 BUILD = ROOT / "runs" / "build"
-FILES = ("firmware.c", "exceptions.c")
+FILES = ("firmware.c", "exceptions.c", "measured.c")
 SCRIPT = "stm32f405.ld"
 COMMON = (
     "-std=gnu11", "-O2", "-ffreestanding", "-nostdlib", "-static", "-Wall", "-Wextra", "-Werror",

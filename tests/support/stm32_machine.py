@@ -1,5 +1,6 @@
 """The tests' own firmware on the emulated microcontroller."""
 
+from collections.abc import Sequence
 from struct import pack, unpack
 
 import numpy as np
@@ -19,8 +20,8 @@ from support.stm32_firmware import build
 class FirmwareOnChip:
     """One image on one chip with an EEPROM, from power-on; variables are read and written by name."""
 
-    def __init__(self, compiler: str = "clang", **variables: int) -> None:
-        self.image = Image(build(compiler))
+    def __init__(self, compiler: str = "clang", flags: Sequence[str] = ("-g",), **variables: int) -> None:
+        self.image = Image(build(compiler, flags))
         self.chip = Chip(self.image.code, self.image.base, build_machine())
         self.eeprom = np.full(8192, 0xFF, np.uint8)
         self.chip.add_device(1, 0x50, self.eeprom, 2)

@@ -120,6 +120,7 @@ class Chip:
             (base, base + size, get(f"{name}_read"), get(f"{name}_write")) for base, size, name in WINDOWS
         ]
         self._sent = self._ffi.new("uint8_t[]", self._library.LINE_BYTES)
+        self._passages = np.zeros((0, 3), np.uint64)
         self._kept: list[NDArray[Any]] = []  # memory of devices, and the speeds of motors
         self._acts: dict[int, Callable[[], object]] = {}  # of devices that act on what is written
         self.breakpoints: set[int] = set()  # of a debugger: a run stops before these instructions
@@ -183,6 +184,22 @@ class Chip:
     def reset(self, cause: int) -> None:
         """Reset the processor: memory is kept, time continues."""
         self._library.machine_reset(self.state, self.vectors, cause)
+
+    def record(self) -> None:
+        """Count the executed blocks from now on."""
+        self._passages = np.zeros((FLASH_SIZE // 2 + 1, 3), np.uint64)
+        self.state.passages = self._ffi.from_buffer("struct passage[]", self._passages)
+
+    @property
+    def passages(self) -> NDArray[np.uint64]:
+        """Return the counts of the blocks since `record`, by half word of flash, (FLASH_SIZE / 2 + 1, 3).
+
+        Blocks that begin there; blocks that end before it and go on there; blocks that end before it and go on elsewhere.
+        """
+        counts, state = self._passages.copy(), self.state
+        if state.block_begin != state.block_end:  # asleep
+            counts[state.block_end // 2, 2] += 1
+        return counts
 
     # Pins
 

@@ -9,13 +9,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from operator import itemgetter
+from os.path import join, normpath
 from pathlib import Path
 from struct import unpack_from
 from typing import Any
 
-from firmware_py.export.elf import call_frames
+from firmware_py.export.elf import FLASH, FLASH_SIZE, call_frames
 from hil.errors import LabError, hint
 
+FLASH_FROM, FLASH_TO = FLASH, FLASH + FLASH_SIZE
 SP, LR, PC = 13, 14, 15
 DEEPEST = 32
 SHARED = 0xFFFF_FFFF  # in .debug_frame (32-bit DWARF), the mark of an entry that functions share
@@ -114,6 +116,17 @@ class Structure:
             raise LabError(f"struct {self.name} has no member {name}; {hint(name, self.members)}") from None
 
 
+@dataclass(frozen=True, slots=True)
+class LineRow:
+    """Code of one line: from an address up to another, which are equal where the line only begins there."""
+
+    begin: int
+    end: int
+    path: str  # as the compiler was called
+    line: int  # 0: the compiler's own code
+    is_statement: bool  # False: code that was moved away from the line's statement
+
+
 class DebugInfo:
     """Answers by address and by name. `path` is for messages."""
 
@@ -140,6 +153,28 @@ class DebugInfo:
         file = line.partition(":")[0]
         units = (unit for _, _, unit in self._units if Path(_name(unit.get_top_DIE())).name == file)
         return next((address for unit in units for address, place in self._table(unit) if place == line), 0)
+
+    @cached_property
+    def rows(self) -> list[LineRow]:
+        """Return all line rows of the code in flash, by address."""
+        found = (row for unit in self._dwarf.iter_CUs() for row in self._rows_of(unit))
+        return sorted(found, key=lambda row: (row.begin, row.end))
+
+    def _rows_of(self, unit: Any) -> Iterator[LineRow]:
+        program = self._dwarf.line_program_for_CU(unit)
+        if program is None:
+            return
+        paths, first = _paths(unit, program), 0 if program["version"] >= 5 else 1
+        before = None
+        for entry in program.get_entries():
+            state = entry.state
+            if state is None:
+                continue
+            is_empty = before is not None and state.end_sequence and before.address == state.address
+            if before is not None and not is_empty and FLASH_FROM <= before.address < FLASH_TO:
+                path = paths[before.file - first] if 0 <= before.file - first < len(paths) else ""
+                yield LineRow(before.address, state.address, path, before.line, bool(before.is_stmt))
+            before = None if state.end_sequence else state
 
     def structure(self, name: str, address: int) -> Structure:
         """Return `struct name` of the file with a function's address; raises `LabError` if it has none."""
@@ -222,6 +257,19 @@ def _ranges(unit: Any, lists: Any) -> list[tuple[int, int]]:
         return []
     high = attributes["DW_AT_high_pc"]
     return [(low, high.value if high.form == "DW_FORM_addr" else low + high.value)]
+
+
+def _paths(unit: Any, program: Any) -> list[str]:
+    """Return the path of each file of a line program."""
+    attribute = unit.get_top_DIE().attributes.get("DW_AT_comp_dir")
+    here = attribute.value if attribute else b""
+    given = program["include_directory"]
+    folders = list(given) if program["version"] >= 5 else [here, *given]
+    joined = (
+        join(here, folders[one.dir_index] if one.dir_index < len(folders) else b"", one.name)
+        for one in program["file_entry"]
+    )
+    return [normpath(path.decode(errors="replace")) for path in joined]
 
 
 def _name(entry: Any) -> str:

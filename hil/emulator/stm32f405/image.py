@@ -6,6 +6,7 @@ An image that cannot run here, or be inspected while it runs, is refused in one 
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from hashlib import sha256
 from operator import attrgetter
 from pathlib import Path
 from struct import unpack_from
@@ -110,6 +111,16 @@ class Image:
 
     def _all_variables(self) -> Iterator[Symbol]:
         return (symbol for named in self._variables.values() for symbol in named)
+
+    @property
+    def sha256(self) -> str:
+        """Return the digest of what is in flash."""
+        return sha256(self.code).hexdigest()
+
+    @property
+    def functions(self) -> list[Symbol]:
+        """Return the functions in flash, by address; several names of one are all there."""
+        return self._functions
 
     def function_at(self, address: int) -> str:
         """Return the name of the function around an address, empty outside all of them."""

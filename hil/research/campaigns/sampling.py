@@ -14,6 +14,7 @@ processor's logarithm.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -187,6 +188,16 @@ def plan_of(spec: Spec) -> Plan:
     return Plan(
         about, spec.flights, job, spec.experiments, spec.profiles, values, spec.half_width, cluster_of(spec)
     )
+
+
+def covered(plan: Plan, out: Path) -> Plan:
+    """Return the plan whose flights add their coverage to OUT."""
+
+    def job(index: int) -> Job:
+        planned = plan.job(index)
+        return replace(planned, options=planned.options | Options(coverage=out.absolute()))
+
+    return replace(plan, job=job)
 
 
 def _type_of(varies: Distribution) -> type:

@@ -331,6 +331,7 @@ void raise_fault(struct machine *m, unsigned exception, uint32_t status, uint32_
 {
     m->cfsr |= status;
     m->masks = 0; /* the end of the block was not reached */
+    cut_block(m, pc);
     int priority = execution_priority(m, 0);
     if (priority <= -1) {
         lock_up(m, pc);

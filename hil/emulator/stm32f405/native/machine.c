@@ -73,10 +73,39 @@ void stop(struct machine *m, uint32_t pc)
     m->engine.emu_stop(m->engine.uc);
 }
 
+/* Record where the last block went on. */
+static void end_block(struct machine *m, uint64_t next)
+{
+    if (m->block_begin == m->block_end)
+        return;
+    struct passage *end = &m->passages[m->block_end / 2];
+    if (next == m->block_end || next == FLASH_BASE + m->block_end)
+        end->fell++;
+    else
+        end->jumped++;
+    m->block_begin = m->block_end;
+}
+
+/* The instruction at `pc` has ended its block. */
+void cut_block(struct machine *m, uint32_t pc)
+{
+    uint32_t at = pc < FLASH_SIZE ? pc : pc - FLASH_BASE;
+    uint16_t first;
+    if (at - m->block_begin >= m->block_end - m->block_begin)
+        return;
+    memcpy(&first, m->flash + at, sizeof first);
+    m->block_end = at + (first >> 11 > 0x1C ? 4 : 2);
+}
+
 static void count(struct machine *m, uint64_t address, uint32_t size)
 {
     uint64_t begin = address < FLASH_SIZE ? address : address - FLASH_BASE;
     if (begin + size <= FLASH_SIZE) {
+        if (m->passages) {
+            m->passages[begin / 2].begun++;
+            m->block_begin = (uint32_t)begin;
+            m->block_end = (uint32_t)begin + size;
+        }
         uint64_t passed = m->before[(begin + size) / 2] - m->before[begin / 2];
         m->now += passed & ((1u << SUM_INSTRUCTIONS) - 1);
         m->instructions += passed >> SUM_INSTRUCTIONS & ((1u << (SUM_MASKS - SUM_INSTRUCTIONS)) - 1);
@@ -112,6 +141,8 @@ static void on_block(uc_engine *uc, uint64_t address, uint32_t size, void *user)
     int counted = resumed == (uint32_t)address; /* in the middle of a block, which was counted as a whole at its begin */
     if (m->masks && !counted)
         set_masks(m);
+    if (m->passages && !counted)
+        end_block(m, address);
     if (m->stepping && m->stepping++ > 1) { /* the instruction was the last of its block, or was carried out here */
         m->resume = counted ? resumed : NOWHERE;
         stop(m, (uint32_t)address);
@@ -412,6 +443,7 @@ void fault_of(struct machine *m, int error)
             m->stop_reason |= STOP_LOW_WRITE;
             return;
         }
+        cut_block(m, m->pc);
         memcpy(&first, m->flash + (m->pc & (FLASH_SIZE - 1)), sizeof first);
         m->pc += first >> 11 > 0x1C ? 4 : 2;
     } else if (error == FETCH_UNMAPPED || error == FETCH_PROTECTED) {

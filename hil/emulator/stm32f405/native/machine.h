@@ -168,6 +168,10 @@ struct watchpoint { /* memory whose access stops for a debugger */
     uint32_t address, size, kind;
 };
 
+struct passage { /* of a half word of flash: blocks that begin there, and that end before it: going on there, or elsewhere */
+    uint64_t begun, fell, jumped;
+};
+
 struct task_switch {
     uint64_t now;
     uint32_t block;
@@ -199,6 +203,8 @@ struct machine {
     uint32_t stacks;  /* whether the last block may lower a stack pointer */
     uint32_t masks;   /* whether the last block may end with a write to BASEPRI or FAULTMASK */
     uint64_t next_address;
+    struct passage *passages; /* of all half words of flash and one more, 0: not recorded */
+    uint32_t block_begin, block_end; /* of the recorded block that has not ended, equal without one; offsets in flash */
     uint8_t *flash, *ram, *ccm;
     uint8_t executed[RAM_SIZE / PAGE_SIZE]; /* pages of RAM from which code was executed */
     uint32_t stopping, attention, fault, stepping, first_step;
@@ -277,6 +283,7 @@ int watch_alignment(struct machine *m);
 
 /* machine.c */
 void stop(struct machine *m, uint32_t pc);
+void cut_block(struct machine *m, uint32_t pc);
 void fault_of(struct machine *m, int error);
 void note_access(struct watchpoint *w, uint32_t first, uint32_t size);
 void plan(struct machine *m, unsigned slot, uint64_t due);
