@@ -23,7 +23,14 @@ from hil.config import DEFAULT_PROFILE, LabConfig
 from hil.errors import LabError, reading
 from hil.laboratory.arguments import Known, checked
 from hil.laboratory.experiment import Experiment
-from hil.laboratory.experiments import check_flown, find_again, find_experiment, find_shipped, finder_of
+from hil.laboratory.experiments import (
+    check_flown,
+    find_again,
+    find_experiment,
+    find_experiments,
+    find_shipped,
+    finder_of,
+)
 from hil.laboratory.fault_kinds import Kind, Knob, declare, knob
 from hil.laboratory.faults import Fault
 from hil.laboratory.faults import parse as fault
@@ -36,14 +43,18 @@ from hil.laboratory.metrics import METRICS, Metric, Verdict, column, free_flight
 from hil.laboratory.request import RADIO, Options, Request
 from hil.laboratory.run import MakeFlight
 from hil.laboratory.run import fly as fly_into
+from hil.laboratory.swarms.flying import fly_swarm as fly_together
+from hil.laboratory.swarms.folder import swarm_folder, swarm_reserved
+from hil.laboratory.swarms.request import swarm_of
+from hil.laboratory.swarms.result import SwarmResult
 from hil.pictures.exports.coverage import write_coverage
 from hil.pictures.exports.demonstrations import Demonstrations, demonstrations_of
 from hil.world.rigid import RigidBody
 
 __all__ = [
     "Along", "Experiment", "Fault", "Goal", "Kind", "Knob", "LabError", "Metric", "Options", "Request",
-    "RigidBody", "Run", "column", "command_of", "declare", "fault", "fly", "knob", "load_run", "position_error",
-    "request_of",
+    "RigidBody", "Run", "Swarm", "column", "command_of", "declare", "fault", "fly", "fly_swarm", "knob", "load_run",
+    "position_error", "request_of",
 ]  # fmt: skip
 
 Progress = Callable[[float], None]  # (share of the flight, 0..1)
@@ -114,6 +125,30 @@ def fly(
     if request.bench.coverage is not None:
         write_coverage(request.bench.coverage)
     return run
+
+
+@checked
+def fly_swarm(
+    flown: Experiment | str,
+    robots: int,
+    folder: Path | str | None = None,
+    report: bool = False,
+    replace: bool = False,
+    **options: Unpack[Options],
+) -> Swarm:
+    """Fly several robots together in lockstep, by default into `runs/EXPERIMENT-SEED-xROBOTS`.
+
+    `flown` is as for `fly`, or a folder with a trajectory for each robot. Robot 1 has the seed of `options`, the next ones
+    the next. `report` writes the reports of the swarm and of each robot. Raises `LabError` for bad input.
+    """
+    chosen = find_experiments(flown, robots) if isinstance(flown, str) else [flown] * robots
+    request = swarm_of(chosen, **options)
+    place = swarm_folder(request) if folder is None else Path(folder)
+    with swarm_reserved(request, place, replace):
+        swarm = Swarm(fly_together(request, place))
+        if report:
+            swarm.write_report()
+    return swarm
 
 
 def maker_of(request: Request) -> MakeFlight:
@@ -297,6 +332,61 @@ class Run:
         if report := self.paths.get("report.html"):
             place = f'<a href="{escape(str(report))}">{escape(str(report))}</a>'
         return f"<p><b>{verdict}</b>: {escape(how)}</p><table><tr>{head}</tr>{rows}</table><p>{place}</p>"
+
+
+@dataclass(frozen=True, eq=False)
+class Swarm:
+    """Robots that flew together, and their folder."""
+
+    result: SwarmResult
+
+    @property
+    def folder(self) -> Path:
+        """The folder with a run folder for each robot."""
+        return self.result.folder
+
+    @property
+    def robots(self) -> tuple[Run, ...]:
+        """The flight of each robot."""
+        return tuple(map(Run, self.result.robots))
+
+    @property
+    def passed(self) -> bool:
+        """Whether every robot passed and the swarm's own limits hold."""
+        return self.result.passed
+
+    @property
+    def outcome(self) -> Outcome:
+        """The worst of all robots: completed, lost, interrupted or error."""
+        return self.result.outcome
+
+    @property
+    def metrics(self) -> Mapping[str, float]:
+        """Figures of the whole swarm: `distance_min` [m]; NaN where the flight has no value."""
+        return Known("metric", self.result.metrics)
+
+    @property
+    def verdicts(self) -> tuple[Verdict, ...]:
+        """The limits of the whole swarm."""
+        return self.result.verdicts
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of the hashes of all robots; the same for the same flight."""
+        return self.result.hash
+
+    def write_report(self) -> Path:
+        """Write `report.html` of the swarm and of each robot, and return the path of the first."""
+        from hil.pictures.swarm import write_swarm_report  # loads matplotlib
+
+        for one in self.robots:
+            one.write_report()
+        return write_swarm_report(self.result)
+
+    def __repr__(self) -> str:
+        failed = [f"robot {i}" for i, one in enumerate(self.robots, 1) if not one.passed]
+        failed += [str(one) for one in self.verdicts if not one.holds]
+        return f"<{self.result.request.title}: {'; '.join(failed) or 'all limits hold'}; {self.folder}>"
 
 
 @checked

@@ -25,7 +25,14 @@ from ground_station.config import CaptureConfig, GroundConfig, PilotConfig, Stat
 from hil.board.config import ImuConfig, MarkersConfig, MocapConfig, SensorConfig, SerialConfig
 from hil.emulator.crazyflie.config import RadioConfig
 from hil.errors import LabError, RefusedFileError, hint, shown
-from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
+from hil.world.config import (
+    BatteryConfig,
+    GeometryConfig,
+    PlantConfig,
+    PlantServoConfig,
+    SwarmConfig,
+    TunnelConfig,
+)
 from hil.world.floaty.geometry import check
 from hil.world.floaty.shape import check_hover
 from hil.world.quadrotor import QuadrotorConfig
@@ -116,6 +123,7 @@ class LabConfig(FirmwareConfig):
     tracker: TrackerConfig = Field(default_factory=TrackerConfig)
     capture: CaptureConfig = Field(default_factory=CaptureConfig)
     flight: FlightConfig = Field(default_factory=FlightConfig)
+    swarm: SwarmConfig = Field(default_factory=SwarmConfig)
     limits: dict[str, dict[str, float]] = Field(
         default_factory=dict, description="limits by experiment that replace the experiment's own"
     )

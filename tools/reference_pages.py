@@ -64,7 +64,7 @@ COMMANDS = {
     "cli-boards": ("Command line: boards", "board deploy"),
 }
 SECTIONS = {
-    "profile": ("Profile keys", "flight limits controller model estimator predictor allocation excitation servo"),
+    "profile": ("Profile keys", "flight swarm limits controller model estimator predictor allocation excitation servo"),
     "profile-board": ("Profile keys: board and station", "supervisor box cpu mavlink logic station pilot tracker capture"),
     "profile-world": ("Profile keys: robot and tunnel", "robot geometry plant actuators quadrotor battery tunnel"),
     "profile-devices": ("Profile keys: sensors and links", "imu sensors mocap markers radio serial"),

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from hil.laboratory.experiment import Experiment
     from hil.laboratory.flight import Flight
     from hil.laboratory.request import Options, Request
+    from hil.laboratory.swarms.result import SwarmResult
     from hil.live.panel_commands import PanelCommands
     from hil.pictures.compare import FlownRun
 
@@ -33,6 +34,11 @@ SEEDS_MAX = 10_000
 @click.option(
     "--seeds", type=click.IntRange(1, SEEDS_MAX), default=1, metavar="N",
     help="Fly N seeds from --seed on, in parallel; logs without pictures.",
+)  # fmt: skip
+@click.option(
+    "--robots", type=int, metavar="N",
+    help="Fly N robots together in lockstep, with seeds from --seed on, places and limits of [swarm] in the profile. "
+    "EXPERIMENT may then be a folder with a trajectory (.csv) for each.",
 )  # fmt: skip
 @click.option(
     "--duration", "duration_s", type=float, metavar="S", help="Free flight [s]; default: the experiment's."
@@ -79,12 +85,13 @@ SEEDS_MAX = 10_000
 def fly(
     experiment: str,
     seeds: int,
+    robots: int | None,
     target: str | None,
     out: Path | None,
     baseline: Path | None,
     **given: Any,
 ) -> int:
-    """Fly EXPERIMENT (see `floaty list`) in the virtual laboratory.
+    """Fly EXPERIMENT in the virtual laboratory: a name (see `floaty list`), FILE.py:NAME, or a trajectory FILE.csv.
 
     Exit code 0: all limits hold; 1: a limit fails, or a metric leaves the baseline's; 2: bad input; 130: interrupted.
     """
@@ -96,6 +103,11 @@ def fly(
         import hil.pictures.exports.perfetto  # noqa: F401 - reports a missing package now, not after the flight
     from hil.api import request_of
 
+    if robots is not None:
+        _check_alone(robots, seeds > 1 or any(crew.values()), target, baseline)
+        return _fly_together(experiment, robots, options, out)
+    if together := [one for one in options["overrides"] if one.startswith("swarm.")]:
+        raise LabError(f"--set {together[0]}: has no effect on one robot; --robots N flies several")
     request = request_of(experiment, **options)
     before = None if baseline is None else _flown(baseline)
     if seeds > 1:
@@ -125,6 +137,51 @@ def _cover(request: Request) -> None:
     """Write the files of --coverage."""
     if request.bench.coverage is not None:
         common.print_coverage(request.bench.coverage)
+
+
+def _check_alone(robots: int, many: bool, target: str | None, baseline: Path | None) -> None:
+    """Raise `LabError` for options that are for one robot."""
+    given = {"--seeds, --workers, --cluster, --resume": many, "--view": target, "--baseline": baseline}
+    if wrong := [name for name, value in given.items() if value]:
+        raise LabError(f"--robots {robots}: {', '.join(wrong)}: not for robots that fly together")
+
+
+def _fly_together(experiment: str, robots: int, options: Options, out: Path | None) -> int:
+    """Fly several robots on one clock, with the pictures of all; return the exit code."""
+    from hil.commands.tables import print_swarm
+    from hil.laboratory.experiments import find_experiments
+    from hil.laboratory.swarms.flying import fly_swarm
+    from hil.laboratory.swarms.folder import swarm_folder, swarm_reserved
+    from hil.laboratory.swarms.request import swarm_of
+    from hil.pictures.swarm import write_swarm_report
+
+    request = swarm_of(find_experiments(experiment, robots), **options)
+    common.announce_compilation()
+    folder = out or swarm_folder(request)
+    columns = TextColumn("{task.fields[now]}"), TimeRemainingColumn()
+    with swarm_reserved(request, folder), common.progress_bar(*columns) as progress:
+        bar = progress.add_task(request.title, total=None, now="")
+
+        def show(now_us: int, end_us: int) -> None:
+            progress.update(bar, completed=now_us, total=end_us, now=f"{now_us * 1e-6:6.1f} s")
+
+        result = fly_swarm(request, folder, show)
+        progress.update(bar, description="writing recordings and reports", total=None, now="")
+        for one in result.robots:
+            common.write_pictures(one.folder, one.request.experiment)
+        write_swarm_report(result)
+        common.write_recording(lambda: write_swarm_recording(result))
+    print_swarm(result)
+    if result.outcome == "interrupted":
+        return common.INTERRUPTED
+    return 0 if result.passed else 1
+
+
+def write_swarm_recording(result: SwarmResult) -> None:
+    """Write the recording of robots that flew together."""
+    from hil.pictures.viewer.swarm import write_swarm_rrd
+
+    write_swarm_rrd(result)
 
 
 def _flown(folder: Path) -> FlownRun:

@@ -241,10 +241,18 @@ def write_pictures(folder: Path, experiment: Experiment) -> None:
     """Write report and recording; without rerun only the report: the log allows a recording later."""
     from hil.pictures.report import write_report
 
-    write_report(folder, experiment)
-    try:
+    def write() -> None:
         from hil.pictures.viewer.recording import write_run_rrd
 
         write_run_rrd(folder)
+
+    write_report(folder, experiment)
+    write_recording(write)
+
+
+def write_recording(write: Callable[[], None]) -> None:
+    """Write a recording; report if it is impossible."""
+    try:
+        write()
     except LabError as error:
         warn(f"floaty: no recording: {error}")

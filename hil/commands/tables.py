@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from rich.table import Table
@@ -13,6 +14,7 @@ from hil.commands.options import console, right, say, wide_console
 
 if TYPE_CHECKING:
     from hil.laboratory.files.result import Result
+    from hil.laboratory.swarms.result import SwarmResult
     from hil.research.campaigns.jobs import Row
 
 SEED_COLUMNS = (
@@ -34,10 +36,7 @@ def print_seeds(rows: list[Row]) -> None:
     for row in rows:
         table.add_row(
             str(row.seed),
-            *(
-                " ".join(f"{row.metrics.get(name, math.nan) * scale:.{digits}f}" for name in names)
-                for _, names, scale, digits in SEED_COLUMNS
-            ),
+            *_cells(row.metrics),
             row.hash[:12],
             "ok" if row.passed else row.error or f"fails: {', '.join(row.failed)}",
         )
@@ -55,6 +54,13 @@ def print_seeds(rows: list[Row]) -> None:
             for name, digits in (("within_6cm_", 1), ("rms_", 2))
         )
         say(f"mean of the completed: rms {rms} cm; < 6 cm {shares} % of the time")
+
+
+def _cells(metrics: Mapping[str, float]) -> list[str]:
+    return [
+        " ".join(f"{metrics.get(name, math.nan) * scale:.{digits}f}" for name in names)
+        for _, names, scale, digits in SEED_COLUMNS
+    ]
 
 
 def print_result(result: Result) -> None:
@@ -81,6 +87,25 @@ def print_result(result: Result) -> None:
             if load.calls:
                 say(f"  {result.request.bench.board} {name:11} {load}")
     for name in ("report.html", "flight.rrd", "flight.perfetto-trace", "log.parquet"):
+        if (result.folder / name).is_file():
+            hint = f"   (floaty view {result.folder})" if name == "flight.rrd" else ""
+            say(f"  {result.folder / name}{hint}")
+
+
+def print_swarm(result: SwarmResult) -> None:
+    """Print one row per robot of those that flew together, their common limits and their files."""
+    headings = right("robot", "seed", *(column[0] for column in SEED_COLUMNS), "hash", "verdict")
+    table = Table(*headings, title=f"{result.request.title}, profile {result.request.robots[0].profile}")
+    for number, one in enumerate(result.robots, 1):
+        failed = ", ".join(verdict.metric for verdict in one.failed)
+        how = "ok" if one.passed else one.cause or f"fails: {failed}"
+        table.add_row(str(number), str(one.request.seed), *_cells(one.metrics), one.hash[:12], how)
+    wide_console(150).print(table)
+    for verdict in result.verdicts:
+        say(f"{verdict}: {verdict.mark}; {result.nearest or 'they did not fly together'}")
+    passed = sum(one.passed for one in result.robots)
+    say(f"{result.outcome}; {passed} of {len(result.robots)} robots hold all limits; hash {result.hash[:16]}")
+    for name in ("report.html", "flight.rrd", "swarm.json"):
         if (result.folder / name).is_file():
             hint = f"   (floaty view {result.folder})" if name == "flight.rrd" else ""
             say(f"  {result.folder / name}{hint}")

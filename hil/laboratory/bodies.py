@@ -31,7 +31,8 @@ SIZES = {
     "vibration": 2,
 }
 PARTS = (
-    "outputs", "tunnel", "settings", "sensors", "room", "escs", "look", "markers", "lost", "advance", "set_counts", "draw",
+    "outputs", "tunnel", "settings", "sensors", "room", "escs", "look", "markers", "lost", "lift", "advance", "set_counts",
+    "draw",
     "hold", "release", "put_back", "push", "channels",
 )  # fmt: skip
 

@@ -188,9 +188,9 @@ def _side_wind(axis: int) -> Knob:
 
 def _push(part: int) -> Knob:
     def write(robot: Robot, pushes: list[float]) -> None:
-        robot.body.push(pushes[:3], pushes[3:])
+        robot.push(pushes[:3], pushes[3:])
 
-    return _component(part, lambda robot: robot.body.pushes.tolist(), write)
+    return _component(part, lambda robot: list(robot.pushes), write)
 
 
 UPLINK_LOSS, DOWNLINK_LOSS = (_radio(f"{way}_loss", either) for way in ("uplink", "downlink"))

@@ -173,14 +173,23 @@ class Flight:
     def run(self, progress: Progress | None = None, recorder: Recorder | None = None) -> Outcome:
         """Fly to the end, the crash, or Ctrl-C, into a log of `channels`; it is left open for the caller to close."""
         interrupted = False
-        self._recorder = recorder
-        early, self._early = self._early, []  # where nothing is recorded, they go there again
-        for source, text in early:
-            self.note(source, text)
+        self.record_in(recorder)
         try:
             self.lab.run(progress)
         except KeyboardInterrupt:
             interrupted = True
+        return self.end(interrupted)
+
+    def record_in(self, recorder: Recorder | None) -> None:
+        """Write rows and events into a log of `channels` from now on."""
+        self._recorder = recorder
+        early, self._early = self._early, []  # where nothing is recorded, they go there again
+        for source, text in early:
+            self.note(source, text)
+
+    def end(self, interrupted: bool = False) -> Outcome:
+        """Return how the flight ended; its line ends, too."""
+        if interrupted:
             self.note("lab", "interrupted by the user")
         flashed = self.robot.firmware.flashed
         for text in flashed.known_findings if flashed is not None else ():

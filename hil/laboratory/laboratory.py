@@ -28,6 +28,7 @@ class Laboratory:
         self.events = EventQueue()
         self.now_us = 0
         self.end_us = NEVER_US
+        self._pause_us = NEVER_US
         self._robot: Robot | None = None
 
     def add(self, robot: Robot) -> None:
@@ -42,13 +43,25 @@ class Laboratory:
         with refusing("", EndlessInstantError):
             self._run(progress)
 
+    def run_to(self, us: int) -> None:
+        """Run like `run`, to an instant at most, for laboratories that run in turn on clocks that do not wait."""
+        self._pause_us = us
+        try:
+            self.run()
+        finally:
+            self._pause_us = NEVER_US
+
+    @property
+    def _until_us(self) -> int:
+        return min(self.end_us, self._pause_us)
+
     def _run(self, progress: Progress | None) -> None:
         clock, next_progress_us = self.clock, self.now_us
         self._run_firmware()
-        while self.now_us < min(WARM_UP_US, self.end_us):
+        while self.now_us < min(WARM_UP_US, self._until_us):
             self._step(FREE)
         clock.start(self.now_us)
-        while self.now_us < self.end_us:
+        while self.now_us < self._until_us:
             self._step(clock)
             if progress is not None and self.now_us >= next_progress_us:
                 progress(self.now_us)
@@ -82,7 +95,7 @@ class Laboratory:
 
     def _next_event_us(self, beats: bool) -> int:
         """Return the time of the next hardware event that the robot does not run by itself, or the end."""
-        next_us, end_us = self.events.other_us if beats else self.events.next_us, self.end_us
+        next_us, end_us = self.events.other_us if beats else self.events.next_us, self._until_us
         return end_us if next_us is None or next_us > end_us else next_us
 
     def _run_firmware(self) -> None:

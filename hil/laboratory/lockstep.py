@@ -9,6 +9,7 @@ from pathlib import Path
 
 from firmware_py.errors import FirmwareError
 from firmware_py.export.boards import runner_of
+from firmware_py.wire.memories import CONFIG_SIZE
 from firmware_py.wire.telemetry import ALL_BLOCKS, CRAZYFLIE_BLOCKS
 from ground_station.errors import LinkError
 from ground_station.lines import print_line
@@ -21,12 +22,14 @@ from ground_station.tracker import tracker_of
 from ground_station.trajectory import FlightPlan, Goal, Trajectory
 from hil.board.board_firmware import Executor, Flashed, PythonBoard
 from hil.board.clock import Clock, FreeRunning, Paced
+from hil.board.eeprom import factory_config
 from hil.board.image_firmware import ChipImage
 from hil.board.image_settings import APP_PARAMETER, NO_APP, ImageSettings, stock_contents
+from hil.board.pins import new_eeprom
 from hil.board.radio import Receiver, VirtualRadio
 from hil.board.real_core import is_link, real_core
 from hil.board.uart import VirtualSerial
-from hil.emulator.crazyflie.shockburst import Air
+from hil.emulator.crazyflie.shockburst import TURN_ROUND_US, Air, air_us
 from hil.emulator.stm32f405.gdb import GdbServer
 from hil.errors import LabError, refusing
 from hil.laboratory.channels import radio_channel, serial_channel, tracker_channel
@@ -35,25 +38,40 @@ from hil.laboratory.files.recorder import SETTINGS
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import Laboratory
 from hil.laboratory.request import MAVLINK, Bench, Request
-from hil.laboratory.robot import PYTHON_BOARD, Ports, Robot, Site
+from hil.laboratory.robot import PYTHON_BOARD, Ports, Robot, Site, nobody_listens
 from hil.world.body import Channel
 
 
 class ModelledLine:
     """`hil.laboratory.flight.Line` for the modelled links; `station`, `tracker` and `radio` may be read."""
 
-    def __init__(self, telemetry: Path | None, request: Request, site: Site, lab: Laboratory) -> None:
+    def __init__(
+        self, telemetry: Path | None, number: int, request: Request, site: Site, lab: Laboratory
+    ) -> None:
         config, events, streams = site.config, site.events, site.streams
         serial = request.bench.link == MAVLINK
         self.record: Path | None = None  # the log has the goals already
         self._release_us = config.flight.release_us
         self.trajectory = FlightPlan(Goal(config.flight.home, 0.0), lambda *_: request.trajectory)
         self.trajectory.start(self._release_us)
+        self._bits_per_second, self._wire_us = config.radio.bits_per_second, site.executor.wire_us
         self.tracker = tracker_of(config.tracker, config.mocap.period_us)
         air = Air.of(config.radio)
         uart = VirtualSerial(config.serial, events, streams.serial) if serial else None
         self.radio = VirtualRadio(config.radio, events, streams.radio, air, site.executor.wire_us)
-        self.robot = Robot(site, Ports(self.radio.downlink, None if serial else air, uart))
+        self._to_peers: Receiver = nobody_listens
+        self._peer_noise = streams.radio.spawn(1)[0]
+        eeprom = new_eeprom()
+        if number:
+            eeprom[:CONFIG_SIZE] = factory_config(number, self._bits_per_second)
+        ports = Ports(
+            self.radio.downlink,
+            None if serial else air,
+            uart,
+            eeprom=eeprom,
+            to_peers=lambda now_us, packet: self._to_peers(now_us, packet),
+        )
+        self.robot = Robot(site, ports)
         self._frames: FrameLog | None = None
         self._pilot: CrazyflieLink | None = None
         self._link, self._channel = (
@@ -134,6 +152,18 @@ class ModelledLine:
         """Fly another trajectory from now on."""
         self.trajectory.steer(trajectory)
 
+    def join(self, to_peers: Receiver) -> None:
+        """Pass the packets that the board broadcasts to other boards."""
+        self._to_peers = to_peers
+
+    def hear_peer(self, now_us: int, packet: bytes) -> None:
+        """Let a packet of another board arrive, unless it is lost."""
+        if self._peer_noise.random() >= self.radio.medium.lost_up(len(packet)):
+            delay_us = TURN_ROUND_US + air_us(len(packet), self._bits_per_second) + self._wire_us(packet)
+            self.robot.events.at(
+                now_us + delay_us, lambda now_us: self.robot.packet_received(now_us, packet, True)
+            )
+
     def command(self, now_us: int, packet: bytes) -> None:
         """Send an operator's packet over the radio."""
         self.radio.uplink(now_us, packet)
@@ -166,19 +196,24 @@ def lockstep_flight(
     telemetry: Path | None = None,
     executor: Executor = PYTHON_BOARD,
     clock: Clock | None = None,
+    number: int = 0,
 ) -> Flight:
-    """Return a flight over a modelled link. Without a clock it is paced if the request is in real time."""
+    """Return a flight over a modelled link. Without a clock it is paced if the request is in real time.
+
+    `number` is the robot's in a swarm, from 1, and gives its board an own radio address.
+    """
     clock = clock or (Paced() if request.bench.realtime else FreeRunning())
-    return Flight(request, clock, partial(ModelledLine, telemetry), executor)
+    return Flight(request, clock, partial(ModelledLine, telemetry, number), executor)
 
 
 def in_lockstep(request: Request, telemetry: Path | None, stack: ExitStack) -> Flight:
     """Return a flight over a modelled link. Raises `LabError` if its board is not available."""
     with refusing("--board ", LinkError):
-        return lockstep_flight(request, telemetry, _executor(request, stack))
+        return lockstep_flight(request, telemetry, executor_of(request, stack))
 
 
-def _executor(request: Request, stack: ExitStack) -> Executor:
+def executor_of(request: Request, stack: ExitStack) -> Executor:
+    """Return what executes the firmware of a request. Raises `LabError` or `LinkError` if it is not available."""
     bench = request.bench
     if is_link(bench.board):
         return PythonBoard(real_core(bench.board, stack))

@@ -27,12 +27,13 @@ from hil.board.pins import CpuLoad, InjectFailure, Requests, VirtualBoard, new_e
 from hil.board.uart import VirtualSerial
 from hil.config import LabConfig, load_config
 from hil.emulator.crazyflie import syslink
+from hil.emulator.crazyflie.nrf51 import peer_packet
 from hil.emulator.crazyflie.shockburst import Air
 from hil.emulator.events import EventQueue
 from hil.errors import LabError
 from hil.laboratory.bodies import make_body
 from hil.world.battery import Battery, open_circuit_voltage
-from hil.world.body import Body, Carrier
+from hil.world.body import Body, Carrier, Vector
 
 IMU_PERIOD_US = 1_000
 # Share of a gyro's flight noise before the fans run, if it exceeds what the stock firmware accepts at rest: less than 100
@@ -93,6 +94,9 @@ class Ports:
     radio_command: Callable[[int, int, bytes], None] | None = None
     fail: InjectFailure = unsupported
     eeprom: bytearray = field(default_factory=new_eeprom)
+    to_peers: Callable[[int, bytes], object] = lambda now_us, packet: (
+        None
+    )  # takes what it sends to other boards
 
 
 class Robot:
@@ -112,6 +116,8 @@ class Robot:
         self.say = site.say
         self.free = False
         self.powered = True
+        self.pushes: tuple[float, ...] = (0.0,) * 6  # of faults: force [N, W] and torque [N m, B]
+        self._contact: tuple[float, ...] = (0.0,) * 3
         self.body: Body = make_body(config, streams.gusts, self.start_W)
         self.body.hold()
         at_rest = self.body.draw(0, open_circuit_voltage(config.battery.charge))
@@ -230,6 +236,20 @@ class Robot:
 
     # Body
 
+    def push(self, force_W: Vector, torque_B: Vector) -> None:
+        """Apply a force [N] and a torque [N m] until the next call."""
+        self.pushes = (*force_W, *torque_B)
+        self._apply()
+
+    def touch(self, force_W: Vector) -> None:
+        """Apply the force [N] of other robots until the next call."""
+        self._contact = tuple(force_W)
+        self._apply()
+
+    def _apply(self) -> None:
+        force_W = [push + contact for push, contact in zip(self.pushes[:3], self._contact, strict=True)]
+        self.body.push(force_W, self.pushes[3:])
+
     def release(self) -> None:
         self.body.release()
         self.free = True
@@ -315,6 +335,8 @@ class Robot:
         if kind in (syslink.SWITCH_OFF, syslink.STM32_OFF):
             self.say("board", "switched off by its firmware")
             self.events.at(now_us, lambda _: self.cut_power())
+        elif kind == syslink.PEER_BROADCAST and data:
+            self._ports.to_peers(now_us, peer_packet(data))
 
 
 def with_system(config: LabConfig, system: int) -> LabConfig:

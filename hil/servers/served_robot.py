@@ -8,8 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from firmware_py.wire import WireError
-from firmware_py.wire.memories import CONFIG_SIZE, decode_config, encode_config
-from firmware_py.wire.memories import RadioSettings as EepromSettings
+from firmware_py.wire.memories import CONFIG_SIZE, decode_config
 from firmware_py.wire.parameters import SetByName, encode_pose_kind, encode_set_by_name
 from firmware_py.wire.telemetry import Sample
 from ground_station.links.loopback import LoopbackLink
@@ -20,11 +19,11 @@ from ground_station.trajectory import Goal, Hold
 from hil.board.board_firmware import BoardFirmware
 from hil.board.clock import Readers
 from hil.board.dongle import VirtualDongle
+from hil.board.eeprom import CHANNEL, address_of, factory_config
 from hil.board.image_settings import APP_PARAMETER, NO_APP, stock_contents
 from hil.board.pins import InjectFailure, new_eeprom, unsupported
 from hil.board.radio import VirtualRadio
 from hil.board.uart import VirtualSerial
-from hil.config import LabConfig
 from hil.emulator.crazyflie.nrf51 import RATES, AirSettings, Band, Nrf51, ToPeers
 from hil.emulator.crazyflie.radio_line import POLL_PERIOD_US
 from hil.emulator.crazyflie.shockburst import Air
@@ -70,16 +69,10 @@ class BoardFile:
             raise LabError(f"{self._path}: {error.strerror}") from None
 
 
-CHANNEL = 80
 RATE_NAMES = ("250K", "1M", "2M")  # in a URI
 UDP_RETRY_US = 500_000
 STAYS_US = 1_000_000  # a radio's new setting is reported once it has stayed this long
 UDP_QUEUE = 1000  # packets of a program waiting at the host: cflib does not repeat over UDP
-
-
-def address_of(number: int) -> bytes:
-    """Return the radio address of board 1, 2, ...: the Crazyflie's default, then E7E7E7E702 and on."""
-    return bytes((0xE7, 0xE7, 0xE7, 0xE7, 0xE7 if number == 1 else number))
 
 
 # Of each USB transfer: cflib and the dongle's socket, unpaced, reach 4500 exchanges per second.
@@ -145,7 +138,7 @@ class ServedRobot:
         chip = bytes((number, 0x10, 0xA7, 0xF1, 0x0A, 0xC0))
         band = Band(events, rng.random, to_peers)
         self.nrf51 = Nrf51(settings, chip, config.radio.downlink_queue, band, self, air, wire_us)
-        eeprom[:CONFIG_SIZE] = _factory_config(number, config)
+        eeprom[:CONFIG_SIZE] = factory_config(number, config.radio.bits_per_second)
         self._file = BoardFile(state, number, eeprom) if state is not None else None
         if self._file is not None:
             self._file.load()
@@ -341,9 +334,3 @@ class ServedRobot:
 def _pose_kind(absolute: bool) -> Sequence[bytes]:
     """Return the setting of the kind of poses: a booted image begins with absolute ones."""
     return (encode_pose_kind(absolute),)
-
-
-def _factory_config(number: int, config: LabConfig) -> bytes:
-    """Return the configuration block with a board's own address and the profile's data rate."""
-    rate = RATES.index(config.radio.bits_per_second)
-    return encode_config(EepromSettings(CHANNEL, rate, int.from_bytes(address_of(number))))

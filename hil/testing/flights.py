@@ -14,7 +14,7 @@ from typing import Unpack
 import pytest
 
 from firmware_py.export.boards import BOARDS, runner_of
-from hil.api import Run, command_of, maker_of, request_of
+from hil.api import Run, Swarm, command_of, fly_swarm, maker_of, request_of
 from hil.config import DEFAULT_PROFILE, Overrides, load_config, settings_of
 from hil.errors import LabError
 from hil.laboratory.arguments import checked
@@ -118,21 +118,40 @@ class Flights:
         """
         item = self._item
         assert item is not None
-        chosen: Options = {**item.choice, **options}
-        chosen["faults"] = (*self.faults, *options.get("faults", ()))
-        chosen["profile"] = self._placed(chosen["profile"])
-        self._need(chosen["board"])
-        if self._coverage is not None and chosen["board"] not in BOARDS:
-            chosen["coverage"] = self._coverage
         if isinstance(experiment, str):
             experiment = self._placed(experiment)
-        request = request_of(experiment, **chosen)
+        request = request_of(experiment, **self._chosen(options))
         number = len(item.flown) + 1
         place = item.folder / str(number)
         with reserved(request, place):  # not `hil.fly`, which writes the coverage after every flight
             run = Run(fly(request, place, flight_of=maker_of(request)))
         item.flown.append(Flown(number, request, run))
         return run
+
+    @checked
+    def fly_swarm(self, experiment: Experiment | str, robots: int, **options: Unpack[Options]) -> Swarm:
+        """Fly several robots together, with options as for `fly`; each of them is a flight of the test.
+
+        Skips the test when a board is not available here. Raises `LabError` for bad input.
+        """
+        item = self._item
+        assert item is not None
+        if isinstance(experiment, str):
+            experiment = self._placed(experiment)
+        number = len(item.flown) + 1
+        swarm = fly_swarm(experiment, robots, item.folder / str(number), **self._chosen(options))
+        item.flown += [Flown(number + i, run.request, run) for i, run in enumerate(swarm.robots)]
+        return swarm
+
+    def _chosen(self, options: Options) -> Options:
+        """Return the options of a flight of the test. Skips the test when a board is not available here."""
+        chosen: Options = {**self.choice, **options}
+        chosen["faults"] = (*self.faults, *options.get("faults", ()))
+        chosen["profile"] = self._placed(chosen["profile"])
+        self._need(chosen["board"])
+        if self._coverage is not None and chosen["board"] not in BOARDS:
+            chosen["coverage"] = self._coverage
+        return chosen
 
     @checked
     def board(self, link: str = RADIO, profile: str | None = None, overrides: Overrides = ()) -> BareBoard:
@@ -200,7 +219,7 @@ class Flights:
         """Return a path relative to the root folder as an absolute one; another name unchanged."""
         path, end, variable = name.partition(".py:") if ".py:" in name else (name, "", "")
         placed = self.home / (path + end.rstrip(":"))
-        is_path = placed.suffix in (".py", ".toml") and placed.is_file()
+        is_path = placed.suffix in (".py", ".toml", ".csv") and placed.is_file()
         return f"{self.home / path}{end}{variable}" if is_path else name
 
 

@@ -172,6 +172,10 @@ class Body(Motion, Protocol):
     def lost(self) -> str | None:
         """The first reason why the flight is over, with its value and unit; None while it flies."""
 
+    @property
+    def lift(self) -> float:
+        """The force [N] along z of B that air, floor and holder have on it: rotors in still air push the air as hard."""
+
     def advance(self, now_us: int) -> None:
         """Advance the truth by all of its steps that end at or before `now_us`."""
 

@@ -177,3 +177,34 @@ class BatteryConfig(Section):
     electronics_power: float = number(0.3, "[0, 50]", "board and IMU [W]; paper, Energy efficiency")
     servo_power: float = number(0.50, "[0, 10]", "of each, holding [W]; calibrated on the paper's 3.4 W")
     servo_energy: float = number(0.33, "[0, 10]", "per angle turned [J/rad]; calibrated on the paper's 3.4 W")
+
+
+class SwarmConfig(Section):
+    """Robots that fly together by `floaty fly --robots`: their places, and what they do to one another."""
+
+    spacing: float = number(
+        0.5, "(0, 20]", "of the V without `places`: robots behind one another, x and y [m]"
+    )
+    places: tuple[Three, ...] = Field(
+        (),
+        description="x, y, z from the profile's home, W [m], of robot 1, 2, ...; empty: a V that points along x",
+    )
+    distance_min: float = number(
+        0.15, "[0, 10]", "limit on the least distance between two centres of mass after the release [m]"
+    )
+    radius: float = number(
+        0.07,
+        "[0, 1]",
+        "of the sphere by which robots touch [m]; a 2.1+ with its propellers; 0: they never touch",
+    )
+    stiffness: float = number(150.0, "(0, 5000]", "of two spheres [N/m]; chosen, as that of the floor")
+    damping: float = number(0.3, "[0, 50]", "of two spheres that approach each other [N s/m]; chosen")
+    wake: float = number(1.0, "[0, 3]", "factor on the speed of the rotors' wakes [1]; 0: no downwash")
+    wake_radius: float = number(
+        0.065, "(0.005, 1]", "of the wake at the rotors [m]; chosen: the rotors' outline"
+    )
+    wake_spread: float = number(
+        0.1,
+        "[0, 1]",
+        "growth of that radius per length [1]; a free turbulent jet's, Pope, Turbulent Flows, 5.1",
+    )

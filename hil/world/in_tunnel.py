@@ -103,6 +103,11 @@ class TunnelBody:
         cause = self._lost[0]
         return self.loss_texts[cause].format(self._body.lost_value) if cause else None
 
+    @property
+    def lift(self) -> float:
+        """The force [N] along z of B that air, floor and holder have on the body."""
+        return float(self._body.mass * self.specific_force_B[2])
+
     def hold(self) -> None:
         self._body.held = i32(1)
         self._body.v_WB[:] = self._body.omega_B[:] = 0.0

@@ -38,6 +38,7 @@ class Tunnel:
         decay = np.array([exp(-STEP_US * 1e-6 / tau) for tau in GUST_TAU])
         air.gust_decay[:] = decay  # exact discretisation of an Ornstein-Uhlenbeck process
         air.gust_kick[:] = np.array(GUST_RMS[config.turbulence]) * np.sqrt(1.0 - decay**2)
+        self._wake = (0.0, 0.0, 0.0)
         self.set_gust_scale(config.gust_scale)
         self.set_side_wind(*config.side_wind)
         self.set_fan_factor(config.fan_factor)
@@ -53,8 +54,16 @@ class Tunnel:
 
     def set_side_wind(self, x: float, y: float, z: float = 0.0) -> None:
         """Add a wind [m/s, W] everywhere; a fan beside the tunnel."""
-        wind = tuple(_inside("side wind", component, -20.0, 20.0) for component in (x, y, z))
-        self.air.fields.side_wind_W[:] = self.side_wind = wind
+        self.side_wind = tuple(_inside("side wind", one, -20.0, 20.0) for one in (x, y, z))
+        self._blow()
+
+    def set_wake(self, x: float, y: float, z: float) -> None:
+        """Add the wake of other robots [m/s, W]."""
+        self._wake = (x, y, z)
+        self._blow()
+
+    def _blow(self) -> None:
+        self.air.fields.side_wind_W[:] = [a + b for a, b in zip(self.side_wind, self._wake, strict=True)]
 
     def block(self, x: float, y: float, radius: float, depth: float) -> None:
         """Remove the share `depth` of the flow around (x, y) [m, W], half of it at `radius` [m]; depth 0 clears."""

@@ -140,8 +140,7 @@ class Nrf51:
     def command(self, now_us: int, kind: int, data: bytes) -> None:
         """Execute a command of the STM32, as in syslink."""
         if kind == syslink.PEER_BROADCAST and data:
-            packet = bytes((NULL | 0x0C, PEERS | data[0] & 0x0F)) + data[1:]
-            self._band.to_peers(replace(self.settings, address=BROADCAST), packet)
+            self._band.to_peers(replace(self.settings, address=BROADCAST), peer_packet(data))
         elif kind in (syslink.RADIO_CHANNEL, syslink.RADIO_RATE) and len(data) == 1:
             self.settings = self._tuned(SET_CHANNEL if kind == syslink.RADIO_CHANNEL else SET_RATE, data[0])
         elif kind == syslink.RADIO_ADDRESS and len(data) == 5:
@@ -327,6 +326,11 @@ class Nrf51:
 def _kind(data: bytes) -> int | None:
     """Return the type of a packet to the radio chip, None for one to the processor."""
     return data[1] if len(data) > 1 and data[0] & NULL_MASK == NULL else None
+
+
+def peer_packet(data: bytes) -> bytes:
+    """Return the packet on the air of what a board sends to the others: its port, and the content."""
+    return bytes((NULL | 0x0C, PEERS | data[0] & 0x0F)) + data[1:]
 
 
 def is_to_peers(data: bytes) -> bool:

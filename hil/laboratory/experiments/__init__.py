@@ -1,5 +1,7 @@
 """The experiments: one small file per subject, with trajectory, faults and limits; `EXPERIMENTS` has them by name."""
 
+from pathlib import Path
+
 from hil.errors import LabError, hint
 from hil.laboratory.experiment import Experiment, Source
 from hil.laboratory.experiments.airspeed import AIRSPEEDS
@@ -7,9 +9,10 @@ from hil.laboratory.experiments.disturbances import OCCLUSION, PUSHED, SIDE_WIND
 from hil.laboratory.experiments.identification import IDENTIFICATION
 from hil.laboratory.experiments.overload import OVERLOAD
 from hil.laboratory.experiments.own import entries, in_file, in_package
-from hil.laboratory.experiments.position import EIGHT, HEIGHT_SINE, HOVER, Y_SQUARE
+from hil.laboratory.experiments.position import EIGHT, FORMATION, HEIGHT_SINE, HOVER, Y_SQUARE
 from hil.laboratory.experiments.power import ENDURANCE, POWER
 from hil.laboratory.experiments.take_off import TAKE_OFF_LANDING
+from hil.laboratory.experiments.trajectories import SUFFIX, in_csv, in_folder
 from hil.laboratory.experiments.yaw import YAW_SINES, YAW_STEP, YAW_STEP_0
 from hil.laboratory.files.result import Result
 from hil.laboratory.request import Find
@@ -17,18 +20,19 @@ from hil.laboratory.request import Find
 EXPERIMENTS: dict[str, Experiment] = {
     experiment.name: experiment
     for experiment in (
-        HOVER, YAW_STEP, YAW_STEP_0, *YAW_SINES, HEIGHT_SINE, Y_SQUARE, EIGHT, PUSHED, *SIDE_WINDS, OCCLUSION, *AIRSPEEDS,
-        POWER, ENDURANCE, TAKE_OFF_LANDING, OVERLOAD, *IDENTIFICATION,
+        HOVER, YAW_STEP, YAW_STEP_0, *YAW_SINES, HEIGHT_SINE, Y_SQUARE, EIGHT, FORMATION, PUSHED, *SIDE_WINDS, OCCLUSION,
+        *AIRSPEEDS, POWER, ENDURANCE, TAKE_OFF_LANDING, OVERLOAD, *IDENTIFICATION,
     )
 }  # fmt: skip
 
 __all__ = [
-    "EXPERIMENTS", "Experiment", "check_flown", "find_again", "find_experiment", "find_shipped", "finder_of",
+    "EXPERIMENTS", "Experiment", "check_flown", "find_again", "find_experiment", "find_experiments", "find_shipped",
+    "finder_of",
 ]  # fmt: skip
 
 
 def find_experiment(name: str) -> Experiment:
-    """Return an experiment: by name, if it ships or is in an installed package, or as FILE.py:NAME.
+    """Return an experiment: by name, if it ships or is in an installed package, as FILE.py:NAME, or of a trajectory.
 
     Raises `LabError` for an unknown one, with the nearest name.
     """
@@ -36,11 +40,18 @@ def find_experiment(name: str) -> Experiment:
         return EXPERIMENTS[name]
     if ".py" in name:
         return in_file(name)
+    if name.endswith(SUFFIX):
+        return in_csv(Path(name))
     installed = entries()
     if name in installed:
         return in_package(installed[name])
     near = hint(name, [*EXPERIMENTS, *installed])
     raise LabError(f"experiment {name!r}: unknown; {near}; one of your own is FILE.py:NAME")
+
+
+def find_experiments(name: str, count: int) -> list[Experiment]:
+    """Return the experiment of each of several robots: the same, or those of a folder with a trajectory for each."""
+    return in_folder(Path(name), count) if Path(name).is_dir() else [find_experiment(name)] * count
 
 
 def find_shipped(name: str, source: Source | None) -> Experiment | None:

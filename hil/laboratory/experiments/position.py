@@ -66,3 +66,9 @@ EIGHT = Experiment(
     limits={"lost": 0.0, "rms_x": 0.2, "rms_y": 0.2, "max_x": 0.35, "max_y": 0.35},
     trajectory=eight,
 )
+FORMATION = Experiment(
+    name="formation",
+    summary="hold one's place among others for 60 s (with --robots; profile crazyflie in one room)",
+    duration_s=60.0,
+    limits={"lost": 0.0, "in_box": 0.99, "attitude_max": 0.349066},
+)

@@ -7,6 +7,9 @@ from hil.pictures.viewer.plots import ShownCurves
 from hil.pictures.viewer.track import timeline_of
 
 FOLLOWED_S = 20.0  # shown by the curves of a live flight
+EYE = rrb.EyeControls3D(
+    position=(0.62, -0.48, 1.45), look_target=(0.0, 0.0, 1.12), tracking_entity="world/robot"
+)
 TRAIL_S = 4.0
 WANTED_S = 15.0  # of the goal's path, before and after
 # Title and origin of each plot; the first two have their own place, the rest are tabs.
@@ -75,7 +78,11 @@ def blueprint(schema: pa.Schema, live: bool = False) -> rrb.Blueprint:
     states = rrb.StateTimelineView(name="States", origin="state", time_ranges=shown)
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(_tunnel(timeline), rrb.Horizontal(states, texts), row_shares=[3, 1]),
+            rrb.Vertical(
+                tunnel_view(timeline, "world", ["world"], EYE),
+                rrb.Horizontal(states, texts),
+                row_shares=[3, 1],
+            ),
             rrb.Vertical(*plots[:2], rrb.Tabs(*plots[2:])),
             column_shares=[5, 4],
         ),
@@ -85,20 +92,20 @@ def blueprint(schema: pa.Schema, live: bool = False) -> rrb.Blueprint:
     )
 
 
-def _tunnel(timeline: str) -> rrb.Spatial3DView:
+def tunnel_view(timeline: str, origin: str, worlds: list[str], eye: rrb.EyeControls3D) -> rrb.Spatial3DView:
+    """Return the view of the scenes at the paths `worlds`, in front of an eye."""
     before = rrb.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_S)
     now = rrb.TimeRangeBoundary.cursor_relative()
     begin, end = (rrb.TimeRangeBoundary.cursor_relative(seconds=seconds) for seconds in (-WANTED_S, WANTED_S))
     return rrb.Spatial3DView(
-        name="Wind tunnel",
-        origin="world",
-        eye_controls=rrb.EyeControls3D(
-            position=(0.62, -0.48, 1.45), look_target=(0.0, 0.0, 1.12), tracking_entity="world/robot"
-        ),
+        name="Wind tunnel" if origin == "world" else "Room",
+        origin=origin,
+        eye_controls=eye,
         background=(14, 18, 22),  # pale lines stay visible in a light theme, too
         line_grid=False,
         overrides={
-            "world/trail": [rrb.VisibleTimeRanges(rrb.VisibleTimeRange(timeline, start=before, end=now))],
-            "world/wanted": [rrb.VisibleTimeRanges(rrb.VisibleTimeRange(timeline, start=begin, end=end))],
+            f"{world}/{name}": [rrb.VisibleTimeRanges(rrb.VisibleTimeRange(timeline, start=start, end=stop))]
+            for world in worlds
+            for name, start, stop in (("trail", before, now), ("wanted", begin, end))
         },
     )

@@ -27,26 +27,29 @@ def timeline_of(metadata: Mapping[bytes, bytes] | None) -> tuple[str, int]:
 class RecordingTrack:
     """Writes to a recording, with times of the flight's log."""
 
-    def __init__(self, recording: rr.RecordingStream, schema: pa.Schema) -> None:
-        self._recording = recording
+    def __init__(self, recording: rr.RecordingStream, schema: pa.Schema, below: str = "") -> None:
+        """`below`: the beginning of all paths, with a slash at its end."""
+        self._recording, self._below = recording, below
         self._timeline, self._zero_us = timeline_of(schema.metadata)
         recording.set_log_time_enabled(False)
 
     def static(self, path: str, content: Any) -> None:
         """Log what is true at all times."""
-        self._recording.log(path, content, static=True)
+        self._recording.log(self._below + path, content, static=True)
 
     def at(self, t_us: int, path: str, content: Any) -> None:
         """Log what begins at an instant of the log."""
         self._recording.set_time(self._timeline, duration=np.timedelta64(t_us - self._zero_us, "us"))
-        self._recording.log(path, content)
+        self._recording.log(self._below + path, content)
 
     def send(self, path: str, times_us: Times, columns: Iterable[Any]) -> None:
         """Log one row of columns per instant."""
         if len(times_us) == 0:
             return
         since = (times_us - self._zero_us).astype("timedelta64[us]")
-        self._recording.send_columns(path, [rr.TimeColumn(self._timeline, duration=since)], columns)
+        self._recording.send_columns(
+            self._below + path, [rr.TimeColumn(self._timeline, duration=since)], columns
+        )
 
     def curve(self, path: str, times_us: Times, values: NDArray[np.float64]) -> None:
         """Log the points of a plot's curves, (N,) or (N, curves)."""

@@ -1,0 +1,1 @@
+"""Several robots on one clock: their requests and places, their flight in turn, and its result."""

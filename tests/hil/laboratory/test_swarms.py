@@ -1,0 +1,163 @@
+"""Robots that fly together in lockstep: the same bits as alone, what they do to one another, trajectories of Crazyswarm2."""
+
+import json
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.compiling import bound
+from firmware_py.core.subset import i32
+from firmware_py.firmware import Firmware
+from hil.api import column, fly, fly_swarm
+from hil.board.board_firmware import PowerOn, PythonBoard
+from hil.emulator.crazyflie import syslink
+from hil.errors import LabError
+from hil.laboratory.experiments import find_experiment, find_experiments
+from hil.laboratory.experiments.trajectories import BEGIN_S, in_csv
+from hil.laboratory.swarms import flying
+from hil.laboratory.swarms.request import swarm_of
+from hil.testing.flights import Flights
+from hil.world.neighbours import AIR_DENSITY, Neighbours, interact
+from support.command import Cli
+
+ELF = os.environ.get("FLOATY_STOCK_ELF", "")
+APART = ("swarm.spacing=1.5",)
+
+
+def test_robots_apart_fly_bit_for_bit_as_alone(floaty: Flights, tmp_path: Path) -> None:
+    swarm = floaty.fly_swarm("hover", 2, duration_s=2.0, overrides=APART, seed=3)
+    alone = [
+        fly("hover", tmp_path / f"{seed}", duration_s=2.0, overrides=APART, seed=seed) for seed in (3, 4)
+    ]
+    assert [one.hash for one in swarm.robots] == [one.hash for one in alone]
+    assert swarm.metrics["distance_min"] == pytest.approx(1.5 * math.sqrt(2.0), abs=0.1)
+    written = json.loads((swarm.folder / "swarm.json").read_text())
+    assert written["hash"] == swarm.hash
+    assert [one["hash"] for one in written["robots"]] == [one.hash for one in swarm.robots]
+    again = fly_swarm("hover", 2, tmp_path / "again", duration_s=2.0, overrides=APART, seed=3)
+    assert again.hash == swarm.hash
+    nearer = fly_swarm(
+        "hover", 2, tmp_path / "limit", duration_s=0.5, overrides=("swarm.distance_min=3", *APART)
+    )
+    assert all(one.outcome == "completed" for one in nearer.robots)
+    assert not nearer.passed
+    assert "distance_min" in repr(nearer)
+
+
+class Talker(PythonBoard):
+    """Sends one packet to the other boards at its first one from the ground, and prints theirs."""
+
+    def boot(self, start: PowerOn) -> Firmware:
+        firmware, sent = super().boot(start), []
+        received = firmware.radio_received
+
+        def hear(data: bytes, broadcast: bool = False) -> None:
+            if broadcast:
+                start.board.debug_write(f"peer says {data[2:].decode()}")
+                return
+            if not sent:
+                sent.append(data)
+                start.board.radio_command(syslink.PEER_BROADCAST, b"\x03hello")
+            received(data)
+
+        firmware.radio_received = hear
+        return firmware
+
+
+def test_boards_hear_what_the_others_send(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flying, "executor_of", lambda request, stack: Talker())
+    request = swarm_of([find_experiment("hover")] * 3, duration_s=0.2, overrides=APART)
+    result = flying.fly_swarm(request, tmp_path)
+    for one in result.robots:
+        events = (one.folder / "events.jsonl").read_text().splitlines()
+        assert sum("peer says hello" in line for line in events) == 2
+
+
+def neighbours(*places: tuple[float, float, float], **settings: float) -> Neighbours:
+    """Return robots of 30 g at places, after one computation."""
+    block = Neighbours.allocate()
+    near = block.fields
+    near.count = i32(len(places))
+    near.wake_radius, near.wake_spread, near.stiffness = 0.065, 0.1, 150.0
+    for name, value in settings.items():
+        setattr(near, name, value)
+    for i, place in enumerate(places):
+        near.flies[i], near.p_WB[i], near.lift_W[i] = 1.0, place, (0.0, 0.0, 0.2943)
+    bound(interact, block)()
+    return near
+
+
+@pytest.mark.parametrize("below", [0.05, 0.5, 2.0])
+def test_a_wake_carries_the_momentum_of_the_thrust(below: float) -> None:
+    rings = np.linspace(0.0, 1.5, 15)
+    near = neighbours((0.0, 0.0, 3.0), *((r, 0.0, 3.0 - below) for r in rings), wake=1.0)
+    speeds = -near.wake_W[1:16, 2]
+    width = 0.065 + 0.1 * below
+    assert speeds[1:4] == pytest.approx(speeds[0] * np.exp(-((rings[1:4] / width) ** 2)), rel=1e-6, abs=1e-9)
+    momentum_flow = AIR_DENSITY * np.pi * width**2 * speeds[0] ** 2 / 2  # of a Gaussian profile
+    assert momentum_flow == pytest.approx(0.2943)
+    assert not neighbours((0.0, 0.0, 1.0), (0.0, 0.0, 1.5), wake=1.0).wake_W[1].any()  # above it
+
+
+def test_spheres_push_each_other_apart_alike() -> None:
+    near = neighbours((0.0, 0.0, 1.0), (0.06, 0.08, 1.0), (5.0, 0.0, 1.0), radius=0.07)
+    assert near.touch_W[1] == pytest.approx((150 * 0.04 * 0.6, 150 * 0.04 * 0.8, 0.0))
+    assert near.touch_W[0] == pytest.approx(-near.touch_W[1])
+    assert (near.least, near.one, near.other) == (pytest.approx(0.1), 0, 1)
+    assert not near.touch_W[2].any()
+    assert not neighbours((0.0, 0.0, 1.0), (0.06, 0.08, 1.0), radius=0.0).touch_W.any()
+
+
+@pytest.mark.skipif(
+    not ELF, reason="FLOATY_STOCK_ELF names no build of Bitcraze's firmware: no swarm was flown"
+)
+def test_the_wake_of_a_stock_crazyflie_presses_the_one_below(tmp_path: Path) -> None:
+    places = "swarm.places=[[0.0, 0.0, 0.6], [0.0, 0.02, 0.0]]"
+    flown = [
+        fly_swarm("hover", 2, tmp_path / wake, duration_s=10.0, profile="crazyflie", board=ELF,
+                  overrides=(places, f"swarm.wake={wake}"))
+        for wake in ("1", "0")
+    ]  # fmt: skip
+    lift = [
+        np.mean(column(one.robots[1].free, *(f"rotor.thrust_{i}" for i in (1, 2, 3, 4)))[500:700].sum(1))
+        for one in flown
+    ]
+    assert lift[0] > 1.05 * lift[1]
+
+
+ROW = "2,1,0,0.5,0,0,0,0,0,0,1,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0.5,0,0,0,0,0,0,0"
+
+
+def test_a_trajectory_of_crazyswarm_counts_from_the_robot(tmp_path: Path) -> None:
+    path = tmp_path / "figure 8.csv"
+    path.write_text(f"duration,x^0,x^1\n{ROW}\n1{ROW[1:]}\n")
+    experiment = in_csv(path)
+    assert experiment.name == "figure-8"
+    pieces = experiment.trajectory.path  # type: ignore[attr-defined]
+    assert pieces(0.0) == [0.0, 0.0, 0.0, 0.5]
+    assert pieces(BEGIN_S + 1.5) == pytest.approx([0.5 * 1.5**2, 1.5, 0.0, 0.5])
+    assert pieces(BEGIN_S + 2.5) == pytest.approx([0.125, 0.5, 0.0, 0.5])  # of the second piece
+    assert pieces(99.0) == pieces(BEGIN_S + 3.0)
+    for name in ("traj10.csv", "traj2.csv"):
+        (tmp_path / name).write_text(ROW)
+    assert [one.name for one in find_experiments(str(tmp_path), 3)] == ["figure-8", "traj2", "traj10"]
+    path.write_text(f"{ROW}\n1,2,x\n")
+    with pytest.raises(LabError, match=r"figure 8.csv:2: 3 values: expected 33 numbers"):
+        in_csv(path)
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (("--robots", "1"), "--robots 1: expected 2 to 16"),
+        (("--robots", "2", "--view"), "--robots 2: --view: not for robots that fly together"),
+        (("--robots", "2", "--link", "udp://127.0.0.1:1"), "--link udp://127.0.0.1:1: --robots is for flights in lockstep"),
+        (("--set", "swarm.wake=0"), "--set swarm.wake=0: has no effect on one robot"),
+        (("--robots", "3", "--set", "swarm.places=[[0,0,0]]"), "swarm.places: 1 places, expected one for each of 3 robots"),
+    ],
+)  # fmt: skip
+def test_what_cannot_fly_together_is_refused(words: tuple[str, ...], text: str, cli: Cli) -> None:
+    assert text in cli.refusal("fly", "hover", *words)
