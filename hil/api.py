@@ -148,6 +148,8 @@ def fly_swarm(
         swarm = Swarm(fly_together(request, place))
         if report:
             swarm.write_report()
+    if (coverage := options.get("coverage")) is not None:
+        write_coverage(coverage)
     return swarm
 
 

@@ -13,10 +13,12 @@ from typing import Unpack
 
 import pytest
 
+from firmware_py.errors import FirmwareError
 from firmware_py.export.boards import BOARDS, runner_of
+from firmware_py.logic.loading import check_file
 from hil.api import Run, Swarm, command_of, fly_swarm, maker_of, request_of
 from hil.config import DEFAULT_PROFILE, Overrides, load_config, settings_of
-from hil.errors import LabError
+from hil.errors import LabError, RefusedFileError
 from hil.laboratory.arguments import checked
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.files.folder import reserved
@@ -127,6 +129,14 @@ class Flights:
             run = Run(fly(request, place, flight_of=maker_of(request)))
         item.flown.append(Flown(number, request, run))
         return run
+
+    @checked
+    def check(self, file: str) -> None:
+        """Check a control law or an estimator without a flight. Raises `LabError` with a line for each refusal."""
+        try:
+            check_file(self.home / file)
+        except FirmwareError as error:
+            raise RefusedFileError(str(error)) from None
 
     @checked
     def fly_swarm(self, experiment: Experiment | str, robots: int, **options: Unpack[Options]) -> Swarm:

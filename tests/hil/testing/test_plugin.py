@@ -75,6 +75,10 @@ def test_other(floaty):
 def test_expected(floaty):
     with pytest.raises(LabError):
         floaty.fly(profile="profile.toml")
+
+def test_check(floaty):
+    with pytest.raises(LabError, match="list comprehension: write a loop"):
+        floaty.check("controller.py")
 """
 
 
@@ -82,7 +86,7 @@ def test_a_broken_controller_is_one_message_without_traceback(pytester: pytest.P
     make_project(pytester.path, LAW.replace("DT * memory", "sum([v for v in control.u]) * memory"))
     tests = pytester.makepyfile(BROKEN).name
     result = pytester.runpytest_inprocess()
-    result.assert_outcomes(failed=4, passed=1)
+    result.assert_outcomes(failed=4, passed=2)
     shown, _, _ = result.stdout.str().partition(
         "short test summary info"
     )  # it repeats whole messages where the variable CI is set
