@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from ground_station import __main__ as alone
+from ground_station.program import Session
 
 pytestmark = pytest.mark.usefixtures("own_signal_handlers")
 
@@ -38,6 +39,25 @@ def test_bad_input_is_one_line(
     shown = capsys.readouterr().err
     assert line in shown
     assert shown.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("failure", "incomplete", "code"), [("", False, 0), ("", True, 3), ("lost", True, 2)]
+)
+def test_the_exit_code_tells_of_failures_and_of_records_with_gaps(
+    monkeypatch: pytest.MonkeyPatch, failure: str, incomplete: bool, code: int
+) -> None:
+    def flown(operator: object, settings: object, session: Session, *_: object) -> tuple[str, None]:
+        if incomplete:
+            session.records.write("log.csv", _fail)
+        return failure, None
+
+    monkeypatch.setattr(alone, "fly_with", flown)
+    assert alone.main(["--link", "udp://127.0.0.1:1"]) == code
+
+
+def _fail() -> None:
+    raise OSError(28, "No space left on device")
 
 
 def test_a_missing_file_of_settings_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -58,6 +58,7 @@ class FlowSensor:
         self._sharpness = min(max(distance / FOCUS, 0.0), 1.0)
         if self._sharpness == 0.0:
             self._spot_W = None
+            self._show()
             return
         if self._spot_W is not None:
             x, y, z = to_body(q, tuple(a - b for a, b in zip(self._spot_W, place, strict=True)))

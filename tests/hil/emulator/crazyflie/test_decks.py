@@ -296,6 +296,20 @@ def test_motion_is_forgotten_once_it_was_read_and_by_a_reset() -> None:
         assert burst(bench)[:3] == (0x30, 0, 0)
 
 
+def test_who_loses_the_floor_sees_no_feature_and_the_way_until_it_is_back_is_not_counted() -> None:
+    bench = DeckBench("flow2")
+    bench.place((0.0, 0.0, 1.0))
+    bench.wait(20_000)
+    assert burst(bench)[3] > 0
+    bench.place((0.0, 0.0, 1.0), about(0, math.pi))
+    bench.wait(8_264)
+    assert burst(bench)[::3] == (0x30, 0)
+    bench.place((0.4, 0.3, 1.0))
+    bench.wait(8_264)
+    motion, x, y, quality = burst(bench)
+    assert (abs(x) < 8, abs(y) < 8, quality > 0) == (True, True, True)
+
+
 def test_near_the_floor_fewer_features_are_counted() -> None:
     bench, seen = DeckBench("flow2"), []
     for height in (0.02, 0.05, 0.5, 1.0):
