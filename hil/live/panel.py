@@ -215,11 +215,15 @@ def _state(row: pa.Table) -> dict[str, Any]:
 
 
 def _curves(rows: pa.Table) -> dict[str, Any]:
-    """Return the title and names of each graph, and time [s] and all values of every fifth row; None where unknown."""
+    """Return the title and names of each graph, and of every fifth row time [s], all values and the number of faults.
+
+    An unknown value is None.
+    """
     some = rows.take(np.arange(0, rows.num_rows, DRAWN_EVERY))
     shown = curves.errors_and_actuators(some)
+    faults = column(some, "fault.active") if "fault.active" in some.column_names else np.zeros(some.num_rows)
     table = np.round(
-        np.column_stack((curves.since_release(some), *(curve.read(some) for _, curve in shown))), 3
+        np.column_stack((curves.since_release(some), *(curve.read(some) for _, curve in shown), faults)), 3
     )
     return {
         "graphs": [[f"{title} [{curve.unit}]", *curve.names] for title, curve in shown],

@@ -108,7 +108,8 @@ def test_a_page_that_reads_slowly_gets_the_newest_rows_and_texts_and_all_values(
 
 
 def test_a_page_shows_only_the_newest_row(panel: PanelScreen, loop: IOLoop, tmp_path: Path) -> None:
-    fly(Request.of(EXPERIMENTS["hover"], duration_s=0.5), tmp_path / "run")
+    request = Request.of(EXPERIMENTS["hover"], duration_s=0.5, faults=("push.x@0.1:0.2=0.1",))
+    fly(request, tmp_path / "run")
     log = load_log(tmp_path / "run")
     socket = connect(loop, panel, panel.token, panel.origin)
     receive(loop, socket)
@@ -122,6 +123,7 @@ def test_a_page_shows_only_the_newest_row(panel: PanelScreen, loop: IOLoop, tmp_
         curves += message["curves"]
     assert texts == [f"lab: from {first}" for first in range(0, 140, 20)]
     assert [row[0] for row in curves] == pytest.approx([-1.0 + 0.05 * index for index in range(28)], abs=0.01)
+    assert [row[0] for row in curves if row[-1]] == pytest.approx([0.1, 0.15, 0.2, 0.25], abs=0.011)
     assert message["state"]["t_s"] == pytest.approx(0.39, abs=0.01)
     assert message["state"]["supervisor"] == "flying"
     assert message["state"]["goal"] == [0.0, 0.0, 1.15, 0.0]
