@@ -9,6 +9,7 @@ import ast
 from dataclasses import dataclass
 from typing import ClassVar
 
+from firmware_py.core import structs as core
 from firmware_py.export import hints
 from firmware_py.export.errors import ExportError, FollowUpError, refusal
 from firmware_py.export.hints import CONSTRUCTS, FUNCTIONS, HOLE, SIGNS, instead
@@ -156,6 +157,8 @@ class Expressions:
             raise FollowUpError(text)
         if node.attr not in struct.fields:
             hint = hints.nearest(node.attr, struct.fields, f"{name}.")
+            if "now" in struct.fields and node.attr.upper() in vars(core):  # part of the state
+                hint = f": write {name}.now[{node.attr.upper()} + k]"
             raise self.refuse(node, f"{text} is no field of a struct{hint}")
         self.read.add(node.value.id)
         return Value(f"{node.value.id}->{node.attr}", struct.fields[node.attr].kind)

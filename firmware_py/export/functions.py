@@ -5,7 +5,7 @@ import textwrap
 from typing import ClassVar
 
 from firmware_py.export import hints
-from firmware_py.export.errors import ExportError, FollowUpError
+from firmware_py.export.errors import ExportError, FollowUpError, refusal
 from firmware_py.export.expressions import Expressions, Value, describe
 from firmware_py.export.hints import CONSTRUCTS, HOLE, instead
 from firmware_py.export.locals import find_locals, leaves
@@ -146,9 +146,8 @@ class FunctionPrinter:
             case ast.For():
                 self._for(node, depth)
             case _:
-                raise self._print.refuse(
-                    node, f"{hints.word(node)}{instead(CONSTRUCTS, type(node).__name__)}"
-                )
+                reason = f"{hints.word(node)}{instead(CONSTRUCTS, type(node).__name__)}"
+                raise refusal(self.kernel.path, node, f"{reason} (in {self.kernel.node.name})")
 
     def _assign_local(self, node: ast.Assign, target: ast.Name, depth: int) -> None:
         name = target.id

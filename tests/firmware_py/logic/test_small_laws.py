@@ -93,6 +93,8 @@ ACCEPTED = [
 ]  # fmt: skip
 # A law, and what is to be written instead.
 REFUSED = [
+    ("a = ZERO\nb = DT\na, b = b, a\nreturn a", "write one assignment for each value"),
+    ("return estimator.velocity[2]", "write estimator.now[VELOCITY + k]"),
     ("if memory.mode:\n    return DT\nreturn ZERO", "write memory.mode != 0"),
     ("total = ZERO\nfor g in TABLE:\n    total = total + g\nreturn total", "write for k in range(4): and TABLE[k] for g"),
     ("for i in range(len(TABLE)):\n    memory.errors[i] = ZERO\nreturn ZERO", "write 4"),
