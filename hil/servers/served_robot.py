@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from firmware_py.export.elf import ERASED
 from firmware_py.wire import WireError
 from firmware_py.wire.memories import CONFIG_SIZE, decode_config, encode_config
 from firmware_py.wire.memories import RadioSettings as EepromSettings
@@ -74,7 +73,9 @@ class BoardFile:
 CHANNEL = 80
 RATE_NAMES = ("250K", "1M", "2M")  # in a URI
 UDP_RETRY_US = 500_000
-BOOTLOADER_SIZE = 0x4000  # [bytes] of flash before the firmware
+STARTED_US = (
+    4_000_000  # after a restart: the stock firmware takes packets once it has tested itself, after 3.1 s
+)
 STAYS_US = 1_000_000  # a radio's new setting is reported once it has stayed this long
 UDP_QUEUE = 1000  # packets of a program waiting at the host: cflib does not repeat over UDP
 
@@ -248,8 +249,9 @@ class ServedRobot:
 
     def _pilot_settings(self, told: list[BoardFirmware]) -> Sequence[bytes]:
         """Return the profile's parameters for the Crazyflie's own firmware, once per boot; `told` has the last one."""
-        firmware = self.robot.firmware
-        if firmware in told or firmware.flashed is None:
+        firmware, booted_us = self.robot.firmware, self.robot.booted_us
+        starts = booted_us and self.robot.events.now_us - booted_us < STARTED_US
+        if firmware in told or firmware.flashed is None or starts:
             return ()
         told[:] = [firmware]
         table = firmware.flashed.parameters
@@ -290,7 +292,7 @@ class ServedRobot:
             self._report(f"the flashed image cannot run: {error}; the one before it starts instead")
             self.robot.execute(before)
             return False
-        self._report(f"starts the flashed image, {len(flash.rstrip(ERASED)) - BOOTLOADER_SIZE} bytes")
+        self._report("starts the flashed image")
         return True
 
     def stop(self, now_us: int) -> None:

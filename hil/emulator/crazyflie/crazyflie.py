@@ -154,7 +154,8 @@ class Crazyflie:
 
     def _report_access(self, address: int, crash: Crash) -> None:
         """Report an access that has no effect; keep one that Bitcraze's firmware is known for."""
-        if any((place.split()[0], address) in KNOWN_WRITES for place in crash.trace):
+        names = {place.split()[0] for place in crash.trace}
+        if any(at == address and (name in names or not self.image.named) for name, at in KNOWN_WRITES):
             self.known.append(str(crash))
         else:
             self._outside.debug_write(str(crash))

@@ -78,7 +78,7 @@ def test_a_flashed_image_starts_at_the_next_start_and_one_that_cannot_run_is_nam
     assert isinstance(served.robot.executor, ChipImage)
     assert served.robot.executor.image.code.startswith(flash_binary(second))
     assert re.match(r"flashed image: no symbols: tasks, log variables", lines[0])
-    assert re.match(r"board 1: starts the flashed image, \d+ bytes$", lines[-1])
+    assert lines[-1] == "board 1: starts the flashed image"
     flash(bytes(PAGE_SIZE))
     (line,) = lines
     assert re.match(
