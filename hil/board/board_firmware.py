@@ -153,6 +153,10 @@ class Flashed(Protocol):
     """A board with compiled constants; a profile reaches it over the radio."""
 
     @property
+    def notes(self) -> Sequence[str]:
+        """What was taken of a release, and what is unknown of an image without symbols, each as one line."""
+
+    @property
     def parameters(self) -> Mapping[str, ImageParameter]:
         """Its parameters, by name."""
 
@@ -281,17 +285,29 @@ class Executor(Protocol):
     def wire_us(self, data: bytes) -> int:
         """Return a packet's time between its radio chip and it, unless it simulates that itself."""
 
+    @property
+    def in_flash(self) -> bytes:
+        """The content of its flash from the start on, as a boot loader reads it; empty: unknown."""
+
+    def flashed_with(self, flash: bytes) -> Executor:
+        """Return what executes a flash that was written to; itself if nothing changes. Raises `LabError`."""
+
     def boot(self, start: PowerOn) -> BoardFirmware:
         """Return the firmware of a new boot."""
 
 
 @dataclass(frozen=True, slots=True)
 class PythonBoard:
-    """Executes the firmware in Python, with its flight core in `runner`."""
+    """Executes the firmware in Python, with its flight core in `runner`; what is flashed is not executed."""
 
     runner: RunnerFactory = default_runner
     needs_polls: ClassVar[bool] = False
     wire_us = staticmethod(syslink_us)
+
+    in_flash: ClassVar[bytes] = b""
+
+    def flashed_with(self, flash: bytes) -> PythonBoard:
+        return self
 
     def boot(self, start: PowerOn) -> Firmware:
         return Firmware(start.config, start.board, start.serial, self.runner)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from firmware_py.board import ImuCounts
 from firmware_py.config import FirmwareConfig, parameters_of
+from firmware_py.export.elf import ERASED, FLASH, read
 from firmware_py.logic.loading import Logic, load_logic
 from firmware_py.rtos import TaskReport
 from firmware_py.signals import CONTROL, ESTIMATOR, INPUT, Signals
@@ -30,6 +31,7 @@ from hil.board.board_firmware import ImageReport, Pins, PowerOn
 from hil.emulator.crazyflie import syslink
 from hil.emulator.crazyflie.crazyflie import Crazyflie
 from hil.emulator.crazyflie.log_table import ImageVariable, log_numbers, log_table, parameter_table
+from hil.emulator.crazyflie.release_file import is_release, released_firmware
 from hil.emulator.stm32f405.chip import SOFTWARE, WATCHDOG, build_machine
 from hil.emulator.stm32f405.gdb import GdbServer
 from hil.emulator.stm32f405.image import Image
@@ -51,6 +53,11 @@ ESTIMATE = (
     *((f"gyro.{name}", DEGREE) for name in "xyz"),
 )  # fmt: skip
 MOTORS = tuple(f"motor.m{number}" for number in (1, 2, 3, 4))
+FLASHED = Path("flashed image")
+NO_SYMBOLS = (
+    "no symbols: tasks, log variables and parameters are found by the shape of their tables; functions, source lines, "
+    "queues, the heap and assertions have no names (--elf FILE, from which it was made, has them)"
+)
 NO_FLOATS, NO_COUNTS = np.empty(0, np.float32), np.empty(0, np.int32)
 
 
@@ -109,13 +116,40 @@ class ChipImage:
     image: Image
     library: Path
     debugger: GdbServer | None = None
+    notes: tuple[
+        str, ...
+    ] = ()  # what was taken of a release, and what is unknown of an image without symbols
     is_recorded: bool = False  # count the executed blocks
     needs_polls: ClassVar[bool] = True
 
     @classmethod
     def load(cls, path: Path, elf: Path | None, debugger: GdbServer | None = None) -> ChipImage:
-        """Read an image and compile the machine. Raises `LabError` and `ExportError`."""
-        return cls(Image(path, elf), build_machine(), debugger)
+        """Read an image, or that of a release's zip, and compile the machine. Raises `LabError` and `ExportError`."""
+        content, shown, notes = read(path), path, []
+        if is_release(path, content):
+            taken = released_firmware(path, content)
+            content, shown, notes = taken.content, path / taken.name, [taken.note]
+        return cls.flashed(Image(shown, elf, content), build_machine(), debugger, notes)
+
+    @classmethod
+    def flashed(
+        cls, image: Image, library: Path, debugger: GdbServer | None = None, notes: Sequence[str] = ()
+    ) -> ChipImage:
+        """Return an image that has been read."""
+        unnamed = () if image.named else (f"{image.path}: {NO_SYMBOLS}",)
+        return cls(image, library, debugger, (*notes, *unnamed))
+
+    @property
+    def in_flash(self) -> bytes:
+        """The content of the flash up to the image's end; what lies before the image is erased."""
+        return ERASED * (self.image.base - FLASH) + self.image.code
+
+    def flashed_with(self, flash: bytes) -> ChipImage:
+        """Return the image in a flash that was written to: this one, if it is the same. Raises `LabError`."""
+        content = flash[self.image.base - FLASH :].rstrip(ERASED)
+        if content == self.image.code.rstrip(ERASED):
+            return self
+        return ChipImage.flashed(Image(FLASHED, None, content), self.library, self.debugger)
 
     def wire_us(self, data: bytes) -> int:
         return 0  # the chip simulates its serial line itself
@@ -153,6 +187,7 @@ class ImageFirmware:
         self._crazyflie = Crazyflie(
             flashed.image, flashed.library, board, polls, flashed.debugger, outputs, carrier
         )
+        self.notes = flashed.notes
         self.image, self.chip, self.parts = flashed.image, self._crazyflie.chip, self._crazyflie.parts
         self.kernel = self.scheduler = self._crazyflie.processor
         if flashed.is_recorded:

@@ -79,7 +79,11 @@ class RealBoard:
     moving: bool
     wall: Paced  # maps simulated time to the wall clock
     needs_polls: ClassVar[bool] = False
+    in_flash: ClassVar[bytes] = b""
     wire_us = staticmethod(syslink_us)
+
+    def flashed_with(self, flash: bytes) -> RealBoard:
+        return self
 
     def boot(self, start: PowerOn) -> RealFirmware:
         """Switch the board to the loop. Raises `LinkError` when it does not answer."""

@@ -58,12 +58,10 @@ SEEDS_MAX = 10_000
 @click.option(
     "--board", metavar="BOARD", default="c", show_default=True,
     help="What executes the flight core: c (the C that is flashed), python (for a debugger) or cortex-m4 (its machine code, "
-    "emulated); the image of a Crazyflie's firmware, an ELF file, which flies whole; or a real board, which must not fly: "
-    "radio://0/80/2M/E7E7E7E7E7, usb://0 or udp://HOST:PORT.",
+    "emulated); the image of a Crazyflie's firmware, which flies whole: an ELF file, a .bin or the zip of a release; or a "
+    "real board, which must not fly: radio://0/80/2M/E7E7E7E7E7, usb://0 or udp://HOST:PORT.",
 )  # fmt: skip
-@click.option(
-    "--elf", type=PATH, metavar="FILE", help="With a .bin as --board: the ELF that it was made from."
-)
+@common.elf_option
 @common.gdb_option
 @common.coverage_option
 @click.option(

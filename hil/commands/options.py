@@ -111,6 +111,10 @@ view_option = click.option(
     help="Watch live: in the rerun viewer, in a browser, in a viewer that is open somewhere, in Foxglove, which with "
     ":parameters also changes those of the board.",
 )  # fmt: skip
+elf_option = click.option(
+    "--elf", type=PATH, metavar="FILE",
+    help="With a .bin or a release's zip as --board: the ELF that it was made from, which names tasks, functions and lines.",
+)  # fmt: skip
 gdb_option = click.option(
     "--gdb", type=click.IntRange(0, 65535), metavar="PORT",
     help="With an image as --board: wait for GDB on this port of 127.0.0.1 (0: any); time stands still at its breakpoints.",

@@ -40,6 +40,7 @@ class ServeOptions:
     radio_port: int
     mavlink: str | None
     board: str | None
+    elf: Path | None
     gdb: int | None
     boards: int
     station: str | None
@@ -70,8 +71,10 @@ class ServeOptions:
 @click.option(
     "--board",
     metavar="FILE",
-    help="The image of a Crazyflie's firmware, an ELF file, which every board executes whole.",
+    help="The image of a Crazyflie's firmware, which every board executes whole: an ELF file, a .bin or the zip of "
+    "a release.",
 )
+@common.elf_option
 @common.gdb_option
 @click.option("--boards", type=click.IntRange(1, BOARDS_MAX), default=1, show_default=True, metavar="N")
 @click.option(
@@ -147,7 +150,7 @@ def _executor(asked: ServeOptions) -> Executor:
     if asked.board is None:
         return PYTHON_BOARD
     stack = click.get_current_context().with_resource(ExitStack())
-    return image_at(asked.board, None, debugger(asked.gdb, Path(asked.board), stack))
+    return image_at(asked.board, asked.elf, debugger(asked.gdb, asked.elf or Path(asked.board), stack))
 
 
 def _run(server: Server, swarm: Swarm, endpoints: Endpoints, view: LiveView | None, say: Say) -> None:
@@ -188,7 +191,7 @@ def _station_of(asked: ServeOptions, config: LabConfig) -> str | None:
     if asked.board is None:
         raise LabError(
             f"profile {asked.profile}: its robot flies with the Crazyflie's own firmware; "
-            "--board FILE: the image, an ELF file"
+            "--board FILE: the image, an ELF file, a .bin or the zip of a release"
         )
     if asked.station == "corrections":
         raise LabError(
@@ -204,6 +207,8 @@ def _check_options(asked: ServeOptions) -> None:
         raise LabError(f"--udp {udp}: there are no {boards} ports from there on")
     if board is not None and asked.mavlink is not None:
         raise LabError(f"--mavlink {asked.mavlink}: {board} speaks CRTP over its radio, not MAVLink")
+    if asked.elf is not None and board is None:
+        raise LabError(f"--elf {asked.elf}: goes with an image as --board")
     if gdb is not None and (board is None or boards > 1):
         raise LabError(f"--gdb {gdb}: needs one board and an image as --board")
 

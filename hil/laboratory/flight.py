@@ -18,7 +18,7 @@ from hil.board.clock import Clock
 from hil.emulator.events import EventQueue
 from hil.laboratory import channels
 from hil.laboratory.faults import Switchboard
-from hil.laboratory.files.recorder import Recorder
+from hil.laboratory.files.recorder import SETTINGS, Recorder
 from hil.laboratory.laboratory import Laboratory, Progress
 from hil.laboratory.request import Request
 from hil.laboratory.robot import PYTHON_BOARD, Robot, Site, Streams
@@ -112,6 +112,9 @@ class Flight:
             self.switchboard = Switchboard(self.robot)
             request.experiment.prepare(self.robot)
             self.switchboard.prepare(self.faults)
+            flashed = self.robot.firmware.flashed
+            for text in flashed.notes if flashed is not None else ():
+                self.note(SETTINGS, text)
             self.schedule = ScheduleTrace(self.robot.firmware.scheduler)
             self._recorded = self.robot.firmware
             self._resets_before = 0  # the release

@@ -31,6 +31,7 @@ from hil.board.real_core import is_link, real_core
 from hil.board.uart import VirtualSerial
 from hil.emulator.crazyflie.shockburst import TURN_ROUND_US, Air, air_us
 from hil.emulator.stm32f405.gdb import GdbServer
+from hil.emulator.stm32f405.image import has_symbols
 from hil.errors import LabError, refusing
 from hil.laboratory.channels import radio_channel, serial_channel, tracker_channel
 from hil.laboratory.files.coverage import check_coverage
@@ -239,12 +240,15 @@ def image_of(bench: Bench, debugger: GdbServer | None = None) -> ChipImage:
 
 
 def debugger(port: int | None, image: Path, stack: ExitStack) -> GdbServer | None:
-    """Open the port of `--gdb` until the stack is closed; it prints the command to type when it waits."""
+    """Open the port of `--gdb` until the stack is closed; it prints the command to type when it waits.
+
+    `image` is the ELF, or what flies without one.
+    """
     if port is None:
         return None
 
     def waiting(port: int) -> None:
-        connect = f"-ex 'target remote 127.0.0.1:{port}'"
-        print_line(f"waiting for gdb-multiarch {shlex.quote(str(image))} {connect}")
+        symbols = f"{shlex.quote(str(image))} " if has_symbols(image) else ""
+        print_line(f"waiting for gdb-multiarch {symbols}-ex 'target remote 127.0.0.1:{port}'")
 
     return stack.enter_context(closing(GdbServer(port, waiting)))

@@ -225,7 +225,7 @@ class Request:
         if not self.bench.is_image or self.bench.link != RADIO:
             raise LabError(
                 f"profile {self.profile}: its robot flies with the Crazyflie's own firmware over the radio; "
-                "--board FILE: the image, an ELF file"
+                "--board FILE: the image, an ELF file, a .bin or the zip of a release"
             )
         if times.land_us - times.begin_us < HELD_LEAST_US:
             least = self.duration_s - 1e-6 * (times.land_us - times.begin_us)
@@ -352,5 +352,5 @@ def check_image(board: str) -> None:
     if not Path(board).is_file():
         raise LabError(
             f"--board {board}: no such file; expected {', '.join(BOARDS)}, an image of a Crazyflie's firmware: an ELF "
-            "file, or the link to a real board"
+            "file, a .bin or the zip of a release, or the link to a real board"
         )

@@ -172,6 +172,10 @@ class Robot:
         if self._thief is not None:
             self._occupy(self._thief)
 
+    def execute(self, executor: Executor) -> None:
+        """Let another image start at the next boot."""
+        self.executor = executor
+
     def cut_power(self) -> None:
         """Stop the firmware; the servos keep their last pulse."""
         self.powered = False

@@ -71,6 +71,9 @@ class BoardFile:
 
 RATE_NAMES = ("250K", "1M", "2M")  # in a URI
 UDP_RETRY_US = 500_000
+STARTED_US = (
+    4_000_000  # after a restart: the stock firmware takes packets once it has tested itself, after 3.1 s
+)
 STAYS_US = 1_000_000  # a radio's new setting is reported once it has stayed this long
 UDP_QUEUE = 1000  # packets of a program waiting at the host: cflib does not repeat over UDP
 
@@ -149,7 +152,14 @@ class ServedRobot:
         self.udp_radio.connect(self.robot.packet_received, self._to_udp)
         if uart is not None:
             uart.connect(self.robot.uart_ready, self._from_line)
-        flashed = self.robot.firmware.flashed
+        self.nrf51.bootloader.load(self.robot.executor.in_flash)
+        self._report_image()
+
+    def _report_image(self) -> None:
+        """Report what is known of the image; raises `LabError` for one that does not fit the profile."""
+        flashed, config, say = self.robot.firmware.flashed, self.robot.config, self._say
+        for text in flashed.notes if flashed is not None else ():
+            say(text)
         if flashed is not None and config.pilot.enabled:
             stock_contents(flashed.parameters, self.robot.firmware.log_numbers, config.pilot)
         elif flashed is not None and APP_PARAMETER not in flashed.parameters:
@@ -232,8 +242,9 @@ class ServedRobot:
 
     def _pilot_settings(self, told: list[BoardFirmware]) -> Sequence[bytes]:
         """Return the profile's parameters for the Crazyflie's own firmware, once per boot; `told` has the last one."""
-        firmware = self.robot.firmware
-        if firmware in told or firmware.flashed is None:
+        firmware, booted_us = self.robot.firmware, self.robot.booted_us
+        starts = booted_us and self.robot.events.now_us - booted_us < STARTED_US
+        if firmware in told or firmware.flashed is None or starts:
             return ()
         told[:] = [firmware]
         table = firmware.flashed.parameters
@@ -256,8 +267,26 @@ class ServedRobot:
 
     def start(self, now_us: int) -> None:
         self.nrf51.tune(self._settings_at_boot())
-        self.robot.boot(now_us)
+        if not self._boot_flashed(now_us):
+            self.robot.boot(now_us)
         self._open_udp(now_us)
+
+    def _boot_flashed(self, now_us: int) -> bool:
+        """Start the image that was flashed since the last start; return whether there was one that can run."""
+        before, flash = self.robot.executor, self.nrf51.bootloader.take_written()
+        try:
+            executor = before.flashed_with(flash) if flash else before
+            if executor is before:
+                return False
+            self.robot.execute(executor)
+            self.robot.boot(now_us)
+            self._report_image()
+        except LabError as error:
+            self._report(f"the flashed image cannot run: {error}; the one before it starts instead")
+            self.robot.execute(before)
+            return False
+        self._report("starts the flashed image")
+        return True
 
     def stop(self, now_us: int) -> None:
         """Lose power: clients get no answers."""

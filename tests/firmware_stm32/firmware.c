@@ -22,6 +22,32 @@ enum planted {
 };
 enum { ASSERTED = 1 };
 
+#ifdef USUAL_PLACES /* of FreeRTOS V10; without it others, which only debugging information tells */
+typedef struct xLIST_ITEM {
+  uint32_t xItemValue;
+  struct xLIST_ITEM *pxNext, *pxPrevious;
+  void *pvOwner;
+  struct xLIST *pxContainer;
+} ListItem_t;
+
+typedef struct xLIST {
+  uint32_t uxNumberOfItems;
+  ListItem_t *pxIndex;
+  struct {
+    uint32_t xItemValue;
+    ListItem_t *pxNext, *pxPrevious;
+  } xListEnd;
+} List_t;
+
+typedef struct tskTaskControlBlock {
+  uint32_t *pxTopOfStack;
+  ListItem_t xStateListItem, xEventListItem;
+  uint32_t uxPriority, *pxStack;
+  char pcTaskName[8];
+  uint32_t uxBasePriority;
+  volatile uint8_t ucNotifyState[1];
+} TCB_t;
+#else
 typedef struct xLIST_ITEM {
   struct xLIST_ITEM *pxNext, *pxPrevious;
   void *pvOwner;
@@ -48,6 +74,7 @@ typedef struct tskTaskControlBlock {
   ListItem_t xEventListItem, xStateListItem;
   volatile uint8_t ucNotifyState[1];
 } TCB_t;
+#endif
 
 typedef struct QueueDefinition {
   uint32_t uxItemSize, uxLength, uxMessagesWaiting;
@@ -116,14 +143,20 @@ static void unmask(uint32_t before) {
   __asm volatile("msr basepri, %0\n isb" ::"r"(before) : "memory");
 }
 
+#define END_OF(list) ((ListItem_t *)&(list)->xListEnd)
+
 static void empty(List_t *list) {
-  list->xListEnd.pxNext = list->xListEnd.pxPrevious = &list->xListEnd;
+  list->xListEnd.pxNext = list->xListEnd.pxPrevious = END_OF(list);
+  list->xListEnd.xItemValue = 0xFFFFFFFF;
+#ifdef USUAL_PLACES
+  list->pxIndex = END_OF(list);
+#endif
   list->uxNumberOfItems = 0;
 }
 
 static void put(List_t *list, ListItem_t *item) {
   item->pxPrevious = list->xListEnd.pxPrevious;
-  item->pxNext = &list->xListEnd;
+  item->pxNext = END_OF(list);
   item->pxPrevious->pxNext = list->xListEnd.pxPrevious = item;
   item->pxContainer = list;
   list->uxNumberOfItems++;
@@ -185,7 +218,7 @@ __attribute__((naked)) void PendSV_Handler(void) {
 __attribute__((used)) static void tick(void) {
   uint32_t before = mask();
   xTickCount++;
-  for (ListItem_t *item = pxDelayedTaskList->xListEnd.pxNext, *next; item != &pxDelayedTaskList->xListEnd; item = next) {
+  for (ListItem_t *item = pxDelayedTaskList->xListEnd.pxNext, *next; item != END_OF(pxDelayedTaskList); item = next) {
     next = item->pxNext;
     if ((int32_t)(xTickCount - item->xItemValue) >= 0) {
       ready(item->pvOwner);

@@ -1,8 +1,9 @@
 """Both bootloaders of the board, as bytes in and bytes out: target FF is the STM32, target FE the nRF51.
 
 A page is loaded into a buffer in packets of up to 25 bytes, written to flash with one command, and can be read back.
-Writing replaces a page and takes no time. The flashed contents are kept and can be compared; the emulated firmware is
-Python and starts with any contents. Facts: cflib's bootloader module and Bitcraze's two bootloaders.
+Writing replaces a page and takes no time. The flashed contents are kept and can be compared. A board that executes an
+image starts what was written; firmware in Python starts with any contents. Facts: cflib's bootloader module and Bitcraze's
+two bootloaders.
 """
 
 import struct
@@ -31,6 +32,7 @@ class FlashTarget:
     buffer_pages: int
     flash_pages: int
     first_page: int  # the bootloader lies below it
+    written: bool = field(default=False, init=False)  # since the last start
     flash: bytearray = field(init=False, repr=False)
     buffer: bytearray = field(init=False, repr=False)
 
@@ -46,6 +48,15 @@ class Bootloader:
         self.stm32 = FlashTarget(STM32, buffer_pages=10, flash_pages=1024, first_page=16)
         self.nrf51 = FlashTarget(NRF51, buffer_pages=1, flash_pages=232, first_page=88)
         self.malformed = 0
+
+    def load(self, flash: bytes) -> None:
+        """Put what the STM32 executes into its flash."""
+        self.stm32.flash[: len(flash)] = flash
+
+    def take_written(self) -> bytes:
+        """Return the STM32's flash if it was written to since the last call, else nothing."""
+        written, self.stm32.written = self.stm32.written, False
+        return bytes(self.stm32.flash) if written else b""
 
     def answer(self, packet: bytes) -> bytes | None:
         """Return the answer to a packet, None when it needs none; malformed packets are counted."""
@@ -95,4 +106,5 @@ def _write(target: FlashTarget, buffer_page: int, page: int, pages: int) -> byte
         return OUT_OF_RANGE
     data = target.buffer[buffer_page * PAGE_SIZE : (buffer_page + pages) * PAGE_SIZE]
     target.flash[page * PAGE_SIZE : (page + pages) * PAGE_SIZE] = data
+    target.written = True
     return DONE

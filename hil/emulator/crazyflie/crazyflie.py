@@ -20,6 +20,7 @@ from hil.emulator.stm32f405.gdb import DebuggedChip, GdbServer
 from hil.emulator.stm32f405.image import Image
 from hil.emulator.stm32f405.processor import ChipProcessor
 from hil.emulator.stm32f405.stopped_tasks import TaskWatch
+from hil.emulator.stm32f405.unnamed_freertos import UnnamedFreeRtos
 from hil.errors import LabError
 from hil.world.body import Carrier
 
@@ -67,7 +68,8 @@ class Crazyflie:
         if carrier is not None and carrier.escs is not None:
             for motor, (timer, channel) in enumerate(outputs):
                 chip.add_esc(timer, channel, carrier.escs[motor : motor + 1], POLES)
-        self.tasks = FreeRtos.of(image, chip.read)
+        kernel = FreeRtos if image.named else UnnamedFreeRtos
+        self.tasks = kernel.of(image, chip.read)
         run = chip.run if debugger is None else DebuggedChip(chip, debugger, self.tasks).run
         self.processor = ChipProcessor(chip, self.tasks, self._act, run)
         decks = Decks(chip, self.processor, carrier)
@@ -152,7 +154,8 @@ class Crazyflie:
 
     def _report_access(self, address: int, crash: Crash) -> None:
         """Report an access that has no effect; keep one that Bitcraze's firmware is known for."""
-        if any((place.split()[0], address) in KNOWN_WRITES for place in crash.trace):
+        names = {place.split()[0] for place in crash.trace}
+        if any(at == address and (name in names or not self.image.named) for name, at in KNOWN_WRITES):
             self.known.append(str(crash))
         else:
             self._outside.debug_write(str(crash))
@@ -161,6 +164,8 @@ class Crazyflie:
         """Report tasks that stopped, or keep the others from running, once, before anything else has gone wrong."""
         if self._crashed:
             return
+        if not self.image.named:
+            self.processor.find_kernel()
         busy = self.processor.longest_busy(least_us)
         if busy is not None and busy[0] not in self._hanging:
             self._hanging.add(busy[0])

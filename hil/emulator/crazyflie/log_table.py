@@ -1,7 +1,7 @@
 """An image's log variables and parameters, found by the firmware's own tables and read from the chip's memory.
 
 A table is an array of entries in flash; special entries begin and end a group. A number in a table of contents counts the
-other entries.
+other entries. In an image without symbols the table is the longest run of whole groups.
 """
 
 import struct
@@ -15,6 +15,7 @@ from hil.emulator.stm32f405.image import Image
 
 GROUP, START, TYPE = 0x80, 0x01, 0x0F  # of the firmware's log.h and param.h
 LOG_BY_FUNCTION, READ_ONLY = 0x40, 0x40
+FLAGS = 0x20  # an entry of the core
 NAME_LENGTH = 32
 
 
@@ -63,10 +64,7 @@ def parameter_table(image: Image, chip: Chip) -> dict[str, ImageParameter]:
 
 def _entries(image: Image, chip: Chip, table: str, layout: str) -> Iterator[tuple[int, str, int, int]]:
     """Yield number, name, type and address of each variable in a table."""
-    ends = [f"_{table}_{end}" for end in ("start", "stop")]
-    if not all(map(image.has, ends)):
-        return
-    begin, end = (image.symbol(name).address for name in ends)
+    begin, end = _place(image, table, layout)
     size, group, number = struct.calcsize(layout), "", 0
     for at in range(begin, end - size + 1, size):
         kind, name_at, address = struct.unpack(layout, chip.read(at, size))
@@ -76,6 +74,47 @@ def _entries(image: Image, chip: Chip, table: str, layout: str) -> Iterator[tupl
         else:
             yield number, f"{group}.{name}", kind, address
             number += 1
+
+
+def _place(image: Image, table: str, layout: str) -> tuple[int, int]:
+    """Return begin and end of a table, equal when there is none."""
+    if not image.named:
+        return _found_place(image, struct.calcsize(layout))
+    ends = [f"_{table}_{end}" for end in ("start", "stop")]
+    begin, end = (image.symbol(name).address for name in ends) if all(map(image.has, ends)) else (0, 0)
+    return begin, end
+
+
+def _found_place(image: Image, size: int) -> tuple[int, int]:
+    """Return begin and end of the longest run of groups of entries with this size [bytes]."""
+    code, longest, at = image.code, (0, 0), 0
+    while at <= len(code) - size:
+        end = _end_of_group(image, at, size)
+        begin, at = at, max(end, at + 4)
+        while end and (further := _end_of_group(image, end, size)):
+            at = end = further
+        longest = max(longest, (begin, max(end, begin)), key=lambda run: run[1] - run[0])
+    return longest[0] + image.base, longest[1] + image.base
+
+
+def _end_of_group(image: Image, at: int, size: int) -> int:
+    """Return where a group of entries that begins at an offset ends; 0 if there is none."""
+    code = image.code
+    if at > len(code) - size or code[at] & ~FLAGS != GROUP | START or not _is_entry(image, at):
+        return 0
+    for place in range(at + size, len(code) - size + 1, size):
+        if code[place] & ~FLAGS == GROUP:
+            return place + size
+        if code[place] & GROUP or not _is_entry(image, place):
+            return 0
+    return 0
+
+
+def _is_entry(image: Image, at: int) -> bool:
+    """Return whether an entry has a name in flash."""
+    kind, name = struct.unpack_from("<2I", image.code, at)
+    text = image.code[name - image.base :][:NAME_LENGTH] if name > image.base else b""
+    return kind >> 16 == 0 and text[:1].isalnum() and text.partition(b"\0")[0].isascii()
 
 
 def _read(chip: Chip, address: int, scalar: Scalar) -> float:

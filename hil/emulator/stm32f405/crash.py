@@ -167,7 +167,8 @@ class CrashReports:
     def _who(self, number: int) -> str:
         """Return the task, or the handler of the exception with that number."""
         if number:
-            name, own = self._image.function_at(self._vector(number) & ~1), number - FIRST_INTERRUPT
+            handler, own = self._vector(number) & ~1, number - FIRST_INTERRUPT
+            name = self._image.function_at(handler) if self._image.named else f"0x{handler:08x}"
             return f"{f'interrupt {own}' if own >= 0 else f'exception {number}'} ({name or 'no handler'})"
         if self._kernel is None or not self._kernel.running:
             return "main, before the scheduler ran"

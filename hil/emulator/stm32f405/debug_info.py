@@ -28,7 +28,7 @@ class CallFrames:
 
     def __init__(self, dwarf: Any) -> None:
         self._dwarf = dwarf
-        section = dwarf.debug_frame_sec
+        section = None if dwarf is None else dwarf.debug_frame_sec
         self._content = section.stream.getvalue() if section else b""
         self._entries = sorted(self._headers())
 
@@ -128,7 +128,7 @@ class LineRow:
 
 
 class DebugInfo:
-    """Answers by address and by name. `path` is for messages."""
+    """Answers by address and by name; nothing is known without `dwarf`. `path` is for messages."""
 
     def __init__(self, dwarf: Any, path: Path) -> None:
         self._dwarf, self._path = dwarf, path
@@ -195,6 +195,8 @@ class DebugInfo:
     @cached_property
     def _units(self) -> list[tuple[int, int, Any]]:
         """Return start, end and compilation unit of every piece of code."""
+        if self._dwarf is None:
+            return []
         lists = self._dwarf.range_lists()
         pieces = []
         for unit in self._dwarf.iter_CUs():
@@ -206,7 +208,7 @@ class DebugInfo:
     @cached_property
     def _index(self) -> Any:
         """Return GCC's index, which saves reading every unit; other compilers omit it."""
-        return self._dwarf.get_aranges()
+        return None if self._dwarf is None else self._dwarf.get_aranges()
 
     def _unit_at(self, address: int) -> Any:
         offset = self._index.cu_offset_at_addr(address) if self._index is not None else None

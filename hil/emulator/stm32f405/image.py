@@ -1,6 +1,6 @@
-"""The flashed image: the ELF of an STM32F405, or the .bin made of one, with the names of its addresses.
+"""The flashed image: the ELF of an STM32F405 or a .bin, with the names of its addresses if there is an ELF.
 
-An image that cannot run here, or be inspected while it runs, is refused in one line.
+An image that cannot run here is refused in one line.
 """
 
 from bisect import bisect_right
@@ -11,10 +11,17 @@ from operator import attrgetter
 from pathlib import Path
 from struct import unpack_from
 
-from firmware_py.export.elf import FLASH, FLASH_SIZE, MAGIC, MEMORIES, Elf, Symbol, read
+import numpy as np
+
+from firmware_py.export.elf import ERASED, FLASH, FLASH_SIZE, MAGIC, MEMORIES, Elf, Symbol, read
 from firmware_py.export.errors import ExportError
 from hil.emulator.stm32f405.debug_info import DebugInfo
+from hil.emulator.stm32f405.literals import literals
 from hil.errors import LabError, hint
+
+BASES = (FLASH + 0x4000, FLASH)  # of a .bin: behind the Crazyflie's boot loader, or at the start
+# Of the words that are addresses in flash; of whole releases, 0.006 and up to 21 lie behind the end, by chance.
+BEHIND_SHARE, BEHIND_LEAST = 0.012, 24
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,24 +38,29 @@ class MemoryUse:
 
 
 class Image:
-    """An image and its symbols. Raises `LabError` with one line if it cannot run on an STM32F405."""
+    """An image and its symbols. Raises `LabError` with one line if it cannot run on an STM32F405.
 
-    def __init__(self, path: Path, elf: Path | None = None) -> None:
+    `content` is that of `path`, when it has been read already. A .bin without an ELF has no names.
+    """
+
+    def __init__(self, path: Path, elf: Path | None = None, content: bytes | None = None) -> None:
         self.path = path
+        self.named = True  # whether symbols and lines are known
+        self._functions: list[Symbol] = []
+        self._variables: dict[str, list[Symbol]] = {}
         try:
-            self._read(elf)
+            self._read(read(path) if content is None else content, elf)
         except ExportError as error:
             raise LabError(str(error)) from None
 
-    def _read(self, elf_path: Path | None) -> None:
-        content = read(self.path)
+    def _read(self, content: bytes, elf_path: Path | None) -> None:
         if content[:4] == MAGIC:
             if elf_path is not None:
                 raise LabError(f"--elf {elf_path}: goes with a .bin; {self.path} is an ELF file itself")
             elf = Elf(self.path, content)
         elif elf_path is None:
-            needed = "a .bin needs --elf FILE, the ELF that it was made of"
-            raise LabError(f"{self.path}: not an ELF file; {needed}")
+            self._read_unnamed(content)
+            return
         else:
             elf = Elf(elf_path)
         self.base = elf.base  # of the vector table
@@ -57,6 +69,31 @@ class Image:
         self.memory = tuple(_memory_use(elf, self.code))
         self._take_names(elf)
         self.constants = elf.constants(self.base, len(self.code))  # half words without instructions
+
+    def _read_unnamed(self, content: bytes) -> None:
+        """Read a .bin of which nothing else is known: it lies where its reset vector leads, behind a boot loader or not."""
+        self.code = content + ERASED * (-len(content) % 4)
+        self.base = next((base for base in BASES if self._leads_into(base)), BASES[0])
+        self._check_vectors()
+        self._check_end()
+        self.memory = (MemoryUse("flash", len(self.code), FLASH + FLASH_SIZE - self.base),)
+        self.named, self.constants = False, literals(self.code)
+        self.debug = DebugInfo(None, self.path)
+
+    def _leads_into(self, base: int) -> bool:
+        return len(self.code) >= 8 and 0 <= unpack_from("<I", self.code, 4)[0] - base < len(self.code)
+
+    def _check_end(self) -> None:
+        """Refuse a .bin that ends before its code: words that lead behind its end are none of a whole one's addresses."""
+        end = self.base + len(self.code)
+        words = np.frombuffer(self.code, "<u4")
+        behind = np.count_nonzero((words > end) & (words < FLASH + FLASH_SIZE))
+        inside = np.count_nonzero((words >= self.base) & (words <= end))
+        if behind > max(BEHIND_SHARE * inside, BEHIND_LEAST):
+            raise LabError(
+                f"{self.path}: truncated: {len(self.code)} bytes from 0x{self.base:08x} on, and {behind} "
+                "addresses in it lie behind that"
+            )
 
     def _take_names(self, elf: Elf) -> None:
         if not elf.symbols:
@@ -72,7 +109,6 @@ class Image:
         self.debug = DebugInfo(elf.dwarf, elf.path)
         functions = [one for one in elf.symbols if one.is_function and one.address >= FLASH]
         self._functions = sorted(functions, key=attrgetter("address"))
-        self._variables: dict[str, list[Symbol]] = {}
         for symbol in elf.symbols:
             if symbol.is_variable:
                 self._variables.setdefault(symbol.name, []).append(symbol)
@@ -131,6 +167,8 @@ class Image:
     def place(self, address: int) -> str:
         """Return a code address as text: function and line if known, else the number."""
         name = self.function_at(address)
+        if not self.named:
+            return f"0x{address:08x}"
         if not name:
             return f"0x{address:08x}, outside every function"
         line = self.debug.line_at(address)
@@ -158,6 +196,14 @@ class Image:
                 f"is not Thumb code between 0x{self.base:08x} and 0x{end:08x}"
             )
         self.initial_stack_pointer, self.reset = stack, entry & ~1
+
+
+def has_symbols(path: Path) -> bool:
+    """Return whether a debugger reads a file: an ELF. Raises `LabError` when it cannot be read."""
+    try:
+        return read(path)[:4] == MAGIC
+    except ExportError as error:
+        raise LabError(str(error)) from None
 
 
 def _same(path: Path, content: bytes, elf: Elf) -> bytes:

@@ -52,8 +52,12 @@ class ChipProcessor:
         self._kernel = kernel
         self._outside: ChipTask | None = None  # the outside load
         self._place = 0  # among the tasks, in the order in which they first ran
-        if kernel is not None:
-            chip.state.kernel = kernel.places
+        self.find_kernel()
+
+    def find_kernel(self) -> None:
+        """Tell the machine where the scheduler's structures are; without symbols they appear while it runs."""
+        if self._kernel is not None:
+            self.chip.state.kernel = self._kernel.places
 
     def every(self, period_us: int, do: Callable[[int], object]) -> None:
         """Call something periodically by the chip's time."""

@@ -1,8 +1,10 @@
 """A real build of the Crazyflie firmware with the exported app flies: the ELF that FLOATY_CF2_ELF names, byte for byte."""
 
+import json
 import os
 import shutil
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -107,23 +109,33 @@ def test_an_experiments_settings_reach_the_image_before_its_release(tmp_path: Pa
     assert not any("keeps its own" in event["text"] for event in events)
 
 
+@pytest.mark.parametrize("kind", ["elf", "bin", "zip"])
 def test_an_image_without_the_app_is_flown_and_recorded_with_its_tasks_and_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from hil.board import image_firmware
-    from support.stm32_firmware import build
+    from support.stm32_firmware import build, flash_binary
 
-    monkeypatch.setattr(image_firmware, "WARM_UP_US", 20_000)
-    elf = build("clang")
-    request = Request.of(HOVER, duration_s=0.1, board=str(elf), overrides=("flight.release_us=50000",))
+    monkeypatch.setattr(image_firmware, "WARM_UP_US", 120_000)
+    board = elf = build("clang", ("-g", "-DUSUAL_PLACES", "-fno-strict-aliasing"))
+    if kind == "bin":
+        board = tmp_path / "cf2.bin"
+        board.write_bytes(flash_binary(elf))
+    elif kind == "zip":
+        board = tmp_path / "firmware-cf2-2025.09.zip"
+        with zipfile.ZipFile(board, "w") as file:
+            part = {"platform": "cf2", "target": "stm32", "type": "fw", "release": "2025.09"}
+            file.writestr("manifest.json", json.dumps({"version": 1, "files": {"cf2.bin": part}}))
+            file.writestr("cf2.bin", flash_binary(elf))
+    request = Request.of(HOVER, duration_s=0.1, board=str(board), overrides=("flight.release_us=50000",))
     result = fly(request, tmp_path / "run")
     assert (result.outcome, result.cause) == ("completed", None)
     print_result(result)
-    assert (
-        "the image lacks Floaty's app: the servos move only if its own code moves them"
-        in capsys.readouterr().out
-    )
-    assert len(result.tasks) > 1
+    printed = capsys.readouterr().out
+    assert "the image lacks Floaty's app: the servos move only if its own code moves them" in printed
+    assert (f"{board.name}: took cf2.bin, release 2025.09 for platform cf2" in printed) == (kind == "zip")
+    assert ("no symbols: tasks, log variables and parameters are found" in printed) == (kind != "elf")
+    assert {"REPORT", "SPIN-0", "SPIN-1"} <= {task.name for task in result.tasks}
     names = [f"cpu.{task.name}" for task in result.tasks]
     log = load_log(tmp_path / "run")
     assert [name for name in log.column_names if name.startswith("cpu.")] == names
@@ -135,9 +147,10 @@ def test_an_image_without_the_app_is_flown_and_recorded_with_its_tasks_and_repor
     [
         (
             "no-such-board",
-            "expected c, python, cortex-m4, an image of a Crazyflie's firmware: an ELF file, or the link",
+            "expected c, python, cortex-m4, an image of a Crazyflie's firmware: an ELF file, a .bin or the zip of a "
+            "release, or the link",
         ),
-        (str(Path(__file__)), "not an ELF file; a .bin needs --elf FILE, the ELF that it was made of"),
+        (str(Path(__file__)), "no vector table at 0x08004000: the stack pointer there"),
     ],
 )
 def test_an_invalid_image_is_refused_in_one_line(tmp_path: Path, board: str, text: str) -> None:

@@ -1,12 +1,16 @@
 """What a server shows of its first robot, and where several start."""
 
+import re
 import select
 import socket
+from struct import pack
 
 import pytest
 
 from hil.board.clock import Readers
+from hil.board.image_firmware import ChipImage
 from hil.config import load_config
+from hil.emulator.crazyflie.bootloader import CHUNK, LOAD_BUFFER, PAGE_SIZE, WRITE_FLASH
 from hil.emulator.events import EventQueue
 from hil.errors import LabError
 from hil.laboratory.files.recorder import stored_in
@@ -15,7 +19,7 @@ from hil.laboratory.robot import Site, Streams
 from hil.servers.served_robot import UDP_RETRY_US, ServedRobot
 from hil.servers.server import Server, Service
 from hil.world.scene import VisualModel
-from support.stm32_firmware import build
+from support.stm32_firmware import build, flash_binary
 from support.watching import Watcher
 
 
@@ -43,6 +47,45 @@ def test_firmware_without_the_app_is_reported() -> None:
     lines: list[str] = []
     Server(Service(load_config(), executor=image_at(str(build()), None)), lines.append).close()
     assert [line for line in lines if "the image lacks Floaty's app" in line]
+
+
+def test_a_flashed_image_starts_at_the_next_start_and_one_that_cannot_run_is_named() -> None:
+    """As a flashing tool writes it: page by page, through the boot loader."""
+    pytest.importorskip("unicorn")
+    first, second = (
+        build(flags=flags) for flags in (("-g",), ("-g", "-DUSUAL_PLACES", "-fno-strict-aliasing"))
+    )
+    lines: list[str] = []
+    site = Site(load_config(), EventQueue(), Streams.of_seed(1), lambda *_: None, image_at(str(first), None))
+    served = ServedRobot(1, site, lines.append)
+    loader, before = served.nrf51.bootloader, served.robot.executor
+    assert bytes(loader.stm32.flash[0x4000:]).startswith(flash_binary(first))
+
+    def flash(image: bytes) -> None:
+        padded = image + b"\xff" * (-len(image) % PAGE_SIZE)
+        for page in range(len(padded) // PAGE_SIZE):
+            for at in range(0, PAGE_SIZE, CHUNK):
+                data = padded[page * PAGE_SIZE + at : (page + 1) * PAGE_SIZE][:CHUNK]
+                loader.answer(pack("<3BHH", 0xFF, 0xFF, LOAD_BUFFER, 0, at) + data)
+            assert loader.answer(pack("<3BHHH", 0xFF, 0xFF, WRITE_FLASH, 0, 16 + page, 1))
+        served.stop(0)
+        lines.clear()
+        served.start(1)
+
+    flash(flash_binary(first))
+    assert (lines, served.robot.executor) == ([], before), "the same image keeps its symbols"
+    flash(flash_binary(second))
+    assert isinstance(served.robot.executor, ChipImage)
+    assert served.robot.executor.image.code.startswith(flash_binary(second))
+    assert re.match(r"flashed image: no symbols: tasks, log variables", lines[0])
+    assert lines[-1] == "board 1: starts the flashed image"
+    flash(bytes(PAGE_SIZE))
+    (line,) = lines
+    assert re.match(
+        r"board 1: the flashed image cannot run: flashed image: no vector table at 0x08004000", line
+    )
+    assert served.robot.firmware.flashed is not None
+    served.close()
 
 
 def on_udp(lines: list[str]) -> tuple[ServedRobot, Readers, int]:

@@ -7,11 +7,14 @@ from contextlib import suppress
 from pathlib import Path
 from struct import pack_into
 
+import numpy as np
 import pytest
 from elftools.elf.elffile import ELFFile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from firmware_py.export.cycles import count
+from firmware_py.export.elf import Elf
 from hil.emulator.stm32f405.image import Image
 from hil.errors import LabError
 from support import stm32_firmware
@@ -173,7 +176,7 @@ def test_a_bin_of_another_build_is_refused_at_the_first_byte_that_differs(elf: P
 def test_a_file_of_another_kind_is_refused(elf: Path, tmp_path: Path) -> None:
     text = tmp_path / "cf2.bin"
     text.write_bytes(b"no firmware at all" * 40)
-    assert "not an ELF file; a .bin needs --elf FILE" in refused(text)
+    assert "no vector table at 0x08004000: the stack pointer there" in refused(text)
     assert f"{text}: not an ELF file" in refused(elf.with_name("firmware.c"), text)
     assert "goes with a .bin" in refused(elf, elf)
     assert "No such file" in refused(tmp_path / "missing.elf")
@@ -185,6 +188,41 @@ def test_another_machine_is_refused_by_its_name(changed) -> None:
     assert "built for big-endian" in refused(changed(5, "<B", 2))
     assert "64-bit ELF file (x86-64)" in refused(Path(shutil.which("true") or "/bin/true"))
     assert "not linked" in refused(changed(44, "<H", 0))
+
+
+@COMPILERS
+def test_a_bin_without_an_elf_has_the_places_and_constants_of_its_elf(compiler: str, tmp_path: Path) -> None:
+    elf = Image(stm32_firmware.build(compiler))
+    binary = tmp_path / "cf2.bin"
+    binary.write_bytes(elf.code)
+    image = Image(binary)
+    assert (image.base, image.reset, image.code, image.named) == (elf.base, elf.reset, elf.code, False)
+    assert image.place(image.reset) == f"0x{image.reset:08x}"
+    right, found = (count(elf.code, constants).cycles for constants in (elf.constants, image.constants))
+    spans = [(f.address - elf.base, f.size) for f in Elf(elf.path).symbols if f.is_function and f.size]
+    same = [
+        np.array_equal(*(np.diff(one[at // 2 : (at + size) // 2 + 1]) for one in (right, found)))
+        for at, size in spans
+    ]
+    assert np.mean(same) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"", "its flash holds 0 bytes, no vector table"),
+        (b"\xff" * 4096, "no vector table at 0x08004000: the stack pointer there, 0xfffffffc"),
+        (b"\x00\x00\x02\x20\x01\x50\x00\x08", "the reset vector there, 0x08005001, is not Thumb code"),
+        (b"\x00\x00\x02\x20\x09\x40\x00\x08" + bytes(1 << 20), "do not fit into the 1048576 bytes of flash"),
+        (
+            b"\x00\x00\x02\x20\x09\x40\x00\x08" + 30 * b"\x01\x50\x00\x08",
+            "truncated: 128 bytes from 0x08004000 on",
+        ),
+    ],
+)
+def test_a_bin_that_cannot_start_is_refused(content: bytes, expected: str, tmp_path: Path) -> None:
+    (tmp_path / "cf2.bin").write_bytes(content)
+    assert expected in refused(tmp_path / "cf2.bin")
 
 
 @pytest.mark.parametrize("fraction", [0.0001, 0.001, 0.3, 0.9, 0.9999])

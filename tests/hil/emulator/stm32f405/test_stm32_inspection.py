@@ -2,21 +2,23 @@
 
 import os
 import re
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from pathlib import Path
 from struct import pack
 
+import numpy as np
 import pytest
 
 from hil.emulator.crazyflie.log_table import log_table, parameter_table
 from hil.emulator.stm32f405 import stopped_tasks
-from hil.emulator.stm32f405.chip import StopReason
+from hil.emulator.stm32f405.chip import Chip, StopReason, build_machine
 from hil.emulator.stm32f405.crash import CrashReports
 from hil.emulator.stm32f405.freertos import FreeRtos, Wait
 from hil.emulator.stm32f405.image import Image
 from hil.emulator.stm32f405.processor import ChipProcessor
 from hil.emulator.stm32f405.stopped_tasks import StoppedTask, TaskWatch
-from support.stm32_firmware import SOURCES
+from hil.emulator.stm32f405.unnamed_freertos import UnnamedFreeRtos
+from support.stm32_firmware import SOURCES, build
 from support.stm32_machine import FirmwareOnChip
 
 MS = 1000
@@ -391,14 +393,51 @@ def test_a_task_without_samples_is_named_with_the_list_where_it_waits(
 
 
 @COMPILERS
-def test_log_variables_and_parameters_are_read_from_the_images_own_tables(compiler: str) -> None:
+def test_tasks_are_found_by_their_shape_without_symbols(compiler: str, tmp_path: Path) -> None:
+    elf = Image(build(compiler, ("-g", "-DUSUAL_PLACES", "-fno-strict-aliasing")))
+    (tmp_path / "cf2.bin").write_bytes(elf.code)
+    image = Image(tmp_path / "cf2.bin")
+    chip = Chip(image.code, image.base, build_machine())
+    chip.add_device(1, 0x50, np.full(8192, 0xFF, np.uint8), 2)
+    named, kernel = FreeRtos(elf, chip.read), UnnamedFreeRtos.of(image, chip.read)
+    assert kernel is not None
+    processor = ChipProcessor(chip, kernel, lambda why: None, chip.run)
+    assert (kernel.places[0], kernel.running, kernel.tasks(), kernel.heap_bytes) == (
+        0,
+        False,
+        [],
+        (None, None),
+    )
+    processor.run(30_000)
+    processor.find_kernel()
+    processor.run(60_000)
+    *places, end = named.places
+    assert kernel.places == (*places, end)
+    assert kernel.running
+    assert {task.name for task in processor.tasks} == {"REPORT", "SPIN-0", "SPIN-1"}
+    for ours, theirs in zip(kernel.tasks(), named.tasks(), strict=True):
+        state = {"suspended": "blocked"}.get(theirs.state, theirs.state)  # the lists have no names
+        assert ours == replace(theirs, state=state, base_priority=ours.priority)
+        assert kernel.endless_wait(ours.block) is None
+    assert UnnamedFreeRtos.of(Image(build(compiler)), chip.read).places[0] == 0  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("named", [True, False])
+@COMPILERS
+def test_log_variables_and_parameters_are_read_from_the_images_own_tables(
+    compiler: str, named: bool, tmp_path: Path
+) -> None:
     machine = FirmwareOnChip(compiler)
     run_to_end(machine, 5)
-    log = {variable.name: variable for variable in log_table(machine.image, machine.chip)}
+    image = machine.image
+    if not named:
+        (tmp_path / "cf2.bin").write_bytes(image.code)
+        image = Image(tmp_path / "cf2.bin")
+    log = {variable.name: variable for variable in log_table(image, machine.chip)}
     assert list(log) == ["queue.taken", "queue.lost"]  # not what a function would have to be called for
     machine.poke("samples_lost", 42)
     assert log["queue.lost"].read() == 42
-    table = parameter_table(machine.image, machine.chip)
+    table = parameter_table(image, machine.chip)
     found = {name: (one.number, one.scalar.name, one.writable, one.read()) for name, one in table.items()}
     assert found == {
         "test.gain": (0, "F32", True, 1.5),
