@@ -134,6 +134,7 @@ class OpenDevice:
     def _by_itself(self) -> int:
         """Let the program read or write the file of the device node."""
         self._program.sendall(WORDS.pack(RUN, 0, 0))
+        result: int
         _, result, error = WORDS.unpack(self._received(WORDS.size))
         return -error if result & 0xFFFFFFFF == 0xFFFFFFFF else result
 
@@ -161,7 +162,8 @@ class OpenDevice:
         sent = b"" if kind & IN or not size else self._read(data, size)
         answer = self._controlled(kind, request, value, sent)
         self._write(data, answer[:size])
-        return min(len(answer), size) if kind & IN else size
+        length: int = min(len(answer), size) if kind & IN else size
+        return -errno.ENODEV if self._gone else length
 
     def _controlled(self, kind: int, request: int, value: int, sent: bytes) -> bytes:
         if kind & 0x60 == 0:
@@ -170,6 +172,7 @@ class OpenDevice:
         return b""
 
     def _bulk(self, place: int) -> int:
+        size: int
         point, size, timeout_ms, data = TRANSFER_BULK.unpack(self._read(place, TRANSFER_BULK.size))
         if not point & IN:
             sent = self._read(data, size)
@@ -187,7 +190,7 @@ class OpenDevice:
             direction, request, value, _, length = SETUP.unpack(setup[: SETUP.size])
             answer = self._controlled(direction, request, value, setup[SETUP.size :])[:length]
             self._write(data + SETUP.size, answer)
-            self._complete(place, len(answer) if direction & IN else length)
+            self._complete(place, -errno.ENODEV if self._gone else len(answer) if direction & IN else length)
         elif kind != URB_BULK:
             return -errno.EINVAL
         elif point & IN:
@@ -303,7 +306,9 @@ def _serve(listening: socket.socket, connect: Callable[[], Connection], running:
 def why_not() -> str:
     """Return why programs cannot be given a dongle here; empty: they can."""
     places = ("/usr/lib", "/usr/lib64", "/usr/local/lib")
-    found = any(path for place in places for path in (*Path(place).glob(PRELOAD), *Path(place).glob(f"*/{PRELOAD}")))
+    found = any(
+        path for place in places for path in (*Path(place).glob(PRELOAD), *Path(place).glob(f"*/{PRELOAD}"))
+    )
     if struct.calcsize("P") != 8 or sys.byteorder != "little":
         return "needs a 64-bit little-endian machine"
     return "" if found else MISSING
