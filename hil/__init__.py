@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from hil.api import *
 
 __all__ = [
-    "Along", "Experiment", "Fault", "Goal", "Kind", "Knob", "LabError", "Metric", "Request", "RigidBody", "Run", "column",
-    "declare", "fault", "fly", "knob", "load_run", "position_error",
+    "Along", "Experiment", "Fault", "Goal", "Kind", "Knob", "LabError", "Metric", "Request", "RigidBody", "Run", "Swarm",
+    "column", "declare", "fault", "fly", "fly_swarm", "knob", "load_run", "position_error",
 ]  # fmt: skip
 
 

@@ -91,7 +91,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "youplot": ("hil/pictures/pages.py",),
     "time": (
         "hil/board/clock.py", "hil/commands/listing.py",
-        "hil/research/campaigns/jobs.py", "ground_station/clock.py",
+        "hil/research/campaigns/jobs.py", "ground_station/clock.py", "hil/servers/usb_dongle.py",
     ),
     "datetime": (),
     "asyncio": (),
@@ -110,18 +110,18 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "ctypes": ("firmware_py/compiling.py", "firmware_py/core/subset.py", "firmware_py/export/cortex_m4.py"),
     "cffi": ("hil/emulator/stm32f405/chip.py",),
     "subprocess": (
-        "hil/laboratory/files/installation.py", "hil/live/", "hil/servers/linked.py",
+        "hil/laboratory/files/installation.py", "hil/live/", "hil/servers/linked.py", "hil/servers/usb_dongle.py",
         "ground_station/sources/motioncapture_client.py",
         "firmware_py/export/compilers.py",
     ),
     "socket": (
         "hil/board/clock.py", "hil/emulator/stm32f405/gdb.py",
         "hil/live/window.py", "hil/servers/dongle_plugin.py", "hil/servers/tcp_port.py",
-        "hil/servers/udp_server.py", "hil/servers/serial_server.py", "hil/servers/motive.py",
+        "hil/servers/udp_server.py", "hil/servers/serial_server.py", "hil/servers/motive.py", "hil/servers/usb_dongle.py",
         "ground_station/sources/optitrack.py", "ground_station/sources/motioncapture_process.py",
     ),
     "select": ("ground_station/clock.py", "hil/emulator/stm32f405/gdb.py"),
-    "selectors": ("ground_station/clock.py",),
+    "selectors": ("ground_station/clock.py", "hil/servers/usb_dongle.py"),
     "platformdirs": ("firmware_py/kept_code.py",),
     "jinja2.FileSystemBytecodeCache": ("hil/pictures/pages.py",),
     "pickle": (),  # loading one executes what it names
@@ -174,8 +174,11 @@ NORMAL_NOISE = "hil/world/fixed_order.py"
 DRAWS = (
     "standard_normal", "exponential", "standard_exponential", "geometric", "poisson", "multivariate_normal",
 )  # fmt: skip
-# Only the first prints texts of others; the next prints to a pipe, the third its own progress, the last paths in ASCII.
-PRINTERS = ("ground_station/lines.py", "hil/live/picture.py", "hil/api.py", "firmware_py/kept_code.py")
+# Only the first prints texts of others; the next prints to a pipe, the third its own progress, the fourth paths in
+# ASCII, the last what its own command refuses.
+PRINTERS = (
+    "ground_station/lines.py", "hil/live/picture.py", "hil/api.py", "firmware_py/kept_code.py", "hil/servers/usb_dongle.py",
+)  # fmt: skip
 SUBSET = "firmware_py/core/subset.py"  # the border of the subset: it may use the standard library
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 from rich.table import Column
 from rich.text import Text
@@ -76,7 +77,7 @@ def wide_console(width: int = 150) -> Console:
 
 def right(*headings: str) -> list[Column]:
     """Return the columns of a table whose cells are numbers."""
-    return [Column(heading, justify="right") for heading in headings]
+    return [Column(escape(heading), justify="right") for heading in headings]
 
 
 code_option = click.option(

@@ -38,6 +38,8 @@ class ServeOptions:
     udp: int | None
     radio: bool
     radio_port: int
+    usb: bool
+    program: tuple[str, ...]
     mavlink: str | None
     board: str | None
     elf: Path | None
@@ -62,6 +64,12 @@ class ServeOptions:
     "--radio-port", type=click.IntRange(0, 65535), default=RADIO_PORT, show_default=True, metavar="PORT",
     help="Where the Crazyradio's server listens; 0: any.",
 )  # fmt: skip
+@click.option(
+    "--usb", is_flag=True,
+    help="Put the virtual Crazyradio on the USB bus of PROGRAM, in any language, and serve until that ends; without "
+    "PROGRAM, print the command that starts one so.",
+)  # fmt: skip
+@click.argument("program", nargs=-1, type=click.UNPROCESSED)
 @click.option(
     "--mavlink",
     metavar="END",
@@ -97,8 +105,8 @@ class ServeOptions:
 def serve(asked: ServeOptions) -> int:
     """Serve robots in virtual tunnels, in real time, until Ctrl-C.
 
-    Without --udp, --radio or --mavlink the first board is on UDP. A robot is held until it flies: corrections come from
-    clients or, with --station, from within. Motive calls the bodies floaty, floaty2, .... It tracks them
+    Without --udp, --radio, --usb or --mavlink the first board is on UDP. A robot is held until it flies: corrections come
+    from clients or, with --station, from within. Motive calls the bodies floaty, floaty2, .... It tracks them
     by eight markers each; with --set markers.enabled=false poses have noise of their own instead. Its stream is that of
     [capture] in the profile: capture.port (frames go to the next one), axes, multicast and natnet.
 
@@ -106,6 +114,8 @@ def serve(asked: ServeOptions) -> int:
 
     While it runs, a line like push.y=2 or mocap.dropout:0.5 injects that fault at once; help lists the other commands.
     """
+    if asked.usb:
+        asked = replace(asked, radio=True)
     if asked.udp is None and not asked.radio and asked.mavlink is None:
         asked = replace(asked, udp=UDP_PORT)
     _check_options(asked)
@@ -137,9 +147,9 @@ def serve(asked: ServeOptions) -> int:
     with closing(Swarm(plan, asked.boards, endpoints, say)) as swarm:
         view = common.open_live(asked.target, say)
         with closing(Server(plan, say, view, swarm.to_peers)) as server:
-            _run(server, swarm, endpoints, view, say)
+            code = _run(server, swarm, endpoints, view, say, asked)
     say(f"stopped; time stood still for {server.clock.stood_still_us / 1000:.0f} ms")
-    return INCOMPLETE if records.incomplete else 0
+    return code or (INCOMPLETE if records.incomplete else 0)
 
 
 def _executor(asked: ServeOptions) -> Executor:
@@ -153,9 +163,15 @@ def _executor(asked: ServeOptions) -> Executor:
     return image_at(asked.board, asked.elf, debugger(asked.gdb, asked.elf or Path(asked.board), stack))
 
 
-def _run(server: Server, swarm: Swarm, endpoints: Endpoints, view: LiveView | None, say: Say) -> None:
-    """Open all robots' endpoints and serve until Ctrl-C, with faults typed at the terminal or in the picture's panel."""
+def _run(
+    server: Server, swarm: Swarm, endpoints: Endpoints, view: LiveView | None, say: Say, asked: ServeOptions
+) -> int:
+    """Open all robots' endpoints and serve until Ctrl-C, with faults typed at the terminal or in the picture's panel.
+
+    Return the exit code of the program that had the radio on its bus, 0 without one.
+    """
     from ground_station.stops import stop_signals
+    from hil.servers import usb_dongle
     from hil.servers.live_faults import LiveFaults
 
     def answer(text: str) -> None:
@@ -166,10 +182,13 @@ def _run(server: Server, swarm: Swarm, endpoints: Endpoints, view: LiveView | No
     def stopping() -> bool:
         for line in view.lines() if view is not None else ():
             faults.take(line, server.lab.now_us)
-        return bool(stops)
+        return bool(stops) or (client is not None and client.poll() is not None)
 
-    others = swarm.wait()
-    _print_addresses([server.open(endpoints, [other.dongles for other in others]), *others], say)
+    others, client = swarm.wait(), None
+    robots = [server.open(endpoints, [other.dongles for other in others]), *others]
+    _print_addresses(robots, say)
+    if asked.usb and not asked.program:
+        say(f"usb    {shlex.join(usb_dongle.command_of(robots[0].dongles))} PROGRAM")
     motive = _motive(server, 1 + len(others), say) if endpoints.motive else None
     with nullcontext() if motive is None else closing(motive):
         swarm.listen(server, answer, motive)
@@ -177,11 +196,15 @@ def _run(server: Server, swarm: Swarm, endpoints: Endpoints, view: LiveView | No
         faults.listen(sys.stdin)
         stops = stop_signals()
         say("serving; Ctrl-C ends")
+        if asked.program:
+            client = usb_dongle.start(robots[0].dongles, asked.program)
         server.run(stopping)
+        code = 0 if client is None else usb_dongle.end(client)
         swarm.close()
         common.close_live(view, say=say)
         if motive is not None and motive.malformed:
             say(f"motive could not read {motive.malformed} packets")
+    return code
 
 
 def _station_of(asked: ServeOptions, config: LabConfig) -> str | None:
@@ -202,7 +225,13 @@ def _station_of(asked: ServeOptions, config: LabConfig) -> str | None:
 
 def _check_options(asked: ServeOptions) -> None:
     """Raise `LabError` for options that contradict each other."""
+    from hil.servers import usb_dongle
+
     udp, board, gdb, boards = asked.udp, asked.board, asked.gdb, asked.boards
+    if asked.program and not asked.usb:
+        raise LabError(f"{shlex.join(asked.program)}: only --usb takes a program")
+    if asked.usb and (why := usb_dongle.why_not()):
+        raise LabError(f"--usb: {why}")
     if udp is not None and udp + boards - 1 > 65535:
         raise LabError(f"--udp {udp}: there are no {boards} ports from there on")
     if board is not None and asked.mavlink is not None:

@@ -42,17 +42,17 @@ def write_swarm_report(result: SwarmResult) -> Path:
     """Write `report.html` and return its path."""
     logs = [load_log(one.folder) for one in result.robots]
     places = [body(log, *"xyz") + origin for log, origin in zip(logs, result.origins, strict=True)]
-    goals = [
-        column(log, "goal.x", "goal.y", "goal.z")[-1] + at
-        for log, at in zip(logs, result.origins, strict=True)
+    homes = [
+        np.add(one.request.config.flight.home, origin)
+        for one, origin in zip(result.robots, result.origins, strict=True)
     ]
-    figures = [_paths(places, goals), _distances(result, logs, places)]
+    figures = [_paths(places, homes), _distances(result, logs, places)]
     rows = [
         RobotRow(
-            number, colour_of(number), one, ", ".join(f"{value:g}" for value in goal.round(3)),
+            number, colour_of(number), one, ", ".join(f"{value:g}" for value in home.round(3)),
             one.cause or "; ".join(map(str, one.failed)),
         )
-        for number, (one, goal) in enumerate(zip(result.robots, goals, strict=True), 1)
+        for number, (one, home) in enumerate(zip(result.robots, homes, strict=True), 1)
     ]  # fmt: skip
     return write_page(
         result.folder / REPORT, "swarm.html.j2", result=result, robots=rows, metrics=SWARM_METRICS, figures=figures,
@@ -60,24 +60,24 @@ def write_swarm_report(result: SwarmResult) -> Path:
     )  # fmt: skip
 
 
-def _paths(places: list[NDArray[np.float64]], goals: list[NDArray[np.float64]]) -> PageFigure:
+def _paths(places: list[NDArray[np.float64]], homes: list[NDArray[np.float64]]) -> PageFigure:
     """Draw where the robots were, from above and from the side."""
 
     def drawn() -> Figure:
         figure = Figure(figsize=(WIDTH, 4.2), layout="constrained")
         for axes, (title, across, up) in zip(figure.subplots(1, 2), VIEWS, strict=True):
-            for number, (place, goal) in enumerate(zip(places, goals, strict=True), 1):
+            for number, (place, home) in enumerate(zip(places, homes, strict=True), 1):
                 colour = colour_of(number)
                 axes.plot(100 * place[:, across], 100 * place[:, up], color=colour)
                 axes.plot(*(100 * place[-1, (across, up)]), "o", color=colour, label=f"{number}")
-                axes.plot(*(100 * goal[[across, up]]), "+", color=INK, markersize=9)
+                axes.plot(*(100 * home[[across, up]]), "+", color=INK, markersize=9)
             axes.set(xlabel=f"{'xyz'[across]} [cm]", ylabel=f"{'xyz'[up]} [cm]", title=title)
             axes.set_aspect("equal", adjustable="datalim")
         figure.axes[0].legend(title="robot")
         return figure
 
-    caption = "The paths of the robots in the room; dot: the end; cross: the last goal."
-    return PageFigure("paths", "Where were they?", caption, data_uri(png(drawn)))
+    caption = "The paths of the robots in the room; dot: the end; cross: home."
+    return PageFigure("paths", "Paths", caption, data_uri(png(drawn)))
 
 
 def _distances(result: SwarmResult, logs: list[pa.Table], places: list[NDArray[np.float64]]) -> PageFigure:

@@ -14,6 +14,7 @@ import array
 import errno
 import os
 import socket
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import SimpleNamespace
@@ -29,6 +30,11 @@ CONTROL, WRITE, READ, PORTS = b"C", b"W", b"R", b"P"
 HEAD_SIZE = 3
 ACKNOWLEDGED = 0x01  # bit of an answer's first byte
 NOT_ACKNOWLEDGED = b"\x00"
+SET_CHANNEL, SET_ADDRESS, SET_RATE, SET_ACKS, SET_INLINE = 0x01, 0x02, 0x03, 0x10, 0x23  # vendor requests
+# Modes of a Crazyradio 2.0, in which the settings are a header of each packet; the second adds the signal strength.
+INLINE, INLINE_STRENGTH = 1, 2
+INLINE_SIZE, INLINE_ACKS = 8, 0x10  # of that header, and a bit of its second byte
+STRENGTH_DBM = 40  # below 0 dBm: a board in the same room
 
 _DEVICE = SimpleNamespace(
     bLength=18, bDescriptorType=1, bcdUSB=0x0200, bDeviceClass=0, bDeviceSubClass=0, bDeviceProtocol=0,
@@ -51,6 +57,60 @@ _ENDPOINTS = tuple(
     for address in (0x81, 0x01)
 )  # fmt: skip
 _STRINGS = ("", "Bitcraze AB", "Crazyradio (Floaty virtual laboratory)", SERIAL)
+# What the kernel shows of the device.
+ATTRIBUTES = {
+    "idVendor": f"{_DEVICE.idVendor:04x}", "idProduct": f"{_DEVICE.idProduct:04x}", "bcdDevice": f"{_DEVICE.bcdDevice:04x}",
+    "manufacturer": _STRINGS[1], "product": _STRINGS[2], "serial": SERIAL,
+}  # fmt: skip
+GET_DESCRIPTOR, DEVICE, CONFIGURATION, STRING = 6, 1, 2, 3
+
+
+def all_descriptors() -> bytes:
+    """Return the descriptors of device and configuration, one after the other, as on the wire."""
+    return _device_descriptor() + _configuration_descriptor()
+
+
+def _device_descriptor() -> bytes:
+    d = _DEVICE
+    return struct.pack(
+        "<BBHBBBBHHHBBBB", d.bLength, d.bDescriptorType, d.bcdUSB, d.bDeviceClass, d.bDeviceSubClass, d.bDeviceProtocol,
+        d.bMaxPacketSize0, d.idVendor, d.idProduct, d.bcdDevice, d.iManufacturer, d.iProduct, d.iSerialNumber,
+        d.bNumConfigurations,
+    )  # fmt: skip
+
+
+def _configuration_descriptor() -> bytes:
+    c, i = _CONFIGURATION, _INTERFACE
+    found = struct.pack(
+        "<BBHBBBBB", c.bLength, c.bDescriptorType, c.wTotalLength, c.bNumInterfaces, c.bConfigurationValue,
+        c.iConfiguration, c.bmAttributes, c.bMaxPower,
+    )  # fmt: skip
+    found += bytes((
+        i.bLength, i.bDescriptorType, i.bInterfaceNumber, i.bAlternateSetting, i.bNumEndpoints, i.bInterfaceClass,
+        i.bInterfaceSubClass, i.bInterfaceProtocol, i.iInterface,
+    ))  # fmt: skip
+    for e in _ENDPOINTS:
+        found += struct.pack(
+            "<BBBBHB",
+            e.bLength,
+            e.bDescriptorType,
+            e.bEndpointAddress,
+            e.bmAttributes,
+            e.wMaxPacketSize,
+            e.bInterval,
+        )
+    return found
+
+
+def standard_request(request: int, value: int) -> bytes:
+    """Return what the dongle answers to a request of the USB standard: its descriptors and strings."""
+    kind, index = value >> 8, value & 0xFF
+    if request != GET_DESCRIPTOR or (kind == STRING and index >= len(_STRINGS)):
+        return b""
+    if kind == STRING:
+        text = _STRINGS[index].encode("utf-16-le") if index else b"\x09\x04"
+        return bytes((2 + len(text), STRING)) + text
+    return {DEVICE: _device_descriptor, CONFIGURATION: _configuration_descriptor}.get(kind, bytes)()
 
 
 def frame(kind: bytes, sequence: int, data: bytes) -> bytes:
@@ -111,6 +171,8 @@ class Connection:
         self._requests: dict[int, bytes] = {}
         self._found: dict[tuple[bytes, ...], Line] = {}  # by the settings of the dongle
         self._asked: list[Line] = []  # those that got the last packet
+        self._inline = 0
+        self.awaits_answer = False  # a packet was sent whose answer was not read
         try:
             ports = self._lines[0].read(READY_TIMEOUT_S)
             for other in range(0, len(ports), 2):
@@ -122,25 +184,55 @@ class Connection:
 
     def control(self, data: bytes) -> None:
         """Take a vendor request, which acts from the next packet on."""
-        self._requests[data[0]] = data
+        if data[0] == SET_INLINE:
+            self._inline = data[1]
+        else:
+            self._requests[data[0]] = data
 
     def write(self, packet: bytes) -> None:
-        """Send a packet."""
+        """Send a packet; in an inline mode its header has the settings."""
+        if self._inline:
+            flags, channel = packet[1:3]
+            for request, value, data in (
+                (SET_CHANNEL, channel, b""),
+                (SET_ADDRESS, 0, packet[3:INLINE_SIZE]),
+                (SET_RATE, flags & 0x03, b""),
+                (SET_ACKS, int(flags & INLINE_ACKS != 0), b""),
+            ):
+                self.control(bytes((request, value, 0)) + data)
+            packet = packet[INLINE_SIZE:]
+        acks = self._requests.get(SET_ACKS, b"\0\1")[1] != 0
+        self.awaits_answer = acks or self._inline != 0
         found = self._found.get(tuple(self._requests.values()))
         self._asked = []
         for line in self._lines.copy() if found is None else [found]:
             with self._dropping(line):
                 line.write(self._requests, packet)
-                self._asked.append(line)
+                if acks:
+                    self._asked.append(line)
 
     def read(self, timeout_s: float) -> bytes:
-        """Return the acknowledgement of the last packet, else that there is none. Raises `TimeoutError`."""
-        for line in self._asked:
+        """Return the acknowledgement of the last packet, else that there is none.
+
+        Raises `TimeoutError`; the next call goes on waiting.
+        """
+        answer = self._acknowledgement(timeout_s)
+        self.awaits_answer = False
+        if self._inline:
+            head = answer[:1] + (bytes((STRENGTH_DBM,)) if self._inline == INLINE_STRENGTH else b"")
+            answer = bytes((1 + len(head) + len(answer[1:]),)) + head + answer[1:]
+        return answer
+
+    def _acknowledgement(self, timeout_s: float) -> bytes:
+        while self._asked:
+            line = self._asked[0]
             with self._dropping(line):
                 answer = line.read(timeout_s)
                 if answer[0] & ACKNOWLEDGED:
+                    self._asked = []
                     self._found[tuple(self._requests.values())] = line
                     return answer
+            self._asked.remove(line)
         self._found.pop(tuple(self._requests.values()), None)
         return NOT_ACKNOWLEDGED
 
@@ -264,8 +356,7 @@ class Backend:
     ) -> int:
         """Execute a vendor request, or read a string descriptor."""
         if kind == 0x80 and request == 6:
-            text = _STRINGS[value & 0xFF].encode("utf-16-le") if value & 0xFF else b"\x09\x04"
-            descriptor = bytes((2 + len(text), 3)) + text
+            descriptor = standard_request(request, value)
             data[: len(descriptor)] = array.array("B", descriptor)
             return len(descriptor)
         handle.control(bytes((request, value & 0xFF, value >> 8 & 0xFF)) + bytes(data))

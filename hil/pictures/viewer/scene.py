@@ -151,6 +151,8 @@ class Scene:
         static("world/tunnel/axes", rr.TransformAxes3D(2 * AXIS))
         net = scene.net_lines(NOZZLE_RADIUS, self._plant.ground.height)
         static("world/tunnel/net", rr.LineStrips3D(net, colors=0x8899AA50, radii=0.001))
+        if self._tunnel.fan_factor == 0.0:  # a room
+            return
         angle = np.linspace(0, 2 * np.pi, 73)
         ring = np.column_stack((np.cos(angle), np.sin(angle), np.zeros_like(angle)))
         rings = [NOZZLE_RADIUS * ring, NOZZLE_RADIUS * ring + (0, 0, NOZZLE_TOP)]
