@@ -33,6 +33,15 @@ CLOCK_HIGH, TIM7_COUNT = "usecTimerHighCount", 0x4000_1424  # of the firmware's 
 ASSERTION = "assertFail"
 PLATFORM = "platformInit"  # refuses to start on a board whose device type its table lacks
 PROFILES = {BRUSHED: "crazyflie", BRUSHLESS: "crazyflie-brushless"}  # that ship, by device type
+# Other boards by the device types in their images, and what of them is not modelled.
+OTHER_BOARDS = {
+    "CB11": "a Crazyflie Bolt, whose IMU on SPI and ESCs for PWM are not modelled",
+    "CB10": "a Crazyflie Bolt, whose IMU on SPI and ESCs for PWM are not modelled",
+    "RR10": "a Roadrunner (platform tag), whose radio for positioning is not modelled",
+    "CF20": "a Crazyflie 2.0, whose IMU MPU9250 is not modelled",
+}
+FLAPPER = "a Flapper, whose servos, ESCs and measurement of current (ADC) are not modelled"
+FLAPPER_NAME = b"Flapper ("  # begins the names of its boards, which have the device types of others
 POLES = 12  # of a brushless motor; MOTORS_NBR_OF_POLES of Bitcraze's firmware
 
 
@@ -185,11 +194,22 @@ class Crazyflie:
 
 
 def _check_board(image: Image, device_type: str) -> None:
-    """Raise `LabError` for Bitcraze's firmware that would not start on a board of this type."""
-    known = [one for one in PROFILES if f"{one}\0".encode() in image.code]
-    if image.has(PLATFORM) and device_type not in known:
-        fitting = "".join(f"; --profile {PROFILES[one]}" for one in known)
-        raise LabError(
-            f"{image.path}: built for boards of device type {' and '.join(known) or 'unknown here'}, but this robot's is "
-            f"{device_type}{fitting}"
-        )
+    """Raise `LabError` for Bitcraze's firmware that would not start on a board of this type, or drives another robot.
+
+    Firmware without symbols is Bitcraze's if it has one of the device types.
+    """
+    found = [one for one in (*PROFILES, *OTHER_BOARDS) if f"{one}\0".encode() in image.code]
+    if not (image.has(PLATFORM) if image.named else found):
+        return
+    if FLAPPER_NAME in image.code:
+        raise LabError(f"{image.path}: built for {FLAPPER}")
+    if device_type in found:
+        return
+    known = [one for one in PROFILES if one in found]
+    if found and not known:
+        raise LabError(f"{image.path}: built for {OTHER_BOARDS[found[0]]}")
+    fitting = "".join(f"; --profile {PROFILES[one]}" for one in known)
+    raise LabError(
+        f"{image.path}: built for boards of device type {' and '.join(known) or 'unknown here'}, but this robot's is "
+        f"{device_type}{fitting}"
+    )

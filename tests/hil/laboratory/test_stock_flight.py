@@ -1,6 +1,8 @@
 """The Crazyflie's own firmware, unmodified, flies a Crazyflie's body: the ELF that FLOATY_STOCK_ELF names, byte for byte."""
 
+import json
 import os
+import zipfile
 from math import degrees, radians
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +15,7 @@ from hil.api import Request, column, fly
 from hil.board.image_firmware import stock_signals
 from hil.config import load_config
 from hil.emulator.crazyflie.log_table import log_table
+from hil.emulator.stm32f405.image import Image
 from hil.errors import LabError
 from hil.laboratory.experiments import find_experiment
 from hil.laboratory.experiments.position import HOVER
@@ -114,6 +117,31 @@ def test_takes_off_holds_and_lands_with_each_controller(controller: int, tmp_pat
 def test_follows_steps_and_a_figure_of_eight_within_its_limits(experiment: str, tmp_path: Path) -> None:
     result = fly(experiment, tmp_path / "run", profile=PROFILE, board=ELF).result
     assert [str(verdict) for verdict in result.verdicts if not verdict.holds] == []
+
+
+@needs_image
+@pytest.mark.parametrize("kind", ["bin", "zip"])
+def test_a_release_without_symbols_flies_as_with_them(kind: str, tmp_path: Path) -> None:
+    """Its cycles are almost those of the ELF: so is its flight."""
+    code, board = Image(Path(ELF)).code, tmp_path / f"cf2.{kind}"
+    if kind == "bin":
+        board.write_bytes(code)
+    else:
+        with zipfile.ZipFile(board, "w", zipfile.ZIP_DEFLATED) as file:
+            part = {"platform": "cf2", "target": "stm32", "type": "fw", "release": "test"}
+            file.writestr("manifest.json", json.dumps({"version": 2, "files": {"cf2.bin": part}}))
+            file.writestr("cf2.bin", code)
+    named, unnamed = (
+        fly("hover", tmp_path / name, profile=PROFILE, board=str(path), duration_s=8.0).result
+        for name, path in (("elf", Path(ELF)), ("bin", board))
+    )
+    assert unnamed.passed, unnamed.failed
+    assert named.image is not None
+    assert unnamed.image is not None
+    assert named.image.stack_free_bytes.keys() == unnamed.image.stack_free_bytes.keys()
+    assert {task.name for task in named.tasks} == {task.name for task in unnamed.tasks}
+    for metric in ("rms_x", "rms_y", "rms_z"):
+        assert unnamed.metrics[metric] == pytest.approx(named.metrics[metric], abs=0.002)
 
 
 @needs_image

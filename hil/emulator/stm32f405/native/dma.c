@@ -116,7 +116,10 @@ void dma_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value)
         }
         update_line(m, n, s);
         break;
-    case 0x04: stream->ndtr = value & 0xFFFF; break;
+    case 0x04: /* read-only while a transfer is under way, chapter 10.5.6; Bitcraze's I2C driver writes it before one has begun */
+        if (!(was & ENABLE && stream->place))
+            stream->ndtr = value & 0xFFFF;
+        break;
     default: *plain[(offset - FIRST_STREAM) % STREAM_SIZE / 4 - 2] = value;
     }
 }
