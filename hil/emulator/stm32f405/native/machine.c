@@ -101,6 +101,8 @@ static void count(struct machine *m, uint64_t address, uint32_t size)
 {
     uint64_t begin = address < FLASH_SIZE ? address : address - FLASH_BASE;
     if (begin + size <= FLASH_SIZE) {
+        if (m->profile)
+            profile_block(m, (uint32_t)begin, (uint32_t)begin + size);
         if (m->passages) {
             m->passages[begin / 2].begun++;
             m->block_begin = (uint32_t)begin;
@@ -412,6 +414,8 @@ void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause)
     set_register(m, R_CONTROL, 0);
     set_register(m, R_MSP, words[0]);
     m->pc = words[1] & ~1u;
+    if (m->profile)
+        profile_reset(m);
 }
 
 /* True for the first sixteen. */
