@@ -189,6 +189,7 @@ class Chip:
     def record(self) -> None:
         """Count the executed blocks from now on."""
         self._passages = np.zeros((FLASH_SIZE // 2 + 1, 3), np.uint64)
+        self.state.recorded = 1
         self.state.passages = self._ffi.from_buffer("struct passage[]", self._passages)
 
     def profile(self, functions: Sequence[tuple[int, int]]) -> None:
@@ -199,6 +200,7 @@ class Chip:
             numbers[(begin - FLASH) // 2 : (end - FLASH) // 2] = number
             numbers[(begin - FLASH) // 2] = number | 1 << 15
         self._profile.nodes = 1
+        self.state.recorded = 1
         self.state.profile = self._profile
         self._library.profile_reset(self.state)
 

@@ -267,6 +267,7 @@ struct machine {
     uint64_t until, due[SLOTS];
     uint64_t *before; /* sums of `SUM_...` over instructions before each half word of flash */
     uint32_t stacks;  /* whether the last block may lower a stack pointer */
+    uint32_t recorded; /* whether there are passages or a profile */
     uint32_t masks;   /* whether the last block may end with a write to BASEPRI or FAULTMASK */
     uint64_t next_address;
     struct profile *profile;  /* 0: not recorded */
