@@ -123,8 +123,9 @@ class CpuProfile:
 
 
 def functions_of(image: Image) -> list[Symbol]:
-    """Return the functions with a size, one of each address; number n of the machine's is the (n - 1)th."""
-    found = {one.address: one for one in reversed(image.functions) if one.size}
+    """Return the functions in flash with a size, one of each address; number n of the machine's is the (n - 1)th."""
+    end = image.base + len(image.code)
+    found = {one.address: one for one in reversed(image.functions) if one.size and one.address < end}
     return [found[address] for address in sorted(found)]
 
 

@@ -16,7 +16,7 @@ import pyarrow.parquet
 from hil.board.board_firmware import ImageReport
 from hil.emulator.stm32f405.chip import CYCLES_PER_US
 from hil.emulator.stm32f405.cpu_profile import Calls, CpuProfile, TaskTimes
-from hil.errors import LabError, writing
+from hil.errors import LabError, made_folder, writing
 from hil.laboratory.files.whole_files import replacing, write_whole
 
 OPTION = "--profile-cpu"
@@ -29,6 +29,7 @@ def check_profile_place(out: Path) -> None:
     """Raise `LabError` when OUT cannot be the beginning of a file's name."""
     if not out.name or out.is_dir():
         raise LabError(f"{OPTION} {out}: a folder; expected the beginning of a file's name")
+    made_folder(OPTION, out.parent)
 
 
 def files_of(out: Path) -> tuple[Path, ...]:
@@ -40,7 +41,6 @@ def write_profile(out: Path, folder: Path, profile: CpuProfile, image: ImageRepo
     """Write the files of OUT, and the activations into the run folder. Raises `LabError`."""
     text, speedscope, folded = files_of(out)
     with writing(OPTION, out):
-        out.parent.mkdir(parents=True, exist_ok=True)
         write_whole(text, "".join(f"{line}\n" for line in report(profile, image)))
         write_whole(speedscope, json.dumps(speedscope_of(profile, out.name)))
         write_whole(folded, "".join(f"{line}\n" for line in folded_of(profile)))
