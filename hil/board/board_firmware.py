@@ -24,6 +24,7 @@ from firmware_py.tasks import FlightTasks
 from firmware_py.wire.scalars import Scalar
 from hil.emulator.crazyflie.log_table import ImageParameter
 from hil.emulator.crazyflie.shockburst import syslink_us
+from hil.emulator.stm32f405.cpu_profile import CpuProfile
 from hil.world.body import Carrier
 from hil.world.servos import OUTPUTS
 
@@ -175,6 +176,9 @@ class Flashed(Protocol):
     @property
     def passages(self) -> NDArray[np.uint64]:
         """How often its blocks were executed, as of `Chip.passages`; empty where that is not counted."""
+
+    def cpu_profile(self) -> CpuProfile:
+        """Return where its cycles went; only where that was recorded."""
 
     def differences(self, config: FirmwareConfig) -> str:
         """Return the differences between its core and a profile in one line; empty if none."""

@@ -33,6 +33,7 @@ from hil.emulator.crazyflie.crazyflie import Crazyflie
 from hil.emulator.crazyflie.log_table import ImageVariable, log_numbers, log_table, parameter_table
 from hil.emulator.crazyflie.release_file import is_release, released_firmware
 from hil.emulator.stm32f405.chip import SOFTWARE, WATCHDOG, build_machine
+from hil.emulator.stm32f405.cpu_profile import CpuProfile, Reader, functions_of
 from hil.emulator.stm32f405.gdb import GdbServer
 from hil.emulator.stm32f405.image import Image
 from hil.errors import LabError
@@ -120,6 +121,7 @@ class ChipImage:
         str, ...
     ] = ()  # what was taken of a release, and what is unknown of an image without symbols
     is_recorded: bool = False  # count the executed blocks
+    is_profiled: bool = False  # charge the cycles to functions
     needs_polls: ClassVar[bool] = True
 
     @classmethod
@@ -190,8 +192,10 @@ class ImageFirmware:
         self.notes = flashed.notes
         self.image, self.chip, self.parts = flashed.image, self._crazyflie.chip, self._crazyflie.parts
         self.kernel = self.scheduler = self._crazyflie.processor
-        if flashed.is_recorded:
+        if flashed.is_recorded or flashed.is_profiled:
             self.chip.record()
+        if flashed.is_profiled:
+            self.chip.profile([(one.address, one.address + one.size) for one in functions_of(self.image)])
         self._board = board
         self._table = {variable.name: variable for variable in log_table(self.image, self.chip)}
         self.variables = [one for name, one in self._table.items() if name.startswith("excite.")]
@@ -231,6 +235,9 @@ class ImageFirmware:
     @property
     def passages(self) -> NDArray[np.uint64]:
         return self.chip.passages
+
+    def cpu_profile(self) -> CpuProfile:
+        return Reader(self.image, self.chip, self.kernel.task_names, self.kernel.ahead_us).read()
 
     def differences(self, config: FirmwareConfig) -> str:
         if not self.image.has("floaty_parameters"):

@@ -65,6 +65,10 @@ SEEDS_MAX = 10_000
 @common.gdb_option
 @common.coverage_option
 @click.option(
+    "--profile-cpu", type=PATH, metavar="OUT",
+    help="With an image as --board: write where its cycles went to OUT.txt, OUT.speedscope.json and OUT.folded.",
+)  # fmt: skip
+@click.option(
     "--hil", "in_loop", type=click.Choice(["still", "moving"]), is_flag=False, flag_value="still",
     help="Let the board of --board fly by its own tasks and clock, with the gyro samples of the virtual IMU; its servos "
     "stay at hover, or move as well.",
@@ -132,7 +136,13 @@ def fly(
 
 
 def _cover(request: Request) -> None:
-    """Write the files of --coverage."""
+    """Write the files of --coverage, and name those of --profile-cpu."""
+    if request.bench.profile_cpu is not None:
+        from hil.laboratory.files.cpu_profile import files_of
+
+        say("processor time:")
+        for file in files_of(request.bench.profile_cpu):
+            say(f"  {file}")
     if request.bench.coverage is not None:
         common.print_coverage(request.bench.coverage)
 
@@ -215,6 +225,8 @@ def _check_seeds(seeds: int, request: Request, target: str | None) -> None:
     bench = request.bench
     if bench.coverage is not None:
         check_image_coverage(bench.coverage, bench.board, bench.elf)
+    if bench.profile_cpu is not None:
+        raise LabError(f"--profile-cpu {bench.profile_cpu}: --seeds {seeds}: is for one seed")
     if bench.realtime or target or bench.trace:
         raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
     if bench.gdb is not None:

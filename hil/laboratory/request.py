@@ -64,6 +64,7 @@ class Bench:
     realtime: bool = False  # pace the flight to the wall clock
     trace: bool = False  # record the schedule of the whole flight, not only 50 ms
     coverage: Path | None = field(default=None, compare=False)  # where an image's executed blocks are added
+    profile_cpu: Path | None = field(default=None, compare=False)  # where its cycles are written
 
     @property
     def is_image(self) -> bool:
@@ -87,6 +88,8 @@ class Bench:
             raise LabError(f"--gdb {self.gdb}: needs one flight with an image as --board")
         if self.coverage is not None and not self.is_image:
             raise LabError(f"--coverage {self.coverage}: needs an image as --board, not {self.board}")
+        if self.profile_cpu is not None and not self.is_image:
+            raise LabError(f"--profile-cpu {self.profile_cpu}: needs an image as --board, not {self.board}")
         if self.in_loop and not (is_link(self.board) and self.link == RADIO):
             raise LabError(
                 f"--hil: --board {self.board} --link {self.link}: expected the link to a real board as --board"
@@ -133,6 +136,7 @@ class Options(TypedDict, total=False):
     realtime: bool
     trace: bool
     coverage: Path | None
+    profile_cpu: Path | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,7 +314,7 @@ class Request:
 
 def _stored_bench(bench: Bench) -> dict[str, Any]:
     """Return what of a bench makes the flight: not where else its observations are added."""
-    return {name: value for name, value in asdict(bench).items() if name != "coverage"}
+    return {name: value for name, value in asdict(bench).items() if name not in ("coverage", "profile_cpu")}
 
 
 def _nested(values: Mapping[str, Any]) -> Mapping[str, Any]:

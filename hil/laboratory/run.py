@@ -19,6 +19,7 @@ from hil.board.clock import Pace
 from hil.config import check_logic
 from hil.laboratory.files.ages import with_goals_sent
 from hil.laboratory.files.coverage import Executed, add_executed
+from hil.laboratory.files.cpu_profile import write_profile
 from hil.laboratory.files.folder import replacing_older
 from hil.laboratory.files.recorder import Observer, Recorder, load_log
 from hil.laboratory.files.result import (
@@ -156,6 +157,8 @@ class Started:
         if bench.coverage is not None and firmware.flashed is not None and result.image is not None:
             flown = Executed(result.image.sha256, 1, firmware.flashed.passages, bench.board, bench.elf)
             add_executed(bench.coverage, flown)
+        if bench.profile_cpu is not None and firmware.flashed is not None and result.image is not None:
+            write_profile(bench.profile_cpu, folder, firmware.flashed.cpu_profile(), result.image)
         return result
 
 

@@ -6,7 +6,7 @@ up with the core.
 """
 
 import mmap
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from functools import cache, partial
 from pathlib import Path
@@ -120,6 +120,7 @@ class Chip:
             (base, base + size, get(f"{name}_read"), get(f"{name}_write")) for base, size, name in WINDOWS
         ]
         self._sent = self._ffi.new("uint8_t[]", self._library.LINE_BYTES)
+        self._profile: Any = None
         self._passages = np.zeros((0, 3), np.uint64)
         self._kept: list[NDArray[Any]] = []  # memory of devices, and the speeds of motors
         self._acts: dict[int, Callable[[], object]] = {}  # of devices that act on what is written
@@ -188,7 +189,34 @@ class Chip:
     def record(self) -> None:
         """Count the executed blocks from now on."""
         self._passages = np.zeros((FLASH_SIZE // 2 + 1, 3), np.uint64)
+        self.state.recorded = 1
         self.state.passages = self._ffi.from_buffer("struct passage[]", self._passages)
+
+    def profile(self, functions: Sequence[tuple[int, int]]) -> None:
+        """Charge every cycle from now on to functions: begin and end of each, from number 1 on."""
+        self._profile = self._ffi.new("struct profile *")
+        numbers = np.frombuffer(self._ffi.buffer(self._profile.functions), np.uint16)
+        for number, (begin, end) in enumerate(functions, 1):
+            numbers[(begin - FLASH) // 2 : (end - FLASH) // 2] = number
+            numbers[(begin - FLASH) // 2] = number | 1 << 15
+        self._profile.nodes = 1
+        self.state.recorded = 1
+        self.state.profile = self._profile
+        self._library.profile_reset(self.state)
+
+    def cycles_of_code(self) -> NDArray[np.int64]:
+        """Return the cycles of the instruction that begins at each half word of flash, without refills."""
+        cycles = (self._before & np.uint64((1 << self._library.SUM_INSTRUCTIONS) - 1)).astype(np.int64)
+        return np.diff(cycles)
+
+    def buffer(self, member: Any) -> Any:
+        """Return the memory of an array in the machine."""
+        return self._ffi.buffer(member)
+
+    def profiled(self) -> Any:
+        """Return the `struct profile` of machine.h up to now."""
+        self._library.profile_settle(self.state)
+        return self._profile
 
     @property
     def passages(self) -> NDArray[np.uint64]:

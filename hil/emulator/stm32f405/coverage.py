@@ -101,9 +101,7 @@ class ImageLines:
 
     def coverage(self, counts: NDArray[np.uint64]) -> list[FileCoverage]:
         """Return the coverage of every source file, by path; `counts` are those of `Chip.passages`."""
-        runs = np.cumsum(
-            counts[:-1, BEGUN].astype(np.int64) - counts[:-1, FELL:].sum(axis=1).astype(np.int64)
-        )
+        runs = runs_of(counts)
         files: dict[str, FileCoverage] = {}
         numbers: Counter[tuple[str, int]] = Counter()  # of branches, by line
         for row in self.rows:
@@ -127,6 +125,12 @@ class ImageLines:
             file.functions.sort(key=lambda one: (one.line, one.name))
             file.branches.sort(key=lambda one: (one.line, one.number))
         return [files[path] for path in sorted(files)]
+
+
+def runs_of(counts: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """Return how often the instruction at each half word of flash ran, from the counts of `Chip.passages`."""
+    ended = counts[:-1, FELL:].sum(axis=1)
+    return np.cumsum(counts[:-1, BEGUN].astype(np.int64) - ended.astype(np.int64))
 
 
 def _branches(image: Image) -> Iterator[tuple[int, int]]:

@@ -155,7 +155,7 @@ class Image:
 
     @property
     def functions(self) -> list[Symbol]:
-        """Return the functions in flash, by address; several names of one are all there."""
+        """Return the functions in flash and RAM, by address; several names of one are all there."""
         return self._functions
 
     def function_at(self, address: int) -> str:

@@ -123,6 +123,12 @@ class ChipProcessor:
         )
 
     @property
+    def task_names(self) -> list[str]:
+        """Return the names of the tasks that have run, as `state.task` numbers them."""
+        state = self.chip.state
+        return [self._task(task.block).name for task in state.task[0 : state.task_count]]
+
+    @property
     def current(self) -> ChipTask:
         state = self.chip.state
         return self._task(state.task[state.running].block) if state.task_count else ChipTask("-", 0, 0)

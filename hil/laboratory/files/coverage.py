@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.export.elf import FLASH_SIZE
-from hil.errors import LabError, reading, writing
+from hil.errors import LabError, made_folder, reading, writing
 from hil.laboratory.files.whole_files import replacing
 
 OPTION = "--coverage"
@@ -52,6 +52,7 @@ def check_coverage(out: Path, image: str) -> None:
         _check_image(out, image, read_executed(out))
     elif info.exists():
         raise LabError(f"{OPTION} {out}: {info} exists without its {counts.name}: choose another name")
+    made_folder(OPTION, out.parent)
 
 
 def read_executed(out: Path) -> Executed:
@@ -67,21 +68,19 @@ def read_executed(out: Path) -> Executed:
 def add_executed(out: Path, flown: Executed) -> None:
     """Add a flight. Raises `LabError` when OUT has those of another image."""
     path, counts = file_of(out, COUNTS), flown.counts
-    with writing(OPTION, out):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with _locked(path) as file:
-            flights = flown.flights
-            if file.seek(0, 2):
-                file.seek(0)
-                before = _read(path, file)
-                _check_image(out, flown.image, before)
-                flights, counts = before.flights + flights, before.counts + counts
-            places = np.flatnonzero(counts.any(axis=1)).astype(np.uint32)
-            with replacing(path) as partial, partial.open("wb") as written:
-                np.savez(
-                    written, image=flown.image, flights=flights, board=str(Path(flown.board).absolute()),
-                    elf="" if flown.elf is None else str(flown.elf.absolute()), places=places, counts=counts[places],
-                )  # fmt: skip
+    with writing(OPTION, out), _locked(path) as file:
+        flights = flown.flights
+        if file.seek(0, 2):
+            file.seek(0)
+            before = _read(path, file)
+            _check_image(out, flown.image, before)
+            flights, counts = before.flights + flights, before.counts + counts
+        places = np.flatnonzero(counts.any(axis=1)).astype(np.uint32)
+        with replacing(path) as partial, partial.open("wb") as written:
+            np.savez(
+                written, image=flown.image, flights=flights, board=str(Path(flown.board).absolute()),
+                elf="" if flown.elf is None else str(flown.elf.absolute()), places=places, counts=counts[places],
+            )  # fmt: skip
 
 
 def _read(path: Path, file: IO[bytes]) -> Executed:
@@ -107,8 +106,7 @@ def _locked(path: Path) -> Iterator[IO[bytes]]:
     while True:
         with path.open("a+b") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
-            if path.exists() and os.path.samestat(
-                path.stat(), os.fstat(file.fileno())
-            ):  # not replaced meanwhile
+            is_current = path.exists() and os.path.samestat(path.stat(), os.fstat(file.fileno()))
+            if is_current:  # not replaced by the process that had the lock before
                 yield file
                 return

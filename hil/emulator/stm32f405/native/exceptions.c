@@ -205,6 +205,8 @@ void enter(struct machine *m, unsigned exception, uint32_t return_address)
     m->active[exception >> 6] |= 1ull << (exception & 63);
     look(m);
     m->exceptions++;
+    if (m->profile)
+        profile_enter(m, exception);
     m->now += ENTRY_CYCLES;
     uint32_t *vector = word(m, m->vtor + 4 * exception);
     if (!vector) { /* nor is there one for the HardFault that follows */
@@ -243,8 +245,11 @@ static void look_at_task(struct machine *m)
     if (m->task_count) {
         m->task[m->running].cycles += m->now - m->running_since;
         m->task[m->running].ran = m->now;
-        if (waits(m, m->task[m->running].block))
+        if (waits(m, m->task[m->running].block)) {
             m->task[m->running].busy_since = 0;
+            if (m->profile)
+                end_activation(m);
+        }
     }
     look_at_stack(m, *current);
     m->running_since = m->now;
@@ -281,6 +286,8 @@ void leave(struct machine *m, uint32_t exc_return)
     int valid = may_return(m, exc_return, exception, active > 1);
     uint32_t control = get_register(m, R_CONTROL);
     int process = exc_return & USE_PSP, floats = !(exc_return & NO_FLOATS), stack = process ? R_PSP : R_MSP;
+    if (m->profile)
+        profile_leave(m, m->now + RETURN_CYCLES);
     m->active[exception >> 6] &= ~(1ull << (exception & 63));
     if (exception != NMI)
         m->faultmask = 0;
@@ -324,6 +331,8 @@ void leave(struct machine *m, uint32_t exc_return)
     }
     if (m->kernel.current_place && (exception == PENDSV || exception == SVC))
         look_at_task(m);
+    if (m->profile)
+        profile_resume(m);
 }
 
 /* Enter the handler of a fault, or HardFault if it is disabled or already active (B1.5.14). */

@@ -74,7 +74,7 @@ void stop(struct machine *m, uint32_t pc)
 }
 
 /* Record where the last block went on. */
-static void end_block(struct machine *m, uint64_t next)
+static __attribute__((noinline)) void end_block(struct machine *m, uint64_t next)
 {
     if (m->block_begin == m->block_end)
         return;
@@ -84,6 +84,17 @@ static void end_block(struct machine *m, uint64_t next)
     else
         end->jumped++;
     m->block_begin = m->block_end;
+}
+
+static __attribute__((noinline)) void begin_block(struct machine *m, uint32_t begin, uint32_t end)
+{
+    if (m->profile)
+        profile_block(m, begin, end);
+    if (m->passages) {
+        m->passages[begin / 2].begun++;
+        m->block_begin = begin;
+        m->block_end = end;
+    }
 }
 
 /* The instruction at `pc` has ended its block. */
@@ -101,11 +112,8 @@ static void count(struct machine *m, uint64_t address, uint32_t size)
 {
     uint64_t begin = address < FLASH_SIZE ? address : address - FLASH_BASE;
     if (begin + size <= FLASH_SIZE) {
-        if (m->passages) {
-            m->passages[begin / 2].begun++;
-            m->block_begin = (uint32_t)begin;
-            m->block_end = (uint32_t)begin + size;
-        }
+        if (m->recorded)
+            begin_block(m, (uint32_t)begin, (uint32_t)begin + size);
         uint64_t passed = m->before[(begin + size) / 2] - m->before[begin / 2];
         m->now += passed & ((1u << SUM_INSTRUCTIONS) - 1);
         m->instructions += passed >> SUM_INSTRUCTIONS & ((1u << (SUM_MASKS - SUM_INSTRUCTIONS)) - 1);
@@ -141,7 +149,7 @@ static void on_block(uc_engine *uc, uint64_t address, uint32_t size, void *user)
     int counted = resumed == (uint32_t)address; /* in the middle of a block, which was counted as a whole at its begin */
     if (m->masks && !counted)
         set_masks(m);
-    if (m->passages && !counted)
+    if (m->recorded && !counted)
         end_block(m, address);
     if (m->stepping && m->stepping++ > 1) { /* the instruction was the last of its block, or was carried out here */
         m->resume = counted ? resumed : NOWHERE;
@@ -412,6 +420,8 @@ void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause)
     set_register(m, R_CONTROL, 0);
     set_register(m, R_MSP, words[0]);
     m->pc = words[1] & ~1u;
+    if (m->profile)
+        profile_reset(m);
 }
 
 /* True for the first sixteen. */

@@ -23,6 +23,13 @@ enum {
     DEVICES = 16, ESCS = 4, BREAKPOINTS = 64, LOW_WRITERS = 16, WATCHPOINTS = 8, LINE_BYTES = 4096, TASKS = 32, SWITCHES = 4096,
 };
 
+/* Of a profile. A node whose function is ROOT + n is the root of a task below TASKS, of what runs before all tasks at TASKS, of
+   exception n - TASKS - 1 above. STACKS: those of tasks, of the start, of nested exceptions. A bin is an eighth of an octave. */
+enum {
+    NODES = 1 << 16, FRAMES = 64, LEVELS = 16, STACKS = TASKS + 1 + LEVELS, ROOTS = TASKS + 1 + EXCEPTIONS, ROOT = 1 << 16,
+    TOUCHED = 1024, ACTIVATIONS = 1 << 20, BINS = 256,
+};
+
 /* Sums in one number, from these bits on: cycles, instructions, those that may write BASEPRI or FAULTMASK, and those that
    may lower a stack pointer. A block has at most one of the third, at its end, and few of the fourth. */
 enum { SUM_CYCLES = 0, SUM_INSTRUCTIONS = 28, SUM_MASKS = 48, SUM_STACKERS = 50 };
@@ -172,6 +179,65 @@ struct passage { /* of a half word of flash: blocks that begin there, and that e
     uint64_t begun, fell, jumped;
 };
 
+struct node { /* of the tree of calls; `site`: after the call, offset in flash; `recent`: in its task's activation */
+    uint64_t cycles, asleep, recent, activation;
+    uint32_t function, site, parent, child, sibling, calls;
+};
+
+struct frame {
+    uint32_t node, back;
+};
+
+struct calls {
+    uint32_t depth;
+    struct frame frame[FRAMES];
+};
+
+struct activation { /* of a task, from its first instruction after a wait to the next wait */
+    uint64_t begin, end, cycles, task; /* `cycles`: of its own, without interrupts and sleep */
+};
+
+struct activity { /* the activation of a task that has not ended; `others`: totals of all at its begin */
+    uint64_t number, begin, cycles, others[ROOTS];
+    uint32_t touched, node[TOUCHED];
+};
+
+struct worst { /* the longest activation of a task: its nodes, and what all took meanwhile */
+    uint64_t begin, end, cycles, recent[TOUCHED], others[ROOTS];
+    uint32_t count, node[TOUCHED];
+};
+
+struct handler {
+    uint64_t begin, nested;
+    uint32_t exception;
+};
+
+struct service { /* of an exception, without those that interrupt it */
+    uint64_t count, cycles, worst, when;
+    uint32_t bin[BINS];
+};
+
+struct masked {
+    uint64_t cycles, when;
+    uint32_t begin, end, root; /* places: offsets in flash */
+};
+
+struct profile {
+    uint64_t since, taken, slept, lost, activations, logged, total[ROOTS]; /* `lost`: calls and activations without room */
+    uint32_t at, root, function, back, last, level, nodes;
+    uint64_t masked_since[2];
+    uint32_t masked_at[2];
+    struct masked masked[2];
+    struct handler handler[LEVELS + 1];
+    struct calls calls[STACKS];
+    struct activity activity[TASKS + 1];
+    struct worst worst[TASKS + 1];
+    struct service service[EXCEPTIONS];
+    uint16_t functions[FLASH_SIZE / 2]; /* around each half word: its number, with the highest bit where it begins; 0: none */
+    struct node node[NODES];
+    struct activation log[ACTIVATIONS];
+};
+
 struct task_switch {
     uint64_t now;
     uint32_t block;
@@ -201,8 +267,10 @@ struct machine {
     uint64_t until, due[SLOTS];
     uint64_t *before; /* sums of `SUM_...` over instructions before each half word of flash */
     uint32_t stacks;  /* whether the last block may lower a stack pointer */
+    uint32_t recorded; /* whether there are passages or a profile */
     uint32_t masks;   /* whether the last block may end with a write to BASEPRI or FAULTMASK */
     uint64_t next_address;
+    struct profile *profile;  /* 0: not recorded */
     struct passage *passages; /* of all half words of flash and one more, 0: not recorded */
     uint32_t block_begin, block_end; /* of the recorded block that has not ended, equal without one; offsets in flash */
     uint8_t *flash, *ram, *ccm;
@@ -253,6 +321,8 @@ uint32_t machine_step(struct machine *m);
 int machine_break(struct machine *m, uint32_t address, int on);
 int machine_watch(struct machine *m, uint32_t kind, uint32_t address, uint32_t size, int on);
 uint32_t machine_sent(struct machine *m, uint32_t n, uint8_t *bytes);
+void profile_reset(struct machine *m);
+void profile_settle(struct machine *m);
 void machine_pin(struct machine *m, uint32_t port, uint32_t pin, uint32_t high);
 uint32_t usart_feed(struct machine *m, unsigned n, const uint8_t *bytes, uint32_t size);
 
@@ -287,6 +357,13 @@ void cut_block(struct machine *m, uint32_t pc);
 void fault_of(struct machine *m, int error);
 void note_access(struct watchpoint *w, uint32_t first, uint32_t size);
 void plan(struct machine *m, unsigned slot, uint64_t due);
+
+/* profile.c */
+void profile_block(struct machine *m, uint32_t at, uint32_t end);
+void profile_enter(struct machine *m, unsigned exception);
+void profile_leave(struct machine *m, uint64_t now);
+void profile_resume(struct machine *m);
+void end_activation(struct machine *m);
 
 /* timers.c */
 uint32_t timer_read(struct machine *m, unsigned n, uint32_t offset);

@@ -140,8 +140,9 @@ def test_coverage_adds_over_flights_keeps_the_hash_and_is_of_one_image(
     monkeypatch.setattr(image_firmware, "WARM_UP_US", 20_000)
     out, elf = tmp_path / "cov", stm32_firmware.build()
 
-    def flown(number: int, coverage: Path | None, board: Path = elf) -> str:
-        options = {} if coverage is None else {"coverage": coverage}
+    def flown(number: int, coverage: Path | None, board: Path = elf, profile: Path | None = None) -> str:
+        given = {"coverage": coverage, "profile_cpu": profile}
+        options = {name: path for name, path in given.items() if path is not None}
         request = Request.of(
             find_experiment("hover"), duration_s=0.1, board=str(board),
             overrides=("flight.release_us=50000",), **options,
@@ -151,7 +152,12 @@ def test_coverage_adds_over_flights_keeps_the_hash_and_is_of_one_image(
     first = flown(1, out)
     once = read_executed(out).counts
     info = (tmp_path / "cov.info").read_text(encoding="utf-8").splitlines()
-    assert {flown(2, None), flown(3, tmp_path / "cov.info")} == {first}
+    assert {flown(2, None, profile=tmp_path / "cpu"), flown(3, tmp_path / "cov.info")} == {first}
+    shown = json.loads((tmp_path / "cpu.speedscope.json").read_text(encoding="utf-8"))["profiles"]
+    stacks = (tmp_path / "cpu.folded").read_text(encoding="utf-8").splitlines()
+    cycles = sum(int(line.rpartition(" ")[2]) for line in stacks)
+    assert cycles == sum(weight for one in shown for weight in one["weights"]) > 168 * 120_000
+    assert f"{cycles} cycles of 168 MHz" in (tmp_path / "cpu.txt").read_text(encoding="utf-8")
     both = read_executed(out)
     assert both.flights == 2
     assert (both.counts == 2 * once).all()
@@ -169,6 +175,12 @@ def test_coverage_adds_over_flights_keeps_the_hash_and_is_of_one_image(
         flown(4, out, stm32_firmware.build("gcc"))
     with pytest.raises(LabError, match=r"^--coverage \S+: needs an image as --board, not c$"):
         Request.of(find_experiment("hover"), coverage=out)
+    with pytest.raises(LabError, match=r"^--profile-cpu \S+: needs an image as --board, not c$"):
+        Request.of(find_experiment("hover"), profile_cpu=out)
+    with pytest.raises(
+        LabError, match=r"^--profile-cpu \S+: a folder; expected the beginning of a file's name$"
+    ):
+        flown(4, None, profile=tmp_path)
     (tmp_path / "cov.counts").unlink()
     with pytest.raises(LabError, match=r"cov\.info exists without its cov\.counts: choose another name$"):
         flown(5, out)

@@ -1,0 +1,88 @@
+"""Where the cycles of an image go: all of them, to the functions and tasks that the firmware itself counts."""
+
+import pytest
+
+pytest.importorskip("unicorn")
+pytest.importorskip("cffi")
+
+from hil.emulator.stm32f405.chip import SOFTWARE, StopReason
+from hil.emulator.stm32f405.cpu_profile import Calls, CpuProfile, Reader, functions_of
+from support.stm32_machine import FirmwareOnChip
+
+ASSERTION, MASKING, NESTED = 3, 2, 3  # a mistake and two scenarios
+
+
+class Profiled(FirmwareOnChip):
+    """The tests' firmware, its cycles charged from power-on."""
+
+    def __init__(self, compiler: str, **variables: int) -> None:
+        super().__init__(compiler, **variables)
+        self.on_time_line = self.processor()
+        self.chip.record()
+        self.chip.profile([(one.address, one.address + one.size) for one in functions_of(self.image)])
+
+    def run_with_samples(self, us: int) -> CpuProfile:
+        for now_us in range(1_000, us + 1, 1_000):
+            while self.chip.now_us < now_us:
+                if self.run(now_us) & StopReason.RESET:
+                    self.chip.reset(SOFTWARE)
+            self.chip.pin("C", 14, True)
+            self.chip.pin("C", 14, False)
+        return Reader(self.image, self.chip, self.on_time_line.task_names, 0).read()
+
+
+def calls_of(calls: Calls, name: str) -> int:
+    return calls.calls * (calls.name == name) + sum(calls_of(child, name) for child in calls.children)
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_every_cycle_and_call_is_charged_to_the_task_that_the_firmware_counts(compiler: str) -> None:
+    firmware = Profiled(compiler)
+    profile = firmware.run_with_samples(300_000)
+    roots = {one.name.split()[-1]: one for one in profile.roots}
+    assert sum(one.total for one in profile.roots) == profile.cycles == firmware.chip.state.now
+    assert profile.lost == 0
+    assert calls_of(roots["REPORT"], "send_line") == firmware.peek("lines_sent") > 5
+    for task in range(2):
+        entered = calls_of(roots[f"SPIN-{task}"], "check_fp_registers")
+        assert entered - 1 <= firmware.peek("fp_rounds", task) <= entered
+    assert calls_of(roots["SysTick_Handler"], "tick") == firmware.peek("xTickCount")
+    tasks = {one.name: one for one in profile.tasks}
+    assert len(tasks["FILTER"].cycles) == pytest.approx(firmware.peek("samples_taken"), abs=1)
+    filtering = tasks["FILTER"]
+    # All that it took outside its activations is the one that has not ended.
+    assert filtering.cycles.sum() <= roots["FILTER"].total
+    assert filtering.cycles.sum() == pytest.approx(roots["FILTER"].total, rel=0.01)
+    longest = filtering.longest
+    assert longest.us == pytest.approx((filtering.end_us - filtering.begin_us).max())
+    assert sum(part.cycles for part in longest.parts) == longest.cycles
+    assert longest.cycles + sum(cycles for _, cycles in longest.others) == round(168 * longest.us)
+    assert longest.parts[0].name == "filter"
+    assert longest.parts[0].hottest.startswith("firmware.c:")
+    handlers = {one.name.split()[-1]: one for one in profile.handlers}
+    assert handlers["SysTick_Handler"].count == firmware.peek("xTickCount")
+    for one in handlers.values():
+        assert one.percentiles[0] <= one.percentiles[1] <= one.percentiles[2] <= one.worst
+        assert one.cycles == roots[one.name.split()[-1]].total
+    (masked,) = profile.masked
+    assert masked.by == "BASEPRI"
+    assert 20 < masked.cycles < 1000
+
+
+def test_cycles_add_up_across_a_reset() -> None:
+    firmware = Profiled("clang", planted=ASSERTION)
+    profile = firmware.run_with_samples(100_000)
+    assert sum(one.total for one in profile.roots) == firmware.chip.state.now
+    assert sum(calls_of(one, "Reset_Handler") for one in profile.roots) > 1
+
+
+@pytest.mark.parametrize("scenario", [MASKING, NESTED])
+def test_masked_interrupts_and_nested_exceptions_are_seen(scenario: int) -> None:
+    firmware = Profiled("gcc", scenario=scenario)
+    firmware.run(5_000)
+    profile = Reader(firmware.image, firmware.chip, [], 0).read()
+    assert sum(one.total for one in profile.roots) == firmware.chip.state.now
+    masked = {one.by: one for one in profile.masked}
+    assert "exceptions.c" in masked["PRIMASK or FAULTMASK"].begin
+    assert masked["PRIMASK or FAULTMASK"].cycles < 200
+    assert ("BASEPRI" in masked) == (scenario == MASKING)
