@@ -92,13 +92,14 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "time": (
         "hil/board/clock.py", "hil/commands/listing.py",
         "hil/research/campaigns/jobs.py", "ground_station/clock.py", "hil/servers/usb_dongle.py",
+        "hil/servers/dongle_plugin.py",
     ),
     "datetime": (),
     "asyncio": (),
     "threading": (
         "hil/live/feed.py", "hil/live/local_server.py", "hil/research/campaigns/workers.py",
         "ground_station/links/live_link.py", "ground_station/links/crazyradio.py", "ground_station/links/mavlink_serial.py",
-        "ground_station/terminal.py",
+        "ground_station/terminal.py", "hil/servers/dongle_plugin.py",
     ),
     "prompt_toolkit": ("ground_station/terminal.py",),
     "multiprocessing": ("hil/research/campaigns/workers.py", "hil/servers/swarm.py"),

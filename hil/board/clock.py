@@ -143,6 +143,11 @@ class Paced:
                 self.readers[reader](now_us)
         self._readable = []
 
+    def standstill_us(self, now_us: int) -> int:
+        """Return how long simulated time stood still up to a simulated instant, with the stall that it is in."""
+        late_us = self.late_us(now_us) if self._start_ns is not None else 0
+        return self.stood_still_us + max(late_us // self.STALL_US * self.STALL_US, 0)
+
     def pause(self, wait: Callable[[], None]) -> None:
         began_us = self.wall_us()
         wait()

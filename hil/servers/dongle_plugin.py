@@ -7,15 +7,22 @@ environment variable FLOATY_DONGLE=127.0.0.1:PORT is the server's address. It re
 
 A frame on the socket: kind (1 byte), sequence number (1), length (1), data. The server first sends `P` with the ports of
 the robots that other processes serve (2 bytes each); the client connects to these, too. It sends `C` (vendor request:
-request, value low and high, then its data) and `W` (packet for the air); the server answers `W` with `R`.
+request, value low and high, then its data) and `W` (packet for the air); the server answers `W` with `R`. It answers
+`T`, too: with how long simulated time stood still so far, because its machine was too slow [us, 8 bytes].
+
+A program's `time.sleep` of `FOLLOWED_S` or more lasts as much longer as simulated time stands still meanwhile: a program
+that sleeps until the robot has landed, and then stops its motors, would otherwise stop them in the air.
 """
 
 import array
+import atexit
 import errno
 import os
 import socket
 import struct
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import SimpleNamespace
 from typing import Any
@@ -24,9 +31,11 @@ VARIABLE = "FLOATY_DONGLE"
 DEFAULT_SERVER = "127.0.0.1:19840"
 SERIAL = "F10A7Y0001"
 CONNECT_TIMEOUT_S = 2.0
+FOLLOWED_S = 0.05
+PAUSES_TIMEOUT_S = 10.0  # a server that does not answer at all
 READY_TIMEOUT_S = 60.0  # a server may compile first
 
-CONTROL, WRITE, READ, PORTS = b"C", b"W", b"R", b"P"
+CONTROL, WRITE, READ, PORTS, PAUSES = b"C", b"W", b"R", b"P", b"T"
 HEAD_SIZE = 3
 ACKNOWLEDGED = 0x01  # bit of an answer's first byte
 NOT_ACKNOWLEDGED = b"\x00"
@@ -136,6 +145,11 @@ class Line:
         self._requests = dict(requests)
         self._send(WRITE, packet)
 
+    def ask(self, kind: bytes, timeout_s: float) -> bytes:
+        """Return the answer to an empty frame. Raises `TimeoutError` without one."""
+        self._send(kind, b"")
+        return self.read(timeout_s)
+
     def _send(self, kind: bytes, data: bytes) -> None:
         self._sequence = (self._sequence + 1) & 0xFF
         self._socket.sendall(frame(kind, self._sequence, data))
@@ -157,6 +171,43 @@ class Line:
 
     def close(self) -> None:
         self._socket.close()
+
+
+class SimulatedClock:
+    """Sleeps in the server's simulated time, by the wall clock where no server answers."""
+
+    def __init__(self, server: tuple[str, int], sleep: Callable[[float], None]) -> None:
+        self._server, self._sleep = server, sleep
+        self._line: Line | None = None
+        self._lock = threading.Lock()
+
+    def sleep(self, duration_s: float) -> None:
+        """Sleep as `time.sleep` does, longer by what simulated time stood still."""
+        before_us = self._stood_still_us() if duration_s >= FOLLOWED_S else None
+        self._sleep(duration_s)
+        while before_us is not None:
+            now_us = self._stood_still_us()
+            if now_us is None or now_us <= before_us:
+                return
+            self._sleep((now_us - before_us) * 1e-6)
+            before_us = now_us
+
+    def _stood_still_us(self) -> int | None:
+        with self._lock:
+            try:
+                if self._line is None:
+                    self._line = Line(self._server)
+                    self._line.read(PAUSES_TIMEOUT_S)
+                return int.from_bytes(self._line.ask(PAUSES, PAUSES_TIMEOUT_S))
+            except OSError:
+                self.close()
+                return None
+
+    def close(self) -> None:
+        """Forget the server until the next sleep."""
+        if self._line is not None:
+            self._line.close()
+        self._line = None
 
 
 class Connection:
@@ -378,7 +429,12 @@ def install() -> None:
         import libusb_package
     except ImportError:  # this program uses no Crazyradio
         return
-    backend = Backend(os.environ.get(VARIABLE) or DEFAULT_SERVER)
+    server = os.environ.get(VARIABLE) or DEFAULT_SERVER
+    backend = Backend(server)
+    host, _, port = server.rpartition(":")
+    clock = SimulatedClock((host, int(port)), time.sleep)
+    atexit.register(clock.close)
+    setattr(time, "sleep", clock.sleep)  # noqa: B010
     setattr(libusb_package, "get_libusb1_backend", lambda: backend)  # noqa: B010
 
 

@@ -174,9 +174,18 @@ class ServedRobot:
         rate = RATE_NAMES[RATES.index(radio.bits_per_second)]
         return f"radio://0/{radio.channel}/{rate}/{radio.address.hex().upper()}"
 
-    def serve_radio(self, port: int, readers: Readers, others: Sequence[int] = ()) -> int:
-        """Offer Crazyradios on a port (0: any), which also reach the robots on the ports `others`; return the port."""
-        self._dongles = DongleServer(port, readers, self._new_dongle, self._report, others)
+    def serve_radio(
+        self,
+        port: int,
+        readers: Readers,
+        others: Sequence[int] = (),
+        stood_still_us: Callable[[int], int] = lambda now_us: 0,
+    ) -> int:
+        """Offer Crazyradios on a port (0: any), which also reach the robots on the ports `others`; return the port.
+
+        Programs sleep longer by what `stood_still_us` returns more at the end.
+        """
+        self._dongles = DongleServer(port, readers, self._new_dongle, self._report, others, stood_still_us)
         return self._dongles.port
 
     def _report(self, text: str) -> None:

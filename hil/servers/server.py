@@ -162,7 +162,8 @@ class Server:
         served, readers, later = self.served, self.clock.readers, self.number - 1
         dongles, udp, mavlink = 0, "", ""
         if endpoints.radio is not None:
-            dongles = served.serve_radio(0 if later else endpoints.radio, readers, others)
+            port = 0 if later else endpoints.radio
+            dongles = served.serve_radio(port, readers, others, self.clock.standstill_us)
         if endpoints.udp is not None:
             udp = served.serve_udp(endpoints.udp and endpoints.udp + later, readers)
         if endpoints.mavlink:

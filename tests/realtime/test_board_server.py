@@ -1,11 +1,15 @@
 """`floaty serve` and unmodified cflib: by radio with and without losses, by UDP, in this and in other processes."""
 
 import gc
+import os
+import signal
 import subprocess
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Iterator
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -15,7 +19,7 @@ import pytest
 from cflib.bootloader import Bootloader
 from cflib.utils.power_switch import PowerSwitch
 
-from hil.servers.dongle_plugin import Backend
+from hil.servers.dongle_plugin import VARIABLE, Backend, SimulatedClock
 from support.cflib_client import CflibClient
 from support.plugged_dongle import plug
 from support.serving import PATIENCE_S, Served, serve
@@ -157,3 +161,22 @@ def test_four_boards_on_one_dongle(cache: Path) -> None:
         for thread in closing:
             thread.join(PATIENCE_S)
         assert all(client.gone.is_set() for client in clients)
+
+
+def test_a_program_sleeps_as_much_longer_as_simulated_time_stands_still(served: Served) -> None:
+    slept: list[float] = []
+
+    def sleep(duration_s: float) -> None:
+        slept.append(duration_s)
+        if len(slept) == 1:
+            os.kill(served.process.pid, signal.SIGSTOP)
+            time.sleep(0.4)
+            os.kill(served.process.pid, signal.SIGCONT)
+
+    host, _, port = served.environment[VARIABLE].rpartition(":")
+    with closing(SimulatedClock((host, int(port)), sleep)) as clock:
+        clock.sleep(0.5)
+    assert slept[0] == 0.5
+    assert sum(slept[1:]) >= 0.3
+    SimulatedClock((host, 1), slept.append).sleep(0.7)
+    assert slept[-1] == 0.7  # no server: the wall clock
