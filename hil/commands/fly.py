@@ -162,7 +162,10 @@ def _fly_one(request: Request, folder: Path, target: str | None) -> int:
     from hil.laboratory.run import fly
 
     view = common.open_live(target)
-    with common.progress_bar(TextColumn("{task.fields[now]}"), TimeRemainingColumn()) as progress:
+    bar_wanted = request.bench.gdb is None  # its thread would not survive going back in time
+    with common.progress_bar(
+        TextColumn("{task.fields[now]}"), TimeRemainingColumn(), wanted=bar_wanted
+    ) as progress:
         bar = progress.add_task(f"{request.experiment.name} seed {request.seed}", total=None, now="")
         hands: list[PanelCommands] = []
 

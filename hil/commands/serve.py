@@ -147,7 +147,8 @@ def _executor(asked: ServeOptions) -> Executor:
     if asked.board is None:
         return PYTHON_BOARD
     stack = click.get_current_context().with_resource(ExitStack())
-    return image_at(asked.board, None, debugger(asked.gdb, Path(asked.board), stack))
+    why_forward = "a served robot flies in real time, with programs that cannot go back"
+    return image_at(asked.board, None, debugger(asked.gdb, Path(asked.board), stack, why_forward))
 
 
 def _run(server: Server, swarm: Swarm, endpoints: Endpoints, view: LiveView | None, say: Say) -> None:

@@ -26,6 +26,7 @@ from hil.board.radio import Receiver, VirtualRadio
 from hil.board.real_core import is_link, real_core
 from hil.board.uart import VirtualSerial
 from hil.emulator.crazyflie.shockburst import Air
+from hil.emulator.stm32f405.checkpoints import Checkpoints, why_none
 from hil.emulator.stm32f405.gdb import GdbServer
 from hil.errors import LabError, refusing
 from hil.laboratory.channels import radio_channel, serial_channel, tracker_channel
@@ -181,7 +182,9 @@ def _executor(request: Request, stack: ExitStack) -> Executor:
     if is_link(bench.board):
         return PythonBoard(real_core(bench.board, stack))
     if bench.is_image:
-        return image_at(bench.board, bench.elf, debugger(bench.gdb, bench.elf or Path(bench.board), stack))
+        why_forward = "real time does not" if bench.realtime else ""
+        server = debugger(bench.gdb, bench.elf or Path(bench.board), stack, why_forward)
+        return image_at(bench.board, bench.elf, server)
     with refusing(f"--board {bench.board}: ", FirmwareError):
         return PythonBoard(runner_of(bench.board, request.config.logic))
 
@@ -192,13 +195,22 @@ def image_at(board: str, elf: Path | None, debugger: GdbServer | None = None) ->
         return ChipImage.load(Path(board), elf, debugger)
 
 
-def debugger(port: int | None, image: Path, stack: ExitStack) -> GdbServer | None:
-    """Open the port of `--gdb` until the stack is closed; it prints the command to type when it waits."""
+def debugger(
+    port: int | None, image: Path, stack: ExitStack, why_forward: str = "", from_us: int = 0
+) -> GdbServer | None:
+    """Open the port of `--gdb` until the stack is closed; it prints the command to type when it waits.
+
+    It waits at power-on, or at a later time of the laboratory. `why_forward`: why this flight cannot go back in time.
+    """
     if port is None:
         return None
+    why_forward = why_forward or why_none()
+    if why_forward:
+        print_line(f"--gdb {port}: time runs forward only: {why_forward}")
 
     def waiting(port: int) -> None:
         connect = f"-ex 'target remote 127.0.0.1:{port}'"
         print_line(f"waiting for gdb-multiarch {shlex.quote(str(image))} {connect}")
 
-    return stack.enter_context(closing(GdbServer(port, waiting)))
+    checkpoints = None if why_forward else Checkpoints()
+    return stack.enter_context(closing(GdbServer(port, waiting, checkpoints, from_us)))
