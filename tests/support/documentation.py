@@ -39,7 +39,7 @@ NOT_RUN = (
     (r"floaty board doctor\b", BOARD),
     (r"floaty fly .*--board (radio|usb|udp):", BOARD),
     (r"floaty (fly|deploy check) .*build/cf2(1bl)?\.elf", IMAGE),
-    (r"gdb-multiarch ", IMAGE),
+    (r"(gdb-multiarch|floaty debug) ", IMAGE),
     (r"floaty fly .*--link (radio|udp|mavlink):", PACED),
     (r"env PYTHONPATH=\S+ FLOATY_DONGLE=", SERVER),
     (r"(mavproxy\.py|python tests/support/mavsdk_(client|offboard)\.py) ", SERVER),
