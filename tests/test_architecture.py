@@ -99,7 +99,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "threading": (
         "hil/live/feed.py", "hil/live/local_server.py", "hil/research/campaigns/workers.py",
         "ground_station/links/live_link.py", "ground_station/links/crazyradio.py", "ground_station/links/mavlink_serial.py",
-        "ground_station/terminal.py", "hil/servers/dongle_plugin.py",
+        "ground_station/terminal.py", "hil/servers/dongle_plugin.py", "hil/emulator/stm32f405/checkpoints.py",
     ),
     "prompt_toolkit": ("ground_station/terminal.py",),
     "multiprocessing": ("hil/research/campaigns/workers.py", "hil/servers/swarm.py"),
@@ -108,7 +108,10 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "onnx": ("firmware_py/policy/reading.py",),
     "safetensors": ("firmware_py/policy/reading.py",),
     "elftools": ("firmware_py/export/elf.py",),
-    "ctypes": ("firmware_py/compiling.py", "firmware_py/core/subset.py", "firmware_py/export/cortex_m4.py"),
+    "ctypes": (
+        "firmware_py/compiling.py", "firmware_py/core/subset.py", "firmware_py/export/cortex_m4.py",
+        "hil/emulator/stm32f405/checkpoints.py",
+    ),
     "cffi": ("hil/emulator/stm32f405/chip.py",),
     "subprocess": (
         "hil/laboratory/files/installation.py", "hil/live/", "hil/servers/linked.py", "hil/servers/usb_dongle.py",
@@ -116,12 +119,14 @@ CONFINED: dict[str, tuple[str, ...]] = {
         "firmware_py/export/compilers.py",
     ),
     "socket": (
-        "hil/board/clock.py", "hil/emulator/stm32f405/gdb.py",
+        "hil/board/clock.py", "hil/emulator/stm32f405/checkpoints.py", "hil/emulator/stm32f405/gdb.py",
         "hil/live/window.py", "hil/servers/dongle_plugin.py", "hil/servers/tcp_port.py",
         "hil/servers/udp_server.py", "hil/servers/serial_server.py", "hil/servers/motive.py", "hil/servers/usb_dongle.py",
         "ground_station/sources/optitrack.py", "ground_station/sources/motioncapture_process.py",
     ),
-    "select": ("ground_station/clock.py", "hil/emulator/stm32f405/gdb.py"),
+    "select": (
+        "ground_station/clock.py", "hil/emulator/stm32f405/checkpoints.py", "hil/emulator/stm32f405/gdb.py",
+    ),
     "selectors": ("ground_station/clock.py", "hil/servers/usb_dongle.py"),
     "platformdirs": ("firmware_py/kept_code.py",),
     "jinja2.FileSystemBytecodeCache": ("hil/pictures/pages.py",),

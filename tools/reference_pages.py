@@ -61,7 +61,7 @@ COMMANDS = {
     "cli": ("Command line", "list fly new check policy runs view report compare export import docs"),
     "cli-studies": ("Command line: studies", "replay paper study drag-model campaign identify tune design"),
     "cli-programs": ("Command line: programs and real flights", "serve station param"),
-    "cli-boards": ("Command line: boards", "board deploy"),
+    "cli-boards": ("Command line: boards", "board deploy debug"),
 }
 SECTIONS = {
     "profile": ("Profile keys", "flight swarm limits controller model estimator predictor allocation excitation servo"),

@@ -36,6 +36,7 @@ COMMANDS = {
     "export": "pictures.export",
     "import": "pictures.import_",
     "replay": "fly.replay_run",
+    "debug": "fly.debug_run",
     "serve": "serve.serve",
     "station": "station.station",
     "param": "param.param",
@@ -56,7 +57,7 @@ COMMANDS = {
 GROUPS = {
     "Every day": "fly list report view runs compare export import new check docs",
     "Programs and real flights": "serve station param",
-    "Boards": "deploy board policy",
+    "Boards": "deploy board policy debug",
     "Studies": "replay paper study campaign identify tune design drag-model",
 }
 NAMED_BY_LIST = ("fly", "study")  # commands whose argument `floaty list` names

@@ -243,7 +243,10 @@ def _fly_one(request: Request, folder: Path, target: str | None) -> int:
     from hil.laboratory.run import fly
 
     view = common.open_live(target)
-    with common.progress_bar(TextColumn("{task.fields[now]}"), TimeRemainingColumn()) as progress:
+    bar_wanted = request.bench.gdb is None  # its thread would not survive going back in time
+    with common.progress_bar(
+        TextColumn("{task.fields[now]}"), TimeRemainingColumn(), wanted=bar_wanted
+    ) as progress:
         bar = progress.add_task(f"{request.experiment.name} seed {request.seed}", total=None, now="")
         hands: list[PanelCommands] = []
 
@@ -331,3 +334,42 @@ def replay_run(
         table.add_row(what, *(f"{getattr(one, name) * scale:.4g}" for one in (flown, other)), unit)
     common.console.print(table)
     say(f"  {folder / 'report.html'}")
+
+
+@click.command("debug")
+@common.run_folder
+@click.option(
+    "--at", default="crash", show_default=True, metavar="crash|SECONDS",
+    help="The firmware's first failure, or the robot's crash; or a time of the log.",
+)  # fmt: skip
+@click.option("--before", type=click.FloatRange(0.0, 3600.0), default=1.0, show_default=True, metavar="S",
+    help="How long before it the flight waits for GDB [s].",
+)  # fmt: skip
+@click.option("--port", type=click.IntRange(0, 65535), default=3333, show_default=True, metavar="PORT",
+    help="GDB's port on 127.0.0.1; 0: any.",
+)  # fmt: skip
+@click.option("--out", type=common.PATH, metavar="DIR", help="Run folder [RUN-debug, replaced].")
+@common.code_option
+def debug_run(run: Path, at: str, before: float, port: int, out: Path | None, named: str | None) -> int:
+    """Fly RUN, a flight of an image, again, and wait for GDB shortly before its crash; time also runs backwards there.
+
+    The flight is the same, bit for bit, whatever you look at and however often you go back.
+    """
+    from hil.api import load_run
+    from hil.laboratory.files.debugging import begin_us, debugged_request, waiting_flight
+    from hil.laboratory.files.folder import reserved
+    from hil.laboratory.run import fly
+
+    flown = load_run(run, named).result
+    request, from_us = debugged_request(flown), begin_us(flown, at, before)
+    folder = out or run.with_name(f"{run.name}-debug")
+    say(f"flying {run} again up to {max(from_us, 0) * 1e-6:.2f} s")
+    with reserved(request, folder), writing("--out", folder):
+        result = fly(request, folder, flight_of=waiting_flight(port, from_us))
+    same = (
+        "the same flight"
+        if result.hash == flown.hash
+        else "not the same flight: it was interrupted or changed"
+    )
+    say(f"{folder}: hash {result.hash[:16]}, {same}")
+    return common.exit_code(result)

@@ -199,10 +199,10 @@ def warn(text: str) -> None:
     print_line(text, sys.stderr)
 
 
-def progress_bar(*columns: ProgressColumn) -> Progress:
+def progress_bar(*columns: ProgressColumn, wanted: bool = True) -> Progress:
     """Return a progress bar on standard error with more columns, invisible without a terminal."""
     shown = (TextColumn("{task.description}"), BarColumn(), *columns)
-    return Progress(*shown, console=notices, transient=True, disable=not notices.is_terminal)
+    return Progress(*shown, console=notices, transient=True, disable=not (wanted and notices.is_terminal))
 
 
 @contextmanager

@@ -160,7 +160,9 @@ def _executor(asked: ServeOptions) -> Executor:
     if asked.board is None:
         return PYTHON_BOARD
     stack = click.get_current_context().with_resource(ExitStack())
-    return image_at(asked.board, asked.elf, debugger(asked.gdb, asked.elf or Path(asked.board), stack))
+    why_forward = "a served robot flies in real time, with programs that cannot go back"
+    server = debugger(asked.gdb, asked.elf or Path(asked.board), stack, why_forward)
+    return image_at(asked.board, asked.elf, server)
 
 
 def _run(

@@ -30,6 +30,7 @@ from hil.board.radio import Receiver, VirtualRadio
 from hil.board.real_core import is_link, real_core
 from hil.board.uart import VirtualSerial
 from hil.emulator.crazyflie.shockburst import TURN_ROUND_US, Air, air_us
+from hil.emulator.stm32f405.checkpoints import Checkpoints, why_none
 from hil.emulator.stm32f405.gdb import GdbServer
 from hil.emulator.stm32f405.image import has_symbols
 from hil.errors import LabError, refusing
@@ -220,7 +221,9 @@ def executor_of(request: Request, stack: ExitStack) -> Executor:
     if is_link(bench.board):
         return PythonBoard(real_core(bench.board, stack))
     if bench.is_image:
-        return image_of(bench, debugger(bench.gdb, bench.elf or Path(bench.board), stack))
+        forward = bench.coverage is not None or bench.profile_cpu is not None
+        why_forward = "real time does not" if bench.realtime else "what has run is counted" if forward else ""
+        return image_of(bench, debugger(bench.gdb, bench.elf or Path(bench.board), stack, why_forward))
     with refusing(f"--board {bench.board}: ", FirmwareError):
         return PythonBoard(runner_of(bench.board, request.config.logic))
 
@@ -241,16 +244,23 @@ def image_of(bench: Bench, debugger: GdbServer | None = None) -> ChipImage:
     return replace(image, is_recorded=bench.coverage is not None, is_profiled=bench.profile_cpu is not None)
 
 
-def debugger(port: int | None, image: Path, stack: ExitStack) -> GdbServer | None:
+def debugger(
+    port: int | None, image: Path, stack: ExitStack, why_forward: str = "", from_us: int = 0
+) -> GdbServer | None:
     """Open the port of `--gdb` until the stack is closed; it prints the command to type when it waits.
 
-    `image` is the ELF, or what flies without one.
+    It waits at power-on, or at a later time of the laboratory. `image` is the ELF, or what flies without
+    one. `why_forward`: why this flight cannot go back in time.
     """
     if port is None:
         return None
+    why_forward = why_forward or why_none()
+    if why_forward:
+        print_line(f"--gdb {port}: time runs forward only: {why_forward}")
 
     def waiting(port: int) -> None:
         symbols = f"{shlex.quote(str(image))} " if has_symbols(image) else ""
         print_line(f"waiting for gdb-multiarch {symbols}-ex 'target remote 127.0.0.1:{port}'")
 
-    return stack.enter_context(closing(GdbServer(port, waiting)))
+    checkpoints = None if why_forward else Checkpoints()
+    return stack.enter_context(closing(GdbServer(port, waiting, checkpoints, from_us)))

@@ -266,7 +266,11 @@ def text_of(item: Item, kept: bool, options: str, root: Path) -> str:
         if result.stood_still_ms:
             lines += [f"  machine  was too slow: time stood still for {result.stood_still_ms:.0f} ms"]
         again = command_of(request) or f"pytest {options}'{item.name}'"
-        texts.append("\n".join([*lines, f"  again    {again}"]))
+        lines.append(f"  again    {again}")
+        if kept and request.bench.is_image:
+            at = "" if result.failures or result.outcome == "lost" else f" --at {request.duration_s:g}"
+            lines.append(f"  debug    floaty debug {shlex.quote(str(one.run.folder))}{at}")
+        texts.append("\n".join(lines))
     if more := len(item.flown) - len(texts):
         texts.append(f"({more} flights before that are not shown)")
     return _below(root, "\n".join(texts))

@@ -18,7 +18,7 @@
 
 enum planted {
   NOTHING, BUS_FAULT, UNDEFINED, ASSERTION, HUNGRY_WATCHDOG, NULL_CALL, NULL_READ, NULL_WRITE, DIVISION, HANG, OVERFLOW,
-  BRIEF_OVERFLOW, LAST_CALL, MUTEX, SUSPENDED, DELAYED, DELETED, UNALIGNED, BREAKPOINT, MASKED_CALL
+  BRIEF_OVERFLOW, LAST_CALL, MUTEX, SUSPENDED, DELAYED, DELETED, UNALIGNED, BREAKPOINT, MASKED_CALL, WILD_WRITE
 };
 enum { ASSERTED = 1 };
 
@@ -440,9 +440,28 @@ __attribute__((noinline)) static void send_line(void) {
   lines_sent++;
 }
 
+#ifndef PLANTED /* goes wrong so, from this tick on */
+#define PLANTED NOTHING
+#define PLANTED_TICK 0
+#endif
+
 static void (*volatile nobody)(void);
 static volatile uint32_t *volatile nowhere;
 static volatile uint32_t zero, wasted;
+
+static void nothing(void) {}
+
+static struct {
+  volatile uint32_t samples[4];
+  void (*volatile done)(void);
+} box = {.done = nothing};
+
+/* Overwrites what follows the samples, once; it is called 300 ms later. */
+__attribute__((noinline)) static void store(volatile uint32_t *samples, uint32_t count) {
+  for (uint32_t i = 0; i < count; i++) {
+    samples[i] = 0;
+  }
+}
 
 __attribute__((noinline)) static uint32_t dig(uint32_t depth) {
   volatile uint32_t hole[16];
@@ -479,6 +498,14 @@ __attribute__((noinline)) static uint32_t go_wrong(uint32_t how) {
       return 7 / zero;
     case HANG:
       hang();
+      break;
+    case WILD_WRITE:
+      if (box.samples[0]) {
+        store(box.samples, LENGTH(box.samples) + 1);
+      }
+      if (xTickCount > PLANTED_TICK + 300) {
+        box.done();
+      }
       break;
     case OVERFLOW:
       return dig(20);
@@ -532,6 +559,10 @@ static void report(void) {
     TIM_CCR1(TIM3) = 1000 + xTickCount % 1000;
     if (planted != HUNGRY_WATCHDOG) {
       IWDG_KR = 0xAAAA;
+    }
+    if (PLANTED_TICK && xTickCount > PLANTED_TICK && !planted) {
+      planted = PLANTED;
+      box.samples[0] = 1;
     }
     eeprom[0] ^= (uint8_t)go_wrong(planted);
     delay(10);

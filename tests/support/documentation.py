@@ -39,7 +39,7 @@ NOT_RUN = (
     (r"floaty board doctor\b", BOARD),
     (r"floaty fly .*--board (radio|usb|udp):", BOARD),
     (r"floaty (fly|deploy check) .*(build/cf2(1bl)?\.elf|cf2\.bin|firmware-cf2-.*\.zip)", IMAGE),
-    (r"gdb-multiarch ", IMAGE),
+    (r"(gdb-multiarch|floaty debug) ", IMAGE),
     (r"genhtml ", BOARD),
     (r"floaty fly .*--link (radio|udp|mavlink):", PACED),
     (r"env PYTHONPATH=\S+ FLOATY_DONGLE=", SERVER),

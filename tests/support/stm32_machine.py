@@ -10,8 +10,9 @@ pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
 from hil.emulator.stm32f405.chip import CYCLES_PER_US, Chip, StopReason, build_machine
+from hil.emulator.stm32f405.debugged_chip import DebuggedChip
 from hil.emulator.stm32f405.freertos import FreeRtos
-from hil.emulator.stm32f405.gdb import DebuggedChip, GdbServer
+from hil.emulator.stm32f405.gdb import GdbServer
 from hil.emulator.stm32f405.image import Image
 from hil.emulator.stm32f405.processor import ChipProcessor
 from support.stm32_firmware import build

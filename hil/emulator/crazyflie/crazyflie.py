@@ -15,8 +15,9 @@ from hil.emulator.crazyflie.parts import BRUSHED, BRUSHLESS, Parts
 from hil.emulator.crazyflie.radio_line import Outside, RadioLine
 from hil.emulator.stm32f405.chip import SOFTWARE, WATCHDOG, Chip, StopReason
 from hil.emulator.stm32f405.crash import Crash, CrashReports
+from hil.emulator.stm32f405.debugged_chip import DebuggedChip
 from hil.emulator.stm32f405.freertos import FreeRtos
-from hil.emulator.stm32f405.gdb import DebuggedChip, GdbServer
+from hil.emulator.stm32f405.gdb import GdbServer
 from hil.emulator.stm32f405.image import Image
 from hil.emulator.stm32f405.processor import ChipProcessor
 from hil.emulator.stm32f405.stopped_tasks import TaskWatch
@@ -79,7 +80,9 @@ class Crazyflie:
                 chip.add_esc(timer, channel, carrier.escs[motor : motor + 1], POLES)
         kernel = FreeRtos if image.named else UnnamedFreeRtos
         self.tasks = kernel.of(image, chip.read)
-        run = chip.run if debugger is None else DebuggedChip(chip, debugger, self.tasks).run
+        run = chip.run
+        if debugger is not None:
+            run = DebuggedChip(chip, debugger, self.tasks, lambda: self.processor.ahead_us).run
         self.processor = ChipProcessor(chip, self.tasks, self._act, run)
         decks = Decks(chip, self.processor, carrier)
         self.radio = RadioLine(chip, self.processor, decks, outside, polls)

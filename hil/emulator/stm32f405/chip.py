@@ -24,6 +24,7 @@ from firmware_py.extras import install_command
 from hil.errors import LabError
 
 CYCLES_PER_US = 168
+SECOND = 1_000_000 * CYCLES_PER_US
 SYSTEM, SYSTEM_SIZE = 0x1FFF_0000, 0x1_0000
 OTP, UNIQUE_ID, FLASH_KBYTES = 0x1FFF_7800, 0x1FFF_7A10, 0x1FFF_7A22
 WINDOWS = (
@@ -127,6 +128,7 @@ class Chip:
         self.breakpoints: set[int] = set()  # of a debugger: a run stops before these instructions
         self.crash_points: set[int] = set()  # of the crash reports
         self._planted: set[int] = set()
+        self.resets = 0
         self.reset(POWER_ON)
 
     def _map(self, const: Any) -> None:
@@ -166,8 +168,7 @@ class Chip:
 
     def run(self, until_cycles: int) -> int:
         """Run up to a time, or until the caller must act; return why it ended, a sum of `StopReason`."""
-        if self.breakpoints | self.crash_points != self._planted:
-            self._plant(self.breakpoints | self.crash_points)
+        self._plant(self.breakpoints | self.crash_points)
         return self._after(self._library.machine_run(self.state, until_cycles))
 
     def _after(self, reason: int) -> int:
@@ -176,14 +177,18 @@ class Chip:
             self._cpu.mem_map_ptr(0, self.flash.size, self._readable, self.flash.ctypes.data)
         return reason
 
-    def step(self) -> int:
+    def step(self, until_cycles: int | None = None) -> int:
+        """Execute one instruction, or sleep until a time, at most a second; only an instruction is `StopReason.STEP`."""
+        until = self.state.now + SECOND if until_cycles is None else until_cycles
+        self._plant(self.breakpoints | self.crash_points)
         self._cpu.ctl_flush_tb()  # hooks act on code translated after them, until it is flushed
-        reason = self._after(self._library.machine_step(self.state))
+        reason = self._after(self._library.machine_step(self.state, until))
         self._cpu.ctl_flush_tb()
         return reason
 
     def reset(self, cause: int) -> None:
         """Reset the processor: memory is kept, time continues."""
+        self.resets += 1
         self._library.machine_reset(self.state, self.vectors, cause)
 
     def record(self) -> None:
@@ -228,6 +233,23 @@ class Chip:
         if state.block_begin != state.block_end:  # asleep
             counts[state.block_end // 2, 2] += 1
         return counts
+
+    def save(self) -> tuple[Any, ...]:
+        """Return the whole state of processor, memories and devices, for `restore`."""
+        memories = [memory.copy() for memory in (self.ram, self.ccm, *self._kept)]
+        return bytes(self._ffi.buffer(self.state)), memories, self._cpu.context_save(), self.resets
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        """Set the state that `save` returned; breakpoints and watchpoints stay."""
+        state, memories, context, self.resets = saved
+        before = self._ffi.new("struct machine *", self.state[0])
+        self._ffi.buffer(self.state)[:] = state
+        for name in ("break_hook", "break_address", "watchpoint", "float_hook"):  # of unicorn now
+            setattr(self.state, name, getattr(before, name))
+        for memory, contents in zip((self.ram, self.ccm, *self._kept), memories, strict=True):
+            memory[:] = contents
+        self._cpu.context_restore(context)
+        self._cpu.ctl_flush_tb()
 
     # Pins
 
@@ -348,6 +370,8 @@ class Chip:
 
     def _plant(self, addresses: set[int]) -> None:
         """Set the machine's breakpoints."""
+        if addresses == self._planted:
+            return
         for address in addresses ^ self._planted:
             if not self._library.machine_break(self.state, address, int(address in addresses)):
                 raise LabError("more breakpoints than there is room for")

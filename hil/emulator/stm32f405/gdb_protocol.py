@@ -5,15 +5,16 @@ The machine is stopped while packets are answered; `GdbServer` (gdb.py) carries 
 
 import re
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from enum import Enum, auto
-from typing import Protocol
+from typing import Any, Protocol
 from xml.etree.ElementTree import Element, SubElement, tostring
 
-from hil.emulator.stm32f405.freertos import FreeRtos
+from hil.emulator.stm32f405.freertos import FreeRtos, TaskView
 from hil.errors import LabError
 
 PACKET_SIZE = 0x4000
-SIGINT, SIGTRAP = 2, 5
+SIGINT, SIGTRAP, SIGABRT = 2, 5, 6
 INTERRUPT = b"\x03"
 ESCAPE, ESCAPED_WITH = 0x7D, 0x20
 # Of received bytes: a packet or its beginning, an acknowledgement, Ctrl-C; anything between them is dropped.
@@ -54,8 +55,14 @@ class ResumeRequest(Enum):
     STOP = auto()
     RUN = auto()
     STEP = auto()
+    BACK_STEP = auto()  # to the instruction before
+    BACK_RUN = auto()  # to the last stop before
     DETACH = auto()
     KILL = auto()
+
+
+BACK = (ResumeRequest.BACK_STEP, ResumeRequest.BACK_RUN)
+RUNNING = (ResumeRequest.RUN, ResumeRequest.STEP, *BACK)
 
 
 class MalformedError(Exception):
@@ -105,18 +112,23 @@ class Framing:
 class RemoteProtocol:
     """One debugger of one machine: answers its queries; `request` is its request to the machine."""
 
-    def __init__(self, debuggee: Debuggee, kernel: FreeRtos | None = None) -> None:
-        """`kernel` has the tasks, GDB's threads, each by the address of its control block."""
-        self._debuggee, self._kernel = debuggee, kernel
+    def __init__(self, debuggee: Debuggee, kernel: FreeRtos | None = None, backwards: bool = False) -> None:
+        """`kernel` has the tasks, GDB's threads, each by the address of its control block.
+
+        `backwards`: the machine can go back in time.
+        """
+        self._debuggee, self._kernel, self._backwards = debuggee, kernel, backwards
         self._thread = 0  # whose registers are requested; 0: those of the machine
         self._framing = Framing()
         self._items: list[bytes] = []
         self._watched: set[tuple[int, int, int]] = set()
+        self._tasks: dict[int, str] = {}  # all that were seen
         self._acknowledging = True
         self._signal = SIGTRAP
         self._last = b""
         self.request = ResumeRequest.STOP
         self.interrupted = False  # Ctrl-C arrived while the machine ran
+        self._changed = False  # it has changed registers or memory
         self._commands: dict[bytes, Callable[[bytes], bytes]] = {
             b"?": lambda _: self._stop_reply(),
             b"g": lambda _: self._registers(range(len(REGISTERS))),
@@ -130,6 +142,8 @@ class RemoteProtocol:
             b"s": lambda rest: self._resume(ResumeRequest.STEP, rest),
             b"C": lambda rest: self._resume(ResumeRequest.RUN, rest.partition(b";")[2]),
             b"S": lambda rest: self._resume(ResumeRequest.STEP, rest.partition(b";")[2]),
+            b"v": self._continue,
+            b"b": self._go_back,
             b"q": self._query,
             b"Q": self._set,
             b"H": self._select,
@@ -150,11 +164,42 @@ class RemoteProtocol:
         self._items = waiting
         return answers
 
-    def stopped(self, signal: int, watched: int | None = None) -> bytes:
-        """Return the report to the debugger that its running machine has stopped, and the watched access."""
+    def stopped(self, signal: int, watched: int | None = None, at_begin: bool = False) -> bytes:
+        """Return the report that the running machine has stopped: at a watched access, or where its time begins."""
         self.request, self._signal, self.interrupted, self._thread = ResumeRequest.STOP, signal, False, 0
-        self._last = framed(self._stop_reply(watched))
+        self._last = framed(self._stop_reply(watched, at_begin))
         return self._last + self.receive(b"")
+
+    def stored(self) -> dict[str, Any]:
+        """Return, as JSON has it, what the debugger has set, which does not go back in time with the machine."""
+        return {
+            "breakpoints": sorted(self._debuggee.breakpoints), "watched": sorted(self._watched),
+            "acknowledging": self._acknowledging, "tasks": list(self._tasks.items()),
+        }  # fmt: skip
+
+    def restore(self, stored: dict[str, Any]) -> None:
+        """Set what `stored` has returned; the machine runs."""
+        self._debuggee.breakpoints.clear()
+        self._debuggee.breakpoints.update(stored["breakpoints"])
+        watched = {(kind, address, size) for kind, address, size in stored["watched"]}
+        for one in self._watched - watched:
+            self._debuggee.watch(*one, on=False)
+        for one in watched - self._watched:
+            self._debuggee.watch(*one, on=True)
+        self._watched, self._acknowledging = watched, stored["acknowledging"]
+        self._tasks = dict(stored["tasks"])
+        self._items, self._framing = [], Framing()
+        self.request, self.interrupted, self._changed = ResumeRequest.RUN, False, False
+
+    def take_changes(self) -> bool:
+        """Return whether registers or memory were changed since the last call."""
+        changed, self._changed = self._changed, False
+        return changed
+
+    @property
+    def has_stops(self) -> bool:
+        """Whether there is a breakpoint or a watchpoint."""
+        return bool(self._debuggee.breakpoints or self._watched)
 
     def leave(self, request: ResumeRequest) -> None:
         """Remove all breakpoints from the machine."""
@@ -166,7 +211,7 @@ class RemoteProtocol:
 
     def _answered(self, item: bytes) -> bytes:
         if item == INTERRUPT:
-            self.interrupted = self.request in (ResumeRequest.RUN, ResumeRequest.STEP)
+            self.interrupted = self.request in RUNNING
         if not item.startswith(b"$"):
             return {b"!": b"-" if self._acknowledging else b"", b"-": self._last}.get(item, b"")
         acknowledgement = b"+" if self._acknowledging else b""
@@ -184,14 +229,10 @@ class RemoteProtocol:
             return framed(MALFORMED)
         except LabError:
             return framed(FAULT)
-        return (
-            b""
-            if self.request in (ResumeRequest.RUN, ResumeRequest.STEP, ResumeRequest.KILL)
-            else framed(answer)
-        )
+        return b"" if self.request in (*RUNNING, ResumeRequest.KILL) else framed(answer)
 
-    def _stop_reply(self, watched: int | None = None) -> bytes:
-        why = b"" if watched is None else b"watch:%x;" % watched
+    def _stop_reply(self, watched: int | None = None, at_begin: bool = False) -> bytes:
+        why = b"replaylog:begin;" if at_begin else b"" if watched is None else b"watch:%x;" % watched
         return b"T%02x%sthread:%x;" % (self._signal, why, self._running)
 
     def _registers(self, numbers: Iterable[int]) -> bytes:
@@ -218,9 +259,14 @@ class RemoteProtocol:
 
     def _all_threads(self) -> dict[int, str]:
         """Return all threads, the running one first; it is the only one without a scheduler."""
-        tasks = self._kernel.tasks() if self._kernel is not None and self._kernel.running else []
-        every = {task.block: f"{task.name}, {task.state}, priority {task.priority}" for task in tasks}
-        return {self._running: every.get(self._running, "")} | every
+        running, tasks = self._running, list[TaskView]()
+        if self._kernel is not None and self._kernel.running:
+            with suppress(LabError):  # the scheduler is moving a task from list to list
+                tasks = self._kernel.tasks()
+            for task in tasks:
+                self._tasks[task.block] = f"{task.name}, {task.state}, priority {task.priority}"
+        every = self._tasks if running in self._tasks else {}
+        return {running: every.get(running, "")} | every
 
     def _select(self, rest: bytes) -> bytes:
         """Select the thread for register access; ignore the choice of which one runs."""
@@ -240,6 +286,7 @@ class RemoteProtocol:
         if not self._is_machine():
             raise LabError("the registers of a task that does not run cannot be changed")
         self._debuggee.set_register(name, int.from_bytes(data, "little"))
+        self._changed = True
         return b"OK"
 
     def _read(self, rest: bytes) -> bytes:
@@ -253,6 +300,7 @@ class RemoteProtocol:
         if not data or len(data) != size:
             raise MalformedError
         self._debuggee.write(address, data)
+        self._changed = True
         return b"OK"
 
     def _breakpoint(self, rest: bytes, on: bool) -> bytes:
@@ -273,12 +321,29 @@ class RemoteProtocol:
     def _resume(self, request: ResumeRequest, address: bytes) -> bytes:
         if address:
             self._debuggee.set_register("pc", _hex(address) & ~1)
+            self._changed = True
         self.request = request
+        return b""
+
+    def _continue(self, rest: bytes) -> bytes:
+        """Resume by `vCont`, with which GDB leaves the steps to us: its own miss instructions within IT blocks."""
+        if rest == b"Cont?":
+            return b"vCont;c;C;s;S"
+        name, *actions = rest.split(b";")
+        if name == b"Cont" and actions:
+            steps = any(action[:1] in (b"s", b"S") for action in actions)
+            self.request = ResumeRequest.STEP if steps else ResumeRequest.RUN
+        return b""
+
+    def _go_back(self, rest: bytes) -> bytes:
+        if self._backwards and rest in (b"s", b"c"):
+            self.request = ResumeRequest.BACK_STEP if rest == b"s" else ResumeRequest.BACK_RUN
         return b""
 
     def _query(self, rest: bytes) -> bytes:
         if rest.startswith(b"Supported"):
-            return b"PacketSize=%x;qXfer:features:read+;QStartNoAckMode+" % PACKET_SIZE
+            more = b";ReverseStep+;ReverseContinue+" if self._backwards else b""
+            return b"PacketSize=%x;qXfer:features:read+;QStartNoAckMode+%s" % (PACKET_SIZE, more)
         if rest.startswith(b"Xfer:features:read:target.xml:"):
             offset, size = _pair(rest.rpartition(b":")[2])
             text = target_description().encode()

@@ -73,8 +73,8 @@ def _check(first: Request, count: int) -> None:
         raise LabError(f"--link {bench.link}: --robots is for flights in lockstep: radio, mavlink")
     if is_link(bench.board) or bench.in_loop:
         raise LabError(f"--board {bench.board}: --robots {count}: a real board is in one flight at a time")
-    if bench.gdb is not None or bench.trace or bench.realtime:
-        raise LabError(f"--robots {count}: --gdb, --perfetto and --realtime are for one robot")
+    if bench.gdb is not None or bench.trace or bench.realtime or bench.profile_cpu is not None:
+        raise LabError(f"--robots {count}: --gdb, --perfetto, --profile-cpu and --realtime are for one robot")
 
 
 def places_of(swarm: SwarmConfig, count: int) -> list[Place]:

@@ -175,6 +175,9 @@ static void on_block(uc_engine *uc, uint64_t address, uint32_t size, void *user)
             return;
         }
     }
+    m->earlier_at = m->begun_at;
+    m->begun_at = m->now;
+    m->begun = m->instructions;
     count(m, address, size);
 }
 
@@ -480,6 +483,29 @@ static void execute(struct machine *m, uint64_t count_of)
     }
 }
 
+/* Let time pass without instructions, if none is executed now: for the outside load, and while the core sleeps. */
+static int pass_time(struct machine *m, uint64_t until)
+{
+    uint64_t next = m->next_due < until ? m->next_due : until;
+    if (m->owed && m->resume != m->pc && in_task(m) && !next_exception(m, 0)) {
+        uint64_t part = next - m->now < m->owed ? next - m->now : m->owed;
+        m->owed -= part;
+        m->taken += part;
+        m->running_since += part;
+        m->now += part;
+        return 1;
+    }
+    if (m->asleep || m->locked) {
+        if (m->locked || !next_exception(m, 1)) {
+            m->sleeping += next - m->now;
+            m->now = next;
+            return 1;
+        }
+        m->asleep = 0;
+    }
+    return 0;
+}
+
 /* Run up to a time, or until the caller must act; return the reason (`STOP_...`, 0: it is `until`). */
 uint32_t machine_run(struct machine *m, uint64_t until)
 {
@@ -495,23 +521,8 @@ uint32_t machine_run(struct machine *m, uint64_t until)
             if (m->stop_reason || m->now >= until)
                 return m->stop_reason;
         }
-        uint64_t next = m->next_due < until ? m->next_due : until;
-        if (m->owed && m->resume != m->pc && in_task(m) && !next_exception(m, 0)) {
-            uint64_t part = next - m->now < m->owed ? next - m->now : m->owed;
-            m->owed -= part;
-            m->taken += part;
-            m->running_since += part;
-            m->now += part;
+        if (pass_time(m, until))
             continue;
-        }
-        if (m->asleep || m->locked) {
-            if (m->locked || !next_exception(m, 1)) {
-                m->sleeping += next - m->now;
-                m->now = next;
-                continue;
-            }
-            m->asleep = 0;
-        }
         execute(m, 0);
         if (m->stop_reason & (STOP_BREAK | STOP_LOW_READ | STOP_LOW_WRITE | STOP_DIVISION))
             return m->stop_reason;
@@ -529,21 +540,19 @@ static void on_step(uc_engine *uc, uint64_t address, uint32_t size, void *user)
     m->first_step = 0;
 }
 
-/* Execute one instruction, or enter one exception. */
-uint32_t machine_step(struct machine *m)
+/* Execute one instruction, or enter one exception; return without STOP_STEP if the time or a reason comes before it. */
+uint32_t machine_step(struct machine *m, uint64_t until)
 {
+    m->until = until;
     m->stop_reason = 0;
-    if (m->resume != m->pc) {
-        m->resume = NOWHERE;
-        let_happen(m);
-    }
-    if (m->asleep) {
-        while (!next_exception(m, 1) && m->next_due != NEVER) {
-            m->now = m->next_due;
+    do {
+        if (m->resume != m->pc) {
+            m->resume = NOWHERE;
             let_happen(m);
+            if (m->stop_reason || m->now >= until)
+                return m->stop_reason;
         }
-        m->asleep = 0;
-    }
+    } while (pass_time(m, until));
     uint32_t pc = m->pc;
     m->stepping = 1;
     m->skip_at = pc;
@@ -590,8 +599,11 @@ void note_access(struct watchpoint *w, uint32_t first, uint32_t size)
 {
     if (first >= w->address + w->size || first + size <= w->address)
         return;
-    w->machine->watch_address = first > w->address ? first : w->address;
-    w->machine->stop_reason |= STOP_WATCHPOINT;
+    struct machine *m = w->machine;
+    m->watch_address = first > w->address ? first : w->address;
+    m->watch_pc = get_register(m, R_PC) & ~1u;
+    m->watch_exceptions = m->exceptions;
+    m->stop_reason |= STOP_WATCHPOINT;
 }
 
 /* Set or remove a watchpoint of a GDB kind: 2 writes, 3 reads, 4 both; return 0 without room. */

@@ -245,6 +245,8 @@ struct task_switch {
 
 struct machine {
     uint64_t now, instructions, exceptions, sleeping; /* `sleeping`: cycles spent in WFI */
+    uint64_t begun, begun_at;    /* instructions and cycles before the block that was begun last */
+    uint64_t earlier_at;         /* cycles before the block before it */
     uint64_t next_due;
     uint32_t pc, stop_reason, asleep, watchdog_on;
     uint32_t fault_address, unknown_count;
@@ -260,7 +262,8 @@ struct machine {
     uint32_t stack_begin; /* of the running task, 0: unknown */
     uint32_t overflow;    /* the task whose stack has overflowed first since the reset, 0: none */
     uint32_t divided;     /* a division by zero was reported */
-    uint32_t watch_address; /* the last access of a watchpoint */
+    uint32_t watch_address, watch_pc; /* the last access of a watchpoint, and its instruction */
+    uint64_t watch_exceptions;        /* how many exceptions had been entered then */
     uint32_t task_return;   /* EXC_RETURN of the last exception that has interrupted a task */
     struct task_switch task_switch[SWITCHES];
     struct engine engine;
@@ -317,7 +320,7 @@ int machine_device(struct machine *m, uint32_t bus, uint32_t address, uint8_t *m
 int machine_esc(struct machine *m, uint32_t timer, uint32_t channel, const double *rpm, uint32_t poles);
 void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause);
 uint32_t machine_run(struct machine *m, uint64_t until);
-uint32_t machine_step(struct machine *m);
+uint32_t machine_step(struct machine *m, uint64_t until);
 int machine_break(struct machine *m, uint32_t address, int on);
 int machine_watch(struct machine *m, uint32_t kind, uint32_t address, uint32_t size, int on);
 uint32_t machine_sent(struct machine *m, uint32_t n, uint8_t *bytes);

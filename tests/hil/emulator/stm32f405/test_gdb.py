@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 pytest.importorskip("unicorn")
 
 from hil.emulator.stm32f405.chip import CYCLES_PER_US, Chip, StopReason
+from hil.emulator.stm32f405.debugged_chip import DebuggedChip
 from hil.emulator.stm32f405.freertos import FreeRtos
-from hil.emulator.stm32f405.gdb import DebuggedChip, GdbServer
+from hil.emulator.stm32f405.gdb import GdbServer
 from hil.emulator.stm32f405.gdb_protocol import (
     PACKET_SIZE,
     REGISTERS,
@@ -97,9 +98,7 @@ def test_without_acknowledgements_only_answers_are_sent(protocol: RemoteProtocol
 
 
 def test_unknown_packets_get_an_empty_answer(protocol: RemoteProtocol) -> None:
-    for (
-        packet
-    ) in b"vMustReplyEmpty vCont? X20000000,0: G00 qTStatus R00 b Z5,20000000,4 QPassSignals: _".split():
+    for packet in b"vMustReplyEmpty X20000000,0: G00 qTStatus R00 b Z5,20000000,4 QPassSignals: _".split():
         assert ask(protocol, packet) == b""
 
 
