@@ -29,10 +29,12 @@ from hil import (
     Request,
     RigidBody,
     Run,
+    Swarm,
     column,
     declare,
     fault,
     fly,
+    fly_swarm,
     knob,
     load_run,
     position_error,
@@ -75,8 +77,11 @@ OPTIONS: dict[str, Any] = {
 }  # fmt: skip
 CALLS = (
     Call(fly, {"flown": "hover", "folder": "here", "progress": False, "report": False, "replace": False, **OPTIONS}),
+    Call(fly_swarm, {"flown": "hover", "robots": 2, "folder": "here", "report": False, "replace": False, **OPTIONS}),
     Call(request_of, {"experiment": "hover", **OPTIONS}),
     Call(Flights.fly, {"experiment": "hover", **OPTIONS}),
+    Call(Flights.fly_swarm, {"experiment": "hover", "robots": 2, **OPTIONS}),
+    Call(Flights.check, {"file": "controller.py"}),
     Call(Flights.board, {"link": "radio", "profile": "floaty", "overrides": ()}),
     Call(Flights.baseline, {"name": "mine", "rel": 0.1, "metrics": ["rms_y"]}),
     Call(Request.of, {"experiment": HOVER, **{k: v for k, v in OPTIONS.items() if k not in ("trajectory", "faults")},
@@ -101,7 +106,8 @@ CALLS = (
     Call(trajectories, {"reach_m": 0.1, "turn_rad": 0.1, "every_s": 1.0, "most": 2}),
     Call(Waypoints, {"every_s": 1.0, "goals": ((0.0, 0.0, 0.0, 0.0),)}),
 )  # fmt: skip
-FLYING = (fly, request_of, Flights.fly, Request.of)
+FLYING = (fly, fly_swarm, request_of, Flights.fly, Flights.fly_swarm, Request.of)
+OF_FIXTURE = (Flights.fly, Flights.fly_swarm, Flights.check, Flights.board, Flights.baseline)
 
 
 @pytest.fixture(autouse=True)
@@ -112,7 +118,7 @@ def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 def called(call: Call, arguments: dict[str, Any]) -> object:
     """Call a public function; a method of the fixture with the fixture."""
-    is_method = call.function in (Flights.fly, Flights.board, Flights.baseline)
+    is_method = call.function in OF_FIXTURE
     return call.function(*([flights()] if is_method else []), **arguments)
 
 
@@ -142,6 +148,7 @@ def is_right(name: str, value: object) -> bool:
     return {
         "flown": False,
         "experiment": False,
+        "robots": isinstance(value, int | np.integer) and number and 2 <= value <= 16,
         "folder": value is None or isinstance(value, str | Path),
         "progress": isinstance(value, bool) or callable(value),
         "report": isinstance(value, bool),
@@ -184,9 +191,9 @@ def test_any_other_call_returns_or_is_refused(data: st.DataObject) -> None:
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @example(positional=[], call=CALLS[0])
 def test_any_positional_call_returns_or_is_refused(positional: list[object], call: Call) -> None:
-    if call.function in (Flights.fly, Flights.board, Flights.baseline):
+    if call.function in OF_FIXTURE:
         positional = [flights(), *(positional or [None])]
-    if call.function is fly:
+    if call.function in (fly, fly_swarm):
         positional = positional[:1]
     refused_in_one_line(lambda: call.function(*positional))
     assert not os.listdir(), os.listdir()
@@ -260,7 +267,7 @@ def test_numbers_of_numpy_count_as_numbers() -> None:
 
 
 def test_every_public_name_is_called_here() -> None:
-    called = {call.function for call in CALLS} | {LabError, Request, RigidBody, Run, column}
+    called = {call.function for call in CALLS} | {LabError, Request, RigidBody, Run, Swarm, column}
     assert {getattr(hil, name) for name in hil.__all__} <= called
 
 

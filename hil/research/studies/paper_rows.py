@@ -164,4 +164,10 @@ ROWS: Mapping[str, PaperRow] = {
 }  # fmt: skip
 
 # Not the paper's; 33 min of simulated flight, which `power` computes; flights for `floaty identify`.
-OUTSIDE = ("overload", "endurance", "figure-eight", *(experiment.name for experiment in IDENTIFICATION))
+OUTSIDE = (
+    "overload",
+    "endurance",
+    "figure-eight",
+    "formation",
+    *(experiment.name for experiment in IDENTIFICATION),
+)
