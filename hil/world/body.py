@@ -166,7 +166,7 @@ class Body(Motion, Protocol):
 
     @property
     def sensors(self) -> Mapping[str, OwnSensor]:
-        """The sensors of its own, whose samples own logic reads, by name."""
+        """The sensors that a user's robot declares, by name; own logic reads their samples."""
 
     @property
     def lost(self) -> str | None:

@@ -22,7 +22,7 @@ enum planted {
 };
 enum { ASSERTED = 1 };
 
-#ifdef USUAL_PLACES /* of FreeRTOS V10; without it others, which only debugging information tells */
+#ifdef USUAL_PLACES /* the layout of FreeRTOS V10; without it, one that only the debugging information describes */
 typedef struct xLIST_ITEM {
   uint32_t xItemValue;
   struct xLIST_ITEM *pxNext, *pxPrevious;

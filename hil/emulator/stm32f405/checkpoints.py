@@ -189,7 +189,7 @@ def _wait(pid: int, told: int, kept: set[int]) -> NoReturn:
 
 
 def _awaited(line: socket.socket, life: int) -> Message:
-    """Sleep until a message arrives; end when the first process has ended, or when told so."""
+    """Wait for a message; exit when the first process has ended, or when an empty message arrives."""
     inputs = select.poll()
     inputs.register(line, select.POLLIN)
     inputs.register(life, select.POLLIN)

@@ -1,8 +1,8 @@
 """A flight of several robots: laboratories that run in turn, `SLICE_US` at a time, on one clock.
 
 After each turn the robots feel one another (`hil.world.neighbours`) and hear what their boards have sent to one another, so
-the flight is the same whatever the machine does. A robot whose flight is over is out of the room. Each robot has a
-Crazyradio of its own to the ground station, and radios do not disturb one another.
+the flight is the same whatever the machine does. A robot whose flight is over is out of the room. Each robot has
+its own Crazyradio on the ground; the radios do not interfere.
 """
 
 from collections.abc import Callable

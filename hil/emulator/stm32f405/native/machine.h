@@ -194,7 +194,7 @@ struct calls {
 };
 
 struct activation { /* of a task, from its first instruction after a wait to the next wait */
-    uint64_t begin, end, cycles, task; /* `cycles`: of its own, without interrupts and sleep */
+    uint64_t begin, end, cycles, task; /* `cycles`: those it executed itself, without interrupts and sleep */
 };
 
 struct activity { /* the activation of a task that has not ended; `others`: totals of all at its begin */
