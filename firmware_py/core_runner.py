@@ -24,7 +24,7 @@ from firmware_py.export.methods import METHOD
 from firmware_py.export.native import build
 from firmware_py.export.usage import Usage
 from firmware_py.kept_code import kept_folder, report
-from firmware_py.logic.loading import Logic
+from firmware_py.logic.loading import Logic, sensed_by
 from firmware_py.logic.plugs import CALLS
 
 SOURCES = tuple(Path(package.__path__[0]) for package in (core, export))
@@ -80,10 +80,7 @@ class CoreBlocks:
         }  # fmt: skip
         self.named = core | own
         self.sensed: Mapping[str, F32s] = {}  # what own logic sees of the robot's own sensors, by name
-        self._fields = [
-            (own[field.block].memory[field.name], field.name)
-            for field in (() if logic is None else logic.sensed)
-        ]
+        self._fields = [(own[field.block].memory[field.name], field.name) for field in sensed_by(logic)]
         self.run: CoreRunner = runner(self)
 
     def entry(self, name: str) -> Callable[[], int]:

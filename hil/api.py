@@ -47,7 +47,6 @@ from hil.laboratory.swarms.flying import fly_swarm as fly_together
 from hil.laboratory.swarms.folder import swarm_folder, swarm_reserved
 from hil.laboratory.swarms.request import swarm_of
 from hil.laboratory.swarms.result import SwarmResult
-from hil.pictures.exports.coverage import write_coverage
 from hil.pictures.exports.demonstrations import Demonstrations, demonstrations_of
 from hil.world.rigid import RigidBody
 
@@ -122,8 +121,7 @@ def fly(
         run = Run(result)
         if report:
             run.write_report()
-    if request.bench.coverage is not None:
-        write_coverage(request.bench.coverage)
+    _write_coverage(request.bench.coverage)
     return run
 
 
@@ -148,9 +146,16 @@ def fly_swarm(
         swarm = Swarm(fly_together(request, place))
         if report:
             swarm.write_report()
-    if (coverage := options.get("coverage")) is not None:
-        write_coverage(coverage)
+    _write_coverage(options.get("coverage"))
     return swarm
+
+
+def _write_coverage(out: Path | None) -> None:
+    """Write the files of a flight's coverage, if it has one."""
+    if out is not None:
+        from hil.pictures.exports.coverage import write_coverage
+
+        write_coverage(out)
 
 
 def maker_of(request: Request) -> MakeFlight:

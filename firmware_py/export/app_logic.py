@@ -12,7 +12,7 @@ import numpy as np
 from firmware_py.config import LogicConfig
 from firmware_py.export.literals import literal
 from firmware_py.logic.budget import ARGUMENT, STRUCT
-from firmware_py.logic.loading import Logic, load_logic
+from firmware_py.logic.loading import Logic, load_logic, sensed_by
 from firmware_py.logic.plugs import ANSWERING, BLOCKS, CALLS, OWN, SENSED
 
 CALLS_HEADER = """\
@@ -51,8 +51,8 @@ static inline {result} call_{name}(void) {{
 """
 SENSORS = """\
 /* Reads the robot's own sensors, before each control step, 100 times a second. This file is yours: it is written once. A
- * field stays as it is until you set it, NAN at the start; set it to NAN when there is no sample. A step has 10 ms: do
- * not wait for a sensor here, but read it in a task of its own. */
+ * field stays as it is until you set it, NAN at the start; set it to NAN when there is no sample. Do not
+ * wait for a sensor here: a step takes at most 10 ms. Read slow sensors in a separate task. */
 #include <math.h>
 
 #include "floaty_calls.h"
@@ -86,7 +86,7 @@ def sensed_types(logic: Logic | None) -> dict[str, str]:
 def sensors_source(config: LogicConfig) -> str:
     """Return the C file in which the user reads sensors; empty when own logic has none."""
     logic = load_logic(config)
-    fields = {} if logic is None else {field.block: field.name for field in logic.sensed}
+    fields = {field.block: field.name for field in sensed_by(logic)}
     functions = (
         SENSE.format(name=_point(name), kind=kind, field=fields[name])
         for name, kind in sensed_types(logic).items()

@@ -71,15 +71,6 @@ class Logic:
     loaded: Loaded
     values: Mapping[str, float]  # of every parameter
 
-    @property
-    def sensed(self) -> Iterator[SensedField]:
-        """What its modules read of the robot's own sensors."""
-        for plug in self.loaded.plugs:
-            for field in plug.structs[SENSED].fields.values() if SENSED in plug.structs else ():
-                assert isinstance(field.mark, Sensed)
-                place = f"{_shown(self.loaded.files[plug.point.name])}:{field.line}"
-                yield SensedField(place, plug.block(SENSED), field.name, field.kind.shape, field.mark.unit)
-
     def overrun(self, blocks: Mapping[str, Block[Struct]]) -> str:
         """Return the first loop that exceeded the budget of its call, as one line; empty: none."""
         for plug in self.loaded.plugs:
@@ -93,7 +84,7 @@ class Logic:
     def allocate(self) -> dict[str, Block[Struct]]:
         """Return the memory, with the parameters in it; sensors have no sample yet."""
         blocks = {name: kind.allocate() for name, kind in self.loaded.structs.items()}
-        for field in self.sensed:
+        for field in sensed_by(self):
             blocks[field.block].memory[field.name] = nan
         for parameter in self.loaded.parameters:
             place = parameter.place
@@ -124,6 +115,16 @@ def load_logic(config: LogicConfig) -> Logic | None:
             raise LogicError(f"logic.{name} = {file}: {reason}{near}") from None
     loaded = _load(tuple(texts))
     return Logic(loaded, _values(config.values, loaded.parameters))
+
+
+def sensed_by(logic: Logic | None) -> Iterator[SensedField]:
+    """Yield what own logic reads of the robot's own sensors."""
+    for plug in () if logic is None else logic.loaded.plugs:
+        for field in plug.structs[SENSED].fields.values() if SENSED in plug.structs else ():
+            assert isinstance(field.mark, Sensed)
+            assert logic is not None
+            place = f"{_shown(logic.loaded.files[plug.point.name])}:{field.line}"
+            yield SensedField(place, plug.block(SENSED), field.name, field.kind.shape, field.mark.unit)
 
 
 def check_file(file: Path) -> Loaded:

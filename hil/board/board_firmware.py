@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +24,11 @@ from firmware_py.tasks import FlightTasks
 from firmware_py.wire.scalars import Scalar
 from hil.emulator.crazyflie.log_table import ImageParameter
 from hil.emulator.crazyflie.shockburst import syslink_us
-from hil.emulator.stm32f405.cpu_profile import CpuProfile
 from hil.world.body import Carrier
 from hil.world.servos import OUTPUTS
+
+if TYPE_CHECKING:
+    from hil.emulator.stm32f405.cpu_profile import CpuProfile
 
 # (us, event, who, a, b), in the words of tests/vectors/README.md
 Trace = Callable[[int, str, str, int, int], None]

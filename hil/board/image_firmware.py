@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from math import nan, radians
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from firmware_py.board import ImuCounts
 from firmware_py.config import FirmwareConfig, parameters_of
 from firmware_py.export.elf import ERASED, FLASH, read
-from firmware_py.logic.loading import Logic, load_logic
+from firmware_py.logic.loading import Logic, SensedField, load_logic, sensed_by
 from firmware_py.rtos import TaskReport
 from firmware_py.signals import CONTROL, ESTIMATOR, INPUT, Signals
 from firmware_py.wire.supervisor import LOCKED, Cause, State
@@ -33,12 +33,14 @@ from hil.emulator.crazyflie.crazyflie import Crazyflie
 from hil.emulator.crazyflie.log_table import ImageVariable, log_numbers, log_table, parameter_table
 from hil.emulator.crazyflie.release_file import is_release, released_firmware
 from hil.emulator.stm32f405.chip import SOFTWARE, WATCHDOG, build_machine
-from hil.emulator.stm32f405.cpu_profile import CpuProfile, Reader, functions_of
 from hil.emulator.stm32f405.gdb import GdbServer
 from hil.emulator.stm32f405.image import Image
 from hil.errors import LabError
 from hil.world.body import Carrier
 from hil.world.servos import OUTPUTS
+
+if TYPE_CHECKING:
+    from hil.emulator.stm32f405.cpu_profile import CpuProfile
 
 # The stock firmware's self-test and gyro calibration take 3.06 s. The rest gives the app's estimator the phase that ours
 # has, 2 to 3 ms after a camera pose: a real one has any phase.
@@ -110,6 +112,15 @@ def stock_signals(table: Mapping[str, ImageVariable]) -> Signals:
     return Signals(estimate, NO_COUNTS, NO_FLOATS, NO_FLOATS, motors, supervisor)
 
 
+def read_image(path: Path, elf: Path | None) -> tuple[Image, list[str]]:
+    """Return the image of a file, or that of a release's zip, and what was taken. Raises `LabError` and `ExportError`."""
+    content = read(path)
+    if not is_release(path, content):
+        return Image(path, elf, content), []
+    taken = released_firmware(path, content)
+    return Image(path / taken.name, elf, taken.content), [taken.note]
+
+
 @dataclass(frozen=True, slots=True)
 class ChipImage:
     """The flashed image and the compiled machine that executes it."""
@@ -127,11 +138,8 @@ class ChipImage:
     @classmethod
     def load(cls, path: Path, elf: Path | None, debugger: GdbServer | None = None) -> ChipImage:
         """Read an image, or that of a release's zip, and compile the machine. Raises `LabError` and `ExportError`."""
-        content, shown, notes = read(path), path, []
-        if is_release(path, content):
-            taken = released_firmware(path, content)
-            content, shown, notes = taken.content, path / taken.name, [taken.note]
-        return cls.flashed(Image(shown, elf, content), build_machine(), debugger, notes)
+        image, notes = read_image(path, elf)
+        return cls.flashed(image, build_machine(), debugger, notes)
 
     @classmethod
     def flashed(
@@ -195,25 +203,15 @@ class ImageFirmware:
         if flashed.is_recorded or flashed.is_profiled:
             self.chip.record()
         if flashed.is_profiled:
+            from hil.emulator.stm32f405.cpu_profile import functions_of
+
             self.chip.profile([(one.address, one.address + one.size) for one in functions_of(self.image)])
         self._board = board
         self._table = {variable.name: variable for variable in log_table(self.image, self.chip)}
         self.variables = [one for name, one in self._table.items() if name.startswith("excite.")]
         self.log_numbers = log_numbers(self.image, self.chip)
         self.parameters = parameter_table(self.image, self.chip)
-        self._sensed = (
-            [
-                (
-                    self._struct(f"floaty_{field.block}", logic.loaded.structs[field.block].dtype)[
-                        field.name
-                    ],
-                    field.name,
-                )
-                for field in logic.sensed
-            ]
-            if logic is not None
-            else []
-        )
+        self._sensed = [(self._sensed_field(logic, field), field.name) for field in sensed_by(logic)]
         self._app = self._signals_of_app() if self.image.has("floaty_estimator") else None
         if rest is not None:
             for now_us in range(IMU_PERIOD_US, WARM_UP_US + 1, IMU_PERIOD_US):
@@ -237,6 +235,8 @@ class ImageFirmware:
         return self.chip.passages
 
     def cpu_profile(self) -> CpuProfile:
+        from hil.emulator.stm32f405.cpu_profile import Reader
+
         return Reader(self.image, self.chip, self.kernel.task_names, self.kernel.ahead_us).read()
 
     def differences(self, config: FirmwareConfig) -> str:
@@ -252,8 +252,7 @@ class ImageFirmware:
         own = bool(config.logic.controller or config.logic.estimator)
         if own != self.image.has(OWN_LOGIC):
             found.append("control law, the profile has " + ("one of the user's" if own else "the core's"))
-        logic = load_logic(config.logic)
-        for block in sorted({field.block for field in (() if logic is None else logic.sensed)}):
+        for block in sorted({field.block for field in sensed_by(load_logic(config.logic))}):
             if not self.image.has(f"floaty_{block}"):
                 found.append(f"own sensors, the image has no floaty_{block}")
         return "; ".join(found)
@@ -327,6 +326,11 @@ class ImageFirmware:
         supervisor = ChipSupervisor(self._table if self.image.has("floaty_supervisor") else {})
         memories = self._struct("floaty_estimator", ESTIMATOR), self._struct("floaty_control", CONTROL)
         return Signals.of(*memories, supervisor)
+
+    def _sensed_field(self, logic: Logic | None, field: SensedField) -> NDArray[Any]:
+        """Return a view on what the app's law reads of a sensor."""
+        assert logic is not None
+        return self._struct(f"floaty_{field.block}", logic.loaded.structs[field.block].dtype)[field.name]
 
     def _struct(self, name: str, layout: np.dtype[Any]) -> NDArray[Any]:
         """Return a view on a struct of the core, (1,); zeros for an image without the app."""

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from firmware_py.core.subset import F32s, f32
-from firmware_py.logic.loading import Logic
+from firmware_py.logic.loading import Logic, sensed_by
 from hil.board.config import SensorConfig
 from hil.emulator.events import EventQueue
 from hil.errors import LabError, hint
@@ -37,7 +37,7 @@ class OwnSensors:
 
     def check(self, logic: Logic | None) -> None:
         """Raise `LabError` for what own logic reads and the robot does not measure in that shape and unit."""
-        for field in () if logic is None else logic.sensed:
+        for field in sensed_by(logic):
             sensor = self._sensors.get(field.name)
             if sensor is None:
                 raise LabError(f"{field.place}: sensed.{field.name}: {_there(field.name, self._sensors)}")

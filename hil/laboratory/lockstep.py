@@ -35,8 +35,6 @@ from hil.emulator.stm32f405.gdb import GdbServer
 from hil.emulator.stm32f405.image import has_symbols
 from hil.errors import LabError, refusing
 from hil.laboratory.channels import radio_channel, serial_channel, tracker_channel
-from hil.laboratory.files.coverage import check_coverage
-from hil.laboratory.files.cpu_profile import check_profile_place
 from hil.laboratory.files.recorder import SETTINGS
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import Laboratory
@@ -238,8 +236,12 @@ def image_of(bench: Bench, debugger: GdbServer | None = None) -> ChipImage:
     """Return the image of a flight. Raises `LabError` if it cannot run here, or its coverage has no place."""
     image = image_at(bench.board, bench.elf, debugger)
     if bench.coverage is not None:
+        from hil.laboratory.files.coverage import check_coverage
+
         check_coverage(bench.coverage, image.image.sha256)
     if bench.profile_cpu is not None:
+        from hil.laboratory.files.cpu_profile import check_profile_place
+
         check_profile_place(bench.profile_cpu)
     return replace(image, is_recorded=bench.coverage is not None, is_profiled=bench.profile_cpu is not None)
 

@@ -18,8 +18,6 @@ from ground_station.telemetry_log import TELEMETRY
 from hil.board.clock import Pace
 from hil.config import check_logic
 from hil.laboratory.files.ages import with_goals_sent
-from hil.laboratory.files.coverage import Executed, add_executed
-from hil.laboratory.files.cpu_profile import write_profile
 from hil.laboratory.files.folder import replacing_older
 from hil.laboratory.files.recorder import Observer, Recorder, load_log
 from hil.laboratory.files.result import (
@@ -155,9 +153,13 @@ class Started:
         write_result(result)
         bench = request.bench
         if bench.coverage is not None and firmware.flashed is not None and result.image is not None:
+            from hil.laboratory.files.coverage import Executed, add_executed
+
             flown = Executed(result.image.sha256, 1, firmware.flashed.passages, bench.board, bench.elf)
             add_executed(bench.coverage, flown)
         if bench.profile_cpu is not None and firmware.flashed is not None and result.image is not None:
+            from hil.laboratory.files.cpu_profile import write_profile
+
             write_profile(bench.profile_cpu, folder, firmware.flashed.cpu_profile(), result.image)
         return result
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.export.cycles import is_wide
-from firmware_py.export.elf import FLASH
+from firmware_py.export.elf import FLASH, FLASH_SIZE
 from hil.emulator.stm32f405.debug_info import LineRow
 from hil.emulator.stm32f405.image import Image
 from hil.errors import LabError
@@ -88,7 +88,7 @@ class ImageLines:
         """Yield name, address and last line of every function with lines, once per address, with its first row."""
         known = {one.address: one for one in reversed(self._image.functions)}
         places = sorted(known.values(), key=lambda one: one.address)
-        ends = [one.address for one in places[1:]] + [FLASH + 2**20]
+        ends = [one.address for one in places[1:]] + [FLASH + FLASH_SIZE]
         for one, following in zip(places, ends, strict=True):
             at = bisect_left(self.rows, one.address, key=attrgetter("begin"))
             row = self.rows[at] if at < len(self.rows) else None
@@ -163,7 +163,7 @@ def _is_conditional(code: int, second: int) -> bool:
 
 
 def _jumps(code: int, second: int) -> bool:
-    """Return whether an instruction without a condition of its own jumps: B, BX, BL, BLX, or a POP or load of pc."""
+    """Return whether an unconditional instruction is a jump: B, BX, BL, BLX, or a POP or load into pc."""
     if code >> 11 == 0b11110:
         return second & 0x9000 == 0x9000
     if code & 0xFE50 == 0xE810:  # LDM, POP

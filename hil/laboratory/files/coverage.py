@@ -49,7 +49,7 @@ def check_coverage(out: Path, image: str) -> None:
     if not base_of(out).name or out.is_dir():
         raise LabError(f"{OPTION} {out}: a folder; expected the name of a file, with or without {INFO}")
     if counts.exists() and counts.stat().st_size:  # empty: a process was killed while it made it
-        _check_image(out, image, read_executed(out))
+        check_image(out, image, read_executed(out))
     elif info.exists():
         raise LabError(f"{OPTION} {out}: {info} exists without its {counts.name}: choose another name")
     made_folder(OPTION, out.parent)
@@ -73,7 +73,7 @@ def add_executed(out: Path, flown: Executed) -> None:
         if file.seek(0, 2):
             file.seek(0)
             before = _read(path, file)
-            _check_image(out, flown.image, before)
+            check_image(out, flown.image, before)
             flights, counts = before.flights + flights, before.counts + counts
         places = np.flatnonzero(counts.any(axis=1)).astype(np.uint32)
         with replacing(path) as partial, partial.open("wb") as written:
@@ -92,7 +92,8 @@ def _read(path: Path, file: IO[bytes]) -> Executed:
         return Executed(str(kept["image"]), flights, counts, board, Path(elf) if elf else None)
 
 
-def _check_image(out: Path, image: str, before: Executed) -> None:
+def check_image(out: Path, image: str, before: Executed) -> None:
+    """Raise `LabError` when the sums of OUT are those of another image."""
     if before.image != image:
         raise LabError(
             f"{OPTION} {out}: has the coverage of another image ({before.image[:12]}…, this one is {image[:12]}…): "

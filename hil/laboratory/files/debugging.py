@@ -3,10 +3,9 @@
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
-from hashlib import sha256
 from pathlib import Path
 
-from hil.emulator.stm32f405.image import Image
+from hil.board.image_firmware import read_image
 from hil.errors import LabError, reading
 from hil.laboratory.files.recorder import load_events
 from hil.laboratory.files.result import Result
@@ -28,7 +27,7 @@ def debugged_request(result: Result) -> Request:
         )
     request.experiment.check_known()
     with reading(Path(bench.board)):
-        now = sha256(Image(Path(bench.board), bench.elf).code).hexdigest()
+        now = read_image(Path(bench.board), bench.elf)[0].sha256
     if result.image is not None and result.image.sha256 != now:
         raise LabError(f"{bench.board}: another image than the one that flew in {folder}: fly it again")
     return replace(request, bench=replace(bench, gdb=0))

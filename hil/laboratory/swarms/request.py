@@ -85,8 +85,8 @@ def places_of(swarm: SwarmConfig, count: int) -> list[Place]:
                 f"swarm.places: {len(swarm.places)} places, expected one for each of {count} robots"
             )
         return list(swarm.places[:count])
-    places = []
-    for number in range(1, count + 1):
+    places = [(0.0, 0.0, 0.0)]
+    for number in range(2, count + 1):
         behind = swarm.spacing * (number // 2)
         places.append((-behind, behind if number % 2 == 0 else -behind, 0.0))
-    return [(0.0, 0.0, 0.0), *places[1:]]
+    return places

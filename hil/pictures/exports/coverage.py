@@ -8,10 +8,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from firmware_py.errors import FirmwareError
+from hil.board.image_firmware import read_image
 from hil.emulator.stm32f405.coverage import FileCoverage, FunctionCoverage, ImageLines
 from hil.emulator.stm32f405.image import Image
 from hil.errors import refusing, writing
-from hil.laboratory.files.coverage import INFO, OPTION, PAGE, check_coverage, file_of, read_executed
+from hil.laboratory.files.coverage import (
+    INFO,
+    OPTION,
+    PAGE,
+    check_coverage,
+    check_image,
+    file_of,
+    read_executed,
+)
 from hil.laboratory.files.whole_files import write_whole
 from hil.pictures.pages import write_page
 
@@ -82,16 +91,17 @@ def check_image_coverage(out: Path, board: str, elf: Path | None) -> None:
 
 def _image(board: str, elf: Path | None) -> Image:
     with refusing(f"--board {board}: ", FirmwareError):
-        return Image(Path(board), elf)
+        return read_image(Path(board), elf)[0]
 
 
 def write_coverage(out: Path) -> tuple[Shares, Path, Path]:
     """Write tracefile and page of what was added to OUT; return the totals and both paths. Raises `LabError`."""
     executed = read_executed(out)
     image = _image(executed.board, executed.elf)
-    check_coverage(out, image.sha256)
+    check_image(out, image.sha256, executed)
     roots = [Path.cwd(), *(executed.elf or image.path).parents[:3]]
     files = ImageLines(image).coverage(executed.counts)
+    total = Shares.of(files)
     sources = {file.path: source_of(file, roots) for file in files}
     info, page = file_of(out, INFO), file_of(out, PAGE)
     with writing(OPTION, out):
@@ -104,10 +114,10 @@ def write_coverage(out: Path) -> tuple[Shares, Path, Path]:
             folders.setdefault(str(Path(one.path).parent), []).append(one)
         write_page(
             page, "coverage.html.j2", image=image.path.name, digest=executed.image, flights=executed.flights,
-            total=Shares.of(files), shared=shared,
+            total=total, shared=shared,
             folders=[(name, Shares.of(one.file for one in inside), inside) for name, inside in folders.items()],
         )  # fmt: skip
-    return Shares.of(files), info, page
+    return total, info, page
 
 
 def tracefile(
