@@ -19,7 +19,10 @@ class Clock(Protocol):
     """Waits until the time of a simulated event."""
 
     paced: bool
-    stood_still_us: int  # total pause of simulated time because the machine was too slow
+
+    @property
+    def stood_still_us(self) -> int:
+        """The total pause of simulated time because the machine was too slow."""
 
     def start(self, now_us: int) -> None:
         """Start the clock at the simulated instant."""
@@ -67,6 +70,9 @@ class Paced:
     outside clients would otherwise get a burst of past data, and a line reports the pause. Time starts at a multiple of
     `STALL_US` of the wall clock and stalls for multiples of it, so that cameras in several processes expose together.
     `readers` are called with the time when their socket or file descriptor is readable.
+
+    Clocks of several processes stand still together: each writes its total to its own place in the shared `pauses` and
+    waits until it has paused as long as the one that paused longest.
     """
 
     paced = True
@@ -75,8 +81,8 @@ class Paced:
     STALL_US = 20_000
     NOTICE_PERIOD_US = 1_000_000  # of simulated time between lines
 
-    def __init__(self) -> None:
-        self.stood_still_us = 0
+    def __init__(self, pauses: "memoryview[int] | None" = None, index: int = 0) -> None:
+        self._pauses, self._index = memoryview(bytearray(8)).cast("q") if pauses is None else pauses, index
         self.readers: Readers = {}
         self._readable: list[socket.socket | int] = []
         self._served_us = 0  # the latest instant
@@ -88,6 +94,11 @@ class Paced:
         self._served_us = now_us
         multiple_ns = self.STALL_US * 1000
         self._start_ns = -((now_us * 1000 - time.monotonic_ns()) // multiple_ns) * multiple_ns
+
+    @property
+    def stood_still_us(self) -> int:
+        """The total pause of simulated time because the machine was too slow."""
+        return self._pauses[self._index]
 
     def shift(self, by_us: int) -> None:
         """Shift simulated time on the wall clock, later if positive."""
@@ -117,12 +128,13 @@ class Paced:
         if self._start_ns is None:
             self.start(now_us)
         late_us = self.late_us(now_us)
-        if late_us > self.STALL_US:
-            stalled_us = late_us // self.STALL_US * self.STALL_US
-            self.shift(stalled_us)
-            self.stood_still_us += stalled_us
-            late_us -= stalled_us
-        return max(0, -late_us)
+        pause_us = max(self._pauses) - self.stood_still_us
+        if late_us - pause_us > self.STALL_US:
+            pause_us += (late_us - pause_us) // self.STALL_US * self.STALL_US
+        if pause_us:
+            self.shift(pause_us)
+            self._pauses[self._index] += pause_us
+        return max(0, pause_us - late_us)
 
     def wait_until(self, now_us: int) -> int:
         """Sleep until the wall clock reaches the time, or a reader has input."""

@@ -146,7 +146,7 @@ def serve(asked: ServeOptions) -> int:
     say = records.say
     with closing(Swarm(plan, asked.boards, endpoints, say)) as swarm:
         view = common.open_live(asked.target, say)
-        with closing(Server(plan, say, view, swarm.to_peers)) as server:
+        with closing(Server(plan, say, view, swarm.to_peers, swarm.room)) as server:
             code = _run(server, swarm, endpoints, view, say, asked)
     say(f"stopped; time stood still for {server.clock.stood_still_us / 1000:.0f} ms")
     return code or (INCOMPLETE if records.incomplete else 0)

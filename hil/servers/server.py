@@ -32,6 +32,7 @@ from hil.servers.holder import LaunchClamp
 from hil.servers.motive import Streaming, VirtualMotive
 from hil.servers.serial_server import Address
 from hil.servers.served_robot import ServedRobot
+from hil.servers.shared_room import SharedRoom
 from hil.world.body import Channel
 
 BUTTON_US = 5_000_000  # off, or in the bootloader without a client: then the button is pressed
@@ -127,7 +128,8 @@ class Service:
 class Server:
     """Releases a robot when it flies and puts it back when it is lost; serve it to clients, then `run`.
 
-    `say` gets lines for the user, `observer` sees the robot, `to_peers` gets the board's packets to those of other robots.
+    `say` gets lines for the user, `observer` sees the robot, `to_peers` gets the board's packets to those of other robots,
+    with which it shares `room`.
     """
 
     def __init__(
@@ -136,12 +138,14 @@ class Server:
         say: Callable[[str], None],
         observer: Observer | None = None,
         to_peers: ToPeers = lambda *_: None,
+        room: SharedRoom | None = None,
     ) -> None:
         number, config = plan.number, plan.config
         config = config.model_copy(update={"flight": config.flight.beside(number)})
         if plan.mavlink:
             config = with_system(config, config.mavlink.system + number - 1)
-        self.clock = Paced()
+        room = room or SharedRoom(config)
+        self.clock = Paced(room.pauses, number - 1)
         self.lab = Laboratory(self.clock)
         self.number = number
         self._plan, self._say, self._observer = plan, say, observer
@@ -151,6 +155,7 @@ class Server:
         self.served = ServedRobot(number, site, say, plan.mavlink, plan.state, self._fail, to_peers)
         robot = self.robot = self.served.robot
         self.lab.add(robot)
+        room.join(number, robot)
         self.switchboard = Switchboard(robot)
         self._clamp = LaunchClamp(robot, self._let_go)
         robot.watch(0)
@@ -184,8 +189,8 @@ class Server:
         """Run until `stopping` returns true; may be called again."""
 
         def progress(now_us: int) -> None:
-            for line in self.clock.notices():
-                self._say(line if self.number == 1 else f"board {self.number}: {line}")
+            for line in self.clock.notices() if self.number == 1 else ():  # all clocks stand still together
+                self._say(line)
             if stopping():
                 self.lab.stop()
 

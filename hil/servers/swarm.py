@@ -1,8 +1,9 @@
 """Robots 2, 3, ... of `floaty serve --boards N`: each runs in a separate process, forked from that of robot 1.
 
-Each process opens its robot's connections. A pipe to robot 1's process carries what all share: where clients find the
-robot, lines for the user, poses for Motive, packets between boards, and typed lines. A message is the name of a call and
-its arguments. A robot whose process ends is reported; the others continue.
+Each process opens its robot's connections. A pipe to robot 1's process carries where clients find the robot, lines for the
+user, poses for Motive, packets between boards, and typed lines. A message is the name of a call and its arguments. Where the
+robots are, and how long time stood still, is in memory that they share (`SharedRoom`). A robot whose process ends is
+reported; the others continue.
 """
 
 import multiprocessing
@@ -19,6 +20,7 @@ from hil.errors import LabError
 from hil.servers.live_faults import LiveFaults
 from hil.servers.motive import VirtualMotive
 from hil.servers.server import Endpoints, OpenEndpoints, Server, Service, show
+from hil.servers.shared_room import SharedRoom
 
 FORK = multiprocessing.get_context("fork")  # a robot starts in 0.1 s with what is loaded already
 END_TIMEOUT_S = 10.0  # for a process to end in order
@@ -33,6 +35,7 @@ class Swarm:
         self._processes: dict[int, multiprocessing.process.BaseProcess] = {}
         self._opened: dict[int, OpenEndpoints] = {}
         self._say = say
+        self.room = SharedRoom(plan.config, count)
         self._calls: dict[str, Call] = {"say": say, "opened": self._opened.__setitem__, "fail": _fail}
         for number in range(2, count + 1):
             near, far = FORK.Pipe()
@@ -67,6 +70,7 @@ class Swarm:
                 del server.clock.readers[self._pipes[number].fileno()]
                 self._pipes.pop(number).close()
                 self._processes[number].kill()
+                self.room.leave(number)
                 if motive is not None:
                     motive.lose(number)
 
@@ -129,7 +133,7 @@ class Swarm:
             other.close()
         with suppress(BrokenPipeError):
             try:
-                _serve_apart(plan, endpoints, pipe)
+                _serve_apart(plan, endpoints, pipe, self.room)
             except LabError as error:
                 pipe.send(("fail", (str(error),)))
 
@@ -138,7 +142,7 @@ def _fail(text: str) -> None:
     raise LabError(text)
 
 
-def _serve_apart(plan: Service, endpoints: Endpoints, pipe: Connection) -> None:
+def _serve_apart(plan: Service, endpoints: Endpoints, pipe: Connection, room: SharedRoom) -> None:
     def calling(name: str) -> Call:
         return lambda *arguments: pipe.send((name, arguments))
 
@@ -154,7 +158,7 @@ def _serve_apart(plan: Service, endpoints: Endpoints, pipe: Connection) -> None:
         del server.clock.readers[pipe.fileno()]
 
     ended: list[int] = []
-    server = Server(plan, calling("say"), None, partial(calling("hear"), plan.number))
+    server = Server(plan, calling("say"), None, partial(calling("hear"), plan.number), room)
     faults = LiveFaults(server, calling("answer"))
     calls: dict[str, Call] = {
         "type": lambda line: faults.take(line, server.lab.now_us),

@@ -10,17 +10,17 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
-from firmware_py.compiling import bound
-from firmware_py.core.subset import i32
+import numpy as np
+
 from ground_station.errors import LinkError
 from hil.errors import refusing
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import ModelledLine, executor_of, lockstep_flight
 from hil.laboratory.request import Request
 from hil.laboratory.run import Started
+from hil.laboratory.swarms.neighbourhood import ABSENT, Neighbourhood, row_of
 from hil.laboratory.swarms.request import SwarmRequest
 from hil.laboratory.swarms.result import Nearest, SwarmResult, folder_name, write_swarm
-from hil.world.neighbours import Neighbours, interact
 
 SLICE_US = 2_000  # a contact of 150 N/m with 30 g turns within 40 ms
 SHOWN_US = 250_000
@@ -34,13 +34,7 @@ class Crowd:
         self._started, self._flights = started, [one.flight for one in started]
         self._origins = request.origins
         self._packets: list[tuple[int, bytes]] = []  # index of the sender, packet
-        near, config = Neighbours.allocate(), request.config
-        self._interact, self._near = bound(interact, near), near.fields
-        self._near.count = i32(len(started))
-        for name in ("radius", "stiffness", "damping", "wake_radius", "wake_spread"):
-            setattr(self._near, name, getattr(config, name))
-        self._near.wake = config.wake if request.still_air else 0.0
-        self._affected = [False] * len(started)  # by a wake or a contact
+        self._neighbourhood = Neighbourhood(request.config, len(started), request.still_air)
         for index, flight in enumerate(self._flights):
             _line(flight).join(partial(self._take, index))
 
@@ -49,42 +43,23 @@ class Crowd:
 
     def exchange(self, now_us: int) -> None:
         """Let the robots act on one another at an instant that all of them have reached."""
-        near = self._near
-        for i, (flight, origin) in enumerate(zip(self._flights, self._origins, strict=True)):
-            body, near.flies[i] = flight.robot.body, 0.0 if self._started[i].over else 1.0
-            if near.flies[i]:
-                body.advance(now_us)
-                w, x, y, z = body.q_WB.tolist()
-                lift = body.lift
-                near.p_WB[i] = body.p_WB + origin
-                near.v_WB[i] = body.state[3:6]
-                near.lift_W[i] = (
-                    lift * 2.0 * (x * z + w * y),
-                    lift * 2.0 * (y * z - w * x),
-                    lift * (1.0 - 2.0 * (x * x + y * y)),
-                )
-        self._interact()
-        self._apply()
+        rows = [
+            ABSENT if one.over else row_of(one.flight.robot, now_us, origin)
+            for one, origin in zip(self._started, self._origins, strict=True)
+        ]
+        self._neighbourhood.interact(np.array(rows))
+        for index, flight in enumerate(self._flights):
+            self._neighbourhood.act_on(index, flight.robot)
         self._deliver(now_us)
         if all(flight.robot.free for flight in self._flights):
             self._note_distance(now_us)
 
     def _note_distance(self, now_us: int) -> None:
-        near = self._near
+        near = self._neighbourhood.near
         if self.nearest is None or near.least < self.nearest.distance:
             robots = (int(near.one) + 1, int(near.other) + 1)
             since_s = 1e-6 * (now_us - self._flights[0].release_us)
             self.nearest = Nearest(float(near.least), robots, since_s)
-
-    def _apply(self) -> None:
-        near = self._near
-        wakes, touches = near.wake_W.tolist(), near.touch_W.tolist()
-        for i, flight in enumerate(self._flights):
-            affected = any(wakes[i]) or any(touches[i])
-            if affected or self._affected[i]:
-                flight.robot.body.tunnel.set_wake(*wakes[i])
-                flight.robot.touch(touches[i])
-            self._affected[i] = affected
 
     def _deliver(self, now_us: int) -> None:
         """Let all boards hear what the others have sent."""

@@ -7,12 +7,14 @@ from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from firmware_py.firmware import Firmware
 from hil.board.board_firmware import PowerOn, PythonBoard
 from hil.config import load_config
 from hil.emulator.crazyflie import syslink
+from hil.laboratory.faults import parse
 from hil.servers.dongle_plugin import CONTROL, VARIABLE, WRITE, Connection, frame
 from hil.servers.dongle_server import AHEAD
 from hil.servers.server import Endpoints, Server, Service
@@ -207,3 +209,23 @@ def test_a_peer_packet_of_one_board_reaches_those_of_all_other_processes() -> No
                     server.run(lambda expected=expected: expected <= set(said))
     heard = [line for line in said if "peer says" in line]
     assert len(heard) == 6
+
+
+@pytest.mark.parametrize("radius", [0.07, 0.0])
+def test_robots_of_several_processes_that_touch_push_each_other_apart(radius: float) -> None:
+    settings = ("flight.spacing=0.1", f"swarm.radius={radius}")
+    standing = [parse(f"motor.stop.{motor}@0") for motor in (1, 2, 3, 4)]
+    plan, endpoints = Service(load_config("crazyflie", settings), faults=standing), Endpoints(udp=0)
+    said: list[str] = []
+    with closing(Swarm(plan, 3, endpoints, said.append)) as swarm:
+        swarm.wait()
+        with closing(Server(plan, said.append, None, swarm.to_peers, swarm.room)) as server:
+            swarm.listen(server, said.append, None)
+            server.run(lambda: swarm.room.rows[:, 0].all() and server.lab.now_us > 500_000)
+            y = np.sort(swarm.room.rows[:, 2])
+            if radius == 0.0:
+                assert y == pytest.approx((-0.1, 0.0, 0.1), abs=1e-3)
+            else:
+                assert np.diff(y).min() > 0.13
+            swarm.room.leave(2)
+            assert not swarm.room.rows[1].any()

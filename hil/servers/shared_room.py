@@ -1,0 +1,39 @@
+"""What the processes of served robots share: memory in which each robot has a row and a total of its pauses.
+
+So the robots of `floaty serve --boards N` feel one another, and time stands still for all of them together.
+"""
+
+from mmap import mmap
+
+import numpy as np
+
+from hil.config import LabConfig
+from hil.laboratory.robot import Robot
+from hil.laboratory.swarms.neighbourhood import ABSENT, ROW, Neighbourhood, row_of
+
+PERIOD_US = 4_000  # a contact of 150 N/m with 30 g turns within 40 ms
+
+
+class SharedRoom:
+    """The room of `count` robots, made before their processes are forked. Each process writes to its own row only."""
+
+    def __init__(self, config: LabConfig, count: int = 1) -> None:
+        self.pauses = memoryview(mmap(-1, 8 * count)).cast("q")  # [us] of each clock
+        self.rows = np.frombuffer(mmap(-1, 8 * count * ROW)).reshape(count, ROW)
+        self._neighbourhood = Neighbourhood(config.swarm, count, config.tunnel.fan_factor == 0.0)
+
+    def join(self, number: int, robot: Robot) -> None:
+        """Let robot `number` of this process act on the others, and feel them, while it is free."""
+
+        def exchange(now_us: int) -> None:
+            self.rows[index] = row_of(robot, now_us) if robot.free else ABSENT
+            self._neighbourhood.interact(self.rows)
+            self._neighbourhood.act_on(index, robot)
+
+        index = number - 1
+        if len(self.rows) > 1:
+            robot.events.every(PERIOD_US, PERIOD_US, exchange)
+
+    def leave(self, number: int) -> None:
+        """Take a robot out whose process has ended."""
+        self.rows[number - 1] = ABSENT
