@@ -40,9 +40,7 @@ SEEDS_MAX = 10_000
     help="Fly N robots together in lockstep, with seeds from --seed on, places and limits of [swarm] in the profile. "
     "EXPERIMENT may then be a folder with a trajectory (.csv) for each.",
 )  # fmt: skip
-@click.option(
-    "--duration", "duration_s", type=float, metavar="S", help="Free flight [s]; default: the experiment's."
-)
+@common.duration_option
 @common.profile_options
 @common.fault_option
 @click.option("--realtime", is_flag=True, help="Pace the flight to the wall clock.")
