@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
@@ -402,21 +402,17 @@ def command_of(request: Request) -> str | None:
     experiment = request.experiment
     if not experiment.is_known or find_again(experiment.name, experiment.source) != experiment:
         return None
-    words = ["floaty", "fly", experiment.reference, "--seed", str(request.seed)]
-    words += ["--duration", repr(request.duration_s)] if request.duration_s != experiment.duration_s else []
-    words += ["--profile", request.profile] if request.profile != DEFAULT_PROFILE else []
-    words += _options("--set", request.overrides[len(experiment.settings) :])
-    words += _options("--fault", request.faults[len(experiment.faults) :])
     bench = request.bench
-    words += ["--link", bench.link] if bench.link != RADIO else []
-    words += ["--board", bench.board] if bench.board != C else []
-    words += ["--elf", str(bench.elf)] if bench.elf is not None else []
-    words += [f"--hil={bench.in_loop}"] if bench.in_loop else []
-    return shlex.join(words)
-
-
-def _options(name: str, values: Iterable[str]) -> list[str]:
-    return [word for value in values for word in (name, value)]
+    options = [  # with the usual values
+        ("--seed", request.seed, None), ("--duration", request.duration_s, experiment.duration_s),
+        ("--profile", request.profile, DEFAULT_PROFILE),
+        *(("--set", one, None) for one in request.overrides[len(experiment.settings) :]),
+        *(("--fault", one, None) for one in request.faults[len(experiment.faults) :]),
+        ("--link", bench.link, RADIO), ("--board", bench.board, C), ("--elf", bench.elf, None),
+        ("--hil", bench.in_loop, None),
+    ]  # fmt: skip
+    words = [word for name, value, usual in options if value != usual for word in (name, str(value))]
+    return shlex.join(["floaty", "fly", experiment.reference, *words])
 
 
 def _shown(request: Request) -> Progress:

@@ -86,10 +86,9 @@ class Bench:
             raise LabError(f"--elf {self.elf}: goes with an image as --board, not with {self.board}")
         if self.gdb is not None and not self.is_image:
             raise LabError(f"--gdb {self.gdb}: needs one flight with an image as --board")
-        if self.coverage is not None and not self.is_image:
-            raise LabError(f"--coverage {self.coverage}: needs an image as --board, not {self.board}")
-        if self.profile_cpu is not None and not self.is_image:
-            raise LabError(f"--profile-cpu {self.profile_cpu}: needs an image as --board, not {self.board}")
+        for name, out in (("coverage", self.coverage), ("profile-cpu", self.profile_cpu)):
+            if out is not None and not self.is_image:
+                raise LabError(f"--{name} {out}: needs an image as --board, not {self.board}")
         if self.in_loop and not (is_link(self.board) and self.link == RADIO):
             raise LabError(
                 f"--hil: --board {self.board} --link {self.link}: expected the link to a real board as --board"
@@ -182,23 +181,17 @@ class Request:
         trajectory, duration_s = options.get("trajectory"), options.get("duration_s")
         if trajectory is not None:
             experiment = dataclasses.replace(experiment, trajectory=trajectory)
-        profile, overrides = (
-            options.get("profile", DEFAULT_PROFILE),
-            settings_of(options.get("overrides", ())),
-        )
-        faults = options.get("faults", ())
-        if _has_unknown(faults):
-            digest_of_body(read_config(profile, (*experiment.settings, *overrides)))
-        bench: Mapping[str, Any] = {name: value for name, value in options.items() if name in _OF_BENCH}
+        bench: Any = {name: value for name, value in options.items() if name in Bench.__dataclass_fields__}
         request = cls(
             experiment,
-            profile,
-            (*experiment.settings, *overrides),
+            options.get("profile", DEFAULT_PROFILE),
+            (*experiment.settings, *settings_of(options.get("overrides", ()))),
             options.get("seed", 1),
             experiment.duration_s if duration_s is None else duration_s,
-            tuple(map(str, (*experiment.faults, *_parsed(faults)))),
+            tuple(map(str, (*experiment.faults, *options.get("faults", ())))),
             Bench(**bench),
         )
+        request = dataclasses.replace(request, faults=tuple(map(str, request.planned_faults)))
         request.check()
         return request
 
@@ -246,9 +239,9 @@ class Request:
     @cached_property
     def planned_faults(self) -> tuple[Fault, ...]:
         """The faults of the flight; the file of the user's own robot may declare their kinds. Raises `LabError`."""
-        if _has_unknown(self.faults):
+        if any(text.partition("@")[0] not in KINDS for text in self.faults):
             digest_of_body(self.config)
-        return _parsed(self.faults)
+        return tuple(map(parse, self.faults))
 
     @cached_property
     def times(self) -> FlightTimes | None:
@@ -297,24 +290,20 @@ class Request:
 
     def stored(self) -> dict[str, Any]:
         """Return the request as a run folder stores it, ready for JSON."""
-        source, elf = self.experiment.source, self.bench.elf
+        source, bench = self.experiment.source, self.bench
         return {
             "experiment": self.experiment.name, "source": None if source is None else asdict(source),
             "pictures": self.experiment.pictures, "draws": self.experiment.draw is not None,
             "profile": self.profile, "overrides": self.overrides, "seed": None if self.is_real else self.seed,
             "duration_s": self.duration_s, "faults": self.faults,
-            **_stored_bench(self.bench), "elf": None if elf is None else str(elf),
+            **{one.name: getattr(bench, one.name) for one in fields(Bench) if one.compare},
+            "elf": None if bench.elf is None else str(bench.elf),
         }  # fmt: skip
 
     @staticmethod
     def read(values: Mapping[str, Any], find: Find = unknown) -> Request:
         """Return a stored request; `find` returns its experiment. Raises pydantic's `ValidationError`."""
         return _STORED.validate_python(values, context=find)
-
-
-def _stored_bench(bench: Bench) -> dict[str, Any]:
-    """Return what of a bench makes the flight: not where else its observations are added."""
-    return {name: value for name, value in asdict(bench).items() if name not in ("coverage", "profile_cpu")}
 
 
 def _nested(values: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -324,16 +313,6 @@ def _nested(values: Mapping[str, Any]) -> Mapping[str, Any]:
 
 StoredRequest = Annotated[Request, BeforeValidator(_nested), PlainSerializer(Request.stored)]
 _STORED: TypeAdapter[Request] = TypeAdapter(StoredRequest)
-_OF_BENCH = tuple(one.name for one in fields(Bench))
-
-
-def _has_unknown(faults: Sequence[Fault | str]) -> bool:
-    """Whether a text names a kind that nobody has declared yet."""
-    return any(isinstance(one, str) and one.partition("@")[0] not in KINDS for one in faults)
-
-
-def _parsed(faults: Sequence[Fault | str]) -> tuple[Fault, ...]:
-    return tuple(parse(one) if isinstance(one, str) else one for one in faults)
 
 
 def why_left(config: LabConfig, p_W: Sequence[float]) -> str:
