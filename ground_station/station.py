@@ -111,7 +111,7 @@ class GroundStation:
         due = self._slots.due(frame.t_us)
         event = Event.NONE
         if self.tracker is not None:
-            self.track = self.tracker.take(frame)
+            self.track = self.tracker.track_frame(frame)
             frame, event = self.track.frame, self.track.event
         self.unused.note(now_us, frame.t_us, None if frame.valid else frame.unused, event)
         if not frame.valid:
