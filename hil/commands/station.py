@@ -171,7 +171,7 @@ class OperatorConsole:
 
         def take_lines(session: StationSession, now_us: int) -> None:
             for line in view.lines() if view is not None else ():
-                operator.take(line)
+                operator.queue_line(line)
 
         return [take_lines] if self.flight is None else [take_lines, self.flight.turn]
 
