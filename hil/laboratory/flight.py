@@ -212,7 +212,7 @@ class Flight:
     def _record(self, now_us: int) -> None:
         if self.over:
             return
-        lost = self.robot.look(now_us)
+        lost = self.robot.advance_truth(now_us)
         if self._recorder is not None:
             if self.robot.firmware is not self._recorded:  # it has booted
                 self._recorded = self.robot.firmware

@@ -268,7 +268,7 @@ class Robot:
         self.body.put_back(self.start_W)
         self.free = False
 
-    def look(self, now_us: int) -> str | None:
+    def advance_truth(self, now_us: int) -> str | None:
         """Advance the truth and the battery to this time; return why the flight is over, None while it is not."""
         self.body.advance(now_us)
         self.battery.draw(now_us, self.body.draw(now_us, self.battery.voltage))

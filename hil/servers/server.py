@@ -209,7 +209,7 @@ class Server:
 
     def _look(self, now_us: int) -> None:
         robot, nrf51 = self.robot, self.served.nrf51
-        lost = robot.look(now_us)
+        lost = robot.advance_truth(now_us)
         self.served.keep()
         if self._shown is not None:
             self._shown.row(now_us)
