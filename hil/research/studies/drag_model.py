@@ -89,7 +89,7 @@ def measure(config: LabConfig, seed: int) -> Iterator[MountedRow]:
         plant = Plant(geometry, body, config.tunnel, config.actuators, streams.gusts)
         plant.hold()
         for servo in ACTUATORS:
-            plant.settings[f"servo.pace.{servo}"].turn(0.0)  # the flaps stay at the set angles
+            plant.settings[f"servo.pace.{servo}"].write(0.0)  # the flaps stay at the set angles
         for index, (sweep, angle_deg) in enumerate(product(SWEEPS, ANGLES_DEG)):
             flaps = SIGNS * body.hover_angle
             sweep.turn(flaps, math.radians(angle_deg))
