@@ -220,14 +220,14 @@ def _search(asked: "Tuning") -> int:
     common.announce_compilation()
 
     def report(number: int, rounds: int, best: float) -> None:
-        say(f"round {number} of {rounds}: {aim.metric} {aim.show(best)}")
+        say(f"round {number} of {rounds}: {aim.metric} {aim.cost_text(best)}")
 
     with Runner(common.notices, **asked.crew) as runner:
         found = search(varied, aim, runner, asked.runs, report)
     table = Table("", "before", "found", title=f"{aim.metric} of {aim.experiment}, on other seeds")
     for one, value in zip(varied, found.values, strict=True):
         table.add_row(one.key, f"{one.given:g}", f"{value:g}")
-    table.add_row(aim.metric, aim.show(found.before), aim.show(found.after))
+    table.add_row(aim.metric, aim.cost_text(found.before), aim.cost_text(found.after))
     common.wide_console().print(table)
     if not found.better:
         say("not better than before: nothing is written")
