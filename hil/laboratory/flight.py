@@ -270,7 +270,7 @@ class Flight:
     def show(self) -> None:
         """Show who looks on the rows so far."""
         if self._recorder is not None:
-            self._recorder.show()
+            self._recorder.pass_rows()
 
     def write_schedule(self, folder: Path) -> None:
         """Write the scheduler's trace."""
