@@ -128,7 +128,7 @@ def serve(asked: ServeOptions) -> int:
     plan = Service(config, 1, asked.seed, bool(serial), planned, asked.state, _executor(asked))
     endpoints = Endpoints(asked.udp, asked.radio_port if asked.radio else None, serial, station, asked.motive)
     records = Records()
-    say = records.say
+    say = records.print_text
     with closing(Swarm(plan, asked.boards, endpoints, say)) as swarm:
         view = common.open_live(asked.target, say)
         with closing(Server(plan, say, view, swarm.to_peers)) as server:

@@ -92,9 +92,9 @@ def station(asked: StationOptions) -> int:
     config, experiment = load_config(asked.profile, asked.overrides), find_experiment(asked.named)
     _check_files(asked)
     records = Records()
-    view = common.open_live(asked.target, records.say)
+    view = common.open_live(asked.target, records.print_text)
     flight = _recorded(asked, experiment, view, records)
-    console = OperatorConsole(flight, view, records.say)
+    console = OperatorConsole(flight, view, records.print_text)
     know = view.know if view is not None and asked.target == "foxglove:parameters" else None
     operator = Operator(_trajectory_of, console.reply, console.note, know)
     log = flight.telemetry if flight is not None and asked.out is not None else asked.log
@@ -114,9 +114,9 @@ def station(asked: StationOptions) -> int:
     if result is not None:
         records.write(asked.out, common.write_pictures, result.folder, experiment)
         records.write(STANDARD_OUTPUT, print_result, result)
-    records.write(asked.out, common.close_live, view, result, records.say)
+    records.write(asked.out, common.close_live, view, result, records.print_text)
     for notice in records.notices():
-        records.say(notice)
+        records.print_text(notice)
     if failure:
         raise LabError(failure)
     if records.incomplete:
@@ -135,7 +135,7 @@ def _recorded(
         return None
     bench = Bench(link=asked.uri, board=REAL)
     request = Request(experiment, asked.profile, asked.overrides, 0, experiment.duration_s, (), bench)
-    return RealFlight(asked.out, request, records, records.say, observer=view)
+    return RealFlight(asked.out, request, records, records.print_text, observer=view)
 
 
 @dataclass(frozen=True, slots=True)
