@@ -104,6 +104,19 @@ class Bench:
             )
         self._require_packages()
 
+    def check_many(self, option: str, count: int) -> None:
+        """Raise `LabError` for what only one flight at a time can have, where `option` asks for `count`."""
+        if not self.in_lockstep:
+            raise LabError(f"--link {self.link}: {option} is for flights in lockstep: {', '.join(LOCKSTEP)}")
+        if is_link(self.board) or self.in_loop:
+            raise LabError(f"--board {self.board}: {option} {count}: a real board is in one flight at a time")
+        alone = {
+            "--gdb": self.gdb is not None, "--perfetto": self.trace, "--profile-cpu": self.profile_cpu is not None,
+            "--realtime": self.realtime,
+        }  # fmt: skip
+        if given := [name for name, is_given in alone.items() if is_given]:
+            raise LabError(f"{option} {count}: {', '.join(given)}: for one flight only")
+
     def _require_packages(self) -> None:
         link, board = f"--link {self.link}", f"--board {self.board}"
         if self.link.startswith(MAVLINK):
