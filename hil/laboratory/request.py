@@ -288,10 +288,15 @@ class Request:
         """The heading of a page or a table."""
         return f"{self.experiment.name}, {'real flight' if self.is_real else f'seed {self.seed}'}"
 
+    @property
+    def text(self) -> str:
+        """The title and the options, without those that are as usual."""
+        options = {name: value for name, value in self.parts().items() if name not in ("", "seed")}
+        unusual = [f"{name} {value}" for name, value in options.items() if value != USUAL.get(name, "")]
+        return ", ".join([self.title, *unusual])
+
     def __repr__(self) -> str:
-        told = {name: value for name, value in self.parts().items() if name not in ("", "seed")}
-        unusual = [f"{name} {value}" for name, value in told.items() if value != USUAL.get(name, "")]
-        return f"<Request {', '.join([self.title, *unusual])}>"
+        return f"<Request {self.text}>"
 
     def parts(self) -> dict[str, str]:
         """Return the options as text, by their names in `floaty fly`: equal for equal flights."""
