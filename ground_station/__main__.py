@@ -56,8 +56,8 @@ def main(arguments: list[str] | None = None) -> int:
         record=asked.record,
         records=records,
     )
-    operator = Operator(_no_experiment, records.say, lambda _: None)
-    failure, _ = fly_with(operator, settings, session, records.say, asked.duration)
+    operator = Operator(_no_experiment, records.print_text, lambda _: None)
+    failure, _ = fly_with(operator, settings, session, records.print_text, asked.duration)
     return _refuse(failure) if failure else INCOMPLETE if records.incomplete else 0
 
 

@@ -52,10 +52,10 @@ M = TypeVar("M")  # a message of the protocol
 
 @dataclass(frozen=True, slots=True)
 class Exchange(Generic[M]):
-    """One message and its reply; `take` returns None for any other message."""
+    """One message and its reply; `parse_reply` returns None for any other message."""
 
     send: Callable[[int], object]
-    take: Callable[[M], Any]
+    parse_reply: Callable[[M], Any]
     waits: bool = False  # the reply comes unasked: send only when it does not
     patience_us: int = PATIENCE_US
     missing: str = f"no answer within {PATIENCE_US * 1e-6:.0f} s"  # the error without a reply
@@ -87,7 +87,7 @@ class Dialogue(Generic[M]):
 
     def receive(self, now_us: int, message: M) -> bool:
         """Take a message; return whether it was the expected reply."""
-        reply = None if self._exchange is None else self._exchange.take(message)
+        reply = None if self._exchange is None else self._exchange.parse_reply(message)
         if reply is not None:
             self._go_on(now_us, reply)
         return reply is not None

@@ -70,7 +70,7 @@ class Operator:
         self._well_since_us: int | None = None
         self.known: Sequence[str] = tuple(OF_PROFILE)  # names of parameters, for completion
 
-    def take(self, line: str) -> None:
+    def queue_line(self, line: str) -> None:
         """Queue a line for execution."""
         if line.strip() == "stop":
             self._lines.clear()
@@ -81,7 +81,7 @@ class Operator:
         else:
             self._say(f"{line}: {LINES} lines wait already; it is dropped")
 
-    def turn(self, session: StationSession, now_us: int) -> None:
+    def process_lines(self, session: StationSession, now_us: int) -> None:
         """Continue the present line, or begin the next."""
         self._watch(session, now_us)
         if self._talk is not None:
@@ -267,8 +267,8 @@ def fly_with(
 
     def steer(live: StationSession, now_us: int) -> None:
         for line in terminal.lines():
-            operator.take(line)
-        operator.turn(live, now_us)
+            operator.queue_line(line)
+        operator.process_lines(live, now_us)
 
     failure = ""
     try:

@@ -75,7 +75,7 @@ class LiveStation:
     rate: FrameRate
     say: Callable[[str], None]
     stopping: Callable[[], bool]
-    turn: Callable[[int], None]  # called again and again with the instant while the link holds
+    on_loop: Callable[[int], None]  # called again and again with the instant while the link holds
     records: Records
 
     def run(self) -> None:
@@ -134,7 +134,7 @@ class LiveStation:
                 self.say(f"no poses for {POSE_TIMEOUT_US * 1e-6:.0f} s")
                 pose_us = now_us
             self._take_telemetry()
-            self.turn(now_us)
+            self.on_loop(now_us)
             self._report()
             self.link.check()
             if now_us - status_us >= STATUS_PERIOD_US:

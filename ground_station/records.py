@@ -53,7 +53,7 @@ class Records:
         """Return `write` under the rule."""
         return lambda *what, **more: self.write(name, write, *what, **more)
 
-    def say(self, text: object) -> None:
+    def print_text(self, text: object) -> None:
         """Print a line on the standard output, unless nobody reads it."""
         if not is_writable(sys.stdout):
             self._dropped += 1

@@ -69,7 +69,7 @@ class Slots:
             self._next_us = t_us
         return t_us >= self._next_us - self._early_us
 
-    def take(self, t_us: int) -> None:
+    def fill_slot(self, t_us: int) -> None:
         """Fill the slot of the frame exposed at `t_us`, and unused earlier ones."""
         assert self._next_us is not None
         passed = (t_us + self._early_us - self._next_us) // self._period_us
@@ -111,7 +111,7 @@ class GroundStation:
         due = self._slots.due(frame.t_us)
         event = Event.NONE
         if self.tracker is not None:
-            self.track = self.tracker.take(frame)
+            self.track = self.tracker.track_frame(frame)
             frame, event = self.track.frame, self.track.event
         self.unused.note(now_us, frame.t_us, None if frame.valid else frame.unused, event)
         if not frame.valid:
@@ -123,7 +123,7 @@ class GroundStation:
         self._link.send(now_us, frame, self._trajectory.at(now_us))
         counters.sent += 1
         self.budget.add(frame, now_us, self._link.latency)
-        self._slots.take(frame.t_us)
+        self._slots.fill_slot(frame.t_us)
 
     def notices(self) -> list[str]:
         """Return lines for the user since the last call."""

@@ -81,10 +81,10 @@ class Tracker:
         self._refused_in_a_row = 0
         self._widening = max(1, WIDEN_US // period_us)
 
-    def take(self, frame: MocapFrame) -> Track:
+    def track_frame(self, frame: MocapFrame) -> Track:
         """Return the frame to be used in place of `frame`."""
         self._event = Event.NONE
-        track = self._take(frame)
+        track = self._judge_frame(frame)
         track.event = self._event
         self.quality = track.quality
         return track
@@ -101,7 +101,7 @@ class Tracker:
             return self._config.reacquire_us
         return max(FIT_US, min(5 * min(self._gaps_us, default=0) // 2, self._config.reacquire_us))
 
-    def _take(self, frame: MocapFrame) -> Track:
+    def _judge_frame(self, frame: MocapFrame) -> Track:
         t_us = frame.t_us
         if t_us > self._t_us:
             self._gaps_us.append(t_us - self._t_us)

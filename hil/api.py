@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import Any, Literal, Unpack
+from typing import Any, Generic, Literal, TypeVar, Unpack
 
 import pyarrow as pa
 
@@ -57,6 +57,7 @@ __all__ = [
 ]  # fmt: skip
 
 Progress = Callable[[float], None]  # (share of the flight, 0..1)
+Found = TypeVar("Found", Result, SwarmResult)
 
 
 @checked
@@ -188,10 +189,44 @@ def load_run(folder: Path | str, experiment: Experiment | str | None = None) -> 
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
-    """A flight and its folder."""
+class Flown(Generic[Found]):
+    """What one robot, or robots that flew together, left in a folder."""
 
-    result: Result
+    result: Found
+
+    @property
+    def folder(self) -> Path:
+        """The folder of log, result and pictures; of a swarm, with a run folder for each robot."""
+        return self.result.folder
+
+    @property
+    def passed(self) -> bool:
+        """Whether every robot completed its flight, and every limit holds, also those of a swarm."""
+        return self.result.passed
+
+    @property
+    def outcome(self) -> Outcome:
+        """completed, lost, interrupted or error; of a swarm, the worst of all robots."""
+        return self.result.outcome
+
+    @property
+    def metrics(self) -> Mapping[str, float]:
+        """Figures after the release, in the unit of `Run.unit_of`; of a swarm, `distance_min` [m]. NaN: no value."""
+        return Known("metric", self.result.metrics)
+
+    @property
+    def verdicts(self) -> tuple[Verdict, ...]:
+        """Every limit with its value and whether it holds; of a swarm, those of the whole."""
+        return self.result.verdicts
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of everything recorded, of a swarm of all robots' hashes; the same for the same flight in lockstep."""
+        return self.result.hash
+
+
+class Run(Flown[Result]):
+    """A flight and its folder."""
 
     @property
     def request(self) -> Request:
@@ -209,39 +244,9 @@ class Run:
         return config_of(self.folder, self.log.schema.metadata)
 
     @property
-    def folder(self) -> Path:
-        """The folder of log, result and pictures."""
-        return self.result.folder
-
-    @property
-    def passed(self) -> bool:
-        """Whether the flight was completed and held every limit."""
-        return self.result.passed
-
-    @property
-    def outcome(self) -> Outcome:
-        """completed, lost, interrupted or error."""
-        return self.result.outcome
-
-    @property
     def cause(self) -> str | None:
         """Why the flight was lost or failed."""
         return self.result.cause
-
-    @property
-    def metrics(self) -> Mapping[str, float]:
-        """Figures of the flight after the release, in the unit of `unit_of`; NaN where the flight has no value."""
-        return Known("metric", self.result.metrics)
-
-    @property
-    def verdicts(self) -> tuple[Verdict, ...]:
-        """Every limit with its value and whether it holds."""
-        return self.result.verdicts
-
-    @property
-    def hash(self) -> str:
-        """SHA-256 of everything recorded; the same for the same flight in lockstep."""
-        return self.result.hash
 
     @cached_property
     def log(self) -> pa.Table:
@@ -341,46 +346,13 @@ class Run:
         return f"<p><b>{verdict}</b>: {escape(how)}</p><table><tr>{head}</tr>{rows}</table><p>{place}</p>"
 
 
-@dataclass(frozen=True, eq=False)
-class Swarm:
+class Swarm(Flown[SwarmResult]):
     """Robots that flew together, and their folder."""
-
-    result: SwarmResult
-
-    @property
-    def folder(self) -> Path:
-        """The folder with a run folder for each robot."""
-        return self.result.folder
 
     @property
     def robots(self) -> tuple[Run, ...]:
         """The flight of each robot."""
         return tuple(map(Run, self.result.robots))
-
-    @property
-    def passed(self) -> bool:
-        """Whether every robot passed and the swarm's own limits hold."""
-        return self.result.passed
-
-    @property
-    def outcome(self) -> Outcome:
-        """The worst of all robots: completed, lost, interrupted or error."""
-        return self.result.outcome
-
-    @property
-    def metrics(self) -> Mapping[str, float]:
-        """Figures of the whole swarm: `distance_min` [m]; NaN where the flight has no value."""
-        return Known("metric", self.result.metrics)
-
-    @property
-    def verdicts(self) -> tuple[Verdict, ...]:
-        """The limits of the whole swarm."""
-        return self.result.verdicts
-
-    @property
-    def hash(self) -> str:
-        """SHA-256 of the hashes of all robots; the same for the same flight."""
-        return self.result.hash
 
     def write_report(self) -> Path:
         """Write `report.html` of the swarm and of each robot, and return the path of the first."""
@@ -402,21 +374,17 @@ def command_of(request: Request) -> str | None:
     experiment = request.experiment
     if not experiment.is_known or find_again(experiment.name, experiment.source) != experiment:
         return None
-    words = ["floaty", "fly", experiment.reference, "--seed", str(request.seed)]
-    words += ["--duration", repr(request.duration_s)] if request.duration_s != experiment.duration_s else []
-    words += ["--profile", request.profile] if request.profile != DEFAULT_PROFILE else []
-    words += _options("--set", request.overrides[len(experiment.settings) :])
-    words += _options("--fault", request.faults[len(experiment.faults) :])
     bench = request.bench
-    words += ["--link", bench.link] if bench.link != RADIO else []
-    words += ["--board", bench.board] if bench.board != C else []
-    words += ["--elf", str(bench.elf)] if bench.elf is not None else []
-    words += [f"--hil={bench.in_loop}"] if bench.in_loop else []
-    return shlex.join(words)
-
-
-def _options(name: str, values: Iterable[str]) -> list[str]:
-    return [word for value in values for word in (name, value)]
+    options = [  # with the usual values
+        ("--seed", request.seed, None), ("--duration", request.duration_s, experiment.duration_s),
+        ("--profile", request.profile, DEFAULT_PROFILE),
+        *(("--set", one, None) for one in request.overrides[len(experiment.settings) :]),
+        *(("--fault", one, None) for one in request.faults[len(experiment.faults) :]),
+        ("--link", bench.link, RADIO), ("--board", bench.board, C), ("--elf", bench.elf, None),
+        ("--hil", bench.in_loop, None),
+    ]  # fmt: skip
+    words = [word for name, value, usual in options if value != usual for word in (name, str(value))]
+    return shlex.join(["floaty", "fly", experiment.reference, *words])
 
 
 def _shown(request: Request) -> Progress:

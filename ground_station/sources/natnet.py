@@ -182,7 +182,7 @@ def decode(data: bytes, version: Version) -> Message:
 def _response(reader: Reader) -> Response:
     if reader.left == 4:
         return Response(reader.u32(), "")
-    return Response(None, reader.take(reader.left).partition(b"\0")[0].decode("utf-8", "replace"))
+    return Response(None, reader.read_bytes(reader.left).partition(b"\0")[0].decode("utf-8", "replace"))
 
 
 def _server_info(reader: Reader) -> ServerInfo:
@@ -207,27 +207,27 @@ def _frame(reader: Reader) -> Frame:
     number = reader.u32()
     for _ in range(reader.section(5)):  # marker sets
         reader.text()
-        reader.take(12 * reader.count(12))
+        reader.read_bytes(12 * reader.count(12))
     unlabelled = tuple(reader.vector() for _ in range(reader.section(12)))
     bodies = tuple(_body(reader) for _ in range(reader.section(BODY.size)))
     for _ in range(reader.section(8)):  # skeletons
         reader.u32()
-        reader.take(BODY.size * reader.count(BODY.size))
+        reader.read_bytes(BODY.size * reader.count(BODY.size))
     if reader.version >= (4, 1):
         for _ in range(reader.section(12)):  # assets
             reader.u32()
-            reader.take(BODY.size * reader.count(BODY.size))
-            reader.take(LABELLED.size * reader.count(LABELLED.size))
+            reader.read_bytes(BODY.size * reader.count(BODY.size))
+            reader.read_bytes(LABELLED.size * reader.count(LABELLED.size))
     labelled = tuple(_labelled(reader) for _ in range(reader.section(LABELLED.size)))
     for _ in range(2):  # force plates, devices
         for _ in range(reader.section(8)):
             reader.u32()
             for _ in range(reader.count(4)):  # channels
-                reader.take(4 * reader.count(4))
+                reader.read_bytes(4 * reader.count(4))
     timestamp_s, exposed, received, sent = reader.unpack(SUFFIX)
     if reader.version >= (4, 1) or (reader.version == (4, 0) and reader.left >= PRECISION_SIZE + 2):
-        reader.take(PRECISION_SIZE)  # public readers disagree whether 4.0 has it
-    parameters = int.from_bytes(reader.take(2), "little")
+        reader.read_bytes(PRECISION_SIZE)  # public readers disagree whether 4.0 has it
+    parameters = int.from_bytes(reader.read_bytes(2), "little")
     if reader.left not in (0, END_TAG_SIZE):
         raise MocapError(f"NatNet frame {number}: {reader.left} bytes too many")
     return Frame(number, bodies, unlabelled, labelled, timestamp_s, exposed, received, sent, parameters)
@@ -255,7 +255,7 @@ def _model_definition(reader: Reader) -> ModelDefinition:
         if kind not in PASSED_OVER:
             raise MocapError(f"NatNet model definition: {kind} is not a kind of model")
         for part in PASSED_OVER[kind]:
-            reader.take(part) if isinstance(part, int) else part(reader)
+            reader.read_bytes(part) if isinstance(part, int) else part(reader)
     return ModelDefinition(tuple(bodies))
 
 
@@ -277,7 +277,7 @@ def _descriptions(reader: Reader) -> None:
 def _asset_markers(reader: Reader) -> None:
     for _ in range(reader.count(23)):
         reader.text()
-        reader.take(22)  # id, position, size, parameters
+        reader.read_bytes(22)  # id, position, size, parameters
 
 
 # The useless parts of descriptions, by kind; a number is that many bytes.

@@ -25,7 +25,7 @@ class Reader:
         """Bytes not read yet."""
         return len(self._data) - self._at
 
-    def take(self, size: int) -> bytes:
+    def read_bytes(self, size: int) -> bytes:
         """Return the next bytes."""
         at = self._advance(size)
         return self._data[at : at + size]

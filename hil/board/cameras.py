@@ -84,7 +84,7 @@ class VirtualMocap:
         if self.markers is None:
             pose: Pose | None = self._noisy_pose(body)
         else:
-            self.sighting = self.markers.look(body.p_WB, body.q_WB)
+            self.sighting = self.markers.sighting_of(body.p_WB, body.q_WB)
             pose = self.sighting.pose
         outlier = self.outlier > 0.0 and self._rng_outlier.random() < self.outlier
         offset = _direction(self._rng_outlier) if outlier else NOWHERE

@@ -185,13 +185,13 @@ def process_age_s() -> float:
 
 
 class Pace:
-    """Simulated over real time, from the first `look` at or after an instant; before that, from the start."""
+    """Simulated over real time, from the first `start_when_due` at or after an instant; before that, from the start."""
 
     def __init__(self, from_us: int) -> None:
         self._from_us: int | None = from_us
         self._us, self._ns = 0, time.monotonic_ns()
 
-    def look(self, now_us: int) -> None:
+    def start_when_due(self, now_us: int) -> None:
         """Start counting when it is time."""
         if self._from_us is not None and now_us >= self._from_us:
             self._from_us = None

@@ -170,7 +170,7 @@ class VirtualMarkers:
         self.noise_scale = 1.0
         self.ghosts = float(config.ghosts)
 
-    def look(self, p_WB: Points, q_WB: Points) -> Sighting:
+    def sighting_of(self, p_WB: Points, q_WB: Points) -> Sighting:
         """Return the sighting of a robot at a pose: (3,) [m], (4,) w x y z."""
         w, x, y, z = q_WB.tolist()
         R_WB = rotation_matrix((w, x, y, z))

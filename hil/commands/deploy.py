@@ -39,20 +39,8 @@ def deploy() -> None:
 @deploy.command()
 @click.argument("experiment", required=False)
 @click.option("--all", "every", is_flag=True, help="Every experiment, the first minute of each.")
-@click.option(
-    "--seed",
-    type=click.IntRange(0, 2**63 - 1),
-    default=1,
-    show_default=True,
-    help="Seed of all random numbers.",
-)
-@click.option(
-    "--duration",
-    "duration_s",
-    type=common.Number(0, 86_400, min_open=True),
-    metavar="S",
-    help="Free flight [s]; default: the experiment's.",
-)
+@common.seed_option
+@common.duration_option
 @common.profile_options
 @common.fault_option
 @click.option(

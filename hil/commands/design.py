@@ -10,7 +10,7 @@ import click
 from rich.table import Table
 
 from hil.commands import options as common
-from hil.commands.options import PATH, say
+from hil.commands.options import PATH, common_option, option, say
 from hil.errors import LabError, made_folder, require, writing
 
 if TYPE_CHECKING:
@@ -20,53 +20,60 @@ if TYPE_CHECKING:
 SPEED_MAX = 60.0  # [m/s] the largest that a profile allows
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DesignOptions:
-    """The options of `floaty design`."""
-
-    profile: str
-    overrides: tuple[str, ...]
-    speed: float | None = None  # [m/s]
-    angle: float | None = None  # [deg]
-    length: float = 1.0
-    mass: float = 1.0
-    as_json: bool = False
-    write_to: Path | None
-    out: Path
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Search(DesignOptions):
-    """The options of `floaty design optimise`."""
-
-    seed: int
-    figure: str
-    generations: int
-    updrafts: tuple[float, float]  # [m/s]
-
-
 write_option = click.option(
     "--write", "write_to", type=PATH, metavar="FILE", help="A profile that flies this robot, with gains."
 )
 out_option = click.option("--out", type=PATH, default=Path("runs/design"), show_default=True, metavar="DIR")
 
 
+@dataclass(frozen=True, slots=True)
+class DesignOptions:
+    """The options of `floaty design`."""
+
+    profile: str = common_option(common.profile_option)
+    overrides: tuple[str, ...] = common_option(common.set_option)
+    speed: float | None = option(
+        "--speed", type=common.Number(1, 40), help="Updraft [m/s]: the hover angle follows."
+    )
+    angle: float | None = option(
+        "--angle", type=common.Number(0, 70), help="Hover angle [deg]: the updraft follows."
+    )
+    length: float = option(
+        "--length", type=common.Number(0.1, 10), default=1.0, help="The similar robot: lengths times this."
+    )
+    mass: float = option(
+        "--mass", type=common.Number(0.01, 100), default=1.0, help="The similar robot: masses times this."
+    )
+    as_json: bool = option(
+        "--json", "as_json", is_flag=True, help="Print only the model on board: states, A and B of each axis."
+    )
+    write_to: Path | None = common_option(write_option)
+    out: Path = common_option(out_option)
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """The options of `floaty design optimise`."""
+
+    profile: str = common_option(common.profile_option)
+    overrides: tuple[str, ...] = common_option(common.set_option)
+    seed: int = common_option(common.seed_option)
+    figure: str = option(
+        "--figure", type=click.Choice(["least-authority", "speed-range"]), default="least-authority", show_default=True
+    )  # fmt: skip
+    generations: int = option(
+        "--generations", type=click.IntRange(1, 500), default=25, show_default=True, help="Of the search."
+    )
+    updrafts: tuple[float, float] = option(
+        "--updrafts", type=common.Number(1, 60), nargs=2, default=(8.0, 11.0), show_default=True,
+        help="Which robot could hold these speeds, and at what cost?",
+    )  # fmt: skip
+    write_to: Path | None = common_option(write_option)
+    out: Path = common_option(out_option)
+
+
 @click.group(invoke_without_command=True)
 @click.pass_context
-@common.profile_options
-@click.option("--speed", type=common.Number(1, 40), help="Updraft [m/s]: the hover angle follows.")
-@click.option("--angle", type=common.Number(0, 70), help="Hover angle [deg]: the updraft follows.")
-@click.option(
-    "--length", type=common.Number(0.1, 10), default=1.0, help="The similar robot: lengths times this."
-)
-@click.option(
-    "--mass", type=common.Number(0.01, 100), default=1.0, help="The similar robot: masses times this."
-)
-@click.option(
-    "--json", "as_json", is_flag=True, help="Print only the model on board: states, A and B of each axis."
-)
-@write_option
-@out_option
 @common.asked_as(DesignOptions)
 def design(context: click.Context, robot: DesignOptions) -> None:
     """Compute trim, constants, poles, authority and sweeps of a profile's robot, and compare the paper's claims."""
@@ -80,7 +87,8 @@ def design(context: click.Context, robot: DesignOptions) -> None:
     from hil.research.design.analysis import analyse, write
 
     common.check_profile("--write", robot.write_to)
-    point = point_of(robot)
+    similar = robot.speed, robot.angle, robot.length, robot.mass
+    point = point_of(robot.profile, robot.overrides, *similar)
     common.announce_compilation()
     if robot.write_to is not None:
         about = f"The robot of {robot.profile}, lengths times {robot.length:g}, masses times {robot.mass:g}."
@@ -92,27 +100,6 @@ def design(context: click.Context, robot: DesignOptions) -> None:
 
 
 @design.command()
-@common.profile_options
-@common.seed_option
-@click.option(
-    "--figure",
-    type=click.Choice(["least-authority", "speed-range"]),
-    default="least-authority",
-    show_default=True,
-)
-@click.option(
-    "--generations", type=click.IntRange(1, 500), default=25, show_default=True, help="Of the search."
-)
-@click.option(
-    "--updrafts",
-    type=common.Number(1, 60),
-    nargs=2,
-    default=(8.0, 11.0),
-    show_default=True,
-    help="Which robot could hold these speeds, and at what cost?",
-)
-@write_option
-@out_option
 @common.asked_as(Search)
 def optimise(asked: Search) -> None:
     """Find the kink, centre of mass, base plate and strip with the largest figure, at the profile's span, mass and speed."""
@@ -127,7 +114,7 @@ def optimise(asked: Search) -> None:
         raise LabError(f"--updrafts {updrafts[0]:g} {updrafts[1]:g}: expected the least first")
     common.check_profile("--write", asked.write_to)
     common.announce_compilation()
-    found = search.optimise(point_of(asked), figure, asked.seed, asked.generations)
+    found = search.optimise(point_of(profile, asked.overrides), figure, asked.seed, asked.generations)
     best, front = found.best, search.front(found.tried, figure)
     if asked.write_to is not None:
         about = f"What floaty design optimise --figure {figure} --seed {asked.seed} derived from {profile}."
@@ -177,17 +164,23 @@ def write_profile(point: "Point", path: Path, about: str, length: float = 1.0) -
     say(f"profile {path}")
 
 
-def point_of(robot: DesignOptions) -> "Point":
+def point_of(
+    profile: str,
+    overrides: tuple[str, ...],
+    speed: float | None = None,
+    angle: float | None = None,
+    length: float = 1.0,
+    mass: float = 1.0,
+) -> "Point":
     """Return a profile's robot, or a similar one, in its design hover or at another speed or angle."""
     from hil.config import load_config
     from hil.research.design.linear import point_of as own_point_of
     from hil.research.design.trim import opening_at, scaled
 
-    speed, angle = robot.speed, robot.angle
-    config = load_config(robot.profile, robot.overrides)
-    config.robot.need_plates(robot.profile, "floaty design")
+    config = load_config(profile, overrides)
+    config.robot.need_plates(profile, "floaty design")
     point = own_point_of(config)
-    geometry, opening = scaled(point.geometry, robot.length, robot.mass), point.opening
+    geometry, opening = scaled(point.geometry, length, mass), point.opening
     if speed is not None and angle is not None:
         raise LabError(f"--speed {speed:g} --angle {angle:g}: one follows from the other; give one of them")
     if speed is not None:

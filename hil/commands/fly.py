@@ -40,9 +40,7 @@ SEEDS_MAX = 10_000
     help="Fly N robots together in lockstep, with seeds from --seed on, places and limits of [swarm] in the profile. "
     "EXPERIMENT may then be a folder with a trajectory (.csv) for each.",
 )  # fmt: skip
-@click.option(
-    "--duration", "duration_s", type=float, metavar="S", help="Free flight [s]; default: the experiment's."
-)
+@common.duration_option
 @common.profile_options
 @common.fault_option
 @click.option("--realtime", is_flag=True, help="Pace the flight to the wall clock.")
@@ -223,18 +221,11 @@ def _check_seeds(seeds: int, request: Request, target: str | None) -> None:
     from hil.pictures.exports.coverage import check_image_coverage
 
     bench = request.bench
+    bench.check_many("--seeds", seeds)
+    if target:
+        raise LabError(f"--seeds {seeds}: --view: for one flight only")
     if bench.coverage is not None:
         check_image_coverage(bench.coverage, bench.board, bench.elf)
-    if bench.profile_cpu is not None:
-        raise LabError(f"--profile-cpu {bench.profile_cpu}: --seeds {seeds}: is for one seed")
-    if bench.realtime or target or bench.trace:
-        raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
-    if bench.gdb is not None:
-        raise LabError(f"--gdb {bench.gdb}: needs one flight with an image as --board")
-    if not bench.in_lockstep:
-        raise LabError(f"--link {bench.link}: --seeds is for flights in lockstep")
-    if bench.in_loop or "://" in bench.board:
-        raise LabError(f"--board {bench.board}: --seeds {seeds}: a real board is in one flight at a time")
 
 
 def _fly_one(request: Request, folder: Path, target: str | None) -> int:

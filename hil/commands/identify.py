@@ -10,7 +10,7 @@ import click
 from rich.table import Table
 
 from hil.commands import options as common
-from hil.commands.options import PATH, say, warn
+from hil.commands.options import PATH, common_option, option, say, warn
 from hil.errors import LabError, made_folder, reading, require, writing
 
 if TYPE_CHECKING:
@@ -95,22 +95,58 @@ def _print_constants(found: "Identification") -> None:
 class Tuning:
     """What `floaty tune` is asked for."""
 
-    profile: str
-    repeat: int | None
-    robots: int
-    vary: tuple[str, ...]
-    metric: str
-    experiment: str
-    duration: float | None
-    flights: int
-    seeds: int
-    seed: int
-    board: str
-    out: Path | None
-    runs: Path
     workers: int | None
     cluster: str
     resume: bool
+    profile: str = common_option(common.profile_option)
+    repeat: int | None = option(
+        "--repeat", type=click.IntRange(1, 10), metavar="N",
+        help="Fly the excitations, identify and tune until nothing improves, N times at most.",
+    )  # fmt: skip
+    robots: int = option(
+        "--robots", type=click.IntRange(0, 1000), default=100, show_default=True, metavar="N",
+        help="Number of robots drawn from the intervals of the model; all must be stable.",
+    )  # fmt: skip
+    vary: tuple[str, ...] = option(
+        "--vary", multiple=True, metavar="KEY=LOW..HIGH",
+        help="Instead: search numbers of the profile, as logic.gain_y=-3..-0.5, that make --metric best; repeatable.",
+    )  # fmt: skip
+    metric: str = option("--metric", default="distance", show_default=True, metavar="NAME", help="Of --vary.")
+    experiment: str = option(
+        "--experiment", default="hover", show_default=True, metavar="NAME|FILE.py:NAME", help="Of --vary."
+    )
+    duration: float | None = option(
+        "--duration", type=click.FloatRange(0.5, 600.0), metavar="S", help="Of each flight of --vary."
+    )
+    flights: int = option(
+        "--flights",
+        type=click.IntRange(10, 100_000),
+        default=120,
+        show_default=True,
+        metavar="N",
+        help="Of --vary.",
+    )
+    seeds: int = option(
+        "--seeds",
+        type=click.IntRange(1, 100),
+        default=1,
+        show_default=True,
+        metavar="N",
+        help="Flights for each choice.",
+    )
+    seed: int = common_option(common.seed_option)
+    board: str = option(
+        "--board", metavar="BOARD", default="c", show_default=True, help="As for `floaty fly`."
+    )
+    out: Path | None = option(
+        "--out",
+        type=PATH,
+        metavar="FILE.toml",
+        help="A profile with the gains; of rounds, of the last one that gained.",
+    )
+    runs: Path = option(
+        "--runs", type=PATH, default=Path("runs/tune"), show_default=True, metavar="DIR", help="Of all flights."
+    )  # fmt: skip
 
     @property
     def crew(self) -> dict[str, Any]:
@@ -119,53 +155,8 @@ class Tuning:
 
 
 @click.command()
-@common.profile_option
-@click.option(
-    "--repeat", type=click.IntRange(1, 10), metavar="N",
-    help="Fly the excitations, identify and tune until nothing improves, N times at most.",
-)  # fmt: skip
-@click.option(
-    "--robots", type=click.IntRange(0, 1000), default=100, show_default=True, metavar="N",
-    help="Number of robots drawn from the intervals of the model; all must be stable.",
-)  # fmt: skip
-@click.option(
-    "--vary", multiple=True, metavar="KEY=LOW..HIGH",
-    help="Instead: search numbers of the profile, as logic.gain_y=-3..-0.5, that make --metric best; repeatable.",
-)  # fmt: skip
-@click.option("--metric", default="distance", show_default=True, metavar="NAME", help="Of --vary.")
-@click.option(
-    "--experiment", default="hover", show_default=True, metavar="NAME|FILE.py:NAME", help="Of --vary."
-)
-@click.option("--duration", type=click.FloatRange(0.5, 600.0), metavar="S", help="Of each flight of --vary.")
-@click.option(
-    "--flights",
-    type=click.IntRange(10, 100_000),
-    default=120,
-    show_default=True,
-    metavar="N",
-    help="Of --vary.",
-)
-@click.option(
-    "--seeds",
-    type=click.IntRange(1, 100),
-    default=1,
-    show_default=True,
-    metavar="N",
-    help="Flights for each choice.",
-)
-@common.seed_option
-@click.option("--board", metavar="BOARD", default="c", show_default=True, help="As for `floaty fly`.")
-@click.option(
-    "--out",
-    type=PATH,
-    metavar="FILE.toml",
-    help="A profile with the gains; of rounds, of the last one that gained.",
-)
-@click.option(
-    "--runs", type=PATH, default=Path("runs/tune"), show_default=True, metavar="DIR", help="Of all flights."
-)  # fmt: skip
-@common.runner_options
 @common.asked_as(Tuning)
+@common.runner_options
 def tune(asked: Tuning) -> int:
     """Compute gains of the paper's control law for the profile's model, and fly them in lockstep with its plant.
 
@@ -229,14 +220,14 @@ def _search(asked: "Tuning") -> int:
     common.announce_compilation()
 
     def report(number: int, rounds: int, best: float) -> None:
-        say(f"round {number} of {rounds}: {aim.metric} {aim.show(best)}")
+        say(f"round {number} of {rounds}: {aim.metric} {aim.cost_text(best)}")
 
     with Runner(common.notices, **asked.crew) as runner:
         found = search(varied, aim, runner, asked.runs, report)
     table = Table("", "before", "found", title=f"{aim.metric} of {aim.experiment}, on other seeds")
     for one, value in zip(varied, found.values, strict=True):
         table.add_row(one.key, f"{one.given:g}", f"{value:g}")
-    table.add_row(aim.metric, aim.show(found.before), aim.show(found.after))
+    table.add_row(aim.metric, aim.cost_text(found.before), aim.cost_text(found.after))
     common.wide_console().print(table)
     if not found.better:
         say("not better than before: nothing is written")

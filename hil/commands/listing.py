@@ -102,22 +102,12 @@ def runs(folder: Path) -> None:
     for run in sorted(written, key=lambda run: (written[run], run)):
         try:
             result = read_result(run)
-            row = (_request_of(result), verdict_of(result), result.hash[:HASH_DIGITS])
+            row = (result.request.text, verdict_of(result), result.hash[:HASH_DIGITS])
         except LabError as error:
             row = ("", " ".join(str(error).removeprefix(f"{run / RESULT}: ").split()), "")
         date = time.strftime("%m-%d %H:%M", time.localtime(written[run]))
         table.add_row(date, *map(escape, (str(run.relative_to(folder)), *row)))
     console.print(table)
-
-
-def _request_of(result: Result) -> str:
-    """Return the request as text, without default parts."""
-    from hil.laboratory.request import USUAL
-
-    asked = {**result.request.parts(), "": result.request.experiment.name}
-    return ", ".join(
-        f"{name} {value}".strip() for name, value in asked.items() if value != USUAL.get(name, "")
-    )
 
 
 def verdict_of(result: Result) -> str:

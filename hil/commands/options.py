@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from hil.live.feed import LiveView
 
 INTERRUPTED = 130
+option: Any = click.option  # as the default of a field in `asked_as`
+argument: Any = click.argument
 Asked = TypeVar("Asked")
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -88,6 +90,9 @@ code_option = click.option(
 run_folder = click.argument("run", metavar="RUN", type=PATH)
 seed_option = click.option(
     "--seed", type=click.IntRange(0, 2**62), default=1, show_default=True, help="Seed of all random numbers."
+)
+duration_option = click.option(
+    "--duration", "duration_s", type=float, metavar="S", help="Free flight [s]; default: the experiment's."
 )
 fault_option = click.option(
     "--fault", "faults", multiple=True, metavar="KIND@START[:DURATION][=SIZE]",
@@ -159,14 +164,25 @@ def print_coverage(out: Path) -> None:
 COMPILING = "first run on this machine: compiling flight core and plant, once, some seconds"
 
 
+def common_option(option: Callable[[Any], Any]) -> Any:
+    """Return an option of several commands as the default of a field in `asked_as`."""
+    return option
+
+
 def asked_as(kind: type[Asked]) -> Callable[[Callable[..., int | None]], Callable[..., int | None]]:
-    """Return the decorator that passes a command's options as one frozen dataclass."""
+    """Return the decorator that passes a command's options as one frozen dataclass.
+
+    A field whose default is an `option` or an `argument` adds it to the command.
+    """
 
     def decorator(command: Callable[..., int | None]) -> Callable[..., int | None]:
         @wraps(command)
         def call(*context: click.Context, **options: Any) -> int | None:
             return command(*context, kind(**options))
 
+        for one in reversed(fields(kind)):  # type: ignore[arg-type]
+            if callable(one.default):
+                call = one.default(call)
         return call
 
     return decorator

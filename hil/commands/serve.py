@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hil.commands import options as common
-from hil.commands.options import PATH
+from hil.commands.options import PATH, argument, common_option, option
 from hil.errors import LabError, require
 
 if TYPE_CHECKING:
@@ -35,72 +35,57 @@ BOARDS_MAX = 10
 class ServeOptions:
     """The options of `floaty serve`."""
 
-    udp: int | None
-    radio: bool
-    radio_port: int
-    usb: bool
-    program: tuple[str, ...]
-    mavlink: str | None
-    board: str | None
-    elf: Path | None
-    gdb: int | None
-    boards: int
-    station: str | None
-    motive: bool
-    state: Path | None
-    target: str | None
-    faults: tuple[str, ...]
-    seed: int
-    profile: str
-    overrides: tuple[str, ...]
+    udp: int | None = option(
+        "--udp", type=click.IntRange(0, 65535), metavar="PORT", help="UDP port of the first board; 0: any."
+    )
+    radio: bool = option("--radio", is_flag=True, help="Offer a virtual Crazyradio.")
+    radio_port: int = option(
+        "--radio-port", type=click.IntRange(0, 65535), default=RADIO_PORT, show_default=True, metavar="PORT",
+        help="Where the Crazyradio's server listens; 0: any.",
+    )  # fmt: skip
+    usb: bool = option(
+        "--usb", is_flag=True,
+        help="Put the virtual Crazyradio on the USB bus of PROGRAM, in any language, and serve until that ends; without "
+        "PROGRAM, print the command that starts one so.",
+    )  # fmt: skip
+    program: tuple[str, ...] = argument("program", nargs=-1, type=click.UNPROCESSED)
+    mavlink: str | None = option(
+        "--mavlink",
+        metavar="END",
+        help="Open a serial line with MAVLink: pty, pty:PATH, udp[:[HOST:]PORT] (talks to a ground station that listens "
+        "there), tcp[:[HOST:]PORT] (listens).",
+    )
+    board: str | None = option(
+        "--board",
+        metavar="FILE",
+        help="The image of a Crazyflie's firmware, which every board executes whole: an ELF file, a .bin or the zip of "
+        "a release.",
+    )
+    elf: Path | None = common_option(common.elf_option)
+    gdb: int | None = common_option(common.gdb_option)
+    boards: int = option(
+        "--boards", type=click.IntRange(1, BOARDS_MAX), default=1, show_default=True, metavar="N"
+    )
+    station: str | None = option(
+        "--station", type=click.Choice(["corrections", "poses"]), is_flag=False, flag_value="corrections",
+        help="Fly at home with the built-in ground station; poses: it sends absolute poses, and clients send the goal. "
+        "Of the profile crazyflie: always poses.",
+    )  # fmt: skip
+    motive: bool = option(
+        "--motive/--no-motive", default=True, show_default=True, help="Stream the cameras' poses over NatNet."
+    )
+    state: Path | None = option(
+        "--state", type=PATH, metavar="DIR",
+        help="Keep each board's EEPROM and deck memory in this folder, over restarts of the server.",
+    )  # fmt: skip
+    target: str | None = common_option(common.view_option)
+    faults: tuple[str, ...] = common_option(common.fault_option)
+    seed: int = common_option(common.seed_option)
+    profile: str = common_option(common.profile_option)
+    overrides: tuple[str, ...] = common_option(common.set_option)
 
 
 @click.command()
-@click.option(
-    "--udp", type=click.IntRange(0, 65535), metavar="PORT", help="UDP port of the first board; 0: any."
-)
-@click.option("--radio", is_flag=True, help="Offer a virtual Crazyradio.")
-@click.option(
-    "--radio-port", type=click.IntRange(0, 65535), default=RADIO_PORT, show_default=True, metavar="PORT",
-    help="Where the Crazyradio's server listens; 0: any.",
-)  # fmt: skip
-@click.option(
-    "--usb", is_flag=True,
-    help="Put the virtual Crazyradio on the USB bus of PROGRAM, in any language, and serve until that ends; without "
-    "PROGRAM, print the command that starts one so.",
-)  # fmt: skip
-@click.argument("program", nargs=-1, type=click.UNPROCESSED)
-@click.option(
-    "--mavlink",
-    metavar="END",
-    help="Open a serial line with MAVLink: pty, pty:PATH, udp[:[HOST:]PORT] (talks to a ground station that listens "
-    "there), tcp[:[HOST:]PORT] (listens).",
-)
-@click.option(
-    "--board",
-    metavar="FILE",
-    help="The image of a Crazyflie's firmware, which every board executes whole: an ELF file, a .bin or the zip of "
-    "a release.",
-)
-@common.elf_option
-@common.gdb_option
-@click.option("--boards", type=click.IntRange(1, BOARDS_MAX), default=1, show_default=True, metavar="N")
-@click.option(
-    "--station", type=click.Choice(["corrections", "poses"]), is_flag=False, flag_value="corrections",
-    help="Fly at home with the built-in ground station; poses: it sends absolute poses, and clients send the goal. "
-    "Of the profile crazyflie: always poses.",
-)  # fmt: skip
-@click.option(
-    "--motive/--no-motive", default=True, show_default=True, help="Stream the cameras' poses over NatNet."
-)
-@click.option(
-    "--state", type=PATH, metavar="DIR",
-    help="Keep each board's EEPROM and deck memory in this folder, over restarts of the server.",
-)  # fmt: skip
-@common.view_option
-@common.fault_option
-@common.seed_option
-@common.profile_options
 @common.asked_as(ServeOptions)
 def serve(asked: ServeOptions) -> int:
     """Serve robots in virtual tunnels, in real time, until Ctrl-C.
@@ -143,7 +128,7 @@ def serve(asked: ServeOptions) -> int:
     plan = Service(config, 1, asked.seed, bool(serial), planned, asked.state, _executor(asked))
     endpoints = Endpoints(asked.udp, asked.radio_port if asked.radio else None, serial, station, asked.motive)
     records = Records()
-    say = records.say
+    say = records.print_text
     with closing(Swarm(plan, asked.boards, endpoints, say)) as swarm:
         view = common.open_live(asked.target, say)
         with closing(Server(plan, say, view, swarm.to_peers, swarm.room)) as server:

@@ -12,7 +12,7 @@ import click
 from ground_station.controls import ControlsError
 from ground_station.trajectory import Goal, Trajectory
 from hil.commands import options as common
-from hil.commands.options import FILE, PATH
+from hil.commands.options import FILE, PATH, argument, common_option, option
 from hil.commands.tables import print_result
 from hil.errors import LabError
 
@@ -29,55 +29,45 @@ if TYPE_CHECKING:
 class StationOptions:
     """The options of `floaty station`."""
 
-    uri: str
-    mocap: str | None
-    named: str
-    start_s: float
-    duration: float | None
-    log: Path | None
-    record: Path | None
-    tlog: Path | None
-    out: Path | None
-    target: str | None
-    profile: str
-    overrides: tuple[str, ...]
+    uri: str = option(
+        "--link", "uri", required=True, metavar="URI",
+        help="radio://0/80/2M/E7E7E7E7E7, udp://127.0.0.1:19850, or mavlink:DEVICE[,BAUD] with a DEVICE like /dev/ttyUSB0, "
+        "COM3, socket://HOST:PORT, rfc2217://HOST:PORT.",
+    )  # fmt: skip
+    mocap: str | None = option(
+        "--mocap", metavar="SYSTEM",
+        help="The source of poses, which overrides [capture] of the profile: optitrack:HOST[:PORT], also the Motive of "
+        "`floaty serve`, vicon:HOST[:PORT], qualisys:HOST, vrpn:HOST[:PORT], each with [,body=NAME] [,z-up|,y-up], "
+        "optitrack with [,multicast]; or replay:PATH, a file of --record, a telemetry.csv or a run folder, "
+        "whose end ends the flight.",
+    )  # fmt: skip
+    named: str = argument("named", metavar="[EXPERIMENT]", default="hover")
+    start_s: float = option(
+        "--start", "start_s", type=common.Number(0, 3600), default=1.0, show_default=True, metavar="S",
+        help="When the trajectory begins, after the board first flies.",
+    )  # fmt: skip
+    duration: float | None = option(
+        "--duration", type=common.Number(min=0, min_open=True), metavar="S", help="[default: until Ctrl-C]"
+    )
+    log: Path | None = option("--log", type=FILE, metavar="FILE", help="Telemetry as CSV.")
+    record: Path | None = option(
+        "--record", type=FILE, metavar="FILE",
+        help="Every frame of motion capture as CSV, for --mocap replay:FILE.",
+    )  # fmt: skip
+    tlog: Path | None = option(
+        "--tlog", type=FILE, metavar="FILE",
+        help="Every MAVLink frame of the link, as a telemetry log; for --link mavlink:….",
+    )  # fmt: skip
+    out: Path | None = option(
+        "--out", type=PATH, metavar="DIR",
+        help="Run folder as `floaty fly` writes one: log, telemetry, events, result, report, recording.",
+    )  # fmt: skip
+    target: str | None = common_option(common.view_option)
+    profile: str = common_option(common.profile_option)
+    overrides: tuple[str, ...] = common_option(common.set_option)
 
 
 @click.command()
-@click.option(
-    "--link", "uri", required=True, metavar="URI",
-    help="radio://0/80/2M/E7E7E7E7E7, udp://127.0.0.1:19850, or mavlink:DEVICE[,BAUD] with a DEVICE like /dev/ttyUSB0, "
-    "COM3, socket://HOST:PORT, rfc2217://HOST:PORT.",
-)  # fmt: skip
-@click.option(
-    "--mocap", metavar="SYSTEM",
-    help="The source of poses, which overrides [capture] of the profile: optitrack:HOST[:PORT], also the Motive of `floaty "
-    "serve`, vicon:HOST[:PORT], qualisys:HOST, vrpn:HOST[:PORT], each with [,body=NAME] [,z-up|,y-up], optitrack with "
-    "[,multicast]; or replay:PATH, a file of --record, a telemetry.csv or a run folder, whose end ends the flight.",
-)  # fmt: skip
-@click.argument("named", metavar="[EXPERIMENT]", default="hover")
-@click.option(
-    "--start", "start_s", type=common.Number(0, 3600), default=1.0, show_default=True, metavar="S",
-    help="When the trajectory begins, after the board first flies.",
-)  # fmt: skip
-@click.option(
-    "--duration", type=common.Number(min=0, min_open=True), metavar="S", help="[default: until Ctrl-C]"
-)
-@click.option("--log", type=FILE, metavar="FILE", help="Telemetry as CSV.")
-@click.option(
-    "--record", type=FILE, metavar="FILE",
-    help="Every frame of motion capture as CSV, for --mocap replay:FILE.",
-)  # fmt: skip
-@click.option(
-    "--tlog", type=FILE, metavar="FILE",
-    help="Every MAVLink frame of the link, as a telemetry log; for --link mavlink:….",
-)  # fmt: skip
-@click.option(
-    "--out", type=PATH, metavar="DIR",
-    help="Run folder as `floaty fly` writes one: log, telemetry, events, result, report, recording.",
-)  # fmt: skip
-@common.view_option
-@common.profile_options
 @common.asked_as(StationOptions)
 def station(asked: StationOptions) -> int:
     """Fly EXPERIMENT, by default hover, with a board, real or virtual: poses in, poses or corrections out at 50 Hz.
@@ -102,9 +92,9 @@ def station(asked: StationOptions) -> int:
     config, experiment = load_config(asked.profile, asked.overrides), find_experiment(asked.named)
     _check_files(asked)
     records = Records()
-    view = common.open_live(asked.target, records.say)
+    view = common.open_live(asked.target, records.print_text)
     flight = _recorded(asked, experiment, view, records)
-    console = OperatorConsole(flight, view, records.say)
+    console = OperatorConsole(flight, view, records.print_text)
     know = view.know if view is not None and asked.target == "foxglove:parameters" else None
     operator = Operator(_trajectory_of, console.reply, console.note, know)
     log = flight.telemetry if flight is not None and asked.out is not None else asked.log
@@ -124,9 +114,9 @@ def station(asked: StationOptions) -> int:
     if result is not None:
         records.write(asked.out, common.write_pictures, result.folder, experiment)
         records.write(STANDARD_OUTPUT, print_result, result)
-    records.write(asked.out, common.close_live, view, result, records.say)
+    records.write(asked.out, common.close_live, view, result, records.print_text)
     for notice in records.notices():
-        records.say(notice)
+        records.print_text(notice)
     if failure:
         raise LabError(failure)
     if records.incomplete:
@@ -145,7 +135,7 @@ def _recorded(
         return None
     bench = Bench(link=asked.uri, board=REAL)
     request = Request(experiment, asked.profile, asked.overrides, 0, experiment.duration_s, (), bench)
-    return RealFlight(asked.out, request, records, records.say, observer=view)
+    return RealFlight(asked.out, request, records, records.print_text, observer=view)
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +171,7 @@ class OperatorConsole:
 
         def take_lines(session: StationSession, now_us: int) -> None:
             for line in view.lines() if view is not None else ():
-                operator.take(line)
+                operator.queue_line(line)
 
         return [take_lines] if self.flight is None else [take_lines, self.flight.turn]
 
@@ -190,9 +180,9 @@ def _check_files(asked: StationOptions) -> None:
     """Raise `LabError` for files that cannot be written, or not with these options."""
     if asked.out is not None and asked.log is not None:
         raise LabError(f"--log {asked.log}: --out {asked.out} has a telemetry.csv of its own")
-    for option, path in (("--log", asked.log), ("--record", asked.record), ("--tlog", asked.tlog)):
+    for name, path in (("--log", asked.log), ("--record", asked.record), ("--tlog", asked.tlog)):
         if path is not None and not path.parent.is_dir():
-            raise LabError(f"{option} {path}: there is no folder {path.parent}")
+            raise LabError(f"{name} {path}: there is no folder {path.parent}")
     if asked.tlog is not None and not asked.uri.startswith("mavlink:"):
         raise LabError(
             f"--tlog {asked.tlog}: --link {asked.uri}: only mavlink:DEVICE[,BAUD] has frames of MAVLink"

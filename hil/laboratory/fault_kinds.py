@@ -159,7 +159,7 @@ def _component(
 def _setting(name: str, blend: Blend) -> Knob:
     return Knob(
         lambda robot: robot.body.settings[name].read(),
-        lambda robot, value: robot.body.settings[name].turn(value),
+        lambda robot, value: robot.body.settings[name].write(value),
         blend,
     )
 

@@ -193,14 +193,14 @@ class Switchboard:
 
     def begin(self, fault: Fault, now_us: int) -> None:
         """Set the knobs of a fault."""
-        self._robot.say("lab", f"fault {fault} begins")
+        self._robot.note("lab", f"fault {fault} begins")
         self._switch(fault, [*self.active, fault], now_us)
 
     def end(self, fault: Fault, now_us: int) -> None:
         """Reset the knobs, if the fault is still active."""
         if fault not in self.active:
             return
-        self._robot.say("lab", f"fault {fault} ends")
+        self._robot.note("lab", f"fault {fault} ends")
         remaining = self.active.copy()
         remaining.remove(fault)
         self._switch(fault, remaining, now_us)

@@ -212,7 +212,7 @@ class Flight:
     def _record(self, now_us: int) -> None:
         if self.over:
             return
-        lost = self.robot.look(now_us)
+        lost = self.robot.advance_truth(now_us)
         if self._recorder is not None:
             if self.robot.firmware is not self._recorded:  # it has booted
                 self._recorded = self.robot.firmware
@@ -270,7 +270,7 @@ class Flight:
     def show(self) -> None:
         """Show who looks on the rows so far."""
         if self._recorder is not None:
-            self._recorder.show()
+            self._recorder.pass_rows()
 
     def write_schedule(self, folder: Path) -> None:
         """Write the scheduler's trace."""

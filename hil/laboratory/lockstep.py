@@ -97,8 +97,8 @@ class ModelledLine:
     def _set_up(self, site: Site, flashed: Flashed) -> None:
         """Send the flight's settings to the board; report firmware that may not drive this robot."""
         if APP_PARAMETER not in flashed.parameters:
-            site.say(SETTINGS, NO_APP)
-        say, uplink = partial(site.say, SETTINGS), self.radio.uplink
+            site.note(SETTINGS, NO_APP)
+        say, uplink = partial(site.note, SETTINGS), self.radio.uplink
         settings = ImageSettings(
             flashed.parameters, flashed.differences, site.config, site.events, uplink, say
         )
@@ -142,7 +142,7 @@ class ModelledLine:
         with refusing("--link mavlink: ", LinkError):
             link = MavlinkLink(uart.uplink, site.config.ground.links(self._note_frame))
         self._frames = FrameLog(telemetry.with_name(FRAME_LOG)) if telemetry is not None else None
-        site.events.at(0, lambda now_us: site.say("lab", link.budget.text))
+        site.events.at(0, lambda now_us: site.note("lab", link.budget.text))
         return link, serial_channel(uart, self.robot.firmware, link)
 
     def _note_frame(self, now_us: int, frame: bytes) -> None:

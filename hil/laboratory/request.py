@@ -86,10 +86,9 @@ class Bench:
             raise LabError(f"--elf {self.elf}: goes with an image as --board, not with {self.board}")
         if self.gdb is not None and not self.is_image:
             raise LabError(f"--gdb {self.gdb}: needs one flight with an image as --board")
-        if self.coverage is not None and not self.is_image:
-            raise LabError(f"--coverage {self.coverage}: needs an image as --board, not {self.board}")
-        if self.profile_cpu is not None and not self.is_image:
-            raise LabError(f"--profile-cpu {self.profile_cpu}: needs an image as --board, not {self.board}")
+        for name, out in (("coverage", self.coverage), ("profile-cpu", self.profile_cpu)):
+            if out is not None and not self.is_image:
+                raise LabError(f"--{name} {out}: needs an image as --board, not {self.board}")
         if self.in_loop and not (is_link(self.board) and self.link == RADIO):
             raise LabError(
                 f"--hil: --board {self.board} --link {self.link}: expected the link to a real board as --board"
@@ -104,6 +103,19 @@ class Bench:
                 "mavlink:pty or mavlink:PATH"
             )
         self._require_packages()
+
+    def check_many(self, option: str, count: int) -> None:
+        """Raise `LabError` for what only one flight at a time can have, where `option` asks for `count`."""
+        if not self.in_lockstep:
+            raise LabError(f"--link {self.link}: {option} is for flights in lockstep: {', '.join(LOCKSTEP)}")
+        if is_link(self.board) or self.in_loop:
+            raise LabError(f"--board {self.board}: {option} {count}: a real board is in one flight at a time")
+        alone = {
+            "--gdb": self.gdb is not None, "--perfetto": self.trace, "--profile-cpu": self.profile_cpu is not None,
+            "--realtime": self.realtime,
+        }  # fmt: skip
+        if given := [name for name, is_given in alone.items() if is_given]:
+            raise LabError(f"{option} {count}: {', '.join(given)}: for one flight only")
 
     def _require_packages(self) -> None:
         link, board = f"--link {self.link}", f"--board {self.board}"
@@ -182,23 +194,17 @@ class Request:
         trajectory, duration_s = options.get("trajectory"), options.get("duration_s")
         if trajectory is not None:
             experiment = dataclasses.replace(experiment, trajectory=trajectory)
-        profile, overrides = (
-            options.get("profile", DEFAULT_PROFILE),
-            settings_of(options.get("overrides", ())),
-        )
-        faults = options.get("faults", ())
-        if _has_unknown(faults):
-            digest_of_body(read_config(profile, (*experiment.settings, *overrides)))
-        bench: Mapping[str, Any] = {name: value for name, value in options.items() if name in _OF_BENCH}
+        bench: Any = {name: value for name, value in options.items() if name in Bench.__dataclass_fields__}
         request = cls(
             experiment,
-            profile,
-            (*experiment.settings, *overrides),
+            options.get("profile", DEFAULT_PROFILE),
+            (*experiment.settings, *settings_of(options.get("overrides", ()))),
             options.get("seed", 1),
             experiment.duration_s if duration_s is None else duration_s,
-            tuple(map(str, (*experiment.faults, *_parsed(faults)))),
+            tuple(map(str, (*experiment.faults, *options.get("faults", ())))),
             Bench(**bench),
         )
+        request = dataclasses.replace(request, faults=tuple(map(str, request.planned_faults)))
         request.check()
         return request
 
@@ -246,9 +252,9 @@ class Request:
     @cached_property
     def planned_faults(self) -> tuple[Fault, ...]:
         """The faults of the flight; the file of the user's own robot may declare their kinds. Raises `LabError`."""
-        if _has_unknown(self.faults):
+        if any(text.partition("@")[0] not in KINDS for text in self.faults):
             digest_of_body(self.config)
-        return _parsed(self.faults)
+        return tuple(map(parse, self.faults))
 
     @cached_property
     def times(self) -> FlightTimes | None:
@@ -282,10 +288,15 @@ class Request:
         """The heading of a page or a table."""
         return f"{self.experiment.name}, {'real flight' if self.is_real else f'seed {self.seed}'}"
 
+    @property
+    def text(self) -> str:
+        """The title and the options, without those that are as usual."""
+        options = {name: value for name, value in self.parts().items() if name not in ("", "seed")}
+        unusual = [f"{name} {value}" for name, value in options.items() if value != USUAL.get(name, "")]
+        return ", ".join([self.title, *unusual])
+
     def __repr__(self) -> str:
-        told = {name: value for name, value in self.parts().items() if name not in ("", "seed")}
-        unusual = [f"{name} {value}" for name, value in told.items() if value != USUAL.get(name, "")]
-        return f"<Request {', '.join([self.title, *unusual])}>"
+        return f"<Request {self.text}>"
 
     def parts(self) -> dict[str, str]:
         """Return the options as text, by their names in `floaty fly`: equal for equal flights."""
@@ -297,24 +308,20 @@ class Request:
 
     def stored(self) -> dict[str, Any]:
         """Return the request as a run folder stores it, ready for JSON."""
-        source, elf = self.experiment.source, self.bench.elf
+        source, bench = self.experiment.source, self.bench
         return {
             "experiment": self.experiment.name, "source": None if source is None else asdict(source),
             "pictures": self.experiment.pictures, "draws": self.experiment.draw is not None,
             "profile": self.profile, "overrides": self.overrides, "seed": None if self.is_real else self.seed,
             "duration_s": self.duration_s, "faults": self.faults,
-            **_stored_bench(self.bench), "elf": None if elf is None else str(elf),
+            **{one.name: getattr(bench, one.name) for one in fields(Bench) if one.compare},
+            "elf": None if bench.elf is None else str(bench.elf),
         }  # fmt: skip
 
     @staticmethod
     def read(values: Mapping[str, Any], find: Find = unknown) -> Request:
         """Return a stored request; `find` returns its experiment. Raises pydantic's `ValidationError`."""
         return _STORED.validate_python(values, context=find)
-
-
-def _stored_bench(bench: Bench) -> dict[str, Any]:
-    """Return what of a bench makes the flight: not where else its observations are added."""
-    return {name: value for name, value in asdict(bench).items() if name not in ("coverage", "profile_cpu")}
 
 
 def _nested(values: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -324,16 +331,6 @@ def _nested(values: Mapping[str, Any]) -> Mapping[str, Any]:
 
 StoredRequest = Annotated[Request, BeforeValidator(_nested), PlainSerializer(Request.stored)]
 _STORED: TypeAdapter[Request] = TypeAdapter(StoredRequest)
-_OF_BENCH = tuple(one.name for one in fields(Bench))
-
-
-def _has_unknown(faults: Sequence[Fault | str]) -> bool:
-    """Whether a text names a kind that nobody has declared yet."""
-    return any(isinstance(one, str) and one.partition("@")[0] not in KINDS for one in faults)
-
-
-def _parsed(faults: Sequence[Fault | str]) -> tuple[Fault, ...]:
-    return tuple(parse(one) if isinstance(one, str) else one for one in faults)
 
 
 def why_left(config: LabConfig, p_W: Sequence[float]) -> str:

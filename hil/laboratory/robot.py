@@ -42,7 +42,7 @@ BENCH_NOISE, BENCH_GYRO = 0.05, 10.0 / GYRO_COUNTS  # [rad/s]
 MOCAP_PHASE_US = 7_000  # so that a pose of 40 ms reaches the estimator 1-3 ms before its step
 
 See = Callable[[MocapFrame, int, Sighting | None], None]  # (frame, now_us, sighting of the markers)
-Say = Callable[[str, str], None]  # (source, text)
+Note = Callable[[str, str], None]  # writes a source and its text into the event log
 PYTHON_BOARD = PythonBoard()
 SendPacket = Callable[[int, bytes], bool]  # (now_us, packet): False when it must wait
 
@@ -73,7 +73,7 @@ class Site:
     config: LabConfig
     events: EventQueue
     streams: Streams
-    say: Say
+    note: Note
     executor: Executor = PYTHON_BOARD
 
 
@@ -113,7 +113,7 @@ class Robot:
         self.config = config
         self.events = site.events
         self._beat_us = site.events.beat.cell("now_us")
-        self.say = site.say
+        self.note = site.note
         self.free = False
         self.powered = True
         self.pushes: tuple[float, ...] = (0.0,) * 6  # of faults: force [N, W] and torque [N m, B]
@@ -139,7 +139,7 @@ class Robot:
         self.board = VirtualBoard(
             self.body.set_counts,
             ports.send_packet,
-            lambda now_us, text: self.say("board", text),
+            lambda now_us, text: self.note("board", text),
             self.uart,
             Requests(self._reset, ports.radio_command or self._radio_command, ports.fail),
             ports.eeprom,
@@ -268,7 +268,7 @@ class Robot:
         self.body.put_back(self.start_W)
         self.free = False
 
-    def look(self, now_us: int) -> str | None:
+    def advance_truth(self, now_us: int) -> str | None:
         """Advance the truth and the battery to this time; return why the flight is over, None while it is not."""
         self.body.advance(now_us)
         self.battery.draw(now_us, self.body.draw(now_us, self.battery.voltage))
@@ -329,7 +329,7 @@ class Robot:
     def _reset(self, now_us: int) -> None:
         def restart(now_us: int) -> None:
             if self.powered:
-                self.say("board", "reset")
+                self.note("board", "reset")
                 self._resets += 1
                 (self._ports.restart or self.boot)(now_us)
 
@@ -337,7 +337,7 @@ class Robot:
 
     def _radio_command(self, now_us: int, kind: int, data: bytes) -> None:
         if kind in (syslink.SWITCH_OFF, syslink.STM32_OFF):
-            self.say("board", "switched off by its firmware")
+            self.note("board", "switched off by its firmware")
             self.events.at(now_us, lambda _: self.cut_power())
         elif kind == syslink.PEER_BROADCAST and data:
             self._ports.to_peers(now_us, peer_packet(data))

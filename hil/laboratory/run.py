@@ -99,7 +99,7 @@ class Started:
         """Fly to the end."""
 
         def on_progress(now_us: int) -> None:
-            self._pace.look(now_us)
+            self._pace.start_when_due(now_us)
             if progress is not None:
                 progress(now_us, self.flight)
 
@@ -117,7 +117,7 @@ class Started:
             flight.lab.run_to(us)
             return flight.end() if flight.now_us >= flight.end_us else None
 
-        self._pace.look(us)
+        self._pace.start_when_due(us)
         if self._ended is None:
             self._ended = _ended(self.flight, on)
 

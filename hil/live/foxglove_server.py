@@ -103,7 +103,7 @@ class FoxgloveScreen:
         self._server = LocalServer(PORT, self, {"/": _Client})
         self.address = f"ws://{self._server.host}/?token={self._server.token}"
 
-    def show(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
+    def show_rows(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
         file = io.BytesIO()
         plain = MCAPWriteOptions(compression=None, use_chunks=False)
         with foxglove.open_mcap(file, context=self._context, writer_options=plain):
@@ -127,7 +127,7 @@ class FoxgloveScreen:
                 for client in self.clients:
                     client.advertise([channel])
             for client in self.clients:
-                client.show(self.channels[channel], time_ns, data)
+                client.send_sample(self.channels[channel], time_ns, data)
 
     def _learn(self, values: dict[str, float]) -> None:
         self.values |= values
@@ -219,7 +219,7 @@ class _Client(Guarded, WebSocketHandler):
         numbers = self.owner.channels
         self.tell(op="advertise", channels=[channel.described(numbers[channel]) for channel in channels])
 
-    def show(self, number: int, time_ns: int, data: bytes) -> None:
+    def send_sample(self, number: int, time_ns: int, data: bytes) -> None:
         """Send a message of a channel, if the client has subscribed to it."""
         if number in self._subscriptions:
             self._queue(_DATA.pack(1, self._subscriptions[number], time_ns) + data)

@@ -62,13 +62,13 @@ class PanelScreen:
         self.token, self.origin = self._server.token, f"http://{self._server.host}"
         self.address = f"{self.origin}/?token={self.token}"
 
-    def show(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
+    def show_rows(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
         texts = list(events)
         message: dict[str, Any] = {"texts": [f"{one['source']}: {one['text']}" for one in texts]}
         if self.wants_viewer and self._viewer is None:
             message |= self._open_viewer()
         if self._viewer is not None:
-            self._viewer.show(rows, texts)
+            self._viewer.show_rows(rows, texts)
         if rows.num_rows:
             self._past = [*self._past, rows][-BATCHES_KEPT:]
             if self.pages:

@@ -29,7 +29,7 @@ class Screen(Protocol):
 
     address: str  # the address to show to the user; empty if it is not needed
 
-    def show(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
+    def show_rows(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
         """Show the next rows, and texts up to them."""
 
     def know(self, values: Mapping[str, float]) -> None:
@@ -65,7 +65,7 @@ def run(target: str, program: str, rows: IO[bytes], say: Say) -> None:
             batch, metadata = reader.read_next_batch_with_custom_metadata()
             if known := json.loads(metadata[PARAMETERS]):
                 screen.know(known)
-            screen.show(pa.Table.from_batches([batch]), json.loads(metadata[EVENTS]))
+            screen.show_rows(pa.Table.from_batches([batch]), json.loads(metadata[EVENTS]))
             taken += batch.num_rows
             say(TAKEN, str(taken))
     except (StopIteration, pa.ArrowInvalid):  # the flight is over, or its process was killed

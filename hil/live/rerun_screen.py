@@ -32,7 +32,7 @@ class RerunScreen:
         self._recording = stream_to(taker)
         self._flight: RerunFlight | None = None
 
-    def show(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
+    def show_rows(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
         if self._flight is None:
             self._recording.send_blueprint(blueprint(rows.schema, live=True))
             self._flight = RerunFlight(self._recording, rows.schema)

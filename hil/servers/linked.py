@@ -61,8 +61,8 @@ class StationProcess:
     ) -> None:
         assert isinstance(lab.clock, Paced)
         config, uri = site.config, request.bench.link
-        self._say = site.say
-        self._served = ServedRobot(1, site, partial(site.say, "lab"), uri.startswith(SERIAL))
+        self._say = site.note
+        self._served = ServedRobot(1, site, partial(site.note, "lab"), uri.startswith(SERIAL))
         self.robot = self._served.robot
         self._readers = lab.clock.readers
         self._experiment = request.experiment

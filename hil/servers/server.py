@@ -214,19 +214,19 @@ class Server:
 
     def _look(self, now_us: int) -> None:
         robot, nrf51 = self.robot, self.served.nrf51
-        lost = robot.look(now_us)
+        lost = robot.advance_truth(now_us)
         self.served.keep()
         if self._shown is not None:
             self._shown.row(now_us)
         if nrf51.power in (Power.OFF, Power.BOOTLOADER) and now_us - nrf51.heard_us > BUTTON_US:
-            robot.say("lab", "power button pressed")
+            robot.note("lab", "power button pressed")
             nrf51.press_button(now_us)
         if robot.powered:
             try:
                 robot.firmware.check_watchdog()
             except WatchdogError as error:
-                robot.say("lab", str(error))
+                robot.note("lab", str(error))
                 self.served.start(now_us)
         if lost is not None and robot.free:
-            robot.say("lab", f"lost: {lost}; it is put back")
+            robot.note("lab", f"lost: {lost}; it is put back")
             self._clamp.put_back_later(now_us)

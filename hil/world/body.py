@@ -54,7 +54,7 @@ class Setting:
     """A number of a body that a fault changes in flight."""
 
     read: Callable[[], float]
-    turn: Callable[[float], None]
+    write: Callable[[float], None]
 
 
 @dataclass(frozen=True, slots=True)

@@ -103,7 +103,7 @@ def test_the_same_instant_has_the_same_bits_however_the_time_to_it_is_divided(co
 def test_every_setting_can_be_turned_there_and_back(body: Body) -> None:
     for name, setting in body.settings.items():
         before = setting.read()
-        setting.turn(0.5)
+        setting.write(0.5)
         assert setting.read() == pytest.approx(0.5), name
-        setting.turn(before)
+        setting.write(before)
         assert setting.read() == before

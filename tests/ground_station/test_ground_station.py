@@ -116,7 +116,7 @@ def test_a_slot_begins_an_eighth_of_its_period_before_it_and_takes_one_frame(ste
         number = (t_us + 2_500 - phase_us) // 20_000
         assert slots.due(t_us) == (number > filled)
         if number > filled:
-            slots.take(t_us)
+            slots.fill_slot(t_us)
             filled = number
 
 

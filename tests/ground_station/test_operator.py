@@ -55,13 +55,15 @@ class Bench(CrtpClient):
                 ask=self.controls.ask, answer=self.controls.answer, supervisor_state=self.state
             )
             ground = SimpleNamespace(frame=MocapFrame(self.now_us, self.place, LEVEL, True))
-            self.operator.turn(SimpleNamespace(link=link, ground=ground, plan=self.plan), self.now_us)
+            self.operator.process_lines(
+                SimpleNamespace(link=link, ground=ground, plan=self.plan), self.now_us
+            )
 
     def type(self, *lines, wait_us=500_000):
         """Type lines and return what is answered."""
         self.said.clear()
         for line in lines:
-            self.operator.take(line)
+            self.operator.queue_line(line)
         self.turns(wait_us)
         return list(self.said)
 
@@ -244,7 +246,7 @@ def test_lines_are_done_in_their_order(bench):
 
 def test_too_many_lines_are_refused_and_reported(bench):
     for number in range(LINES + 5):
-        bench.operator.take(f"mark {number}")
+        bench.operator.queue_line(f"mark {number}")
     assert len(bench.said) == 5
     bench.turns(LINES * TURN_US)
     assert bench.noted == [f"mark {number}" for number in range(LINES)]

@@ -102,7 +102,7 @@ def test_a_standard_output_that_fails_is_one_line_and_nothing_raises(
         monkeypatch.setattr(sys, "stdout", output)
         records = Records()
         for number in range(3):
-            records.say(f"line {number}")
+            records.print_text(f"line {number}")
         print("what others print", flush=True)
     line = f"{STANDARD_OUTPUT}: {why}; no more is written to it"
     assert records.notices() == [line]
@@ -141,10 +141,10 @@ def test_a_standard_output_that_nobody_reads_stops_no_flight_and_its_lines_are_c
                     pass
             os.set_blocking(write, True)
             for _ in range(count):
-                records.say("unread")
+                records.print_text("unread")
             while reader.read(65536):
                 pass
-            records.say("read")
+            records.print_text("read")
             missing = b"%d lines are missing here: nobody read the output\n" % count
             assert reader.read(1000) == missing + b"read\n"
     assert records.incomplete
@@ -154,5 +154,5 @@ def test_a_standard_output_that_nobody_reads_stops_no_flight_and_its_lines_are_c
 def test_a_program_without_a_standard_output_flies(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdout", None)  # as Python starts with a closed one
     records = Records()
-    records.say("connected")
+    records.print_text("connected")
     assert not records.incomplete

@@ -42,7 +42,7 @@ def tracking(config: TrackerConfig = CONFIG, count: int = 100, seed: int = 1) ->
     tracker = Tracker(config, PERIOD_US)
     rng = np.random.default_rng(seed)
     for number in range(count):
-        tracker.take(noisy(rng, number))
+        tracker.track_frame(noisy(rng, number))
     assert tracker.quality is Quality.TRACKED
     return tracker
 
@@ -68,7 +68,7 @@ def test_velocity_and_rate_are_those_of_a_known_trajectory() -> None:
     errors = []
     for number in range(1000):
         p, v, R, w = motion(number * PERIOD_US * 1e-6)
-        track = tracker.take(noisy(rng, number, p, R.as_quat(scalar_first=True)))
+        track = tracker.track_frame(noisy(rng, number, p, R.as_quat(scalar_first=True)))
         if number > 20:
             assert track.quality is Quality.TRACKED
             errors.append([*(track.v_WB - v), *(track.w_B - w)])
@@ -83,7 +83,7 @@ def test_velocity_and_rate_are_those_of_a_known_trajectory() -> None:
 def test_a_good_pose_passes_unchanged() -> None:
     tracker = tracking()
     seen = noisy(np.random.default_rng(9), 100)
-    assert tracker.take(seen).frame is seen
+    assert tracker.track_frame(seen).frame is seen
 
 
 # The same as a plain filter
@@ -130,7 +130,7 @@ def test_it_is_the_plain_kalman_filter_over_random_gaps() -> None:
             silent = rng.random() < 0.5
             for _ in range(gap):
                 if not silent:
-                    tracker.take(frame(number, valid=False))
+                    tracker.track_frame(frame(number, valid=False))
                 plain.step(None)
                 number += 1
         p, _, R, _ = motion(number * PERIOD_US * 1e-6)
@@ -138,10 +138,10 @@ def test_it_is_the_plain_kalman_filter_over_random_gaps() -> None:
         if number == 0:
             plain.kf.x[:3] = seen.p_WB
             plain.R = Rotation.from_quat(seen.q_WB, scalar_first=True)
-            tracker.take(seen)
+            tracker.track_frame(seen)
         else:
             plain.step(seen)
-            track = tracker.take(seen)
+            track = tracker.track_frame(seen)
             if number > 1:
                 assert track.quality is YES
                 assert track.v_WB == pytest.approx(plain.kf.x[3:6], abs=1e-9)
@@ -234,7 +234,7 @@ def test_distances_are_distributed_as_chi2_when_the_robot_moves_as_assumed() -> 
 def test_wrong_poses_that_agree_are_refused_for_less_than_the_time_to_reacquire(p, q, count: int) -> None:
     tracker, rng = tracking(), np.random.default_rng(2)
     for number in range(100, 100 + count):
-        track = tracker.take(noisy(rng, number, p, q))
+        track = tracker.track_frame(noisy(rng, number, p, q))
         assert (track.quality, track.frame.valid) == (Quality.REFUSED, False)
     assert tracker.counters.refused == count
 
@@ -243,7 +243,9 @@ def test_wrong_poses_each_in_a_direction_of_its_own_never_pass() -> None:
     tracker, rng = tracking(), np.random.default_rng(4)
     for number in range(100, 400):
         offset = rng.normal(size=3)
-        track = tracker.take(noisy(rng, number, (0.1, -0.2, 1.15) + 0.5 * offset / np.linalg.norm(offset)))
+        track = tracker.track_frame(
+            noisy(rng, number, (0.1, -0.2, 1.15) + 0.5 * offset / np.linalg.norm(offset))
+        )
         assert track.quality is not Quality.TRACKED
 
 
@@ -251,10 +253,10 @@ def test_the_robot_is_found_again_after_outliers_of_a_tenth_of_a_second_however_
     tracker, rng = tracking(), np.random.default_rng(2)
     for start in range(100, 400, 100):
         for number in range(start, start + 20):
-            assert tracker.take(noisy(rng, number, (0.6, -0.2, 1.15))).quality is Quality.REFUSED
+            assert tracker.track_frame(noisy(rng, number, (0.6, -0.2, 1.15))).quality is Quality.REFUSED
         here = (0.1 + 2e-4 * start, -0.2, 1.15)  # 2 cm further every time: the gate has widened
         for number in range(start + 20, start + 100):
-            assert tracker.take(noisy(rng, number, here)).quality is YES
+            assert tracker.track_frame(noisy(rng, number, here)).quality is YES
     assert tracker.counters.restarts == 0
 
 
@@ -262,7 +264,7 @@ def test_the_robot_is_found_again_after_outliers_of_a_tenth_of_a_second_however_
 def test_the_exact_opposite_attitude_is_refused(w: float) -> None:
     tracker = Tracker(CONFIG, PERIOD_US)
     for number in range(3):
-        tracker.take(frame(number))
+        tracker.track_frame(frame(number))
     assert tracker._filter.pose[1] == UPRIGHT
     wrong, after = frame(3, q=(w, 1.0, 0.0, 0.0)), [frame(number) for number in range(4, 110)]
     assert [line for _, line in told(tracker, [wrong, *after])] == [
@@ -283,9 +285,9 @@ def test_the_exact_opposite_attitude_is_refused(w: float) -> None:
 )
 def test_an_invalid_pose_counts_as_not_seen(p, q) -> None:
     tracker = tracking()
-    track = tracker.take(frame(100, p, q))
+    track = tracker.track_frame(frame(100, p, q))
     assert (track.quality, track.frame.valid) == (NOT_YET, False)
-    assert tracker.take(noisy(np.random.default_rng(2), 101)).quality is YES
+    assert tracker.track_frame(noisy(np.random.default_rng(2), 101)).quality is YES
     assert tracker.counters.refused == 0
     assert qualities(*[frame(n, p, q) for n in range(5)]) == [NOT_YET] * 5
 
@@ -300,7 +302,7 @@ def test_a_push_of_20_newton_is_accepted() -> None:
             way = 0.5 * pushed**2 + pushed * after
             turn = Rotation.from_rotvec(154.0 * way * axis).as_quat(scalar_first=True)
             seen = noisy(rng, number, (0.1, -0.2, 1.15) + 20.0 / 0.34 * way * axis, turn)
-            assert tracker.take(seen).quality is Quality.TRACKED, f"{axis} {number}"
+            assert tracker.track_frame(seen).quality is Quality.TRACKED, f"{axis} {number}"
 
 
 # Gaps
@@ -311,7 +313,7 @@ def test_in_a_gap_no_pose_goes_out_and_the_velocity_is_that_before_it() -> None:
     v = np.array([0.5, -0.3, 0.2])
     for number in range(140):
         seen = noisy(rng, number, v * number * PERIOD_US * 1e-6)
-        track = tracker.take(seen if number <= 120 else replace(seen, valid=False))
+        track = tracker.track_frame(seen if number <= 120 else replace(seen, valid=False))
         if number > 120:
             assert (track.frame.valid, track.quality) == (False, Quality.NONE)
             assert track.v_WB == pytest.approx(v, abs=0.1)
@@ -322,16 +324,16 @@ def test_in_a_gap_no_pose_goes_out_and_the_velocity_is_that_before_it() -> None:
 
 def qualities(*frames: MocapFrame) -> list[Quality]:
     tracker = Tracker(CONFIG, PERIOD_US)
-    return [tracker.take(seen).quality for seen in frames]
+    return [tracker.track_frame(seen).quality for seen in frames]
 
 
 def test_a_track_begins_with_three_poses_that_fit() -> None:
     tracker = Tracker(CONFIG, PERIOD_US)
     for number in (0, 1):
-        track = tracker.take(frame(number))
+        track = tracker.track_frame(frame(number))
         assert (track.quality, track.frame.valid) == (NOT_YET, False)
         assert isnan(track.v_WB[0])
-    assert tracker.take(frame(2)).quality is YES
+    assert tracker.track_frame(frame(2)).quality is YES
 
 
 def test_a_stray_first_pose_does_not_lock_the_gate() -> None:
@@ -361,7 +363,8 @@ def test_a_robot_that_falls_is_tracked_from_the_third_pose_on() -> None:
 def test_after_the_time_to_reacquire_the_track_restarts_at_the_newest_pose() -> None:
     tracker, rng = tracking(), np.random.default_rng(2)
     tracked = [
-        tracker.take(noisy(rng, n, (0.6, -0.2, 1.15))).quality is Quality.TRACKED for n in range(100, 200)
+        tracker.track_frame(noisy(rng, n, (0.6, -0.2, 1.15))).quality is Quality.TRACKED
+        for n in range(100, 200)
     ]
     assert tracked.index(True) == 81  # 99 was the last good one, 179 is 400 ms later, 180 and 181 fit it
     assert all(tracked[81:])
@@ -373,7 +376,7 @@ def test_after_the_time_to_reacquire_the_track_restarts_at_the_newest_pose() -> 
 def test_a_clock_that_jumps_costs_two_frames(jump_us: int) -> None:
     tracker, rng = tracking(), np.random.default_rng(2)
     jumped = [replace(seen, t_us=seen.t_us + jump_us) for seen in (noisy(rng, n) for n in range(99, 103))]
-    assert [tracker.take(seen).quality for seen in jumped] == [NOT_YET, NOT_YET, YES, YES]
+    assert [tracker.track_frame(seen).quality for seen in jumped] == [NOT_YET, NOT_YET, YES, YES]
 
 
 def test_a_clock_that_jumps_before_the_track_begins_costs_two_frames() -> None:
@@ -385,11 +388,11 @@ def test_late_and_repeated_frames_are_refused_and_change_nothing() -> None:
     first, second, rng = tracking(), tracking(), np.random.default_rng(2)
     for number in range(100, 130):
         seen = noisy(rng, number)
-        track = first.take(seen)
-        again = first.take(seen)
+        track = first.track_frame(seen)
+        again = first.track_frame(seen)
         assert (again.quality, again.frame.valid) == (Quality.REFUSED, False)
-        assert first.take(frame(number - 7.5, (9.0, 9.0, 9.0))).quality is Quality.REFUSED
-        assert track == second.take(seen)
+        assert first.track_frame(frame(number - 7.5, (9.0, 9.0, 9.0))).quality is Quality.REFUSED
+        assert track == second.track_frame(seen)
     assert first.counters.refused == 60
 
 
@@ -401,7 +404,7 @@ def told(tracker: Tracker, frames: list[MocapFrame]) -> list[tuple[int, str]]:
     unused, lines = UnusedPoses(), []
     unused.note(frames[0].t_us - PERIOD_US, frames[0].t_us - PERIOD_US, None)
     for seen in frames:
-        track = tracker.take(seen)
+        track = tracker.track_frame(seen)
         unused.note(seen.t_us, seen.t_us, None if track.frame.valid else track.frame.unused, track.event)
         lines += [(seen.t_us, line) for line in unused.due()]
     return lines
@@ -447,7 +450,7 @@ def test_occasional_outliers_are_reported_at_most_twice_a_second() -> None:
 
 def test_the_summary_counts() -> None:
     tracker = tracking()
-    tracker.take(frame(100, (0.0, 0.0, 0.0)))
+    tracker.track_frame(frame(100, (0.0, 0.0, 0.0)))
     assert tracker.summary() == "refused (1 refused, 0 restarts)"
 
 
@@ -473,10 +476,10 @@ tame = st.builds(
 def test_anything_may_come_and_the_tracker_recovers(frames: list[MocapFrame]) -> None:
     tracker = Tracker(CONFIG, PERIOD_US)
     for seen in frames:
-        track = tracker.take(seen)
+        track = tracker.track_frame(seen)
         assert track.frame.valid is (track.quality is Quality.TRACKED)
         assert track.frame is seen or not track.frame.valid
-    after = [tracker.take(frame(1000 + n)).quality for n in range(100)]
+    after = [tracker.track_frame(frame(1000 + n)).quality for n in range(100)]
     assert after[82:] == [YES] * 18
 
 

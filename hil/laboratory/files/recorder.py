@@ -150,7 +150,7 @@ class Recorder:
         if self._row == ROWS_PER_BATCH or now_us - self._times[0] >= BATCH_US:
             self._write_batch()
         elif self._row - self._shown == ROWS_SHOWN:
-            self.show()
+            self.pass_rows()
 
     def read_from(self, channels: tuple[Channel, ...]) -> None:
         """Sample these from now on: the same quantities of another object, like a board that has booted again."""
@@ -182,7 +182,7 @@ class Recorder:
         return self._hash.hexdigest()
 
     def _write_batch(self) -> None:
-        self.show()
+        self.pass_rows()
         count = self._row
         self._row = self._shown = 0
         for columns in self._columns:
@@ -206,7 +206,7 @@ class Recorder:
             assert self._folder is not None
             self._records.attempt(self._folder / name, file.close)
 
-    def show(self) -> None:
+    def pass_rows(self) -> None:
         """Pass the rows that it has not seen to the observer, which may keep them."""
         if self._observer is not None:
             fresh = self._batch.slice(self._shown, self._row - self._shown).serialize()

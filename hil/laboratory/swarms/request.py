@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Unpack
 
-from hil.board.real_core import is_link
 from hil.config import settings_of
 from hil.errors import LabError
 from hil.laboratory.experiment import Experiment
@@ -47,7 +46,7 @@ def swarm_of(experiments: Sequence[Experiment], **options: Unpack[Options]) -> S
     if not 2 <= count <= ROBOTS_MAX:
         raise LabError(f"--robots {count}: expected 2 to {ROBOTS_MAX}")
     first = Request.of(experiments[0], **options)
-    _check(first, count)
+    first.bench.check_many("--robots", count)
     places = places_of(first.config.swarm, count)
     still_air = first.config.tunnel.fan_factor == 0.0
     robots = []
@@ -65,16 +64,6 @@ def swarm_of(experiments: Sequence[Experiment], **options: Unpack[Options]) -> S
         return swarm_of(experiments, **longest)
     origins = [(0.0, 0.0, 0.0)] * count if still_air else places
     return SwarmRequest(tuple(robots), tuple(origins), still_air)
-
-
-def _check(first: Request, count: int) -> None:
-    bench = first.bench
-    if not bench.in_lockstep:
-        raise LabError(f"--link {bench.link}: --robots is for flights in lockstep: radio, mavlink")
-    if is_link(bench.board) or bench.in_loop:
-        raise LabError(f"--board {bench.board}: --robots {count}: a real board is in one flight at a time")
-    if bench.gdb is not None or bench.trace or bench.realtime or bench.profile_cpu is not None:
-        raise LabError(f"--robots {count}: --gdb, --perfetto, --profile-cpu and --realtime are for one robot")
 
 
 def places_of(swarm: SwarmConfig, count: int) -> list[Place]:

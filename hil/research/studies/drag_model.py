@@ -53,7 +53,7 @@ class Sweep:
     title: str
     signs: Mapping[int, float]
 
-    def turn(self, flaps: NDArray[np.float64], angle: float) -> None:
+    def turn_flaps(self, flaps: NDArray[np.float64], angle: float) -> None:
         """Set the turned ones of the angles (4,) [rad]."""
         for flap, sign in self.signs.items():
             flaps[flap] = sign * angle
@@ -89,10 +89,10 @@ def measure(config: LabConfig, seed: int) -> Iterator[MountedRow]:
         plant = Plant(geometry, body, config.tunnel, config.actuators, streams.gusts)
         plant.hold()
         for servo in ACTUATORS:
-            plant.settings[f"servo.pace.{servo}"].turn(0.0)  # the flaps stay at the set angles
+            plant.settings[f"servo.pace.{servo}"].write(0.0)  # the flaps stay at the set angles
         for index, (sweep, angle_deg) in enumerate(product(SWEEPS, ANGLES_DEG)):
             flaps = SIGNS * body.hover_angle
-            sweep.turn(flaps, math.radians(angle_deg))
+            sweep.turn_flaps(flaps, math.radians(angle_deg))
             noise = normal(streams.imu, (SAMPLES, 6)) * SENSOR_NOISE
             samples = _measure(plant, flaps, index * SAMPLES * STEP_US) + noise
             mean, deviation = samples.mean(axis=0), samples.std(axis=0)

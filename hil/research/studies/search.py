@@ -71,7 +71,7 @@ class Aim:
         sign = 1.0 if self.meaning.bound == "max" else -1.0
         return float(np.mean([sign * self._of(row) if row.outcome == "completed" else LOST for row in rows]))
 
-    def show(self, cost: float) -> str:
+    def cost_text(self, cost: float) -> str:
         """Return a cost as its metric."""
         if cost >= LOST / max(len(self.seeds), 1):
             return "lost"

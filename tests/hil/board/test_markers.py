@@ -59,7 +59,7 @@ def markers(config: MarkersConfig = ON, seed: int = 1) -> VirtualMarkers:
 
 def look(config: MarkersConfig, turn: Rotation | None = None, p_WB: Array = HOME, seed: int = 1) -> Sighting:
     q_WB = LEVEL if turn is None else turn.as_quat(scalar_first=True)
-    return markers(config, seed).look(p_WB, q_WB)
+    return markers(config, seed).sighting_of(p_WB, q_WB)
 
 
 def kabsch(points: Array, body: Array) -> tuple[Array, Array]:
@@ -117,7 +117,7 @@ def test_the_noise_of_the_pose_is_that_of_the_specification() -> None:
     """`[mocap]` says 0.5 mm and 0.004 rad; what least squares makes of 1.1 mm is known in closed form."""
     turn = Rotation.from_euler("ZYX", [1.0, 0.2, -0.3])
     here, q_WB = markers(), turn.as_quat(scalar_first=True)
-    seen = [here.look(HOME, q_WB) for _ in range(2000)]
+    seen = [here.sighting_of(HOME, q_WB) for _ in range(2000)]
     poses = [sighting.pose for sighting in seen if sighting.pose]
     assert len(poses) == 2000
     moved = turn.inv().apply(np.array([p for p, _ in poses]) - HOME)
@@ -154,7 +154,7 @@ def test_markers_on_a_line_give_no_pose() -> None:
 def test_too_few_markers_are_not_tracked(hidden: int, needed: int, tracked: bool) -> None:
     here = markers(MarkersConfig(enabled=True, min_markers=needed))
     here.hidden = hidden
-    sighting = here.look(HOME, LEVEL)
+    sighting = here.sighting_of(HOME, LEVEL)
     assert sighting.bits == 0xFF << hidden & 0xFF
     assert (sighting.pose is not None) is tracked
     assert (sighting.residuals != 0).tolist() == (sighting.seen.tolist() if tracked else [False] * COUNT)
@@ -164,16 +164,16 @@ def test_too_few_markers_are_not_tracked(hidden: int, needed: int, tracked: bool
 def test_a_body_that_fits_badly_is_not_tracked() -> None:
     here = markers()
     here.noise_scale = 10.0
-    sightings = [here.look(HOME, LEVEL) for _ in range(50)]
+    sightings = [here.sighting_of(HOME, LEVEL) for _ in range(50)]
     assert all(sighting.error > ON.max_error and sighting.pose is None for sighting in sightings)
     here.noise_scale = 1.0
-    assert here.look(HOME, LEVEL).pose is not None
+    assert here.sighting_of(HOME, LEVEL).pose is not None
 
 
 def test_unseen_markers_are_placed_on_the_body() -> None:
     here = markers()
     here.hidden = 4
-    sighting = here.look(HOME, LEVEL)
+    sighting = here.sighting_of(HOME, LEVEL)
     assert sighting.pose is not None
     p, q = sighting.pose
     assert sighting.points[:4] == pytest.approx(
@@ -216,7 +216,7 @@ def test_swapped_markers_are_refused_unless_the_limit_is_wide() -> None:
     for limit, turned in ((0.005, None), (0.2, math.pi)):
         here = markers(MarkersConfig(enabled=True, noise=0.0, max_error=limit))
         here.swapped = 1.0
-        sighting = here.look(HOME, LEVEL)
+        sighting = here.sighting_of(HOME, LEVEL)
         assert sighting.error == pytest.approx(0.0987, abs=0.0005)
         assert sighting.residuals.mean() == pytest.approx(sighting.error)
         if turned is None:
@@ -227,12 +227,12 @@ def test_swapped_markers_are_refused_unless_the_limit_is_wide() -> None:
                 turned
             )
         here.hidden = 1.0  # marker 1, which has label 3
-        assert np.flatnonzero(~here.look(HOME, LEVEL).seen).tolist() == [2]
+        assert np.flatnonzero(~here.sighting_of(HOME, LEVEL).seen).tolist() == [2]
 
 
 def test_share_of_mislabelled_frames_is_the_configured_one_and_leaves_the_others_as_they_were() -> None:
     plain, wrong = markers(), markers(MarkersConfig(enabled=True, mislabelled=0.2))
-    pairs = [(plain.look(HOME, LEVEL), wrong.look(HOME, LEVEL)) for _ in range(1000)]
+    pairs = [(plain.sighting_of(HOME, LEVEL), wrong.sighting_of(HOME, LEVEL)) for _ in range(1000)]
     refused = [b.pose is None for _, b in pairs]
     assert np.mean(refused) == pytest.approx(0.2, abs=0.04)
     assert all(a.pose == b.pose for (a, b), lost in zip(pairs, refused, strict=True) if not lost)
@@ -307,7 +307,7 @@ def test_as_many_cameras_as_must_see_a_marker_are_there() -> None:
 def test_ghosts_lie_near_the_body_have_no_label_and_do_not_change_its_pose() -> None:
     plain, haunted = markers(), markers(MarkersConfig(enabled=True, ghosts=7))
     for _ in range(NOISE_ROWS + 1):
-        without, seen = plain.look(HOME, LEVEL), haunted.look(HOME, LEVEL)
+        without, seen = plain.sighting_of(HOME, LEVEL), haunted.sighting_of(HOME, LEVEL)
         assert without.pose == seen.pose
     assert seen.unlabelled.shape == (7, 3)
     assert 0.1 < np.abs(seen.unlabelled - HOME).max() < GHOST_REACH

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import sysconfig
 import tomllib
+from dataclasses import fields
 from importlib.metadata import packages_distributions
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,8 +21,10 @@ import hil
 from firmware_py.extras import EXTRAS, install_command, why_missing
 from hil import fly, load_run
 from hil.commands.app import COMMANDS, GROUPS
+from hil.commands.fly import fly as fly_command
 from hil.errors import LabError
 from hil.laboratory.files.recorder import load_log
+from hil.laboratory.request import Bench, Options
 from hil.live.window import DISPLAYS
 from support.command import Cli
 from support.serving import FLOATY
@@ -386,6 +389,12 @@ print(*sorted({HEAVY!r} & {{*sys.modules}}))
 """
     found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert found.stdout.strip() == ""
+
+
+def test_every_field_of_a_bench_is_an_option_of_the_api_and_of_fly() -> None:
+    names = {one.name for one in fields(Bench)}
+    assert names <= Options.__annotations__.keys()
+    assert names <= {one.name for one in fly_command.params}
 
 
 def test_a_command_imports_no_other() -> None:

@@ -479,7 +479,7 @@ def test_faults_that_together_leave_a_knobs_range_stop_at_its_end_and_give_it_ba
             faults = [Fault(name, number, 1.0, size) for number in range(3)]
             for fault in faults:
                 board.begin(fault, flight.now_us)
-            robot.look(flight.now_us)
+            robot.advance_truth(flight.now_us)
             assert np.isfinite([knob.read(robot) for knob in kind.knobs if name != "imu.saturation"]).all()
             for fault in faults:
                 board.end(fault, flight.now_us)

@@ -54,7 +54,7 @@ class Stick:
         robot.advance(now_us)
         self.events.run(now_us)
         if ms % 10 == 0:
-            assert robot.look(now_us) is None
+            assert robot.advance_truth(now_us) is None
         if ms % 10 == 5:
             w, x, y, z = robot.body.q_WB
             self.send(0x61, "<B7f", 8, *robot.body.p_WB, x, y, z, w)

@@ -107,7 +107,7 @@ def test_channels_and_messages_are_those_of_foxglove_s_own_server(tmp_path: Path
     screen, own = FoxgloveScreen(None), foxglove.start_server(port=0, context=context)
     found, topics = [], ("/truth/pose", "/battery")
     for address, show in (
-        (screen.address, lambda rows: screen.show(rows, [])),
+        (screen.address, lambda rows: screen.show_rows(rows, [])),
         (f"ws://127.0.0.1:{own.port}", lambda rows: log_rows(rows, context)),
     ):
         client = FoxgloveClient(address)
@@ -130,13 +130,13 @@ def test_channels_and_messages_are_those_of_foxglove_s_own_server(tmp_path: Path
 def test_the_rows_are_those_of_mcap(screen: FoxgloveScreen, client: FoxgloveClient, tmp_path: Path) -> None:
     fly(Request.of(EXPERIMENTS["hover"], duration_s=0.1), tmp_path / "run")
     log = load_log(tmp_path / "run")
-    screen.show(log.slice(0, 20), [{"t_us": 5, "source": "lab", "text": "released"}])
+    screen.show_rows(log.slice(0, 20), [{"t_us": 5, "source": "lab", "text": "released"}])
     while not {"/truth/pose", "/estimate/pose", "/tf", "/flaps", "/text"} <= set(client.channels):
         client.receive("advertise")
     client.send(op="subscribe", subscriptions=[{"id": 1, "channelId": client.channels["/battery"]}])
     client.send(op="getParameters", parameterNames=[], id="subscribed")
     client.receive("parameterValues")
-    screen.show(log.slice(20, 1), [])
+    screen.show_rows(log.slice(20, 1), [])
     time_ns, data = client.receive("message")
     assert time_ns == 1000 * log.column("t")[20].as_py()
     assert json.loads(data)["battery_voltage"] == pytest.approx(log.column("battery.voltage")[20].as_py())

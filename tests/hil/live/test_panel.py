@@ -114,7 +114,7 @@ def test_a_page_shows_only_the_newest_row(panel: PanelScreen, loop: IOLoop, tmp_
     socket = connect(loop, panel, panel.token, panel.origin)
     receive(loop, socket)
     for first in range(0, 140, 20):
-        panel.show(log.slice(first, 20), [{"t_us": 0, "source": "lab", "text": f"from {first}"}])
+        panel.show_rows(log.slice(first, 20), [{"t_us": 0, "source": "lab", "text": f"from {first}"}])
     texts: list[str] = []
     curves: list[list[float]] = []
     while len(texts) < 7:

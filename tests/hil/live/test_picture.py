@@ -18,7 +18,7 @@ class Screen:
     def __init__(self) -> None:
         self.shown: list[Any] = []
 
-    def show(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
+    def show_rows(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
         self.shown.append(("rows", rows["x"].to_pylist(), [event["text"] for event in events]))
 
     def know(self, values: Mapping[str, float]) -> None:

@@ -250,7 +250,7 @@ def test_a_plain_law_through_the_mixer_takes_off_holds_and_stays_level() -> None
 def test_a_weak_propeller_gives_its_share_and_no_other_changes() -> None:
     body = spun_up((0.6,) * 4)
     before = body.thrust.copy()
-    body.settings["motor.strength.2"].turn(0.8 * body.settings["motor.strength.2"].read())
+    body.settings["motor.strength.2"].write(0.8 * body.settings["motor.strength.2"].read())
     body.advance(1_001_000)
     assert body.thrust / before == pytest.approx([1.0, 0.8, 1.0, 1.0], rel=1e-6)
 
@@ -259,11 +259,11 @@ def test_a_motor_without_current_runs_out_and_comes_back() -> None:
     body = spun_up((0.6,) * 4)
     body.hold()
     before = body.rpm[2]
-    body.settings["motor.current.3"].turn(0.0)
+    body.settings["motor.current.3"].write(0.0)
     body.advance(1_000_000 + 647_000)
     assert body.rpm[2] == pytest.approx(before * math.exp(-10), rel=1e-6)
     assert body.rpm[1] == pytest.approx(before, rel=1e-6)
-    body.settings["motor.current.3"].turn(1.0)
+    body.settings["motor.current.3"].write(1.0)
     body.advance(3_000_000)
     assert body.rpm[2] == pytest.approx(before, rel=1e-6)
 
@@ -272,12 +272,12 @@ def test_a_stuck_motor_keeps_its_command_until_released() -> None:
     body = spun_up((0.6,) * 4)
     body.hold()
     before = body.rpm[3]
-    body.settings["motor.obeys.4"].turn(0.0)
+    body.settings["motor.obeys.4"].write(0.0)
     body.set_counts(1_000_000, (0, 0, 0, 0))
     body.advance(2_000_000)
     assert body.rpm[3] == pytest.approx(before, rel=1e-6)
     assert body.rpm[:3] == pytest.approx([0.0] * 3, abs=1.0)
-    body.settings["motor.obeys.4"].turn(1.0)
+    body.settings["motor.obeys.4"].write(1.0)
     body.set_counts(2_000_000, (0, 0, 0, 0))
     body.advance(3_000_000)
     assert body.rpm[3] == pytest.approx(0.0, abs=1.0)

@@ -124,7 +124,7 @@ def test_faults_act_on_their_servo_and_heal() -> None:
     plant.advance(1_000_000)
     assert plant.flaps == pytest.approx(np.add(HOVER, [0.15, 0, 0.1, 0.1]), abs=1e-4)
     for servo in (1, 2, 3, 4):
-        plant.settings[f"servo.trim.{servo}"].turn(0.0)
-        plant.settings[f"servo.pace.{servo}"].turn(1.0)
+        plant.settings[f"servo.trim.{servo}"].write(0.0)
+        plant.settings[f"servo.pace.{servo}"].write(1.0)
     plant.advance(2_000_000)
     assert plant.flaps == pytest.approx(HOVER + 0.1, abs=1e-4)

@@ -92,7 +92,7 @@ def test_measurements_scatter_with_the_gusts_around_the_model() -> None:
 def test_the_sweeps_are_the_papers() -> None:
     for sweep, expected in zip(SWEEPS, ((0.4, -0.1, 0.1, -0.4), (0.1, -0.4, 0.1, -0.4)), strict=True):
         flaps = np.array((0.4, -0.4, 0.4, -0.4))
-        sweep.turn(flaps, 0.1)
+        sweep.turn_flaps(flaps, 0.1)
         assert flaps.tolist() == list(expected)
 
 

@@ -68,9 +68,9 @@ def test_the_given_numbers_are_the_first_that_fly_and_the_search_repeats(tmp_pat
 def test_a_lost_flight_is_worse_than_any_other(tmp_path: Path) -> None:
     best = found(Runner(best=(-3.9, 3.0), lost_below=-3.0), aim("rms_z"), tmp_path)
     assert -3.0 <= best.values[0] < -2.9
-    assert aim("rms_z").show(LOST) == "lost"
-    assert aim("rms_z").show(0.012) == "1.2 cm"
-    assert aim("in_box").show(-0.5) == "50 %"
+    assert aim("rms_z").cost_text(LOST) == "lost"
+    assert aim("rms_z").cost_text(0.012) == "1.2 cm"
+    assert aim("in_box").cost_text(-0.5) == "50 %"
 
 
 def test_numbers_no_better_than_before_are_not_called_better(tmp_path: Path) -> None:
