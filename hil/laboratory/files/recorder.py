@@ -289,7 +289,9 @@ def log_pieces(folder: Path) -> Iterator[pa.Table]:
     else:
         if not folder.exists():
             raise LabError(f"{folder}: there is no such run folder; `floaty runs` lists those that exist")
-        raise LabError(f"{folder}: no {PARQUET} or {STREAM} in it; expected a run folder")
+        inside = ", ".join(sorted(log.parent.name for log in folder.glob(f"*/{PARQUET}"))[:3])
+        but = f", but in {inside}" if inside else ""
+        raise LabError(f"{folder}: no {PARQUET} or {STREAM} in it{but}; expected a run folder")
 
 
 def _checked(path: Path, schema: pa.Schema) -> pa.Schema:

@@ -11,7 +11,7 @@ import pytest
 from firmware_py.compiling import bound
 from firmware_py.core.subset import i32
 from firmware_py.firmware import Firmware
-from hil.api import column, fly, fly_swarm
+from hil.api import column, fly, fly_swarm, load_run
 from hil.board.board_firmware import PowerOn, PythonBoard
 from hil.emulator.crazyflie import syslink
 from hil.errors import LabError
@@ -37,6 +37,8 @@ def test_robots_apart_fly_bit_for_bit_as_alone(floaty: Flights, tmp_path: Path) 
     written = json.loads((swarm.folder / "swarm.json").read_text())
     assert written["hash"] == swarm.hash
     assert [one["hash"] for one in written["robots"]] == [one.hash for one in swarm.robots]
+    with pytest.raises(LabError, match="in it, but in robot-1, robot-2; expected a run folder"):
+        load_run(swarm.folder)
     again = fly_swarm("hover", 2, tmp_path / "again", duration_s=2.0, overrides=APART, seed=3)
     assert again.hash == swarm.hash
     nearer = fly_swarm(
