@@ -1,10 +1,7 @@
 """`floaty serve --boards 3`, a process per robot: Python boards side by side, and images that cflib's swarm flies."""
 
 import os
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import cflib.crtp
@@ -13,12 +10,10 @@ import pytest
 from cflib.crazyflie.swarm import CachedCfFactory, Swarm
 from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 
-from ground_station.config import CaptureConfig
-from ground_station.mocap import MocapFrame
-from ground_station.sources.address import find_source
 from support.cflib_client import CflibClient
 from support.plugged_dongle import plug
-from support.serving import PATIENCE_S, Served, serve
+from support.serving import PATIENCE_S, serve
+from support.watcher import watched
 
 ELF = os.environ.get("FLOATY_STOCK_ELF", "")
 NAMES = ("floaty", "floaty2", "floaty3")
@@ -28,43 +23,6 @@ START_S = 1.0  # from arming to the take-off
 OFF = 0.15  # at the end of a leg at most [m]
 
 
-class Watcher(threading.Thread):
-    """Keeps what a Motive says of one body, with the time when it came."""
-
-    def __init__(self, served: Served, name: str) -> None:
-        super().__init__(daemon=True)
-        self.frames: list[tuple[float, MocapFrame]] = []
-        self.stop = threading.Event()
-        self._source = find_source(f"{served.motive},body={name}", CaptureConfig())
-        self._source.open()
-        self.start()
-
-    def run(self) -> None:
-        while not self.stop.is_set():
-            if (frame := self._source.receive(0.05)) is not None:
-                self.frames.append((time.monotonic(), frame))
-        self._source.close()
-
-    def near(self, instant_s: float) -> np.ndarray:
-        """Where the body was at a time."""
-        seen = [(abs(t - instant_s), frame) for t, frame in self.frames if frame.valid]
-        off_s, frame = min(seen, key=lambda one: one[0])
-        assert off_s < 0.1
-        return np.array(frame.p_WB)
-
-
-@contextmanager
-def watched(served: Served) -> Iterator[list[Watcher]]:
-    watchers = [Watcher(served, name) for name in NAMES]
-    try:
-        yield watchers
-    finally:
-        for watcher in watchers:
-            watcher.stop.set()
-        for watcher in watchers:
-            watcher.join()
-
-
 @pytest.mark.alone  # three boards, their station and three watchers
 def test_three_robots_fly_side_by_side_and_a_push_moves_the_one_it_is_typed_for(tmp_path: Path) -> None:
     arguments = ("--boards", "3", "--radio", "--radio-port", "0", "--station")
@@ -72,7 +30,7 @@ def test_three_robots_fly_side_by_side_and_a_push_moves_the_one_it_is_typed_for(
         plug(served)
         for number in (1, 2, 3):
             served.wait_for(f"board {number}: released", PATIENCE_S)
-        with watched(served) as watchers:
+        with watched(served, NAMES) as watchers:
             clients = [CflibClient(uri, tmp_path).ready() for uri in served.radio_uris]
             for client in clients:
                 rows = client.rows(20, 10, "stateEstimate.y", "pm.vbat")
@@ -121,7 +79,10 @@ def test_three_images_fly_what_cflibs_swarm_commands_while_the_wall_clock_runs(
         for number in (1, 2, 3):
             served.wait_for(f"board {number}: STAB: Starting stabilizer loop", PATIENCE_S)
         uris = served.radio_uris if link == "radio" else served.udp_uris
-        with watched(served) as watchers, Swarm(uris, CachedCfFactory(rw_cache=str(tmp_path))) as swarm:
+        with (
+            watched(served, NAMES) as watchers,
+            Swarm(uris, CachedCfFactory(rw_cache=str(tmp_path))) as swarm,
+        ):
             swarm.reset_estimators()
             began_s = time.monotonic()
             swarm.parallel_safe(square)

@@ -4,12 +4,14 @@ import importlib.util
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from hil.servers import usb_dongle
 from support.serving import FLOATY, PATIENCE_S, serve
+from support.watcher import watched
 
 SOURCE = Path(__file__).parent.parent / "support" / "usb_radio.cpp"
 pytestmark = pytest.mark.skipif(
@@ -59,6 +61,21 @@ def test_a_program_in_cpp_reaches_the_robot_that_its_address_names(program: Path
                 done.stderr
             )
             assert done.returncode == 0
+
+
+def test_a_program_in_cpp_flies_the_robot_that_its_address_names(program: Path) -> None:
+    """A take-off to 1.5 m moves the second robot's goal, and not the first one's."""
+    flying = ("--boards", "2", "--station", "poses", "--usb", "--radio-port", "0")
+    with serve(*flying, motive=True) as served:
+        command = served.line("usb ")[:-1]
+        served.wait_for("board 2: released", PATIENCE_S)
+        with watched(served, ("floaty", "floaty2")) as (first, second):
+            subprocess.run([*command, program, "02", "1.5"], check=True, timeout=PATIENCE_S)
+            deadline_s = time.monotonic() + PATIENCE_S
+            while not (second.frames and second.frames[-1][1].p_WB[2] > 1.4):
+                assert time.monotonic() < deadline_s
+                time.sleep(0.1)
+        assert first.frames[-1][1].p_WB[2] < 1.3
 
 
 def test_a_server_ends_with_its_program_and_has_its_exit_code(program: Path) -> None:

@@ -1,7 +1,8 @@
-// Finds a Crazyradio by libusb, tunes it, and pings the board until it answers; asynchronous and synchronous.
+// Finds a Crazyradio by libusb, tunes it, and pings the board of an address; with a height [m] it has the board take off.
 #include <libusb-1.0/libusb.h>
 #include <cstdio>
 #include <cstdlib>
+#include <cstring>
 int main(int argc, char **argv) {
   libusb_context *context;
   if (libusb_init(&context)) return 2;
@@ -24,6 +25,18 @@ int main(int argc, char **argv) {
     if (libusb_bulk_transfer(radio, 0x01, &null_packet, 1, &sent, 1000)) return 6;
     if (libusb_bulk_transfer(radio, 0x81, answer, sizeof answer, &size, 1000)) return 7;
     answered += answer[0] & 1;
+  }
+  if (argc > 2) {
+    float height = std::strtof(argv[2], 0), duration = 1.0f;
+    unsigned char take_off[16] = {0x80, 7};  // high-level commander: group, height, yaw, keep the yaw, duration
+    std::memcpy(take_off + 3, &height, 4);
+    take_off[11] = 1;
+    std::memcpy(take_off + 12, &duration, 4);
+    unsigned char answer[64] = {0};
+    for (int sent, size; !(answer[0] & 1);) {
+      if (libusb_bulk_transfer(radio, 0x01, take_off, sizeof take_off, &sent, 1000)) return 8;
+      if (libusb_bulk_transfer(radio, 0x81, answer, sizeof answer, &size, 1000)) return 9;
+    }
   }
   unsigned char answer[64];
   int size;
