@@ -180,7 +180,7 @@ class BatteryConfig(Section):
 
 
 class SwarmConfig(Section):
-    """Robots that fly together by `floaty fly --robots`: their places, and what they do to one another."""
+    """Robots that fly together: the places of `floaty fly --robots`, and what they do to one another."""
 
     spacing: float = number(
         0.5, "(0, 20]", "of the V without `places`: robots behind one another, x and y [m]"
