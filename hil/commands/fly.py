@@ -106,8 +106,7 @@ def fly(
     if robots is not None:
         _check_alone(robots, seeds > 1 or any(crew.values()), target, baseline)
         return _fly_together(experiment, robots, options, out)
-    if together := [one for one in options["overrides"] if one.startswith("swarm.")]:
-        raise LabError(f"--set {together[0]}: has no effect on one robot; --robots N flies several")
+    common.check_alone(options["overrides"], "--robots N flies several")
     request = request_of(experiment, **options)
     before = None if baseline is None else _flown(baseline)
     if seeds > 1:

@@ -120,6 +120,8 @@ def serve(asked: ServeOptions) -> int:
     config = load_config(asked.profile, (*markers, *poses, *asked.overrides))
     config.check_effect("--set ", asked.overrides, asked.profile)
     config.check_decks(asked.board is not None)
+    if asked.boards == 1:
+        common.check_alone(asked.overrides, "--boards N serves several")
     station = _station_of(asked, config)
     serial = parse_addresses(asked.mavlink, asked.boards) if asked.mavlink is not None else []
     planned = [parse(text) for text in asked.faults]

@@ -16,7 +16,6 @@ from hil.world.config import SwarmConfig
 from hil.world.neighbours import ROBOTS_MAX
 
 Place = tuple[float, float, float]  # [m] in W of the room
-SECTION = "swarm."  # of the overrides that act on several robots only
 
 
 @dataclass(frozen=True, slots=True)
