@@ -206,8 +206,14 @@ def _view(array: Any) -> Callable[[], Any]:
     return lambda: array
 
 
-def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]:
-    """Return the channels of any flight; the recorder adds the first column, `t`."""
+def flight_channels(
+    robot: Robot,
+    trajectory: Trajectory,
+    line: Sequence[Channel],
+    ground: Sequence[Channel] = (),
+    more: Sequence[Channel] = (),
+) -> tuple[Channel, ...]:
+    """Return the channels of a robot, its line and its ground station; the recorder adds the first column, `t`."""
     body, board, firmware = robot.body, robot.board, robot.firmware
     imu = Channel("int16", lambda: board.imu, (quantity("imu", "gx gy gz ax ay az", "counts", "S"),))
     return (
@@ -223,6 +229,12 @@ def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]
             else _stock_channels(robot, trajectory, imu)
         ),
         *_scheduler_channels(firmware),
+        *line,
+        battery_channel(robot.battery),
+        *ground,
+        *((marker_channel(robot.mocap),) if robot.mocap.markers else ()),
+        *more,
+        *board_channels(firmware),
     )
 
 

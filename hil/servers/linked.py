@@ -20,7 +20,6 @@ from ground_station.trajectory import Goal, Trajectory
 from hil.board.clock import Paced
 from hil.board.image_settings import to_set
 from hil.errors import LabError
-from hil.laboratory.channels import radio_channel, serial_channel
 from hil.laboratory.experiments import find_again
 from hil.laboratory.files.ages import STATION_CLOCK
 from hil.laboratory.flight import Flight
@@ -128,13 +127,8 @@ class StationProcess:
 
     def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
         """Return the counters of line and board; the station keeps its own record."""
-        robot = self.robot
-        if robot.uart is not None:
-            line: tuple[Channel, ...] = (serial_channel(robot.uart, robot.firmware, None),)
-        else:
-            line = (radio_channel(self._served.udp_radio),) if self._served.udp else ()
-        clock = Channel("int64", Paced.wall_us, (Quantity((STATION_CLOCK,), "us"),))
-        return line, (clock,)
+        line = self._served.channels() if self.robot.uart or self._served.udp else ()
+        return line, (Channel("int64", Paced.wall_us, (Quantity((STATION_CLOCK,), "us"),)),)
 
     def steer(self, trajectory: Trajectory) -> None:
         raise LabError("the goal is that of the ground station, a program of its own: steer it there")

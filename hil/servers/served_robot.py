@@ -28,11 +28,13 @@ from hil.emulator.crazyflie.nrf51 import RATES, AirSettings, Band, Nrf51, ToPeer
 from hil.emulator.crazyflie.radio_line import POLL_PERIOD_US
 from hil.emulator.crazyflie.shockburst import Air
 from hil.errors import LabError
+from hil.laboratory.channels import radio_channel, serial_channel
 from hil.laboratory.files.whole_files import replacing
 from hil.laboratory.robot import Ports, Robot, Site
 from hil.servers.dongle_server import DongleServer
 from hil.servers.serial_server import Address, Endpoint
 from hil.servers.udp_server import UdpServer
+from hil.world.body import Channel
 
 
 class BoardFile:
@@ -166,6 +168,11 @@ class ServedRobot:
             say(NO_APP)
         elif flashed is not None and (stays := flashed.differences(config)):
             say(f"the image has its own {stays}")
+
+    def channels(self) -> tuple[Channel, ...]:
+        """Return the counters of its serial line, else of its radio over UDP."""
+        uart = self.robot.uart
+        return (serial_channel(uart, self.robot.firmware, None) if uart else radio_channel(self.udp_radio),)
 
     @property
     def uri(self) -> str:

@@ -14,14 +14,7 @@ from hil.board.clock import Paced
 from hil.board.markers import NO_POINTS
 from hil.config import LabConfig
 from hil.emulator.crazyflie.nrf51 import AirSettings, Power, ToPeers
-from hil.laboratory.channels import (
-    battery_channel,
-    board_channels,
-    flight_channels,
-    marker_channel,
-    radio_channel,
-    serial_channel,
-)
+from hil.laboratory.channels import flight_channels
 from hil.laboratory.faults import Fault, Switchboard
 from hil.laboratory.files.recorder import Observer, Recorder
 from hil.laboratory.flight import RECORD_PERIOD_US, RECORD_PHASE_US
@@ -49,42 +42,6 @@ def open_motive(settings: Streaming, robot: Robot, clock: Paced, count: int = 1)
 def show(robot: Robot, clock: Paced, take: Callable[..., None]) -> None:
     """Pass a robot's frames of the cameras to `VirtualMotive.take`."""
     robot.seen_by(lambda frame, now_us, sighting: take(frame, now_us, sighting, clock.began_us))
-
-
-class Shown:
-    """Shows a served robot to observers, with home as its goal: the clients' goals are unknown here."""
-
-    def __init__(self, served: ServedRobot, observer: Observer) -> None:
-        self._served = served
-        if served.robot.firmware.flashed is None:
-            # A fault may add this task later, but the columns must include all tasks.
-            served.robot.thief.share = 0.0
-        self._firmware = served.robot.firmware
-        config = served.robot.config
-        metadata = {
-            "request": json.dumps({"experiment": "served"}),
-            "config": config.model_dump_json(),
-            "look": json.dumps(served.robot.body.look.stored()),
-        }
-        self._recorder = Recorder(None, self._channels(), metadata, observer)
-
-    def row(self, now_us: int) -> None:
-        """Take a sample of it."""
-        if self._served.robot.firmware is not self._firmware:  # it has booted
-            self._firmware = self._served.robot.firmware
-            self._recorder.read_from(self._channels())
-        self._recorder.row(now_us)
-
-    def _channels(self) -> tuple[Channel, ...]:
-        robot = self._served.robot
-        if robot.uart is not None:
-            line = serial_channel(robot.uart, robot.firmware, None)
-        else:
-            line = radio_channel(self._served.udp_radio)
-        home = Hold(Goal(robot.config.flight.home, 0.0))
-        markers = (marker_channel(robot.mocap),) if robot.mocap.markers else ()
-        own = board_channels(robot.firmware)
-        return (*flight_channels(robot, home), line, battery_channel(robot.battery), *markers, *own)
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,8 +116,28 @@ class Server:
         self.switchboard = Switchboard(robot)
         self._clamp = LaunchClamp(robot, self._let_go)
         robot.watch(0)
-        self._shown = None if observer is None else Shown(self.served, observer)
+        self._shown = None if observer is None else self._shown_to(observer)
         self.lab.events.every(RECORD_PERIOD_US, RECORD_PHASE_US, self._look)
+
+    def _shown_to(self, observer: Observer) -> Recorder:
+        """Return what passes the robot's rows on, with home as its goal: the clients' goals are unknown here."""
+        robot = self.robot
+        if robot.firmware.flashed is None:
+            # A fault may add this task later, but the columns must include all tasks.
+            robot.thief.share = 0.0
+        home = Hold(Goal(robot.config.flight.home, 0.0))
+        metadata = {
+            "request": json.dumps({"experiment": "served"}),
+            "config": robot.config.model_dump_json(),
+            "look": json.dumps(robot.body.look.stored()),
+        }
+
+        def channels() -> tuple[Channel, ...]:
+            return flight_channels(robot, home, self.served.channels())
+
+        recorder = Recorder(None, channels(), metadata, observer)
+        robot.on_boot(lambda: recorder.read_from(channels()))
+        return recorder
 
     def open(self, endpoints: Endpoints, others: Sequence[int] = ()) -> OpenEndpoints:
         """Open the robot to clients; `others` are the ports of the other robots' Crazyradios. Raises `LabError`."""
