@@ -23,7 +23,7 @@ from ground_station.trajectory import FlightPlan, Goal, Trajectory
 from hil.board.board_firmware import Executor, Flashed, PythonBoard
 from hil.board.clock import Clock, FreeRunning, Paced
 from hil.board.eeprom import factory_config
-from hil.board.image_firmware import ChipImage
+from hil.board.image_firmware import ChipImage, ImageObserver
 from hil.board.image_settings import APP_PARAMETER, NO_APP, ImageSettings, stock_contents
 from hil.board.pins import new_eeprom
 from hil.board.radio import Receiver, VirtualRadio
@@ -207,43 +207,46 @@ def lockstep_flight(
     return Flight(request, clock, partial(ModelledLine, telemetry, number), executor)
 
 
-def in_lockstep(request: Request, telemetry: Path | None, stack: ExitStack) -> Flight:
-    """Return a flight over a modelled link. Raises `LabError` if its board is not available."""
+def in_lockstep(request: Request, telemetry: Path | None, stack: ExitStack, from_us: int = 0) -> Flight:
+    """Return a flight over a modelled link, as `executor_of` has it. Raises `LabError` if its board is not available."""
     with refusing("--board ", LinkError):
-        return lockstep_flight(request, telemetry, executor_of(request, stack))
+        return lockstep_flight(request, telemetry, executor_of(request, stack, from_us))
 
 
-def executor_of(request: Request, stack: ExitStack) -> Executor:
-    """Return what executes the firmware of a request. Raises `LabError` or `LinkError` if it is not available."""
+def executor_of(request: Request, stack: ExitStack, from_us: int = 0) -> Executor:
+    """Return what executes the firmware of a request; under `--gdb` it waits at `from_us` of the laboratory's time.
+
+    Raises `LabError` or `LinkError` if it is not available.
+    """
     bench = request.bench
     if is_link(bench.board):
         return PythonBoard(real_core(bench.board, stack))
     if bench.is_image:
-        forward = bench.coverage is not None or bench.profile_cpu is not None
-        why_forward = "real time does not" if bench.realtime else "what has run is counted" if forward else ""
-        return image_of(bench, debugger(bench.gdb, bench.elf or Path(bench.board), stack, why_forward))
+        why_forward = "real time does not" if bench.realtime or not bench.in_lockstep else ""
+        server = debugger(bench.gdb, bench.elf or Path(bench.board), stack, why_forward, from_us)
+        return replace(image_at(bench.board, bench.elf), debugger=server, observers=observers_of(bench))
     with refusing(f"--board {bench.board}: ", FirmwareError):
         return PythonBoard(runner_of(bench.board, request.config.logic))
 
 
-def image_at(board: str, elf: Path | None, debugger: GdbServer | None = None) -> ChipImage:
+def image_at(board: str, elf: Path | None) -> ChipImage:
     """Return the image that `--board` and `--elf` name. Raises `LabError` if it cannot run here."""
     with refusing(f"--board {board}: ", FirmwareError):
-        return ChipImage.load(Path(board), elf, debugger)
+        return ChipImage.load(Path(board), elf)
 
 
-def image_of(bench: Bench, debugger: GdbServer | None = None) -> ChipImage:
-    """Return the image of a flight. Raises `LabError` if it cannot run here, or its coverage has no place."""
-    image = image_at(bench.board, bench.elf, debugger)
+def observers_of(bench: Bench) -> tuple[ImageObserver, ...]:
+    """Return what watches an image in flight."""
+    found: list[ImageObserver] = []
     if bench.coverage is not None:
-        from hil.laboratory.files.coverage import check_coverage
+        from hil.laboratory.files.coverage import Coverage
 
-        check_coverage(bench.coverage, image.image.sha256)
+        found.append(Coverage(bench.coverage, bench.board, bench.elf))
     if bench.profile_cpu is not None:
-        from hil.laboratory.files.cpu_profile import check_profile_place
+        from hil.laboratory.files.cpu_profile import Profiler
 
-        check_profile_place(bench.profile_cpu)
-    return replace(image, is_recorded=bench.coverage is not None, is_profiled=bench.profile_cpu is not None)
+        found.append(Profiler(bench.profile_cpu))
+    return tuple(found)
 
 
 def debugger(

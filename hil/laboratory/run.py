@@ -151,16 +151,8 @@ class Started:
             image=None if firmware.flashed is None else firmware.flashed.report(),
         )
         write_result(result)
-        bench = request.bench
-        if bench.coverage is not None and firmware.flashed is not None and result.image is not None:
-            from hil.laboratory.files.coverage import Executed, add_executed
-
-            flown = Executed(result.image.sha256, 1, firmware.flashed.passages, bench.board, bench.elf)
-            add_executed(bench.coverage, flown)
-        if bench.profile_cpu is not None and firmware.flashed is not None and result.image is not None:
-            from hil.laboratory.files.cpu_profile import write_profile
-
-            write_profile(bench.profile_cpu, folder, firmware.flashed.cpu_profile(), result.image)
+        if firmware.flashed is not None:
+            firmware.flashed.report_observed(folder)
         return result
 
 

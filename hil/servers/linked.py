@@ -24,9 +24,9 @@ from hil.laboratory.experiments import find_again
 from hil.laboratory.files.ages import STATION_CLOCK
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import WARM_UP_US, Laboratory
-from hil.laboratory.lockstep import image_of
+from hil.laboratory.lockstep import executor_of
 from hil.laboratory.request import Request
-from hil.laboratory.robot import PYTHON_BOARD, Site
+from hil.laboratory.robot import Site
 from hil.servers.dongle_plugin import VARIABLE
 from hil.servers.dongle_server import HOST
 from hil.servers.holder import HOLD_US, LaunchClamp
@@ -220,10 +220,9 @@ def linked_flight(request: Request, telemetry: Path | None, stack: ExitStack) ->
             "package, where the ground station's process finds it"
         )
     arguments = ["--profile", request.profile, *(f"--set={override}" for override in request.overrides)]
-    bench = request.bench
-    executor = image_of(bench) if bench.is_image else PYTHON_BOARD
     assert telemetry is not None
-    return Flight(request, Paced(), partial(StationProcess, telemetry, arguments), executor)
+    line_of = partial(StationProcess, telemetry, arguments)
+    return Flight(request, Paced(), line_of, executor_of(request, stack))
 
 
 def _pty(uri: str) -> Address:
