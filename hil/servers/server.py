@@ -20,6 +20,7 @@ from hil.laboratory.files.recorder import Observer, Recorder
 from hil.laboratory.flight import RECORD_PERIOD_US, RECORD_PHASE_US
 from hil.laboratory.laboratory import NEVER_US, Laboratory
 from hil.laboratory.robot import PYTHON_BOARD, Robot, Site, Streams, with_system
+from hil.servers.built_in_station import fly_built_in
 from hil.servers.failures import Failures
 from hil.servers.holder import LaunchClamp
 from hil.servers.motive import Streaming, VirtualMotive
@@ -151,7 +152,7 @@ class Server:
         if endpoints.mavlink:
             mavlink = served.serve_mavlink(endpoints.mavlink[later], readers)
         if endpoints.station is not None:
-            served.fly(endpoints.station == "poses")
+            fly_built_in(self.robot, endpoints.station == "poses")
         return OpenEndpoints(served.uri, dongles, udp, mavlink)
 
     def hear_peer(self, settings: AirSettings, packet: bytes) -> None:
