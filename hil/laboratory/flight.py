@@ -18,7 +18,7 @@ from hil.board.clock import Clock
 from hil.emulator.events import EventQueue
 from hil.laboratory.channels import excitation_channel, fault_channel, flight_channels
 from hil.laboratory.faults import Switchboard
-from hil.laboratory.files.recorder import SETTINGS, Recorder
+from hil.laboratory.files.recorder import SETTINGS, Correct, Recorder
 from hil.laboratory.laboratory import Laboratory, Progress
 from hil.laboratory.request import Request
 from hil.laboratory.robot import PYTHON_BOARD, Robot, Site, Streams
@@ -44,7 +44,7 @@ class Outcome:
 class Line(Protocol):
     """A robot, what is between it and the ground, and the ground."""
 
-    record: Path | None  # of the ground station, where only that knows the goals it sent
+    correct: Correct | None  # adds to the log what others have recorded
 
     @property
     def robot(self) -> Robot:

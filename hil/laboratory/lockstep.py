@@ -35,7 +35,7 @@ from hil.emulator.stm32f405.gdb import GdbServer
 from hil.emulator.stm32f405.image import has_symbols
 from hil.errors import LabError, refusing
 from hil.laboratory.channels import radio_channel, serial_channel, tracker_channel
-from hil.laboratory.files.recorder import SETTINGS
+from hil.laboratory.files.recorder import SETTINGS, Correct
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import Laboratory
 from hil.laboratory.request import MAVLINK, Bench, Request
@@ -47,11 +47,17 @@ class ModelledLine:
     """`hil.laboratory.flight.Line` for the modelled links; `station`, `tracker` and `radio` may be read."""
 
     def __init__(
-        self, telemetry: Path | None, number: int, request: Request, site: Site, lab: Laboratory
+        self,
+        telemetry: Path | None,
+        number: int,
+        correct: Correct | None,
+        request: Request,
+        site: Site,
+        lab: Laboratory,
     ) -> None:
         config, events, streams = site.config, site.events, site.streams
         serial = request.bench.link == MAVLINK
-        self.record: Path | None = None  # the log has the goals already
+        self.correct = correct
         self._release_us = config.flight.release_us
         self.trajectory = FlightPlan(Goal(config.flight.home, 0.0), lambda *_: request.trajectory)
         self.trajectory.start(self._release_us)
@@ -198,13 +204,14 @@ def lockstep_flight(
     executor: Executor = PYTHON_BOARD,
     clock: Clock | None = None,
     number: int = 0,
+    correct: Correct | None = None,
 ) -> Flight:
     """Return a flight over a modelled link. Without a clock it is paced if the request is in real time.
 
     `number` is the robot's in a swarm, from 1, and gives its board an own radio address.
     """
     clock = clock or (Paced() if request.bench.realtime else FreeRunning())
-    return Flight(request, clock, partial(ModelledLine, telemetry, number), executor)
+    return Flight(request, clock, partial(ModelledLine, telemetry, number, correct), executor)
 
 
 def in_lockstep(request: Request, telemetry: Path | None, stack: ExitStack, from_us: int = 0) -> Flight:

@@ -21,7 +21,8 @@ from hil.board.clock import Paced
 from hil.board.image_settings import to_set
 from hil.errors import LabError
 from hil.laboratory.experiments import find_again
-from hil.laboratory.files.ages import STATION_CLOCK
+from hil.laboratory.files.ages import STATION_CLOCK, with_goals_sent
+from hil.laboratory.files.recorder import Correct
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import WARM_UP_US, Laboratory
 from hil.laboratory.lockstep import executor_of
@@ -65,7 +66,7 @@ class StationProcess:
         self.robot = self._served.robot
         self._readers = lab.clock.readers
         self._experiment = request.experiment
-        self.record: Path | None = telemetry
+        self.correct: Correct | None = partial(with_goals_sent, telemetry)
         self._home = Goal(config.flight.home, 0.0)
         self._release_us: int | None = None  # the robot is held
         self._next_listen_us = 0
