@@ -30,11 +30,10 @@ from hil.laboratory.request import Request
 from hil.laboratory.robot import Site
 from hil.servers.dongle_plugin import VARIABLE
 from hil.servers.dongle_server import HOST
-from hil.servers.holder import HOLD_US, LaunchClamp
 from hil.servers.motive import Streaming, name_of
 from hil.servers.serial_server import Address
 from hil.servers.served_robot import ServedRobot
-from hil.servers.server import open_motive
+from hil.servers.server import HOLD_US, LaunchClamp, open_motive
 from hil.world.body import Channel, Quantity
 
 SITE = Path(__file__).parent / "dongle_site"

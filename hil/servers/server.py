@@ -8,6 +8,7 @@ from pathlib import Path
 
 from firmware_py.rtos import WatchdogError
 from firmware_py.wire.mavlink_numbers import CommandResult
+from firmware_py.wire.supervisor import State
 from ground_station.trajectory import Goal, Hold
 from hil.board.board_firmware import Executor
 from hil.board.clock import Paced
@@ -22,7 +23,6 @@ from hil.laboratory.laboratory import NEVER_US, Laboratory
 from hil.laboratory.robot import PYTHON_BOARD, Robot, Site, Streams, with_system
 from hil.servers.built_in_station import fly_built_in
 from hil.servers.failures import Failures
-from hil.servers.holder import LaunchClamp
 from hil.servers.motive import Streaming, VirtualMotive
 from hil.servers.serial_server import Address
 from hil.servers.served_robot import ServedRobot
@@ -30,6 +30,9 @@ from hil.servers.shared_room import SharedRoom
 from hil.world.body import Channel
 
 BUTTON_US = 5_000_000  # off, or in the bootloader without a client: then the button is pressed
+HOLD_US = 1_000_000  # flying in the holder before the release
+PUT_BACK_US = 1_000_000  # after a loss
+WATCH_PERIOD_US = 10_000
 
 
 def open_motive(settings: Streaming, robot: Robot, clock: Paced, count: int = 1) -> VirtualMotive:
@@ -43,6 +46,39 @@ def open_motive(settings: Streaming, robot: Robot, clock: Paced, count: int = 1)
 def show(robot: Robot, clock: Paced, take: Callable[..., None]) -> None:
     """Pass a robot's frames of the cameras to `VirtualMotive.take`."""
     robot.seen_by(lambda frame, now_us, sighting: take(frame, now_us, sighting, clock.began_us))
+
+
+class LaunchClamp:
+    """Holds one robot. Calls `let_go` when it has flown in its holder for a second, or stands on the floor."""
+
+    def __init__(self, robot: Robot, let_go: Callable[[int], None]) -> None:
+        self._robot = robot
+        self._let_go = let_go
+        self._flying_since_us: int | None = None
+        robot.events.every(WATCH_PERIOD_US, WATCH_PERIOD_US, self._watch)
+
+    def put_back_later(self, now_us: int) -> None:
+        """Return the robot to the holder after a delay."""
+        self._robot.catch()
+        self._robot.events.at(now_us + PUT_BACK_US, self._put_back)
+
+    def _put_back(self, now_us: int) -> None:
+        self._robot.put_back(now_us)
+        self._flying_since_us = None
+
+    def _watch(self, now_us: int) -> None:
+        robot = self._robot
+        if robot.free or robot.body.lost is not None:
+            return
+        if robot.config.pilot.enabled:  # it stands on the floor
+            self._let_go(now_us)
+            return
+        if not robot.powered or robot.firmware.signals.supervisor.state is not State.FLYING:
+            self._flying_since_us = None
+        elif self._flying_since_us is None:
+            self._flying_since_us = now_us
+        elif now_us - self._flying_since_us >= HOLD_US:
+            self._let_go(now_us)
 
 
 @dataclass(frozen=True, slots=True)

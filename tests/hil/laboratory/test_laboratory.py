@@ -15,10 +15,9 @@ from hil.laboratory.faults import Fault, parse
 from hil.laboratory.laboratory import Laboratory
 from hil.laboratory.robot import Ports, Robot, Site, Streams, nobody_listens
 from hil.servers.built_in_station import fly_built_in
-from hil.servers.holder import LaunchClamp
 from hil.servers.live_faults import LiveFaults
 from hil.servers.served_robot import ServedRobot
-from hil.servers.server import Server, Service
+from hil.servers.server import LaunchClamp, Server, Service
 
 SECOND_US = 1_000_000
 
