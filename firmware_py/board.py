@@ -22,9 +22,6 @@ class Board(Protocol):
     def sensors(self) -> Mapping[str, F32s]:
         """The last samples of the robot's own sensors, by name; NaN: there is none."""
 
-    def read_imu(self) -> ImuCounts:
-        """Return the registers of the BMI088 as they are now."""
-
     def read_battery_mv(self) -> int:
         """Return the supply voltage [mV]."""
 

@@ -78,7 +78,7 @@ class Firmware:
         self._notices = Notices(self.kernel, self._console.write)
         self._supervisor = CoreSupervisor(core, self._console.write, self._client_is_there)
         self.pilot = Pilot(
-            core, self._supervisor, lambda: acceleration(board.read_imu()), self._notices.refuse
+            core, self._supervisor, lambda: acceleration(board.imu.tolist()), self._notices.refuse
         )
         findings = Findings(self._zero_found, self._pose_refused, self._pose_gated)
         self.flight_tasks = FlightTasks(
@@ -213,7 +213,7 @@ class Firmware:
 
     def _measured(self) -> tuple[Vector, Vector]:
         """Return the IMU's present measurement: rates [rad/s, B] and acceleration [g, B]."""
-        counts = self._board.read_imu()
+        counts = self._board.imu.tolist()
         return rates(counts, self._core.data.fields.gyro_bias.tolist()), acceleration(counts)
 
     def _client_is_there(self) -> bool:

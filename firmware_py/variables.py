@@ -75,7 +75,7 @@ def _crazyflie(running: Running) -> Iterator[LogVariable]:
     parameters = running.core.parameters.fields
 
     def rate(axis: int) -> float:
-        return degrees(rates(board.read_imu(), bias.tolist())[axis])
+        return degrees(rates(board.imu.tolist(), bias.tolist())[axis])
 
     def battery_level() -> float:
         return 10 * min(9, bisect_left(CHARGE_CURVE_MV, board.read_battery_mv()))
@@ -86,7 +86,7 @@ def _crazyflie(running: Running) -> Iterator[LogVariable]:
     yield from _parts("stabilizer", "roll pitch yaw", "deg", partial(_legacy_angle, running))
     yield LogVariable("stabilizer.thrust", F32, "", lambda: 0.0)
     yield from _parts("gyro", "x y z", "deg/s", rate)
-    yield from _parts("acc", "x y z", "g", lambda axis: acceleration(board.read_imu())[axis])
+    yield from _parts("acc", "x y z", "g", lambda axis: acceleration(board.imu.tolist())[axis])
     yield LogVariable("pm.vbat", F32, "V", lambda: board.read_battery_mv() * 1e-3)
     yield LogVariable("pm.vbatMV", U16, "mV", board.read_battery_mv)
     yield LogVariable("pm.state", I8, "", battery_state)

@@ -7,7 +7,6 @@ turns the gyro's counts itself; the tests compare it with `body_of`.
 from collections.abc import Sequence
 from math import pi, sqrt
 
-from firmware_py.board import ImuCounts
 from firmware_py.geometry import Vector
 
 GYRO_SCALE = 2000.0 / 32768.0 * pi / 180.0  # [rad/s per count] at +-2000 deg/s
@@ -21,13 +20,13 @@ def body_of(v_S: Vector) -> Vector:
     return COS_45 * (x + y), COS_45 * (y - x), z
 
 
-def rates(counts: ImuCounts, zero: Sequence[float]) -> Vector:
+def rates(counts: Sequence[int], zero: Sequence[float]) -> Vector:
     """Return the body rates p, q, r [rad/s, B]; `zero` is the gyro's [counts, S]."""
     x, y, z = (GYRO_SCALE * (count - at_rest) for count, at_rest in zip(counts[:3], zero, strict=True))
     return body_of((x, y, z))
 
 
-def acceleration(counts: ImuCounts) -> Vector:
+def acceleration(counts: Sequence[int]) -> Vector:
     """Return the specific force [g, B]."""
     x, y, z = (ACCELEROMETER_SCALE * count for count in counts[3:])
     return body_of((x, y, z))

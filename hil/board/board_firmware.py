@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
 
-import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.board import Board, ImuCounts
@@ -26,9 +26,6 @@ from hil.emulator.crazyflie.log_table import ImageParameter
 from hil.emulator.crazyflie.shockburst import syslink_us
 from hil.world.body import Carrier
 from hil.world.servos import OUTPUTS
-
-if TYPE_CHECKING:
-    from hil.emulator.stm32f405.cpu_profile import CpuProfile
 
 # (us, event, who, a, b), in the words of tests/vectors/README.md
 Trace = Callable[[int, str, str, int, int], None]
@@ -175,12 +172,8 @@ class Flashed(Protocol):
     def known_findings(self) -> Sequence[str]:
         """Harmless mistakes that its makers' firmware is known for, each as one line."""
 
-    @property
-    def passages(self) -> NDArray[np.uint64]:
-        """How often its blocks were executed, as of `Chip.passages`; empty where that is not counted."""
-
-    def cpu_profile(self) -> CpuProfile:
-        """Return where its cycles went; only where that was recorded."""
+    def report_observed(self, folder: Path) -> None:
+        """Let its observers report a flight, whose run folder is given. Raises `LabError`."""
 
     def differences(self, config: FirmwareConfig) -> str:
         """Return the differences between its core and a profile in one line; empty if none."""

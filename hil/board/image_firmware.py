@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import nan, radians
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,9 +38,6 @@ from hil.emulator.stm32f405.image import Image
 from hil.errors import LabError
 from hil.world.body import Carrier
 from hil.world.servos import OUTPUTS
-
-if TYPE_CHECKING:
-    from hil.emulator.stm32f405.cpu_profile import CpuProfile
 
 # The stock firmware's self-test and gyro calibration take 3.06 s. The rest gives the app's estimator the phase that ours
 # has, 2 to 3 ms after a camera pose: a real one has any phase.
@@ -121,33 +118,38 @@ def read_image(path: Path, elf: Path | None) -> tuple[Image, list[str]]:
     return Image(path / taken.name, elf, taken.content), [taken.note]
 
 
+class ImageObserver(Protocol):
+    """Watches an image from power-on to the end of its flight; what it counts is memory of the chip (`Chip.save`)."""
+
+    def begin(self, firmware: ImageFirmware) -> None:
+        """Begin before the first instruction. Raises `LabError` if there is no place for the report."""
+
+    def report(self, firmware: ImageFirmware, folder: Path) -> None:
+        """Report a flight, whose run folder is given. Raises `LabError`."""
+
+
 @dataclass(frozen=True, slots=True)
 class ChipImage:
     """The flashed image and the compiled machine that executes it."""
 
     image: Image
     library: Path
+    notes: tuple[str, ...] = ()  # what was taken of a release, and what is unknown without symbols
     debugger: GdbServer | None = None
-    notes: tuple[
-        str, ...
-    ] = ()  # what was taken of a release, and what is unknown of an image without symbols
-    is_recorded: bool = False  # count the executed blocks
-    is_profiled: bool = False  # charge the cycles to functions
+    observers: tuple[ImageObserver, ...] = ()
     needs_polls: ClassVar[bool] = True
 
     @classmethod
-    def load(cls, path: Path, elf: Path | None, debugger: GdbServer | None = None) -> ChipImage:
+    def load(cls, path: Path, elf: Path | None) -> ChipImage:
         """Read an image, or that of a release's zip, and compile the machine. Raises `LabError` and `ExportError`."""
         image, notes = read_image(path, elf)
-        return cls.flashed(image, build_machine(), debugger, notes)
+        return cls.flashed(image, build_machine(), notes)
 
     @classmethod
-    def flashed(
-        cls, image: Image, library: Path, debugger: GdbServer | None = None, notes: Sequence[str] = ()
-    ) -> ChipImage:
+    def flashed(cls, image: Image, library: Path, notes: Sequence[str] = ()) -> ChipImage:
         """Return an image that has been read."""
         unnamed = () if image.named else (f"{image.path}: {NO_SYMBOLS}",)
-        return cls(image, library, debugger, (*notes, *unnamed))
+        return cls(image, library, (*notes, *unnamed))
 
     @property
     def in_flash(self) -> bytes:
@@ -159,7 +161,8 @@ class ChipImage:
         content = flash[self.image.base - FLASH :].rstrip(ERASED)
         if content == self.image.code.rstrip(ERASED):
             return self
-        return ChipImage.flashed(Image(FLASHED, None, content), self.library, self.debugger)
+        written = ChipImage.flashed(Image(FLASHED, None, content), self.library)
+        return replace(written, debugger=self.debugger)
 
     def wire_us(self, data: bytes) -> int:
         return 0  # the chip simulates its serial line itself
@@ -200,12 +203,9 @@ class ImageFirmware:
         self.notes = flashed.notes
         self.image, self.chip, self.parts = flashed.image, self._crazyflie.chip, self._crazyflie.parts
         self.kernel = self.scheduler = self._crazyflie.processor
-        if flashed.is_recorded or flashed.is_profiled:
-            self.chip.record()
-        if flashed.is_profiled:
-            from hil.emulator.stm32f405.cpu_profile import functions_of
-
-            self.chip.profile([(one.address, one.address + one.size) for one in functions_of(self.image)])
+        self._observers = flashed.observers
+        for observer in self._observers:
+            observer.begin(self)
         self._board = board
         self._table = {variable.name: variable for variable in log_table(self.image, self.chip)}
         self.variables = [one for name, one in self._table.items() if name.startswith("excite.")]
@@ -230,14 +230,9 @@ class ImageFirmware:
             for task, run_time_us, activations in counted
         ]  # fmt: skip
 
-    @property
-    def passages(self) -> NDArray[np.uint64]:
-        return self.chip.passages
-
-    def cpu_profile(self) -> CpuProfile:
-        from hil.emulator.stm32f405.cpu_profile import Reader
-
-        return Reader(self.image, self.chip, self.kernel.task_names, self.kernel.ahead_us).read()
+    def report_observed(self, folder: Path) -> None:
+        for observer in self._observers:
+            observer.report(self, folder)
 
     def differences(self, config: FirmwareConfig) -> str:
         if not self.image.has("floaty_parameters"):
@@ -260,7 +255,7 @@ class ImageFirmware:
     # Interrupts and time
 
     def imu_ready(self) -> None:
-        self.parts.sample(self._board.read_imu())
+        self.parts.sample(self._board.imu.tolist())
         for field, name in self._sensed:
             field[:] = self._board.sensors[name]
 

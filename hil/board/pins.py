@@ -101,9 +101,6 @@ class VirtualBoard:
         """The processor's current time, by the hardware's clock."""
         return self._booted_us + (self._kernel.now_us if self._kernel else 0)
 
-    def read_imu(self) -> ImuCounts:
-        return tuple(self.imu.tolist())
-
     def read_battery_mv(self) -> int:
         return self.battery_mv
 

@@ -155,7 +155,7 @@ class RealFirmware:
         """Send the virtual IMU's new sample, read the board's reports, and wait for the board when it is late."""
         if self._window.count == 0:  # compilation is done: samples flow from now on
             self._client.execute([loop(self._mode)])
-        self._window.put(self._board.read_imu()[:3])
+        self._window.put(self._board.imu[:3].tolist())
         self._exchange()
         if not self._window.full:
             return

@@ -149,7 +149,7 @@ def _executor(asked: ServeOptions) -> Executor:
     stack = click.get_current_context().with_resource(ExitStack())
     why_forward = "a served robot flies in real time, with programs that cannot go back"
     server = debugger(asked.gdb, asked.elf or Path(asked.board), stack, why_forward)
-    return image_at(asked.board, asked.elf, server)
+    return replace(image_at(asked.board, asked.elf), debugger=server)
 
 
 def _run(

@@ -12,28 +12,22 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_py.board import ImuCounts
 from firmware_py.export.app_toc import AppParameter, app_parameters
-from firmware_py.wire.crtp import PORT_PARAMETERS, Packet, decode, encode
+from firmware_py.wire.crtp import PORT_PARAMETERS
 from firmware_py.wire.parameters import CHANNEL_WRITE, encode_ident
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.supervisor import Cause
 from hil.board.board_firmware import PythonBoard
 from hil.board.image_firmware import ChipImage, ImageFirmware
-from hil.board.imu import VirtualImu
-from hil.board.pins import VirtualBoard
 from hil.config import LabConfig, load_config
 from hil.deploy.beside import fly_beside_python
 from hil.deploy.doctor import Finding
 from hil.deploy.service_programs import PROGRAMS
-from hil.deploy.services import ServiceBench, differences, play_in_copies
-from hil.emulator.events import EventQueue
+from hil.deploy.services import STEP_US, ServiceBench, differences, play_in_copies
 from hil.emulator.stm32f405.image import Image, MemoryUse
 from hil.errors import LabError
-from hil.laboratory.bodies import make_body
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import image_at
-from hil.laboratory.robot import BENCH_NOISE, Streams
 
 FREE_LEAST = 1024  # [bytes]
 APP = "floaty_toc_apply"  # exists in images with the exported app
@@ -44,7 +38,6 @@ UNPROVEN = (
     "differences in flight below the bounds above",
 )
 Show = Callable[[str, int, int], None]  # (what, done, of how many)
-STEP_US = 1_000
 ANSWER_US = 200_000  # time limit for the answer to a write
 ACT_US = 20_000  # from a request until the stabilizer task has served it
 STALE_US = 150_000  # more than from a controller's last step until the app has moved the servos to hover
@@ -124,21 +117,14 @@ def _values(parameter: AppParameter, scalar: Scalar) -> list[float]:
     return [other, *(value for value in outside if scalar.cast(value) == value)]
 
 
-class ImageBench:
-    """An image at rest in its holder; `parameters` of the radio and memory by name."""
+class ImageBench(ServiceBench):
+    """A bench with an image that has the app; parameters of the radio and memory by name."""
+
+    firmware: ImageFirmware
 
     def __init__(self, flashed: ChipImage, config: LabConfig) -> None:
-        self.console: list[str] = []
-        self._answers: list[bytes] = []
-        board = VirtualBoard(lambda *_: None, self._take, lambda now_us, text: self.console.append(text))
-        streams = Streams.of_seed(1)
-        self._imu = VirtualImu(config.imu, streams.imu)
-        self._imu.set_noise_scale(BENCH_NOISE)
-        self._body = make_body(config, streams.gusts, config.flight.home)
-        self.firmware = ImageFirmware(flashed, board, self._sample)
-        board.run_on(self.firmware.kernel, EventQueue())
+        super().__init__(flashed, config)
         self._table = self.firmware.parameters
-        self._now_us = 0
         self._of_parameters = flashed.image.symbol("floaty_toc_apply").address
 
     def scalar(self, name: str) -> Scalar | None:
@@ -152,12 +138,11 @@ class ImageBench:
         """Write a parameter over the radio. Raises `LabError` without an answer."""
         entry = self._table[name]
         ident = encode_ident(entry.number)
-        data = encode(Packet(PORT_PARAMETERS, CHANNEL_WRITE, ident + entry.scalar.pack(value)))
-        self._answers.clear()
-        self.firmware.radio_received(data)
+        self.received.clear()
+        self.post(PORT_PARAMETERS, CHANNEL_WRITE, ident + entry.scalar.pack(value))
         for _ in range(ANSWER_US // STEP_US):
             self.run(STEP_US)
-            for answer in map(decode, self._answers):
+            for answer in self.received:
                 if (answer.port, answer.channel, answer.data[:2]) == (PORT_PARAMETERS, CHANNEL_WRITE, ident):
                     return
         within = f"within {ANSWER_US // 1000} ms"
@@ -218,20 +203,6 @@ class ImageBench:
             if found != expected:
                 yield f"servo outputs: {unit}.{name} = 0x{found:x}, expected 0x{expected:x}"
 
-    def run(self, us: int) -> None:
-        """Run for a time, with an IMU sample each millisecond."""
-        for _ in range(us // STEP_US):
-            self._now_us += STEP_US
-            self.firmware.kernel.run(self._now_us)
-            self.firmware.parts.sample(self._sample())
-
-    def _sample(self) -> ImuCounts:
-        return self._imu.sample(self._body)
-
-    def _take(self, now_us: int, data: bytes) -> bool:
-        self._answers.append(data)
-        return True
-
 
 def check_services(
     image: ServiceBench, python: ServiceBench, progress: Callable[[int], None]
@@ -259,6 +230,10 @@ def check_image(elf: Path, profile: str, overrides: tuple[str, ...], show: Show)
     bench = ImageBench(flashed, config)
     constants = bench.firmware.differences(config)
     yield Finding("constants", constants or "as in the profile", not constants)
+    python = ServiceBench(
+        PythonBoard(), config
+    )  # the programs are played on copies, and leave both as they are
+    services = list(check_services(bench, python, lambda done: show("services", done, len(PROGRAMS))))
     table = app_parameters(config)
     found = list(check_parameters(table, bench, lambda done: show("parameters", done, len(table))))
     good = f"{len(table)} defaults, limits and the fields that they write are the profile's"
@@ -274,13 +249,8 @@ def check_image(elf: Path, profile: str, overrides: tuple[str, ...], show: Show)
     ):
         yield from _all(list(failures), subject, good)
 
-    services = check_services(
-        ServiceBench(flashed, config),
-        ServiceBench(PythonBoard(), config),
-        lambda done: show("services", done, len(PROGRAMS)),
-    )
     yield from _all(
-        list(services),
+        services,
         "services",
         f"{len(PROGRAMS)} programs of requests are answered as by the Python board",
     )

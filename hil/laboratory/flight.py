@@ -16,9 +16,9 @@ from ground_station.trajectory import Trajectory
 from hil.board.board_firmware import Executor
 from hil.board.clock import Clock
 from hil.emulator.events import EventQueue
-from hil.laboratory import channels
+from hil.laboratory.channels import excitation_channel, fault_channel, flight_channels
 from hil.laboratory.faults import Switchboard
-from hil.laboratory.files.recorder import SETTINGS, Recorder
+from hil.laboratory.files.recorder import SETTINGS, Correct, Recorder
 from hil.laboratory.laboratory import Laboratory, Progress
 from hil.laboratory.request import Request
 from hil.laboratory.robot import PYTHON_BOARD, Robot, Site, Streams
@@ -44,7 +44,7 @@ class Outcome:
 class Line(Protocol):
     """A robot, what is between it and the ground, and the ground."""
 
-    record: Path | None  # of the ground station, where only that knows the goals it sent
+    correct: Correct | None  # adds to the log what others have recorded
 
     @property
     def robot(self) -> Robot:
@@ -116,7 +116,6 @@ class Flight:
             for text in flashed.notes if flashed is not None else ():
                 self.note(SETTINGS, text)
             self.schedule = ScheduleTrace(self.robot.firmware.scheduler)
-            self._recorded = self.robot.firmware
             self._resets_before = 0  # the release
             self.line.begin(self._plan)
             self.robot.watch(0)
@@ -162,16 +161,10 @@ class Flight:
         self.events.at(end_us if self._trace_all else start_us + WINDOW_US, self.schedule.end)
 
     def channels(self) -> tuple[Channel, ...]:
-        robot, (line, tracker) = self.robot, self.line.channels()
-        found = [*channels.flight_channels(robot, self.line.trajectory), *line]
-        found += channels.battery_channel(robot.battery), *tracker
-        if robot.mocap.markers:
-            found.append(channels.marker_channel(robot.mocap))
-        if self.faults:
-            found.append(channels.fault_channel(self.switchboard.active))
+        more = [fault_channel(self.switchboard.active)] if self.faults else []
         if any(self.config.excitation.rms):
-            found.append(channels.excitation_channel(robot.firmware))
-        return (*found, *channels.board_channels(robot.firmware))
+            more.append(excitation_channel(self.robot.firmware))
+        return flight_channels(self.robot, self.line.trajectory, *self.line.channels(), more)
 
     def run(self, progress: Progress | None = None, recorder: Recorder | None = None) -> Outcome:
         """Fly to the end, the crash, or Ctrl-C, into a log of `channels`; it is left open for the caller to close."""
@@ -186,6 +179,8 @@ class Flight:
     def record_in(self, recorder: Recorder | None) -> None:
         """Write rows and events into a log of `channels` from now on."""
         self._recorder = recorder
+        if recorder is not None:
+            self.robot.on_boot(lambda: recorder.read_from(self.channels()))
         early, self._early = self._early, []  # where nothing is recorded, they go there again
         for source, text in early:
             self.note(source, text)
@@ -214,9 +209,6 @@ class Flight:
             return
         lost = self.robot.advance_truth(now_us)
         if self._recorder is not None:
-            if self.robot.firmware is not self._recorded:  # it has booted
-                self._recorded = self.robot.firmware
-                self._recorder.read_from(self.channels())
             self._recorder.row(now_us)
         self.robot.firmware.check_watchdog()
         self._watch_logic(now_us)

@@ -23,7 +23,7 @@ from ground_station.trajectory import FlightPlan, Goal, Trajectory
 from hil.board.board_firmware import Executor, Flashed, PythonBoard
 from hil.board.clock import Clock, FreeRunning, Paced
 from hil.board.eeprom import factory_config
-from hil.board.image_firmware import ChipImage
+from hil.board.image_firmware import ChipImage, ImageObserver
 from hil.board.image_settings import APP_PARAMETER, NO_APP, ImageSettings, stock_contents
 from hil.board.pins import new_eeprom
 from hil.board.radio import Receiver, VirtualRadio
@@ -35,7 +35,7 @@ from hil.emulator.stm32f405.gdb import GdbServer
 from hil.emulator.stm32f405.image import has_symbols
 from hil.errors import LabError, refusing
 from hil.laboratory.channels import radio_channel, serial_channel, tracker_channel
-from hil.laboratory.files.recorder import SETTINGS
+from hil.laboratory.files.recorder import SETTINGS, Correct
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import Laboratory
 from hil.laboratory.request import MAVLINK, Bench, Request
@@ -47,11 +47,17 @@ class ModelledLine:
     """`hil.laboratory.flight.Line` for the modelled links; `station`, `tracker` and `radio` may be read."""
 
     def __init__(
-        self, telemetry: Path | None, number: int, request: Request, site: Site, lab: Laboratory
+        self,
+        telemetry: Path | None,
+        number: int,
+        correct: Correct | None,
+        request: Request,
+        site: Site,
+        lab: Laboratory,
     ) -> None:
         config, events, streams = site.config, site.events, site.streams
         serial = request.bench.link == MAVLINK
-        self.record: Path | None = None  # the log has the goals already
+        self.correct = correct
         self._release_us = config.flight.release_us
         self.trajectory = FlightPlan(Goal(config.flight.home, 0.0), lambda *_: request.trajectory)
         self.trajectory.start(self._release_us)
@@ -198,52 +204,56 @@ def lockstep_flight(
     executor: Executor = PYTHON_BOARD,
     clock: Clock | None = None,
     number: int = 0,
+    correct: Correct | None = None,
 ) -> Flight:
     """Return a flight over a modelled link. Without a clock it is paced if the request is in real time.
 
     `number` is the robot's in a swarm, from 1, and gives its board an own radio address.
     """
     clock = clock or (Paced() if request.bench.realtime else FreeRunning())
-    return Flight(request, clock, partial(ModelledLine, telemetry, number), executor)
+    return Flight(request, clock, partial(ModelledLine, telemetry, number, correct), executor)
 
 
-def in_lockstep(request: Request, telemetry: Path | None, stack: ExitStack) -> Flight:
-    """Return a flight over a modelled link. Raises `LabError` if its board is not available."""
+def in_lockstep(request: Request, telemetry: Path | None, stack: ExitStack, from_us: int = 0) -> Flight:
+    """Return a flight over a modelled link, as `executor_of` has it. Raises `LabError` if its board is not available."""
     with refusing("--board ", LinkError):
-        return lockstep_flight(request, telemetry, executor_of(request, stack))
+        return lockstep_flight(request, telemetry, executor_of(request, stack, from_us))
 
 
-def executor_of(request: Request, stack: ExitStack) -> Executor:
-    """Return what executes the firmware of a request. Raises `LabError` or `LinkError` if it is not available."""
+def executor_of(request: Request, stack: ExitStack, from_us: int = 0) -> Executor:
+    """Return what executes the firmware of a request; under `--gdb` it waits at `from_us` of the laboratory's time.
+
+    Raises `LabError` or `LinkError` if it is not available.
+    """
     bench = request.bench
     if is_link(bench.board):
         return PythonBoard(real_core(bench.board, stack))
     if bench.is_image:
-        forward = bench.coverage is not None or bench.profile_cpu is not None
-        why_forward = "real time does not" if bench.realtime else "what has run is counted" if forward else ""
-        return image_of(bench, debugger(bench.gdb, bench.elf or Path(bench.board), stack, why_forward))
+        why_forward = "real time does not" if bench.realtime or not bench.in_lockstep else ""
+        server = debugger(bench.gdb, bench.elf or Path(bench.board), stack, why_forward, from_us)
+        return replace(image_at(bench.board, bench.elf), debugger=server, observers=observers_of(bench))
     with refusing(f"--board {bench.board}: ", FirmwareError):
         return PythonBoard(runner_of(bench.board, request.config.logic))
 
 
-def image_at(board: str, elf: Path | None, debugger: GdbServer | None = None) -> ChipImage:
+def image_at(board: str, elf: Path | None) -> ChipImage:
     """Return the image that `--board` and `--elf` name. Raises `LabError` if it cannot run here."""
     with refusing(f"--board {board}: ", FirmwareError):
-        return ChipImage.load(Path(board), elf, debugger)
+        return ChipImage.load(Path(board), elf)
 
 
-def image_of(bench: Bench, debugger: GdbServer | None = None) -> ChipImage:
-    """Return the image of a flight. Raises `LabError` if it cannot run here, or its coverage has no place."""
-    image = image_at(bench.board, bench.elf, debugger)
+def observers_of(bench: Bench) -> tuple[ImageObserver, ...]:
+    """Return what watches an image in flight."""
+    found: list[ImageObserver] = []
     if bench.coverage is not None:
-        from hil.laboratory.files.coverage import check_coverage
+        from hil.laboratory.files.coverage import Coverage
 
-        check_coverage(bench.coverage, image.image.sha256)
+        found.append(Coverage(bench.coverage, bench.board, bench.elf))
     if bench.profile_cpu is not None:
-        from hil.laboratory.files.cpu_profile import check_profile_place
+        from hil.laboratory.files.cpu_profile import Profiler
 
-        check_profile_place(bench.profile_cpu)
-    return replace(image, is_recorded=bench.coverage is not None, is_profiled=bench.profile_cpu is not None)
+        found.append(Profiler(bench.profile_cpu))
+    return tuple(found)
 
 
 def debugger(

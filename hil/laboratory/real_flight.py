@@ -20,7 +20,6 @@ from ground_station.telemetry_log import TELEMETRY
 from hil.config import LabConfig
 from hil.errors import LabError, made_folder, require_empty
 from hil.laboratory.bodies import make_body
-from hil.laboratory.channels import station_channels
 from hil.laboratory.files.ages import STATION_START
 from hil.laboratory.files.recorder import STREAM, Observer, Recorder, load_log
 from hil.laboratory.files.result import (
@@ -32,6 +31,7 @@ from hil.laboratory.files.result import (
     with_resets,
     write_result,
 )
+from hil.laboratory.files.station_channels import station_channels
 from hil.laboratory.flight import RECORD_PERIOD_US
 from hil.laboratory.metrics import check_limits, measure
 from hil.laboratory.request import Request, why_left

@@ -22,7 +22,7 @@ from hil.board.board_firmware import PythonBoard
 from hil.config import LabConfig
 from hil.errors import LabError
 from hil.laboratory.channels import ESTIMATE, FLAPS, INPUTS, quantity
-from hil.laboratory.files.recorder import PARQUET, finish_table, load_log
+from hil.laboratory.files.recorder import load_log
 from hil.laboratory.files.result import Result
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
@@ -96,7 +96,7 @@ def replay(request: Request, digest: str, replayed: LabConfig, folder: Path) -> 
         return made[-1]
 
     def flight_of(request: Request, telemetry: Path | None, _stack: object) -> Flight:
-        return lockstep_flight(request, telemetry, PythonBoard(shadowed))
+        return lockstep_flight(request, telemetry, PythonBoard(shadowed), correct=partial(_with_replay, made))
 
     result = fly(request, folder, flight_of=flight_of)
     if result.hash != digest:
@@ -104,13 +104,14 @@ def replay(request: Request, digest: str, replayed: LabConfig, folder: Path) -> 
         raise LabError(
             f"{folder}: flown again, its hash is {now}, not {then}: another version flew it, or its files changed"
         )
-    finish_table(folder / PARQUET, partial(_with_replay, made))
     return result
 
 
 def _with_replay(made: list[Shadowed], log: pa.Table) -> pa.Table:
     """Return a log with what the second core knew at each row; NaN before its first tick. A boot makes a new core."""
     rows = [row for shadowed in made for row in shadowed.rows]
+    if not rows:  # interrupted before
+        return log
     times = np.array([row[0] for row in rows], np.int64)
     times += WRAP_US * np.cumsum(np.diff(times, prepend=times[:1]) < -WRAP_US // 2)
     newest = np.searchsorted(times, column(log, "t"), "right") - 1

@@ -134,6 +134,7 @@ class Robot:
         self._carrier = Carrier(self.body, streams.board, self.body.room, config.robot.decks, self.body.escs)
         self._thief: CpuLoad | None = None
         self._seen_by: list[See] = []
+        self._on_boot: list[Callable[[], None]] = []
         self._resets = 0
         self._failures: tuple[str, ...] = ()  # of the firmware before the last power-on
         self.board = VirtualBoard(
@@ -171,6 +172,12 @@ class Robot:
         self._in_c = flight is not None and flight.take_beats(self.events.beat, now_us, self._take_beat)
         if self._thief is not None:
             self._occupy(self._thief)
+        for act in self._on_boot:
+            act()
+
+    def on_boot(self, act: Callable[[], None]) -> None:
+        """Call `act` after every further boot: `firmware` is another one then."""
+        self._on_boot.append(act)
 
     def execute(self, executor: Executor) -> None:
         """Let another image start at the next boot."""

@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from firmware_py.rtos import WatchdogError
@@ -17,7 +16,6 @@ from ground_station.errors import LinkError
 from ground_station.telemetry_log import TELEMETRY
 from hil.board.clock import Pace
 from hil.config import check_logic
-from hil.laboratory.files.ages import with_goals_sent
 from hil.laboratory.files.folder import replacing_older
 from hil.laboratory.files.recorder import Observer, Recorder, load_log
 from hil.laboratory.files.result import (
@@ -151,16 +149,8 @@ class Started:
             image=None if firmware.flashed is None else firmware.flashed.report(),
         )
         write_result(result)
-        bench = request.bench
-        if bench.coverage is not None and firmware.flashed is not None and result.image is not None:
-            from hil.laboratory.files.coverage import Executed, add_executed
-
-            flown = Executed(result.image.sha256, 1, firmware.flashed.passages, bench.board, bench.elf)
-            add_executed(bench.coverage, flown)
-        if bench.profile_cpu is not None and firmware.flashed is not None and result.image is not None:
-            from hil.laboratory.files.cpu_profile import write_profile
-
-            write_profile(bench.profile_cpu, folder, firmware.flashed.cpu_profile(), result.image)
+        if firmware.flashed is not None:
+            firmware.flashed.report_observed(folder)
         return result
 
 
@@ -185,8 +175,7 @@ def _ended(flight: Flight, fly: Callable[[], Ended | None]) -> tuple[Outcome, st
 
 def _close(flight: Flight, recorder: Recorder, folder: Path) -> str:
     """Finish the files of a flight and release its resources; return the hash of the record."""
-    record = flight.line.record
     with closing(flight):  # even when the recorder cannot write to a full disk
-        digest = recorder.close(None if record is None else partial(with_goals_sent, record))
+        digest = recorder.close(flight.line.correct)
     flight.write_schedule(folder)
     return digest

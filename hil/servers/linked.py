@@ -20,21 +20,20 @@ from ground_station.trajectory import Goal, Trajectory
 from hil.board.clock import Paced
 from hil.board.image_settings import to_set
 from hil.errors import LabError
-from hil.laboratory.channels import radio_channel, serial_channel
 from hil.laboratory.experiments import find_again
-from hil.laboratory.files.ages import STATION_CLOCK
+from hil.laboratory.files.ages import STATION_CLOCK, with_goals_sent
+from hil.laboratory.files.recorder import Correct
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import WARM_UP_US, Laboratory
-from hil.laboratory.lockstep import image_of
+from hil.laboratory.lockstep import executor_of
 from hil.laboratory.request import Request
-from hil.laboratory.robot import PYTHON_BOARD, Site
+from hil.laboratory.robot import Site
 from hil.servers.dongle_plugin import VARIABLE
 from hil.servers.dongle_server import HOST
-from hil.servers.holder import HOLD_US, LaunchClamp
 from hil.servers.motive import Streaming, name_of
 from hil.servers.serial_server import Address
 from hil.servers.served_robot import ServedRobot
-from hil.servers.server import open_motive
+from hil.servers.server import HOLD_US, LaunchClamp, open_motive
 from hil.world.body import Channel, Quantity
 
 SITE = Path(__file__).parent / "dongle_site"
@@ -66,7 +65,7 @@ class StationProcess:
         self.robot = self._served.robot
         self._readers = lab.clock.readers
         self._experiment = request.experiment
-        self.record: Path | None = telemetry
+        self.correct: Correct | None = partial(with_goals_sent, telemetry)
         self._home = Goal(config.flight.home, 0.0)
         self._release_us: int | None = None  # the robot is held
         self._next_listen_us = 0
@@ -128,13 +127,8 @@ class StationProcess:
 
     def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
         """Return the counters of line and board; the station keeps its own record."""
-        robot = self.robot
-        if robot.uart is not None:
-            line: tuple[Channel, ...] = (serial_channel(robot.uart, robot.firmware, None),)
-        else:
-            line = (radio_channel(self._served.udp_radio),) if self._served.udp else ()
-        clock = Channel("int64", Paced.wall_us, (Quantity((STATION_CLOCK,), "us"),))
-        return line, (clock,)
+        line = self._served.channels() if self.robot.uart or self._served.udp else ()
+        return line, (Channel("int64", Paced.wall_us, (Quantity((STATION_CLOCK,), "us"),)),)
 
     def steer(self, trajectory: Trajectory) -> None:
         raise LabError("the goal is that of the ground station, a program of its own: steer it there")
@@ -226,10 +220,9 @@ def linked_flight(request: Request, telemetry: Path | None, stack: ExitStack) ->
             "package, where the ground station's process finds it"
         )
     arguments = ["--profile", request.profile, *(f"--set={override}" for override in request.overrides)]
-    bench = request.bench
-    executor = image_of(bench) if bench.is_image else PYTHON_BOARD
     assert telemetry is not None
-    return Flight(request, Paced(), partial(StationProcess, telemetry, arguments), executor)
+    line_of = partial(StationProcess, telemetry, arguments)
+    return Flight(request, Paced(), line_of, executor_of(request, stack))
 
 
 def _pty(uri: str) -> Address:

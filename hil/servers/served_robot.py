@@ -4,19 +4,10 @@ Its EEPROM survives a restart of the server, in a file of a folder.
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 from firmware_py.wire import WireError
 from firmware_py.wire.memories import CONFIG_SIZE, decode_config
-from firmware_py.wire.parameters import SetByName, encode_pose_kind, encode_set_by_name
-from firmware_py.wire.telemetry import Sample
-from ground_station.links.loopback import LoopbackLink
-from ground_station.mocap import MocapFrame
-from ground_station.station import GroundStation
-from ground_station.tracker import tracker_of
-from ground_station.trajectory import Goal, Hold
-from hil.board.board_firmware import BoardFirmware
 from hil.board.clock import Readers
 from hil.board.dongle import VirtualDongle
 from hil.board.eeprom import CHANNEL, address_of, factory_config
@@ -28,11 +19,13 @@ from hil.emulator.crazyflie.nrf51 import RATES, AirSettings, Band, Nrf51, ToPeer
 from hil.emulator.crazyflie.radio_line import POLL_PERIOD_US
 from hil.emulator.crazyflie.shockburst import Air
 from hil.errors import LabError
+from hil.laboratory.channels import radio_channel, serial_channel
 from hil.laboratory.files.whole_files import replacing
 from hil.laboratory.robot import Ports, Robot, Site
 from hil.servers.dongle_server import DongleServer
 from hil.servers.serial_server import Address, Endpoint
 from hil.servers.udp_server import UdpServer
+from hil.world.body import Channel
 
 
 class BoardFile:
@@ -71,44 +64,12 @@ class BoardFile:
 
 RATE_NAMES = ("250K", "1M", "2M")  # in a URI
 UDP_RETRY_US = 500_000
-STARTED_US = (
-    4_000_000  # after a restart: the stock firmware takes packets once it has tested itself, after 3.1 s
-)
 STAYS_US = 1_000_000  # a radio's new setting is reported once it has stayed this long
 UDP_QUEUE = 1000  # packets of a program waiting at the host: cflib does not repeat over UDP
 
 
 # Of each USB transfer: cflib and the dongle's socket, unpaced, reach 4500 exchanges per second.
 HOST_SHARE_US = 110
-WORLD = Goal((0.0, 0.0, 0.0), 0.0)  # relative to this goal a pose is absolute
-
-
-class _PosesOnly:
-    """Carries corrections, or absolute poses, or with `poses` false nothing; telemetry belongs to the clients."""
-
-    def __init__(
-        self,
-        transmit: Callable[[int, bytes], object],
-        latency_us: int,
-        settings: Callable[[], Sequence[bytes]],
-        poses: bool,
-    ) -> None:
-        self._link = LoopbackLink(transmit, latency_us, dict)
-        self.latency = self._link.latency
-        self._transmit, self._settings, self._poses = transmit, settings, poses
-
-    def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
-        if self._poses:
-            self._link.send(now_us, frame, goal)
-
-    def start_telemetry(self, now_us: int) -> None:
-        """Send the settings instead."""
-        for packet in self._settings():
-            self._transmit(now_us, packet)
-
-    def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
-        """Return nothing."""
-        return ()
 
 
 class ServedRobot:
@@ -166,6 +127,11 @@ class ServedRobot:
             say(NO_APP)
         elif flashed is not None and (stays := flashed.differences(config)):
             say(f"the image has its own {stays}")
+
+    def channels(self) -> tuple[Channel, ...]:
+        """Return the counters of its serial line, else of its radio over UDP."""
+        uart = self.robot.uart
+        return (serial_channel(uart, self.robot.firmware, None) if uart else radio_channel(self.udp_radio),)
 
     @property
     def uri(self) -> str:
@@ -233,40 +199,6 @@ class ServedRobot:
             self._line_end = None
         if self._dongles is not None:
             self._dongles.close()
-
-    def fly(self, absolute: bool = False) -> None:
-        """Send poses from a ground station on a link hidden from clients: corrections for home, or absolute poses.
-
-        With absolute poses the clients set the goal.
-        """
-        config = self.robot.config
-        settings = (
-            partial(self._pilot_settings, []) if config.pilot.enabled else partial(_pose_kind, absolute)
-        )
-        link = _PosesOnly(self._wire, config.station.link_latency_us, settings, config.pilot.poses)
-        tracker = tracker_of(config.tracker, config.mocap.period_us)
-        goal = WORLD if absolute else Goal(config.flight.home, 0.0)
-        ground = GroundStation(link, Hold(goal), None, config.station, tracker)
-        self.robot.seen_by(lambda frame, now_us, _: ground.on_frame(frame, now_us))
-
-    def _pilot_settings(self, told: list[BoardFirmware]) -> Sequence[bytes]:
-        """Return the profile's parameters for the Crazyflie's own firmware, once per boot; `told` has the last one."""
-        firmware, booted_us = self.robot.firmware, self.robot.booted_us
-        starts = booted_us and self.robot.events.now_us - booted_us < STARTED_US
-        if firmware in told or firmware.flashed is None or starts:
-            return ()
-        told[:] = [firmware]
-        table = firmware.flashed.parameters
-        return [
-            encode_set_by_name(SetByName(name, table[name].scalar, value))
-            for name, value in self.robot.config.pilot.values.items()
-        ]
-
-    def _wire(self, now_us: int, data: bytes) -> None:
-        def arrive(now_us: int) -> None:
-            self.robot.packet_received(now_us, data)
-
-        self.robot.events.at(now_us + self.robot.config.station.link_latency_us, arrive)
 
     # Processor
 
@@ -367,8 +299,3 @@ class ServedRobot:
     def _from_line(self, now_us: int, data: bytes) -> None:
         if self._line_end is not None:
             self._line_end.send(data)
-
-
-def _pose_kind(absolute: bool) -> Sequence[bytes]:
-    """Return the setting of the kind of poses: a booted image begins with absolute ones."""
-    return (encode_pose_kind(absolute),)

@@ -8,27 +8,21 @@ from pathlib import Path
 
 from firmware_py.rtos import WatchdogError
 from firmware_py.wire.mavlink_numbers import CommandResult
+from firmware_py.wire.supervisor import State
 from ground_station.trajectory import Goal, Hold
 from hil.board.board_firmware import Executor
 from hil.board.clock import Paced
 from hil.board.markers import NO_POINTS
 from hil.config import LabConfig
 from hil.emulator.crazyflie.nrf51 import AirSettings, Power, ToPeers
-from hil.laboratory.channels import (
-    battery_channel,
-    board_channels,
-    flight_channels,
-    marker_channel,
-    radio_channel,
-    serial_channel,
-)
+from hil.laboratory.channels import flight_channels
 from hil.laboratory.faults import Fault, Switchboard
 from hil.laboratory.files.recorder import Observer, Recorder
 from hil.laboratory.flight import RECORD_PERIOD_US, RECORD_PHASE_US
 from hil.laboratory.laboratory import NEVER_US, Laboratory
 from hil.laboratory.robot import PYTHON_BOARD, Robot, Site, Streams, with_system
+from hil.servers.built_in_station import fly_built_in
 from hil.servers.failures import Failures
-from hil.servers.holder import LaunchClamp
 from hil.servers.motive import Streaming, VirtualMotive
 from hil.servers.serial_server import Address
 from hil.servers.served_robot import ServedRobot
@@ -36,6 +30,9 @@ from hil.servers.shared_room import SharedRoom
 from hil.world.body import Channel
 
 BUTTON_US = 5_000_000  # off, or in the bootloader without a client: then the button is pressed
+HOLD_US = 1_000_000  # flying in the holder before the release
+PUT_BACK_US = 1_000_000  # after a loss
+WATCH_PERIOD_US = 10_000
 
 
 def open_motive(settings: Streaming, robot: Robot, clock: Paced, count: int = 1) -> VirtualMotive:
@@ -51,40 +48,37 @@ def show(robot: Robot, clock: Paced, take: Callable[..., None]) -> None:
     robot.seen_by(lambda frame, now_us, sighting: take(frame, now_us, sighting, clock.began_us))
 
 
-class Shown:
-    """Shows a served robot to observers, with home as its goal: the clients' goals are unknown here."""
+class LaunchClamp:
+    """Holds one robot. Calls `let_go` when it has flown in its holder for a second, or stands on the floor."""
 
-    def __init__(self, served: ServedRobot, observer: Observer) -> None:
-        self._served = served
-        if served.robot.firmware.flashed is None:
-            # A fault may add this task later, but the columns must include all tasks.
-            served.robot.thief.share = 0.0
-        self._firmware = served.robot.firmware
-        config = served.robot.config
-        metadata = {
-            "request": json.dumps({"experiment": "served"}),
-            "config": config.model_dump_json(),
-            "look": json.dumps(served.robot.body.look.stored()),
-        }
-        self._recorder = Recorder(None, self._channels(), metadata, observer)
+    def __init__(self, robot: Robot, let_go: Callable[[int], None]) -> None:
+        self._robot = robot
+        self._let_go = let_go
+        self._flying_since_us: int | None = None
+        robot.events.every(WATCH_PERIOD_US, WATCH_PERIOD_US, self._watch)
 
-    def row(self, now_us: int) -> None:
-        """Take a sample of it."""
-        if self._served.robot.firmware is not self._firmware:  # it has booted
-            self._firmware = self._served.robot.firmware
-            self._recorder.read_from(self._channels())
-        self._recorder.row(now_us)
+    def put_back_later(self, now_us: int) -> None:
+        """Return the robot to the holder after a delay."""
+        self._robot.catch()
+        self._robot.events.at(now_us + PUT_BACK_US, self._put_back)
 
-    def _channels(self) -> tuple[Channel, ...]:
-        robot = self._served.robot
-        if robot.uart is not None:
-            line = serial_channel(robot.uart, robot.firmware, None)
-        else:
-            line = radio_channel(self._served.udp_radio)
-        home = Hold(Goal(robot.config.flight.home, 0.0))
-        markers = (marker_channel(robot.mocap),) if robot.mocap.markers else ()
-        own = board_channels(robot.firmware)
-        return (*flight_channels(robot, home), line, battery_channel(robot.battery), *markers, *own)
+    def _put_back(self, now_us: int) -> None:
+        self._robot.put_back(now_us)
+        self._flying_since_us = None
+
+    def _watch(self, now_us: int) -> None:
+        robot = self._robot
+        if robot.free or robot.body.lost is not None:
+            return
+        if robot.config.pilot.enabled:  # it stands on the floor
+            self._let_go(now_us)
+            return
+        if not robot.powered or robot.firmware.signals.supervisor.state is not State.FLYING:
+            self._flying_since_us = None
+        elif self._flying_since_us is None:
+            self._flying_since_us = now_us
+        elif now_us - self._flying_since_us >= HOLD_US:
+            self._let_go(now_us)
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,8 +153,28 @@ class Server:
         self.switchboard = Switchboard(robot)
         self._clamp = LaunchClamp(robot, self._let_go)
         robot.watch(0)
-        self._shown = None if observer is None else Shown(self.served, observer)
+        self._shown = None if observer is None else self._shown_to(observer)
         self.lab.events.every(RECORD_PERIOD_US, RECORD_PHASE_US, self._look)
+
+    def _shown_to(self, observer: Observer) -> Recorder:
+        """Return what passes the robot's rows on, with home as its goal: the clients' goals are unknown here."""
+        robot = self.robot
+        if robot.firmware.flashed is None:
+            # A fault may add this task later, but the columns must include all tasks.
+            robot.thief.share = 0.0
+        home = Hold(Goal(robot.config.flight.home, 0.0))
+        metadata = {
+            "request": json.dumps({"experiment": "served"}),
+            "config": robot.config.model_dump_json(),
+            "look": json.dumps(robot.body.look.stored()),
+        }
+
+        def channels() -> tuple[Channel, ...]:
+            return flight_channels(robot, home, self.served.channels())
+
+        recorder = Recorder(None, channels(), metadata, observer)
+        robot.on_boot(lambda: recorder.read_from(channels()))
+        return recorder
 
     def open(self, endpoints: Endpoints, others: Sequence[int] = ()) -> OpenEndpoints:
         """Open the robot to clients; `others` are the ports of the other robots' Crazyradios. Raises `LabError`."""
@@ -174,7 +188,7 @@ class Server:
         if endpoints.mavlink:
             mavlink = served.serve_mavlink(endpoints.mavlink[later], readers)
         if endpoints.station is not None:
-            served.fly(endpoints.station == "poses")
+            fly_built_in(self.robot, endpoints.station == "poses")
         return OpenEndpoints(served.uri, dongles, udp, mavlink)
 
     def hear_peer(self, settings: AirSettings, packet: bytes) -> None:

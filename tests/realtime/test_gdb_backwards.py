@@ -134,3 +134,34 @@ def test_no_process_outlives_the_flight(tmp_path: Path, how: str) -> None:
         debugger.communicate()
     assert flight.returncode == {"kill": -signal.SIGKILL, "ctrl-c": 130}.get(how, 1)
     assert processes_of(out) == []
+
+
+def test_what_is_counted_goes_back_with_time(tmp_path: Path) -> None:
+    elf = stm32_firmware.build("gcc")
+    there_and_back = (
+        "break send_line", "continue 30", "reverse-stepi", "reverse-step", "next", "reverse-continue",
+        "continue", "delete", "detach",
+    )  # fmt: skip
+
+    def fly(name: str) -> list[str]:
+        counted = ("--coverage", str(tmp_path / name), "--profile-cpu", str(tmp_path / name))
+        return [
+            "fly",
+            "hover",
+            "--duration",
+            "0.5",
+            "--board",
+            str(elf),
+            "--out",
+            str(tmp_path / f"{name}-run"),
+            *counted,
+        ]
+
+    subprocess.run([*FLOATY, *fly("forward")], cwd=ROOT, capture_output=True, timeout=120)
+    with waiting(*fly("back"), "--gdb", "0") as (flight, address):
+        printed, _ = gdb(address, elf, *there_and_back).communicate(timeout=120)
+        flight.communicate(timeout=120)
+    assert printed.count("hit Breakpoint") > 1, printed
+    for ending in (".info", ".folded", ".txt"):
+        first, second = ((tmp_path / f"{name}{ending}").read_text() for name in ("forward", "back"))
+        assert first == second

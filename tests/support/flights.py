@@ -18,6 +18,7 @@ from hil.laboratory.files.result import Result
 from hil.laboratory.lockstep import image_at
 from hil.laboratory.request import Options, Request
 from hil.laboratory.run import fly
+from hil.servers.built_in_station import fly_built_in
 from hil.servers.server import Server, Service
 
 
@@ -40,7 +41,7 @@ def served_image(elf: str, profile: str) -> Iterator[Server]:
     """Serve an image in lockstep with poses of the cameras; it has run for a second."""
     server = Server(Service(load_config(profile), executor=image_at(elf, None)), lambda text: None)
     try:
-        server.served.fly(absolute=True)
+        fly_built_in(server.robot, absolute=True)
         server.lab.end_at(1_000_000)
         server.lab.run()
         yield server

@@ -6,6 +6,7 @@ from typing import Any
 from hil.board.clock import FreeRunning, Readers
 from hil.config import load_config
 from hil.laboratory.robot import Robot
+from hil.servers.built_in_station import fly_built_in
 from hil.servers.server import Server, Service
 from support.mavlink_client import STATION, codec, lines
 
@@ -25,7 +26,7 @@ class MavlinkLab:
         self.robot: Robot = self.served.robot
         self.served.serve_mavlink(self, {})  # type: ignore[arg-type]
         if flying:
-            self.served.fly(absolute)
+            fly_built_in(self.robot, absolute)
         self.run(0.1)
 
     @property

@@ -123,7 +123,7 @@ class Chip:
         self._sent = self._ffi.new("uint8_t[]", self._library.LINE_BYTES)
         self._profile: Any = None
         self._passages = np.zeros((0, 3), np.uint64)
-        self._kept: list[NDArray[Any]] = []  # memory of devices, and the speeds of motors
+        self._kept: list[NDArray[Any]] = []  # of devices, speeds of motors, and what is counted
         self._acts: dict[int, Callable[[], object]] = {}  # of devices that act on what is written
         self.breakpoints: set[int] = set()  # of a debugger: a run stops before these instructions
         self.crash_points: set[int] = set()  # of the crash reports
@@ -192,8 +192,11 @@ class Chip:
         self._library.machine_reset(self.state, self.vectors, cause)
 
     def record(self) -> None:
-        """Count the executed blocks from now on."""
+        """Count the executed blocks from now on, unless that is done already."""
+        if self.state.recorded:
+            return
         self._passages = np.zeros((FLASH_SIZE // 2 + 1, 3), np.uint64)
+        self._kept.append(self._passages)
         self.state.recorded = 1
         self.state.passages = self._ffi.from_buffer("struct passage[]", self._passages)
 
@@ -205,7 +208,8 @@ class Chip:
             numbers[(begin - FLASH) // 2 : (end - FLASH) // 2] = number
             numbers[(begin - FLASH) // 2] = number | 1 << 15
         self._profile.nodes = 1
-        self.state.recorded = 1
+        self._kept.append(np.frombuffer(self._ffi.buffer(self._profile), np.uint8))
+        self.record()
         self.state.profile = self._profile
         self._library.profile_reset(self.state)
 

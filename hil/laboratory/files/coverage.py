@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.export.elf import FLASH_SIZE
+from hil.board.image_firmware import ImageFirmware
 from hil.errors import LabError, made_folder, reading, writing
 from hil.laboratory.files.whole_files import replacing
 
@@ -31,6 +32,23 @@ class Executed:
     counts: NDArray[np.uint64]
     board: str  # where the image was found
     elf: Path | None
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """`ImageObserver` that adds a flight to OUT."""
+
+    out: Path
+    board: str  # where the image was found
+    elf: Path | None
+
+    def begin(self, firmware: ImageFirmware) -> None:
+        check_coverage(self.out, firmware.image.sha256)
+        firmware.chip.record()
+
+    def report(self, firmware: ImageFirmware, folder: Path) -> None:
+        counts = firmware.chip.passages
+        add_executed(self.out, Executed(firmware.image.sha256, 1, counts, self.board, self.elf))
 
 
 def base_of(out: Path) -> Path:

@@ -6,6 +6,7 @@ and own cycles of every activation.
 
 import json
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from hil.board.board_firmware import ImageReport
+from hil.board.image_firmware import ImageFirmware
 from hil.emulator.stm32f405.chip import CYCLES_PER_US
-from hil.emulator.stm32f405.cpu_profile import Calls, CpuProfile, TaskTimes
+from hil.emulator.stm32f405.cpu_profile import Calls, CpuProfile, Reader, TaskTimes, functions_of
 from hil.errors import LabError, made_folder, writing
 from hil.laboratory.files.whole_files import replacing, write_whole
 
@@ -25,11 +27,23 @@ SPEEDSCOPE, FOLDED, TEXT = ".speedscope.json", ".folded", ".txt"
 SHOWN_FUNCTIONS, SHOWN_PARTS = 25, 6
 
 
-def check_profile_place(out: Path) -> None:
-    """Raise `LabError` when OUT cannot be the beginning of a file's name."""
-    if not out.name or out.is_dir():
-        raise LabError(f"{OPTION} {out}: a folder; expected the beginning of a file's name")
-    made_folder(OPTION, out.parent)
+@dataclass(frozen=True, slots=True)
+class Profiler:
+    """`ImageObserver` that charges the cycles of a flight and writes the files of OUT."""
+
+    out: Path
+
+    def begin(self, firmware: ImageFirmware) -> None:
+        if not self.out.name or self.out.is_dir():
+            raise LabError(f"{OPTION} {self.out}: a folder; expected the beginning of a file's name")
+        made_folder(OPTION, self.out.parent)
+        functions = functions_of(firmware.image)
+        firmware.chip.profile([(one.address, one.address + one.size) for one in functions])
+
+    def report(self, firmware: ImageFirmware, folder: Path) -> None:
+        kernel = firmware.kernel
+        profile = Reader(firmware.image, firmware.chip, kernel.task_names, kernel.ahead_us).read()
+        write_profile(self.out, folder, profile, firmware.report())
 
 
 def files_of(out: Path) -> tuple[Path, ...]:

@@ -10,7 +10,7 @@ from hil.errors import LabError, reading
 from hil.laboratory.files.recorder import load_events
 from hil.laboratory.files.result import Result
 from hil.laboratory.flight import Flight
-from hil.laboratory.lockstep import debugger, image_at, lockstep_flight
+from hil.laboratory.lockstep import in_lockstep
 from hil.laboratory.request import Request
 
 CRASH = "crash"
@@ -62,8 +62,7 @@ def waiting_flight(port: int, from_us: int) -> Callable[[Request, Path | None, E
     """Return the function that assembles a flight which waits for GDB on a port, at a time of the laboratory."""
 
     def flight_of(request: Request, telemetry: Path | None, stack: ExitStack) -> Flight:
-        bench = request.bench
-        server = debugger(port, bench.elf or Path(bench.board), stack, from_us=from_us)
-        return lockstep_flight(request, telemetry, image_at(bench.board, bench.elf, server))
+        waiting = replace(request, bench=replace(request.bench, gdb=port))
+        return in_lockstep(waiting, telemetry, stack, from_us)
 
     return flight_of

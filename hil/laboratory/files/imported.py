@@ -22,13 +22,13 @@ from firmware_py.geometry import from_euler_zyx
 from hil.config import read_config
 from hil.errors import LabError, reading
 from hil.laboratory.bodies import make_body
-from hil.laboratory.channels import UNKNOWN_STATE
 from hil.laboratory.experiment import unknown
 from hil.laboratory.files.alignment import released_like
 from hil.laboratory.files.joined import Joined, Source, join, words_of
 from hil.laboratory.files.log_map import OWN, TARGETS, Map, guess, read_column, with_goal
 from hil.laboratory.files.recorder import EVENTS, PARQUET, RELEASE_US
 from hil.laboratory.files.result import Program, Result, judged, metadata_of, write_result
+from hil.laboratory.files.station_channels import UNKNOWN_STATE
 from hil.laboratory.files.tables import read_tables
 from hil.laboratory.files.whole_files import replacing, write_whole
 from hil.laboratory.metrics import measure

@@ -57,6 +57,7 @@ ARROW_ERRORS = (pa.ArrowException, ValueError, KeyError, TypeError, NotImplement
 RELEASE_US = b"release_us"  # in the metadata of a log whose flight was released
 PARQUET, STREAM, EVENTS = "log.parquet", "log.arrows", "events.jsonl"
 
+Correct = Callable[[pa.Table], pa.Table]  # adds to a log what became known only after the flight
 P = ParamSpec("P")
 
 
@@ -166,11 +167,8 @@ class Recorder:
             line = json.dumps({"t_us": now_us, "source": source, "text": text}) + "\n"
             self._write(EVENTS, self._write_line, self._events, line)
 
-    def close(self, correct: Callable[[pa.Table], pa.Table] | None = None) -> str:
-        """Finish the files; returns the SHA-256 over times, names and values of all columns as they were recorded.
-
-        `correct` may add what became known only after the flight.
-        """
+    def close(self, correct: Correct | None = None) -> str:
+        """Finish the files; returns the SHA-256 over times, names and values of all columns as they were recorded."""
         with ExitStack() as closing:  # all of them, even on a full disk
             for name, written in ((STREAM, self._file), (STREAM, self._stream), (EVENTS, self._events)):
                 if written is not None:
@@ -214,9 +212,7 @@ class Recorder:
             self._shown = self._row
 
 
-def finish_log(
-    folder: Path, release_us: int | None = None, correct: Callable[[pa.Table], pa.Table] | None = None
-) -> None:
+def finish_log(folder: Path, release_us: int | None = None, correct: Correct | None = None) -> None:
     """Convert the stream into `log.parquet`, even when the flight ended in the middle of a batch."""
     stream = folder / STREAM
     pieces = _read_stream(stream)
@@ -232,13 +228,6 @@ def finish_log(
         for table in chain([first], pieces):
             writer.write_table(table)
     stream.unlink()
-
-
-def finish_table(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
-    """Replace a log by what `change` makes of it, whole or not at all."""
-    table = change(pa.parquet.read_table(path))
-    with replacing(path) as partial:
-        pa.parquet.write_table(table, partial, compression="zstd", use_dictionary=False)
 
 
 def load_log(folder: Path) -> pa.Table:

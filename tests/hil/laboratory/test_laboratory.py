@@ -14,10 +14,10 @@ from hil.errors import LabError
 from hil.laboratory.faults import Fault, parse
 from hil.laboratory.laboratory import Laboratory
 from hil.laboratory.robot import Ports, Robot, Site, Streams, nobody_listens
-from hil.servers.holder import LaunchClamp
+from hil.servers.built_in_station import fly_built_in
 from hil.servers.live_faults import LiveFaults
 from hil.servers.served_robot import ServedRobot
-from hil.servers.server import Server, Service
+from hil.servers.server import LaunchClamp, Server, Service
 
 SECOND_US = 1_000_000
 
@@ -29,7 +29,7 @@ class Bench:
         self.said: list[str] = []
         self.server = Server(Service(load_config(), number, seed, faults=faults), self.said.append)
         self.server.lab.clock = FreeRunning()
-        self.server.served.fly()
+        fly_built_in(self.server.robot)
 
     def fly(self, duration_s: float) -> list[str]:
         """Go on for a while; returns what was said meanwhile."""

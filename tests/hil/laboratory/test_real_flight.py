@@ -27,11 +27,11 @@ from ground_station.station import GroundStation
 from ground_station.trajectory import FlightPlan, Goal
 from hil.config import load_config
 from hil.errors import LabError
-from hil.laboratory.channels import Unwrapped
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.files.ages import ages_in_time_of, reported_ages
 from hil.laboratory.files.recorder import Observer, Recorder, load_events, load_log, release_of
 from hil.laboratory.files.result import Result, read_result
+from hil.laboratory.files.station_channels import Unwrapped
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import ALWAYS, body, free_flight, known, measure
 from hil.laboratory.real_flight import RealFlight, why_lost

@@ -23,6 +23,7 @@ from firmware_py.wire.crtp import PORT_MEMORIES, Packet, encode, encode_ext_pose
 from ground_station.mocap import MocapFrame
 from hil.board.clock import FreeRunning
 from hil.config import load_config
+from hil.servers.built_in_station import fly_built_in
 from hil.servers.server import Server, Service
 
 POSE_PERIOD_US = 20_000
@@ -41,7 +42,7 @@ class Script:
         self.robot = self.server.robot
         self._next_us = 0
         if station:
-            self.server.served.fly(absolute=True)
+            fly_built_in(self.robot, absolute=True)
         else:
             self.robot.seen_by(lambda frame, now_us, _: self._feed(frame, now_us))
         self.cf = SimpleNamespace(

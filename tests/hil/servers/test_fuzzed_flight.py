@@ -12,6 +12,7 @@ import pytest
 from firmware_py.wire import crtp, high_level
 from hil.board.clock import FreeRunning
 from hil.config import load_config
+from hil.servers.built_in_station import fly_built_in
 from hil.servers.server import Server, Service
 from support.mavlink_client import STATION, codec
 from support.mavlink_lab import MavlinkLab
@@ -29,7 +30,7 @@ class Fuzzed:
         self.server = Server(Service(config), self.said.append)
         self.server.lab.clock = FreeRunning()
         self.served = self.server.served
-        self.served.fly(absolute)
+        fly_built_in(self.served.robot, absolute)
         self.rng = np.random.default_rng(seed)
         if absolute:
             self.wait(1.0)
