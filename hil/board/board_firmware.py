@@ -22,12 +22,12 @@ from firmware_py.rtos import TaskReport
 from firmware_py.signals import Signals
 from firmware_py.tasks import FlightTasks
 from firmware_py.wire.scalars import Scalar
-from hil.emulator.crazyflie.log_table import ImageParameter
 from hil.emulator.crazyflie.shockburst import syslink_us
 from hil.world.body import Carrier
 from hil.world.servos import OUTPUTS
 
 if TYPE_CHECKING:
+    from hil.emulator.crazyflie.log_table import ImageParameter
     from hil.emulator.stm32f405.cpu_profile import CpuProfile
 
 # (us, event, who, a, b), in the words of tests/vectors/README.md

@@ -15,7 +15,6 @@ from firmware_py.signals import COUNTERS, Signals
 from firmware_py.table import whole_names
 from firmware_py.wire.telemetry import ATTITUDE, BLOCKS, SLOW_BLOCKS, TIMESTAMP_MASK
 from ground_station.latency import STAGES
-from ground_station.program import StationSession
 from ground_station.tracker import Tracker
 from ground_station.trajectory import Goal, Trajectory
 from hil.board.board_firmware import BoardFirmware
@@ -29,6 +28,7 @@ from hil.world.body import Channel, Quantity
 
 if TYPE_CHECKING:
     from ground_station.links.mavlink import MavlinkLink  # needs pymavlink
+    from ground_station.program import StationSession
 
 UNKNOWN = (nan, nan, nan)  # a vector without a measurement
 UNKNOWN_STATE = 4  # of the supervisor, beside those of `firmware_py.wire.supervisor`
@@ -307,7 +307,7 @@ class Unwrapped:
 class StationView:
     """A ground station's current values as rows of a log; `start_us` is the log's time 0."""
 
-    def __init__(self, session: StationSession, start_us: int) -> None:
+    def __init__(self, session: "StationSession", start_us: int) -> None:
         self._link, self._ground, self._start_us = session.link, session.ground, start_us
         self._poses, self._rejected = Unwrapped(), Unwrapped()
 
@@ -358,7 +358,7 @@ class StationView:
 
 
 def station_channels(
-    session: StationSession, free: Callable[[], bool], goal: Callable[[], Goal], start_us: int
+    session: "StationSession", free: Callable[[], bool], goal: Callable[[], Goal], start_us: int
 ) -> tuple[Channel, ...]:
     """Return the channels of a flight that only its ground station sees; `start_us` is the log's time 0."""
     view, ground = StationView(session, start_us), session.ground
