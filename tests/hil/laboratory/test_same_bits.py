@@ -28,6 +28,7 @@ from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from support.other_machine import TARGETS, CoreElsewhere, OtherMachine
+from support.paths import TESTS
 
 FAULTS = (
     "servo.slow.2@0.1:0.5=0.5",
@@ -67,7 +68,13 @@ def print_hashes() -> None:
 def hashes(setting: dict[str, str]) -> list[str]:
     """Return the hashes of all flights, flown by a process of its own."""
     command = [sys.executable, "-W", "error::ImportWarning", __file__]
-    done = subprocess.run(command, env=os.environ | setting, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command,
+        env=os.environ | {"PYTHONPATH": str(TESTS)} | setting,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout.split()
 
