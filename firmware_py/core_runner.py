@@ -7,7 +7,7 @@ machine; under `firmware_py.export` also its plain Python, and machine code of a
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -17,15 +17,15 @@ from firmware_py.config import CpuConfig
 from firmware_py.core import entry
 from firmware_py.core.structs import Control, Estimator, Input, Parameters, Report, Sampling, Supervisor
 from firmware_py.core.subset import Block, F32s, Struct
-from firmware_py.export.c99 import translate
-from firmware_py.export.compilers import Compiler, by_first_that_works
 from firmware_py.export.errors import CompilerError
 from firmware_py.export.methods import METHOD
-from firmware_py.export.native import build
 from firmware_py.export.usage import Usage
 from firmware_py.kept_code import kept_folder, report
 from firmware_py.logic.loading import Logic, sensed_by
 from firmware_py.logic.plugs import CALLS
+
+if TYPE_CHECKING:
+    from firmware_py.export.compilers import Compiler
 
 SOURCES = tuple(Path(package.__path__[0]) for package in (core, export))
 
@@ -154,9 +154,13 @@ def core_library(logic: Logic | None) -> Path:
 
 
 def _compile(logic: Logic | None) -> Path:
+    from firmware_py.export.c99 import translate  # not needed where a library is kept
+    from firmware_py.export.compilers import by_first_that_works
+    from firmware_py.export.native import build
+
     text = translate() if logic is None else logic.loaded.translation
 
-    def make(compiler: Compiler) -> Path:
+    def make(compiler: "Compiler") -> Path:
         if logic is not None:
             report(f"compiling {', '.join(Path(file).name for file in logic.loaded.files.values())}")
         return build(text, compiler)

@@ -2,7 +2,6 @@
 
 import shlex
 import sys
-from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
 # Extras of the modules that are imported only where they are needed. Several have scipy.
@@ -18,6 +17,8 @@ PROJECT = "floaty-hil"  # on no package index, so messages name an extra's packa
 
 def packages_of_extras() -> dict[str, list[str]]:
     """Return the packages of each extra, as pip takes them; none for sources that were never installed."""
+    from importlib.metadata import PackageNotFoundError, requires  # slow to load
+
     extras: dict[str, list[str]] = {}
     try:
         requirements = requires(PROJECT) or ()

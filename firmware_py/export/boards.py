@@ -4,8 +4,6 @@ from functools import partial
 
 from firmware_py.config import LogicConfig
 from firmware_py.core_runner import PlainRunner, RunnerFactory, default_runner
-from firmware_py.export.arm_image import build_image, build_meter
-from firmware_py.export.cortex_m4 import CortexM4Runner, find_emulator
 from firmware_py.logic.loading import translation_of
 
 C, PYTHON, CORTEX_M4 = BOARDS = "c", "python", "cortex-m4"  # the first one is usual
@@ -20,6 +18,9 @@ def runner_of(board: str, logic: LogicConfig) -> RunnerFactory:
         return default_runner
     if board == PYTHON:
         return PlainRunner
+    from firmware_py.export.arm_image import build_image, build_meter
+    from firmware_py.export.cortex_m4 import CortexM4Runner, find_emulator
+
     find_emulator()
     core = translation_of(logic)
     image = build_image(core.source, core.header)

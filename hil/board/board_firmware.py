@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from numpy.typing import NDArray
 
@@ -22,10 +22,12 @@ from firmware_py.rtos import TaskReport
 from firmware_py.signals import Signals
 from firmware_py.tasks import FlightTasks
 from firmware_py.wire.scalars import Scalar
-from hil.emulator.crazyflie.log_table import ImageParameter
 from hil.emulator.crazyflie.shockburst import syslink_us
 from hil.world.body import Carrier
 from hil.world.servos import OUTPUTS
+
+if TYPE_CHECKING:
+    from hil.emulator.crazyflie.log_table import ImageParameter
 
 # (us, event, who, a, b), in the words of tests/vectors/README.md
 Trace = Callable[[int, str, str, int, int], None]

@@ -4,7 +4,10 @@ An image has the constants of the profile that it was exported with. Before the 
 then written one by one, as an operator does; those without a parameter remain and are reported again.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 from firmware_py.config import FirmwareConfig
 from firmware_py.table import OF_PROFILE, value_in
@@ -12,9 +15,11 @@ from firmware_py.wire.crtp import decode
 from ground_station.config import PilotConfig
 from ground_station.controls import ControlAction, ControlRequest, ControlsError
 from ground_station.links.crtp_controls import PORTS, CrtpControls, TocEntry
-from hil.emulator.crazyflie.log_table import ImageParameter
 from hil.emulator.events import EventQueue
 from hil.errors import LabError, hint, refusing
+
+if TYPE_CHECKING:
+    from hil.emulator.crazyflie.log_table import ImageParameter
 
 TURN_US = 10_000  # between checks for an overdue answer
 APP_PARAMETER = "floaty.armed"  # which every image with Floaty's app has

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import fields, replace
 from functools import wraps
@@ -196,7 +196,7 @@ def check_profile(option: str, path: Path | None) -> None:
         raise LabError(f"{option} {path}: cannot be written ({path.parent} is not a folder)")
 
 
-def check_alone(overrides: Sequence[str], several: str) -> None:
+def check_alone(overrides: Iterable[str], several: str) -> None:
     """Refuse settings of a swarm for one robot; `several` says how more of them fly."""
     for override in overrides:
         if override.startswith("swarm."):

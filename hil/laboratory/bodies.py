@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from hil.config import LabConfig
-from hil.emulator.crazyflie.decks import DECKS
 from hil.errors import LabError, blame, hint
 from hil.laboratory.files.own_files import load_file
 from hil.world.battery import open_circuit_voltage
@@ -46,6 +45,8 @@ def floaty(config: LabConfig, rng_gust: np.random.Generator, p_WB: Vector) -> Bo
 
 def crazyflie(config: LabConfig, rng: np.random.Generator, p_WB: Vector) -> Body:
     """Return a Crazyflie with its decks."""
+    from hil.emulator.crazyflie.decks import DECKS
+
     mass = config.quadrotor.mass + sum(DECKS[name].mass for name in config.robot.decks)
     quadrotor = config.quadrotor.model_copy(update={"mass": mass})
     return Quadrotor(quadrotor, config.tunnel, config.battery, rng, p_WB)

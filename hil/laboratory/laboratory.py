@@ -27,8 +27,7 @@ class Laboratory:
         self.clock = clock
         self.events = EventQueue()
         self.now_us = 0
-        self.end_us = NEVER_US
-        self._pause_us = NEVER_US
+        self._limit(NEVER_US, NEVER_US)
         self._robot: Robot | None = None
 
     def add(self, robot: Robot) -> None:
@@ -45,15 +44,14 @@ class Laboratory:
 
     def run_to(self, us: int) -> None:
         """Run like `run`, to an instant at most, for laboratories that run in turn on clocks that do not wait."""
-        self._pause_us = us
+        self._limit(self.end_us, us)
         try:
             self.run()
         finally:
-            self._pause_us = NEVER_US
+            self._limit(self.end_us, NEVER_US)
 
-    @property
-    def _until_us(self) -> int:
-        return min(self.end_us, self._pause_us)
+    def _limit(self, end_us: int, pause_us: int) -> None:
+        self.end_us, self._pause_us, self._until_us = end_us, pause_us, min(end_us, pause_us)
 
     def _run(self, progress: Progress | None) -> None:
         clock, next_progress_us = self.clock, self.now_us
@@ -70,11 +68,11 @@ class Laboratory:
 
     def end_at(self, us: int) -> None:
         """End `run` at an instant."""
-        self.end_us = us
+        self._limit(us, self._pause_us)
 
     def stop(self) -> None:
         """End `run` after the current instant."""
-        self.end_us = self.now_us
+        self._limit(self.now_us, self._pause_us)
 
     def _step(self, clock: Clock) -> None:
         """Run the firmware up to the hardware's next event or an earlier input from outside, then that."""

@@ -1,11 +1,14 @@
 """A flight in lockstep: radio or serial line are modelled, and the ground station shares the time line."""
 
+from __future__ import annotations
+
 import shlex
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from firmware_py.errors import FirmwareError
 from firmware_py.export.boards import runner_of
@@ -23,16 +26,12 @@ from ground_station.trajectory import FlightPlan, Goal, Trajectory
 from hil.board.board_firmware import Executor, Flashed, PythonBoard
 from hil.board.clock import Clock, FreeRunning, Paced
 from hil.board.eeprom import factory_config
-from hil.board.image_firmware import ChipImage, ImageObserver
 from hil.board.image_settings import APP_PARAMETER, NO_APP, ImageSettings, stock_contents
 from hil.board.pins import new_eeprom
 from hil.board.radio import Receiver, VirtualRadio
 from hil.board.real_core import is_link, real_core
 from hil.board.uart import VirtualSerial
 from hil.emulator.crazyflie.shockburst import TURN_ROUND_US, Air, air_us
-from hil.emulator.stm32f405.checkpoints import Checkpoints, why_none
-from hil.emulator.stm32f405.gdb import GdbServer
-from hil.emulator.stm32f405.image import has_symbols
 from hil.errors import LabError, refusing
 from hil.laboratory.channels import radio_channel, serial_channel, tracker_channel
 from hil.laboratory.files.recorder import SETTINGS, Correct
@@ -41,6 +40,10 @@ from hil.laboratory.laboratory import Laboratory
 from hil.laboratory.request import MAVLINK, Bench, Request
 from hil.laboratory.robot import PYTHON_BOARD, Ports, Robot, Site, nobody_listens
 from hil.world.body import Channel
+
+if TYPE_CHECKING:
+    from hil.board.image_firmware import ChipImage, ImageObserver
+    from hil.emulator.stm32f405.gdb import GdbServer
 
 
 class ModelledLine:
@@ -238,6 +241,8 @@ def executor_of(request: Request, stack: ExitStack, from_us: int = 0) -> Executo
 
 def image_at(board: str, elf: Path | None) -> ChipImage:
     """Return the image that `--board` and `--elf` name. Raises `LabError` if it cannot run here."""
+    from hil.board.image_firmware import ChipImage  # not needed by a flight without an image
+
     with refusing(f"--board {board}: ", FirmwareError):
         return ChipImage.load(Path(board), elf)
 
@@ -266,6 +271,10 @@ def debugger(
     """
     if port is None:
         return None
+    from hil.emulator.stm32f405.checkpoints import Checkpoints, why_none
+    from hil.emulator.stm32f405.gdb import GdbServer
+    from hil.emulator.stm32f405.image import has_symbols
+
     why_forward = why_forward or why_none()
     if why_forward:
         print_line(f"--gdb {port}: time runs forward only: {why_forward}")

@@ -9,7 +9,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypedDict, Unpack
 
@@ -321,7 +321,7 @@ class Request:
     @staticmethod
     def read(values: Mapping[str, Any], find: Find = unknown) -> Request:
         """Return a stored request; `find` returns its experiment. Raises pydantic's `ValidationError`."""
-        return _STORED.validate_python(values, context=find)
+        return _stored().validate_python(values, context=find)
 
 
 def _nested(values: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -330,7 +330,11 @@ def _nested(values: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 StoredRequest = Annotated[Request, BeforeValidator(_nested), PlainSerializer(Request.stored)]
-_STORED: TypeAdapter[Request] = TypeAdapter(StoredRequest)
+
+
+@cache
+def _stored() -> TypeAdapter[Request]:
+    return TypeAdapter(StoredRequest)
 
 
 def why_left(config: LabConfig, p_W: Sequence[float]) -> str:

@@ -16,7 +16,7 @@ from firmware_py.signals import REFUSED
 from ground_station.latency import STAGES
 from hil.laboratory.faults import switched_on
 from hil.laboratory.files.recorder import OPERATOR, release_of
-from hil.laboratory.metrics import attitude_error, column, position_error
+from hil.laboratory.metrics import attitude_error, column, position_error, rows_at
 
 ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK, GREY = (
     "#e69f00", "#56b4e9", "#009e73", "#b8a900", "#0072b2", "#d55e00", "#cc79a7", "#888888",
@@ -106,7 +106,7 @@ def row_of_last_fusion(rows: pa.Table) -> pa.Table:
     if "estimator.fused" not in rows.column_names:  # a real board does not report it
         return rows.slice(0, 0)
     fusions = np.flatnonzero(np.diff(column(rows, "estimator.fused"), prepend=0.0) > 0)
-    return rows.take(fusions[-1:])
+    return rows_at(rows, fusions[-1:])
 
 
 def plain(*names: str, scale: float = 1.0) -> Read:

@@ -16,7 +16,7 @@ from ground_station.latency import STAGES, reported_stages
 from hil.laboratory.experiments.measures import yaw_and_goal
 from hil.laboratory.faults import spans_of
 from hil.laboratory.files.recorder import release_of
-from hil.laboratory.metrics import BOX, body, column, free_flight
+from hil.laboratory.metrics import BOX, body, column, free_flight, rows_at
 from hil.laboratory.schedule import runs
 from hil.pictures import curves
 from hil.pictures.curves import since_release
@@ -162,7 +162,7 @@ def _up_and_down(
 def _every(step: int, rows: pa.Table, *groups: str) -> pa.Table:
     """Return `t` and groups of columns in every `step`-th row; a long log is mapped, so only these are read."""
     names = [name for name in rows.column_names if name == "t" or name.startswith(groups)]
-    return rows.select(names).take(np.arange(0, rows.num_rows, step))
+    return rows_at(rows.select(names), np.arange(0, rows.num_rows, step))
 
 
 def station(rows: pa.Table) -> Plot:

@@ -1,90 +1,131 @@
-"""Exported C on other machines, in an emulator: AArch64, and x86-64 with another C library.
+"""Exported C on other machines: AArch64 under qemu-user, with musl and with glibc, and x86-64 with musl.
 
-The stubs stand for what a method of CPython needs of Python; its `self` is the table of addresses itself.
+A program reads calls with their memory and answers with what they left there. Its stubs stand for what a method of
+CPython needs of Python; the `self` of a method is the table of addresses itself.
 """
 
-from collections.abc import Iterable
+import re
+import shutil
+import struct
+import subprocess
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 import numpy as np
-from elftools.elf.elffile import ELFFile
+import pytest
 from numpy.typing import NDArray
-from unicorn import Uc, arm64_const, unicorn_const, x86_const
 
+from firmware_py.core_runner import CoreBlocks
 from firmware_py.export.compilers import compile_texts, zig
 from firmware_py.export.kernels import FLAGS
 from firmware_py.export.methods import METHOD
 
-STUBS = """
-long long answered;
-char *PyBytes_AsString(void *object) { return object; }
-void *PyLong_FromLongLong(long long value) { answered = value; return &answered; }
-long long PyLong_AsLongLong(void *object) { return *(long long *)object; }
-void *PyErr_Occurred(void) { return 0; }
-int PyErr_BadArgument(void) { return 0; }
-void *PyObject_CallNoArgs(void *callable) { return callable; }
-void Py_DecRef(void *object) { (void)object; }
+PROGRAM = """
+#include <stdint.h>
+#include <stdio.h>
+
+typedef void *Method(void *self, void *const *given, intptr_t count);
+{declared}
+static Method *const methods[] = {{ {names} }};
+static long long answered;
+char *PyBytes_AsString(void *object) {{ return object; }}
+void *PyLong_FromLongLong(long long value) {{ answered = value; return &answered; }}
+long long PyLong_AsLongLong(void *object) {{ return *(long long *)object; }}
+void *PyErr_Occurred(void) {{ return 0; }}
+int PyErr_BadArgument(void) {{ return 0; }}
+void *PyObject_CallNoArgs(void *callable) {{ return callable; }}
+void Py_DecRef(void *object) {{ (void)object; }}
 char _Py_NoneStruct;
-int main(void) { return 0; }
+
+int main(void) {{
+    static int64_t memory[1 << 19], head[{words}];
+    // head: the method, how many numbers and arrays it takes, the numbers, the sizes of the arrays
+    while (fread(head, sizeof head, 1, stdin) == 1) {{
+        void *given[{words}], *places[{words}];
+        const int64_t count = head[1], *sizes = head + 3 + count;
+        char *place = (char *)memory;
+        for (int i = 0; i < count; i++) given[i] = &head[3 + i];
+        for (int i = 0; i < head[2]; place += (sizes[i++] + 63) / 64 * 64) {{
+            places[i] = place;
+            if (sizes[i] > 0 && fread(place, (size_t)sizes[i], 1, stdin) != 1) return 1;
+        }}
+        methods[head[0]](places, given, count);
+        fwrite(&answered, sizeof answered, 1, stdout);
+        for (int i = 0; i < head[2]; i++) fwrite(places[i], (size_t)sizes[i], 1, stdout);
+        fflush(stdout);
+    }}
+}}
 """
-X0, X2, SP, X30 = (getattr(arm64_const, f"UC_ARM64_REG_{name}") for name in ("X0", "X2", "SP", "X30"))
-RDI, RDX, RSP = (getattr(x86_const, f"UC_X86_REG_{name}") for name in ("RDI", "RDX", "RSP"))
-DATA, STACK, RETURN, ROOM, PAGE = 0x50000000, 0x60000000, 0x70000000, 1 << 22, 0x1000
-STACK_END = STACK + ROOM // 2
-# Processor, and its registers at a call of a method without arguments. x86-64 finds the place to return to on the stack.
-TARGETS = {
-    "aarch64-linux-musl": (
-        (unicorn_const.UC_ARCH_ARM64, unicorn_const.UC_MODE_ARM),
-        {X0: DATA, X2: 0, SP: STACK_END, X30: RETURN},
-    ),
-    "x86_64-linux-musl": (
-        (unicorn_const.UC_ARCH_X86, unicorn_const.UC_MODE_64),
-        {RDI: DATA, RDX: 0, RSP: STACK_END - 8},
-    ),
+WORDS = 64
+QEMU, GLIBC = "qemu-aarch64", Path("/usr/aarch64-linux-gnu")
+# The words before the program, and the linker's.
+TARGETS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "x86_64-linux-musl": ((), ("-static",)),
+    "aarch64-linux-musl": ((QEMU,), ("-static",)),
+    "aarch64-linux-gnu": ((QEMU, "-L", str(GLIBC)), ()),
 }
 
 
 class OtherMachine:
-    """A program with methods in the memory of an emulated processor."""
+    """A program with methods, which runs on another machine until the end of a `with` block.
 
-    def __init__(self, target: str, texts: dict[str, str]) -> None:
-        processor, self._registers = TARGETS[target]
-        texts = texts | {"stubs.c": STUBS}
+    The test is skipped where that machine is missing.
+    """
+
+    def __init__(self, target: str, texts: Mapping[str, str]) -> None:
+        before, linked = TARGETS[target]
+        if before and not shutil.which(QEMU):
+            pytest.skip(f"no {QEMU} (package qemu-user)")
+        if "-L" in before and not GLIBC.is_dir():
+            pytest.skip(f"no {GLIBC} (package libc6-arm64-cross)")
+        found = re.findall(rf"^void \*{METHOD}(\w+)\(.*;$", "\n".join(texts.values()), re.MULTILINE)
+        self._numbers = {name: number for number, name in enumerate(found)}
+        methods = [METHOD + name for name in found]
+        texts = texts | {  # type: ignore[operator]
+            "program.c": PROGRAM.format(
+                declared="".join(f"Method {name};\n" for name in methods),
+                names=", ".join(methods),
+                words=WORDS,
+            )
+        }
+        flags = [flag for flag in FLAGS if flag not in ("-shared", "-fPIC")]
         sources = [name for name in texts if name.endswith(".c")]
-        flags = (flag for flag in FLAGS if flag not in ("-shared", "-fPIC"))
-        linked = ("-target", target, "-static", "-Wl,--no-gc-sections")
-        program = compile_texts(texts, (*sources, "-lm"), (*flags, *linked), "program.elf", zig())
-        self._cpu = Uc(*processor)
-        with program.open("rb") as file:
-            elf = ELFFile(file)
-            table = elf.get_section_by_name(".symtab")
-            self._addresses = {symbol.name: symbol["st_value"] for symbol in table.iter_symbols()}
-            pages = set()
-            for part in elf.iter_segments("PT_LOAD"):
-                start = part["p_vaddr"]
-                pages |= set(range(start // PAGE, -(-(start + part["p_memsz"]) // PAGE)))
-            for page in pages:
-                self._cpu.mem_map(page * PAGE, PAGE)
-            for part in elf.iter_segments("PT_LOAD"):
-                self._cpu.mem_write(part["p_vaddr"], part.data())
-        for place in (DATA, STACK, RETURN):
-            self._cpu.mem_map(place, ROOM)
-        if processor[0] == unicorn_const.UC_ARCH_ARM64:
-            self._cpu.reg_write(arm64_const.UC_ARM64_REG_CPACR_EL1, 3 << 20)  # floating point is allowed
+        program = compile_texts(
+            texts, (*sources, "-lm"), (*flags, "-target", target, *linked), "program", zig()
+        )
+        program.chmod(0o700)
+        self._process = subprocess.Popen((*before, program), stdin=subprocess.PIPE, stdout=subprocess.PIPE)
 
-    def call(self, name: str, arrays: Iterable[NDArray[np.generic]]) -> int:
+    def call(self, name: str, arrays: Iterable[NDArray[np.generic]], *numbers: int) -> int:
         """Run a method on the memory of arrays; return its answer."""
         arrays = tuple(arrays)
-        sizes = [-(-one.nbytes // 64) * 64 for one in arrays]
-        places = [DATA + PAGE + sum(sizes[:index]) for index in range(len(sizes))]
-        for one, place in zip(arrays, places, strict=True):
-            self._cpu.mem_write(place, one.tobytes())
-        self._cpu.mem_write(DATA, np.array(places, np.uint64).tobytes())
-        self._cpu.mem_write(STACK_END - 8, RETURN.to_bytes(8, "little"))
-        for register, value in self._registers.items():
-            self._cpu.reg_write(register, value)
-        self._cpu.emu_start(self._addresses[METHOD + name], RETURN)
-        for one, place in zip(arrays, places, strict=True):
-            content = bytes(self._cpu.mem_read(place, one.nbytes))
-            one.reshape(-1).view(np.uint8)[:] = np.frombuffer(content, np.uint8)
-        answer = bytes(self._cpu.mem_read(self._addresses["answered"], 8))
-        return int.from_bytes(answer, "little", signed=True)
+        head = (self._numbers[name], len(numbers), len(arrays), *numbers, *(one.nbytes for one in arrays))
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        words = struct.pack(f"={WORDS}q", *head, *(0,) * (WORDS - len(head)))
+        self._process.stdin.write(words + b"".join(one.tobytes() for one in arrays))
+        self._process.stdin.flush()
+        answer = int.from_bytes(self._process.stdout.read(8), "little", signed=True)
+        for one in arrays:
+            content = self._process.stdout.read(one.nbytes)
+            if one.flags.writeable:
+                one.reshape(-1).view(np.uint8)[:] = np.frombuffer(content, np.uint8)
+        return answer
+
+    def __enter__(self) -> "OtherMachine":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.communicate()  # it ends where there are no more calls
+
+
+class CoreElsewhere:
+    """Runs the flight core on another machine."""
+
+    def __init__(self, machine: OtherMachine, core: CoreBlocks) -> None:
+        self._machine, self._core = machine, core
+
+    def call(self, name: str) -> int:
+        """Execute an entry point."""
+        blocks = (self._core.named[block] for block in self._core.calls[name])
+        return self._machine.call(name, [block.memory for block in blocks])

@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -173,11 +174,13 @@ def judged(
     )
 
 
-_RESULT = TypeAdapter(Result)
+@cache  # building it takes time that a flight has after its end
+def _as_json() -> TypeAdapter[Result]:
+    return TypeAdapter(Result)
 
 
 def write_result(result: Result) -> None:
-    values = _RESULT.dump_python(result, mode="json")
+    values = _as_json().dump_python(result, mode="json")
     flat = {**values.pop("request"), **values.pop("program"), **values}
     write_whole(result.folder / RESULT, json.dumps(flat, indent=2) + "\n")
 
@@ -201,7 +204,7 @@ def read_result(folder: Path, find: Find = unknown) -> Result:
 
 def _read(values: Any, folder: Path, find: Find) -> Result:
     parts = {**values, "request": values, "program": values} if isinstance(values, dict) else values
-    return replace(_RESULT.validate_python(parts, context=find), folder=folder)
+    return replace(_as_json().validate_python(parts, context=find), folder=folder)
 
 
 def _of_killed(folder: Path, find: Find) -> Result:

@@ -10,7 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from ground_station.latency import STAGES
-from hil.laboratory.metrics import BOX, column
+from hil.laboratory.metrics import BOX, column, rows_at
 from hil.laboratory.schedule import runs
 from hil.pictures import curves
 from hil.pictures.curves import Curves
@@ -105,7 +105,7 @@ class Plots:
 
     def add_slow(self, past: pa.Table, at: NDArray[np.int64]) -> None:
         """Draw slow quantities of rows `at`, with those of a second before them."""
-        chosen = past.take(at)
+        chosen = rows_at(past, at)
         times = column(chosen, "t")
         for path, limit in LIMITS.items():
             self._track.curve(path, times, np.full((len(times), 2), (limit, -limit)))

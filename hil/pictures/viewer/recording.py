@@ -16,6 +16,7 @@ from rerun_bindings import CatalogClientInternal
 from hil.errors import LabError, unlinked
 from hil.laboratory.files.ages import ages_in_time_of
 from hil.laboratory.files.recorder import OPERATOR, load_events, log_pieces, stored_in
+from hil.laboratory.metrics import rows_at
 from hil.laboratory.schedule import load_schedule
 from hil.pictures.links import HOST
 from hil.pictures.viewer.layout import LEGEND, blueprint
@@ -57,7 +58,7 @@ class RerunFlight:
         at = np.arange(before + -self._count % SLOW, past.num_rows, SLOW)
         if len(at):
             self.plots.add_slow(past, at)
-            self._scene.add_tether(past.take(at))
+            self._scene.add_tether(rows_at(past, at))
         self._count += rows.num_rows
         self._past = past.slice(max(0, past.num_rows - ROWS_OF_A_SECOND))
 

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +14,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_py.core.structs import Control, Report, Sampling, Supervisor
-from firmware_py.core_runner import CoreBlocks
 from firmware_py.export.c99 import translate
 from firmware_py.export.compilers import Compiler, compilers, find_compiler
 from firmware_py.export.errors import ExportError
 from firmware_py.export.native import build, texts_of
 from support import core_streams
 from support.core_streams import Recording, first_difference, record_flight, record_plausible, record_wild
-from support.other_machine import TARGETS, OtherMachine
+from support.other_machine import TARGETS, CoreElsewhere, OtherMachine
 from support.paths import ROOT, TESTS
 
 C = translate()
@@ -68,19 +68,9 @@ def test_c_gives_the_bits_of_python_in_every_call_of_a_flight_and_on_arbitrary_b
 def test_other_machines_compute_the_same_bits(
     target: str, flight: Recording, plausible: Recording, wild: Recording
 ) -> None:
-    machine = OtherMachine(target, texts_of(C))
-
-    class Runner:
-        def __init__(self, core: CoreBlocks) -> None:
-            self._core = core
-
-        def call(self, name: str) -> int:
-            blocks = (self._core.named[block] for block in self._core.calls[name])
-            return machine.call(name, [block.memory for block in blocks])
-
-    assert first_difference(flight, Runner) is None
-    assert first_difference(plausible, Runner) is None
-    assert first_difference(wild, Runner) is None
+    with OtherMachine(target, texts_of(C)) as machine:
+        for recording in (flight, plausible, wild):
+            assert first_difference(recording, partial(CoreElsewhere, machine)) is None
 
 
 @gcc_only

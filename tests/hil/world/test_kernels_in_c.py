@@ -139,14 +139,14 @@ def test_other_machines_compute_the_same_bits(
     here, there = allocate(), allocate()
     arrays, copies = ([array_of(one) for one in memory] for memory in (here, there))
     call = bound(kernel, *here)
-    machine = OtherMachine(target, {"kernels.c": translate((kernel,), tuple(arrays))})
-    for _ in range(STATES):
-        draw(rng, here)
-        before = bytes_of(here)
-        for ours, theirs in zip(copies, arrays, strict=True):
-            ours[:] = theirs
-        call()
-        machine.call(kernel.__name__, copies)
-        for one in (*arrays, *copies):
-            make_nan_one(one)
-        assert bytes_of(there) == bytes_of(here) != before
+    with OtherMachine(target, {"kernels.c": translate((kernel,), tuple(arrays))}) as machine:
+        for _ in range(STATES):
+            draw(rng, here)
+            before = bytes_of(here)
+            for ours, theirs in zip(copies, arrays, strict=True):
+                ours[:] = theirs
+            call()
+            machine.call(kernel.__name__, copies)
+            for one in (*arrays, *copies):
+                make_nan_one(one)
+            assert bytes_of(there) == bytes_of(here) != before

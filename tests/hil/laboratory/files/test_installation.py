@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from firmware_py import extras
 from firmware_py.compiling import flies_as
 from hil.errors import LabError
 from hil.laboratory.files import installation
@@ -85,7 +84,7 @@ def test_a_missing_package_of_an_extra_is_named(program: Program, monkeypatch: p
         "numpy>=2; extra == 'radio'",
         "ruff; extra == 'test'",
     ]
-    monkeypatch.setattr(extras, "requires", lambda project: requirements)
+    monkeypatch.setattr("importlib.metadata.requires", lambda project: requirements)
     found = rows()
     assert found["extra radio"] == f"no-such-radio not installed, numpy {version('numpy')}"
     assert "extra test" not in found
