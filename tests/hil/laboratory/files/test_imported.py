@@ -15,7 +15,9 @@ from mcap_ros2.writer import Writer as Ros2Writer
 from scipy.spatial.transform import Rotation
 
 from hil import LabError, column, fly, load_run
+from hil.laboratory.files.alignment import released_like
 from hil.laboratory.files.imported import import_log
+from hil.laboratory.files.joined import Joined
 from hil.laboratory.files.log_map import Map
 from hil.pictures.viewer.recording import recording_of
 from support.command import Cli
@@ -124,6 +126,24 @@ def test_the_release_is_where_the_path_fits_that_of_another_flight(cli: Cli, tmp
     assert "where both paths fit best" in cli.err
     assert cli("import", path, "--like", tmp_path / "none", "--out", tmp_path / "more") == 2
     assert "there is no such run folder" in cli.err
+
+
+@pytest.mark.parametrize("offset_us", [0, 3_000, 7_000, 11_000, 16_000])
+@pytest.mark.parametrize("later_s", [0.0, 2.4])
+def test_the_best_fit_is_found_between_the_steps_of_the_search(offset_us: int, later_s: float) -> None:
+    def path(t_us: np.ndarray) -> dict[str, np.ndarray]:
+        t = 1e-6 * t_us
+        return {"x": np.sin(2.0 * t) + 0.3 * np.sin(7.0 * t), "y": np.cos(3.0 * t), "z": 0.1 * t}
+
+    since_us, begin_us = 10_000.0 * np.arange(600), 5_000_000 + offset_us
+    flown = {"t": since_us + 1_000_000, "flight.free": np.ones(600)}
+    like = pa.table(flown | {f"truth.{axis}": values for axis, values in path(since_us).items()})
+    t_us = begin_us + 1e6 * later_s + 10_000.0 * np.arange(600)  # the log may begin long after the release
+    joined = Joined(
+        t_us, {axis: 2.0 + values for axis, values in path(t_us - begin_us).items()}, {}, "t [us]"
+    )
+    chosen = Map(columns={f"cameras.{axis}": f"{axis} [m]" for axis in "xyz"})
+    assert released_like("log", joined, chosen, like).release_s == pytest.approx(1e-6 * begin_us, abs=0.0021)
 
 
 def test_a_telemetry_log_of_mavlink_is_in_the_world_s_frame(cli: Cli, tmp_path: Path) -> None:
