@@ -17,8 +17,9 @@ from scipy.spatial.transform import Rotation
 from hil import LabError, column, fly, load_run
 from hil.laboratory.files.alignment import released_like
 from hil.laboratory.files.imported import import_log
-from hil.laboratory.files.joined import Joined
+from hil.laboratory.files.joined import Joined, join
 from hil.laboratory.files.log_map import Map
+from hil.laboratory.files.tables import Table
 from hil.pictures.viewer.recording import recording_of
 from support.command import Cli
 
@@ -216,6 +217,39 @@ def test_a_map_chooses_scales_turns_and_releases(tmp_path: Path) -> None:
     assert log.column("goal.x")[3].as_py() == 0.25
     assert log.column("flight.free").to_numpy().tolist() == [0] * 10 + [1] * (ROWS - 10)
     assert log.schema.metadata[b"release_us"] == b"200000"
+
+
+@pytest.mark.parametrize(
+    ("step", "unit"), [(0.5, "s"), (0.0005, "s"), (0.6, "ms"), (500.0, "ms"), (501.0, "us"), (5e5, "us")]
+)
+def test_times_without_a_unit_have_that_of_a_usual_step(step: float, unit: str) -> None:
+    t = step * np.array([0, 0, 0, 0, 1, np.inf, 1, 2, np.nan, 3])  # repeated, and some that are no times
+    joined = join("log", [Table({"t": t, "x": np.arange(10.0)}, ())], None)
+    assert joined.clock == f"t [{unit}]"
+    assert joined.columns["x"].tolist() == [0.0, 4.0, 7.0, 9.0]
+    assert joined.notes == ["6 rows whose t does not advance are left out"]
+
+
+def test_a_clock_from_the_release_releases_at_its_zero(tmp_path: Path) -> None:
+    path = csv(tmp_path / "log.csv", {"time from the release [s]": T - 0.2, **place("x", "y", "z")})
+    log = import_log([path], tmp_path).log
+    assert log.column("flight.free").to_numpy().tolist() == [0] * 10 + [1] * (ROWS - 10)
+
+
+@pytest.mark.parametrize("size", [0.89, 1.11])
+def test_a_quaternion_is_of_unit_length_to_a_tenth(tmp_path: Path, size: float) -> None:
+    def columns(scale: float) -> dict[str, Any]:
+        return {f"q{part}": scale * QUATERNIONS[:, index] for index, part in enumerate("wxyz")}
+
+    for scale in (0.91, 1.09):
+        import_log(
+            [csv(tmp_path / "log.csv", {"t": T, **place("x", "y", "z"), **columns(scale)})],
+            tmp_path / f"{scale}",
+        )
+    with pytest.raises(LabError, match=f"a quaternion of length {size}; expected 1"):
+        import_log(
+            [csv(tmp_path / "log.csv", {"t": T, **place("x", "y", "z"), **columns(size)})], tmp_path / "wrong"
+        )
 
 
 def test_files_are_joined_on_the_rows_of_the_first(tmp_path: Path) -> None:
