@@ -26,11 +26,13 @@ class Room:
     latency = LinkLatency("air", 0, measured=False)
 
     def __init__(
-        self, blind: tuple[float, float], lost: tuple[float, float], ends_in_failsafe: bool = True
+        self, blind: tuple[float, float], lost: tuple[float, float], in_failsafe: bool = True
     ) -> None:
-        self.now_us, self.blind, self.lost, self.ends_in_failsafe = 0, blind, lost, ends_in_failsafe
+        self.now_us, self.blind, self.lost, self.ends_in_failsafe = 0, blind, lost, in_failsafe
         self.says: list[tuple[float, str]] = []
         self.goals: list[tuple[int, Goal]] = []
+        self.ages_us: list[int] = []  # of the poses, when the link got them
+        self.connects_s = 0.0
         self._next_us, self._muted_us = 0, inf
 
     def say(self, text: str) -> None:
@@ -48,18 +50,23 @@ class Room:
         if data is not None:  # of the link
             return []
         end_us = self.now_us + round(1e6 * timeout_or_us)
-        if self._next_us > end_us or self._in(self.blind) or timeout_or_us == 0:
-            self.now_us, self._next_us = end_us, max(self._next_us, end_us // FRAME_US * FRAME_US + FRAME_US)
+        if self._in(self.blind):
+            self._next_us = max(self._next_us, end_us // FRAME_US * FRAME_US + FRAME_US)
+        if self._next_us > end_us:
+            self.now_us = end_us
             return None
-        self.now_us = max(self.now_us, self._next_us)
+        self.now_us, exposed_us = max(self.now_us, self._next_us), self._next_us
         self._next_us += FRAME_US
-        return MocapFrame(self.now_us, (0.0, 0.0, 1.15), (1.0, 0.0, 0.0, 0.0), True)
+        return MocapFrame(exposed_us, (0.0, 0.0, 1.15), (1.0, 0.0, 0.0, 0.0), True)
 
     # Link
 
     def open(self, give_up: Callable[[], bool]) -> None:
         self.say("opened")
-        if give_up() or self._in(self.lost):
+        for _ in range(12):
+            self.now_us += round(1e6 * self.connects_s) // 12
+            assert not give_up()
+        if self._in(self.lost):
             raise LinkError("not there")
         self._muted_us = inf
 
@@ -68,13 +75,16 @@ class Room:
             raise LinkError(f"lost at {self.now_us * 1e-6:.0f} s")
 
     @property
-    def supervisor_state(self) -> State:
+    def supervisor_state(self) -> State | None:
         if self.now_us > self._muted_us + 500_000 and self.ends_in_failsafe:
             return State.FAILSAFE
+        if self._muted_us < inf:
+            return None
         return State.FLYING if self.now_us > 2_000_000 else State.WAITING
 
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
         self.goals.append((now_us, goal))
+        self.ages_us.append(now_us - frame.t_us)
 
     def mute(self) -> None:
         self._muted_us = self.now_us
@@ -133,6 +143,13 @@ def test_every_line_of_a_station_has_its_time(monkeypatch: pytest.MonkeyPatch) -
     assert not [now_us for now_us, goal in room.goals if goal.p_WG[0] < 0.05 and now_us > moved_us[0]]
 
 
+def test_no_pose_is_sent_that_waited_while_the_board_connected(monkeypatch: pytest.MonkeyPatch) -> None:
+    room = Room((inf, inf), (3.0, 3.1))
+    room.connects_s = 1.2
+    flown(room, monkeypatch, 6.0)
+    assert 100 < len(room.ages_us) == sum(age_us < FRAME_US for age_us in room.ages_us)
+
+
 def test_a_link_that_stays_lost_ends_the_flight_after_half_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
     room = Room(blind=(inf, inf), lost=(10.0, inf))
     with pytest.raises(LinkError, match="lost at 10 s"):
@@ -141,7 +158,7 @@ def test_a_link_that_stays_lost_ends_the_flight_after_half_a_minute(monkeypatch:
 
 
 def test_a_board_that_reports_no_failsafe_is_left_after_two_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    room = flown(Room((inf, inf), (inf, inf), ends_in_failsafe=False), monkeypatch, 5.0)
+    room = flown(Room((inf, inf), (inf, inf), in_failsafe=False), monkeypatch, 5.0)
     assert room.instants("closed")[0] == pytest.approx(7.0, abs=0.05)
     assert not room.instants("the board is in failsafe")
 

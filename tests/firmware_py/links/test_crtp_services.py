@@ -564,6 +564,9 @@ def test_memory_tester_gives_the_address_and_counts_wrong_bytes(client: CrtpClie
     assert client.log(logs, "memTst.errCntW") == [0]
     assert client.one(MEM, 2, struct.pack("<BI", 2, 0x10) + b"\x10\x99\x98")[-1] == 0
     assert client.log(logs, "memTst.errCntW") == [2]
+    assert client.one(MEM, 2, struct.pack("<BI", 2, 0x10) + b"\x99")[-1] == 0
+    assert client.log(logs, "memTst.errCntW") == [3]
+    assert [len(client.one(MEM, 0, bytes((2, number)))) for number in (4, 5)] == [15, 2]  # the last, and none
     client.write(params, "memTst.resetW", 1)
     assert client.log(logs, "memTst.errCntW") == [0]
 
