@@ -46,7 +46,8 @@ def place(x: str, y: str, z: str, scale: float = 1.0) -> dict[str, Any]:
 
 
 STOCK = {
-    "Timestamp": 1e3 * T + 5000, **place("stateEstimate.x", "stateEstimate.y", "stateEstimate.z"),
+    "Timestamp": 1e3 * T + 5000, **place("kalman.stateX", "kalman.stateY", "kalman.stateZ", 3.0),
+    **place("stateEstimate.x", "stateEstimate.y", "stateEstimate.z"),
     "stateEstimate.roll": DEGREES[:, 0], "stateEstimate.pitch": -DEGREES[:, 1], "stateEstimate.yaw": DEGREES[:, 2],
     "pm.vbat": np.full(ROWS, 3.9),
 }  # fmt: skip
