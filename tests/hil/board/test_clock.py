@@ -177,11 +177,11 @@ def test_a_pause_takes_no_simulated_time(wall: Wall) -> None:
 def test_the_pace_counts_from_the_first_look_at_its_instant(wall: Wall) -> None:
     pace = clock.Pace(1_000_000)
     wall.us += 5_000_000
-    pace.look(999_999)
+    pace.start_when_due(999_999)
     assert pace.factor(1_000_000) == 0.2
-    pace.look(1_000_000)
+    pace.start_when_due(1_000_000)
     wall.us += 1_000_000
-    pace.look(2_000_000)
+    pace.start_when_due(2_000_000)
     wall.us += 1_000_000
     assert pace.factor(21_000_000) == 10.0
 

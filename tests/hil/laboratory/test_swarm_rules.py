@@ -57,7 +57,7 @@ def crowd_of(*flown: Flown, still_air: bool = True, **settings: float) -> tuple[
     config: Any = SimpleNamespace(**{**SwarmConfig(wake=1.5).model_dump(), **settings})
     request: Any = SimpleNamespace(config=config, origins=ORIGINS[: len(flown)], still_air=still_air)
     crowd = Crowd(request, list(flown))  # type: ignore[arg-type]
-    return crowd, crowd._near
+    return crowd, crowd._neighbourhood.near
 
 
 def test_every_robot_is_in_the_room_with_its_place_speed_and_the_lift_along_its_own_axis() -> None:
