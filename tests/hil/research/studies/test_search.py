@@ -54,7 +54,7 @@ def test_a_flight_that_was_not_completed_costs_more_than_any(outcome: str) -> No
     ]
     assert asked.cost(jobs[1:]) == 0.5
     assert asked.cost(jobs) == (LOST + 0.5) / 2
-    assert (asked.show(asked.cost(jobs)), asked.show(0.5)) == ("lost", "50 cm")
+    assert (asked.cost_text(asked.cost(jobs)), asked.cost_text(0.5)) == ("lost", "50 cm")
 
 
 @pytest.mark.parametrize("metric", ["rms_z", "in_box"])  # smallest is best, largest is best
