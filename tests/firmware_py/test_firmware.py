@@ -10,9 +10,11 @@ from firmware_py.core.sampling import WINDOW
 from firmware_py.core.structs import Input, Sampling
 from firmware_py.core_runner import CoreBlocks, default_runner
 from firmware_py.errors import FirmwareError
+from firmware_py.firmware import Firmware
 from firmware_py.supervisor import wrapped
 from firmware_py.tasks import MEASUREMENT_QUEUE
 from firmware_py.wire import crtp, telemetry
+from firmware_py.wire.parameters import ABSOLUTE
 from firmware_py.wire.supervisor import State
 from hil.config import load_config
 from support.firmware_bench import HOVER_COUNTS, FirmwareBench
@@ -25,6 +27,13 @@ def bench() -> FirmwareBench:
 
 def test_flaps_are_at_hover_before_the_first_tick(bench: FirmwareBench) -> None:
     assert bench.writes[0][1] == HOVER_COUNTS
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_poses_are_of_the_kind_of_the_profile(bench: FirmwareBench, absolute: bool) -> None:
+    firmware = Firmware(load_config("floaty", (f"predictor.absolute={absolute}".lower(),)), bench)
+    (kind,) = [one.read() for one in firmware.parameters if one.name == ABSOLUTE]
+    assert kind == absolute
 
 
 def test_controller_writes_counts_every_ten_milliseconds(bench: FirmwareBench) -> None:

@@ -1,8 +1,10 @@
 """Frames in, corrections out, telemetry into the log."""
 
 import csv
+import time
 from dataclasses import replace
-from math import isnan, pi
+from datetime import UTC, datetime
+from math import inf, isnan, pi
 
 import numpy as np
 import pytest
@@ -13,15 +15,18 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.geometry import from_euler_zyx
 from firmware_py.wire import crtp, telemetry
+from ground_station.clock import clock_us, epoch_us, signing_start
 from ground_station.config import GroundConfig, StationConfig, TrackerConfig
 from ground_station.corrections import correct
+from ground_station.latency import LatencyBudget, LinkLatency
 from ground_station.links.log_blocks import START_ORDER
 from ground_station.links.loopback import LoopbackLink
 from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation, Slots
 from ground_station.telemetry_log import AGE_COLUMNS, TelemetryLog
+from ground_station.throttle import Throttle
 from ground_station.tracker import Quality, Tracker
-from ground_station.trajectory import Goal, Hold, Offsets, Sine, Square, Step
+from ground_station.trajectory import Along, Goal, Hold, Offsets, Sine, Square, Step
 from support.log_board import TABLE, LogBoard, data_packet
 
 HOME = Goal((0.0, 0.0, 1.15), 0.0)
@@ -390,3 +395,34 @@ def test_hold_holds_and_offsets_begin_at_their_start():
     assert trajectory.at(6_000_000).p_WG[1] == -0.05
     assert trajectory.at(6_000_000).p_WG[2] == pytest.approx(1.35)
     assert trajectory.at(11_000_000).p_WG == pytest.approx((0.25, 0.05, 1.15))
+    course = Along(lambda t: (1.0, t, 0.0))(home, 1_000_000)
+    assert course.at(999_999) == home
+    assert course.at(1_000_000) == Goal((1.25, 0.0, 1.15), 0.5)
+    assert course.at(1_500_000) == Goal((1.25, 0.5, 1.15), 0.5)
+
+
+@pytest.mark.parametrize("offset", [(1.0, 2.0), (1.0, 2.0, 3.0, 4.0, 5.0), (1.0, 2.0, inf), "xyz"])
+def test_a_path_returns_three_finite_numbers_or_four(offset):
+    with pytest.raises(ValueError, match="expected"):
+        Along(lambda t: offset)(HOME, 0).at(0)
+
+
+def test_the_last_row_of_the_budget_is_of_the_newest_pose():
+    budget = LatencyBudget()
+    for late_us in (10_000, 45_000):
+        budget.add(MocapFrame(7, HOME.p_WG, UPRIGHT, True), 7 + late_us, LinkLatency("air", 0, measured=True))
+    assert sum(part for part in budget.last() if not isnan(part)) == 45_000
+
+
+def test_a_line_of_a_kind_is_due_again_after_five_seconds():
+    throttle = Throttle()
+    due = [t_us for t_us in (0, 1, 4_999_999, 5_000_000, 9_999_999, 10_000_001) if throttle.admits("a", t_us)]
+    assert due == [0, 5_000_000, 10_000_001]
+    assert throttle.admits("b", 4)
+
+
+def test_both_epochs_count_from_the_clock_s_zero():
+    now_us, unix_s = clock_us(), time.time()
+    assert (epoch_us() + now_us) * 1e-6 == pytest.approx(unix_s, abs=1.0)
+    signed_s = unix_s - datetime(2015, 1, 1, tzinfo=UTC).timestamp()
+    assert signing_start() * 1e-5 + now_us * 1e-6 == pytest.approx(signed_s, abs=1.0)

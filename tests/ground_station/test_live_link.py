@@ -221,3 +221,30 @@ def test_99_of_100_poses_are_no_older_than_the_p99(count, p99_us):
     assert (
         sum(row[3] <= pose.p99_us for row in rows) >= 0.99 * count > sum(row[3] < pose.p99_us for row in rows)
     )
+
+
+def test_a_link_that_is_opened_again_has_nothing_of_the_time_before():
+    board = opened()
+    board.gate.clear()
+    board.put(1)
+    assert board.sending.wait(PATIENCE_S)
+    board.put(2)  # waits in the mailbox
+    board._on_bytes(b"old")
+    board.mute()
+    board.gate.set()
+    board.close()
+    board._connect, before = lambda: True, board.received_us
+    board.open(lambda: False)
+    assert (before > 0, board.received_us, board.received()) == (True, 0, [])
+    board.put(3)
+    wait_for(board, 2)
+    assert board.numbers == [1, 3]
+    board.close()
+
+
+@pytest.mark.parametrize(
+    ("after_us", "why"), [(4_000_000, ""), (4_000_001, "never"), (60_000_001, "not connected after 60 s")]
+)
+def test_a_board_that_does_not_connect_is_given_up_with_the_reason(monkeypatch, after_us, why):
+    monkeypatch.setattr("ground_station.links.live_link.clock_us", lambda: 7 + after_us)
+    assert Board()._why_hopeless(7, lambda: False) == why

@@ -101,6 +101,9 @@ def test_a_replay_hands_on_each_frame_when_it_is_due_by_its_own_clock(timeout_s:
         source = ReplaySource(path)
         for _ in range(2):
             source.open()
+            assert source.receive(0.0) is None  # the caller only polls
+            now_us[0] += 3_000_000
+            assert source.summary() == "mocap 0 of 10 replayed"
             arrivals, valid, begun_us = [], [], now_us[0]
             while not source.over:
                 if (frame := source.receive(timeout_s)) is not None:
@@ -108,6 +111,7 @@ def test_a_replay_hands_on_each_frame_when_it_is_due_by_its_own_clock(timeout_s:
                     valid.append(frame.valid)
             assert source.receive(timeout_s) is None
             assert source.notices()[-1] == "the recording is over: 10 frames"
+            assert source.summary() == "mocap 10 of 10 replayed"
             assert [t_us for _, t_us in arrivals] == [20_000 * n - 7_000 for n in range(10)]
             assert valid == [n % 3 == 1 for n in range(10)]
             due = [20_000 * n for n in range(10)]
@@ -153,6 +157,13 @@ def test_a_bad_record_is_one_line(tmp_path: Path, rows: str, message: str) -> No
     with pytest.raises(MocapError) as caught:
         read_frames(path)
     assert str(caught.value).startswith(f"{path}: {message}")
+
+
+def test_frames_may_arrive_at_one_instant_and_at_any_that_a_float_counts(tmp_path: Path) -> None:
+    path = tmp_path / "frames.csv"
+    record(path, []).close()
+    path.write_text(path.read_text() + GOOD + GOOD + GOOD.replace("1", str(2**53), 1))
+    assert [arrival_us for arrival_us, _ in read_frames(path)] == [1, 1, 2**53]
 
 
 @given(rows=st.binary(max_size=200), header=st.sampled_from([b"", b"arrival [us],mocap.t [us]\n", None]))

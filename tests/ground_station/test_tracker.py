@@ -336,6 +336,13 @@ def test_a_track_begins_with_three_poses_that_fit() -> None:
     assert tracker.track_frame(frame(2)).quality is YES
 
 
+def test_poses_before_the_first_track_make_it_no_restart() -> None:
+    tracker = Tracker(CONFIG, PERIOD_US)
+    for number in (0, 1, 500, 501, 502):
+        track = tracker.track_frame(frame(number))
+    assert (track.quality, track.event, tracker.counters.restarts) == (YES, Event.NONE, 0)
+
+
 def test_a_stray_first_pose_does_not_lock_the_gate() -> None:
     stray = (1.0, 1.0, 1.0)
     assert qualities(frame(0, stray), frame(1), frame(2), frame(3), frame(4)) == [NOT_YET] * 3 + [YES] * 2
@@ -408,6 +415,46 @@ def told(tracker: Tracker, frames: list[MocapFrame]) -> list[tuple[int, str]]:
         unused.note(seen.t_us, seen.t_us, None if track.frame.valid else track.frame.unused, track.event)
         lines += [(seen.t_us, line) for line in unused.due()]
     return lines
+
+
+@pytest.mark.parametrize(("after", "periods"), [(0.6, 1), (1.4, 1), (1.6, 2), (2.4, 2), (2.6, 3)])
+def test_a_frame_between_two_periods_counts_as_the_nearer_one(after: float, periods: int) -> None:
+    tracks = [tracking().track_frame(frame(99 + shift, (0.101, -0.2, 1.15))) for shift in (after, periods)]
+    assert tracks[0].v_WB == tracks[1].v_WB
+
+
+@given(st.integers(0, 2**32), st.integers(0, 9))
+@settings(max_examples=40, deadline=None)
+def test_a_track_after_a_loss_is_that_of_a_new_tracker(seed: int, missing: int) -> None:
+    lost, fresh = tracking(), Tracker(CONFIG, PERIOD_US)
+    for number in range(100, 150):  # poses that are refused for long, and then none
+        lost.track_frame(frame(number, (0.6, 0.6, 0.6)))
+    lost.track_frame(frame(1000, valid=False))
+    rng = np.random.default_rng(seed)
+    v = rng.uniform(-2.0, 2.0, 3)
+    for number in [0, *range(1 + missing, 30)]:
+        seen = noisy(rng, 1100 + number, v * number * PERIOD_US * 1e-6)
+        one, other = lost.track_frame(seen), fresh.track_frame(seen)
+        assert (one.quality, one.frame) == (other.quality, other.frame)
+        assert np.array_equal([*one.v_WB, *one.w_B], [*other.v_WB, *other.w_B], equal_nan=True)
+
+
+def test_poses_alternate_from_the_third_return_on_and_poses_of_one_place_never_do() -> None:
+    def reasons(numbers: range, every: int) -> list[Reason]:
+        tracker = tracking()
+        tracks = [
+            (
+                number,
+                tracker.track_frame(
+                    frame(number, (0.6, 0.6, 1.15)) if number % every == 0 else frame(number)
+                ),
+            )
+            for number in numbers
+        ]
+        return [track.frame.unused[0] for number, track in tracks if number % every == 0]
+
+    assert reasons(range(100, 112), 2) == [Reason.DEVIATES] * 3 + [Reason.PLACES] * 3
+    assert reasons(range(100, 112), 1) == [Reason.DEVIATES] * 12
 
 
 def test_one_line_reports_refused_poses() -> None:

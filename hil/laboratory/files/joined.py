@@ -48,7 +48,8 @@ def join(what: str, tables: Sequence[Table], clock: str | float | None) -> Joine
     for number, table in enumerate(tables):
         source = _clock_of(what, table, clock if isinstance(clock, str) else None, number == 0)
         times = _values(table, source.name) * TIME[source.unit]
-        advances = np.isfinite(times) & (times > np.fmax.accumulate(np.concatenate(([-np.inf], times[:-1]))))
+        known = np.where(np.isfinite(times), times, -np.inf)
+        advances = known > np.maximum.accumulate(np.concatenate(([-np.inf], known[:-1])))
         if not advances.all():
             joined.notes.append(f"{(~advances).sum()} rows whose {source.name} does not advance are left out")
         times = times[advances]

@@ -48,7 +48,8 @@ def test_a_pose_that_stays_the_same_while_the_robot_turns_is_refused_until_any_b
     assert set(after) == {POSE_FROZEN}  # although it no longer turns
     refused = while_turning.count(POSE_FROZEN) + len(after)
     assert core.fields.frozen == core.fields.invalid == refused
-    for changed in ((np.nextafter(np.float32(0.1), np.float32(1)), *PLACE[1:]), PLACE):
+    above = np.nextafter(np.float32(PLACE), np.float32(1))
+    for changed in (place for row in np.where(np.eye(3), above, PLACE) for place in (row, PLACE)):
         assert core.pose(changed, LEVEL, age_us) == POSE_ON_TIME
         core.tick()
     assert core.pose(PLACE, quaternion(roll=1e-6), age_us) == POSE_ON_TIME

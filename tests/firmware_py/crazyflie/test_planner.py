@@ -27,7 +27,7 @@ from firmware_py.crazyflie.planner import (
     straight_up,
 )
 from firmware_py.crazyflie.trajectories import COMPRESSED, LOCATION_MEMORY, POLYNOMIALS, decode_trajectory
-from firmware_py.wire.high_level import Define
+from firmware_py.wire.high_level import Define, PathCommand
 
 NUMBERS = st.floats(-2.0, 2.0)
 VECTORS = st.tuples(NUMBERS, NUMBERS, NUMBERS)
@@ -272,6 +272,23 @@ def test_only_at_rest_it_takes_off_and_only_once_it_lands(phase: Phase, command:
     if phase is not Phase.IDLE:
         commander.planner.follow(straight_up(REST, 1.0, 0.0, 2.0), 0.0, landing=phase is Phase.LANDING)
     assert commander.execute(struct.pack("<BBff?f", command, 0, 0.5, 0.0, True, 2.0), 1.0) == status
+
+
+def test_a_path_in_flight_begins_at_the_goal_of_its_instant_between_two_set_points() -> None:
+    board = SimpleNamespace(estimate=lambda: REST, admits=lambda places: True)
+    commander = HighLevelCommander(board, lambda kind, text: None)
+    commander.block(False)
+    commander.planner.follow(straight_up(REST, 1.0, 0.0, 2.0), 0.0)
+    commander.setpoint(0.79)
+    before = commander.planner.goal(0.799)
+    assert (
+        commander.execute(struct.pack("<4B5f", PathCommand.GO_TO, 0, 0, 0, 1.0, 2.0, 3.0, 0.0, 2.0), 0.799)
+        == 0
+    )
+    after = commander.planner.goal(0.799)
+    assert before is not None
+    assert after is not None
+    assert (*after.position, *after.velocity) == pytest.approx((*before.position, *before.velocity), abs=1e-9)
 
 
 @pytest.mark.parametrize("relative", [False, True])

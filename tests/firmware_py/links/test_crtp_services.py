@@ -6,6 +6,7 @@ import json
 import struct
 from collections import Counter
 from math import inf, nan
+from types import SimpleNamespace
 from zlib import crc32
 
 import numpy as np
@@ -19,7 +20,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from firmware_py.config import parameters_of
-from firmware_py.links.console import pieces
+from firmware_py.links.console import Notices, pieces
 from firmware_py.links.crtp_stack import PORT_QUEUE
 from firmware_py.links.parameters import ParameterStorage
 from firmware_py.wire import crtp, telemetry
@@ -420,6 +421,8 @@ def test_every_parameter_refuses_bad_values_and_returns_the_one_in_force(client:
 
 @pytest.mark.parametrize("channel", [1, 2])
 def test_unknown_parameter_is_enoent(client: CrtpClient, channel: int) -> None:
+    first = len(client.firmware.parameters)  # the first number that none has
+    assert client.one(PARAM, channel, struct.pack("<H", first)) == struct.pack("<HB", first, errno.ENOENT)
     assert client.one(PARAM, channel, b"\xff\xff") == bytes((0xFF, 0xFF, errno.ENOENT))
 
 
@@ -564,8 +567,39 @@ def test_memory_tester_gives_the_address_and_counts_wrong_bytes(client: CrtpClie
     assert client.log(logs, "memTst.errCntW") == [0]
     assert client.one(MEM, 2, struct.pack("<BI", 2, 0x10) + b"\x10\x99\x98")[-1] == 0
     assert client.log(logs, "memTst.errCntW") == [2]
+    assert client.one(MEM, 2, struct.pack("<BI", 2, 0x10) + b"\x99")[-1] == 0
+    assert client.log(logs, "memTst.errCntW") == [3]
+    assert [len(client.one(MEM, 0, bytes((2, number)))) for number in (4, 5)] == [15, 2]  # the last, and none
     client.write(params, "memTst.resetW", 1)
     assert client.log(logs, "memTst.errCntW") == [0]
+
+
+def test_a_store_counts_its_bytes_to_the_last_one() -> None:
+    storage = ParameterStorage(bytearray(b"\xff" * 2048))
+    assert (storage.size, storage.used) == (1024, 10)
+    for size, fits in ((255, True), (255, True), (255, True), (223, False), (222, True)):
+        before = storage.used
+        assert storage.store(f"g.{before}", bytes(size)) == fits
+        assert storage.used == before + fits * (4 + len(str(before)) + size)
+    assert storage.used == 1024
+
+
+def test_sixteen_blocks_of_26_bytes_are_taken_and_no_more(client: CrtpClient, logs) -> None:
+    number, kind = logs["stateEstimate.x"]  # a float
+    assert [client.create(block, *[(kind, number)] * 6) for block in range(17)] == [0] * 16 + [errno.ENOMEM]
+    client.one(LOG, 1, b"\x05\0")
+    byte = next(one for one in logs.values() if one[1] == Scalar.U8.log_number)
+    assert client.create(1, *[(kind, number)] * 6, *[byte[::-1]] * 2) == 0
+    assert client.one(LOG, 1, bytes((7, 1, byte[1])) + struct.pack("<H", byte[0]))[2] == errno.E2BIG
+
+
+def test_a_refused_kind_is_reported_with_the_count_of_what_was_withheld_since_its_last_line() -> None:
+    kernel, lines = SimpleNamespace(now_us=0), []
+    notices = Notices(kernel, lines.append)  # type: ignore[arg-type]
+    for at_s in (0, 1, 9.999999, 10, 11, 20, 30):
+        kernel.now_us = round(1e6 * at_s)
+        notices.refuse("kind", f"at {at_s}")
+    assert lines == ["at 0", "at 10 (2 more before)", "at 20 (1 more before)", "at 30"]
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import math
 import re
 import struct
+import zlib
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -17,6 +18,8 @@ from firmware_py.signals import COUNTERS
 from firmware_py.wire import crtp, telemetry
 from firmware_py.wire.mavlink import POSES
 from firmware_py.wire.mavlink_dialect import NUMBERS
+from firmware_py.wire.mavlink_numbers import Mode
+from firmware_py.wire.mavlink_services import mavlink_name
 from firmware_py.wire.supervisor import Cause, State
 from support.firmware_bench import LEVEL, FirmwareBench
 from support.mavlink_client import GYRO_ZERO_US, HOME, STREAMS, MavlinkClient, codec, count
@@ -548,6 +551,32 @@ def test_the_older_request_sets_groups_of_streams(client: MavlinkClient, group: 
         for name in GROUPS["ALL"]:
             expected = times * GROUPS[group].count(name)
             assert (counts.get(name, 0) == expected) == (name in GROUPS[group]), (name, counts)
+    client.send("request_data_stream", 1, 1, getattr(dialect, f"MAV_DATA_STREAM_{group}"), 60, 1)
+    for name in GROUPS[group][:1]:
+        assert client.command(510, NUMBERS[name])[1].interval_us == 17_000
+
+
+def test_a_mode_is_described_by_its_index_or_all_are(client: MavlinkClient) -> None:
+    modes = [client.command(512, NUMBERS["AVAILABLE_MODES"], index) for index in range(len(Mode) + 2)]
+    assert [[answer.mode_index for answer in answers[1:]] for answers in modes] == [
+        [*range(1, len(Mode) + 1)], *([index] for index in range(1, len(Mode) + 1)), [],
+    ]  # fmt: skip
+
+
+def test_manual_control_of_this_board_is_refused_and_long_texts_are_numbered_from_1(
+    client: MavlinkClient,
+) -> None:
+    for target in (0, 1, 2):
+        client.codec.srcSystem = 100 + target
+        client.send("manual_control", target, 0, 0, 0, 0, 0)
+        client.run(client.now_us + 3000)
+    assert [message.text for message in client.of("STATUSTEXT")] == ["MANUAL_CONTROL is not served"] * 2
+    client.stack._texts = 0xFFFE
+    texts = [
+        client.ask("param_set", 1, 1, name, 1.0, 4) for name in (b"RND_FLAPHOVERANG", b"RND_FLAPTIMECONS")
+    ]
+    ids = [text.id for answers in texts for text in answers if text.get_type() == "STATUSTEXT"]
+    assert ids == [0xFFFF, 0xFFFF, 1, 1]  # 0 is the number of a text of one piece
 
 
 @pytest.mark.parametrize(("rate_hz", "interval_us"), [(60, 17_000), (70, 14_000)])
@@ -699,6 +728,9 @@ def test_the_hash_changes_with_any_value_and_back(client: MavlinkClient) -> None
     second = digest()
     client.one("param_set", 1, 1, b"EXT_Z_P", 3.0, 9)
     assert digest() == first != second
+    written = [one for one in own_parameters(client) if one.write is not None]
+    content = b"".join(mavlink_name(one.name).encode() + one.value() for one in written)
+    assert first == zlib.crc32(content) >> 8
 
 
 def slow_line(client: MavlinkClient, bytes_per_ms: int = 6) -> None:
@@ -911,7 +943,8 @@ def test_the_versions_of_the_protocol_are_reported(client: MavlinkClient, params
 def test_ping_timesync_and_file_transfer_are_answered(client: MavlinkClient) -> None:
     ping = client.one("ping", 1234, 5, 0, 0)
     assert (ping.time_usec, ping.seq, ping.target_system, ping.target_component) == (1234, 5, 255, 190)
-    assert client.ask("ping", 1234, 5, 1, 1) == []  # an answer
+    for target in ((1, 1), (1, 0)):
+        assert client.ask("ping", 1234, 5, *target) == []  # an answer
     sync = client.one("timesync", 0, 77)
     assert (sync.ts1, sync.tc1 // 1_000_000_000) == (77, 0)
     assert sync.tc1 > 20_000_000

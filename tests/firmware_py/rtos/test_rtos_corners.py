@@ -6,6 +6,7 @@ Priorities start at 2: the timer service task has 1.
 import pytest
 
 from firmware_py.rtos import FOREVER, Kernel, Statistics
+from firmware_py.rtos.errors import KernelError
 from support.kernel_tasks import start
 
 
@@ -312,3 +313,10 @@ def test_notifying_a_ready_task_does_not_restart_its_activation(kernel):
     kernel.start()
     kernel.run(5_000)
     assert statistics.reports()[0].worst_latency_us == 2_000
+
+
+def test_a_kernel_has_2047_tasks_and_refuses_the_next(kernel):
+    while len(kernel.names) < 2048:  # with the caller before the start
+        kernel.create_task("many", 2, holder_of(kernel, (), 0))
+    with pytest.raises(KernelError, match="there are 2047 tasks, which is the most"):
+        kernel.create_task("one more", 2, holder_of(kernel, (), 0))

@@ -11,7 +11,7 @@ from cflib.crtp.crtpstack import CRTPPacket
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_py.wire import WireError, crtp, high_level, log, telemetry
+from firmware_py.wire import WireError, crtp, high_level, localisation, log, telemetry
 from firmware_py.wire.high_level import PathCommand
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.toc import Toc
@@ -168,6 +168,14 @@ def test_cflib_reads_the_block(block):
     values = tuple(range(1, 1 + len(block.variables)))
     config.unpack_log_data(block.layout.pack(*values), 0)
     assert received == {variable.name: value for variable, value in zip(block.variables, values, strict=True)}
+
+
+@given(st.lists(st.tuples(st.integers(0, 255), *[st.floats(-32.0, 32.0)] * 3), min_size=1, max_size=3))
+def test_packed_positions_are_the_nearest_millimetre_of_each_robot(robots):
+    sent = localisation.encode_packed_poses((address, p, Q) for address, *p in robots)
+    for (address, *p), (found, pose) in zip(robots, localisation.decode_packed_poses(sent), strict=True):
+        assert found == address
+        assert pose.p_GB == pytest.approx(p, abs=0.000501)
 
 
 def test_variables_have_one_home():

@@ -2,8 +2,10 @@
 
 import fcntl
 import math
+import os
 import resource
 import socket
+import time
 from pathlib import Path
 
 import pytest
@@ -151,6 +153,39 @@ def test_a_slow_machine_is_reported_once_per_second_and_every_stall_counts(wall:
     assert paced.stood_still_us == pytest.approx(2_500_000, abs=60_000)
 
 
+@pytest.mark.parametrize(("late_us", "stall_us"), [(-5, 0), (20_000, 0), (20_001, 20_000), (59_999, 40_000)])
+def test_time_stalls_for_multiples_beyond_the_first(wall: Wall, late_us: int, stall_us: int) -> None:
+    paced = Paced()
+    assert paced.standstill_us(0) == 0  # before the start
+    paced.start(0)
+    wall.us += 1000 + late_us
+    assert paced.standstill_us(1000) == late_us // 20_000 * 20_000 * (late_us > 0)
+    paced.wait_until(1000)
+    assert paced.stood_still_us == stall_us
+    assert paced.standstill_us(1000) == stall_us + 20_000 * (late_us == 20_000)
+
+
+def test_a_pause_takes_no_simulated_time(wall: Wall) -> None:
+    paced = Paced()
+    paced.start(0)
+    wall.us += 7_000
+    for _ in range(2):
+        paced.pause(lambda: wall.sleep(3.0))
+        assert paced.now_us() == 7_000
+
+
+def test_the_pace_counts_from_the_first_look_at_its_instant(wall: Wall) -> None:
+    pace = clock.Pace(1_000_000)
+    wall.us += 5_000_000
+    pace.start_when_due(999_999)
+    assert pace.factor(1_000_000) == 0.2
+    pace.start_when_due(1_000_000)
+    wall.us += 1_000_000
+    pace.start_when_due(2_000_000)
+    wall.us += 1_000_000
+    assert pace.factor(21_000_000) == 10.0
+
+
 def test_free_running_time_never_waits() -> None:
     free = FreeRunning()
     free.wait_until(10**15)
@@ -160,5 +195,11 @@ def test_free_running_time_never_waits() -> None:
 def test_process_age_is_nan_where_unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     first = clock.process_age_s()
     assert 0.0 < first <= clock.process_age_s()
+    (tmp_path / "stat").write_text(
+        "7 (a (b) c) S " + " ".join(str(1000 * n) for n in range(4, 53))
+    )  # proc(5)
+    monkeypatch.setattr(clock, "PROCESS", tmp_path / "stat")
+    since_boot_s = time.clock_gettime(time.CLOCK_BOOTTIME)
+    assert clock.process_age_s() == pytest.approx(since_boot_s - 22_000 / os.sysconf("SC_CLK_TCK"), abs=1.0)
     monkeypatch.setattr(clock, "PROCESS", tmp_path / "none")
     assert math.isnan(clock.process_age_s())

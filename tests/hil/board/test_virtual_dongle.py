@@ -160,7 +160,7 @@ def test_giving_up_takes_as_long_as_the_tries(
     bench = DongleAndBoard(**lost)
     bench.board.settings = AirSettings(80, bits_per_second, ADDRESS)
     bench.tune(channel, rate, ADDRESS)
-    bench.dongle.control(0x06, retries, b"")
+    bench.dongle.control(0x06, 0x70 | retries, b"")  # of which the lower half counts
     assert bench.exchange(b"\x10hello") == b"\x00"
     try_us = 130 + (73 + 8 * 6) * 1e6 / bits_per_second + retry_us
     assert bench.events.now_us == pytest.approx(500 + (retries + 1) * try_us, abs=retries + 1)

@@ -100,6 +100,18 @@ def test_line_load_and_latency_are_counted():
     assert counters.latency_sum_us == pytest.approx(1000 * (29 * 173.611 + 1000), abs=1000)
 
 
+@pytest.mark.parametrize(("size", "line_us"), [(20, 210), (64, 640), (100, 640 + 1010)])
+def test_the_latency_of_a_chunk_counts_from_its_sender(size, line_us):
+    bench = LineWithEnds(baud=1_000_000)
+    for sent_us in (3_000, 50_000):
+        bench.uplink(sent_us, bytes(size))
+        bench.write(sent_us, bytes(size))
+    line = bench.run().line
+    chunks = len(bench.on_board) // 2
+    assert line.up.latency_sum_us == line.down.latency_sum_us == 2 * (line_us + 1000 * chunks)
+    assert line.up.deliveries == line.down.deliveries == 2 * chunks
+
+
 def test_rounding_does_not_add_up():
     bench = LineWithEnds(baud=921_600, host_latency_us=0)
     for number in range(1000):
@@ -153,12 +165,12 @@ def test_wrong_bits_follow_the_binomial_law_and_are_counted(direction, rate):
     bench = LineWithEnds(**{f"{direction}_bit_error_rate": rate}, baud=3_000_000)
     size, count = 100, 2000
     for number in range(count):
-        bench.uplink(number * 1000, bytes(size))
-        bench.write(number * 1000, bytes(size))
+        bench.uplink(number * 1000, b"\x5a" * size)
+        bench.write(number * 1000, b"\x5a" * size)
     bench.run()
     bits = {
-        "uplink": np.unpackbits(np.frombuffer(joined(bench.on_board), np.uint8)),
-        "downlink": np.unpackbits(np.frombuffer(joined(bench.on_ground), np.uint8)),
+        "uplink": np.unpackbits(np.frombuffer(joined(bench.on_board), np.uint8) ^ 0x5A),
+        "downlink": np.unpackbits(np.frombuffer(joined(bench.on_ground), np.uint8) ^ 0x5A),
     }
     total = 8 * size * count
     wrong = bits.pop(direction)

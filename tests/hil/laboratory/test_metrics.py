@@ -10,17 +10,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_py.geometry import from_euler_zyx, in_goal_frame, to_euler_zyx, yaw_quaternion
+from firmware_py.wire.supervisor import State
 from hil.errors import LabError
 from hil.laboratory.experiments import measures
+from hil.laboratory.metric_pairs import MetricPair, differing, pairs_of, text_of
 from hil.laboratory.metrics import (
     ALWAYS,
     METRICS,
     PHASES,
     _time_seen,
     attitude_error,
+    judge,
     limits_of,
     measure,
     position_error,
+    short_of,
     show,
 )
 
@@ -62,7 +66,7 @@ def test_metrics_count_from_the_release_to_the_end() -> None:
         "estimator.too_old": [1] * 15,
         "estimator.invalid": range(15),
         "tracker.refused": range(0, 30, 2),
-        "estimator.pose_age_us": [*4 * [0], *11 * [40_000]],
+        "estimator.pose_age_us": [*4 * [0], *10 * [40_000], 51_000],
         "loop.delay": [*4 * [0], *11 * [2_000]],
         "loop.added": [*4 * [0], *11 * [5_000]],
         "loop.stood": [1_000_000 * second for second in range(15)],
@@ -79,7 +83,7 @@ def test_metrics_count_from_the_release_to_the_end() -> None:
             "lost": 0.0, "flown": 10.0, "rms_x": rms_x, "rms_y": rms_y,
             "rms_z": np.sqrt((0.11**2 + 0.06**2 + 0.1**2) / 11), "max_x": 0.3, "max_y": 0.2, "max_z": 0.11,
             "within_6cm_x": 10 / 11, "within_6cm_y": 10 / 11, "within_6cm_z": 8 / 11, "in_box": 8 / 11,
-            "attitude_max": 0.2, "y_over_x": rms_y / rms_x, "age_mean": 0.04, "failsafe": 10.0 * 2 / 11,
+            "attitude_max": 0.2, "y_over_x": rms_y / rms_x, "age_mean": 0.041, "failsafe": 10.0 * 2 / 11,
             "resets": 0.0, "uncontrolled": 10.0 * 5 / 11, "unseen": 0.0, "line_up": 0.1, "line_down": 0.5,
             "line_overrun": 7.0, "poses_refused": 2 + 1 + 14, "frames_refused": 28.0, "loop_delay": 0.002,
             "loop_added": 0.005, "loop_stood": 14.0, "samples_held": 1.0, "samples_late": 2.0,
@@ -87,6 +91,9 @@ def test_metrics_count_from_the_release_to_the_end() -> None:
         }
     )  # fmt: skip
     assert told.keys() <= METRICS.keys()
+    calibrates = [*5 * [2], *4 * [State.CALIBRATING], *3 * [2], *3 * [State.CALIBRATING]]
+    booted = table.set_column(table.column_names.index("supervisor.state"), "supervisor.state", [calibrates])
+    assert (measure(booted, lost=False)["resets"], measure(booted, False, resets=5)["resets"]) == (2.0, 5.0)
     short = measure(table.slice(0, 5), lost=True)  # a single row is free
     assert {name: value for name, value in short.items() if not np.isnan(value)} == {
         "lost": 1.0,
@@ -104,14 +111,19 @@ def test_a_flight_from_floor_to_floor_is_judged_by_its_phases() -> None:
         "truth.vz": np.gradient(height, 0.1), "truth.y": 0.3 * (times == 500_000) + 0.04 * (times == 5_000_000),
         "supervisor.state": 2 * np.ones(51), **{f"estimate.{name}": times for name in "xyzpqr"},
     }  # fmt: skip
-    zero = ("truth.x", "goal.x", "goal.y", "goal.yaw", "truth.qx", "truth.qy", "truth.qz")
+    log["truth.vz"][[29, 32]] = -2.0, -1.5  # 1.1 and 0.8 s before the feet touch
+    log["truth.x"] = 0.01 * (times == 1_500_000) + 0.02 * (
+        times == 2_000_000
+    )  # first held row, first of the landing
+    zero = ("goal.x", "goal.y", "goal.yaw", "truth.qx", "truth.qy", "truth.qz")
     table = pa.table({**log, **{name: np.zeros(51) for name in zero}})
     phases = {"take_off_us": 0, "begin_us": 1_500_000, "land_us": 2_000_000, "landed_us": 4_000_000}
     values = measure(table.replace_schema_metadata({PHASES: json.dumps(phases)}), lost=False)
     assert (values["max_z"], values["rms_z"], values["in_box"]) == (0.0, 0.0, 1.0)
     assert values["held"] == pytest.approx(0.5)
     assert values["reached_box"] == pytest.approx(0.9)
-    assert values["touch_down_speed"] == pytest.approx(0.98)
+    assert values["touch_down_speed"] == pytest.approx(1.5), "of the last ten rows"
+    assert values["max_x"] == pytest.approx(0.01)
     assert values["off_path"] == pytest.approx(0.3)
     assert values["landed_off_axis"] == pytest.approx(0.04)
     assert measure(table, lost=False)["max_z"] == pytest.approx(1.0), "all of a flight without phases"
@@ -137,7 +149,55 @@ def test_a_second_counts_as_flown_when_both_its_ends_were_seen(
 def test_a_profile_s_limits_replace_those_of_the_experiment_and_of_every_flight() -> None:
     assert limits_of({"rms_x": 1.0}) == {"rms_x": 1.0, **ALWAYS}
     assert limits_of({"rms_x": 1.0, "resets": 2.0}) == {"rms_x": 1.0, **ALWAYS, "resets": 2.0}
+    assert limits_of({"resets": 2.0}, {"rms_y": 2.0}) == {"rms_y": 2.0, **ALWAYS, "resets": 2.0}
     assert limits_of({"rms_x": 1.0}, {"rms_y": 2.0, "unseen": 3.0}) == {"rms_y": 2.0, **ALWAYS, "unseen": 3.0}
+
+
+@pytest.mark.parametrize(("lost", "admitted", "applies"), [
+    (0.0, None, True), (1.0, None, False), (1.0, 0.0, False), (1.0, 1.0, True), (0.0, 1.0, True),
+])  # fmt: skip
+def test_a_lost_flight_fails_all_limits_unless_the_loss_is_admitted(lost, admitted, applies) -> None:
+    limits = {"rms_x": 0.5, "in_box": 0.9} | ({} if admitted is None else {"lost": admitted})
+    good = judge({"lost": lost, "rms_x": 0.5, "in_box": 0.9}, limits, {})  # each at its bound
+    assert [(one.metric, one.holds, one.applies) for one in good[:2]] == [
+        ("rms_x", applies, applies),
+        ("in_box", applies, applies),
+    ]
+    assert [one.holds for one in good[2:]] == ([] if admitted is None else [lost <= admitted])
+    bad = judge({"lost": lost, "rms_x": 0.5001, "in_box": np.nan}, limits, {})
+    assert [one.mark for one in bad[:2]] == ["FAILS" if applies else "lost"] * 2
+
+
+def test_a_share_names_its_time_where_that_is_more_than_a_tenth_of_a_second_short() -> None:
+    share, values = METRICS["in_box"], {"flown": 7.9, "held": np.nan}
+    assert [short_of(share, 1.0, values, duration_s) for duration_s in (7.9, 7.99, 8.1)] == [
+        "",
+        "",
+        " of 7.9 s",
+    ]
+    assert short_of(share, 1.0, {"flown": 7.9, "held": 3.0}, 8.0) == " of 3 s"
+    assert short_of(METRICS["rms_x"], 1.0, values, 60.0) == short_of(share, np.nan, values, 60.0) == ""
+
+
+def test_two_flights_are_compared_in_every_metric_that_one_of_them_has() -> None:
+    pairs = pairs_of(
+        {"rms_x": 0.01, "in_box": 0.5, "lost": 0.0}, {"rms_x": 0.02, "in_box": 0.25, "rms_y": 0.5}, {}
+    )
+    named = {one.name: one for one in pairs}
+    assert list(named) == ["lost", "rms_x", "rms_y", "in_box"]  # in the order of all metrics
+    assert named["rms_x"].cells == ("rms_x", "1", "2", "1", "cm")
+    assert named["in_box"].cells == ("in_box", "50", "25", "-25", "%")
+    assert named["lost"].cells[1:4] == ("0", "–", "–")
+    assert {one.name for one in differing(pairs)} == {"lost", "rms_x", "rms_y", "in_box"}
+    assert differing(pairs_of({"rms_x": 0.01}, {"rms_x": 0.01}, {})) == []
+    near = (("rms_x", 0.99), ("rms_x", 1.0), ("in_box", 0.5), ("in_box", 0.49))
+    assert [named[name].within(rel) for name, rel in near] == [False, True, True, False]
+    assert not named["rms_y"].within(10.0)
+    assert MetricPair("never", "s", (np.inf, np.inf)).within(0.0)
+    assert text_of([named["rms_x"]]) == [
+        "metric  first  second  difference  unit",
+        "rms_x       1       2           1  cm",
+    ]
 
 
 def test_what_never_happens_is_shown_as_never() -> None:

@@ -102,6 +102,9 @@ def test_a_prober_is_answered_and_changes_nothing(
     board.read(1)
     assert prober.recv(64) == null
     assert (board.received, board.server.ignored, board.said) == ([b"\xf0a"], 0, [])
+    first.send(null + b"\x01")  # more than a header is a packet
+    board.read(2)
+    assert board.received[1:] == [null + b"\x01"]
 
 
 @pytest.mark.parametrize(

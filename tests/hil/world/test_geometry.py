@@ -115,6 +115,7 @@ IMPOSSIBLE: Mapping[str, str] = {
     "geometry.base_side=0.3": r"base_side = 0\.3: leaves no flaps inside footprint = 0\.23",
     "geometry.strip_width=0.08": r"strip_width = 0\.08: leaves no flat part of the flap, which is 0\.075 wide",
     "geometry.outline=[[-0.01, 0.05], [0.115, 0.0], [0.115, 0.115]]": r"outline\[0\] = \(-0\.01, 0\.05\): .* overlap",
+    "geometry.outline=[[0.05, 0.05], [0.115, -0.01], [0.115, 0.115]]": r"outline\[1\] = \(0\.115, -0\.01\): .* overlap",
     "geometry.outline=[[0.05, 0.05], [0.125, 0.0], [0.115, 0.115]]": r"outline\[1\] = .* outside footprint / 2",
     "geometry.outline=[[0.05, 0.0], [0.115, 0.0], [0.06, 0.03], [0.04, 0.11]]": "not convex",
     "geometry.outline=[[0.05, 0.0], [0.1, 0.0]]": "2 corners: expected three",

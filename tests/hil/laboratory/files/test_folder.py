@@ -14,6 +14,7 @@ from hil import LabError, fly, load_run
 from hil.api import request_of
 from hil.laboratory.files.folder import folder_of, reserved
 from hil.laboratory.files.recorder import PARQUET
+from hil.laboratory.files.whole_files import write_whole
 from support.command import Cli
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -178,3 +179,12 @@ def test_a_second_flight_into_a_folder_is_refused_until_the_first_ends_or_is_kil
         assert os.listdir("shared") == []
         other.kill()
     assert fly("hover", "shared", duration_s=SHORT).folder == Path("shared")
+
+
+def test_a_link_to_a_file_stays_a_link_when_the_file_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path / "elsewhere" / "file")
+    for text in ("first", "second"):
+        write_whole(link, text)
+        assert (link.is_symlink(), (tmp_path / "elsewhere" / "file").read_text()) == (True, text)

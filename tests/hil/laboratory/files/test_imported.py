@@ -15,8 +15,11 @@ from mcap_ros2.writer import Writer as Ros2Writer
 from scipy.spatial.transform import Rotation
 
 from hil import LabError, column, fly, load_run
+from hil.laboratory.files.alignment import released_like
 from hil.laboratory.files.imported import import_log
+from hil.laboratory.files.joined import Joined, join
 from hil.laboratory.files.log_map import Map
+from hil.laboratory.files.tables import Table
 from hil.pictures.viewer.recording import recording_of
 from support.command import Cli
 
@@ -43,7 +46,8 @@ def place(x: str, y: str, z: str, scale: float = 1.0) -> dict[str, Any]:
 
 
 STOCK = {
-    "Timestamp": 1e3 * T + 5000, **place("stateEstimate.x", "stateEstimate.y", "stateEstimate.z"),
+    "Timestamp": 1e3 * T + 5000, **place("kalman.stateX", "kalman.stateY", "kalman.stateZ", 3.0),
+    **place("stateEstimate.x", "stateEstimate.y", "stateEstimate.z"),
     "stateEstimate.roll": DEGREES[:, 0], "stateEstimate.pitch": -DEGREES[:, 1], "stateEstimate.yaw": DEGREES[:, 2],
     "pm.vbat": np.full(ROWS, 3.9),
 }  # fmt: skip
@@ -126,6 +130,24 @@ def test_the_release_is_where_the_path_fits_that_of_another_flight(cli: Cli, tmp
     assert "there is no such run folder" in cli.err
 
 
+@pytest.mark.parametrize("offset_us", [0, 3_000, 7_000, 11_000, 16_000])
+@pytest.mark.parametrize("later_s", [0.0, 2.4])
+def test_the_best_fit_is_found_between_the_steps_of_the_search(offset_us: int, later_s: float) -> None:
+    def path(t_us: np.ndarray) -> dict[str, np.ndarray]:
+        t = 1e-6 * t_us
+        return {"x": np.sin(2.0 * t) + 0.3 * np.sin(7.0 * t), "y": np.cos(3.0 * t), "z": 0.1 * t}
+
+    since_us, begin_us = 10_000.0 * np.arange(600), 5_000_000 + offset_us
+    flown = {"t": since_us + 1_000_000, "flight.free": np.ones(600)}
+    like = pa.table(flown | {f"truth.{axis}": values for axis, values in path(since_us).items()})
+    t_us = begin_us + 1e6 * later_s + 10_000.0 * np.arange(600)  # the log may begin long after the release
+    joined = Joined(
+        t_us, {axis: 2.0 + values for axis, values in path(t_us - begin_us).items()}, {}, "t [us]"
+    )
+    chosen = Map(columns={f"cameras.{axis}": f"{axis} [m]" for axis in "xyz"})
+    assert released_like("log", joined, chosen, like).release_s == pytest.approx(1e-6 * begin_us, abs=0.0021)
+
+
 def test_a_telemetry_log_of_mavlink_is_in_the_world_s_frame(cli: Cli, tmp_path: Path) -> None:
     run = fly("hover", tmp_path / "run", duration_s=0.4, overrides={"flight.home": (0.02, 0.03, 1.15)})
     assert cli("export", tmp_path / "run", "--tlog") == 0
@@ -196,6 +218,39 @@ def test_a_map_chooses_scales_turns_and_releases(tmp_path: Path) -> None:
     assert log.column("goal.x")[3].as_py() == 0.25
     assert log.column("flight.free").to_numpy().tolist() == [0] * 10 + [1] * (ROWS - 10)
     assert log.schema.metadata[b"release_us"] == b"200000"
+
+
+@pytest.mark.parametrize(
+    ("step", "unit"), [(0.5, "s"), (0.0005, "s"), (0.6, "ms"), (500.0, "ms"), (501.0, "us"), (5e5, "us")]
+)
+def test_times_without_a_unit_have_that_of_a_usual_step(step: float, unit: str) -> None:
+    t = step * np.array([0, 0, 0, 0, 1, np.inf, 1, 2, np.nan, 3])  # repeated, and some that are no times
+    joined = join("log", [Table({"t": t, "x": np.arange(10.0)}, ())], None)
+    assert joined.clock == f"t [{unit}]"
+    assert joined.columns["x"].tolist() == [0.0, 4.0, 7.0, 9.0]
+    assert joined.notes == ["6 rows whose t does not advance are left out"]
+
+
+def test_a_clock_from_the_release_releases_at_its_zero(tmp_path: Path) -> None:
+    path = csv(tmp_path / "log.csv", {"time from the release [s]": T - 0.2, **place("x", "y", "z")})
+    log = import_log([path], tmp_path).log
+    assert log.column("flight.free").to_numpy().tolist() == [0] * 10 + [1] * (ROWS - 10)
+
+
+@pytest.mark.parametrize("size", [0.89, 1.11])
+def test_a_quaternion_is_of_unit_length_to_a_tenth(tmp_path: Path, size: float) -> None:
+    def columns(scale: float) -> dict[str, Any]:
+        return {f"q{part}": scale * QUATERNIONS[:, index] for index, part in enumerate("wxyz")}
+
+    for scale in (0.91, 1.09):
+        import_log(
+            [csv(tmp_path / "log.csv", {"t": T, **place("x", "y", "z"), **columns(scale)})],
+            tmp_path / f"{scale}",
+        )
+    with pytest.raises(LabError, match=f"a quaternion of length {size}; expected 1"):
+        import_log(
+            [csv(tmp_path / "log.csv", {"t": T, **place("x", "y", "z"), **columns(size)})], tmp_path / "wrong"
+        )
 
 
 def test_files_are_joined_on_the_rows_of_the_first(tmp_path: Path) -> None:

@@ -204,6 +204,7 @@ def test_a_cell_names_its_failed_flights_first_and_whether_its_fault_happens() -
     happens, size = names.index("fault 1 push.y happens"), names.index("fault 1 push.y size")
     points = np.full((8, len(names)), 0.01)
     points[4:, happens] = 1.0
+    points[7, [size, names.index("actuators.tau")]] = 1.0  # in the last cell, not beyond it
     failed = np.array([False, True, False, True, False, True, True, False])
     weights = np.zeros(len(names))
     weights[[happens, size, names.index("actuators.tau")]] = 2.0, 1.0, -0.6
@@ -219,9 +220,10 @@ def test_a_cell_names_its_failed_flights_first_and_whether_its_fault_happens() -
         point[0, [happens, *drawn.shown]] = 1.0, *place
         shade = next(n for n, path in enumerate(shades.get_paths()) if path.contains_point(place))
         assert shades.levels[shade] <= 100.0 * found.chance(point)[0] <= shades.levels[shade + 1]
-    assert [(one.failed, one.flown) for one in cells.values()] == [(2, 4)], "of those with the fault"
-    (flights,) = (one.flights for one in cells.values())
+    assert [(one.failed, one.flown) for one in cells.values()] == [(2, 3), (0, 1)], "of those with the fault"
+    flights, (last,) = (one.flights for one in cells.values())
     assert [flight[:2] for flight in flights] == [(15, True), (16, True), (14, False)]
+    assert last[:2] == (17, False)
     fault, number = axes(spec)[happens], axes(spec)[size]
     assert (report._range(fault, 0.0, 0.5)[:8], report._range(fault, 0.5, 1.0)[:5]) == ("without ", "with ")
     assert report._ticks(fault) == ([0.0, 1.0], ["without", "with"])

@@ -10,7 +10,15 @@ from scipy import stats
 from hil.config import load_config
 from hil.errors import LabError
 from hil.research.campaigns.config import Distribution, Spec
-from hil.research.campaigns.sampling import axes, check_design, cluster_of, draw, points_of, value_at
+from hil.research.campaigns.sampling import (
+    as_flown,
+    axes,
+    check_design,
+    cluster_of,
+    draw,
+    points_of,
+    value_at,
+)
 from hil.world.floaty.correction import PAPER_TABLE
 from support.campaigns import spec_of
 
@@ -162,3 +170,22 @@ def test_a_campaign_over_seeds_alone_has_no_axes() -> None:
     spec = spec_of(parameters={}, faults=[], flights=3)
     assert axes(spec) == ()
     assert [draw(spec, index).options["seed"] for index in range(3)] == [1, 2, 3]
+
+
+def test_points_as_flown_say_which_faults_happened_and_nothing_of_those_that_did_not() -> None:
+    fault = {"kind": "push.y", "probability": 0.25, "start_s": 1.0, "size": {"uniform": [0.5, 2.0]}}
+    wind = {"tunnel.side_wind": {"uniform": [0.0, 0.1]}}
+    faults = [fault, fault | {"probability": 1.0}]
+    spec = Spec.model_validate(
+        {"experiments": ["hover"], "flights": 64, "faults": faults, "parameters": wind}
+    )
+    drawn = points_of(spec)
+    flown = as_flown(spec, drawn)
+    names = [axis.name for axis in axes(spec)]
+    happens, size = names.index("fault 1 push.y happens"), names.index("fault 1 push.y size")
+    always = names.index("fault 2 push.y size")
+    there = [len(draw(spec, index).options["faults"]) == 2 for index in range(64)]
+    assert 8 < sum(there) < 24
+    assert flown[:, happens].tolist() == [float(one) for one in there]
+    assert np.array_equal(flown[:, size], np.where(there, drawn[:, size], 0.5))
+    assert np.array_equal(flown[:, [always, 0]], drawn[:, [always, 0]])

@@ -36,6 +36,7 @@ PUSH = HOVER + '[[faults]]\nkind = "push.y"\n'
         (HOVER + 'sampling = "halton"', "sampling = 'halton': input should be 'random', 'sobol'"),
         (HOVER + 'stop = "soon"', "stop = 'soon': expected \"failure rate known to ±1 %\""),
         (HOVER + 'stop = "failure rate known to ±0 %"', "above 0 and below 50"),
+        (HOVER + 'stop = "failure rate known to ±50 %"', "above 0 and below 50"),
         (HOVER + "seed = -1", "seed = -1"),
         (TAU + "{ unifrom = [1, 2] }", "did you mean uniform?"),
         (TAU + "{ uniform = [2, 1] }", "expected low < high"),

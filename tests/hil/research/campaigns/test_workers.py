@@ -14,9 +14,10 @@ from distributed import LocalCluster
 from rich.console import Console
 
 from hil.errors import LabError
+from hil.laboratory.request import Options
 from hil.research.campaigns.config import Spec
 from hil.research.campaigns.dataset import Dataset
-from hil.research.campaigns.jobs import Row, fly_job
+from hil.research.campaigns.jobs import Job, Row, failed, fly_job
 from hil.research.campaigns.run import InterimResult, Runner, conduct
 from hil.research.campaigns.sampling import draw, plan_of
 from hil.research.campaigns.workers import DIED, FlyOne, Workers
@@ -189,3 +190,8 @@ def test_the_command_flies_and_resumes(cli: Cli, monkeypatch: pytest.MonkeyPatch
     assert (out / "flights" / "all.parquet").read_bytes() == before, "nothing was left to fly"
     assert cli("campaign", "tiny.toml") == 2
     assert "--resume continues it" in cli.err
+
+
+def test_a_flight_without_a_seed_has_that_of_a_request() -> None:
+    job = Job(0, "hover", Options(), {})
+    assert failed(job, "").columns()["seed"] == job.request().seed == 1

@@ -45,6 +45,18 @@ def found(runner: Any, asked: Aim, tmp_path: Path, rounds: list[Any] | None = No
     return search(VARIED, asked, runner, tmp_path, lambda *round_: (rounds or []).append(round_))
 
 
+@pytest.mark.parametrize("outcome", ["lost", "reset", "error", "interrupted"])
+def test_a_flight_that_was_not_completed_costs_more_than_any(outcome: str) -> None:
+    asked = aim("rms_z", seeds=(1, 2))
+    jobs = [
+        Row(Job(0, "hover", Options(), {}), one, "", True, "", {"rms_z": 0.5}, {})
+        for one in (outcome, "completed")
+    ]
+    assert asked.cost(jobs[1:]) == 0.5
+    assert asked.cost(jobs) == (LOST + 0.5) / 2
+    assert (asked.cost_text(asked.cost(jobs)), asked.cost_text(0.5)) == ("lost", "50 cm")
+
+
 @pytest.mark.parametrize("metric", ["rms_z", "in_box"])  # smallest is best, largest is best
 def test_it_finds_the_best_numbers_and_judges_them_on_other_seeds(tmp_path: Path, metric: str) -> None:
     runner = Runner()

@@ -167,3 +167,17 @@ def test_an_excitation_has_the_same_telemetry_on_every_board_so_gains_are_the_sa
         fly(request, tmp_path / board)
         logs.add((tmp_path / board / "telemetry.csv").read_bytes())
     assert len(logs) == 1
+
+
+def test_hovers_share_a_seed_and_excitations_have_each_their_own(tmp_path: Path) -> None:
+    asked: list[dict[str, Any]] = []
+    runner: Any = SimpleNamespace(log=lambda name, flights, folder: asked.append(flights) or ["row"])
+    flights = TuningFlights(7, "python", tmp_path, runner)
+    flights.hover("after", "mine", ("a=1",), ("b=2",))
+    flights.excitations("mine")
+    hovers, excited = (
+        [(folder, one["seed"], one["board"]) for folder, (_, one) in flown.items()] for flown in asked
+    )
+    assert hovers == [("after", 7, "python"), ("after-1", 7, "python"), ("after-2", 7, "python")]
+    assert [one["overrides"] for _, one in asked[0].values()] == [(), ("a=1",), ("b=2",)]
+    assert excited == [(f"identify-u{n}", 6 + n, "python") for n in (1, 2, 3, 4)]

@@ -1,0 +1,183 @@
+"""The whole life of a station on a simulated clock: lines and their instants, a lost link, and the end."""
+
+from collections.abc import Callable
+from math import inf
+from pathlib import Path
+
+import pytest
+
+from firmware_py.wire.supervisor import State
+from firmware_py.wire.telemetry import Sample
+from ground_station import program
+from ground_station.config import GroundConfig
+from ground_station.errors import LinkError
+from ground_station.latency import LinkLatency
+from ground_station.mocap import MocapFrame
+from ground_station.program import LoopHook, Session, StationSession, fly, run_until
+from ground_station.trajectory import Goal, Offsets, Step, Trajectory
+
+FRAME_US = 20_000
+
+
+class Room:
+    """Clock, cameras and board: blind and lost between instants [s]; it flies from 2 s on, and `says` what happens when."""
+
+    uri = "room"
+    latency = LinkLatency("air", 0, measured=False)
+
+    def __init__(
+        self, blind: tuple[float, float], lost: tuple[float, float], in_failsafe: bool = True
+    ) -> None:
+        self.now_us, self.blind, self.lost, self.ends_in_failsafe = 0, blind, lost, in_failsafe
+        self.says: list[tuple[float, str]] = []
+        self.goals: list[tuple[int, Goal]] = []
+        self.ages_us: list[int] = []  # of the poses, when the link got them
+        self.connects_s = 0.0
+        self._next_us, self._muted_us = 0, inf
+
+    def say(self, text: str) -> None:
+        self.says.append((self.now_us * 1e-6, text))
+
+    def instants(self, begin: str) -> list[float]:
+        return [t_s for t_s, text in self.says if text.startswith(begin)]
+
+    def _in(self, span: tuple[float, float]) -> bool:
+        return span[0] <= self.now_us * 1e-6 < span[1]
+
+    # Cameras
+
+    def receive(self, timeout_or_us: float, data: bytes | None = None) -> MocapFrame | list[Sample] | None:
+        if data is not None:  # of the link
+            return []
+        end_us = self.now_us + round(1e6 * timeout_or_us)
+        if self._in(self.blind):
+            self._next_us = max(self._next_us, end_us // FRAME_US * FRAME_US + FRAME_US)
+        if self._next_us > end_us:
+            self.now_us = end_us
+            return None
+        self.now_us, exposed_us = max(self.now_us, self._next_us), self._next_us
+        self._next_us += FRAME_US
+        return MocapFrame(exposed_us, (0.0, 0.0, 1.15), (1.0, 0.0, 0.0, 0.0), True)
+
+    # Link
+
+    def open(self, give_up: Callable[[], bool]) -> None:
+        self.say("opened")
+        for _ in range(12):
+            self.now_us += round(1e6 * self.connects_s) // 12
+            assert not give_up()
+        if self._in(self.lost):
+            raise LinkError("not there")
+        self._muted_us = inf
+
+    def check(self) -> None:
+        if self._in(self.lost):
+            raise LinkError(f"lost at {self.now_us * 1e-6:.0f} s")
+
+    @property
+    def supervisor_state(self) -> State | None:
+        if self.now_us > self._muted_us + 500_000 and self.ends_in_failsafe:
+            return State.FAILSAFE
+        if self._muted_us < inf:
+            return None
+        return State.FLYING if self.now_us > 2_000_000 else State.WAITING
+
+    def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
+        self.goals.append((now_us, goal))
+        self.ages_us.append(now_us - frame.t_us)
+
+    def mute(self) -> None:
+        self._muted_us = self.now_us
+
+    def close(self) -> None:
+        self.say("closed")
+
+    def received(self) -> list[tuple[int, bytes]]:
+        return []
+
+    def notices(self) -> list[str]:
+        return []
+
+    def summary(self) -> str:
+        return ""
+
+    def start_telemetry(self, now_us: int) -> None: ...
+
+
+def flown(
+    room: Room,
+    monkeypatch: pytest.MonkeyPatch,
+    until_s: float,
+    hooks: tuple[LoopHook, ...] = (),
+    **more: object,
+) -> Room:
+    def step(home: Goal, start_us: int) -> Trajectory:
+        return Offsets(home, start_us, x=Step(0.1))
+
+    monkeypatch.setattr(program, "clock_us", lambda: room.now_us)
+    monkeypatch.setattr(program, "find_link", lambda uri, settings: room)
+    monkeypatch.setattr(program, "_open_source", lambda mocap, capture: room)
+    stopping = run_until(lambda: False, until_s)
+    fly(GroundConfig(), Session("room", None, step, start_s=1.5, **more), room.say, stopping, hooks)  # type: ignore[arg-type]
+    return room
+
+
+def test_every_line_of_a_station_has_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    turns: list[StationSession] = []
+    room = Room(blind=(10.0, 21.0), lost=(30.0, 33.2))
+    flown(room, monkeypatch, 40.0, (lambda session, now_us: turns.append(session),))
+    near = {"abs": 0.05}
+    assert room.instants("no poses for 5 s") == pytest.approx([15.0, 20.0], **near)
+    again = [33.5, 38.5]
+    assert room.instants("poses ") == pytest.approx([5.0, 10.0, 15.0, 20.0, 25.0, again[1]], **near)
+    assert room.instants("pose ") == room.instants("poses ")  # the budget's line follows
+    assert room.instants("lost at 30 s; connecting again") == pytest.approx([30.0], **near)
+    assert room.instants("opened") == pytest.approx([0.0, *(30.0 + 0.5 * n for n in range(8))], **near)
+    assert room.instants("connected to room") == pytest.approx([0.0, again[0]], **near)
+    assert room.instants("the board is in failsafe") == pytest.approx([40.5], **near)
+    assert room.says[-1][1] == "closed"
+    start_us = turns[0].plan.start_us  # of the first flying state, not of that after the lost link
+    assert start_us == pytest.approx(3_500_000, abs=50_000)
+    moved_us = [now_us for now_us, goal in room.goals if goal.p_WG[0] > 0.05]
+    assert moved_us[0] == pytest.approx(start_us, abs=FRAME_US)
+    assert not [now_us for now_us, goal in room.goals if goal.p_WG[0] < 0.05 and now_us > moved_us[0]]
+
+
+def test_no_pose_is_sent_that_waited_while_the_board_connected(monkeypatch: pytest.MonkeyPatch) -> None:
+    room = Room((inf, inf), (3.0, 3.1))
+    room.connects_s = 1.2
+    flown(room, monkeypatch, 6.0)
+    assert 100 < len(room.ages_us) == sum(age_us < FRAME_US for age_us in room.ages_us)
+
+
+def test_a_link_that_stays_lost_ends_the_flight_after_half_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    room = Room(blind=(inf, inf), lost=(10.0, inf))
+    with pytest.raises(LinkError, match="lost at 10 s"):
+        flown(room, monkeypatch, 100.0)
+    assert room.instants("opened")[-1] == pytest.approx(40.5, abs=0.6)
+
+
+def test_a_board_that_reports_no_failsafe_is_left_after_two_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    room = flown(Room((inf, inf), (inf, inf), in_failsafe=False), monkeypatch, 5.0)
+    assert room.instants("closed")[0] == pytest.approx(7.0, abs=0.05)
+    assert not room.instants("the board is in failsafe")
+
+
+def test_what_happened_to_the_files_of_a_flight_is_said_while_it_flies(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    room = Room((inf, inf), (inf, inf))
+
+    def fails(session: StationSession, now_us: int) -> None:
+        if now_us > 1_000_000:
+            records.write("some file", broken)
+
+    def broken() -> None:
+        raise OSError(28, "")
+
+    records = program.Records()
+    flown(room, monkeypatch, 3.0, (fails,), records=records, record=tmp_path / "frames.csv")
+    assert room.instants("some file: No space left") == pytest.approx([1.02], abs=0.05)
+    assert (tmp_path / "frames.csv").read_text().count("\n") == pytest.approx(
+        177, abs=2
+    )  # 3.5 s with the title
