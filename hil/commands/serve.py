@@ -170,7 +170,7 @@ def _run(
 
     def stopping() -> bool:
         for line in view.lines() if view is not None else ():
-            faults.take(line, server.lab.now_us)
+            faults.execute_line(line, server.lab.now_us)
         return bool(stops) or (client is not None and client.poll() is not None)
 
     others, client = swarm.wait(), None

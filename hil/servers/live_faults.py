@@ -53,12 +53,12 @@ class LiveFaults:
             *lines, rest = (self._rest + data).split(b"\n")
             self._rest = rest[: LINE_MAX + 1]  # what is too long already stays so
             for line in lines:
-                self.take(line.decode(errors="backslashreplace").strip(), now_us)
+                self.execute_line(line.decode(errors="backslashreplace").strip(), now_us)
 
         if os.isatty(descriptor) or not os.path.samestat(os.fstat(descriptor), os.stat(os.devnull)):
             readers[descriptor] = read
 
-    def take(self, line: str, now_us: int) -> None:
+    def execute_line(self, line: str, now_us: int) -> None:
         """Execute a line; answer an invalid line without changing anything."""
         if line == "help":
             for listed in HELP.splitlines():

@@ -161,7 +161,7 @@ def _serve_apart(plan: Service, endpoints: Endpoints, pipe: Connection, room: Sh
     server = Server(plan, calling("say"), None, partial(calling("hear"), plan.number), room)
     faults = LiveFaults(server, calling("answer"))
     calls: dict[str, Call] = {
-        "type": lambda line: faults.take(line, server.lab.now_us),
+        "type": lambda line: faults.execute_line(line, server.lab.now_us),
         "hear": server.hear_peer,
         "end": end,
     }

@@ -138,7 +138,7 @@ def test_the_battery_of_a_served_robot_empties() -> None:
 def live(bench: Bench) -> tuple[Callable[[str], None], list[str]]:
     answers: list[str] = []
     faults = LiveFaults(bench.server, answers.append)
-    return lambda line: faults.take(line, bench.server.lab.now_us), answers
+    return lambda line: faults.execute_line(line, bench.server.lab.now_us), answers
 
 
 def test_a_typed_fault_acts_at_once_and_ends_by_itself() -> None:
