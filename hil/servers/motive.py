@@ -192,7 +192,7 @@ class VirtualMotive:
         for each in (self._socket, *self._groups):
             each.close()
 
-    def take(
+    def stream_frame(
         self,
         body: int,
         frame: MocapFrame,

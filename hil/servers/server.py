@@ -39,12 +39,12 @@ def open_motive(settings: Streaming, robot: Robot, clock: Paced, count: int = 1)
     """Open a Motive that tracks `count` bodies, and a robot as the first."""
     markers = robot.body.markers.places if robot.config.markers.enabled else NO_POINTS
     motive = VirtualMotive(settings, count, clock.readers, markers, robot.config.mocap.period_us)
-    show(robot, clock, partial(motive.take, 1))
+    show(robot, clock, partial(motive.stream_frame, 1))
     return motive
 
 
 def show(robot: Robot, clock: Paced, take: Callable[..., None]) -> None:
-    """Pass a robot's frames of the cameras to `VirtualMotive.take`."""
+    """Pass a robot's frames of the cameras to `VirtualMotive.stream_frame`."""
     robot.seen_by(lambda frame, now_us, sighting: take(frame, now_us, sighting, clock.began_us))
 
 

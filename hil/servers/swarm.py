@@ -76,7 +76,7 @@ class Swarm:
 
         self._calls |= {"answer": answer, "hear": hear}
         if motive is not None:
-            self._calls["take"] = motive.take
+            self._calls["take"] = motive.stream_frame
         for number, pipe in self._pipes.items():
             server.clock.readers[pipe.fileno()] = partial(read, number)
             self._send(number, "type", "")

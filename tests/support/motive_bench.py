@@ -60,7 +60,7 @@ class MotiveBench:
         frame = seen(self.number)
         shown = MocapFrame(7_000_000, frame.p_WB, frame.q_WB, valid, unused=(reason, ()))
         sighting = sighted(self.number, valid) if self.markers else None
-        self.motive.take(1, shown, 7_000_000 + LATENCY_US, sighting)
+        self.motive.stream_frame(1, shown, 7_000_000 + LATENCY_US, sighting)
 
     def answer(self) -> None:
         """Answer what clients have asked by now."""

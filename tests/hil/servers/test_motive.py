@@ -247,8 +247,8 @@ def test_markers_of_all_bodies_share_a_frame_and_are_distinguishable(start) -> N
     lab, client = start(lambda lab: VirtualMotive(one, 2, lab.readers, PLACES))
     client.connect()
     for _ in range(2):  # nothing is left of the frame before
-        lab.motive.take(1, seen(1), 0, sighted(1))
-        lab.motive.take(2, seen(2), 0, sighted(2))
+        lab.motive.stream_frame(1, seen(1), 0, sighted(1))
+        lab.motive.stream_frame(2, seen(2), 0, sighted(2))
         frame = decode(client.hear(), (3, 1))
         assert [marker.id for marker in frame.labelled] == [
             body << 16 | row for body in (1, 2) for row in range(1, 9)
@@ -262,15 +262,15 @@ def test_bodies_of_one_exposure_share_a_frame(start) -> None:
     one = Streaming(0, (3, 1), False)
     lab, client = start(lambda lab: VirtualMotive(one, 2, lab.readers))
     client.connect()
-    lab.motive.take(1, seen(1), 0)
+    lab.motive.stream_frame(1, seen(1), 0)
     assert client.hears_nothing()
-    lab.motive.take(2, seen(2), 0)
+    lab.motive.stream_frame(2, seen(2), 0)
     found = decode(client.hear(), (3, 1)).bodies
     assert [body.id for body in found] == [1, 2]
     client.say(MessageId.REQUEST_MODELDEF)
     assert [body.name for body in decode(client.hear(), (3, 1)).bodies] == ["floaty", "floaty2"]
     lab.motive.lose(2)
-    lab.motive.take(1, replace(seen(1), t_us=1_000_000), 0)
+    lab.motive.stream_frame(1, replace(seen(1), t_us=1_000_000), 0)
     assert [body.valid for body in decode(client.hear(), (3, 1)).bodies] == [True, False]
 
 
@@ -282,7 +282,7 @@ def test_a_body_whose_process_is_late_is_not_tracked_in_one_frame_and_is_in_time
     def expose(body: int, count: int) -> None:
         """Clocks of their own, which began at different times."""
         frame = replace(seen(10 * count + body), t_us=1_000_000 * body + 10_000 * count)
-        lab.motive.take(body, frame, frame.t_us, None, 50_000_000 - 1_000_000 * body)
+        lab.motive.stream_frame(body, frame, frame.t_us, None, 50_000_000 - 1_000_000 * body)
 
     for body in (3, 1):
         expose(body, 1)
