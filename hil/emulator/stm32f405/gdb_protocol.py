@@ -94,7 +94,7 @@ class Framing:
     def __init__(self) -> None:
         self._waiting = b""
 
-    def take(self, data: bytes) -> list[bytes]:
+    def split_packets(self, data: bytes) -> list[bytes]:
         """Return complete items: `$payload` of good packets, `!` for each with a wrong checksum, `+`, `-` and Ctrl-C."""
         received, self._waiting, found = self._waiting + data, b"", []
         for item in ITEM.finditer(received):
@@ -154,7 +154,7 @@ class RemoteProtocol:
 
     def receive(self, data: bytes) -> bytes:
         """Return the answer to received bytes. While the machine runs, packets wait until it stops."""
-        self._items += self._framing.take(data)
+        self._items += self._framing.split_packets(data)
         answers, waiting = b"", []
         for item in self._items:
             if self.request is ResumeRequest.STOP or not item.startswith(b"$"):
