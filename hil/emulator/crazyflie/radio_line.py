@@ -86,7 +86,7 @@ class RadioLine:
 
     def sent(self) -> None:
         """Do what the STM32 has asked for."""
-        for kind, data in self._decoder.take(self._chip.sent(SYSLINK_USART)):
+        for kind, data in self._decoder.decode_frames(self._chip.sent(SYSLINK_USART)):
             self._execute(kind, data)
 
     def _execute(self, kind: int, data: bytes) -> None:

@@ -36,7 +36,7 @@ class Decoder:
         self.broken = 0
         self._bytes = b""
 
-    def take(self, data: bytes) -> Iterator[tuple[int, bytes]]:
+    def decode_frames(self, data: bytes) -> Iterator[tuple[int, bytes]]:
         """Yield type and data of every frame that is whole by now."""
         self._bytes += data
         while (begin := self._bytes.find(START)) >= 0:

@@ -47,7 +47,7 @@ class Line:
         ring = chip.read(inbox.address, inbox.size)
         new = bytes(ring[at % inbox.size] for at in range(self._seen, count))
         self._seen = count
-        return list(self._decoder.take(new))
+        return list(self._decoder.decode_frames(new))
 
     def _at(self, name: str) -> int:
         return self.firmware.image.symbol(name).address

@@ -18,7 +18,9 @@ def test_frames_are_found_in_whatever_pieces_they_come() -> None:
     for size in (1, 2, 3, 7, len(stream)):
         decoder = Decoder()
         found = [
-            f for begin in range(0, len(stream), size) for f in decoder.take(stream[begin : begin + size])
+            f
+            for begin in range(0, len(stream), size)
+            for f in decoder.decode_frames(stream[begin : begin + size])
         ]
         assert found == [(0, b"ab"), (0x13, b""), (0x20, bytes(range(32)))]
         assert decoder.broken == 0
@@ -30,5 +32,8 @@ def test_a_frame_with_a_wrong_bit_is_counted_and_the_next_ones_are_found(place: 
     broken = bytearray(encode(0, b"abcd"))
     broken[place] ^= bit
     decoder = Decoder()
-    assert list(decoder.take(bytes(broken) + encode(1, b"x") + encode(2, b"y"))) == [(1, b"x"), (2, b"y")]
+    assert list(decoder.decode_frames(bytes(broken) + encode(1, b"x") + encode(2, b"y"))) == [
+        (1, b"x"),
+        (2, b"y"),
+    ]
     assert decoder.broken == 1
