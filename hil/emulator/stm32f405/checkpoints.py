@@ -79,7 +79,7 @@ class Checkpoints:
         os.close(held)
         os.close(told)
 
-    def take(self, position: tuple[int, ...], cycles: int) -> Message | None:
+    def leave_copy(self, position: tuple[int, ...], cycles: int) -> Message | None:
         """Leave a copy asleep, and return None; in a copy that is woken, return the message."""
         self._reap()
         ours, theirs = socket.socketpair()

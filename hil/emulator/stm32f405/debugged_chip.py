@@ -132,7 +132,7 @@ class DebuggedChip:
             due = now - last >= PERIOD if self._search is None else self._search.is_due(last, now)
             if not due:
                 return
-        woken = checkpoints.take(here, now)
+        woken = checkpoints.leave_copy(here, now)
         if woken is not None:
             self._server.protocol.restore(woken["debugger"])
             self._request, self._search = ResumeRequest.RUN, Search.of(woken["search"])
