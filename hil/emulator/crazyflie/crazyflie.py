@@ -182,7 +182,7 @@ class Crazyflie:
         if busy is not None and busy[0] not in self._hanging:
             self._hanging.add(busy[0])
             self._report(self._crashes.hang(*busy))
-        for task in self._watch.look() if self._watch is not None else ():
+        for task in self._watch.newly_stopped() if self._watch is not None else ():
             self._report(self._crashes.stopped(task.block, task.silent_us, task.period_us, task.reason))
 
     def _reset(self, cause: int) -> None:

@@ -44,7 +44,7 @@ class TaskWatch:
         ] = {}  # of each task: instants, and how often it had run
         self._reported: set[int] = set()
 
-    def look(self) -> Iterator[StoppedTask]:
+    def newly_stopped(self) -> Iterator[StoppedTask]:
         """Yield the tasks that have stopped since the last look, each once; note which ones have run."""
         state, now_us = self._chip.state, self._chip.now_us
         for index, task in enumerate(state.task[0 : state.task_count]):

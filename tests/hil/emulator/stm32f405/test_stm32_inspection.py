@@ -366,7 +366,7 @@ def test_a_regular_task_that_waits_for_ever_is_named_with_what_it_waits_for(
         found = []
         for ms in range(machine.chip.now_us // MS + 40, end_ms, 40):
             run_to_end(machine, ms)
-            found += watch.look()
+            found += watch.newly_stopped()
         return found
 
     assert not look_until(600)  # FROZEN never ran regularly
