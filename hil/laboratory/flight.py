@@ -69,7 +69,7 @@ class Line(Protocol):
     def listen(self, receive: Callable[[int, bytes], object]) -> None:
         """Pass what the board sends to an operator. Raises `LabError` where the ground station is another program."""
 
-    def look(self, now_us: int) -> list[tuple[str, str]]:
+    def new_messages(self, now_us: int) -> list[tuple[str, str]]:
         """Return the messages since the last call: (source, text)."""
 
     def finish(self, lab: Laboratory) -> None:
@@ -214,7 +214,7 @@ class Flight:
         self._watch_logic(now_us)
         self._watch_estimate(now_us)
         self._note_drops(now_us)
-        for source, text in self.line.look(now_us):
+        for source, text in self.line.new_messages(now_us):
             self.note(source, text)
         for line in self.lab.clock.notices():
             self.note("lab", line)

@@ -184,7 +184,7 @@ class ModelledLine:
             raise LabError("over MAVLink a flight in lockstep has no operator who sets parameters")
         self._receivers.append(receive)
 
-    def look(self, now_us: int) -> list[tuple[str, str]]:
+    def new_messages(self, now_us: int) -> list[tuple[str, str]]:
         lines = self.station.notices()
         if self._pilot is not None:
             lines += self._pilot.notices

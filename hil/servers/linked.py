@@ -139,7 +139,7 @@ class StationProcess:
     def listen(self, receive: Callable[[int, bytes], object]) -> None:
         raise LabError("the ground station is a program of its own: set parameters there")
 
-    def look(self, now_us: int) -> list[tuple[str, str]]:
+    def new_messages(self, now_us: int) -> list[tuple[str, str]]:
         """Raise `LabError` when the station has ended, or nothing flies for too long; return its output."""
         if now_us < WARM_UP_US:
             return []
