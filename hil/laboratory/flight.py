@@ -259,7 +259,7 @@ class Flight:
         else:
             self._early.append((source, text))
 
-    def show(self) -> None:
+    def show_rows(self) -> None:
         """Show who looks on the rows so far."""
         if self._recorder is not None:
             self._recorder.pass_rows()

@@ -51,7 +51,7 @@ class PanelCommands:
             self._flight.lab.clock.pause(lambda: self._wait_paused(now_us))
 
     def _wait_paused(self, now_us: int) -> None:
-        self._flight.show()
+        self._flight.show_rows()
         while self._paused:
             lines = self._view.wait()
             if not lines:  # the panel has gone
@@ -73,7 +73,7 @@ class PanelCommands:
             return
         self._flight.note(OPERATOR, line)
         if self._paused:
-            self._flight.show()
+            self._flight.show_rows()
 
     def _do(self, word: str, rest: str, now_us: int) -> None:
         if word in ("pause", "step") and not self._lockstep:
