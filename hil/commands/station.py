@@ -173,7 +173,7 @@ class OperatorConsole:
             for line in view.lines() if view is not None else ():
                 operator.queue_line(line)
 
-        return [take_lines] if self.flight is None else [take_lines, self.flight.turn]
+        return [take_lines] if self.flight is None else [take_lines, self.flight.on_loop]
 
 
 def _check_files(asked: StationOptions) -> None:

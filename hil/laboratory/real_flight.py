@@ -99,7 +99,7 @@ class RealFlight:
         """The current time by the log's clock."""
         return self._now_us - self._start_us
 
-    def turn(self, session: StationSession, now_us: int) -> None:
+    def on_loop(self, session: StationSession, now_us: int) -> None:
         """Record a row when it is due."""
         if now_us < self._next_us:
             return

@@ -103,7 +103,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     plan = FlightPlan(HOME, experiment.trajectory)
     plan.start(CONFIG.flight.release_us)
     session = StationSession(Link(flight.line.station), flight.line.station, plan)  # type: ignore[arg-type, attr-defined]
-    flight.events.every(TURN_US, TURN_US, lambda now_us: record.turn(session, now_us))
+    flight.events.every(TURN_US, TURN_US, lambda now_us: record.on_loop(session, now_us))
     flight.run(recorder=recorder)
     recorder.close()
     flight.close()
@@ -254,7 +254,7 @@ class StationBench:
         while self.now_us < end_us:
             self.now_us += TURN_US
             self.ground.on_frame(MocapFrame(self.now_us - AGE_US, p, (1.0, 0.0, 0.0, 0.0), True), self.now_us)
-            self.record.turn(self.session, self.now_us)
+            self.record.on_loop(self.session, self.now_us)
 
     def result(self, **how: Any) -> Result:
         result = self.record.close(**how)
@@ -298,7 +298,7 @@ def test_time_without_poses_is_not_flown_and_fails_its_limit(tmp_path: Path, com
     end_us = bench.now_us + 3_500_000
     while bench.now_us < end_us:
         bench.now_us += TURN_US
-        bench.record.turn(bench.session, bench.now_us)
+        bench.record.on_loop(bench.session, bench.now_us)
     if comes_back:
         bench.fly(1.0)
     result = bench.result()
@@ -391,7 +391,7 @@ def test_slow_cameras_do_not_make_more_than_a_second_be_lost(tmp_path: Path) -> 
     bench = StationBench(tmp_path / "run")
     for _ in range(32):
         bench.now_us += 95_000
-        bench.record.turn(bench.session, bench.now_us)
+        bench.record.on_loop(bench.session, bench.now_us)
     left = Path(shutil.copytree(tmp_path / "run", tmp_path / "left"))
     bench.record.close()
     assert load_log(left).column("t")[-1].as_py() > 32 * 95_000 - 1_100_000
