@@ -71,14 +71,16 @@ class Paced:
     `STALL_US` of the wall clock and stalls for multiples of it, so that cameras in several processes expose together.
     `readers` are called with the time when their socket or file descriptor is readable.
 
-    Clocks of several processes stand still together: each writes its total to its own place in the shared `pauses` and
-    waits until it has paused as long as the one that paused longest.
+    Clocks of several processes stand still together: each writes its total to its own place in the shared `pauses`, and
+    pauses so that none is more than `APART_US` behind the longest. With less room than that, the hitch of one process
+    would stop all of them.
     """
 
     paced = True
 
     SLACK_US = 1000  # do not sleep for less than this
     STALL_US = 20_000
+    APART_US = 100_000  # a multiple of STALL_US
     NOTICE_PERIOD_US = 1_000_000  # of simulated time between lines
 
     def __init__(self, pauses: "memoryview[int] | None" = None, index: int = 0) -> None:
@@ -128,7 +130,7 @@ class Paced:
         if self._start_ns is None:
             self.start(now_us)
         late_us = self.late_us(now_us)
-        pause_us = max(self._pauses) - self.stood_still_us
+        pause_us = max(0, max(self._pauses) - self.APART_US - self.stood_still_us)
         if late_us - pause_us > self.STALL_US:
             pause_us += (late_us - pause_us) // self.STALL_US * self.STALL_US
         if pause_us:

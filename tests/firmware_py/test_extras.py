@@ -9,7 +9,6 @@ from importlib.metadata import PackageNotFoundError
 import pytest
 from packaging.requirements import Requirement
 
-from firmware_py import extras
 from firmware_py.extras import install_command
 from support.paths import ROOT
 
@@ -35,7 +34,7 @@ def test_without_an_installation_the_command_installs_the_clone(monkeypatch: pyt
     def requires(name: str) -> list[str]:
         raise PackageNotFoundError(name)
 
-    monkeypatch.setattr(extras, "requires", requires)
+    monkeypatch.setattr("importlib.metadata.requires", requires)
     *_, option, place = shlex.split(install_command("view"))
     assert (option, place) == ("--editable", f"{ROOT}[view]")
 

@@ -8,6 +8,7 @@ from types import ModuleType
 from hil.errors import LabError, blame, refusing
 
 _LOADED: dict[Path, tuple[str, ModuleType]] = {}  # with the hash of the executed text
+_FOLDERS: set[str] = set()  # of such files, last in `sys.path`, the latest of them first
 
 
 def load_file(what: str, path: Path) -> tuple[ModuleType, str]:
@@ -22,8 +23,7 @@ def load_file(what: str, path: Path) -> tuple[ModuleType, str]:
     name = f"floaty_own_{place.stem}_{hashlib.sha256(str(place).encode()).hexdigest()[:12]}"
     module = ModuleType(name)
     module.__file__ = str(place)
-    if str(place.parent) not in sys.path:
-        sys.path.append(str(place.parent))
+    _prefer(place.parent)
     sys.modules[name] = module  # pickled objects refer to it
     try:
         exec(compile(content, place, "exec"), vars(module))
@@ -31,3 +31,18 @@ def load_file(what: str, path: Path) -> tuple[ModuleType, str]:
         raise LabError(f"{what} {path}: {blame(error)}") from error
     _LOADED[place] = digest, module
     return module, digest
+
+
+def _prefer(folder: Path) -> None:
+    """Let a file of a folder import what is beside it, not modules of the same names beside a file of another folder."""
+    for beside in folder.glob("*.py"):
+        imported = Path(getattr(sys.modules.get(beside.stem), "__file__", None) or beside)
+        if imported != beside and str(imported.parent) in _FOLDERS:
+            del sys.modules[beside.stem]
+    own = str(folder)
+    if own in _FOLDERS:
+        sys.path.remove(own)
+    elif own in sys.path:
+        return
+    _FOLDERS.add(own)
+    sys.path.insert(next((i for i, path in enumerate(sys.path) if path in _FOLDERS), len(sys.path)), own)

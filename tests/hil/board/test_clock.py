@@ -86,19 +86,18 @@ def test_clocks_of_several_processes_stand_still_together(wall: Wall) -> None:
     for paced in clocks:
         paced.start(0)
     wall.us += 111_000
-    clocks[1].wait_until(10_000)  # 101 ms late: it stalls for 100 ms, and the others are early by 99 ms then
-    assert (list(pauses), wall.us - clocks[1].now_us()) == ([0, 100_000, 0], clocks[1].began_us)
-    for paced in (clocks[0], clocks[2], clocks[1]):
-        paced.wait_until(20_000)
-        assert paced.now_us() == 20_000
-    assert [paced.stood_still_us for paced in clocks] == [100_000] * 3
+    for paced, total_us in ((clocks[1], 100_000), (clocks[0], 0)):  # 101 ms late; 1 ms late after catching up
+        paced.wait_until(10_000 if total_us else 110_000)
+        assert paced.stood_still_us == total_us
+    wall.us += 85_000
+    clocks[1].wait_until(20_000)
+    assert list(pauses) == [0, 160_000, 0]
+    began_us = wall.us
+    clocks[2].wait_until(150_000)  # 46 ms late, and 60 ms are the pause of the one that is 100 ms ahead
+    assert (list(pauses), wall.us - began_us) == ([0, 160_000, 60_000], 14_000)
     wall.us += 45_000
-    clocks[2].wait_until(20_000)  # 45 ms late: 40 ms more
-    assert [clocks[2].stood_still_us, clocks[2].standstill_us(20_000)] == [140_000] * 2
-    wall.us += 60_000
-    clocks[0].wait_until(20_000)  # 105 ms late, of which 40 are the other's
-    clocks[2].wait_until(125_000)
-    assert list(pauses) == [200_000, 100_000, 200_000]
+    clocks[0].wait_until(120_000)  # 135 ms late, of which 60 are the other's and 60 its own
+    assert (list(pauses), clocks[0].standstill_us(120_000)) == ([120_000, 160_000, 60_000], 120_000)
 
 
 def test_input_that_comes_before_time_starts_is_not_in_the_past(wall: Wall) -> None:

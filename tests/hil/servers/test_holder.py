@@ -7,7 +7,7 @@ import pytest
 
 from firmware_py.wire.supervisor import State
 from hil.emulator.events import EventQueue
-from hil.servers.holder import LaunchClamp
+from hil.servers.server import LaunchClamp
 
 
 def clamped(**more: Any) -> tuple[Any, list[int], LaunchClamp]:

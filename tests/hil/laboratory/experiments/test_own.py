@@ -21,6 +21,7 @@ from hil.laboratory.experiments import EXPERIMENTS, find_again, find_experiment
 from hil.laboratory.experiments.own import in_file, load_file
 from hil.laboratory.fault_kinds import KINDS, Kind, declare
 from hil.laboratory.faults import parse
+from hil.laboratory.files.own_files import load_file
 from hil.laboratory.files.recorder import load_log
 from hil.laboratory.files.result import read_result
 from hil.laboratory.request import Request
@@ -400,3 +401,17 @@ def test_a_separate_station_is_not_sent_unknown_trajectories(experiment: Experim
     request = Request.of(experiment, link="udp://127.0.0.1:19850")
     with pytest.raises(LabError, match="its trajectory must stand in a file or a package"):
         linked_flight(request, tmp_path / "telemetry.csv", ExitStack())
+
+
+def test_each_file_imports_the_module_that_is_beside_it(tmp_path: Path) -> None:
+    """Two projects have files of the same names; the first one is read again after the second."""
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "beside_own.py").write_text(f"NAME = {name!r}\n")
+        (tmp_path / name / "own.py").write_text("from beside_own import NAME\n")
+    found = [load_file("--experiment", tmp_path / name / "own.py")[0].NAME for name in ("first", "second")]
+    (tmp_path / "first" / "own.py").write_text("from beside_own import NAME\nagain = NAME\n")
+    found.append(load_file("--experiment", tmp_path / "first" / "own.py")[0].again)
+    assert found == ["first", "second", "first"]
+    places = [str(tmp_path / name) for name in ("first", "second")]
+    assert [path for path in sys.path if path in places] == places
