@@ -21,7 +21,6 @@ from hil.laboratory.experiments import EXPERIMENTS, find_again, find_experiment
 from hil.laboratory.experiments.own import in_file, load_file
 from hil.laboratory.fault_kinds import KINDS, Kind, declare
 from hil.laboratory.faults import parse
-from hil.laboratory.files.own_files import load_file
 from hil.laboratory.files.recorder import load_log
 from hil.laboratory.files.result import read_result
 from hil.laboratory.request import Request
