@@ -1,6 +1,7 @@
 """What the processes of served robots share: memory in which each robot has a row and a total of its pauses.
 
-So the robots of `floaty serve --boards N` feel one another, and time stands still for all of them together.
+So time stands still for all robots of `floaty serve --boards N` together, and in still air they feel one another. Where fans
+blow, each has a tunnel of its own.
 """
 
 from mmap import mmap
@@ -20,10 +21,11 @@ class SharedRoom:
     def __init__(self, config: LabConfig, count: int = 1) -> None:
         self.pauses = memoryview(mmap(-1, 8 * count)).cast("q")  # [us] of each clock
         self.rows = np.frombuffer(mmap(-1, 8 * count * ROW)).reshape(count, ROW)
-        self._neighbourhood = Neighbourhood(config.swarm, count, config.tunnel.fan_factor == 0.0)
+        self._is_one = count > 1 and config.tunnel.fan_factor == 0.0
+        self._neighbourhood = Neighbourhood(config.swarm, count, self._is_one)
 
     def join(self, number: int, robot: Robot) -> None:
-        """Let robot `number` of this process act on the others, and feel them, while it is free."""
+        """Let robot `number` of this process act on the others of one room, and feel them, while it is free."""
 
         def exchange(now_us: int) -> None:
             self.rows[index] = row_of(robot, now_us) if robot.free else ABSENT
@@ -31,7 +33,7 @@ class SharedRoom:
             self._neighbourhood.act_on(index, robot)
 
         index = number - 1
-        if len(self.rows) > 1:
+        if self._is_one:
             robot.events.every(PERIOD_US, PERIOD_US, exchange)
 
     def leave(self, number: int) -> None:

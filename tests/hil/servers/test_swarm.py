@@ -18,6 +18,7 @@ from hil.laboratory.faults import parse
 from hil.servers.dongle_plugin import CONTROL, VARIABLE, WRITE, Connection, frame
 from hil.servers.dongle_server import AHEAD
 from hil.servers.server import Endpoints, Server, Service
+from hil.servers.shared_room import SharedRoom
 from hil.servers.swarm import Swarm
 from support.serving import PATIENCE_S, Served, serve
 
@@ -229,3 +230,14 @@ def test_robots_of_several_processes_that_touch_push_each_other_apart(radius: fl
                 assert np.diff(y).min() > 0.13
             swarm.room.leave(2)
             assert not swarm.room.rows[1].any()
+
+
+@pytest.mark.parametrize(("profile", "share"), [("crazyflie", True), ("floaty", False)])
+def test_robots_share_a_room_in_still_air_only(profile: str, share: bool) -> None:
+    """Where fans blow all fly at the same home, each in a tunnel of its own."""
+    config = load_config(profile)
+    room = SharedRoom(config, 2)
+    with closing(Server(Service(config), print, None, room=room)) as server:
+        server.robot.release()
+        server.run(lambda: server.lab.now_us > 20_000)
+    assert room.rows[:, 0].tolist() == [float(share), 0.0]
