@@ -45,8 +45,10 @@ def build(
     if result.is_file():
         return result
     place.mkdir(parents=True, exist_ok=True)
-    for name, text in texts.items():
-        (place / name).write_text(text, encoding="utf-8")
+    for name, text in texts.items():  # replaced, not written over: the compiler of another process has it mapped
+        fresh = place / f"{name}.{os.getpid()}"
+        fresh.write_text(text, encoding="utf-8")
+        fresh.replace(place / name)
     partial = f"firmware.{os.getpid()}"
     cache = {"ZIG_LOCAL_CACHE_DIR": str(BUILD / "zig"), "ZIG_GLOBAL_CACHE_DIR": str(BUILD / "zig")}
     ran = subprocess.run(
