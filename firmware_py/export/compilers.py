@@ -16,8 +16,6 @@ from firmware_py.export.errors import CompilerError
 from firmware_py.extras import install_command
 from firmware_py.kept_code import kept_folder, may_load
 
-ATTEMPTS = 3  # clang itself crashed once (SIGBUS) in a run of all tests
-
 SYSTEM_COMPILERS = ("gcc", "clang", "cc")
 LIBRARY_FLAGS = (
     "-shared",
@@ -97,15 +95,14 @@ def compile_texts(
         return result
     partial = f"{output}.{os.getpid()}"  # another process may write it, too
     try:
+        # Replaced, not written over: the compiler of another process may have the old file mapped.
         for name, text in texts.items():
-            (place / name).write_text(text, encoding="utf-8")
+            (place / f"{name}.{os.getpid()}").write_text(text, encoding="utf-8")
+            (place / f"{name}.{os.getpid()}").replace(place / name)
     except OSError as error:
         raise CompilerError(f"{place}: cannot be written ({error.strerror or error})") from None
     caches = {name: str(kept_folder("zig")) for name in ("ZIG_LOCAL_CACHE_DIR", "ZIG_GLOBAL_CACHE_DIR")}
-    for _ in range(ATTEMPTS):
-        done = _run((*command, "-o", partial, *inputs), cwd=place, env=os.environ | caches)
-        if "frontend command failed" not in done.stderr:
-            break
+    done = _run((*command, "-o", partial, *inputs), cwd=place, env=os.environ | caches)
     if done.returncode:
         complaints = [line for line in done.stderr.splitlines() if "error" in line]
         raise CompilerError(f"{compiler.name}: {(complaints or [f'exit {done.returncode}'])[0]}")

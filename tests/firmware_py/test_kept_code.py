@@ -12,7 +12,7 @@ from firmware_py import compiling
 from firmware_py.compiling import bound, compiler
 from firmware_py.core.subset import F64s
 from firmware_py.export import kernels
-from firmware_py.export.compilers import compilers
+from firmware_py.export.compilers import compile_texts, compilers
 from firmware_py.export.errors import CompilerError, ExportError
 from firmware_py.export.kernels import library
 from firmware_py.export.live_reading import Arrays
@@ -178,3 +178,15 @@ def test_folders_that_nobody_has_used_for_long_are_deleted() -> None:
     used.touch()
     kept_folder("c", "new")
     assert (old.exists(), used.exists()) == (False, True)
+
+
+def test_sources_are_replaced_where_another_process_may_compile_them() -> None:
+    """A file that is written over while a compiler has it mapped ends that by SIGBUS."""
+    text = "int one(void) { return 1; }\n"
+    first, *_ = compilers()
+    result = compile_texts({"one.c": text}, ("one.c",), ("-shared", "-fPIC"), "one.so", first)
+    with result.with_name("one.c").open() as mapped:
+        result.unlink()
+        assert compile_texts({"one.c": text}, ("one.c",), ("-shared", "-fPIC"), "one.so", first) == result
+        assert os.fstat(mapped.fileno()).st_nlink == 0
+        assert mapped.read() == result.with_name("one.c").read_text() == text

@@ -45,7 +45,8 @@ def build(
     if result.is_file():
         return result
     place.mkdir(parents=True, exist_ok=True)
-    for name, text in texts.items():  # replaced, not written over: the compiler of another process has it mapped
+    # Replaced, not written over: the compiler of another process may have the old file mapped.
+    for name, text in texts.items():
         fresh = place / f"{name}.{os.getpid()}"
         fresh.write_text(text, encoding="utf-8")
         fresh.replace(place / name)
