@@ -14,7 +14,7 @@ from typing import Any
 
 from firmware_py.export.errors import CompilerError
 from firmware_py.extras import install_command
-from firmware_py.kept_code import kept_folder, may_load
+from firmware_py.kept_code import keep, kept_folder, may_load
 
 SYSTEM_COMPILERS = ("gcc", "clang", "cc")
 LIBRARY_FLAGS = (
@@ -95,10 +95,8 @@ def compile_texts(
         return result
     partial = f"{output}.{os.getpid()}"  # another process may write it, too
     try:
-        # Replaced, not written over: the compiler of another process may have the old file mapped.
         for name, text in texts.items():
-            (place / f"{name}.{os.getpid()}").write_text(text, encoding="utf-8")
-            (place / f"{name}.{os.getpid()}").replace(place / name)
+            keep(place / name, text.encode())  # the compiler of another process may have the old file mapped
     except OSError as error:
         raise CompilerError(f"{place}: cannot be written ({error.strerror or error})") from None
     caches = {name: str(kept_folder("zig")) for name in ("ZIG_LOCAL_CACHE_DIR", "ZIG_GLOBAL_CACHE_DIR")}

@@ -21,20 +21,21 @@ class SharedRoom:
     def __init__(self, config: LabConfig, count: int = 1) -> None:
         self.pauses = memoryview(mmap(-1, 8 * count)).cast("q")  # [us] of each clock
         self.rows = np.frombuffer(mmap(-1, 8 * count * ROW)).reshape(count, ROW)
+        self._settings = config.swarm
         self._is_one = count > 1 and config.tunnel.fan_factor == 0.0
-        self._neighbourhood = Neighbourhood(config.swarm, count, self._is_one)
 
     def join(self, number: int, robot: Robot) -> None:
         """Let robot `number` of this process act on the others of one room, and feel them, while it is free."""
+        if not self._is_one:
+            return
+        index, neighbourhood = number - 1, Neighbourhood(self._settings, len(self.rows), still_air=True)
 
         def exchange(now_us: int) -> None:
             self.rows[index] = row_of(robot, now_us) if robot.free else ABSENT
-            self._neighbourhood.interact(self.rows)
-            self._neighbourhood.act_on(index, robot)
+            neighbourhood.interact(self.rows)
+            neighbourhood.act_on(index, robot)
 
-        index = number - 1
-        if self._is_one:
-            robot.events.every(PERIOD_US, PERIOD_US, exchange)
+        robot.events.every(PERIOD_US, PERIOD_US, exchange)
 
     def leave(self, number: int) -> None:
         """Take a robot out whose process has ended."""

@@ -16,7 +16,7 @@ ABSENT = np.zeros(ROW)
 
 
 class Neighbourhood:
-    """`count` robots; their wakes count in still air only: where fans blow, each has a tunnel of its own."""
+    """What `count` robots do to one another. They have wakes in still air only; elsewhere each has its own tunnel."""
 
     def __init__(self, config: SwarmConfig, count: int, still_air: bool) -> None:
         near = Neighbours.allocate()

@@ -234,7 +234,7 @@ def test_robots_of_several_processes_that_touch_push_each_other_apart(radius: fl
 
 @pytest.mark.parametrize(("profile", "share"), [("crazyflie", True), ("floaty", False)])
 def test_robots_share_a_room_in_still_air_only(profile: str, share: bool) -> None:
-    """Where fans blow all fly at the same home, each in a tunnel of its own."""
+    """Where fans blow, each robot flies at home in its own tunnel, so their places must not be compared."""
     config = load_config(profile)
     room = SharedRoom(config, 2)
     with closing(Server(Service(config), print, None, room=room)) as server:
