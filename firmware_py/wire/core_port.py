@@ -218,6 +218,7 @@ LAYOUTS = (HEAD, ABOUT, PLACE, PLACE_SIZE, CALL, CALLED, WHY, HEALTH, MODE, SAMP
 _HEAD, _ABOUT, _PLACE, _PLACE_SIZE, _CALL, _CALLED, _WHY, _HEALTH, _MODE, _SAMPLES, _LOOP = (
     layout.struct for layout in LAYOUTS
 )
+_ANSWERS = {Message.HELLO: _ABOUT, Message.CALL: _CALLED, Message.HEALTH: _HEALTH, Message.REFUSED: _WHY}
 _NARROW, _WIDE = struct.Struct("<I"), struct.Struct("<hhh")
 WRITE_MAX = MAX_DATA - _HEAD.size - _PLACE.size  # bytes in a packet
 READ_MAX = MAX_DATA - _HEAD.size
@@ -234,6 +235,11 @@ class CoreAnswer:
     session: int
     number: int
     body: bytes
+
+    def check_size(self) -> None:
+        """Raise `WireError` when the body is too short for an answer of its kind."""
+        if self.kind in _ANSWERS:
+            _unpack(_ANSWERS[self.kind], self.body)
 
     def about(self) -> About:
         """Read the answer to HELLO."""

@@ -71,10 +71,7 @@ class CoreClient:
         """Begin a session, with all memory on the board zero."""
         for _ in range(SESSIONS):
             self._session, self._number = self._session % SESSIONS + 1, 0
-            try:
-                about = self._exchange([core_port.hello()])[0].about()
-            except WireError as error:
-                raise LinkError(f"{self.name}: {error}") from None
+            about = self._exchange([core_port.hello()])[0].about()
             if about.version != core_port.VERSION:
                 what = f"its app has protocol version {about.version}, expected {core_port.VERSION}"
                 raise LinkError(f"{self.name}: {what}: export and flash it again")
@@ -133,6 +130,10 @@ class CoreClient:
             except WireError:
                 continue
             if answer.session == self._session and answer.number - self._number & 0xFFFF < count:
+                try:
+                    answer.check_size()
+                except WireError as error:
+                    raise LinkError(f"{self.name}: {error}") from None
                 if answer.kind == core_port.Message.REFUSED:
                     raise LinkError(f"{self.name}: {TEXTS.get(answer.refusal(), 'it refuses a request')}")
                 return answer

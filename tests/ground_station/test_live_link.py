@@ -160,6 +160,18 @@ def test_a_failed_connection_closes_the_device(stops, failure, why):
     assert board.opened == 0
 
 
+def test_a_link_that_was_never_opened_keeps_no_pose_and_can_be_closed():
+    board = Board()
+    board.put(1)
+    board.close()
+    board.opened = 0
+    board.open(lambda: False)
+    board.put(2)
+    wait_for(board, 1)
+    assert board.numbers == [2]
+    board.close()
+
+
 def test_a_board_that_is_silent_for_two_seconds_is_lost():
     board = opened()
     board.received_us = clock_us()

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation
 
-from firmware_py.core import entry
+from firmware_py.core import entry, estimator
 from firmware_py.core.structs import POSE_INVALID, POSE_ON_TIME, Estimator, Parameters
 from firmware_py.core_runner import CoreBlocks, NativeRunner
 from ground_station.trajectory import Goal, Offsets, Sine, Square, Trajectory
@@ -563,6 +563,20 @@ def test_variances_do_not_grow_beyond_their_bound() -> None:
         core.tick()
         assert_sane(core)
     assert np.diag(core.P)[:3].tolist() == [100.0] * 3
+
+
+@pytest.mark.parametrize(
+    ("variance", "held"), [(1e-12, 1e-9), (0.9e-9, 1e-9), (1.1e-9, 1.1e-9), (99.0, 99.0), (101.0, 100.0)]
+)
+def test_a_variance_is_held_between_its_bounds_and_covariances_below_their_product(
+    variance: float, held: float
+) -> None:
+    core = Core()
+    core.fields.P[:] = 1e3
+    np.fill_diagonal(core.fields.P, variance)
+    estimator.keep_sane(core.parameters.fields, core.fields)
+    assert np.diag(core.P).tolist() == [np.float32(held)] * 16
+    assert core.P[5, 9] == core.P[9, 5] == pytest.approx(held)
 
 
 @pytest.mark.parametrize("bad", BAD)

@@ -14,10 +14,14 @@ from firmware_py.export.c99 import translate
 from firmware_py.export.profile_c import profile_hash
 from firmware_py.wire import WireError
 from firmware_py.wire.core_port import (
+    ABOUT,
+    CALLED,
+    HEALTH,
     LAYOUTS,
     NAME_SIZE,
     PORT_CORE,
     READ_MAX,
+    WHY,
     WRITE_MAX,
     Call,
     CoreAnswer,
@@ -282,6 +286,19 @@ def client_of(app: App, mess: float = 0.0) -> tuple[CoreClient, AppPackets]:
     return CoreClient(packets, "app"), packets
 
 
+class ShortAnswers(AppPackets):
+    """A board whose answers end too early."""
+
+    def __init__(self, kind: Message, size: int) -> None:
+        self.kind, self.body = kind, bytes(size)
+
+    def send(self, data: bytes) -> None:
+        self.request = data
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        return bytes((self.kind,)) + self.request[1:4] + self.body
+
+
 @pytest.mark.parametrize("mess", [0.0, 0.1])
 def test_a_flight_on_the_app_equals_python_bitwise_at_any_loss(app: App, mess: float) -> None:
     client, _ = client_of(app, mess)
@@ -399,6 +416,18 @@ def test_a_session_number_that_was_in_use_is_not_taken(app: App) -> None:
     client._session -= 1  # an earlier program had the number that would come next
     assert client.begin().done == 0
     assert client.execute([read(0, 4)])[0].body == bytes(4)
+
+
+@pytest.mark.parametrize("kind", [Message.HELLO, Message.CALL, Message.HEALTH, Message.REFUSED])
+def test_an_answer_that_lacks_its_last_byte_is_one_line_and_not_silence(kind: Message) -> None:
+    size = {Message.HELLO: ABOUT, Message.CALL: CALLED, Message.HEALTH: HEALTH, Message.REFUSED: WHY}[
+        kind
+    ].struct.size
+    client = CoreClient(ShortAnswers(kind, size - 1), "app")
+    with pytest.raises(
+        LinkError, match=rf"^app: {size - 1} bytes behind the head: at least {size} are expected$"
+    ):
+        client.begin() if kind == Message.HELLO else client.execute([(kind, b"")])
 
 
 def test_a_core_of_another_layout_is_refused_in_one_line(app: App, tmp_path: Path) -> None:
