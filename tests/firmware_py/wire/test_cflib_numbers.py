@@ -94,5 +94,12 @@ def test_a_number_is_cflibs(ours: object, theirs: object, name: str, called: str
     assert getattr(ours, name) == getattr(theirs, called)
 
 
+def test_commands_older_or_newer_than_cflibs_have_the_firmwares_numbers() -> None:
+    """crtp_commander_high_level.c of crazyflie-firmware."""
+    older = {"TAKE_OFF_1": 1, "LAND_1": 2, "TAKE_OFF_WITH_VELOCITY": 9, "LAND_WITH_VELOCITY": 10}
+    assert {name: PATH[name] for name in older} == older
+    assert LOG.START_MS == 8
+
+
 def test_the_bit_of_a_lock_is_cflibs() -> None:
     assert 1 << supervisor.BIT_IS_LOCKED == supervisor_wire.LOCKED
