@@ -299,6 +299,21 @@ class ShortAnswers(AppPackets):
         return bytes((self.kind,)) + self.request[1:4] + self.body
 
 
+class Silence(AppPackets):
+    """A board that does not answer."""
+
+    def __init__(self) -> None:
+        self.waits_s: list[float] = []
+        self.requests = 0
+
+    def send(self, data: bytes) -> None:
+        self.requests += 1
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        self.waits_s.append(timeout_s)
+        return None
+
+
 @pytest.mark.parametrize("mess", [0.0, 0.1])
 def test_a_flight_on_the_app_equals_python_bitwise_at_any_loss(app: App, mess: float) -> None:
     client, _ = client_of(app, mess)
@@ -416,6 +431,14 @@ def test_a_session_number_that_was_in_use_is_not_taken(app: App) -> None:
     client._session -= 1  # an earlier program had the number that would come next
     assert client.begin().done == 0
     assert client.execute([read(0, 4)])[0].body == bytes(4)
+
+
+def test_requests_are_repeated_ever_more_seldom_until_three_seconds_are_silent() -> None:
+    silence = Silence()
+    with pytest.raises(LinkError, match=r"^app: silent for 3 s$"):
+        CoreClient(silence, "app").execute([call(Call.RESET), read(0, 4)])
+    assert silence.waits_s == pytest.approx([0.1, 0.2, *[0.4] * 7])
+    assert silence.requests == 2 * (1 + 8)
 
 
 @pytest.mark.parametrize("kind", [Message.HELLO, Message.CALL, Message.HEALTH, Message.REFUSED])
