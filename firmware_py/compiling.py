@@ -83,7 +83,8 @@ def bound_together(functions: Functions, *memory: Memory) -> list[Callable[..., 
         except (CompilerError, OSError) as error:
             fall_back(str(error))
     taken = [one.fields if isinstance(one, Block) else one for one in memory]
-    return [partial(function, *taken) for function in functions]
+    silent = np.errstate(all="ignore")  # C computes with infinities and NaN without a warning
+    return [partial(silent(function), *taken) for function in functions]
 
 
 def bound_in(library: Path, method: str, *arrays: NDArray[Any]) -> Callable[..., Any]:

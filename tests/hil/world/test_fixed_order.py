@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
+from firmware_py import compiling
 from hil.world.fixed_order import STEPS, eigen, fit_polynomial, normal, product
 
 shapes = st.tuples(st.integers(1, 6), st.integers(1, 6), st.integers(1, 6))
@@ -57,3 +58,12 @@ def test_noise_is_numpys_to_the_rounding_and_normal() -> None:
     drawn = normal(np.random.default_rng(2), 20_000)
     assert drawn == pytest.approx(np.random.default_rng(2).standard_normal(20_000), abs=0.5 / STEPS)
     assert kstest(drawn, "norm").pvalue > 0.01
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_an_element_next_to_zero_is_no_warning_in_c_and_in_python(
+    plain: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compiling, "PLAIN", plain)
+    S = np.array([[1.0, 0.5, 5e-324], [0.5, 2.0, 0.0], [5e-324, 0.0, 3.0]])
+    assert sorted(eigen(S)[0]) == pytest.approx(np.linalg.eigvalsh(S))
