@@ -118,7 +118,7 @@ METRICS: Mapping[str, Metric] = {
     ),
     "poses_refused": Metric("", "max", "poses that the estimator did not fuse"),
     "frames_refused": Metric("", "max", "frames that the ground station's tracker refused"),
-    "failsafe": Metric("s", "max", "time in failsafe: flaps at hover, loop open"),
+    "failsafe": Metric("s", "max", "time in failsafe: actuators at hover, loop open"),
     "resets": Metric("", "max", "how often the board's processor was reset"),
     "uncontrolled": Metric(
         "s", "max", "time in which no loop was closed: failsafe, or the board hangs, boots or waits"

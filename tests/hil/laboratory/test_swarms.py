@@ -41,6 +41,9 @@ def test_robots_apart_fly_bit_for_bit_as_alone(floaty: Flights, tmp_path: Path) 
         load_run(swarm.folder)
     again = fly_swarm("hover", 2, tmp_path / "again", duration_s=2.0, overrides=APART, seed=3)
     assert again.hash == swarm.hash
+    pages = [tmp_path / "again" / place / "report.html" for place in ("", "robot-1", "robot-2")]
+    assert again.write_report() == pages[0]
+    assert [page.is_file() for page in pages] == [True] * 3
 
 
 class Talker(PythonBoard):
