@@ -51,7 +51,9 @@ def join(what: str, tables: Sequence[Table], clock: str | float | None) -> Joine
         known = np.where(np.isfinite(times), times, -np.inf)
         advances = known > np.maximum.accumulate(np.concatenate(([-np.inf], known[:-1])))
         if not advances.all():
-            joined.notes.append(f"{(~advances).sum()} rows whose {source.name} does not advance are left out")
+            still = int((~advances).sum())
+            rows_are = "1 row is" if still == 1 else f"{still} rows are"
+            joined.notes.append(f"{rows_are} left out: {source.name} does not advance there")
         times = times[advances]
         if not len(times):
             raise LabError(f"{what}: {source.name}: no row with a time")
@@ -69,6 +71,7 @@ def join(what: str, tables: Sequence[Table], clock: str | float | None) -> Joine
             joined.units[key] = one.unit
         if table.left_out:
             joined.notes.append(f"columns without numbers are left out: {', '.join(table.left_out)}")
+        joined.notes += table.notes
     return joined
 
 

@@ -1,11 +1,14 @@
 """Reads tables of other programs: CSV, Parquet, MCAP, MAVLink telemetry logs, and the micro-SD logs of a Crazyflie."""
 
 import json
+import math
+import re
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BytesIO
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +37,11 @@ ARROW = (pa.ArrowException, OSError, ValueError)
 STAMPS = (".stamp", ".timestamp")  # inside messages of MCAP: the file has the time of each
 LONGEST = 16  # of a list whose numbers become columns: not of images and point clouds
 
+NUMBER = re.compile(r"\s*\"?[-+.\d]")  # how a row of numbers begins
+NO_VALUE = ["", "nan", "NaN", "None", "null", "NULL"]
+TORN = 0.01  # share of the rows, or cells, that may be unreadable
+SHOWN = 3  # of those, in lines of their own
+
 Values = NDArray[np.float64]
 
 
@@ -43,6 +51,7 @@ class Table:
 
     columns: Mapping[str, Values]
     left_out: tuple[str, ...] = ()  # columns without numbers
+    notes: tuple[str, ...] = ()  # what else was left out, each a line
 
 
 def read_tables(path: Path) -> list[Table]:
@@ -58,25 +67,78 @@ def read_tables(path: Path) -> list[Table]:
             return [_numbers(path, pa.parquet.read_table(pa.BufferReader(content)))]
     if content.startswith(MCAP_MAGIC):
         return _mcap(path, content)
-    return [_numbers(path, _csv(path, content))]
+    return [_csv(path, content)]
 
 
-def _csv(path: Path, content: bytes) -> pa.Table:
-    """Return a table whose first line has the names; it may begin with #, and end with the units in brackets."""
-    text = content.removeprefix(b"\xef\xbb\xbf").lstrip(b"# \t\r\n")
-    lines = text.split(b"\n", 2)
-    if b"\0" in text or len(lines) < 2:
+def _csv(path: Path, content: bytes) -> Table:
+    """Return the table of lines with the names in the first one that is no remark (#), or behind the # of the last remark.
+
+    A few lines that are cut off or torn are left out. Names may end with the units in brackets.
+    """
+    text = _decoded(content).lstrip()
+    lines = text.splitlines()
+    remarks = sum(1 for _ in takewhile(lambda line: line.startswith("#"), lines))
+    if "\0" in text or len(lines) < remarks + 2:
         raise LabError(f"{path}: expected {FORMATS}")
-    delimiter = max((b",", b";", b"\t"), key=lines[0].count)
-    comma = delimiter != b"," and b"," in lines[1] and b"." not in lines[1]  # of German and French numbers
+    if remarks and NUMBER.match(lines[remarks]):
+        remarks -= 1
+    names, first = lines[remarks].lstrip("# \t"), lines[remarks + 1]
+    delimiter = max((",", ";", "\t"), key=names.count)
+    comma = delimiter != "," and "," in first and "." not in first  # of German and French numbers
+    torn: list[str] = []
+
+    def leave_out(row: pa.csv.InvalidRow) -> str:
+        torn.append(f"expected {row.expected_columns} columns, got {row.actual_columns}: {row.text}")
+        return "skip"
+
+    body = "\n".join((names, *lines[remarks + 1 :], "")).encode()
     with refusing(f"{path}: expected {FORMATS}: ", *ARROW):
-        return pa.csv.read_csv(
-            pa.BufferReader(text),
-            parse_options=pa.csv.ParseOptions(delimiter=delimiter.decode()),
-            convert_options=pa.csv.ConvertOptions(
-                decimal_point="," if comma else ".", null_values=["", "nan", "NaN", "None", "null", "NULL"]
-            ),
+        table = pa.csv.read_csv(
+            pa.BufferReader(body),
+            read_options=pa.csv.ReadOptions(use_threads=False),  # `leave_out` counts
+            parse_options=pa.csv.ParseOptions(delimiter=delimiter, invalid_row_handler=leave_out),
+            convert_options=pa.csv.ConvertOptions(decimal_point="," if comma else ".", null_values=NO_VALUE),
         )
+    if len(torn) > 1 + TORN * table.num_rows:
+        raise LabError(f"{path}: {len(torn)} of {len(torn) + table.num_rows} rows are torn: {torn[0]}")
+    for index, name in enumerate(table.column_names):
+        if pa.types.is_string(table.column(index).type):
+            numbers = _mostly_numbers(table.column(index).to_pylist(), comma)
+            if numbers is not None:
+                values, wrong = numbers
+                torn += [f"{name.strip()}: no number: {one!r}" for one in wrong]
+                table = table.set_column(index, name, pa.array(values))
+    found = _numbers(path, table)
+    notes = [
+        f"left out: a row, {one}" if one.startswith("expected") else f"left out: {one}"
+        for one in torn[:SHOWN]
+    ]
+    notes += [f"left out: {len(torn) - SHOWN} more"] if len(torn) > SHOWN else []
+    return replace(found, notes=tuple(notes))
+
+
+def _decoded(content: bytes) -> str:
+    """Return the text of UTF-8, of UTF-16 with its mark, or else of Windows."""
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return content.decode("utf-16", "replace")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("cp1252", "replace")
+
+
+def _mostly_numbers(cells: list[str | None], comma: bool) -> tuple[list[float], list[str]] | None:
+    """Return the numbers of a column, NaN elsewhere, and the texts between them; None for a column of texts."""
+    values, wrong, count = [math.nan] * len(cells), list[str](), 0
+    for row, cell in enumerate(cells):
+        if cell is None:
+            continue
+        try:
+            values[row] = float(cell.replace(",", ".") if comma else cell)
+            count += 1
+        except ValueError:
+            wrong.append(cell)
+    return (values, wrong) if len(wrong) < min(count, 2 + TORN * count) else None
 
 
 def _numbers(path: Path, table: pa.Table) -> Table:

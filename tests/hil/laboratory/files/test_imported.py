@@ -3,7 +3,7 @@
 import json
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from hil.laboratory.files.alignment import released_like
 from hil.laboratory.files.imported import import_log
 from hil.laboratory.files.joined import Joined, join
 from hil.laboratory.files.log_map import Map
-from hil.laboratory.files.tables import Table
+from hil.laboratory.files.tables import Table, read_tables
 from hil.pictures.viewer.recording import recording_of
 from support.command import Cli
 
@@ -177,6 +177,61 @@ def test_other_delimiters_decimal_commas_marks_and_words_are_read(tmp_path: Path
     assert "columns without numbers are left out: note" in done.notes
 
 
+@pytest.mark.parametrize(
+    ("change", "note"),
+    [
+        (lambda text: text.encode("utf-16"), ""),
+        (lambda text: text.replace("\n", ",1\n").replace(",1\n", ",h\u00f6he [\u00b0]\n", 1).encode("cp1252"), ""),
+        (lambda text: f"# by me\n# on Monday\n{text}".encode(), ""),
+        (lambda text: f"# by me\n# {text}".encode(), ""),
+        (lambda text: f"{text}9.9,1.0".encode(), "left out: a row, expected 4 columns, got 2: 9.9,1.0"),
+        (lambda text: f"{text}9.9,1.0,1.0,oops\n".encode(), "left out: z: no number: 'oops'"),
+    ],
+    ids=["UTF-16", "Windows", "remarks", "names in the last remark", "cut off", "torn cell"],
+)  # fmt: skip
+def test_usual_faults_of_a_file_are_read_over_and_said(
+    change: Callable[[str], bytes], note: str, tmp_path: Path
+) -> None:
+    path = csv(tmp_path / "log.csv", {"time": T, **place("x", "y", "z")})
+    path.write_bytes(change(path.read_text()))
+    done = import_log([path], tmp_path)
+    assert done.log.column("cameras.z").to_numpy()[:ROWS] == pytest.approx(PLACE[:, 2])
+    assert [one for one in done.notes if one.startswith("left out")] == [note] * bool(note)
+
+
+@pytest.mark.parametrize(("rows", "torn", "shown"), [(200, 3, 3), (400, 5, 3), (200, 4, None)])
+def test_a_hundredth_of_the_rows_may_be_torn_and_no_more(
+    rows: int, torn: int, shown: int | None, tmp_path: Path
+) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("t,x\n" + "".join(f"{t},1\n" for t in range(rows)) + "1,2,3\n" * torn)
+    if shown is None:
+        with pytest.raises(
+            LabError, match=f"{torn} of {rows + torn} rows are torn: expected 2 columns, got 3: 1,2,3$"
+        ):
+            read_tables(path)
+        return
+    (table,) = read_tables(path)
+    line, more = "left out: a row, expected 2 columns, got 3: 1,2,3", torn - shown
+    assert list(table.notes) == [line] * shown + [f"left out: {more} more"] * bool(more)
+    assert len(table.columns["x"]) == rows
+
+
+@pytest.mark.parametrize(
+    ("cells", "numbers"),
+    [(["1", "2", "a"], 2), (["1", "a"], None), (["1"] * 200 + ["a"] * 3, 200), (["1"] * 200 + ["a"] * 4, None),
+     (["", "", "", "a"], None)],
+)  # fmt: skip
+def test_a_column_of_numbers_may_have_few_texts(
+    cells: list[str], numbers: int | None, tmp_path: Path
+) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("t,x\n" + "".join(f"{t},{cell}\n" for t, cell in enumerate(cells)))
+    (table,) = read_tables(path)
+    assert ("x" in table.columns, table.left_out) == (numbers is not None, () if numbers else ("x",))
+    assert numbers is None or np.isfinite(table.columns["x"]).sum() == numbers
+
+
 def test_what_is_missing_is_unknown_or_said(tmp_path: Path) -> None:
     done = import_log(
         [csv(tmp_path / "log.csv", {"t": T, **place("x", "y", "z"), "fan [rpm]": 900 + T})], tmp_path
@@ -228,7 +283,7 @@ def test_times_without_a_unit_have_that_of_a_usual_step(step: float, unit: str) 
     joined = join("log", [Table({"t": t, "x": np.arange(10.0)}, ())], None)
     assert joined.clock == f"t [{unit}]"
     assert joined.columns["x"].tolist() == [0.0, 4.0, 7.0, 9.0]
-    assert joined.notes == ["6 rows whose t does not advance are left out"]
+    assert joined.notes == ["6 rows are left out: t does not advance there"]
 
 
 def test_a_clock_from_the_release_releases_at_its_zero(tmp_path: Path) -> None:
@@ -266,7 +321,7 @@ def test_files_are_joined_on_the_rows_of_the_first(tmp_path: Path) -> None:
     volts = done.log.column("battery.voltage").to_numpy()
     expected = np.select([T >= 0.5, T >= 0.4, T >= 0.1], [3.8, 3.9, 4.0], np.nan)
     assert volts == pytest.approx(expected, nan_ok=True)
-    assert "1 rows whose Timestamp does not advance are left out" in done.notes
+    assert "1 row is left out: Timestamp does not advance there" in done.notes
     assert [done.log.column(f"robot.{name}").to_numpy()[-1] for name in ("x.2", "x_", "x__")] == [
         1.0,
         2.0,
@@ -389,7 +444,7 @@ BAD: Mapping[str, tuple[Mapping[str, Any] | bytes, str, str]] = {
     "text": (b"t\nhello\n", "", f"no rows with numbers; {FORMATS}"),
     "binary": (b"\1\0\2", "", FORMATS),
     "empty": (b"", "", FORMATS),
-    "ragged": (b"t,x,y,z\n1,2,3,4\n1,2\n", "", f"{FORMATS}: "),
+    "ragged": (b"t,x,y,z\n1,2,3,4\n1,2\n1,2\n", "", "2 of 3 rows are torn: expected 4 columns, got 2: 1,2"),
     "half a Parquet": (b"PAR1abc", "", "damaged Parquet: "),
     "a changed micro-SD log": (micro_sd(2)[:-5] + b"12345", "", "a damaged micro-SD log: its checksum is wrong"),
     "half an MCAP file": (b"\x89MCAP0\r\n" + bytes(40), "", "damaged MCAP: "),
