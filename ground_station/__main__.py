@@ -39,7 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--record", type=Path, metavar="FILE", help="frames of motion capture as CSV")
     asked = parser.parse_args(arguments)
     try:
-        tree = tomllib.loads(asked.settings.read_text("utf-8")) if asked.settings is not None else {}
+        tree = tomllib.loads(asked.settings.read_text("utf-8-sig")) if asked.settings is not None else {}
         settings = GroundConfig.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]

@@ -256,7 +256,7 @@ def _toml_of(name: str, value: Any) -> str:
 def read_toml(kind: str, path: Path) -> dict[str, Any]:
     """Return the table of a TOML file of a kind ("profile"). Raises `LabError` when it cannot be read or is not TOML."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise LabError(f"{kind} {path}: {error.strerror or error}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:

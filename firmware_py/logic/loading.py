@@ -108,7 +108,7 @@ def load_logic(config: LogicConfig) -> Logic | None:
     texts = []
     for name, file in files.items():
         try:
-            texts.append((name, file, Path(file).read_text(encoding="utf-8")))
+            texts.append((name, file, Path(file).read_text(encoding="utf-8-sig")))
         except (OSError, UnicodeDecodeError) as error:
             reason = getattr(error, "strerror", None) or error
             near = "" if file.endswith(".py") else f"; laws that ship: {', '.join(SHIPPED_LAWS)}"
@@ -133,7 +133,7 @@ def check_file(file: Path) -> Loaded:
     Raises `LogicError` for a file that cannot be used, `ExportError` with a line for each refusal.
     """
     try:
-        text = file.read_text(encoding="utf-8")
+        text = file.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise LogicError(f"{file}: {getattr(error, 'strerror', None) or error}") from None
     functions = set(re.findall(r"^def (\w+)", text, re.MULTILINE))

@@ -117,7 +117,7 @@ class Map(BaseModel):
         import tomllib
 
         try:
-            return Map.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+            return Map.model_validate(tomllib.loads(path.read_text(encoding="utf-8-sig")))
         except ValidationError as error:
             detail = error.errors()[0]
             key = ".".join(map(str, detail["loc"][:2]))

@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import pytest
 
 import hil
+from hil import fly
 from hil.laboratory.experiments import find_experiment
 from hil.laboratory.files.recorder import load_log
 from hil.laboratory.files.result import read_result
@@ -50,6 +51,15 @@ def test_pytest_without_the_laboratory_is_one_line(cli: Cli) -> None:
         f"ERROR: {sys.executable} has no laboratory (floaty-hil): run the pytest of"
     )
     assert ran.stderr.strip().count("\n") == 0
+
+
+def test_files_that_an_editor_begins_with_the_mark_of_utf8_are_read(cli: Cli) -> None:
+    assert cli("new", "law") == 0
+    for path in (Path("law/profile.toml"), Path("law/controller.py"), Path("law/experiments.py")):
+        path.write_text(path.read_text(encoding="utf-8"), encoding="utf-8-sig")
+    assert cli("check", "law/controller.py") == 0
+    flown = fly("law/experiments.py:figure_eight", duration_s=0.1, profile="law/profile.toml")
+    assert flown.result.outcome == "completed"
 
 
 def test_an_empty_folder_becomes_a_project(cli: Cli) -> None:

@@ -264,7 +264,7 @@ def test_a_map_chooses_scales_turns_and_releases(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(
         'profile = "floaty"\nrelease_s = 10.2\n[columns]\nt = "clock [s]"\n"cameras.x" = "a [m]"\n'
         '"cameras.y" = "b [mm]"\n"cameras.z" = "-c [m]"\n"goal.x" = 0.25\n',
-        encoding="utf-8",
+        encoding="utf-8-sig",
     )
     log = import_log([path], tmp_path, Map.read(tmp_path / "mine.toml")).log
     assert np.stack([log.column(f"cameras.{axis}").to_numpy() for axis in "xyz"], axis=1) == pytest.approx(
