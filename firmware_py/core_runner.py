@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
-from firmware_py import core, export
+from firmware_py import core, export, logic
 from firmware_py.compiling import PLAIN, SUFFIX, bound_in, fall_back, hash_of, kept_library
 from firmware_py.config import CpuConfig
 from firmware_py.core import entry
@@ -27,7 +27,7 @@ from firmware_py.logic.plugs import CALLS
 if TYPE_CHECKING:
     from firmware_py.export.compilers import Compiler
 
-SOURCES = tuple(Path(package.__path__[0]) for package in (core, export))
+SOURCES = tuple(Path(package.__path__[0]) for package in (core, export, logic))
 
 
 class CoreRunner(Protocol):

@@ -17,8 +17,8 @@ from typing import Any, Generic, Literal, TypeVar, Unpack
 
 import pyarrow as pa
 
-from firmware_py.export.boards import C
 from ground_station import trajectory
+from hil.board.cores.boards import C
 from hil.config import DEFAULT_PROFILE, LabConfig
 from hil.errors import LabError, reading
 from hil.laboratory.arguments import Known, checked

@@ -11,7 +11,7 @@ import numpy as np
 
 from firmware_py.config import LogicConfig
 from firmware_py.export.literals import literal
-from firmware_py.logic.budget import ARGUMENT, STRUCT
+from firmware_py.logic.entry import own_blocks
 from firmware_py.logic.loading import Logic, load_logic, sensed_by
 from firmware_py.logic.plugs import ANSWERING, BLOCKS, CALLS, OWN, SENSED
 
@@ -68,14 +68,8 @@ CORE_TYPES = {name: f"Floaty{struct}" for name, struct in BLOCKS.items()}
 
 def own_types(logic: Logic | None) -> dict[str, str]:
     """Return the C types of the blocks that own logic adds to the core's, by name."""
-    if logic is None:
-        return {}
-    types = {"guard": "FloatyGuard"}
-    for plug in logic.loaded.plugs:
-        types |= {plug.block(argument): f"Floaty{struct.name}" for argument, struct in plug.structs.items()}
-        if plug.charged:
-            types[plug.block(ARGUMENT)] = f"Floaty{STRUCT}"
-    return types
+    blocks = own_blocks(logic.loaded.plugs) if logic else {}
+    return {name: f"Floaty{struct}" for name, struct in blocks.items()}
 
 
 def sensed_types(logic: Logic | None) -> dict[str, str]:

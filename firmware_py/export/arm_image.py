@@ -7,7 +7,7 @@ text, flags and compiler is not built again.
 from dataclasses import dataclass
 from pathlib import Path
 
-from firmware_py.export.compilers import HOST_FLAGS, compile_texts, zig
+from firmware_py.export.compilers import compile_texts, zig
 from firmware_py.export.elf import FLASH, Elf
 from firmware_py.export.errors import ExportError
 from firmware_py.logic.plugs import CALLS
@@ -37,12 +37,6 @@ def build_image(source: str, header: str, optimisation: str = "-Os") -> CoreImag
     texts.update({name: (SOURCES / name).read_text(encoding="utf-8") for name in ("rt.c", "flash.ld")})
     flags = (*TARGET_FLAGS, optimisation, "-fno-builtin", "-T", "flash.ld")
     return read_image(compile_texts(texts, ("floaty_core.c", "rt.c"), flags, "floaty_core.elf", zig()))
-
-
-def build_meter() -> Path:
-    """Compile arm/meter.c into a library for this machine. Raises `ExportError`."""
-    text = (SOURCES / "meter.c").read_text(encoding="utf-8")
-    return compile_texts({"meter.c": text}, ("meter.c",), HOST_FLAGS, "meter.so", zig())
 
 
 def read_image(path: Path, alone: bool = True) -> CoreImage:

@@ -2,7 +2,7 @@
 
 Cycles are those of ARM's Cortex-M4 Technical Reference Manual (DDI 0439), instruction set summary and FPU instruction set,
 with the upper figure where it gives a range, plus one where a sum, product or quotient of floats goes into the next one. The
-refill after a jump and the flash's wait states depend on the path through the code: `arm/meter.c` adds them.
+refill after a jump and the flash's wait states depend on the path through the code: the emulated chip adds them.
 """
 
 from dataclasses import dataclass

@@ -13,8 +13,7 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 from firmware_py.config import LogicConfig
-from firmware_py.core.budget import CALL_CYCLES, LoopBudget
-from firmware_py.core.guard import Guard
+from firmware_py.core.budget import CALL_CYCLES
 from firmware_py.core.subset import Block, Sensed, Struct
 from firmware_py.errors import LogicError
 from firmware_py.export.c99 import Translation, check, core_texts, translate
@@ -22,7 +21,7 @@ from firmware_py.export.errors import ExportError, RefusalError
 from firmware_py.export.reading import read_modules
 from firmware_py.export.syntax import ENTRY, OWN
 from firmware_py.logic.budget import ARGUMENT, budgeted
-from firmware_py.logic.entry import GUARD, compose
+from firmware_py.logic.entry import compose, own_blocks
 from firmware_py.logic.laws import SHIPPED_LAWS
 from firmware_py.logic.plugs import GROUP, POINTS, SENSED, Plug, PlugPoint, read_plug
 from firmware_py.table import CoreParameter, CoreVariable
@@ -191,7 +190,6 @@ def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
         translation = translate(texts, shown)
     files = {name: file for name, file, _ in modules}
     own = SimpleNamespace()
-    structs: dict[str, type[Struct]] = {GUARD: Guard}
     for plug in plugs:
         name = f"own_{plug.point.name}"
         try:
@@ -199,12 +197,8 @@ def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
         except Exception as error:
             raise LogicError(f"{shown[name]}: {type(error).__name__}: {error}") from error
         setattr(own, name, module)
-        for argument, struct in plug.structs.items():
-            kind = getattr(module, struct.name.removeprefix(plug.point.name.capitalize()))
-            structs[plug.block(argument)] = kind
-        if plug.charged:
-            structs[plug.block(ARGUMENT)] = LoopBudget
     run = _run(ENTRY, entry.text, f"{ENTRY}.py", own)
+    structs = {block: getattr(run, struct) for block, struct in own_blocks(plugs).items()}
     return Loaded(plugs, digest, entry.calls, run, translation, structs, files)
 
 

@@ -103,6 +103,7 @@ def read_plug(point: PlugPoint, module: Module) -> Plug:
         for field in structs[argument].fields.values() if argument in structs else ():
             with module.refusals.note():
                 variables += _variables(point, argument, module, field)
+    structs = dict(sorted(structs.items(), reverse=True))  # sensed, own, memory
     return Plug(point, hooks, structs, tuple(parameters), tuple(variables), {})
 
 

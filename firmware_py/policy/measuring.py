@@ -1,6 +1,6 @@
 """Measures a learned law as machine code of the Cortex-M4: processor time, memory, and the error from its policy.
 
-Cycles are those of `firmware_py/export/cortex_m4.py` for one step of the controller. The weights are read from flash, for
+Cycles are those of `hil/board/cores/cortex_m4.py` for one step of the controller. The weights are read from flash, for
 which five cycles are added per line of 16 bytes: the emulator counts the waits for instructions only.
 """
 
@@ -12,12 +12,11 @@ from firmware_py.config import FirmwareConfig, parameters_of
 from firmware_py.core.budget import CALL_CYCLES
 from firmware_py.core.observation import OBSERVATIONS
 from firmware_py.core.structs import MODE_FLY, STATES
-from firmware_py.core_runner import CoreBlocks
-from firmware_py.export.arm_image import build_image, build_meter
+from firmware_py.core_runner import CoreBlocks, CoreCosts, RunnerFactory
+from firmware_py.export.arm_image import build_image
 from firmware_py.export.c99 import translate
-from firmware_py.export.cortex_m4 import CortexM4Runner, find_emulator
 from firmware_py.export.usage import CLOCK_MHZ
-from firmware_py.logic.loading import load_logic, translation_of
+from firmware_py.logic.loading import load_logic
 from firmware_py.policy.reading import Policy
 
 CALLS = 32
@@ -47,19 +46,15 @@ class LawFigures:
         return f"{time}, {slot}; flash {self.flash_bytes} B, RAM {self.ram_bytes} B"
 
 
-def measure(config: FirmwareConfig, policy: Policy) -> LawFigures:
-    """Call the law of a profile on states all over the flight envelope.
+def measure(config: FirmwareConfig, policy: Policy, runner: RunnerFactory) -> LawFigures:
+    """Call the law of a profile, with a runner that measures, on states all over the flight envelope.
 
-    Raises `ExportError` when the emulator or the compiler is missing.
+    Raises `ExportError` when the compiler is missing.
     """
-    find_emulator()
-    core, flown = translate(), translation_of(config.logic)
+    core = translate()
     default = build_image(core.source, core.header)
-    image, meter = build_image(flown.source, flown.header), build_meter()
-    blocks = CoreBlocks(
-        parameters_of(config), lambda blocks: CortexM4Runner(blocks, image, meter), load_logic(config.logic)
-    )
-    assert isinstance(blocks.run, CortexM4Runner)
+    blocks = CoreBlocks(parameters_of(config), runner, load_logic(config.logic))
+    assert isinstance(blocks.run, CoreCosts)
     memory = blocks.named["controller_memory"].memory
     blocks.data.fields.mode = np.int32(MODE_FLY)
     observations, actions = np.empty((CALLS, OBSERVATIONS), np.float32), np.empty((CALLS, 4), np.float32)
@@ -73,9 +68,12 @@ def measure(config: FirmwareConfig, policy: Policy) -> LawFigures:
     own = [
         block.memory.nbytes for name, block in blocks.named.items() if name in ("controller_memory", "guard")
     ]
+    usage = blocks.run.usage
+    assert usage is not None
+    assert usage.flash_bytes is not None
     return LawFigures(
-        blocks.run.load["control"].worst_cycles + WAIT_STATES * lines,
-        len(image.code) - len(default.code),
+        usage.entries["control"].worst_cycles + WAIT_STATES * lines,
+        usage.flash_bytes - len(default.code),
         sum(own),
         float(np.abs(actions - expected).max()),
     )

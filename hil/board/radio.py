@@ -26,6 +26,7 @@ from hil.emulator.crazyflie.shockburst import (
     Air,
     BoardEnd,
     RadioExchange,
+    Safelink,
     Transmitter,
     Waiting,
     again_us,
@@ -77,11 +78,11 @@ class VirtualRadio:
         self._uniforms: list[float] = []
         self._transmitter = Transmitter(config, events, self._uniform)
         self.air = self._transmitter.counters  # of the simulated exchanges
-        self._board = BoardEnd(config.downlink_queue, safelink=True)
+        self._board, self._safelink = BoardEnd(config.downlink_queue), Safelink(True)
         self._up_queue: deque[Waiting] = deque()
         self._busy = False  # an exchange is planned or in progress
         self._idle_since_us = 0
-        self._counter = 0  # safelink's, of the packets to the board
+        self._counter = 0  # safelink's, of both directions
         self._uploading: Waiting | None = None  # kept until it is answered
         self._answer_size: int | None = None  # of the exchange in progress, once the board has heard it
 
@@ -181,7 +182,8 @@ class VirtualRadio:
     def _hear(self, now_us: int) -> int:
         """Receive the packet on board, pass it on if it is new, and answer; every retry gets the same answer."""
         if self._answer_size is None:
-            if self._board.takes(self._counter) and self._uploading is not None:
+            self._safelink, new, _ = self._safelink.hear(self._counter, self._counter)
+            if new and self._uploading is not None:
                 deliver = partial(self._deliver_up, self._uploading)
                 self._events.at(now_us + self._wire_us(self._uploading.data), deliver)
             else:

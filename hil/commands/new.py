@@ -60,6 +60,7 @@ def policy(file: Path, folder: Path) -> None:
     """
     from firmware_py.policy.measuring import LawFigures, measure
     from firmware_py.policy.reading import LIBRARIES, read_policy
+    from hil.board.cores.boards import CORTEX_M4, runner_of
     from hil.config import load_config
 
     if file.suffix in LIBRARIES:
@@ -76,7 +77,8 @@ def policy(file: Path, folder: Path) -> None:
             write_project(
                 "policy", (POLICY_TEMPLATES,), Path(scratch), **values, figures=LawFigures(0, 0, 0, 0.0)
             )
-            figures = measure(load_config(f"{scratch}/profile.toml"), network)
+            config = load_config(f"{scratch}/profile.toml")
+            figures = measure(config, network, runner_of(CORTEX_M4, config.logic))
         except (FirmwareError, LabError) as error:
             raise LabError(f"policy {file}: {str(error).replace(f'{scratch}/', '')}") from None
     if figures.share > ROOM:

@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.export.boards import C
+from hil.board.cores.boards import C
 from hil.deploy.drill import DRILL
 from hil.laboratory.experiments.position import HOVER
 from hil.laboratory.files.recorder import load_events

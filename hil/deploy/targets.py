@@ -8,13 +8,14 @@ from pathlib import Path
 
 from firmware_py.config import LogicConfig
 from firmware_py.core_runner import CoreBlocks, CoreRunner, NativeRunner, PlainRunner, RunnerFactory
-from firmware_py.export.arm_image import CoreImage, build_image, build_meter, read_image
-from firmware_py.export.cortex_m4 import CortexM4Runner, find_emulator
+from firmware_py.export.arm_image import CoreImage, build_image, read_image
 from firmware_py.export.errors import ExportError
 from firmware_py.export.native import build
 from firmware_py.export.usage import EntryLoad
 from firmware_py.logic.loading import translation_of
+from hil.board.cores.cortex_m4 import CortexM4Runner
 from hil.board.real_core import RealCore, is_link, open_real_core
+from hil.emulator.stm32f405.chip import build_machine
 from hil.errors import LabError
 
 PLAIN, C_O0, C_O2, CORTEX_M4 = TARGETS = ("plain", "c-O0", "c-O2", "cortex-m4")
@@ -41,8 +42,8 @@ def target_names(text: str | None) -> tuple[str, ...]:
 class Metered(CortexM4Runner):
     """Machine code with counted ticks: each has poses, the estimator and the controller."""
 
-    def __init__(self, blocks: CoreBlocks, image: CoreImage, meter: Path, ticks: EntryLoad) -> None:
-        super().__init__(blocks, image, meter)
+    def __init__(self, blocks: CoreBlocks, image: CoreImage, machine: Path, ticks: EntryLoad) -> None:
+        super().__init__(blocks, image, machine)
         self._ticks = ticks
         self._so_far: tuple[int, int] | None = None  # instructions, cycles at the last tick's end; None: boot
 
@@ -101,9 +102,8 @@ class Toolbox:
                     library = build(c, optimisation=OPTIMISATION[name])
                     self._native[name] = partial(NativeRunner, library=library)
                 elif name == CORTEX_M4:
-                    find_emulator()
+                    self._machine = build_machine()
                     self._image = read_image(elf, False) if elf else build_image(c.source, c.header)
-                    self._meter = build_meter()
                     flash = None if elf else len(self._image.code)
                     self.machine_code = MachineCode(flash, EntryLoad())
         except ExportError as error:
@@ -114,7 +114,7 @@ class Toolbox:
 
         def cortex_m4(blocks: CoreBlocks) -> CoreRunner:
             assert self.machine_code is not None
-            runner = Metered(blocks, self._image, self._meter, self.machine_code.ticks)
+            runner = Metered(blocks, self._image, self._machine, self.machine_code.ticks)
             stack.callback(self._measure, runner)
             return runner
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from firmware_py.errors import FirmwareError
-from firmware_py.export.boards import runner_of
 from firmware_py.wire.memories import CONFIG_SIZE
 from firmware_py.wire.telemetry import ALL_BLOCKS, CRAZYFLIE_BLOCKS
 from ground_station.errors import LinkError
@@ -25,6 +24,7 @@ from ground_station.tracker import tracker_of
 from ground_station.trajectory import FlightPlan, Goal, Trajectory
 from hil.board.board_firmware import Executor, Flashed, PythonBoard
 from hil.board.clock import Clock, FreeRunning, Paced
+from hil.board.cores.boards import runner_of
 from hil.board.eeprom import factory_config
 from hil.board.image_settings import APP_PARAMETER, NO_APP, ImageSettings, stock_contents
 from hil.board.pins import new_eeprom

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from firmware_py.config import parameters_of
 from firmware_py.core_runner import CoreBlocks, CoreRunner, default_runner
-from firmware_py.export.boards import PYTHON, C
 from firmware_py.logic.loading import load_logic
 from firmware_py.signals import COUNTERS, REFUSED
 from hil.board.board_firmware import PythonBoard
+from hil.board.cores.boards import PYTHON, C
 from hil.config import LabConfig
 from hil.errors import LabError
 from hil.laboratory.channels import ESTIMATE, FLAPS, INPUTS, quantity

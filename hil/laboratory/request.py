@@ -23,10 +23,10 @@ from pydantic import (
 )
 from pydantic_core.core_schema import CoreSchema, with_info_after_validator_function
 
-from firmware_py.export.boards import BOARDS, CORTEX_M4, C
 from ground_station.links.crazyflie_link import FlightTimes, FromFloor
 from ground_station.links.schemes import SCHEMES
 from ground_station.trajectory import Goal, Trajectory
+from hil.board.cores.boards import BOARDS, CORTEX_M4, C
 from hil.board.real_core import is_link
 from hil.config import DEFAULT_PROFILE, LabConfig, Overrides, check_logic, read_config, settings_of
 from hil.errors import LabError, require

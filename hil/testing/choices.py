@@ -10,8 +10,8 @@ from itertools import product
 from typing import Any
 
 from firmware_py.config import LogicConfig
-from firmware_py.export.boards import BOARDS, C, runner_of
 from firmware_py.export.errors import ExportError
+from hil.board.cores.boards import BOARDS, C, runner_of
 from hil.config import DEFAULT_PROFILE
 from hil.errors import LabError, hint
 from hil.laboratory.faults import parse

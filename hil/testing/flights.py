@@ -14,9 +14,9 @@ from typing import Unpack
 import pytest
 
 from firmware_py.errors import FirmwareError
-from firmware_py.export.boards import BOARDS, runner_of
 from firmware_py.logic.loading import check_file
 from hil.api import Run, Swarm, command_of, fly_swarm, maker_of, request_of
+from hil.board.cores.boards import BOARDS, runner_of
 from hil.config import DEFAULT_PROFILE, Overrides, load_config, settings_of
 from hil.errors import LabError, RefusedFileError
 from hil.laboratory.arguments import checked

@@ -273,7 +273,7 @@ def _marked(item: pytest.Item) -> Marked:
 
 def _wanted(config: pytest.Config) -> Wanted:
     """Return the options of the command line and pytest's configuration."""
-    from firmware_py.export.boards import BOARDS
+    from hil.board.cores.boards import BOARDS
     from hil.config import DEFAULT_PROFILE
     from hil.testing.choices import Wanted
 

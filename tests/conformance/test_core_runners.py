@@ -6,7 +6,7 @@ import pytest
 from firmware_py.config import LogicConfig, parameters_of
 from firmware_py.core.structs import POSE_INVALID, POSE_ON_TIME, POSE_TOO_OLD, Input, Parameters
 from firmware_py.core_runner import CoreBlocks, RunnerFactory, default_runner
-from firmware_py.export.boards import BOARDS, runner_of
+from hil.board.cores.boards import BOARDS, runner_of
 from hil.config import load_config
 from support.core_streams import Recording, blocks_of, fill, record_wild, run_step
 

@@ -18,7 +18,15 @@ from typing import Protocol
 
 from hil.emulator.crazyflie import syslink
 from hil.emulator.crazyflie.bootloader import HEADER, NRF51, Bootloader
-from hil.emulator.crazyflie.shockburst import TURN_ROUND_US, Air, BoardEnd, Waiting, air_us, syslink_us
+from hil.emulator.crazyflie.shockburst import (
+    TURN_ROUND_US,
+    Air,
+    BoardEnd,
+    Safelink,
+    Waiting,
+    air_us,
+    syslink_us,
+)
 from hil.emulator.events import EventQueue
 
 NULL, NULL_MASK = 0xF3, 0xF3  # an empty packet's header; the other bits are safelink's
@@ -128,7 +136,7 @@ class Nrf51:
 
     def _forget(self) -> None:
         """Clear the memory."""
-        self._end = BoardEnd(self._capacity)
+        self._end, self._safelink = BoardEnd(self._capacity), Safelink(False)
         self._service = b""
         self._answer = b""  # sent last, to be repeated
         self._reset_armed = False
@@ -171,7 +179,7 @@ class Nrf51:
 
     def hear(self, now_us: int, data: bytes) -> bytes:
         """Take a packet from the air and return the acknowledgement's payload."""
-        self.heard_us, end = now_us, self._end
+        self.heard_us = now_us
         if self.power is Power.BOOTLOADER:
             answer = self._next_answer(now_us)
             self._bootload(now_us, data)
@@ -187,12 +195,13 @@ class Nrf51:
         if kind == SAFELINK and len(data) == 3:
             self._service = data
             answer = self._next_answer(now_us)
-            end.switch(bool(data[2]))
+            self._safelink = Safelink(bool(data[2]))
             self._processor.greet(now_us)
             return answer
-        if end.takes(data[0] >> 3 & 1):
+        self._safelink, new, arrived = self._safelink.hear(data[0] >> 3 & 1, data[0] >> 2 & 1)
+        if new:
             self._take(now_us, data, broadcast=False)
-        return self._next_answer(now_us) if end.answered(data[0] >> 2 & 1) else self._answer
+        return self._next_answer(now_us) if arrived else self._answer
 
     def hear_peer(self, now_us: int, settings: AirSettings, packet: bytes) -> None:
         """Let a packet of another board arrive, unless it is lost."""
@@ -237,17 +246,17 @@ class Nrf51:
 
     def _next_answer(self, now_us: int) -> bytes:
         """Return the answer after the one that has arrived."""
-        end = self._end
-        end.confirm()
+        down = self._safelink.down << 2
+        self._end.confirm()
         if self._service:
             self._answer, self._service = self._service, b""
-        elif packet := end.answer(now_us):
-            counted = bytes((packet[0] & NULL_MASK | end.down << 2,)) + packet[1:]
-            self._answer = counted if end.safelink else packet
+        elif packet := self._end.answer(now_us):
+            counted = bytes((packet[0] & NULL_MASK | down,)) + packet[1:]
+            self._answer = counted if self._safelink.on else packet
         elif self.power is Power.BOOTLOADER:
             self._answer = b""
         else:
-            self._answer = bytes((NULL | end.down << 2, SIGNAL_STRENGTH, SIGNAL_DBM))
+            self._answer = bytes((NULL | down, SIGNAL_STRENGTH, SIGNAL_DBM))
         return self._answer
 
     def _pass_on(self, data: bytes, broadcast: bool, now_us: int) -> None:

@@ -1,9 +1,9 @@
 """Enhanced ShockBurst between a dongle and a board: one packet up, and in its acknowledgement one down.
 
-`Transmitter` is the dongle's radio: it repeats a packet until it hears the answer. `BoardEnd` is the state of the board's
-radio chip: its queue, and safelink's counters, one bit per direction, which deliver every packet once. The polling host
-is separate: `hil.board.radio` models one and skips empty polls, a dongle has a real one. Figures: Crazyradio,
-nRF24L01+, Bitcraze's nRF51 firmware and its documentation. Radios that send at the same time do not disturb each other.
+`Transmitter` is the dongle's radio: it repeats a packet until it hears the answer. `BoardEnd` is the queue of the board's
+radio chip, `Safelink` the state of the protocol that delivers every packet once. The polling host is separate:
+`hil.board.radio` models one and skips empty polls, a dongle has a real one. Figures: Crazyradio, nRF24L01+, Bitcraze's
+nRF51 firmware and its documentation. Radios that send at the same time do not disturb each other.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 from firmware_py.elementary import power
 from hil.emulator.crazyflie.config import RadioConfig
@@ -168,42 +168,38 @@ class Waiting:
     data: bytes
 
 
+class Safelink(NamedTuple):
+    """The state of safelink on board: one bit per direction.
+
+    On, a packet whose bit is that of the last one is a repetition, and so is the answer to it. Off, all are new.
+    """
+
+    on: bool
+    up: int = 1
+    down: int = 1
+
+    def hear(self, up: int, down: int) -> tuple[Safelink, bool, bool]:
+        """Return the state after a packet with the host's bits, whether it is new, and whether the last answer arrived."""
+        new, arrived = not self.on or up != self.up, not self.on or down != self.down
+        return Safelink(self.on, self.up ^ new, self.down ^ arrived), new, arrived
+
+
 class BoardEnd:
-    """The board's half of an exchange: what it has received already, and what it has to send.
+    """The board's half of an exchange: what it has to send.
 
     The head of the queue stays there until the answer that carries it has arrived, and counts towards `capacity`.
     """
 
-    def __init__(self, capacity: int, safelink: bool = False) -> None:
+    def __init__(self, capacity: int) -> None:
         self.queue: deque[Waiting] = deque()
         self._capacity = capacity
         self._answering = False  # with the head of the queue
-        self.switch(safelink)
-
-    def switch(self, safelink: bool) -> None:
-        """Switch safelink, which resets its counters; without it every packet is new, and no answer is repeated."""
-        self.safelink = safelink
-        self.up = self.down = 1
 
     def put(self, packet: Waiting) -> bool:
         """Take a packet for the ground; False when the queue is full."""
         if len(self.queue) >= self._capacity:
             return False
         self.queue.append(packet)
-        return True
-
-    def takes(self, up: int) -> bool:
-        """Whether a packet with the host's counter `up` is a new one."""
-        if self.safelink and up == self.up:
-            return False
-        self.up ^= 1
-        return True
-
-    def answered(self, down: int) -> bool:
-        """Whether the host's counter `down` says that the last answer has arrived; then the next one is due."""
-        if self.safelink and down == self.down:
-            return False
-        self.down ^= 1
         return True
 
     def confirm(self) -> Waiting | None:

@@ -2,7 +2,7 @@
 
 Time counts in cycles of 168 MHz since power-on. `run` continues until a given time or until the caller must act; compiled
 code calls no Python. Cycles are those of `firmware_py.export.cycles`, plus three for every jump; flash is assumed to keep
-up with the core.
+up with the core, unless `empty_flash_cache` is called.
 """
 
 import mmap
@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.export.compilers import HOST_FLAGS, compile_texts, zig
-from firmware_py.export.cortex_m4 import find_emulator
 from firmware_py.export.cycles import count
 from firmware_py.export.elf import CCM, CCM_SIZE, FLASH, FLASH_SIZE, RAM, RAM_SIZE
 from firmware_py.export.errors import ExportError
@@ -56,6 +55,15 @@ class StopReason(IntEnum):
     WATCHPOINT = 1024  # an access that the debugger watches, at most a block of instructions ago
     LOW_WRITE = 2048  # the first write of an instruction near address 0
     DEVICE = 4096  # a device was written to that acts on it
+
+
+def find_emulator() -> Any:
+    """Return the package unicorn. Raises `ExportError` when it is missing."""
+    try:
+        import unicorn
+    except ImportError:
+        raise ExportError(f"unicorn is missing: {install_command('deploy')}") from None
+    return unicorn
 
 
 def build_machine() -> Path:
@@ -190,6 +198,13 @@ class Chip:
         """Reset the processor: memory is kept, time continues."""
         self.resets += 1
         self._library.machine_reset(self.state, self.vectors, cause)
+
+    def empty_flash_cache(self) -> None:
+        """Begin as after a jump, with an empty cache before the flash; from now on its misses wait."""
+        if not self.state.flash_cache:
+            self._flash_cache = self._ffi.new("struct flash_cache *")
+            self.state.flash_cache = self._flash_cache
+        self._library.flash_empty(self.state)
 
     def record(self) -> None:
         """Count the executed blocks from now on, unless that is done already."""

@@ -79,7 +79,7 @@ class CrashReports:
 
     def lockup(self) -> Crash:
         """Return where the processor gave up: at a fault inside a fault's handler or on entry to it."""
-        return self._here(f"lock-up, no fault handler could run: {self._reasons()}")
+        return self._here(f"lock-up, no fault handler could run: {fault_reasons(self._chip)}")
 
     def overflow(self, task: int) -> Crash:
         """Return the task whose stack overflowed, and its current place: it may have returned."""
@@ -140,7 +140,7 @@ class CrashReports:
         number = self._chip.register("xpsr") & 0x1FF
         what = f"{self._who(number)} is not handled"
         if number in FAULTS:
-            what = f"{FAULTS[number]}: {self._reasons()}"
+            what = f"{FAULTS[number]}: {fault_reasons(self._chip)}"
         try:
             stacked = stacked_registers(self._chip.read, frame, exc_return)
         except LabError:
@@ -148,21 +148,6 @@ class CrashReports:
         if self._word(CFSR) & NOT_STACKED:
             return Crash(what, self._who(0), ())
         return Crash(what, self._who(stacked["xpsr"] & 0x1FF), self._trace(self._numbered(stacked)))
-
-    def _reasons(self) -> str:
-        """Return the bits of the fault status registers in words."""
-        status, hard = self._word(CFSR), self._word(HFSR)
-        reasons = [words for bit, words in CFSR_WORDS.items() if status >> bit & 1]
-        if hard & VECTOR_UNREADABLE:
-            reasons.append("the vector of an exception could not be read")
-        if hard & BREAKPOINT:
-            reasons.append("a breakpoint instruction without a debugger")
-        if hard & ESCALATED and not reasons:
-            reasons.append("a supervisor call where its priority does not allow it")
-        what = " and ".join(reasons) or "for a reason that its registers do not say"
-        if status & (BFAR_VALID | MMFAR_VALID):
-            return f"{what} at 0x{self._word(BFAR if status & BFAR_VALID else MMFAR):08x}"
-        return what
 
     def _who(self, number: int) -> str:
         """Return the task, or the handler of the exception with that number."""
@@ -229,4 +214,24 @@ class CrashReports:
         return f"0x{address:08x}"
 
     def _word(self, address: int) -> int:
-        return int(unpack("<I", self._chip.read(address, 4))[0])
+        return _word(self._chip, address)
+
+
+def fault_reasons(chip: Chip) -> str:
+    """Return the bits of the fault status registers in words."""
+    status, hard = _word(chip, CFSR), _word(chip, HFSR)
+    reasons = [words for bit, words in CFSR_WORDS.items() if status >> bit & 1]
+    if hard & VECTOR_UNREADABLE:
+        reasons.append("the vector of an exception could not be read")
+    if hard & BREAKPOINT:
+        reasons.append("a breakpoint instruction without a debugger")
+    if hard & ESCALATED and not reasons:
+        reasons.append("a supervisor call where its priority does not allow it")
+    what = " and ".join(reasons) or "for a reason that its registers do not say"
+    if status & (BFAR_VALID | MMFAR_VALID):
+        return f"{what} at 0x{_word(chip, BFAR if status & BFAR_VALID else MMFAR):08x}"
+    return what
+
+
+def _word(chip: Chip, address: int) -> int:
+    return int(unpack("<I", chip.read(address, 4))[0])

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
 
-from firmware_py.export.boards import BOARDS, C
+from hil.board.cores.boards import BOARDS, C
 from hil.config import DEFAULT_PROFILE, keys_at, read_toml
 from hil.errors import LabError, hint
 from hil.laboratory.bodies import MEASURED

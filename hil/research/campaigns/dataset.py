@@ -17,8 +17,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from firmware_py.export.boards import C
 from firmware_py.logic.loading import digest_of
+from hil.board.cores.boards import C
 from hil.config import load_config
 from hil.errors import LabError, writing
 from hil.laboratory.bodies import digest_of_body

@@ -11,10 +11,10 @@ from firmware_py.config import parameters_of
 from firmware_py.core.budget import CALL_CYCLES
 from firmware_py.core.structs import MODE_FLY
 from firmware_py.core_runner import CoreBlocks
-from firmware_py.export.boards import BOARDS, runner_of
-from firmware_py.export.cortex_m4 import CortexM4Runner
 from firmware_py.logic.budget import CLOCK_MHZ
 from firmware_py.logic.loading import load_logic
+from hil.board.cores.boards import BOARDS, runner_of
+from hil.board.cores.cortex_m4 import CortexM4Runner
 from hil.errors import LabError
 from support.own_logic import ESTIMATOR, LAW, own_config
 from support.paths import ROOT

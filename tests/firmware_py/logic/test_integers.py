@@ -5,8 +5,8 @@ import pytest
 from firmware_py.config import parameters_of
 from firmware_py.core.structs import MODE_FLY
 from firmware_py.core_runner import CoreBlocks
-from firmware_py.export.boards import BOARDS, runner_of
 from firmware_py.logic.loading import load_logic
+from hil.board.cores.boards import BOARDS, runner_of
 from hil.config import LabConfig
 from support.own_logic import own_config
 

@@ -9,12 +9,12 @@ import pytest
 from firmware_py.config import parameters_of
 from firmware_py.core.structs import MODE_FLY
 from firmware_py.core_runner import CoreBlocks
-from firmware_py.export.boards import BOARDS, runner_of
 from firmware_py.firmware import Firmware
 from firmware_py.links.parameters import Parameter
 from firmware_py.logic.loading import load_logic
 from firmware_py.wire.parameters import EINVAL, OK
 from firmware_py.wire.supervisor import Cause, State
+from hil.board.cores.boards import BOARDS, runner_of
 from hil.config import LabConfig
 from support.firmware_bench import HOVER_COUNTS, FirmwareBench
 from support.mavlink_client import GYRO_ZERO_US, MavlinkClient

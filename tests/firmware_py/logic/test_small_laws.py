@@ -9,10 +9,10 @@ import pytest
 from firmware_py.config import parameters_of
 from firmware_py.core.structs import MODE_FLY
 from firmware_py.core_runner import CoreBlocks
-from firmware_py.export.boards import runner_of
 from firmware_py.export.compilers import Compiler, compilers
 from firmware_py.export.native import STRICT, build
 from firmware_py.logic.loading import load_logic
+from hil.board.cores.boards import runner_of
 from hil.config import LabConfig
 from hil.errors import LabError
 from support.command import Cli

@@ -9,9 +9,9 @@ import pytest
 from firmware_py.config import parameters_of
 from firmware_py.core.structs import MODE_FLY
 from firmware_py.core_runner import CoreBlocks, default_runner
-from firmware_py.export.boards import runner_of
 from firmware_py.logic.loading import load_logic
 from firmware_py.policy.reading import read_policy
+from hil.board.cores.boards import runner_of
 from hil.config import load_config
 from hil.laboratory.files.result import read_result
 from support.command import Cli

@@ -238,6 +238,7 @@ def test_code_outside_its_memory_is_exit_1(cli: Cli, monkeypatch: pytest.MonkeyP
     options = ("--duration", "0.1", "--targets", "cortex-m4", "--source", "wild.c")
     assert cli("deploy", "check", "hover", *options) == 1
     assert "tick 23, in estimate: " in cli.out
+    assert ": access to where there is no memory at 0x" in cli.out
 
 
 FIRMWARE = """

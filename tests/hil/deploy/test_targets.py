@@ -6,8 +6,8 @@ import pytest
 
 from firmware_py.config import LogicConfig, parameters_of
 from firmware_py.core_runner import CoreBlocks
-from firmware_py.export.cortex_m4 import CortexM4Runner
 from firmware_py.logic.loading import load_logic
+from hil.board.cores.cortex_m4 import CortexM4Runner
 from hil.config import load_config
 from hil.deploy.targets import CORTEX_M4, TARGETS, TICK_HZ, Toolbox, target_names
 

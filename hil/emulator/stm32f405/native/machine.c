@@ -114,6 +114,8 @@ static void count(struct machine *m, uint64_t address, uint32_t size)
     if (begin + size <= FLASH_SIZE) {
         if (m->recorded)
             begin_block(m, (uint32_t)begin, (uint32_t)begin + size);
+        if (m->flash_cache)
+            read_flash(m, (uint32_t)begin, (uint32_t)begin + size);
         uint64_t passed = m->before[(begin + size) / 2] - m->before[begin / 2];
         m->now += passed & ((1u << SUM_INSTRUCTIONS) - 1);
         m->instructions += passed >> SUM_INSTRUCTIONS & ((1u << (SUM_MASKS - SUM_INSTRUCTIONS)) - 1);

@@ -14,7 +14,7 @@ begin with #. */
 
 enum {
     CLOCK_HZ = 168000000,
-    FLASH_BASE = 0x08000000, FLASH_SIZE = 0x100000,
+    FLASH_BASE = 0x08000000, FLASH_SIZE = 0x100000, FLASH_LINE = 16, FLASH_LINES = FLASH_SIZE / FLASH_LINE,
     RAM_BASE = 0x20000000, RAM_SIZE = 0x20000,
     CCM_BASE = 0x10000000, CCM_SIZE = 0x10000,
     PERIPHERALS_SIZE = 0x80000, PAGE_SIZE = 1024, /* unicorn's pages of memory */
@@ -243,6 +243,15 @@ struct task_switch {
     uint32_t block;
 };
 
+struct flash_line { /* its neighbours in the order of their last use; FLASH_LINES on both sides of all lines */
+    uint32_t newer, older, cached;
+};
+
+struct flash_cache {
+    uint32_t filled;
+    struct flash_line lines[FLASH_LINES + 1];
+};
+
 struct machine {
     uint64_t now, instructions, exceptions, sleeping; /* `sleeping`: cycles spent in WFI */
     uint64_t begun, begun_at;    /* instructions and cycles before the block that was begun last */
@@ -273,6 +282,7 @@ struct machine {
     uint32_t recorded; /* whether there are passages or a profile */
     uint32_t masks;   /* whether the last block may end with a write to BASEPRI or FAULTMASK */
     uint64_t next_address;
+    struct flash_cache *flash_cache; /* 0: flash keeps up with the core */
     struct profile *profile;  /* 0: not recorded */
     struct passage *passages; /* of all half words of flash and one more, 0: not recorded */
     uint32_t block_begin, block_end; /* of the recorded block that has not ended, equal without one; offsets in flash */
@@ -324,6 +334,7 @@ uint32_t machine_step(struct machine *m, uint64_t until);
 int machine_break(struct machine *m, uint32_t address, int on);
 int machine_watch(struct machine *m, uint32_t kind, uint32_t address, uint32_t size, int on);
 uint32_t machine_sent(struct machine *m, uint32_t n, uint8_t *bytes);
+void flash_empty(struct machine *m);
 void profile_reset(struct machine *m);
 void profile_settle(struct machine *m);
 void machine_pin(struct machine *m, uint32_t port, uint32_t pin, uint32_t high);
@@ -348,6 +359,9 @@ uint64_t system_read(uc_engine *uc, uint64_t offset, unsigned size, void *user);
 void system_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t value, void *user);
 
 void tick_due(struct machine *m);
+
+/* flash.c: `begin` and `end` count from the begin of flash */
+void read_flash(struct machine *m, uint32_t begin, uint32_t end);
 
 /* alignment.c */
 void on_unaligned(struct machine *m, uint32_t pc);

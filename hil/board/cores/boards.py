@@ -18,10 +18,9 @@ def runner_of(board: str, logic: LogicConfig) -> RunnerFactory:
         return default_runner
     if board == PYTHON:
         return PlainRunner
-    from firmware_py.export.arm_image import build_image, build_meter
-    from firmware_py.export.cortex_m4 import CortexM4Runner, find_emulator
+    from firmware_py.export.arm_image import build_image
+    from hil.board.cores.cortex_m4 import CortexM4Runner
+    from hil.emulator.stm32f405.chip import build_machine
 
-    find_emulator()
-    core = translation_of(logic)
-    image = build_image(core.source, core.header)
-    return partial(CortexM4Runner, image=image, meter=build_meter())
+    machine, core = build_machine(), translation_of(logic)
+    return partial(CortexM4Runner, image=build_image(core.source, core.header), machine=machine)
