@@ -49,11 +49,11 @@ class Programs:
         kinds = ["whole", "real", "truth", "write", "augment"] + 2 * ["if", "for"] * (depth > 0)
         match self.random.choice(kinds + ["while", "swap", "choice"] * self.language.live):
             case "whole":
-                return f"{self.random.choice('nm')} = {self.held(*self.whole(3), True)}"
+                return self.assigned(self.random.choice("nm"), self.held(*self.whole(3), True))
             case "real":
-                return f"{self.random.choice('xy')} = {self.held(*self.number(3), False)}"
+                return self.assigned(self.random.choice("xy"), self.held(*self.number(3), False))
             case "truth":
-                return f"is_far = {self.language.truth.format(self.condition(2))}"
+                return self.assigned("is_far", self.language.truth.format(self.condition(2)))
             case "write":
                 place, whole = self.random.choice(self.language.places)
                 return f"{place} = {self.held(*(self.whole if whole else self.number)(2), whole)}"
@@ -74,6 +74,10 @@ class Programs:
             case _:
                 (yes, first), (no, second) = self.number(2), self.number(2)
                 return f"x = {self.held(f'(({yes}) if {self.condition(1)} else ({no}))', max(first, second), False)}"
+
+    def assigned(self, name: str, text: str) -> str:
+        negation = "not " if name == "is_far" else "-"  # compilers complain of x = x
+        return f"{name} = {negation}{name}" if text == name else f"{name} = {text}"
 
     def block(self, depth: int) -> str:
         return indent(
