@@ -353,12 +353,11 @@ class Expressions:
         literal = constant_literal(node)
         if literal is not None:
             return Value(literal[1], literal[0], UNARY if literal[1].startswith("-") else PRIMARY)
-        if isinstance(node.args[0], ast.Constant | ast.UnaryOp) and constant_literal(node.args[0]) is None:
-            for constant in ast.walk(node.args[0]):
-                if isinstance(constant, ast.Constant):
-                    bounds = "-3.4e38..3.4e38" if target == F32 else "-2147483648..2147483647"
-                    reason = f"{ast.unparse(node)} is no finite 32-bit number: write one of {bounds}"
-                    raise self.refuse(node, reason)
+        bare = node.args[0].operand if isinstance(node.args[0], ast.UnaryOp) else node.args[0]
+        if isinstance(bare, ast.Constant) and constant_literal(node.args[0]) is None:
+            bounds = "-3.4e38..3.4e38" if target == F32 else "-2147483648..2147483647"
+            reason = f"{ast.unparse(node)} is no finite 32-bit number: write one of {bounds}"
+            raise self.refuse(node, reason)
         value = self.value(node.args[0], alone)
         if value.kind == target:
             return value

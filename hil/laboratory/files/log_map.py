@@ -60,7 +60,7 @@ def _of_axis(axis: str) -> tuple[str, ...]:
 
 def _of_part(part: str) -> tuple[str, ...]:
     return (
-        rf"{_SEEN}\.(?:{_TURN}\.?)?q?{part}", rf"{_TURN}\.?{part}", rf"stateestimate\.q{part}",
+        rf"{_SEEN}\.(?:{_TURN}\.?q?|q){part}", rf"{_TURN}\.?{part}", rf"stateestimate\.q{part}",
         rf"{_OF_SEEN}{_ROS_TURN}\.{part}", rf"{_OF_ANY}{_ROS_TURN}\.{part}",
     )  # fmt: skip
 

@@ -1,7 +1,9 @@
 """The laboratory's kernels in C do what their Python does, and what has no equal in C is refused."""
 
 import math
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from firmware_py.export.errors import ExportError
 from firmware_py.export.kernels import build, library, translate
 from firmware_py.export.live_reading import Arrays
 from firmware_py.export.methods import METHOD
+from support.random_programs import Language, Programs
 
 COMPILERS = [one for one in compilers() if one.name != "cc"]
 IDS = [one.name for one in COMPILERS]
@@ -100,6 +103,55 @@ def test_c_computes_the_bits_of_python(compiler: Compiler) -> None:
         assert [array.tobytes() for array in in_c] == [array.tobytes() for array in in_python]
 
     holds()
+
+
+LIVE = Language(
+    reals=("numbers[0]", "numbers[n % 5]", "COEFFICIENTS[m % 3]"),
+    wholes=("counts[0]", "counts[m % 3]"),
+    places=(("numbers[m % 5]", False), ("counts[n % 3]", True)),
+    real="{}", of_whole="f64({})", whole_of="i32({})", root="math.sqrt", truth="{}", live=True,
+)  # fmt: skip
+RANDOM = """\
+import math
+from firmware_py.compiling import compiler
+from firmware_py.core.subset import F64s, I32s, f64, i32
+
+COEFFICIENTS = (0.5, -0.25, 3.0)
+kernel = compiler()
+"""
+KERNEL = """
+
+@kernel
+def random_{name}(numbers: F64s, counts: I32s) -> None:
+    \"\"\"Do.\"\"\"
+{body}
+    numbers[4] = numbers[4] * 0.125 + (x - y if is_far else n - m - counts[0])
+"""
+
+
+def test_random_kernels_compute_the_bits_of_python(tmp_path: Path) -> None:
+    path = tmp_path / "random_kernels.py"
+    kernels = (KERNEL.format(name=n, body=indent(Programs(LIVE, n).body(), "    ")) for n in range(30))
+    path.write_text(RANDOM + "".join(kernels), encoding="utf-8")
+    spec = spec_from_file_location("random_kernels", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    functions = tuple(vars(module)[f"random_{n}"] for n in range(30))
+    in_c, in_python = ((np.zeros(5), np.zeros(3, i32)) for _ in range(2))
+    built = library(functions, in_c)
+    rng = np.random.default_rng(2)
+    for function in functions:
+        call = bound_in(built, METHOD + function.__name__, *in_c)
+        for _ in range(8):
+            for one, other, content in zip(
+                in_c, in_python, (rng.normal(0, 3, 5), rng.integers(-9, 9, 3)), strict=True
+            ):
+                one[:] = other[:] = content
+            call()
+            function(*in_python)
+            assert [one.tobytes() for one in in_c] == [one.tobytes() for one in in_python], function.__name__
 
 
 @kernel

@@ -14,9 +14,9 @@ from hil.errors import LabError
 from hil.laboratory.experiments import EXPERIMENTS, find_experiment
 from hil.laboratory.lockstep import ModelledLine
 from hil.laboratory.swarms.flying import Crowd
-from hil.laboratory.swarms.folder import other_swarm_in
+from hil.laboratory.swarms.folder import other_swarm_in, swarm_folder, swarm_reserved
 from hil.laboratory.swarms.request import SwarmRequest, places_of, swarm_of
-from hil.laboratory.swarms.result import Nearest, SwarmResult, write_swarm
+from hil.laboratory.swarms.result import SWARM, Nearest, SwarmResult, folder_name, write_swarm
 from hil.world.config import SwarmConfig
 
 ORIGINS = ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), (-4.0, 5.0, -6.0))
@@ -200,3 +200,27 @@ def test_a_swarm_passes_from_its_least_distance_on_and_its_file_says_so(
     ]  # fmt: skip
     swapped = replace(result, robots=result.robots[::-1])
     assert swapped.hash != result.hash
+
+
+def test_a_swarm_is_named_by_its_first_robot_and_gets_the_first_folder_that_holds_no_other(
+    tmp_path: Path,
+) -> None:
+    request = swarm_of([EXPERIMENTS["pushes"], EXPERIMENTS["hover"], EXPERIMENTS["pushes"]], seed=7)
+    assert request.title == "pushes, hover, 3 robots, seeds 7 to 9"
+    assert swarm_folder(request, tmp_path) == tmp_path / "pushes-7-x3"
+    (tmp_path / "pushes-7-x3" / "notes").mkdir(parents=True)
+    assert swarm_folder(request, tmp_path) == tmp_path / "pushes-7-x3-2"
+    (tmp_path / "pushes-7-x3-2").mkdir()
+    assert swarm_folder(request, tmp_path) == tmp_path / "pushes-7-x3-2", "an empty folder is free"
+    for number in (1, 2):
+        (tmp_path / "pushes-7-x3-2" / folder_name(number)).mkdir()
+    (tmp_path / "pushes-7-x3-2" / SWARM).touch()
+    assert swarm_folder(request, tmp_path) == tmp_path / "pushes-7-x3-3"
+    with (
+        pytest.raises(LabError, match=r"--out .*/pushes-7-x3: holds something else: choose another folder"),
+        swarm_reserved(request, tmp_path / "pushes-7-x3"),
+    ):
+        raise AssertionError
+    (tmp_path / "pushes-7-x3-2" / folder_name(3)).mkdir()
+    (tmp_path / "pushes-7-x3-2" / folder_name(3) / "something").touch()
+    assert other_swarm_in(tmp_path / "pushes-7-x3-2", request), "robot 3's folder holds something"

@@ -400,3 +400,64 @@ def test_a_breakpoint_of_others_is_theirs() -> None:
 def test_kill_ends_the_flight_like_ctrl_c() -> None:
     with pytest.raises(KeyboardInterrupt):
         on_chip(lambda _: [b"k"], 2_000)
+
+
+@pytest.mark.parametrize(("packet", "request_", "backwards"), [
+    (b"vCont;c", ResumeRequest.RUN, False), (b"vCont;C05", ResumeRequest.RUN, False),
+    (b"vCont;s:1;c", ResumeRequest.STEP, False),
+    (b"vCont;S05:1;c", ResumeRequest.STEP, False), (b"vCont;c;s:1", ResumeRequest.STEP, False),
+    (b"vCont", ResumeRequest.STOP, True),
+    (b"vKill;1", ResumeRequest.STOP, True), (b"bs", ResumeRequest.BACK_STEP, True), (b"bc", ResumeRequest.BACK_RUN, True),
+    (b"bs", ResumeRequest.STOP, False), (b"bx", ResumeRequest.STOP, True), (b"C05;20000000", ResumeRequest.RUN, False),
+    (b"S05", ResumeRequest.STEP, False),
+])  # fmt: skip
+def test_a_packet_resumes_as_the_manual_has_it(
+    machine: Chip, packet: bytes, request_: ResumeRequest, backwards: bool
+) -> None:
+    protocol = RemoteProtocol(machine, backwards=backwards)
+    assert ask(protocol, b"vCont?") == b"vCont;c;C;s;S"
+    assert (b"ReverseStep+;ReverseContinue+" in ask(protocol, b"qSupported:xmlRegisters=arm")) is backwards
+    answer = protocol.receive(framed(packet))
+    assert (protocol.request, answer) == (
+        request_,
+        b"+" + (framed(b"") if request_ is ResumeRequest.STOP else b""),
+    )
+
+
+def test_what_a_debugger_has_set_does_not_go_back_in_time(machine: Chip) -> None:
+    """Breakpoints and watchpoints are those of the later instant, acknowledgements and known threads as well."""
+    protocol = RemoteProtocol(machine)
+    for packet in (b"Z1,8001000,2", b"Z2,20000010,4", b"Z3,20000020,2"):
+        assert ask(protocol, packet) == b"OK"
+    assert protocol.has_stops
+    stored = protocol.stored()
+    assert stored["breakpoints"] == [0x800_1000]
+    earlier = RemoteProtocol(machine)
+    machine.breakpoints.clear()
+    watched: list[tuple[int, ...]] = []
+    machine.watch = lambda *one, on: watched.append((*one, on))  # type: ignore[method-assign,assignment]
+    for packet in (b"Z0,8002000,2", b"Z2,20000010,4", b"Z4,20000030,4"):
+        ask(earlier, packet)
+    watched.clear()
+    earlier.receive(b"\x03" + framed(b"c") + framed(b"g"))  # it runs, and a packet waits
+    earlier.restore(stored)
+    assert machine.breakpoints == {0x800_1000}
+    assert sorted(watched) == [(3, 0x2000_0020, 2, True), (4, 0x2000_0030, 4, False)]
+    assert earlier.stored() == stored
+    assert (earlier.request, earlier.interrupted, earlier.take_changes()) == (ResumeRequest.RUN, False, False)
+    assert earlier.stopped(SIGTRAP) == framed(b"T05thread:1;"), "no packet waits any more"
+
+
+@pytest.mark.parametrize(("packet", "changes"), [
+    (b"P0=00000000", True), (b"M20000000,1:00", True), (b"c8000100", True), (b"g", False), (b"m20000000,4", False),
+    (b"Z1,8001000,2", False), (b"c", False),
+])  # fmt: skip
+def test_what_changes_the_machine_is_noted_once(
+    protocol: RemoteProtocol, packet: bytes, changes: bool
+) -> None:
+    assert not protocol.take_changes()
+    protocol.receive(framed(packet))
+    assert protocol.take_changes() is changes
+    assert not protocol.take_changes()
+    assert protocol.stopped(SIGINT, at_begin=True) == framed(b"T02replaylog:begin;thread:1;")
+    assert protocol.stopped(SIGTRAP, 0x2000_0010) == framed(b"T05watch:20000010;thread:1;")

@@ -444,3 +444,55 @@ def test_log_variables_and_parameters_are_read_from_the_images_own_tables(
         "test.revision": (1, "U8", False, 7),
         "wait.timeout": (3, "U16", True, 500),
     }
+
+
+# What the list of a queue's waiting tasks means, by the queue's members (queue.c of FreeRTOS): the item's size, its length,
+# the items that wait, its first byte (0 in a mutex), and the mutex's holder.
+RECEIVE, SEND = "xTasksWaitingToReceive", "xTasksWaitingToSend"
+WAITS = [
+    (RECEIVE, (4, 10, 0, 0x2000_0100, 0), Wait("it waits for an item of queue bus_guard", for_messages=True)),
+    (RECEIVE, (4095, 65_535, 0, 0x2000_0100, 0), Wait("it waits for an item of queue bus_guard", for_messages=True)),
+    (SEND, (4, 10, 10, 0x2000_0100, 0), Wait("it waits for room in queue bus_guard")),
+    (RECEIVE, (0, 1, 0, 0x2000_0100, 0), Wait("it waits for semaphore bus_guard")),
+    (RECEIVE, (0, 1, 0, 0, 0), Wait("it waits for mutex bus_guard")),
+    (RECEIVE, (0, 1, 0, 0, 1), Wait("it waits for mutex bus_guard, which task SPIN-0 holds")),
+    *((RECEIVE, (size, length, waiting, 0x2000_0100, 0), Wait("it waits at bus_guard"))  # no queue
+      for size, length, waiting in ((4, 0, 0), (4, 65_536, 0), (4096, 10, 0), (4, 10, 1))),
+    (SEND, (4, 10, 9, 0x2000_0100, 0), Wait("it waits at bus_guard")),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("member", "values", "wait"), WAITS)
+def test_a_wait_for_a_queue_is_told_by_its_members(member: str, values: tuple[int, ...], wait: Wait) -> None:
+    machine = FirmwareOnChip()
+    kernel = FreeRtos(machine.image, machine.chip.read)
+    run_to_end(machine, 5)
+    queue, layout = machine.image.symbol("bus_guard").address, kernel._queue
+    assert layout is not None
+    names = ("uxItemSize", "uxLength", "uxMessagesWaiting", "pcHead", "u.xSemaphore.xMutexHolder")
+    holder = next(task.block for task in kernel.tasks() if task.name == "SPIN-0")
+    for name, value in zip(names, (*values[:4], values[4] and holder), strict=True):
+        machine.chip.write(queue + layout[name].offset, pack("<I", value))
+    assert kernel._wait_in(queue + layout[member].offset) == wait
+
+
+def test_a_task_is_delayed_for_ever_beyond_an_hour_also_where_the_ticks_wrap() -> None:
+    machine = FirmwareOnChip()
+    kernel = FreeRtos(machine.image, machine.chip.read)
+    run_to_end(machine, 30)
+    tasks = {task.name: task for task in kernel.tasks()}
+    wakes = tasks["REPORT"].block + kernel._task["xStateListItem.xItemValue"].offset
+    for now, ticks, ever in (
+        (100, 3_600_000, False), (100, 3_600_001, True), (2**32 - 10, 3_600_000, False), (2**32 - 10, 3_600_001, True),
+        (100, 2**32 - 1, True), (100, 0, False),
+    ):  # fmt: skip
+        machine.poke("xTickCount", now)
+        machine.chip.write(wakes, pack("<I", (now + ticks) % 2**32))
+        expected = Wait("it is delayed for ever") if ever else None
+        assert kernel.endless_wait(tasks["REPORT"].block) == expected, (now, ticks)
+    assert kernel.endless_wait(tasks["IDLE"].block) is None
+    assert kernel.endless_wait(tasks["FROZEN"].block) == Wait("it is suspended")
+    notify = tasks["FROZEN"].block + kernel._task["ucNotifyState"].offset
+    for state, wait in ((1, "it waits for a notification"), (2, "it is suspended")):
+        machine.chip.write(notify, bytes((state,)))
+        assert kernel.endless_wait(tasks["FROZEN"].block) == Wait(wait)

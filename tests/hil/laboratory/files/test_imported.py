@@ -18,7 +18,7 @@ from hil import LabError, column, fly, load_run
 from hil.laboratory.files.alignment import released_like
 from hil.laboratory.files.imported import import_log
 from hil.laboratory.files.joined import Joined, join
-from hil.laboratory.files.log_map import Map
+from hil.laboratory.files.log_map import Map, guess
 from hil.laboratory.files.tables import Table, read_tables
 from hil.pictures.viewer.recording import recording_of
 from support.command import Cli
@@ -284,6 +284,54 @@ def test_times_without_a_unit_have_that_of_a_usual_step(step: float, unit: str) 
     assert joined.clock == f"t [{unit}]"
     assert joined.columns["x"].tolist() == [0.0, 4.0, 7.0, 9.0]
     assert joined.notes == ["6 rows are left out: t does not advance there"]
+
+
+# Names of programs that write such logs, what they give, with which sign; unit of values as large as the limit, and beyond.
+KNOWN = [
+    *((f"{source}.{axis}", f"cameras.{axis}", "", 20.0, "m", "mm")
+      for axis in "xyz" for source in ("vicon", "mocap.pos", "p")),
+    *((f"stateEstimate.{axis}", f"cameras.{axis}", "", 20.0, "m", "m") for axis in "xyz"),
+    ("LOCAL_POSITION_NED.x", "cameras.x", "", 20.0, "m", "mm"), ("LOCAL_POSITION_NED.y", "cameras.y", "-", 20.0, "m", "mm"),
+    ("LOCAL_POSITION_NED.z", "cameras.z", "-", 20.0, "m", "mm"), ("vicon.roll", "cameras.roll", "", 2 * np.pi, "rad", "deg"),
+    ("phi", "cameras.roll", "", 2 * np.pi, "rad", "deg"), ("theta", "cameras.pitch", "", 2 * np.pi, "rad", "deg"),
+    ("psi", "cameras.yaw", "", 2 * np.pi, "rad", "deg"), ("stabilizer.roll", "cameras.roll", "", 0.1, "deg", "deg"),
+    ("stabilizer.pitch", "cameras.pitch", "-", 0.1, "deg", "deg"),
+    ("ATTITUDE.pitch", "cameras.pitch", "-", 2 * np.pi, "rad", "deg"),
+    ("ATTITUDE.yaw", "cameras.yaw", "-", 2 * np.pi, "rad", "deg"),
+    ("ATTITUDE.roll", "cameras.roll", "", 2 * np.pi, "rad", "deg"),
+    *((f"{name}.x", "goal.x", "", 20.0, "m", "mm") for name in ("target", "setpoint", "desired", "ref", "goal")),
+    ("ctrltarget.z", "goal.z", "", 90.0, "m", "m"), ("setpoint.yaw", "goal.yaw", "", 2 * np.pi, "rad", "deg"),
+    ("SET_POSITION_TARGET_LOCAL_NED.yaw", "goal.yaw", "-", 2 * np.pi, "rad", "deg"),
+    ("SET_POSITION_TARGET_LOCAL_NED.x", "goal.x", "", 20.0, "m", "mm"),
+    ("SET_POSITION_TARGET_LOCAL_NED.z", "goal.z", "-", 20.0, "m", "mm"),
+    ("pm.vbat", "battery.voltage", "", 100.0, "V", "mV"), ("battery", "battery.voltage", "", 100.0, "V", "mV"),
+    ("quat.w", "cameras.qw", "", 1.0, "", ""), ("vicon.qx", "cameras.qx", "", 1.0, "", ""),
+    ("q_z", "cameras.qz", "", 1.0, "", ""),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "column", "sign", "limit", "up_to", "beyond"), KNOWN)
+def test_a_known_name_gives_its_column_in_the_unit_of_its_size(
+    name: str, column: str, sign: str, limit: float, up_to: str, beyond: str
+) -> None:
+    for largest, unit in ((limit, up_to), (1.001 * limit, beyond)):
+        joined = Joined(1e4 * np.arange(3), {name: np.array([0.0, -largest, np.nan])}, {name: ""}, "t [us]")
+        assert guess(joined).columns == {
+            "t": "t [us]",
+            column: f"{sign}{name} [{unit}]" if unit else f"{sign}{name}",
+        }
+    stated = Joined(1e4 * np.arange(3), {name: np.full(3, np.nan)}, {name: ""}, "t [us]")
+    assert guess(stated).columns[column] == (f"{sign}{name} [{up_to}]" if up_to else f"{sign}{name}")
+
+
+@pytest.mark.parametrize(("others", "kept"), [(16, 16), (17, 1)])
+def test_of_many_columns_only_those_that_change_are_kept(others: int, kept: int) -> None:
+    columns = {f"a{number}": np.array([np.nan, 1.0, 1.0 + (number == 3)]) for number in range(others)}
+    joined = Joined(1e4 * np.arange(3), columns, dict.fromkeys(columns, ""), "t [us]")
+    assert len(guess(joined).columns) == 1 + kept
+    assert joined.notes == (
+        [] if kept == others else [f"{others - 1} further columns that do not change are left out"]
+    )
 
 
 def test_a_clock_from_the_release_releases_at_its_zero(tmp_path: Path) -> None:

@@ -1,0 +1,225 @@
+"""The program's end of the virtual Crazyradio: as pyusb sees it, and its frames to each process of a server."""
+
+import errno
+import socket
+from array import array
+from collections.abc import Iterator
+from threading import Thread
+
+import pytest
+import usb.core
+import usb.util
+
+from hil.servers.dongle_plugin import (
+    CONTROL,
+    PAUSES,
+    PORTS,
+    READ,
+    WRITE,
+    Backend,
+    Connection,
+    SimulatedClock,
+    all_descriptors,
+    frame,
+    standard_request,
+)  # fmt: skip
+
+ACKED, LOST = b"\x01", b"\x00"
+
+
+class Process:
+    """A process of a server, played by the test: its frames wait in the socket until the client reads."""
+
+    def __init__(self) -> None:
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self.listener.getsockname()[1]
+
+    def accept(self, greeting: bytes = b"") -> None:
+        self.client, _ = self.listener.accept()
+        self.client.settimeout(2.0)
+        self.client.sendall(greeting)
+
+    def frames(self, many: int) -> list[tuple[bytes, bytes]]:
+        found = []
+        for _ in range(many):
+            kind, self.sequence, size = self.client.recv(3, socket.MSG_WAITALL)
+            found.append((bytes((kind,)), self.client.recv(size, socket.MSG_WAITALL) if size else b""))
+        return found
+
+    def answer(self, data: bytes, sequence: int | None = None) -> None:
+        self.client.sendall(frame(READ, self.sequence if sequence is None else sequence, data))
+
+    def silent(self) -> bool:
+        self.client.setblocking(False)
+        try:
+            return not self.client.recv(1)
+        except BlockingIOError:
+            return True
+        finally:
+            self.client.settimeout(2.0)
+
+    def die(self) -> None:
+        self.client.close()
+
+
+@pytest.fixture
+def processes() -> Iterator[tuple[Process, Process]]:
+    first, second = Process(), Process()
+    yield first, second
+    for one in (first, second):
+        one.listener.close()
+        one.client.close()
+
+
+@pytest.fixture
+def dongle(processes: tuple[Process, Process]) -> Iterator[Connection]:
+    """A dongle whose server has another process; a third one has ended."""
+    first, second = processes
+    gone = socket.create_server(("127.0.0.1", 0))
+    ports = second.port.to_bytes(2) + gone.getsockname()[1].to_bytes(2)
+    gone.close()
+    greeting = Thread(target=first.accept, args=(frame(PORTS, 0, ports),))
+    greeting.start()
+    connection = Connection("127.0.0.1", first.port)
+    greeting.join()
+    second.accept()
+    yield connection
+    connection.close()
+
+
+def test_pyusb_finds_a_crazyradio() -> None:
+    """Vendor and product are Bitcraze's; USB 2.0, chapter 9.6, has the layout of the descriptors."""
+    process = Process()
+    device = usb.core.find(idVendor=0x1915, idProduct=0x7777, backend=Backend(f"127.0.0.1:{process.port}"))
+    assert device is not None
+    assert (device.bcdDevice, device.iManufacturer, device.iProduct, device.iSerialNumber) == (
+        0x0504,
+        1,
+        2,
+        3,
+    )
+    assert [one.bEndpointAddress for one in device[0][(0, 0)]] == [0x81, 0x01]
+    process.listener.close()
+    data = all_descriptors()
+    assert (data[:2], len(data), int.from_bytes(data[20:22], "little")) == (b"\x12\x01", 18 + 32, 32)
+    assert data[8:14] == bytes.fromhex("1519 7777 0405")
+    assert data[27:29] == b"\x09\x04"
+    assert [data[at : at + 7] for at in (36, 43)] == [bytes((7, 5, end, 2, 64, 0, 0)) for end in (0x81, 0x01)]
+    assert standard_request(6, 0x0100) + standard_request(6, 0x0200) == data
+    assert standard_request(6, 0x0300) == b"\x04\x03\x09\x04", "US English"
+    for index, text in enumerate(("Bitcraze AB", "Crazyradio (Floaty virtual laboratory)", "F10A7Y0001"), 1):
+        answer = standard_request(6, 0x0300 + index)
+        assert (answer[0], answer[1], answer[2:].decode("utf-16-le")) == (len(answer), 3, text)
+        buffer = array("B", bytes(255))
+        size = Backend("x:1").ctrl_transfer(None, 0x80, 6, 0x0300 + index, 0, buffer, 0)  # type: ignore[arg-type]
+        assert buffer[:size].tobytes() == answer
+    assert [standard_request(*one) for one in ((6, 0x0304), (6, 0x0400), (5, 0x0301))] == [b"", b"", b""]
+
+
+def test_a_packet_goes_to_every_process_until_a_board_has_answered_with_these_settings(
+    dongle: Connection, processes: tuple[Process, Process]
+) -> None:
+    first, second = processes
+    dongle.control(b"\x01\x50\x00")
+    dongle.write(b"a")
+    for one, answer in ((first, LOST), (second, ACKED + b"up")):
+        assert one.frames(2) == [(CONTROL, b"\x01\x50\x00"), (WRITE, b"a")]
+        one.answer(b"old", one.sequence - 1)  # of a transfer that was given up
+        one.answer(answer)
+    assert dongle.awaits_answer
+    assert dongle.read(1.0) == ACKED + b"up"
+    assert not dongle.awaits_answer
+    dongle.write(b"b")
+    assert second.frames(1) == [(WRITE, b"b")]
+    assert first.silent()
+    second.answer(LOST)
+    assert dongle.read(1.0) == LOST
+    dongle.write(b"c")  # the board may have another process now
+    assert [one.frames(1) for one in (first, second)] == 2 * [[(WRITE, b"c")]]
+    first.answer(ACKED)
+    assert dongle.read(1.0) == ACKED
+    dongle.control(b"\x01\x51\x00")
+    dongle.write(b"d")
+    assert [one.frames(2)[1] for one in (first, second)] == 2 * [(WRITE, b"d")]
+
+
+def test_without_acknowledgements_none_is_awaited(
+    dongle: Connection, processes: tuple[Process, Process]
+) -> None:
+    dongle.control(b"\x10\x00\x00")
+    dongle.write(b"a")
+    assert not dongle.awaits_answer
+    assert dongle.read(1.0) == LOST
+    dongle.control(b"\x10\x01\x00")
+    dongle.write(b"b")
+    assert dongle.awaits_answer
+
+
+@pytest.mark.parametrize(("mode", "head"), [(1, b""), (2, b"\x28")])
+def test_in_an_inline_mode_the_settings_are_in_each_packet(
+    dongle: Connection, processes: tuple[Process, Process], mode: int, head: bytes
+) -> None:
+    """Length, flags with rate and acknowledgement, channel, address; the answer begins with its length."""
+    dongle.control(bytes((0x23, mode, 0)))
+    dongle.write(bytes((9, 0x12, 80)) + b"\xe7\xe7\xe7\xe7\x02" + b"x")
+    settings = [b"\x01\x50\x00", b"\x02\x00\x00\xe7\xe7\xe7\xe7\x02", b"\x03\x02\x00", b"\x10\x01\x00"]
+    for one in processes:
+        assert one.frames(5) == [*((CONTROL, data) for data in settings), (WRITE, b"x")]
+        one.answer(ACKED + b"up")
+    assert dongle.read(1.0) == bytes((4 + len(head),)) + ACKED + head + b"up"
+    dongle.write(bytes((9, 0x01, 80)) + b"\xe7\xe7\xe7\xe7\x02" + b"y")
+    assert [data for _, data in processes[1].frames(3)] == [b"\x03\x01\x00", b"\x10\x00\x00", b"y"]
+    assert dongle.awaits_answer, "also without an acknowledgement"
+    assert dongle.read(1.0) == bytes((2 + len(head),)) + LOST + head
+
+
+def test_a_process_that_ends_is_left_out_and_without_the_first_one_the_dongle_is_unplugged(
+    dongle: Connection, processes: tuple[Process, Process]
+) -> None:
+    first, second = processes
+    backend, buffer = Backend("127.0.0.1:1"), array("B", bytes(64))
+    assert backend.bulk_write(dongle, 1, 0, array("B", b"abc"), 0) == 3
+    with pytest.raises(usb.core.USBTimeoutError) as late:
+        backend.bulk_read(dongle, 0x81, 0, buffer, 20)
+    assert late.value.errno == errno.ETIMEDOUT
+    second.die()
+    first.frames(1)
+    first.answer(LOST)
+    assert backend.bulk_read(dongle, 0x81, 0, buffer, 1000) == 1
+    dongle.write(b"b")
+    first.frames(1)
+    first.answer(ACKED)
+    assert dongle.read(1.0) == ACKED
+    first.die()
+    dongle.write(b"c")
+    with pytest.raises(usb.core.USBError) as gone:
+        backend.bulk_read(dongle, 0x81, 0, buffer, 1000)
+    assert gone.value.errno == errno.ENODEV
+
+
+def test_a_sleep_lasts_longer_by_what_simulated_time_stood_still() -> None:
+    process, slept = Process(), list[float]()
+
+    def sleep(duration_s: float) -> None:
+        slept.append(round(duration_s, 6))
+
+    def serve() -> None:
+        process.accept(frame(PORTS, 0, b""))
+        for stood_us in (1_000, 61_000, 71_000, 71_000):
+            assert process.frames(1) == [(PAUSES, b"")]
+            process.answer(stood_us.to_bytes(8))
+
+    server = Thread(target=serve)
+    server.start()
+    clock = SimulatedClock(("127.0.0.1", process.port), sleep)
+    clock.sleep(0.049)
+    assert slept == [0.049]
+    clock.sleep(0.05)
+    assert slept == [0.049, 0.05, 0.06, 0.01]
+    server.join()
+    clock.close()
+    process.client.close()
+    process.listener.close()
+    plain = SimulatedClock(("127.0.0.1", process.port), sleep)
+    plain.sleep(1.0)
+    assert slept[4:] == [1.0], "without a server"

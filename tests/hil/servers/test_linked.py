@@ -1,0 +1,108 @@
+"""A flight whose ground station is another process: how it is started, what it says, and when it is given up."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+from socket import socket
+from typing import Any
+
+import pytest
+
+from hil.config import load_config
+from hil.errors import LabError
+from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.request import Request
+from hil.servers.dongle_plugin import VARIABLE
+from hil.servers.linked import LISTEN_PERIOD_US, RELEASE_TIMEOUT_US, WARM_UP_US, linked_flight
+
+with socket() as free:
+    free.bind(("127.0.0.1", 0))
+    UDP = f"udp://127.0.0.1:{free.getsockname()[1]}"
+TALK = "import sys; print('first'); print('second'); print('cut', end='', flush=True); sys.stdin.read(); "
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as stack:
+        yield stack
+
+
+def line_of(stack: ExitStack, folder: Path, link: str, program: str = "", **options: Any) -> Any:
+    """Return the line of a linked flight, whose station is a program in Python."""
+    request = Request.of(EXPERIMENTS["yaw-step"], link=link, **options)
+    line: Any = stack.enter_context(closing(linked_flight(request, folder / "telemetry.csv", stack))).line
+    line.started_by = line._command
+    line._command = [sys.executable, "-c", program]
+    return line
+
+
+def heard(line: Any, now_us: int) -> list[tuple[str, str]]:
+    texts: list[tuple[str, str]] = []
+    while len(texts) < 2:
+        line._next_listen_us = 0
+        texts += line.new_messages(now_us)
+    assert line.new_messages(now_us + LISTEN_PERIOD_US - 1) == []
+    return texts
+
+
+@pytest.mark.parametrize(
+    "link", ["radio://0/80/2M/E7E7E7E7E7", UDP, "mavlink:pty"], ids=["radio", "udp", "mavlink"]
+)
+def test_the_station_gets_its_link_its_cameras_and_the_profile(
+    stack: ExitStack, tmp_path: Path, link: str
+) -> None:
+    line = line_of(stack, tmp_path, link, overrides=("controller.gain_r=0.08",))
+    words = line.started_by
+    assert words[1:5] == ["-m", "hil.commands", "station", "yaw-step"]
+    given = dict(zip(words[5::2], words[6::2], strict=False))
+    shown = given["--link"]
+    assert shown == link if not link.startswith("mavlink") else shown.startswith("mavlink:/dev/pts/")
+    assert shown.endswith(f",{load_config().serial.baud}") is link.startswith("mavlink")
+    assert given["--mocap"] == f"optitrack:127.0.0.1:{line._motive.port},body=floaty,y-up"
+    assert given["--log"] == str(tmp_path / "telemetry.csv")
+    assert ("--tlog" in given) is link.startswith("mavlink")
+    assert given["--profile"] == "floaty"
+    assert {"--set=controller.gain_r=0.08", "--set=capture.yaw=0", "--set=capture.origin=[0,0,0]"} <= set(
+        words
+    )
+    assert (VARIABLE in line._environment) is link.startswith("radio")
+
+
+def test_whole_lines_of_the_station_are_heard_once_after_the_warm_up(
+    stack: ExitStack, tmp_path: Path
+) -> None:
+    line = line_of(stack, tmp_path, UDP, TALK + "sys.stdin.close(); import time; time.sleep(60)")
+    assert line.new_messages(WARM_UP_US - 1) == []
+    assert line._station is None, "it starts when the laboratory runs"
+    assert heard(line, WARM_UP_US) == [("station", "first"), ("station", "second")]
+    assert line.new_messages(RELEASE_TIMEOUT_US - 1) == []
+    with pytest.raises(LabError, match=r"^no flight within 60 s: second$"):
+        line.new_messages(RELEASE_TIMEOUT_US)
+    line._release_us = RELEASE_TIMEOUT_US - 1
+    assert line.new_messages(RELEASE_TIMEOUT_US) == []
+
+
+@pytest.mark.parametrize(("program", "said"), [(TALK, "second"), ("", "no output")])
+def test_a_station_that_ends_is_given_up_with_its_last_line(
+    stack: ExitStack, tmp_path: Path, program: str, said: str
+) -> None:
+    line = line_of(stack, tmp_path, UDP, f"{program}raise SystemExit(3)")
+    line._running_station().wait()
+    with pytest.raises(LabError, match=rf"^the station ended with 3: {said}$"):
+        line.new_messages(WARM_UP_US)
+
+
+def test_the_goal_is_at_home_until_the_release_and_its_own_parts_cannot_be_steered(
+    stack: ExitStack, tmp_path: Path
+) -> None:
+    line = line_of(stack, tmp_path, UDP)
+    home = line.trajectory.at(10_000_000)
+    assert home.yaw == 0.0
+    line._release_us = 2_000_000
+    assert line.trajectory.at(2_999_999) == home
+    assert line.trajectory.at(3_000_000).yaw == pytest.approx(1.919862, abs=1e-6)
+    with pytest.raises(LabError, match="steer it there"):
+        line.steer(None)
+    with pytest.raises(LabError, match="set parameters there"):
+        line.listen(print)
