@@ -8,18 +8,26 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import binomtest
 
 from hil.commands import compare, design, identify, listing, paper, tables
+from hil.config import load_config
+from hil.errors import LabError
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.metric_pairs import MetricPair
 from hil.laboratory.metrics import Verdict
 from hil.pictures.compare import Apart, Comparison, FirstDifference
+from hil.research.campaigns.dataset import Dataset
 from hil.research.campaigns.jobs import Job, Row
+from hil.research.campaigns.run import Runner
+from hil.research.campaigns.sampling import draw
 from hil.research.design.axes import PITCH, YAW
 from hil.research.design.margins import Margins
 from hil.research.studies.paper import Paper, Trials
 from hil.research.studies.paper_rows import MetricClaim, PaperRow
 from hil.research.studies.two_boards import FirstCount, Seed
+from support.campaigns import planted, spec_of
+from support.command import Cli
 
 
 @pytest.fixture
@@ -290,4 +298,141 @@ def test_a_design_prints_its_robot_inputs_and_claims(printed: Any) -> None:
         "-1 to 1", "± 2"],
         "the paper's design", ["claim", "paper", "computed", ""], ["pole", "9.5", "9.4", "agrees"], ["lift", "1", "2",
         "differs"],
+    ]  # fmt: skip
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize(
+    ("gains", "code", "kept"),
+    [((True, False), 0, 0), ((False, False), 0, 0), ((False, True), 0, 1), ((), 2, None)],
+)
+def test_rounds_of_tuning_are_printed_in_turn_and_the_last_that_gained_is_written(
+    gains: tuple[bool, ...], code: int, kept: int | None, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After them a round ends with an error: it is fatal only where it is the first."""
+    asked: list[Any] = []
+    profiles = ("floaty", "lqr")
+
+    def rounds(profile: str, flights: Any, robots: int, count: int) -> Any:
+        asked.append((profile, flights.seed, flights.board, robots, count))
+        yield from (Made(better=one, profile=profiles[number]) for number, one in enumerate(gains))
+        raise LabError("no gains")
+
+    monkeypatch.setattr("hil.research.studies.tuning.rounds", rounds)
+    monkeypatch.setattr("hil.research.studies.tuning.write_tuned", lambda *what: asked.append(what))
+    monkeypatch.setattr(identify, "_print_round", lambda one: identify.say(one.profile))
+    assert cli("tune", "--repeat", "3", "--robots", "7", "--seed", "5", "--out", "mine.toml") == code
+    assert asked[0] == ("floaty", 5, "c", 7, 3)
+    if kept is None:
+        assert cli.err.endswith("no gains\n")
+        return
+    printed = [
+        line for number, _ in enumerate(gains, 1) for line in (f"round {number}", profiles[number - 1])
+    ]
+    assert cli.out.splitlines() == [*printed, "  mine.toml   (floaty fly hover --profile mine.toml)"]
+    assert cli.err.splitlines()[-1].endswith("no gains; the best earlier round counts")
+    assert asked[1] == (
+        Path("mine.toml"),
+        "floaty",
+        load_config(profiles[kept]),
+        "Model and gains by floaty tune.",
+    )
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize("better", [True, False])
+def test_one_round_of_tuning_is_judged_by_its_exit_code(
+    better: bool, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "hil.research.studies.tuning.fly_round", lambda *what: Made(better=better, profile="floaty")
+    )
+    monkeypatch.setattr(identify, "_print_round", lambda one: None)
+    assert cli("tune") == (0 if better else 1)
+    assert cli.out == ""
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize("better", [True, False])
+def test_a_search_prints_each_number_and_the_metric_before_and_after_and_writes_what_is_better(
+    better: bool, cli: Cli, printed: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def search(varied: Any, aim: Any, runner: Any, folder: Path, report: Any) -> Any:
+        assert (aim.experiment, aim.metric, aim.seeds, aim.flights) == ("yaw-step", "rms_y", (4, 5), 30)
+        assert (aim.options["profile"], aim.options["duration_s"], aim.options["board"]) == (
+            "floaty",
+            2.0,
+            "py",
+        )
+        report(1, 2, 0.0123)
+        return Made(values=(-1.25, 3.5), before=0.02, after=0.01, better=better)
+
+    monkeypatch.setattr("hil.research.studies.search.search", search)
+    gains = load_config().controller
+    code = cli("tune", "--vary", "controller.gain_y=-3..-0.5", "--vary", "controller.gain_z=1..5", "--metric", "rms_y",
+    "--seeds", "2",
+               "--experiment", "yaw-step", "--duration", "2", "--flights", "30", "--seed", "4", "--board", "py", "--out",
+               "mine.toml")  # fmt: skip
+    assert code == (0 if better else 1)
+    cells = [["", "before", "found"], ["controller.gain_y", f"{gains.gain_y:g}", "-1.25"], ["controller.gain_z",
+    f"{gains.gain_z:g}", "3.5"],
+             ["rms_y", "2 cm", "1 cm"]]  # fmt: skip
+    last = (
+        "mine.toml   (floaty fly yaw-step --profile mine.toml)"
+        if better
+        else "not better than before: nothing is written"
+    )
+    print(cli.out, end="")
+    assert printed() == ["round 1 of 2: rms_y 1.23 cm", "rms_y of yaw-step, on other seeds", *cells, last]
+    assert Path("mine.toml").exists() == better
+    if better:
+        found = load_config("mine.toml")
+        assert (found.controller.gain_y, found.controller.gain_z) == (-1.25, 3.5)
+
+
+@pytest.mark.usefixtures("empty_folder")
+def test_a_campaign_prints_its_rates_its_errors_and_its_three_worst_flights(
+    cli: Cli, printed: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of eight flights 1 and 3 break a limit, 5 is lost and 6 ends with an error."""
+    spec = spec_of(flights=8)
+    changes: dict[int, dict[str, Any]] = {
+        1: {"holds": {"in_box": False}, "metrics": {"in_box": 0.5}}, 3: {"holds": {"in_box": False},
+        "metrics": {"in_box": 0.25}},
+        5: {"outcome": "lost", "error": "fell", "holds": {"in_box": False}, "metrics": {"flown": 0.2}},
+        6: {"outcome": "error", "error": "planted", "holds": {}},
+    }  # fmt: skip
+
+    def campaign(runner: Any, plan: Any, out: Path) -> Any:
+        dataset = Dataset(out, plan, False)
+        for index in range(8):
+            made = planted(draw(spec, index))
+            change = {"holds": {"in_box": True}, **changes.get(index, {})}
+            metrics = made.metrics | {"in_box": 0.99} | change.pop("metrics", {})
+            dataset.add(replace(made, passed=index not in changes, metrics=metrics, **change))
+        dataset.close()
+        return dataset, Made(complete=True, flown=8)
+
+    monkeypatch.setattr(Runner, "campaign", campaign)
+    Path("spec.toml").write_text(
+        'experiments = ["hover"]\nduration_s = 0.3\nflights = 8\nparameters = {"actuators.tau" = {uniform = [0.04, 0.06]}}\n'
+        '[[faults]]\nkind = "push.y"\nprobability = 0.5\nstart_s = 0.1\nsize = {uniform = [1.0, 12.0]}\n'
+    )
+    assert cli("campaign", "spec.toml", "--out", "runs/x") == 0
+    print(cli.out, end="")
+
+    def rate(failed: int, flown: int, which: str = "") -> str:
+        low, high = (100.0 * end for end in binomtest(failed, flown).proportion_ci(method="wilson"))
+        return f"{failed} of {flown}{which}: {100.0 * failed / flown:.2f} % ({low:.2f} to {high:.2f} %)"
+
+    def command(number: int) -> str:
+        options = draw(spec, number).options
+        more = [f"--set {one}" for one in options["overrides"]] + [
+            f"--fault {one}" for one in options["faults"]
+        ]
+        return f"flight {number}: floaty fly hover --seed {number + 1} --duration 0.3 {' '.join(more)}"
+
+    assert [line for line in printed() if "0 of 0" not in line] == [
+        f"failed: {rate(4, 8)}", f"floaty, lost: {rate(1, 7)}", f"floaty, in_box: {rate(2, 6, ' that were not lost')}",
+        "did not end: 1×, first flight 6: planted", *map(command, (5, 3, 1)), "runs/x/report.html",
     ]  # fmt: skip
