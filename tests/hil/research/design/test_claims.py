@@ -159,7 +159,7 @@ def test_pictures_of_a_design_show_their_sweeps_by_name(point: Point) -> None:
     assert [text.get_text() for text in right.get_legend().get_texts()] == ["real", "imaginary"]
     swept, (left, right) = angles(), figures.hover(point, angles()).axes
     for (name, values), colour in zip(
-        left.lines, swept.constants.items(), (AXIS_COLOURS[2], *AXIS_COLOURS[:2], ORANGE), strict=False
+        swept.constants.items(), (AXIS_COLOURS[2], *AXIS_COLOURS[:2], ORANGE), strict=True
     ):
         shown = {one.get_label(): one for one in left.lines}[name]
         assert shown.get_xydata() == pytest.approx(np.c_[np.degrees(OPENINGS), values / max(abs(values))])
