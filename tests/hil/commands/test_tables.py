@@ -8,10 +8,8 @@ from dataclasses import replace
 from math import radians
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from hil.commands.compare import _print_seeds
 from hil.commands.options import exit_code
 from hil.commands.tables import SEED_COLUMNS, print_result, print_seeds
 from hil.laboratory.experiments import EXPERIMENTS
@@ -21,7 +19,6 @@ from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.research.campaigns.jobs import Job, Row
 from hil.research.campaigns.run import Runner
-from hil.research.studies.two_boards import FirstCount, Seed
 from support.command import Cli
 
 
@@ -43,18 +40,6 @@ def made(rms: float, holds: bool, outcome: str = "completed") -> Row:
     metrics |= {"flown": 0.1} | {f"within_6cm_{axis}": 0.9 if holds else 0.5 for axis in "xyz"}
     job = Job(0, "hover", {"profile": "floaty"}, {})
     return Row(job, outcome, "", holds, "0" * 64, metrics, {"rms_x": holds})
-
-
-def test_means_are_those_of_the_completed_flights(capsys: pytest.CaptureFixture[str]) -> None:
-    print_seeds([made(0.01, True), made(0.03, False), made(0.5, False, "lost")])
-    shown = capsys.readouterr().out
-    assert "3 seeds: 1 hold all limits, 1 lost" in shown
-    assert (
-        "mean of the completed: rms x 2.00 y 2.00 z 2.00 cm; < 6 cm x 70.0 y 70.0 z 70.0 % of the time"
-        in shown
-    )
-    assert " 9.0 " in shown, "degrees"
-    assert "fails: rms_x" in shown
 
 
 def test_a_table_shows_control_characters_and_no_writer_can_send_them(
@@ -114,16 +99,3 @@ def test_seeds_count_up_and_one_that_fails_is_exit_code_one(
     assert cli("fly", "hover", "--seeds", "3", "--seed", "5") == code
     assert [job.options["seed"] for job in jobs] == [5, 6, 7]
     assert len({job.folder for job in jobs}) == 3
-
-
-@pytest.mark.parametrize(("differ", "code"), [((False, False), 0), ((True, False), 1), ((True, True), 1)])
-def test_differing_boards_fail(
-    differ: tuple[bool, ...], code: int, capsys: pytest.CaptureFixture[str]
-) -> None:
-    first = FirstCount(7, 0.07, "motor.m1", (1, 2), "radio")
-    rms = (np.full(3, 0.01), np.full(3, 0.011))
-    seeds = [
-        Seed(number, first if one else None, rms, 0.002, (50, 50)) for number, one in enumerate(differ, 1)
-    ]
-    assert _print_seeds(Path("a"), Path("b"), seeds) == code
-    assert "rms errors within 10.0 % of the first's, bodies within 2.00 mm" in capsys.readouterr().out

@@ -1,16 +1,20 @@
 """What `--view` can mean, each as the process that it is; a viewer that is not there is one line before the flight."""
 
 import gc
+import signal
 import socket
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from hil.errors import LabError
-from hil.live import window
+from hil.live import recording, window
 from hil.live.feed import open_view
 from hil.live.local_server import LocalServer
+from hil.live.picture import open_screen
 from hil.live.rerun_screen import RerunScreen
 from hil.live.window import DISPLAYS, LOOPBACK, free_port, open_window, show
 
@@ -57,3 +61,136 @@ def test_a_server_takes_another_port_when_its_own_is_in_use_and_leaves_no_socket
     socket.create_connection((host, int(port)), timeout=10.0).close()
     server.close()
     gc.collect()  # a socket that nobody closed warns, and a warning fails the test
+
+
+LISTENS = (
+    "import socket, sys, time; s = socket.create_server(('127.0.0.1', int(sys.argv[2]))); time.sleep(60)"
+)
+DIES = "import sys; sys.stderr.write('first\\nno display\\n\\n'); sys.exit(3)"
+
+
+def test_a_viewer_is_started_once_it_listens_and_ended_with_its_children(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(window, "COMMAND", (sys.executable, "-c", LISTENS))
+    monkeypatch.setattr(window, "SETTLE_S", 0.05)
+    port = free_port(0)
+    assert not window.is_open(LOOPBACK, port)
+    viewer = window._start(["--port", str(port)], port)
+    assert viewer.poll() is None
+    assert window.is_open(LOOPBACK, port)
+    window.end(viewer)
+    assert viewer.poll() == -9
+    window.end(viewer)  # it is gone already
+
+
+def test_a_viewer_that_does_not_open_is_one_line_with_its_last_message(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(window, "COMMAND", (sys.executable, "-c", DIES))
+    monkeypatch.setenv("DISPLAY", ":0")
+    with pytest.raises(LabError, match=r"^the viewer does not open \(no display\)$"):
+        window._start([], free_port(0))
+    with pytest.raises(LabError, match=r"^run.rrd: the viewer ended with code 3 \(no display\)$"):
+        show("run.rrd", "--new")
+    monkeypatch.setattr(
+        window,
+        "COMMAND",
+        (sys.executable, "-c", "import sys; sys.exit(sys.argv[1:] != ['--new', 'run.rrd'])"),
+    )
+    show("run.rrd", "--new")
+    monkeypatch.setattr(window, "COMMAND", (sys.executable, "-c", "import time; time.sleep(60)"))
+    monkeypatch.setattr(window, "START_TIMEOUT_S", 0.1)
+    with pytest.raises(LabError, match=r"^the viewer does not open \(no message\)$"):
+        window._start([], free_port(0))
+
+
+def test_viewers_in_a_browser_have_a_port_for_the_page_and_one_for_the_data(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    started: list[tuple[list[str], int]] = []
+    monkeypatch.setattr(
+        window, "_start", lambda arguments, port: started.append((arguments, port)) or "process"
+    )
+    monkeypatch.setattr(window, "free_port", lambda wanted: wanted + 1)
+    assert window.serve_web() == (
+        "http://127.0.0.1:9091/?url=rerun%2Bhttp://127.0.0.1:9877/proxy", "rerun+http://127.0.0.1:9877/proxy", "process",
+    )  # fmt: skip
+    assert window.serve_viewer("rerun+http://x") == (9091, "process")
+    assert started == [
+        (
+            ["--port", "9877", "--serve-web", "--web-viewer-port", "9091", "--server-memory-limit", "500MB"],
+            9877,
+        ),
+        (["--serve-web", "--web-viewer-port", "9091", "rerun+http://x"], 9091),
+    ]
+    monkeypatch.setattr(window, "is_open", lambda host, port: True)
+    assert open_window() == "rerun+http://127.0.0.1:9876/proxy"
+    assert len(started) == 2, "one is open"
+    monkeypatch.setattr(window, "is_open", lambda host, port: False)
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert open_window() == "rerun+http://127.0.0.1:9876/proxy"
+    assert started[2] == (["--port", "9876"], 9876)
+
+
+@pytest.mark.parametrize(
+    ("target", "screen"),
+    [
+        ("web", ("panel", "fly", print)), ("foxglove", ("foxglove", None)), ("foxglove:parameters", ("foxglove", print)),
+        ("window", ("rerun", "window")), ("connect:a:1", ("rerun", "connect:a:1")),
+    ],
+)  # fmt: skip
+def test_each_target_has_its_screen(
+    target: str, screen: tuple[object, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, kind in (
+        ("panel.PanelScreen", "panel"),
+        ("foxglove_server.FoxgloveScreen", "foxglove"),
+        ("rerun_screen.RerunScreen", "rerun"),
+    ):
+        monkeypatch.setattr(f"hil.live.{name}", lambda *given, kind=kind: (kind, *given))
+    assert open_screen(target, "fly", print) == screen
+
+
+def test_a_run_is_shown_in_a_browser_at_its_instant_until_ctrl_c(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    said: list[str] = []
+    served: list[object] = []
+
+    class Links:
+        """The links of the report, of which one is followed at once; then Ctrl-C."""
+
+        def __init__(self, run: Path, page_at: Callable[[float], str]) -> None:
+            self.page_at = page_at
+
+        def __enter__(self) -> "Links":
+            return self
+
+        def __exit__(self, *error: object) -> None:
+            served.append("closed")
+
+        def serve_forever(self) -> None:
+            served.append(self.page_at(2.0))
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(recording, "Links", Links)
+    monkeypatch.setattr(
+        recording, "ServedRecording", lambda run: SimpleNamespace(at=lambda at_s: f"rerun+http://x?{at_s:g}")
+    )
+    monkeypatch.setattr(recording, "serve_viewer", lambda address: served.append(address) or (9091, "viewer"))
+    monkeypatch.setattr(recording, "end", served.append)
+    monkeypatch.setattr(recording.signal, "signal", lambda *what: served.append(what))
+    recording.browse(tmp_path, 1.5, said.append)
+    page = "http://127.0.0.1:9091/?url=rerun%2Bhttp://x%3F"
+    assert served == [
+        (signal.SIGTERM, signal.default_int_handler),
+        "rerun+http://x?1.5",
+        f"{page}2",
+        "viewer",
+        "closed",
+    ]
+    assert said == [
+        f"view    {page}1.5",
+        "report  http://127.0.0.1:9877/report.html, whose links lead here, as those of the file do, until Ctrl-C",
+    ]

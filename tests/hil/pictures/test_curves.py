@@ -173,20 +173,79 @@ def test_a_trial_shows_the_true_value_beside_its_target_and_the_mean_opening_eac
         assert [one[7] for one in curve.read(rows)] == pytest.approx(shown)
 
 
-def test_pictures_of_batteries_and_take_offs_show_the_columns_of_their_labels() -> None:
+def trial(number: int, seconds: float) -> pa.Table:
+    """A flight in which everything is `number` times as large as in the first; its first 0.1 s it is held."""
+    count = round(100 * seconds)
     columns = {
-        f"battery.{name}": [value] * 200
-        for name, value in (("voltage", 3.9), ("power", 3.4), ("charge", 0.7))
+        f"battery.{name}": [number * value] * count for name, value in (("voltage", 3.9), ("charge", 0.2))
+    }
+    columns |= {name: [number * value] * count for name, value in (("truth.vz", 0.3), ("flow.z", 9.0))}
+    columns |= {
+        "truth.z": [0.049 + number * 0.5] * count,
+        "goal.z": [1.049] * count,
+        "truth.x": [0.01 * number] * count,
     }
     columns |= {
-        name: [value] * 200 for name, value in (("truth.z", 0.549), ("truth.vz", 0.3), ("flow.z", 9.0))
+        "battery.power": np.repeat(np.arange(seconds + 1) * number, 100)[:count],
+        "flight.free": np.arange(count) >= 10.0,
     }
-    rows = flight([0.0] * 200, **columns, **{"goal.z": [1.049] * 200})
-    for draw, expected in (
-        (trials.discharge, [[3.9], [3.4, 3.4], [70.0]]), (trials.take_off_and_landing, [[50.0, 100.0], [30.0], [9.0], []]),
-    ):  # fmt: skip
-        shown = [[line.values[0] for line in panel.series] for panel in draw(rows).panels]
-        assert shown == [pytest.approx(values) for values in expected]
+    table = flight([180.0] * count, **columns)
+    return table.replace_schema_metadata(
+        RELEASE | {b"config": json.dumps({"supervisor": {"low_battery_mv": 3200}}).encode()}
+    )
+
+
+def test_an_experiment_s_picture_has_its_flight_last_over_the_trials_and_then_the_target() -> None:
+    flights = [trial(n, seconds) for n, seconds in ((1, 3.5), (2, 3.0), (3, 2.0))]
+    light, dark = trials.LIGHT, trials.DARK
+    own = [("", light), ("trials", light), ("flight", dark)]
+    expected = {  # of each panel: label, the lines, and the values in their last rows
+        "follow": {"x [cm]": ([*own, ("target", trials.WANTED)], [3, 2, 1, 0]), "z [cm]": ([*own, ("target",
+        trials.WANTED)], [154.9, 104.9, 54.9, 104.9])},
+        "disturbed": {f"{axis} error [cm]": ([*own[:2], ("flight", colour)], values) for axis, colour, values in (
+            ("x", curves.RED, [-3, -2, -1]), ("y", curves.GREEN, [0, 0, 0]), ("z", curves.BLUE, [50, 0, -50]))},
+        "take_off": {"height over the net [cm]": ([*own, ("goal", "black")], [150, 100, 50, 100]), "climb [cm/s]": (own,
+        [90, 60, 30]),
+                     "air, upwards [m/s]": (own, [27, 18, 9]), "stages": ([], [])},
+        "discharge": {"cell [V]": (own, [11.7, 7.8, 3.9]), "power [W]": (
+            [*own, ("mean 1.32 W", curves.GREY)], [0.3, 2.2, 2.1, 1.32]),
+                      "charge [%]": (own, [60, 40, 20])},
+    }  # fmt: skip
+    plots = {
+        "follow": trials.follow((trials.X, trials.Z), (0.5, 60.0), *flights), "disturbed": trials.disturbed(*flights),
+        "take_off": trials.take_off_and_landing(*flights), "discharge": trials.discharge(*flights),
+    }  # fmt: skip
+    for name, plot in plots.items():
+        assert [one.label for one in plot.panels] == list(expected[name])
+        for panel in plot.panels:
+            lines, values = expected[name][panel.label]
+            assert [(line.name, line.colour) for line in panel.series] == lines, panel.label
+            assert [float(line.values[-1]) for line in panel.series] == pytest.approx(values, abs=0.05), (
+                panel.label
+            )
+            assert [line.dashed for line in panel.series] == [
+                line.name in ("target", "goal") for line in panel.series
+            ]
+    assert [(one.lane, one.name, one.begin_s, one.end_s) for one in plots["take_off"].panels[3].bars] == [
+        ("controller", "on", pytest.approx(2.2), pytest.approx(26.2)), ("controller", "off", pytest.approx(26.2),
+        pytest.approx(26.2)),
+        ("fans", "take-off 93%", 1.0, pytest.approx(8.2)), ("fans", "flight 100%", pytest.approx(8.2), pytest.approx(18.2)),
+        ("fans", "landing 88%", pytest.approx(18.2), pytest.approx(26.2)), ("fans", "off", pytest.approx(26.2),
+        pytest.approx(26.2)),
+    ], "the menu's times"  # fmt: skip
+    cell, power, _ = plots["discharge"].panels
+    assert cell.limits == (3.2,)
+    assert (power.series[2].times.tolist(), power.series[3].times.tolist()) == (
+        [pytest.approx(0.495 + n) for n in range(3)],
+        [0.0, pytest.approx(3.39)],
+    )
+    assert all(one.limits == (-10.0, 10.0) for one in plots["disturbed"].panels)
+    windows = [
+        trials.follow((trials.X,), asked, *flights).window_s
+        for asked in ((0.5, 60.0), (0.5, 2.0), (5.0, 60.0))
+    ]
+    assert windows == [(0.5, pytest.approx(3.39)), (0.5, 2.0), (5.0, 5.1)]
+    assert plots["discharge"].window_s is None
 
 
 def test_logs_differ_first_where_they_do_a_gap_equals_a_gap_and_a_longer_one_goes_on() -> None:

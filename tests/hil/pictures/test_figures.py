@@ -12,9 +12,11 @@ from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
+from ground_station.latency import STAGES
 from hil.laboratory.experiments.overload import loads_that_hurt
 from hil.laboratory.schedule import runs
 from hil.pictures import curves, figures
+from hil.pictures.panels import Picture
 
 RELEASE_US = 1_000_000
 # Machado, Oliveira, Fernandes 2009: what is seen without the red, without the green receptors; of linear RGB.
@@ -130,19 +132,6 @@ def test_curves_and_states_are_in_seconds_from_the_release() -> None:
     ]
 
 
-def test_the_directions_of_a_link_have_each_their_own_line() -> None:
-    count, zeros = np.arange(301.0), np.zeros(301)
-    lost = ("up_dropped", "down_dropped", "retried", "overrun", "no_room", "up_bad", "down_bad")
-    columns = {f"{group}.{name}": zeros for group in ("link", "serial") for name in lost}
-    for name, value in (("up", 1.0), ("down", 3.0)):
-        columns[f"link.{name}_delivered"] = count
-        columns[f"link.{name}_latency_sum"] = 1000 * value * count
-        columns[f"serial.{name}_busy"] = 100 * value * count
-    rows = log([0] * 301, **columns)  # type: ignore[arg-type]
-    for panel in (*figures.radio(rows).panels[:1], *figures.serial_line(rows).panels[:2]):
-        assert {line.name: set(line.values.round(6)) for line in panel.series} == {"up": {1.0}, "down": {3.0}}
-
-
 def overloaded(shares: list[float], error: list[float], late: list[int]) -> pa.Table:
     """A flight with 50 rows per step of the thief's share."""
     rows = 50 * len(shares)
@@ -163,3 +152,139 @@ def test_an_overload_is_held_up_to_the_last_step_inside_the_box_and_never_late_i
     assert at == {"estimator_late_from": 0.95, "controller_late_from": np.inf, "held_up_to": 0.9}
     assert loads_that_hurt(overloaded([0.0, 1.0], [0.0, 0.0], [0, 0]))["held_up_to"] == 1.0
     assert np.isnan(loads_that_hurt(overloaded([0.0, 1.0], [0.2, 0.2], [0, 0]))["held_up_to"])
+
+
+def counted(**per_row: float) -> dict[str, NDArray[np.float64]]:
+    return {name.replace("__", "."): rate * np.arange(201.0) for name, rate in per_row.items()}
+
+
+def known_log() -> pa.Table:
+    """Two seconds of a robot whose every column has a value of its own; it is released after 1 s, counters grow by row."""
+    values = {
+        **{f"truth.{axis}": 0.01 * n for n, axis in enumerate("xyz", 1)}, "truth.qw": 1.0, **dict.fromkeys(("truth.qx",
+        "truth.qy", "truth.qz"), 0.0),
+        **{f"estimate.{name}": 0.1 * n for n, name in enumerate("xyz", 1)}, **{f"replay.{name}": 0.2 * n for n,
+        name in enumerate("xyz", 1)},
+        **{f"estimate.{name}": np.radians(n) for n, name in enumerate(("roll", "pitch", "yaw"), 1)},
+        **{f"replay.{name}": np.radians(10 * n) for n, name in enumerate(("roll", "pitch", "yaw"), 1)},
+        **{f"replay.{name}": float(n) for n, name in enumerate(("refused", "too_old", "invalid"), 1)},
+        **{f"estimator.{name}": 10.0 * n for n, name in enumerate(("refused", "too_old", "invalid"), 1)},
+        **dict.fromkeys(("goal.x", "goal.y", "goal.z", "goal.yaw"), 0.0),
+        "estimator.pose_age_us": 31_000.0, "estimator.horizon": 4.0, "battery.voltage": 3.7, "board.load": 41.0,
+        "flight.free": 1.0,
+        "rtos.measurements_high_water": 7.0, "rtos.measurements_dropped": 2.0, "logic.seen": 5.0,
+    }  # fmt: skip
+    for i in (1, 2, 3, 4):
+        values |= {f"truth.flap_{i}": np.radians(i), f"control.flap_{i}": np.radians(10 * i), f"rotor.thrust_{i}": 0.01 * i,
+                   f"motor.m{i}": 655.35 * i}  # fmt: skip
+    counters = counted(
+        link__up_latency_sum=3000, link__down_latency_sum=5000, link__up_delivered=1, link__down_delivered=2,
+        link__up_dropped=0.1,
+        link__down_dropped=0.2, link__retried=0.3, link__late=0.4, serial__up_busy=600, serial__down_busy=700,
+        serial__overrun=1,
+        serial__no_room=2, serial__up_bad=3, serial__down_bad=4, station__unusable=0.5, station__malformed=0.6,
+        cpu__KALMAN=900,
+        cpu__APP=1.0, cpu__MEM=2.0, cpu__IDLE=5000,
+    )  # fmt: skip
+    counters["estimator.fused"] = np.minimum(np.arange(201) // 2, 95.0)  # the last in row 190
+    constants = {name: np.full(201, value) for name, value in values.items()}
+    times = {"t": 10_000.0 * np.arange(201), "supervisor.state": np.full(201, 2)}
+    return pa.table(times | constants | counters).replace_schema_metadata({"release_us": "1000000"})
+
+
+XYZ_CM, RPY_DEG = {"x": 1, "y": 2, "z": 3}, dict.fromkeys(("roll", "pitch", "yaw"), 0)
+SHOWN = {  # the last values by hand: label, then name and value
+    "Errors": {"position error [cm]": XYZ_CM, "attitude error [deg]": RPY_DEG},
+    "Flaps": {f"flap {i} [deg]": {"command": 10 * i, "true": i} for i in (1, 2, 3, 4)},
+    "Rotors": {"thrust [mN]": {f"M{i}": 10 * i for i in (1, 2, 3, 4)}, "command [%]": {f"M{i}": i for i in (1, 2, 3, 4)}},
+    "States": {"states": {}},
+    "Estimate": {"position [cm]": {"x": 9, "y": 18, "z": 27}, "attitude [deg]": {"roll": 1, "pitch": 2, "yaw": 3}},
+    "Replay": {
+        "position, replayed [cm]": {"x": 19, "y": 38, "z": 57}, "position, flown [cm]": {"x": 9, "y": 18, "z": 27},
+        "attitude, replayed [deg]": {"roll": 10, "pitch": 20, "yaw": 30}, "attitude, flown [deg]": {"roll": 1,
+        "pitch": 2, "yaw": 3},
+        "poses refused [so far]": {f"{name}, {how}": n * (1 if how == "replayed" else 10)
+                                   for n, name in enumerate(("refused", "too_old", "invalid"), 1) for how in ("replayed",
+                                   "flown")},
+    },
+    "Age": {"age on board [ms]": {"age of the pose": 31, "horizon": 40},
+    "without a pose [ms]": {"longest since a fused pose": 100}},
+    "Radio": {"mean latency [ms]": {"up": 3, "down": 2.5}, "so far [packets]": {"lost up": 20, "lost down": 40,
+    "sent again": 60}},
+    "Serial line": {
+        "load of the line [%]": {"up": 6, "down": 7}, "mean latency [ms]": {"up": 3, "down": 2.5},
+        "bytes or frames [so far]": {"overrun": 200, "no room": 400, "bad up": 600, "bad down": 800},
+    },
+    "Station": {"not used [so far]": {"poses late": 80, "poses unusable": 100, "telemetry malformed": 120},
+                "battery [V]": {"a cell": 3.7}, "processor [%]": {"all tasks": 41}},
+    "Board": {"processor [%]": {"KALMAN": 9, "MEM": 0.02}, "queue [measurements]": {"longest so far": 7, "dropped": 2}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("picture", figures.PICTURES, ids=lambda one: one.title)
+def test_a_picture_shows_under_each_name_the_quantity_of_that_name_in_the_label_s_unit(
+    picture: Picture,
+) -> None:
+    log = known_log()
+    plot = picture.draw(log)
+    shown = {
+        one.label: {line.name: round(float(line.values[-1]), 9) for line in one.series} for one in plot.panels
+    }
+    expected = SHOWN[picture.title]
+    assert list(shown) == list(expected)
+    for label, lines in expected.items():
+        assert shown[label] == pytest.approx(lines), label
+        assert list(shown[label]) == list(lines)
+    for one in plot.panels:
+        assert all(len(line.times) == len(line.values) for line in one.series)
+        assert all(line.times[-1] == pytest.approx(1.0) for line in one.series)
+    if picture.title == "Age":
+        assert plot.panels[1].series[0].values[-3:].tolist() == [10.0, 90.0, 100.0], (
+            "the longest of each tenth of a second"
+        )
+    limits = {one.label: one.limits for one in plot.panels if one.limits}
+    assert limits == (
+        {"position error [cm]": (-6, 6), "attitude error [deg]": (-20, 20)}
+        if picture.title == "Errors"
+        else {}
+    )
+    assert {one.label for one in plot.panels if one.stacked} == (
+        {"processor [%]"} if picture.title == "Board" else set()
+    )
+    assert picture.fits(log.column_names)
+    assert picture.fits(["t"]) == (picture.needs == "t")
+
+
+def test_a_course_has_place_and_yaw_beside_their_goals_from_the_first_goal_and_a_fault_s_time() -> None:
+    log, moved = known_log(), np.where(np.arange(201) > 100, 0.5, 0.2)
+    for name, values in (("goal.x", moved), ("goal.yaw", 2 * moved), ("flight.free", np.arange(201) > 50.0)):
+        log = log.set_column(log.column_names.index(name), name, pa.array(np.asarray(values, float)))
+    log = log.replace_schema_metadata(
+        log.schema.metadata | {b"request": json.dumps({"faults": ["push.y@0.3:0.1=2"]}).encode()}
+    )
+    place, turn = figures.course(log).panels
+    assert {line.name: (line.values[-1], line.dashed) for line in place.series} == {
+        "x": (pytest.approx(-19), False), "goal x": (pytest.approx(30), True), "y": (pytest.approx(2), False),
+        "goal y": (0.0, True), "z": (pytest.approx(3), False), "goal z": (0.0, True),
+    }  # fmt: skip
+    assert [(line.name, line.values[-1], line.dashed) for line in turn.series] == [
+        ("yaw", pytest.approx(0), False), ("goal", pytest.approx(np.degrees(1.0)), True),
+    ]  # fmt: skip
+    course = figures.course_of(log)
+    assert (course.box, len(course.flown)) == (10.0, 150)
+    assert np.flatnonzero(course.troubled).tolist() == list(range(79, 90)), (
+        "0.3 to 0.4 s after row 100, from row 51 on"
+    )
+    assert figures.goal_moves(log)
+    assert not figures.goal_moves(log.slice(0, 52))
+
+
+def test_a_latency_budget_stacks_the_stages_that_were_reported() -> None:
+    ages = pa.table({"t": [1_020_000.0]} | {name: [float(n)] for n, name in enumerate(STAGES, 1)})
+    ages = ages.replace_schema_metadata({"release_us": "1000000"})
+    (panel,) = figures.latency_budget(ages).panels
+    assert [(line.name, line.values.tolist(), line.times.tolist()) for line in panel.series] == [
+        (name, [value], [pytest.approx(0.02)]) for name, value in (("camera", 1), ("processing", 2), ("network", 3),
+        ("station", 5), ("link", 6))
+    ]  # fmt: skip
+    assert (panel.label, panel.stacked, panel.least) == ("age [ms]", True, 0.0)

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ground_station.telemetry_log import POSE_COLUMNS, TIME_COLUMN
@@ -30,8 +31,8 @@ from hil.research.identify.identify import (
     interval_text,
     operating_point,
 )
-from hil.research.identify.joint import LATE_S, Estimate, Excited, identities, pose_lateness
-from hil.research.identify.pages import write_pages
+from hil.research.identify.joint import LATE_S, Estimate, Excited, identities, pose_lateness, whitened
+from hil.research.identify.pages import _identity, _one_step, _period, _responses, write_pages
 from hil.research.identify.plates import plant_of, straightened, turns_of
 from hil.research.identify.record import (
     BOARD_COLUMN,
@@ -42,7 +43,8 @@ from hil.research.identify.record import (
     Record,
     load_record,
 )
-from hil.research.identify.response import TICK_DELAYS_S, flap_response
+from hil.research.identify.response import TICK_DELAYS_S, flap_response, one_step, response
+from hil.research.identify.two_controllers import closed_loop
 from hil.world.floaty.correction import OperatingPoint
 
 Array = NDArray[np.float64]
@@ -516,3 +518,80 @@ def test_the_page_shows_identified_constants_first_and_no_empty_column(tmp_path:
     for part in (before, folded):
         rows = [re.findall("<td>(.*?)</td>", row) for row in re.findall("<tr>(.*?)</tr>", part, re.DOTALL)]
         assert all(any(cells) for cells in zip(*filter(None, rows), strict=True))
+
+
+def test_the_pictures_of_an_axis_show_measured_and_fitted_response_over_frequency_and_time() -> None:
+    """Lines of 0.5, 1 and 2 Hz: twice the model, a quarter of a turn later; the excitation of 3 is real."""
+    values = {**CONFIG.model.model_dump(), "lag": 0.05, "delay": 0.0145, "x_rate": 0.0, "y_rate": 0.0}
+    hertz = np.array([0.5, 1.0, 2.0])
+    w = 2 * np.pi * hertz
+    model = response(ROLL, values, w)
+    Z = np.concatenate([np.ones((3, 1)), 2.0 * np.exp(-0.5j * np.pi) * model], axis=1)
+    count = Z.shape[1]
+    C = np.tile(1e-4 * np.eye(count, dtype=complex), (3, 1, 1))
+    coherence = np.outer([0.7, 0.8, 0.9], np.ones(count))
+    seen = Excited(ROLL, 0, spectra.Spectra(w, Z, C, Z[None], np.full(3, 3.0 + 0j), coherence))
+    gain, phase, errors, answer = Figure().subplots(1, 4)
+    _responses(gain, phase, errors, [seen], Estimate(values, {}, 1.0, (0.0,)))
+    fit, measured = gain.lines
+    assert (fit.get_label(), measured.get_label()) == ("joint fit", "measured")
+    assert measured.get_xydata() == pytest.approx(np.c_[hertz, 2 * np.abs(model[:, 0])])
+    assert fit.get_xydata()[[0, -1]] == pytest.approx(np.c_[hertz, np.abs(model[:, 0])][[0, -1]])
+    fit, measured = phase.lines
+    assert measured.get_ydata()[[0, -1]] == pytest.approx(fit.get_ydata()[[0, -1]] - 90.0)
+    assert (gain.get_ylabel(), phase.get_ylabel(), phase.get_xlabel()) == (
+        "roll rate per u1 [rad/s/rad]",
+        "phase [deg]",
+        "frequency [Hz]",
+    )
+    together = next(one for one in gain.figure.axes if one.get_ylabel().startswith("coherence"))
+    assert together.lines[0].get_xydata() == pytest.approx(np.c_[hertz, [0.7, 0.8, 0.9]])
+    left = whitened(seen, values, 0.0).reshape(2, 3, -1)[:, :, 0]
+    assert [line.get_xydata() for line in errors.lines] == [
+        pytest.approx(np.c_[hertz, part]) for part in left
+    ]
+    _period(answer, seen, values)
+    t = answer.lines[0].get_xdata()
+    assert (t[0], t[-1], len(t)) == (0.0, spectra.PERIOD_S, 1001)
+    sums = [
+        (3.0 * amplitude * np.exp(1j * np.outer(t, w))).sum(axis=1).real
+        for amplitude in (Z[:, 1], model[:, 0])
+    ]
+    assert [line.get_ydata() for line in answer.lines] == [pytest.approx(one) for one in sums]
+    assert [line.get_label() for line in answer.lines] == ["measured", "simulated from the input"]
+    assert (answer.get_ylabel(), answer.get_xlim()) == ("roll rate [rad/s]", (0.0, 5.0))
+
+
+def test_the_picture_of_the_paper_s_equations_has_each_flight_s_bins_and_estimate() -> None:
+    records = [
+        replace(swinging(robot_of(CONFIG), hertz, 30.0), name=name)
+        for hertz, name in ((1.0, "a"), (2.0, "b"))
+    ]
+    for axes, record in zip(_identity(tuple(records)).axes, records, strict=True):
+        loop = closed_loop(record, ROLL)
+        bins, line, estimate = axes.lines
+        assert bins.get_xydata() == pytest.approx(np.c_[loop.w**2, (loop.acceleration / loop.angle).real])
+        assert line.get_ydata() == pytest.approx(-line.get_xdata())
+        assert estimate.get_ydata()[0] == loop.starred[1]
+        assert estimate.get_label() == f"c* = {loop.starred[1]:.1f} ± {1.96 * loop.errors[1]:.1f}"
+        assert axes.get_title() == f"{record.name}: b* = {loop.starred[0]:.2f}"
+
+
+def test_the_picture_of_one_step_has_its_error_after_the_filter_settled_and_a_window_in_the_middle() -> None:
+    record, values = (
+        swinging(robot_of(CONFIG), 0.8),
+        {**CONFIG.model.model_dump(), "lag": 0.05, "delay": 0.0145},
+    )
+    axes, seen = Figure().subplots(), Excited(ROLL, 0, SimpleNamespace())  # type: ignore[arg-type]
+    _one_step(axes, record, seen, values, 0.01)
+    t, measured, predicted = one_step(record, 0, values, 0.01)
+    assert axes.lines[0].get_xydata() == pytest.approx(np.c_[t - t[0], measured])
+    assert axes.lines[1].get_xydata() == pytest.approx(np.c_[t - t[0], predicted])
+    left = np.std((measured - predicted)[len(t) // 10 :])
+    assert axes.get_title() == f"one step ahead: error {left:.2g} of {np.std(measured):.2g} rad/s rms"
+    middle = (t[-1] - t[0]) / 2
+    assert axes.get_xlim() == pytest.approx((middle, middle + 1.5))
+    inside = measured[(t - t[0] > middle) & (t - t[0] < middle + 1.5)]
+    assert np.mean(axes.get_ylim()) == pytest.approx(inside.mean())
+    assert np.ptp(axes.get_ylim()) == pytest.approx(1.3 * np.ptp(inside))
+    assert axes.lines[1].get_label() == "predicted 20 ms before"

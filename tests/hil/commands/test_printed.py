@@ -1,0 +1,438 @@
+"""What commands print, whole: tables cell by cell and every line, from values that are all different."""
+
+from dataclasses import replace
+from math import inf, nan, radians
+from pathlib import Path
+from types import SimpleNamespace as Made
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+
+from hil.commands import compare, design, identify, listing, paper, tables
+from hil.config import load_config
+from hil.errors import LabError
+from hil.laboratory.fault_kinds import KINDS
+from hil.laboratory.metric_pairs import MetricPair
+from hil.laboratory.metrics import Verdict
+from hil.pictures.compare import Apart, Comparison, FirstDifference
+from hil.research.campaigns.dataset import Dataset
+from hil.research.campaigns.jobs import Job, Row
+from hil.research.campaigns.run import Runner
+from hil.research.campaigns.sampling import draw
+from hil.research.design.axes import PITCH, YAW
+from hil.research.design.margins import Margins
+from hil.research.studies.paper import Paper, Trials
+from hil.research.studies.paper_rows import MetricClaim, PaperRow
+from hil.research.studies.two_boards import FirstCount, Seed
+from support.campaigns import planted, spec_of
+from support.command import Cli
+
+
+@pytest.fixture
+def printed(capsys: pytest.CaptureFixture[str]) -> Any:
+    """What was printed since: a line is a text, a row of a table a list of its cells."""
+
+    def read() -> list[Any]:
+        found: list[Any] = []
+        for line in capsys.readouterr().out.splitlines():
+            if line[:1] in ("│", "┃"):
+                found.append([cell.strip() for cell in line.replace("┃", "│").split("│")[1:-1]])
+            elif line[:1] not in ("┏", "┡", "├", "└"):
+                found.append(line.strip())
+        return found
+
+    return read
+
+
+def row(seed: int, factor: float, outcome: str = "completed", error: str = "", **holds: bool) -> Row:
+    """A flight in which every figure of the tables has a value of its own."""
+    names = [name for _, group, _, _ in tables.SEED_COLUMNS for name in group]
+    metrics = {name: 0.01 * factor * n for n, name in enumerate(names, 1)} | {"attitude_max": radians(factor)}
+    job = Job(0, "hover", {"profile": "floaty", "seed": seed}, {})
+    return Row(job, outcome, error, all(holds.values()), f"{seed}" * 64, metrics, holds)
+
+
+def test_flights_of_many_seeds_are_a_row_each_and_the_means_of_the_completed(printed: Any) -> None:
+    tables.print_seeds([row(5, 1.0, in_box=True), row(6, 3.0, rms_x=False, in_box=True, resets=False),
+                        row(7, 9.0, "lost", "fell", lost=False)])  # fmt: skip
+    assert printed() == [
+        "hover, profile floaty",
+        [
+            "seed",
+            "rms x y z [cm]",
+            "max x y z [cm]",
+            "< 6 cm x y z [%]",
+            "in box [%]",
+            "attitude max [deg]",
+            "hash",
+            "verdict",
+        ],
+        ["5", "1.00 2.00 3.00", "4.0 5.0 6.0", "7.0 8.0 9.0", "10.0", "1.0", "5" * 12, "ok"],
+        [
+            "6",
+            "3.00 6.00 9.00",
+            "12.0 15.0 18.0",
+            "21.0 24.0 27.0",
+            "30.0",
+            "3.0",
+            "6" * 12,
+            "fails: rms_x, resets",
+        ],
+        ["7", "9.00 18.00 27.00", "36.0 45.0 54.0", "63.0 72.0 81.0", "90.0", "9.0", "7" * 12, "fell"],
+        "3 seeds: 1 hold all limits, 1 lost",
+        "mean of the completed: rms x 2.00 y 4.00 z 6.00 cm; < 6 cm x 14.0 y 16.0 z 18.0 % of the time",
+    ]
+    tables.print_seeds([row(7, 9.0, "lost", "fell", lost=False)])
+    assert printed()[-1] == "1 seeds: 0 hold all limits, 1 lost"
+    tables.print_seeds([])
+    assert printed() == []
+
+
+def test_robots_that_fly_together_are_a_row_each_and_their_common_limits(
+    printed: Any, tmp_path: Path
+) -> None:
+    for name in ("report.html", "flight.rrd"):
+        (tmp_path / name).touch()
+
+    def robot(seed: int, cause: str, *failed: str) -> Any:
+        request = Made(seed=seed, profile="floaty" if seed == 5 else "other")
+        return Made(request=request, failed=[Made(metric=name) for name in failed], passed=not failed and not cause,
+        cause=cause,
+                    metrics=row(seed, seed - 4.0).metrics, hash=f"{seed}" * 64)  # fmt: skip
+
+    robots = (robot(5, ""), robot(6, "", "max_x", "in_box"), robot(7, "fell", "max_x"))
+    verdicts = (Verdict("distance", 0.2, 0.3, False, "m", "min"),)
+    tables.print_swarm(Made(request=Made(title="3 robots", robots=[one.request for one in robots]), robots=robots,
+    verdicts=verdicts,
+                            nearest="1 and 2 at 3 s", outcome="lost", hash="ab" * 32,
+                            folder=tmp_path))  # type: ignore[arg-type]  # fmt: skip
+    title, headings, *rows, limit, summary, report, recording = printed()
+    assert (title, headings[:2], headings[-2:]) == (
+        "3 robots, profile floaty",
+        ["robot", "seed"],
+        ["hash", "verdict"],
+    )
+    assert [[*one[:3], *one[-2:]] for one in rows] == [
+        ["1", "5", "1.00 2.00 3.00", "5" * 12, "ok"], ["2", "6", "2.00 4.00 6.00", "6" * 12, "fails: max_x, in_box"],
+        ["3", "7", "3.00 6.00 9.00", "7" * 12, "fell"],
+    ]  # fmt: skip
+    assert limit == f"{verdicts[0]}: FAILS; 1 and 2 at 3 s"
+    assert summary == "lost; 1 of 3 robots hold all limits; hash abababababababab"
+    assert (report, recording) == (
+        f"{tmp_path}/report.html",
+        f"{tmp_path}/flight.rrd   (floaty view {tmp_path})",
+    )
+
+
+FIRST = FirstDifference(7, 0.25, "truth.x", (1.0, None))
+SAME = Comparison(None, ((), ()), "Over 2 s.", (MetricPair("rms_x", "cm", (1.0, 1.0)),), (), False, (), ())
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, ["1 metrics are equal. Over 2 s.", "identical"]),
+        ({"first": FIRST}, ["1 metrics are equal. Over 2 s.",
+                            "first difference: row 7, 0.250000 s from the release, truth.x: 1.0 | the log has ended"]),
+        ({"first": FIRST, "one_is_real": True},
+         ["1 metrics are equal. Over 2 s.", "one flight is real, the other simulated: they share no rows"]),
+        ({"missing": (("a", "b", "c", "d", "e"), ("p", "q", "r", "s", "t", "u"))},
+         ["1 metrics are equal. Over 2 s.", "not in one: a, b, c, d, e",
+         "not in two: p, q, r, s, t and 1 more, which the page names",
+          "identical in the columns that both have"]),
+        ({"settings": (("seed", "1", "2"), ("link", "a", "b")), "metrics": (*SAME.metrics, MetricPair("max_y", "m", (1.5,
+        1.25)),
+                                                                         MetricPair("own", "s", (nan, 2.0)))},
+         ["seed: 1 | 2", "link: a | b", "one | two", ["metric", "first", "second", "difference", "unit"],
+          ["max_y", "1.5", "1.25", "-0.25", "m"], ["own", "–", "2", "–", "s"], "1 metrics are equal. Over 2 s.",
+          "identical"]),
+        ({"apart": (Apart("x", "cm", 1.2345, 3.456),)},
+         ["1 metrics are equal. Over 2 s.", "distance at the same time", "since the release", ["", "rms", "largest", "unit"],
+          ["x", "1.23", "3.46", "cm"], "identical"]),
+    ],
+)  # fmt: skip
+def test_a_comparison_prints_what_differs(changes: dict[str, Any], expected: list[Any], printed: Any) -> None:
+    compare.print_comparison(Path("one"), Path("two"), replace(SAME, **changes))
+    assert printed() == expected
+
+
+def test_two_boards_are_a_row_per_seed_and_the_largest_of_all(printed: Any) -> None:
+    first = FirstCount(7, 0.0712, "motor.m1", (1, 2), "radio")
+    rms = (np.array([0.01, 0.02, 0.04]), np.array([0.011, 0.02, 0.03]))
+    seeds = [Seed(1, first, rms, 0.002, (50, 51)), Seed(2, None, rms[::-1], 0.0035, (52, 53))]
+    assert compare._print_seeds(Path("a"), Path("b"), seeds) == 1
+    assert printed() == [
+        "a | b", ["seed", "rms x y z [cm]", "rms x y z [cm]", "apart [mm]", "poses", "first servo count", "why"],
+        ["1", "1.000 2.000 4.000", "1.100 2.000 3.000", "2.00", "50 | 51", "0.071 s motor.m1", "radio"],
+        ["2", "1.100 2.000 3.000", "1.000 2.000 4.000", "3.50", "52 | 53", "equal", ""],
+        "2 seeds: rms errors within 33.3 % of the first's, bodies within 3.50 mm",
+    ]  # fmt: skip
+    assert compare._print_seeds(Path("a"), Path("b"), seeds[1:]) == 0
+
+
+def test_faults_are_listed_with_their_sizes_bounds_and_times(printed: Any) -> None:
+    listing._list_faults()
+    lines = [line.split() for line in printed()]
+    assert lines[0] == ["kind", "size", "from..to", "lasts", "hover", "meaning"]
+    told = {line[0]: line[1:] for line in lines[1:]}
+    for name, kind in KINDS.items():
+        size = [f"{kind.size:g}", *kind.unit.split(), f"{kind.low:g}..{kind.high:g}"] * kind.sized
+        lasts = ["to", "the", "end"] if kind.duration_s == inf else [f"{kind.duration_s:g}", "s"]
+        words = [
+            *size,
+            *lasts,
+            *kind.outcome.split(),
+            *kind.meaning.split(),
+            *f"({kind.needs})".split() * bool(kind.needs),
+        ]
+        assert told[name] == words[: len(told[name])]
+        assert len(told[name]) > len(size) + len(lasts)
+
+
+def test_a_verdict_in_a_few_words_is_how_it_ended_or_what_it_failed() -> None:
+    def ended(outcome: str, **holds: bool) -> str:
+        return listing.verdict_of(
+            Made(outcome=outcome, verdicts=[Made(metric=n, holds=h) for n, h in holds.items()])
+        )  # type: ignore[arg-type]
+
+    assert ended("completed", a=True) == ended("completed") == "ok"
+    assert ended("completed", a=False, b=True, c=False) == "fails: a, c"
+    assert ended("lost", a=False) == "lost"
+
+
+def test_a_round_of_tuning_prints_old_and_new_gains_margins_and_motion(printed: Any) -> None:
+    def margins(n: float, stable: bool = True) -> Margins:
+        return Margins(stable, n + 0.25, 1 / n, radians(10 * n), 0.001 * n, n + 0.125)
+
+    axis = Made(
+        axis=PITCH,
+        old=np.array([1.0, 2.0, 3.0, 4.0]),
+        new=np.array([1.5, 2.5, 3.5, 0.00045]),
+        old_margins=margins(2),
+        margins=margins(4),
+        least=margins(5),
+        late=0.006,
+        least_late=0.007,
+        old_motion=None,
+        motion=Made(main=0.011),
+        metric="rms_x",
+    )
+    turn = Made(axis=YAW, old=np.array([5.0, 6.0]), new=np.array([5.5, 6.5]), old_margins=margins(8, False),
+    margins=margins(9),
+                least=margins(10), late=0.011, least_late=0.012, old_motion=Made(main=radians(1.5)),
+                motion=Made(main=radians(0.5)), metric="")  # fmt: skip
+
+    def flight(x: float, outcome: str = "completed") -> Row:
+        return replace(row(1, 1.0, outcome), metrics={"rms_x": x, "rms_y": 0.0, "rms_z": 0.0})
+
+    tuned = Made(axes=(axis, turn), robots=Made(drawn=(1, 2, 3), about="by intervals"), age_s=0.0315, jitter_s=0.0042,
+                 least_delay_s=0.0051, before=flight(0.03))  # fmt: skip
+    flown = (flight(0.02), flight(0.05), flight(0.09, "lost"))
+    identify._print_round(Made(tuned=tuned, flown=flown, better=True))  # type: ignore[arg-type]
+    found = printed()
+    assert [one for one in found if isinstance(one, str)] == [
+        "u = gain (target - estimate) - gains (velocity, angle, rate)",
+        "margins, with the loop opened between command and servo",
+        "rms of the hover",
+        "robots: 3 drawn, by intervals; poses are 31.5 ms old, one in a hundred 4.2 ms older; the least delay margin is "
+        "5.1 ms",
+        "rms distance from the goal: 3.00 cm, with the new gains 2.00 cm",
+    ]  # fmt: skip
+    assert [one for one in found if isinstance(one, list)] == [
+        ["axis", "gains, old", "gains, new"],
+        [PITCH.label, f"{', '.join(PITCH.gains)} = 1, 2, 3, 4", "1.5, 2.5, 3.5, 0.00045"],
+        [YAW.label, f"{', '.join(YAW.gains)} = 5, 6", "5.5, 6.5"],
+        ["axis", "", "gain up", "gain down", "phase", "delay", "late poses", "peak of 1/(1+L)"],
+        [PITCH.label, "old", "2.25", "0.50", "20 deg", "2 ms", "", "2.12"],
+        ["", "new", "4.25", "0.25", "40 deg", "4 ms", "6 ms", "4.12"],
+        ["", "least of 4", "5.25", "0.20", "50 deg", "5 ms", "7 ms", "5.12"],
+        [YAW.label, "old", "not stable", *[""] * 5],
+        ["", "new", "9.25", "0.11", "90 deg", "9 ms", "11 ms", "9.12"],
+        ["", "least of 4", "10.25", "0.10", "100 deg", "10 ms", "12 ms", "10.12"],
+        ["axis", "old, predicted", "old, flown", "new, predicted", "new, flown", "worst robots, flown"],
+        [PITCH.label, "not stable", "3.00 cm", "1.10 cm", "2.00 cm", "5.00 cm, lost"],
+        [YAW.label, "1.50 deg", "", "0.50 deg", "", ""],
+    ]
+    identify._print_round(Made(tuned=tuned, flown=(flight(0.04),), better=False))  # type: ignore[arg-type]
+    assert (
+        printed()[-1]
+        == "rms distance from the goal: 3.00 cm, with the new gains 4.00 cm: the old gains are kept"
+    )
+
+
+def test_the_paper_s_rows_have_its_value_both_profiles_and_what_was_missed(printed: Any) -> None:
+    claims = {"rms_x": MetricClaim("2 cm", 0.02), "max_y": MetricClaim("9 cm", 0.09)}
+    both = [
+        Trials(name, tuple(row(n, factor, in_box=n == 1 or factor < 2) for n in (1, 2)))
+        for name, factor in (("floaty", 1.0), ("lqr", 3.0))
+    ]
+    printed_row = PaperRow("hover", "claim", "place", claims, "because of the wind")
+    paper._print_rows(Paper((("hover", printed_row, tuple(both)),), (), False))  # type: ignore[arg-type]
+    title, headings, *rest = printed()
+    assert (title, headings[:3]) == (
+        "paper and laboratory: mean ± deviation over the seeds",
+        ["result", "figure", "paper"],
+    )
+    assert [one[:3] for one in rest if isinstance(one, list)] == [
+        ["hover", "rms_x", "2 cm"], ["", "max_y", "9 cm"], ["", "limits held", ""],
+    ]  # fmt: skip
+    assert [one[3:] for one in rest if isinstance(one, list)] == [
+        ["1 cm", "3 cm misses by 1 cm"], ["5 cm", "15 cm misses by 6 cm"], ["2 of 2", "1 of 2 FAILS"],
+    ]  # fmt: skip
+    assert rest[-3:] == [
+        "hover, lqr: rms_x misses by 1 cm; max_y misses by 6 cm; limits fail: in_box 1×", "", "because of the wind",
+    ]  # fmt: skip
+
+
+def test_a_design_prints_its_robot_inputs_and_claims(printed: Any) -> None:
+    claim = Made(title="pole", paper="9.5", ours="9.4", verdict="agrees")
+    other = Made(title="lift", paper="1", ours="2", verdict="differs")
+    design.show(
+        Made(robot=[("mass", "0.3 kg")], inputs=[("u1: roll", "-1 to 1", "± 2")], claims=[claim, other])
+    )  # type: ignore[arg-type]
+    assert printed() == [
+        "mass" + 35 * " " + "0.3 kg",
+        ["input", "alone, inside the flaps' range", "linear, in both directions about the hover"], ["u1: roll",
+        "-1 to 1", "± 2"],
+        "the paper's design", ["claim", "paper", "computed", ""], ["pole", "9.5", "9.4", "agrees"], ["lift", "1", "2",
+        "differs"],
+    ]  # fmt: skip
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize(
+    ("gains", "code", "kept"),
+    [((True, False), 0, 0), ((False, False), 0, 0), ((False, True), 0, 1), ((), 2, None)],
+)
+def test_rounds_of_tuning_are_printed_in_turn_and_the_last_that_gained_is_written(
+    gains: tuple[bool, ...], code: int, kept: int | None, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After them a round ends with an error: it is fatal only where it is the first."""
+    asked: list[Any] = []
+    profiles = ("floaty", "lqr")
+
+    def rounds(profile: str, flights: Any, robots: int, count: int) -> Any:
+        asked.append((profile, flights.seed, flights.board, robots, count))
+        yield from (Made(better=one, profile=profiles[number]) for number, one in enumerate(gains))
+        raise LabError("no gains")
+
+    monkeypatch.setattr("hil.research.studies.tuning.rounds", rounds)
+    monkeypatch.setattr("hil.research.studies.tuning.write_tuned", lambda *what: asked.append(what))
+    monkeypatch.setattr(identify, "_print_round", lambda one: identify.say(one.profile))
+    assert cli("tune", "--repeat", "3", "--robots", "7", "--seed", "5", "--out", "mine.toml") == code
+    assert asked[0] == ("floaty", 5, "c", 7, 3)
+    if kept is None:
+        assert cli.err.endswith("no gains\n")
+        return
+    printed = [
+        line for number, _ in enumerate(gains, 1) for line in (f"round {number}", profiles[number - 1])
+    ]
+    assert cli.out.splitlines() == [*printed, "  mine.toml   (floaty fly hover --profile mine.toml)"]
+    assert cli.err.splitlines()[-1].endswith("no gains; the best earlier round counts")
+    assert asked[1] == (
+        Path("mine.toml"),
+        "floaty",
+        load_config(profiles[kept]),
+        "Model and gains by floaty tune.",
+    )
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize("better", [True, False])
+def test_one_round_of_tuning_is_judged_by_its_exit_code(
+    better: bool, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "hil.research.studies.tuning.fly_round", lambda *what: Made(better=better, profile="floaty")
+    )
+    monkeypatch.setattr(identify, "_print_round", lambda one: None)
+    assert cli("tune") == (0 if better else 1)
+    assert cli.out == ""
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize("better", [True, False])
+def test_a_search_prints_each_number_and_the_metric_before_and_after_and_writes_what_is_better(
+    better: bool, cli: Cli, printed: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def search(varied: Any, aim: Any, runner: Any, folder: Path, report: Any) -> Any:
+        assert (aim.experiment, aim.metric, aim.seeds, aim.flights) == ("yaw-step", "rms_y", (4, 5), 30)
+        assert (aim.options["profile"], aim.options["duration_s"], aim.options["board"]) == (
+            "floaty",
+            2.0,
+            "py",
+        )
+        report(1, 2, 0.0123)
+        return Made(values=(-1.25, 3.5), before=0.02, after=0.01, better=better)
+
+    monkeypatch.setattr("hil.research.studies.search.search", search)
+    gains = load_config().controller
+    code = cli("tune", "--vary", "controller.gain_y=-3..-0.5", "--vary", "controller.gain_z=1..5", "--metric", "rms_y",
+    "--seeds", "2",
+               "--experiment", "yaw-step", "--duration", "2", "--flights", "30", "--seed", "4", "--board", "py", "--out",
+               "mine.toml")  # fmt: skip
+    assert code == (0 if better else 1)
+    cells = [["", "before", "found"], ["controller.gain_y", f"{gains.gain_y:g}", "-1.25"], ["controller.gain_z",
+    f"{gains.gain_z:g}", "3.5"],
+             ["rms_y", "2 cm", "1 cm"]]  # fmt: skip
+    last = (
+        "mine.toml   (floaty fly yaw-step --profile mine.toml)"
+        if better
+        else "not better than before: nothing is written"
+    )
+    print(cli.out, end="")
+    assert printed() == ["round 1 of 2: rms_y 1.23 cm", "rms_y of yaw-step, on other seeds", *cells, last]
+    assert Path("mine.toml").exists() == better
+    if better:
+        found = load_config("mine.toml")
+        assert (found.controller.gain_y, found.controller.gain_z) == (-1.25, 3.5)
+
+
+@pytest.mark.usefixtures("empty_folder")
+def test_a_campaign_prints_its_rates_its_errors_and_its_three_worst_flights(
+    cli: Cli, printed: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of eight flights 1 and 3 break a limit, 5 is lost and 6 ends with an error."""
+    spec = spec_of(flights=8)
+    changes: dict[int, dict[str, Any]] = {
+        1: {"holds": {"in_box": False}, "metrics": {"in_box": 0.5}}, 3: {"holds": {"in_box": False},
+        "metrics": {"in_box": 0.25}},
+        5: {"outcome": "lost", "error": "fell", "holds": {"in_box": False}, "metrics": {"flown": 0.2}},
+        6: {"outcome": "error", "error": "planted", "holds": {}},
+    }  # fmt: skip
+
+    def campaign(runner: Any, plan: Any, out: Path) -> Any:
+        dataset = Dataset(out, plan, False)
+        for index in range(8):
+            made = planted(draw(spec, index))
+            change = {"holds": {"in_box": True}, **changes.get(index, {})}
+            metrics = made.metrics | {"in_box": 0.99} | change.pop("metrics", {})
+            dataset.add(replace(made, passed=index not in changes, metrics=metrics, **change))
+        dataset.close()
+        return dataset, Made(complete=True, flown=8)
+
+    monkeypatch.setattr(Runner, "campaign", campaign)
+    Path("spec.toml").write_text(
+        'experiments = ["hover"]\nduration_s = 0.3\nflights = 8\nparameters = {"actuators.tau" = {uniform = [0.04, 0.06]}}\n'
+        '[[faults]]\nkind = "push.y"\nprobability = 0.5\nstart_s = 0.1\nsize = {uniform = [1.0, 12.0]}\n'
+    )
+    assert cli("campaign", "spec.toml", "--out", "runs/x") == 0
+    print(cli.out, end="")
+
+    def rate(failed: int, flown: int, which: str = "") -> str:
+        low, high = (100.0 * end for end in binomtest(failed, flown).proportion_ci(method="wilson"))
+        return f"{failed} of {flown}{which}: {100.0 * failed / flown:.2f} % ({low:.2f} to {high:.2f} %)"
+
+    def command(number: int) -> str:
+        options = draw(spec, number).options
+        more = [f"--set {one}" for one in options["overrides"]] + [
+            f"--fault {one}" for one in options["faults"]
+        ]
+        return f"flight {number}: floaty fly hover --seed {number + 1} --duration 0.3 {' '.join(more)}"
+
+    assert [line for line in printed() if "0 of 0" not in line] == [
+        f"failed: {rate(4, 8)}", f"floaty, lost: {rate(1, 7)}", f"floaty, in_box: {rate(2, 6, ' that were not lost')}",
+        "did not end: 1×, first flight 6: planted", *map(command, (5, 3, 1)), "runs/x/report.html",
+    ]  # fmt: skip
