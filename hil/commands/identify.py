@@ -169,10 +169,12 @@ def tune(asked: Tuning) -> int:
         return _search(asked)
     require("floaty tune", "design", "scipy", "control")
     from hil.config import load_config
+    from hil.laboratory.request import Bench
     from hil.research.campaigns.run import Runner
     from hil.research.studies.tuning import TuningFlights, fly_round, rounds, write_tuned
 
     common.check_profile("--out", asked.out)
+    Bench(board=asked.board).check()
     made_folder("--runs", asked.runs)
     common.announce_compilation()
     best: Round | None = None
@@ -206,12 +208,13 @@ def _search(asked: "Tuning") -> int:
     require("floaty tune --vary", "design", "scipy")
     from hil.config import base_name
     from hil.laboratory.files.whole_files import write_whole
-    from hil.laboratory.request import Options
+    from hil.laboratory.request import Bench, Options
     from hil.research.campaigns.run import Runner
     from hil.research.design.gains import toml_text
     from hil.research.studies.search import Aim, intervals, search
 
     common.check_profile("--out", asked.out)
+    Bench(board=asked.board).check()
     made_folder("--runs", asked.runs)
     varied = intervals(asked.vary, asked.profile)
     options = Options(profile=asked.profile, duration_s=asked.duration, board=asked.board)

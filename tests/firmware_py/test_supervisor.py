@@ -77,48 +77,30 @@ def let_watchdog_bite(client: CrtpClient) -> None:
 STOPS = (stop, stop_on_the_supervisors_port, stop_by_parameter, let_watchdog_bite)
 
 
-@pytest.mark.parametrize("stop", [*STOPS, stop_by_floatys_own_parameter])
-def test_emergency_stop_acts_within_eleven_milliseconds(flying: CrtpClient, stop) -> None:
-    stop(flying)
-    assert after(flying, 11_000) == (State.FAILSAFE, Cause.EMERGENCY_STOP)
+def disarm(client: CrtpClient) -> None:
+    write(client, "floaty.armed", 0)
+
+
+@pytest.mark.parametrize("act", [*STOPS, stop_by_floatys_own_parameter, disarm])
+def test_a_stop_acts_within_eleven_milliseconds_and_the_crazyflie_s_lasts_until_a_reboot(
+    flying: CrtpClient, act: Callable[[CrtpClient], None]
+) -> None:
+    cause = Cause.DISARMED if act is disarm else Cause.EMERGENCY_STOP
+    act(flying)
+    assert after(flying, 11_000) == (State.FAILSAFE, cause)
     assert flying.writes[-1][1] == HOVER_COUNTS
-    assert flying.console == ["supervisor: failsafe, emergency stop"]
-    assert after(flying, 3_000_000)[1] is Cause.EMERGENCY_STOP
-
-
-@pytest.mark.parametrize("stop", STOPS)
-def test_an_emergency_stop_of_the_crazyflie_lasts_until_a_reboot(flying: CrtpClient, stop) -> None:
-    stop(flying)
-    flying.run(flying.now_us + 11_000)
-    flying.one(SUPERVISOR, 1, b"\2")
+    assert flying.console == [f"supervisor: failsafe, {cause.name.lower().replace('_', ' ')}"]
+    assert after(flying, 200_000)[1] is cause
     write(flying, "floaty.stop", 0)
     write(flying, "stabilizer.stop", 0)
+    flying.one(SUPERVISOR, 1, b"\2")
     flying.one(SUPERVISOR, 1, b"\1\1")
-    assert after(flying, 1_000_000) == (State.FAILSAFE, Cause.EMERGENCY_STOP)
-    assert flying.one(SUPERVISOR, 0, b"\x0c")[1] & 1 << 6  # locked
+    locked = act in STOPS
+    assert after(flying, 11_000)[1] is (cause if locked else Cause.NONE)
+    assert bool(flying.one(SUPERVISOR, 0, b"\x0c")[1] & 1 << 6) is locked
     flying.reboot()
     flying.poses(flying.now_us + 605_000, flying.now_us + 2_000_000)
     assert after(flying, 1_000_000) == (State.FLYING, Cause.NONE)
-
-
-def test_floatys_own_stop_can_be_left(flying: CrtpClient) -> None:
-    stop_by_floatys_own_parameter(flying)
-    flying.run(flying.now_us + 11_000)
-    assert not flying.one(SUPERVISOR, 0, b"\x0c")[1] & 1 << 6  # not locked
-    write(flying, "floaty.stop", 0)
-    assert after(flying, 20_000) == (State.FLYING, Cause.NONE)
-
-
-@pytest.mark.parametrize(
-    "arm", [lambda c, on: write(c, "floaty.armed", on), lambda c, on: c.one(SUPERVISOR, 1, bytes((1, on)))]
-)
-def test_a_disarmed_board_hovers_until_it_is_armed(flying: CrtpClient, arm) -> None:
-    arm(flying, False)
-    assert after(flying, 11_000) == (State.FAILSAFE, Cause.DISARMED)
-    assert flying.writes[-1][1] == HOVER_COUNTS
-    flying.run(flying.now_us + 200_000)  # until the Crazyflie's supervisor can be armed
-    arm(flying, True)
-    assert after(flying, 11_000) == (State.FLYING, Cause.NONE)
 
 
 @pytest.mark.parametrize(
@@ -448,25 +430,6 @@ def test_the_wire_has_the_numbers_of_the_core() -> None:
     for kind in (State, Cause):
         numbers = {one.name: getattr(structs, f"{kind.__name__.upper()}_{one.name}") for one in kind}
         assert numbers == {one.name: one.value for one in kind}
-
-
-def test_low_battery_needs_five_seconds_and_ends_by_recovery_with_a_good_voltage(flying: CrtpClient) -> None:
-    flying.battery_mv = 3100
-    flying.run(flying.now_us + 4_000_000)
-    flying.battery_mv = 3300  # a sag
-    flying.run(flying.now_us + 200_000)
-    flying.battery_mv = 3100
-    assert after(flying, 4_800_000)[0] is State.FLYING
-    assert after(flying, 400_000) == (State.FAILSAFE, Cause.LOW_BATTERY)
-    assert flying.writes[-1][1] == HOVER_COUNTS
-    assert flying.console == ["supervisor: failsafe, low battery"]
-    flying.battery_mv = 3800
-    assert after(flying, 1_000_000)[1] is Cause.LOW_BATTERY
-    flying.one(SUPERVISOR, 1, b"\2")  # the Crazyflie's, after a crash
-    assert after(flying, 11_000)[1] is Cause.LOW_BATTERY
-    flying.write(flying.toc(PARAM), "floaty.stop", 0)
-    assert after(flying, 11_000)[0] is State.FLYING
-    assert after(flying, 1_000_000)[0] is State.FLYING
 
 
 def test_state_and_cause_are_log_variables(flying: CrtpClient) -> None:

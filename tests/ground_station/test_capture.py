@@ -16,7 +16,6 @@ from ground_station.frame_rate import FrameRate
 from ground_station.sources.address import find_source, override
 from ground_station.sources.alignment import Alignment
 from hil.config import load_config
-from support.command import Cli
 
 QUARTER = math.pi / 2
 
@@ -153,13 +152,3 @@ def test_a_stream_of_another_rate_is_reported_once() -> None:
 
 
 # The command
-
-
-@pytest.mark.parametrize(("arguments", "message"), [
-    (("--mocap", "replay:/nowhere"), "--mocap replay:/nowhere: /nowhere: No such file or directory"),
-    (("--mocap", "kinect:h"), "--mocap kinect:h: expected optitrack:HOST"),
-    (("--set", "capture.system=optitrak"), "capture.system = 'optitrak': input should be 'optitrack', 'vicon'"),
-    (("--set", "capture.system=qualisys", "--set", "capture.port=1"), "capture.system = qualisys: qualisys: its client"),
-])  # fmt: skip
-def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: tuple[str, ...], message: str) -> None:
-    assert message in cli.refusal("station", "--link", "udp://127.0.0.1:1", *arguments)

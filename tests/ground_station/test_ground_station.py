@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from firmware_py.geometry import from_euler_zyx
@@ -234,12 +233,6 @@ def test_unreadable_telemetry_is_counted_and_other_services_are_not():
     assert bench.station.counters.malformed == 1
     bench.station.on_packet(0, b"\x0chello")  # console
     assert bench.station.counters.malformed == 1
-
-
-@pytest.mark.parametrize("change", [{"corrections_hz": 0}, {"link_latency_us": -1}, {"correctionshz": 50}])
-def test_bad_configuration_is_refused(change):
-    with pytest.raises(ValidationError):
-        StationConfig(**change)
 
 
 def test_telemetry_is_asked_for_at_the_first_frame_and_after_half_a_second_without_it():

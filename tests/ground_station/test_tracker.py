@@ -9,7 +9,6 @@ from filterpy.kalman import KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from pydantic import ValidationError
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -532,14 +531,6 @@ def test_anything_may_come_and_the_tracker_recovers(frames: list[MocapFrame]) ->
 
 def test_a_profile_may_do_without() -> None:
     assert tracker_of(TrackerConfig(enabled=False), PERIOD_US) is None
-
-
-@pytest.mark.parametrize(
-    "change", [{"gate": 0.0}, {"bridge_us": 20_000}, {"position_noise": 0.0}, {"reaquire_us": 1}]
-)
-def test_bad_configuration_is_refused(change: dict[str, float]) -> None:
-    with pytest.raises(ValidationError):
-        TrackerConfig(**change)
 
 
 @pytest.mark.parametrize(("few", "parts"), [(10, 2), (9, 1)])

@@ -51,50 +51,6 @@ def test_an_override_reaches_its_value(override: str, value: object) -> None:
     assert value(load_config("floaty", [override]))
 
 
-@pytest.mark.parametrize(
-    ("profile", "override", "message"),
-    [
-        ("floaty", "tunnel.sped=3", r"tunnel\.sped = 3: unknown key \(did you mean speed\?\)"),
-        ("floaty", "tunel.speed=3", r"did you mean tunnel\?"),
-        ("floaty", "controller.gain_y=nan", r"controller\.gain_y = nan: input should be a finite number"),
-        ("floaty", "controller.gain_y=inf", r"controller\.gain_y = inf"),
-        (
-            "floaty",
-            "controller.gain_y=1e9",
-            r"controller\.gain_y = 1000000000\.0: .*less than or equal to 20",
-        ),
-        (
-            "floaty",
-            "tunnel.speed=0",
-            r"tunnel\.speed = 0: .*greater than 0; still air is tunnel\.fan_factor = 0",
-        ),
-        ("floaty", "tunnel.speed=-1", r"tunnel\.speed = -1: .*greater than 0"),
-        ("floaty", "servo.trim[1]=99999", r"servo\.trim\[1\] = 99999: .*12000"),
-        ("floaty", "servo.trim[7]=0", r"no element \[7\]"),
-        (
-            "floaty",
-            "mocap.period_us=400000",
-            r"mocap\.period_us = 400000: no pose .* than tracker\.reacquire_us = 400000",
-        ),
-        (
-            "crazyflie",
-            "mocap.period_us=500000",
-            r"mocap\.period_us = 500000: no pose .* tracker\.reacquire_us",
-        ),
-        ("floaty", "controller.gain_y", r"expected section\.key=value"),
-        ("floaty", "gain_y=1", r"expected section\.key=value"),
-        ("floaty", "controller.gain_y.deeper=1", r"gain_y is a value, not a section"),
-        ("floaty", "predictor.horizon=13", r"predictor\.horizon = 13"),
-        ("flaoty", "", r"did you mean floaty\?"),
-        ("nowhere/x.toml", "", r"No such file"),
-    ],
-)
-def test_a_mistake_is_one_line_with_key_and_value(profile: str, override: str, message: str) -> None:
-    with pytest.raises(LabError, match=message) as caught:
-        load_config(profile, [override] if override else [])
-    assert "\n" not in str(caught.value)
-
-
 def test_a_profile_builds_on_another(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text('base = "as-flown"\n[tunnel]\nspeed = 9.75\n')
     (tmp_path / "mine2.toml").write_text('base = "mine.toml"\n[controller]\ngain_z = 2.5\n')

@@ -1,18 +1,16 @@
 """The high-level commander, byte for byte as cflib's own classes pack: what it answers, and what the estimator then gets."""
 
-import struct
 from collections.abc import Callable
 from types import SimpleNamespace
 
 import pytest
 from cflib.crazyflie.commander import Commander
 from cflib.crazyflie.high_level_commander import HighLevelCommander
-from cflib.crazyflie.supervisor import BIT_HL_CONTROL_ACTIVE, BIT_HL_CONTROL_DISABLED, BIT_HL_TRAJ_FINISHED
 from scipy.spatial.transform import Rotation
 
 from firmware_py.signals import COUNTERS
 from firmware_py.wire import crtp
-from support.crtp_client import LOG, PARAM, SUPERVISOR, CrtpClient
+from support.crtp_client import LOG, PARAM, CrtpClient
 
 HIGH_LEVEL = 8
 ENOEXEC = 8
@@ -199,41 +197,3 @@ def test_position_set_points_move_the_goal_in_steps(absolute: Flyer, send) -> No
         Rotation.from_euler("z", -30, degrees=True).apply((-0.05, 0.0, 0.02)), abs=0.005
     )
     assert not [line for line in absolute.console if "set-points" in line]
-
-
-ACTIVE, FINISHED, OVERRULED = "hl_control_active", "hl_traj_finished", "hl_control_disabled"
-
-
-def told_of_the_commander(flyer: Flyer) -> set[str]:
-    """As cflib's supervisor reads the bits, all at once and one by one."""
-    flyer.wait(0.06)
-    bits = int.from_bytes(flyer.one(SUPERVISOR, 0, b"\x0c")[1:], "little")
-    assert [flyer.one(SUPERVISOR, 0, bytes((n,))) for n in range(1, 12)] == [
-        bytes((0x80 | n, bits >> n - 1 & 1)) for n in range(1, 12)
-    ]
-    assert flyer.log(flyer.logs, "supervisor.info") == [bits]
-    names = {
-        BIT_HL_CONTROL_ACTIVE: ACTIVE,
-        BIT_HL_TRAJ_FINISHED: FINISHED,
-        BIT_HL_CONTROL_DISABLED: OVERRULED,
-    }
-    return {name for bit, name in names.items() if bits >> bit & 1}
-
-
-def test_the_supervisor_reports_the_commander_s_state(absolute: Flyer) -> None:
-    assert told_of_the_commander(absolute) == {FINISHED}
-    absolute.order(absolute.commander.takeoff, 1.5, 1.0)
-    assert told_of_the_commander(absolute) == {ACTIVE}
-    absolute.wait(1.0)
-    assert told_of_the_commander(absolute) == {ACTIVE, FINISHED}
-    send_position(absolute, *HERE, 0.0)
-    assert told_of_the_commander(absolute) == {FINISHED}
-
-
-def test_the_kind_of_poses_survives_a_reboot(absolute: Flyer) -> None:
-    assert (
-        absolute.one(PARAM, 3, b"\x03" + struct.pack("<H", absolute.params["extPose.absolute"][0]))[3:]
-        == b"\0"
-    )
-    absolute.reboot()
-    assert absolute.read(absolute.params, "extPose.absolute") == 1

@@ -4,7 +4,7 @@ import math
 import re
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -22,7 +22,7 @@ from firmware_py.wire.mavlink_numbers import Mode
 from firmware_py.wire.mavlink_services import mavlink_name
 from firmware_py.wire.supervisor import Cause, State
 from support.firmware_bench import LEVEL, FirmwareBench
-from support.mavlink_client import GYRO_ZERO_US, HOME, STREAMS, MavlinkClient, codec, count
+from support.mavlink_client import GYRO_ZERO_US, HOME, MavlinkClient, codec, count, lines
 
 DENIED, UNSUPPORTED, TEMPORARILY_REJECTED = 2, 3, 1
 IGNORE_POSITION, IGNORE_YAW, IGNORE_REST = 0x7, 0x400, 0x9F8
@@ -326,44 +326,23 @@ def test_an_interval_is_set_read_switched_off_and_reset(client: MavlinkClient) -
     )  # never sent
     assert client.command(510, 0)[1].interval_us == 1_000_000  # of heartbeats
     assert client.command(510, 65_536)[0].result == DENIED
+    assert client.command(511, 0, 0)[0].result == 0  # of heartbeats the default alone may be asked for
 
 
 @pytest.mark.parametrize(
     "params",
     [
-        (30, math.nan),
-        (30, -2),
-        (30, 0.5),
-        (math.nan, 1000),
-        (1e30, 1000),
-        (3, 1000),
-        (0, -1),
-        (0, 60_000_000),
+        *((511, *interval) for interval in ((30, math.nan), (30, -2), (30, 0.5), (math.nan, 1000), (1e30, 1000))),
+        *((511, *interval) for interval in ((3, 1000), (0, -1), (0, 60_000_000))),  # heartbeats are a board's life
+        (400, 2), (400, math.nan), (185, 0), (185, 2), (245, 0), (245, 2), (246, 0), (246, 2), (246, math.nan),
     ],
-)
-def test_an_impossible_interval_is_denied(client: MavlinkClient, params: tuple[float, float]) -> None:
-    """Without heartbeats other clients would lose the board."""
-    assert client.command(511, *params)[0].result == DENIED
+)  # fmt: skip
+def test_impossible_command_parameters_are_denied(client: MavlinkClient, params: tuple[float, ...]) -> None:
+    assert client.command(*params)[0].result == DENIED  # type: ignore[arg-type]
+    assert client.firmware.signals.supervisor.armed
     client.messages.clear()
     client.run(client.now_us + 2_000_000)
     assert len(client.of("HEARTBEAT")) == 2
-
-
-def test_the_default_interval_of_heartbeats_may_be_asked_for(client: MavlinkClient) -> None:
-    assert client.command(511, 0, 0)[0].result == 0
-
-
-def test_a_parameter_of_another_type_is_refused_for_its_type(client: MavlinkClient) -> None:
-    for kind, error, name in (
-        (6, 7, "INT32"),
-        (1, 7, "UINT8"),
-        (10, 6, "REAL64"),
-        (8, 6, ""),  # its text differs from that of INT32 by a number only: once is enough
-        (99, 6, "99"),
-    ):
-        answers = {a.get_type(): a for a in client.ask("param_set", 1, 1, b"EXT_X_P", 2.0, kind)}
-        assert answers["PARAM_ERROR"].error == error
-        assert not name or f"EXT_X_P: type {name} refused, REAL32 is needed" in client.texts()
 
 
 def test_unused_fields_may_be_nan(client: MavlinkClient) -> None:
@@ -659,7 +638,7 @@ def parameter_list(client: MavlinkClient) -> dict[str, Any]:
     return {answer.param_id: answer for answer in answers if answer.get_type() == "PARAM_VALUE"}
 
 
-def test_the_list_is_complete_and_every_value_is_real32(client: MavlinkClient) -> None:
+def test_the_list_is_complete_and_each_value_is_real32_by_index_and_by_name(client: MavlinkClient) -> None:
     table = parameter_list(client)
     writable = [parameter for parameter in own_parameters(client) if parameter.write is not None]
     assert len(table) == len(writable) > 40
@@ -668,52 +647,52 @@ def test_the_list_is_complete_and_every_value_is_real32(client: MavlinkClient) -
     assert {answer.param_type for answer in table.values()} == {dialect.MAV_PARAM_TYPE_REAL32}
     for parameter, answer in zip(writable, sorted(table.values(), key=lambda a: a.param_index), strict=True):
         assert answer.param_value == pytest.approx(float(parameter.read()), rel=1e-6)
-
-
-def test_a_parameter_is_read_by_index_and_by_name(client: MavlinkClient) -> None:
-    table = parameter_list(client)
     for name, listed in list(table.items())[::7]:
         by_name = client.one("param_request_read", 1, 1, name.encode(), -1)
         by_index = client.one("param_request_read", 1, 1, b"", listed.param_index)
         assert by_name.to_dict() == by_index.to_dict() == listed.to_dict()
 
 
-BAD_VALUES = {b"EXT_Z_P": (math.nan, -math.inf, 1e9), b"DLY_ACTIVATE": (2.0, 0.5, math.nan, math.inf)}
-BAD = [(name, value, 9) for name, values in BAD_VALUES.items() for value in values]
+MISSING, OUTSIDE, FLOAT_NEEDED, UNKNOWN_TYPE = 1, dialect.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE, 7, 6
+assert dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST == MISSING
 
 
-@pytest.mark.parametrize(("name", "value", "kind"), [*BAD, (b"EXT_Z_P", 1.0, 6)])
-def test_a_bad_value_echoes_the_old_one(client: MavlinkClient, name: bytes, value: float, kind: int) -> None:
-    before = client.one("param_request_read", 1, 1, name, -1).param_value
-    answers = client.ask("param_set", 1, 1, name, value, kind)
-    again = client.ask("param_set", 1, 1, name, value, kind)
-    assert [a.param_value for a in answers + again if a.get_type() == "PARAM_VALUE"] == [before, before]
-    assert [a.get_type() for a in answers + again].count("STATUSTEXT") == 1
-    assert client.stack.refused == 2
-
-
-def test_each_impossible_parameter_request_is_answered_with_the_reason(client: MavlinkClient) -> None:
-    def error(name: str, *fields: Any) -> tuple[Any, ...]:
-        (found,) = [a for a in client.ask(name, 1, 1, *fields) if a.get_type() == "PARAM_ERROR"]
-        assert (found.target_system, found.target_component) == (255, 190)
-        return found.param_id, found.param_index, found.error
-
-    count = client.one("param_request_read", 1, 1, b"EXT_Z_P", -1).param_count
-    missing, out_of_range = dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST, dialect.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
+@pytest.mark.parametrize(
+    ("asked", "error", "text"),
+    [
+        *((("param_set", b"EXT_Z_P", value, 9), OUTSIDE, "EXT_Z_P") for value in (math.nan, -math.inf, 1e9)),
+        *((("param_set", b"DLY_ACTIVATE", value, 9), OUTSIDE, "DLY_ACTIVATE") for value in (2.0, 0.5, math.nan)),
+        *((("param_set", b"EXT_Z_P", 2.0, kind), error, f"EXT_Z_P: type {name} refused, REAL32 is needed")
+          for kind, error, name in ((6, FLOAT_NEEDED, "INT32"), (1, FLOAT_NEEDED, "UINT8"), (10, UNKNOWN_TYPE, "REAL64"),
+                                    (99, UNKNOWN_TYPE, "99"))),
+        (("param_set", b"NONE", 1.0, 9), MISSING, ""),
+        (("param_request_read", b"NONE", -1), MISSING, ""),
+        (("param_request_read", b"", 10_000), MISSING, ""),
+    ],
+)  # fmt: skip
+def test_an_impossible_parameter_request_is_answered_with_the_reason_and_in_text_once(
+    client: MavlinkClient, asked: tuple[Any, ...], error: int, text: str
+) -> None:
+    kind, name, *values = asked
+    before = client.ask("param_request_read", 1, 1, name, -1)[0]
+    client.run(client.now_us + 20_000_000)
+    client.stack.refused, texts = 0, []
     for _ in range(2):
-        assert error("param_set", b"NONE", 1.0, 9) == ("NONE", -1, missing)
-        assert error("param_request_read", b"NONE", -1) == ("NONE", -1, missing)
-        assert error("param_request_read", b"", count) == ("", count, missing)
-        assert error("param_set", b"EXT_Z_P", 1e9, 9) == ("EXT_Z_P", -1, out_of_range)
-    assert client.stack.refused == 8
+        answers = client.ask(kind, 1, 1, name, *values)
+        (refusal,) = [a for a in answers if a.get_type() == "PARAM_ERROR"]
+        assert (refusal.target_system, refusal.target_component) == (255, 190)
+        index = values[0] if not name else -1
+        assert (refusal.param_id, refusal.param_index, refusal.error) == (name.decode(), index, error)
+        assert [a.param_value for a in answers if a.get_type() == "PARAM_VALUE"] == (
+            [before.param_value] if kind == "param_set" and error != MISSING else []
+        )
+        texts += lines(a for a in answers if a.get_type() == "STATUSTEXT")
+    assert client.stack.refused == 2
+    assert len(texts) == 1
+    assert text in texts[0]
 
 
-def test_an_unknown_parameter_is_reported_in_text_once(client: MavlinkClient) -> None:
-    assert [a.get_type() for a in client.ask("param_set", 1, 1, b"NONE", 1.0, 9)] == [
-        "PARAM_ERROR",
-        "STATUSTEXT",
-    ]
-    assert [a.get_type() for a in client.ask("param_request_read", 1, 1, b"NONE", -1)] == ["PARAM_ERROR"]
+def test_a_name_that_is_no_text_is_refused(client: MavlinkClient) -> None:
     assert client.ask("param_request_read", 1, 1, b"\xff\xfe", -1)[-1].get_type() == "STATUSTEXT"
 
 
@@ -785,26 +764,24 @@ def test_every_command_is_acknowledged_to_its_sender(client: MavlinkClient, kind
         assert refused == (ack.result != 0)
 
 
-@pytest.mark.parametrize("target", [(2, 1), (1, 2), (7, 0)])
-def test_a_command_for_another_system_is_ignored(client: MavlinkClient, target: tuple[int, int]) -> None:
-    assert client.command(400, 0, target=target) == []
-    assert client.stack.unserved == 1
-    assert client.firmware.signals.supervisor.armed
-
-
 @pytest.mark.parametrize(
-    ("target", "armed"), [((3, 25), False), ((3, 1), True), ((1, 25), True), ((3, 0), False)]
+    ("address", "target", "obeyed"),
+    [
+        *(((1, 1), target, True) for target in ((1, 1), (1, 0), (0, 1), (0, 0))),
+        *(((1, 1), target, False) for target in ((2, 1), (1, 2), (7, 0))),
+        *(((3, 25), target, target[0] == 3) for target in ((3, 25), (3, 0))),
+        *(((3, 25), target, False) for target in ((3, 1), (1, 25))),
+    ],
 )
-def test_a_board_has_the_address_of_its_profile(target: tuple[int, int], armed: bool) -> None:
-    client = MavlinkClient("mavlink.system=3", "mavlink.component=25")
-    client.command(400, 0, target=target)
-    assert client.firmware.signals.supervisor.armed == armed
-
-
-@pytest.mark.parametrize("target", [(0, 0), (1, 0), (0, 1)])
-def test_a_command_for_all_is_obeyed(client: MavlinkClient, target: tuple[int, int]) -> None:
-    assert client.command(400, 0, target=target)[0].result == 0
-    assert not client.firmware.signals.supervisor.armed
+def test_a_command_for_the_board_s_own_address_or_for_all_is_obeyed(
+    address: tuple[int, int], target: tuple[int, int], obeyed: bool
+) -> None:
+    client = MavlinkClient(f"mavlink.system={address[0]}", f"mavlink.component={address[1]}")
+    client.run(20_000)
+    answers = client.command(400, 0, target=target)
+    assert [answer.result for answer in answers] == [0] * obeyed
+    assert client.stack.unserved == (not obeyed)
+    assert client.firmware.signals.supervisor.armed is not obeyed
 
 
 def test_a_forced_start_is_no_stop(client: MavlinkClient) -> None:
@@ -813,29 +790,44 @@ def test_a_forced_start_is_no_stop(client: MavlinkClient) -> None:
     assert not client.firmware.signals.supervisor.stopped
 
 
-@pytest.mark.parametrize("params", [(185, 1), (400, 0, 21196)])
-def test_a_forced_stop_is_latched(client: MavlinkClient, params: tuple[float, ...]) -> None:
-    assert client.command(*params)[0].result == 0  # type: ignore[arg-type]
-    client.run(client.now_us + 20_000)
-    assert client.firmware.signals.supervisor.cause is Cause.EMERGENCY_STOP
-    ack, why = client.command(400, 1)
-    assert (ack.result, why.text) == (TEMPORARILY_REJECTED, "not armed: emergency stop; reboot first")
-    assert why.severity == dialect.MAV_SEVERITY_WARNING
+def stopped_by(*params: float) -> Callable[[MavlinkClient], None]:
+    """Return an emergency stop by a command."""
+
+    def stop(client: MavlinkClient) -> None:
+        assert client.command(*params)[0].result == 0  # type: ignore[arg-type]
+        client.run(client.now_us + 20_000)
+        assert client.firmware.signals.supervisor.cause is Cause.EMERGENCY_STOP
+
+    return stop
 
 
-def test_a_recoverable_stop_names_its_parameter(client: MavlinkClient) -> None:
+def stopped_by_parameter(client: MavlinkClient) -> None:
     client.ask("param_set", 1, 1, b"FLOATY_STOP", 1, 9)
-    ack, why = client.command(400, 1)
-    assert (ack.result, why.text) == (TEMPORARILY_REJECTED, "not armed: stopped; set FLOATY_STOP 0")
-    client.ask("param_set", 1, 1, b"FLOATY_STOP", 0, 9)
-    assert client.command(400, 1)[0].result == 0
 
 
-def test_with_an_empty_battery_arming_is_refused_with_that_reason(client: MavlinkClient) -> None:
+def with_an_empty_battery(client: MavlinkClient) -> None:
     client.battery_mv = 3000
     client.run(6_020_000)
+
+
+@pytest.mark.parametrize(
+    ("prevent", "reason"),
+    [
+        (stopped_by(185, 1), "emergency stop; reboot first"),
+        (stopped_by(400, 0, 21196), "emergency stop; reboot first"),
+        (stopped_by_parameter, "stopped; set FLOATY_STOP 0"),
+        (with_an_empty_battery, "battery low"),
+    ],
+)
+def test_arming_is_refused_with_the_reason(
+    client: MavlinkClient, prevent: Callable[[MavlinkClient], None], reason: str
+) -> None:
+    prevent(client)
     ack, why = client.command(400, 1)
-    assert (ack.result, why.text) == (TEMPORARILY_REJECTED, "not armed: battery low")
+    assert (ack.result, why.text) == (TEMPORARILY_REJECTED, f"not armed: {reason}")
+    assert why.severity == dialect.MAV_SEVERITY_WARNING
+    client.ask("param_set", 1, 1, b"FLOATY_STOP", 0, 9)
+    assert (client.command(400, 1)[0].result == 0) == (prevent is stopped_by_parameter)
 
 
 @pytest.mark.parametrize("kind", ["command_long", "command_int"])
@@ -900,39 +892,23 @@ def test_the_heartbeat_is_armed_only_while_the_flaps_are_controlled() -> None:
     assert not armed_at(2_700_000)
 
 
-@pytest.mark.parametrize(
-    "params",
-    [(400, 2), (400, math.nan), (185, 0), (185, 2), (245, 0), (245, 2), (246, 0), (246, 2), (246, math.nan)],
-)
-def test_impossible_command_parameters_are_denied(client: MavlinkClient, params: tuple[float, ...]) -> None:
-    assert client.command(*params)[0].result == DENIED  # type: ignore[arg-type]
-    assert client.firmware.signals.supervisor.armed
+@pytest.mark.parametrize("older", [True, False])
+def test_home_and_versions_are_reported_by_the_older_request_and_the_present_one(
+    client: MavlinkClient, older: bool
+) -> None:
+    def found(request: tuple[float, ...], number: int) -> Any:
+        ack, *answers = client.command(*(request if older else (512, number)))  # type: ignore[arg-type]
+        assert (ack.command, ack.result) == (request[0] if older else 512, 0)
+        (answer,) = (one for one in answers if int.from_bytes(one.get_msgbuf()[7:10], "little") == number)
+        return answer
 
-
-@pytest.mark.parametrize("params", [(410,), (512, 242)])
-def test_home_is_that_of_the_configuration(client: MavlinkClient, params: tuple[float, ...]) -> None:
-    answers = {answer.get_type(): answer for answer in client.command(*params)}  # type: ignore[arg-type]
-    home = answers["HOME_POSITION"]
+    home = found((410,), 242)
     assert (home.x, home.y, home.z) == pytest.approx((0.0, 0.0, -1.15))
-    assert answers["COMMAND_ACK"].result == 0
-
-
-@pytest.mark.parametrize("params", [(520, 1), (512, 148)])
-def test_the_version_is_reported(client: MavlinkClient, params: tuple[float, ...]) -> None:
-    answers = {answer.get_type(): answer for answer in client.command(*params)}  # type: ignore[arg-type]
-    version = answers["AUTOPILOT_VERSION"]
+    version = found((520, 1), 148)
     assert version.flight_sw_version.to_bytes(4, "big")[:2] == bytes((26, 11))
     assert version.uid == 0x00F10A71
     assert version.capabilities & dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
-
-
-@pytest.mark.parametrize("params", [(519, 1), (512, 300)])
-def test_the_versions_of_the_protocol_are_reported(client: MavlinkClient, params: tuple[float, ...]) -> None:
-    """In bytes, because pymavlink does not have the message."""
-    ack, answer = (message for message in client.command(*params) if message.get_type() not in STREAMS)  # type: ignore[arg-type]
-    assert (ack.command, ack.result) == (params[0], 0)
-    frame = bytes(answer.get_msgbuf())
-    assert int.from_bytes(frame[7:10], "little") == 300
+    frame = bytes(found((519, 1), 300).get_msgbuf())  # in bytes, because pymavlink does not have the message
     assert struct.unpack("<HHH16s", frame[10:-2].ljust(22, b"\0")) == (200, 100, 200, bytes(16))
     assert dialect.x25crc(frame[1:-2] + bytes((217,))).crc == int.from_bytes(frame[-2:], "little")
 

@@ -1,4 +1,8 @@
-"""MAVLink's units and frames against scipy and pymavlink: north-east-down outside, z up inside."""
+"""MAVLink's units and frames against scipy and pymavlink: north-east-down outside, z up inside.
+
+What a board (`test_mavlink_board.py`, `test_mavlink_on_request.py`) and a link (`test_mavlink_link.py`) show of poses,
+targets, texts and streams is judged there.
+"""
 
 from math import inf, nan
 from typing import Any
@@ -42,17 +46,6 @@ def near(expected: Any) -> Any:
 
 
 # Uplink
-
-
-def test_pose_is_the_standards_and_comes_back() -> None:
-    message = over_the_wire(mavlink.pose(1_234_567, V, Q_WB))
-    assert message.get_type() == "ATT_POS_MOCAP"
-    assert message.time_usec == 1_234_567
-    assert vector(message, "x y z") == near(D @ V)
-    assert message.q == near(R_NED_FRD.as_quat(scalar_first=True))
-    assert message.covariance == [0.0] * 21
-    pose = mavlink.read_pose(message)
-    assert (pose.t_us, pose.p_WB, pose.q_WB) == (1_234_567, near(V), near(Q_WB))
 
 
 @pytest.mark.parametrize("kind", ["vision", "global_vision", "vicon"])
@@ -155,36 +148,6 @@ def test_a_pose_of_large_covariance_is_refused(covariance: list[float]) -> None:
             mavlink.read_pose(message)
 
 
-@pytest.mark.parametrize(
-    "message",
-    [
-        dialect.MAVLink_att_pos_mocap_message(0, (1, 0, 0, 0), 0, nan, 0),
-        dialect.MAVLink_att_pos_mocap_message(0, (1, 0, 0, 0), inf, 0, 0),
-        dialect.MAVLink_att_pos_mocap_message(0, (0, 0, 0, 0), 0, 0, 0),
-        dialect.MAVLink_att_pos_mocap_message(0, (nan, 0, 0, 1), 0, 0, 0),
-        dialect.MAVLink_vision_position_estimate_message(0, 0, 0, 0, inf, 0, 0),
-        dialect.MAVLink_vision_position_estimate_message(0, 0, inf, 0, 0, 0, 0),
-    ],
-)
-def test_impossible_pose_is_refused(message: Any) -> None:
-    with pytest.raises(WireError):
-        mavlink.read_pose(over_the_wire(message))
-
-
-def test_target_is_the_standards_and_comes_back() -> None:
-    message = over_the_wire(mavlink.target(5000, V, 0.5, system=3, component=4))
-    assert (message.time_boot_ms, message.target_system, message.target_component) == (5000, 3, 4)
-    assert message.coordinate_frame == dialect.MAV_FRAME_LOCAL_NED
-    ignored = dialect.enums["POSITION_TARGET_TYPEMASK"]
-    names = " ".join(entry.name for bit, entry in ignored.items() if bit & message.type_mask)
-    for part in ("VX", "VY", "VZ", "AX", "AY", "AZ", "YAW_RATE"):
-        assert f"{part}_IGNORE" in names
-    assert vector(message, "x y z") == near(D @ V)
-    assert message.yaw == near(-0.5)  # clockwise from above
-    target = mavlink.read_target(message)
-    assert (target.p_WG, target.yaw) == (near(V), near(0.5))
-
-
 def test_masked_parts_of_a_target_are_none() -> None:
     only_yaw = mavlink.read_target(over_the_wire(mavlink.target(0, None, 0.5)))
     assert (only_yaw.p_WG, only_yaw.yaw) == (None, near(0.5))
@@ -247,12 +210,6 @@ def test_each_part_beside_position_and_yaw_is_seen_unless_its_group_is_masked(na
                 mavlink.read_target(over_the_wire(message))
 
 
-def test_command_pads_its_parameters() -> None:
-    message = over_the_wire(services.command(3, 511, 30, 20_000))
-    assert (message.target_system, message.target_component, message.command) == (3, 1, 511)
-    assert vector(message, "param1 param2 param3 param4 param5 param6 param7") == [30, 20_000, 0, 0, 0, 0, 0]
-
-
 def test_station_is_a_station() -> None:
     message = over_the_wire(services.station_heartbeat())
     assert (message.type, message.autopilot) == (dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID)
@@ -262,24 +219,19 @@ def test_station_is_a_station() -> None:
 # Downlink
 
 
-def test_attitude_is_the_standards() -> None:
-    message = over_the_wire(mavlink.attitude(77, *ANGLES, *U))
-    assert vector(message, "yaw pitch roll") == near(R_NED_FRD.as_euler("ZYX"))
-    assert vector(message, "rollspeed pitchspeed yawspeed") == near(D @ U)
-    assert message.time_boot_ms == 77
-
-
-def test_attitude_quaternion_is_the_standards() -> None:
-    message = over_the_wire(mavlink.attitude_quaternion(77, Q_WB, *U))
-    assert vector(message, "q1 q2 q3 q4") == near(R_NED_FRD.as_quat(scalar_first=True))
-    assert vector(message, "rollspeed pitchspeed yawspeed") == near(D @ U)
-
-
-def test_position_is_the_standards() -> None:
-    message = over_the_wire(mavlink.local_position(77, V, U))
-    assert vector(message, "x y z") == near(D @ V)
-    assert vector(message, "vx vy vz") == near(D @ U)
-    assert message.time_boot_ms == 77
+def test_attitude_home_and_version_are_the_standards() -> None:
+    attitude = over_the_wire(mavlink.attitude(77, *ANGLES, *U))
+    assert vector(attitude, "yaw pitch roll") == near(R_NED_FRD.as_euler("ZYX"))
+    quaternion = over_the_wire(mavlink.attitude_quaternion(77, Q_WB, *U))
+    assert vector(quaternion, "q1 q2 q3 q4") == near(R_NED_FRD.as_quat(scalar_first=True))
+    for message in (attitude, quaternion):
+        assert vector(message, "rollspeed pitchspeed yawspeed") == near(D @ U)
+    home = over_the_wire(mavlink.home_position(88, V))
+    assert (vector(home, "x y z"), home.q, home.time_usec) == (near(D @ V), [1.0, 0.0, 0.0, 0.0], 88)
+    version = over_the_wire(services.autopilot_version((1, 2, 3), b"abcdefghij", 0x1234))
+    assert version.flight_sw_version.to_bytes(4, "big")[:3] == bytes((1, 2, 3))
+    assert bytes(version.flight_custom_version) == b"abcdefgh"
+    assert not version.capabilities & dialect.MAV_PROTOCOL_CAPABILITY_FTP
 
 
 @given(st.floats(-7.0, 7.0) | st.sampled_from([0.0, 1e-5, -1e-5, np.pi, -np.pi, 2 * np.pi]))
@@ -291,18 +243,6 @@ def test_a_heading_is_the_yaw_clockwise_from_north_and_less_than_a_full_turn(yaw
         found = unit * getattr(over_the_wire(message), name)
         assert 0.0 <= found < 360.0 - unit / 2
         assert abs((found - north + 180.0) % 360.0 - 180.0) <= 0.5001 * unit
-
-
-def test_home_is_the_standards() -> None:
-    message = over_the_wire(mavlink.home_position(88, V))
-    assert vector(message, "x y z") == near(D @ V)
-    assert (message.q, message.time_usec) == ([1.0, 0.0, 0.0, 0.0], 88)
-
-
-def test_servo_counts_become_microseconds() -> None:
-    message = over_the_wire(mavlink.servo_outputs((1 << 32) + 5, (21_000, 31_500, 42_000, 31_511)))
-    assert vector(message, "servo1_raw servo2_raw servo3_raw servo4_raw") == [1000, 1500, 2000, 1501]
-    assert message.time_usec == 5  # 32 bits, wraps
 
 
 @pytest.mark.parametrize(
@@ -335,12 +275,6 @@ def test_status_has_the_standards_units() -> None:
     assert stale.onboard_control_sensors_health == message.onboard_control_sensors_health & ~failed
 
 
-def test_battery_is_one_cell() -> None:
-    message = over_the_wire(mavlink.battery(3900))
-    assert message.voltages == [3900] + [65_535] * 9
-    assert (message.current_battery, message.battery_remaining) == (-1, -1)
-
-
 def test_estimator_tells_health_and_accuracy() -> None:
     message = over_the_wire(mavlink.estimator_status(9, True, 0.25, 0.5))
     assert message.flags & dialect.ESTIMATOR_POS_HORIZ_ABS
@@ -360,31 +294,6 @@ def test_flight_array_carries_the_telemetry_blocks() -> None:
         mavlink.read_flight_array(
             over_the_wire(dialect.MAVLink_debug_float_array_message(0, b"other", 0, [0.0] * 58))
         )
-
-
-def test_texts_are_cut_to_their_fields() -> None:
-    (text,) = services.status_text(4, "ö" + "x" * 49)
-    assert (over_the_wire(text).text, text.id) == ("?" + "x" * 49, 0)
-    assert over_the_wire(services.named_value(1, "abcdefghijklm", 2.5)).name == "abcdefghij"
-    assert over_the_wire(services.parameter("A" * 16, 2.5, 3, 60)).param_id == "A" * 16
-
-
-@pytest.mark.parametrize(("size", "pieces"), [(51, [50, 1]), (100, [50, 50, 0]), (101, [50, 50, 1])])
-def test_a_long_text_travels_in_pieces_of_which_the_last_is_shorter(size: int, pieces: list[int]) -> None:
-    line = ("0123456789" * 11)[:size]
-    messages = [over_the_wire(message) for message in services.status_text(4, line, 7)]
-    assert "".join(message.text for message in messages) == line
-    assert [len(message.text) for message in messages] == pieces
-    assert [(message.id, message.chunk_seq) for message in messages] == [(7, n) for n in range(len(pieces))]
-
-
-def test_version_is_packed_in_bytes() -> None:
-    message = over_the_wire(services.autopilot_version((1, 2, 3), b"abcdefghij", 0x1234))
-    assert message.flight_sw_version.to_bytes(4, "big")[:3] == bytes((1, 2, 3))
-    assert bytes(message.flight_custom_version) == b"abcdefgh"
-    assert message.uid == 0x1234
-    assert message.capabilities & dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
-    assert not message.capabilities & dialect.MAV_PROTOCOL_CAPABILITY_FTP
 
 
 def test_answers_are_addressed_to_the_sender() -> None:

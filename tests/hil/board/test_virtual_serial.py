@@ -7,9 +7,7 @@ from hypothesis import strategies as st
 
 from hil.board.config import SerialConfig
 from hil.board.uart import VirtualSerial
-from hil.config import load_config
 from hil.emulator.events import EventQueue
-from hil.errors import LabError
 
 
 class LineWithEnds:
@@ -269,16 +267,3 @@ def test_bytes_keep_their_order_and_counters_add_up(up, down, baud, threshold, c
             assert received == order
     assert [when for when, _ in bench.on_ground] == sorted(when for when, _ in bench.on_ground)
     assert all(len(data) <= threshold for _, data in bench.on_ground)
-
-
-@pytest.mark.parametrize(
-    ("override", "complaint"),
-    [
-        ("serial.baud=1200", "serial.baud = 1200: input should be greater than or equal to 9600"),
-        ("serial.bauds=115200", "did you mean baud?"),
-        ("serial.uplink_bit_error_rate=2", "less than or equal to 1"),
-    ],
-)
-def test_configuration_is_checked(override, complaint):
-    with pytest.raises(LabError, match=complaint.replace("?", r"\?")):
-        load_config("floaty", [override])

@@ -66,60 +66,6 @@ def test_a_flight_that_leaves_its_baseline_is_compared_with_it(cli: Cli) -> None
         assert wrong[1] in cli.refusal(*fly_it, *wrong)
 
 
-UDP = ("--link", "udp://127.0.0.1:1")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["fly", "hovver"], "experiment 'hovver': unknown; did you mean hover?"),
-        (["fly", "hover", "--duration", "-1"], "--duration -1"),
-        (["fly", "hover", "--duration", "nan"], "--duration nan"),
-        (["fly", "hover", "--duration", "soon"], "'soon' is not a valid float"),
-        (["design", "--angle", "nan"], "'--angle': nan is not in the range 0<=x<=70"),
-        (["design", "--write", "mine.txt"], "--write mine.txt: a profile's name ends in .toml"),
-        (
-            ["station", "--link", "udp://127.0.0.1:9", "--duration", "nan"],
-            "'--duration': nan is not in the range x>0",
-        ),
-        (["fly", "hover", "--seed", "-1"], "-1"),
-        (["fly", "hover", "--profile", "flaoty"], "did you mean floaty?"),
-        (["fly", "hover", "--set", "controller.gain_z=nan"], "controller.gain_z = nan"),
-        (["fly", "hover", "--set", "controler.gain_z=1"], "did you mean controller?"),
-        (["fly", "hover", "--out", "/proc/floaty/run"], "--out /proc/floaty/run: cannot be written"),
-        (["fly", "hover", "--seeds", "2", "--view"], "--seeds 2"),
-        (["design", "--profile", "crazyflie"], "takes robots of flat plates; this one's body is crazyflie"),
-        (
-            ["drag-model", "--profile", "crazyflie"],
-            "takes robots of flat plates; this one's body is crazyflie",
-        ),
-        (["deploy", "write", "app", "--profile", "crazyflie"], "own firmware, not with the app"),
-        (["station", *UDP, "--tlog", "t.tlog"], "--tlog t.tlog: --link udp://127.0.0.1:1: only mavlink:"),
-        (["station", *UDP, "--out", "a", "--log", "b"], "--log b: --out a has a telemetry.csv"),
-        (["param", "list", "--link", "usb://1"], "usb://1: expected radio://"),
-        (["fly", "hover", "--seeds", "2", "--perfetto"], "--seeds 2"),
-        (["fly", "hover", "--resume"], "--workers, --cluster and --resume are for several --seeds"),
-        (["fly", "hover", "--gdb", "3333"], "--gdb 3333: needs one flight with an image as --board"),
-        (["serve", "--gdb", "3333"], "--gdb 3333: needs one board and an image as --board"),
-        (["fly", "hover", "--bogus"], "No such option"),
-        (["serve", "--baud", "9600"], "--baud: now --set serial.baud=N"),
-        (["deploy", "export", "app"], "deploy export: now floaty deploy write DIR"),
-        (["fly", "hover", "--out", "runs/\udcff"], "b'runs/\\xff': expected a name in UTF-8"),
-        (["fly"], "Missing argument 'EXPERIMENT': `floaty list` names them"),
-        (["study"], "`floaty list` names them"),
-        (["report", "nowhere"], "nowhere"),
-        (["report", "\x1b]0;x\x07"], r"\x1b]0;x\x07"),
-        (["view", "nowhere"], "nowhere"),
-        (["view", __file__], "expected a run folder"),
-        (["flyy"], "flyy: no such command; did you mean fly?"),
-        (["zzzzzz"], "zzzzzz: no such command; see floaty --help"),
-        (["study", "latensy"], "study 'latensy': unknown; did you mean latency?"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: list[str], message: str) -> None:
-    assert message in cli.refusal(*arguments)
-
-
 def test_pages_are_found_by_topic_and_by_words(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     assert cli("docs") == 0
     assert re.search(r"^tests +Your own tests$", cli.out, re.MULTILINE)

@@ -35,13 +35,6 @@ def test_runs_are_listed_with_date_request_verdict_and_hash(cli: Cli) -> None:
     assert "missing" in text
 
 
-@pytest.mark.parametrize("folder", ["runs", "elsewhere"])
-def test_no_runs_are_one_line(cli: Cli, folder: str) -> None:
-    arguments = () if folder == "runs" else (folder,)
-    said = cli.refusal("runs", *arguments)
-    assert said == f"floaty: runs {folder}: no run folder there; `floaty fly hover` makes one\n"
-
-
 @pytest.mark.parametrize("command", ["report", "view"])
 def test_a_missing_run_folder_is_called_missing(cli: Cli, command: str) -> None:
     assert cli(command, "runs/hover-7") == 2

@@ -1,10 +1,8 @@
 """`floaty deploy check`: equal targets are called equal, a bit that differs is found where and when it differs."""
 
-import os
 import re
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -314,27 +312,6 @@ def test_the_core_inside_a_linked_firmware_is_checked(
 def test_c_that_does_not_compile_is_one_line_and_exit_code_two(cli: Cli) -> None:
     Path("broken.c").write_text("int x = ;\n", encoding="utf-8")
     cli.refusal("deploy", "check", "hover", "--targets", "c-O2", "--source", "broken.c")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["hovver"], "did you mean hover?"),
-        (["hover", "--all"], "hover and --all: one or the other"),
-        (["--fault", "push.y@1=2"], "for which EXPERIMENT?"),
-        (["hover", "--targets", "plain,c"], "'c' is none of plain, c-O0, c-O2, cortex-m4"),
-        (["hover", "--duration", "0"], "--duration"),
-        (["hover", "--profile", "flaoty"], "did you mean floaty?"),
-        (["hover", "--source", "nowhere.c"], "nowhere.c"),
-        (["hover", "--elf", "nowhere.elf"], "nowhere.elf: No such file"),
-        (["hover", "--source", "a.c", "--elf", "a.elf"], "one or the other"),
-        (["hover", "--elf", __file__], "not an ELF file"),
-        (["hover", "--elf", os.path.realpath(sys.executable)], "a 64-bit ELF file"),
-        (["hover", "--targets", "plain", "--elf", "cf2.elf"], "--elf cf2.elf: nothing to check it with"),
-    ],
-)
-def test_bad_input_of_check_is_one_line_and_exit_two(cli: Cli, arguments: list[str], message: str) -> None:
-    assert message in cli.refusal("deploy", "check", *arguments)
 
 
 def test_the_exported_app_holds_the_c_that_is_checked(cli: Cli) -> None:

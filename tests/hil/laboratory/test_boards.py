@@ -6,16 +6,12 @@ from pathlib import Path
 import pytest
 
 from hil.config import load_config
-from hil.errors import LabError
-from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.files.recorder import load_log
 from hil.laboratory.files.result import Result
 from hil.laboratory.lockstep import image_at
-from hil.laboratory.request import Request
 from support.flights import hover
 from support.stm32_firmware import build
 
-HOVER = EXPERIMENTS["hover"]
 DURATION_S = 1.5
 
 
@@ -75,12 +71,6 @@ def test_the_report_shows_what_the_board_takes(tmp_path: Path) -> None:
     page = write_report(tmp_path).read_text(encoding="utf-8")
     assert "<td>cortex-m4</td>" in page
     assert "instructions" in page
-
-
-@pytest.mark.parametrize("link", ["udp://127.0.0.1:19850", "radio://0/80/2M/E7E7E7E7E7"])
-def test_over_a_link_only_c_flies(link: str) -> None:
-    with pytest.raises(LabError, match="only c flies over a link"):
-        Request.of(HOVER, link=link, board="python")
 
 
 @pytest.mark.long

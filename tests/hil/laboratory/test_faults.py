@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -83,38 +82,6 @@ def test_a_fault_reads_back_from_its_text(data: st.DataObject) -> None:
 def test_every_default_is_a_size_that_its_kind_allows() -> None:
     for name in KINDS:
         assert str(parse(f"{name}@1")).startswith(f"{name}@1")
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("mocap.dropot@3", "unknown kind 'mocap.dropot'; did you mean mocap.dropout?"),
-        ("servo.stuck.5@3", "did you mean servo.stuck."),
-        ("flood@3", "unknown kind 'flood'; floaty list --faults"),
-        ("mocap.dropout", "expected KIND@START"),
-        ("mocap.dropout@", "expected KIND@START"),
-        ("mocap.dropout@1=1:2", "expected KIND@START"),
-        ("mocap.dropout@soon", "start, duration and size are numbers"),
-        ("mocap.dropout@-1", "expected 0 or more after"),
-        ("mocap.dropout@inf", "expected 0 or more after"),
-        ("mocap.dropout@nan", "expected 0 or more after"),
-        ("mocap.dropout@1:0", "expected more than 0, or inf"),
-        ("mocap.dropout@1:nan", "expected more than 0, or inf"),
-        ("mocap.dropout@1=1.5", "size 1.5: expected 0..1"),
-        ("push.x@1=nan", "size nan: expected -20..20 N"),
-        ("servo.stuck.1@1=0.5", "this kind has no size to choose"),
-        ("motor.stop.1@1", "acts on a part of crazyflie only; this flight is one of floaty"),
-        ("push.x@30", "the flight ends 30 s after the release, before it begins"),
-        ("marker.swap@1", "fault marker.swap@1: needs --set markers.enabled=true"),
-        ("serial.cut@1", "acts with --link mavlink only; this robot has no serial line"),
-    ],
-)
-def test_a_wrong_fault_is_one_line_and_exit_code_two(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, text: str, message: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert message in cli.refusal("fly", "hover", "--fault", text)
-    assert os.listdir() == []
 
 
 @pytest.mark.parametrize("link", ["radio", "udp://127.0.0.1:19850", "radio://0/80/2M/E7E7E7E7E7", MAVLINK])

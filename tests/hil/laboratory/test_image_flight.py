@@ -142,30 +142,6 @@ def test_an_image_without_the_app_is_flown_and_recorded_with_its_tasks_and_repor
     assert {one.task for one in runs(load_schedule(tmp_path / "run"))} <= {task.name for task in result.tasks}
 
 
-@pytest.mark.parametrize(
-    ("board", "text"),
-    [
-        (
-            "no-such-board",
-            "expected c, python, cortex-m4, an image of a Crazyflie's firmware: an ELF file, a .bin or the zip of a "
-            "release, or the link",
-        ),
-        (str(Path(__file__)), "no vector table at 0x08004000: the stack pointer there"),
-    ],
-)
-def test_an_invalid_image_is_refused_in_one_line(tmp_path: Path, board: str, text: str) -> None:
-    with pytest.raises(LabError) as refused:
-        flown(tmp_path / "run", 1.0, board=board)
-    assert text in str(refused.value)
-    assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize("link", ["mavlink", "mavlink:pty", "mavlink:/tmp/uart"])
-def test_an_image_has_no_serial_line_for_mavlink(link: str) -> None:
-    with pytest.raises(LabError, match="speaks CRTP over its radio, not MAVLink"):
-        Request.of(HOVER, link=link, board=str(Path(__file__)))
-
-
 @pytest.mark.parametrize("link", ["radio://0/80/2M/E7E7E7E7E7", "udp://127.0.0.1:19850"])
 def test_an_image_is_reached_over_radio_and_udp(link: str) -> None:
     assert not Request.of(HOVER, link=link, board=str(Path(__file__))).bench.in_lockstep

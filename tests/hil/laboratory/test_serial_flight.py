@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 
-from hil.errors import LabError
 from hil.laboratory.files.recorder import load_events, load_log
 from hil.laboratory.files.result import Result
 from hil.laboratory.metrics import column
@@ -41,13 +40,6 @@ def test_the_budget_is_stated_before_take_off(tmp_path: Path) -> None:
     assert first["t_us"] == 0
     assert first["text"].startswith("57600 baud: uplink ")
     assert "telemetry 25 Hz" in first["text"]
-
-
-def test_a_line_that_cannot_carry_the_poses_is_refused_before_take_off(tmp_path: Path) -> None:
-    with pytest.raises(
-        LabError, match=r"9600 baud: 50 poses/s need .* lower station\.corrections_hz or raise serial\.baud"
-    ):
-        hover(tmp_path / "run", "serial.baud=9600", link=MAVLINK)
 
 
 def test_same_seed_same_hash_over_the_serial_line(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from hil.config import load_config
 from hil.emulator.crazyflie.log_table import log_table
 from hil.emulator.stm32f405.image import Image
 from hil.errors import LabError
-from hil.laboratory.experiments import find_experiment
 from hil.laboratory.experiments.position import HOVER
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.request import why_left
@@ -36,27 +35,6 @@ def test_flight_too_short_for_take_off_and_landing_is_refused(tmp_path: Path) ->
     with pytest.raises(LabError, match=r"^--duration 6: take-off and landing alone take 7.3 s"):
         Request.of(HOVER, profile=PROFILE, board=str(image), duration_s=6.0)
     assert Request.of(HOVER, profile=PROFILE, board=str(image), duration_s=7.4).times is not None
-
-
-@pytest.mark.parametrize(
-    ("profile", "override"),
-    [(PROFILE, "controller.gain_z=3"), (PROFILE, "actuators.tau=0.1"), ("floaty", "quadrotor.mass=0.03")],
-)
-def test_a_setting_that_the_robot_ignores_is_refused(profile: str, override: str, tmp_path: Path) -> None:
-    image = tmp_path / "cf2.elf"
-    image.write_bytes(b"")
-    with pytest.raises(
-        LabError, match=rf"^--set {override}: has no effect on the robot of profile {profile}$"
-    ):
-        Request.of(HOVER, profile=profile, board=str(image), overrides=[override])
-
-
-@pytest.mark.parametrize("experiment", ["take-off-landing", "airspeed-9", "identify"])
-def test_an_experiment_for_flaps_is_refused(experiment: str, tmp_path: Path) -> None:
-    image = tmp_path / "cf2.elf"
-    image.write_bytes(b"")
-    with pytest.raises(LabError, match=rf"^experiment {experiment}: .*has no effect on the robot of profile"):
-        Request.of(find_experiment(experiment), profile=PROFILE, board=str(image))
 
 
 def test_goals_stay_in_the_room() -> None:

@@ -21,7 +21,6 @@ from hil.laboratory.swarms import flying
 from hil.laboratory.swarms.request import swarm_of
 from hil.testing.flights import Flights
 from hil.world.neighbours import AIR_DENSITY, Neighbours, interact
-from support.command import Cli
 
 ELF = os.environ.get("FLOATY_STOCK_ELF", "")
 APART = ("swarm.spacing=1.5",)
@@ -146,15 +145,3 @@ def test_a_trajectory_of_crazyswarm_counts_from_the_robot(tmp_path: Path) -> Non
     path.write_text(f"{ROW}\n1,2,x\n")
     with pytest.raises(LabError, match=r"figure 8.csv:2: 3 values: expected 33 numbers"):
         in_csv(path)
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (("--robots", "2", "--view"), "--robots 2: --view: not for robots that fly together"),
-        (("--robots", "2", "--link", "udp://127.0.0.1:1"), "--link udp://127.0.0.1:1: --robots is for flights in lockstep"),
-        (("--set", "swarm.wake=0"), "--set swarm.wake=0: has no effect on one robot"),
-    ],
-)  # fmt: skip
-def test_what_cannot_fly_together_is_refused(words: tuple[str, ...], text: str, cli: Cli) -> None:
-    assert text in cli.refusal("fly", "hover", *words)

@@ -55,9 +55,3 @@ def test_an_invalid_memory_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "board-1.eeprom").write_bytes(b"short")
     with pytest.raises(LabError, match=r"board-1.eeprom: 5 bytes; this memory has 8192"):
         serve(tmp_path)
-
-
-def test_an_invalid_folder_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(LabError, match=r"--state .*file: File exists"):
-        serve(tmp_path / "file")

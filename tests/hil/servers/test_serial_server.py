@@ -110,15 +110,3 @@ def test_addresses_count_up_to_the_last_port(text: str, host: str, ends: list[st
     assert {end.host for end in addresses} == {host}
     where = [end.path or "" if end.kind == "pty" else end.port for end in addresses]
     assert [f"{end.kind}:{place}".rstrip(":") for end, place in zip(addresses, where, strict=True)] == ends
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "", "usb", "udp:x", "udp:0", "udp:127.0.0.1:x", "tcp:-1", "tcp:65535", "tcp:65536", "udp:²",
-        "tcp:" + "9" * 5000,
-    ],
-)  # fmt: skip
-def test_other_addresses_are_refused_in_one_line(text: str) -> None:
-    with pytest.raises(LabError, match=r"^--mavlink [^\n]*\Z"):
-        parse_addresses(text, 2)

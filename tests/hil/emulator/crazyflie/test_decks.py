@@ -14,7 +14,6 @@ from hil.config import RobotConfig, load_config
 from hil.emulator.crazyflie import syslink
 from hil.emulator.crazyflie.decks import DECKS, EXPANDER_ADDRESS
 from hil.emulator.crazyflie.ranger import ADDRESS
-from hil.errors import LabError
 from support.deck_bench import DeckBench
 
 FLOW, MULTIRANGER = 0x0F, 0x0C  # products, of Bitcraze's drivers
@@ -31,18 +30,6 @@ def test_profile_knows_the_decks_that_there_are() -> None:
     (literal, _) = get_args(RobotConfig.model_fields["decks"].annotation)
     assert set(get_args(literal)) == set(DECKS)
     assert load_config("crazyflie-decks").robot.decks == ("flow2", "multiranger")
-
-
-@pytest.mark.parametrize(
-    ("value", "line"),
-    [
-        ('["flow3"]', r"^robot.decks\[0\] = 'flow3': input should be 'flow2' or 'multiranger'$"),
-        ('["flow2", "flow2"]', r"^robot.decks = \['flow2', 'flow2'\]: value error, each deck at most once$"),
-    ],
-)
-def test_unknown_deck_and_one_twice_are_one_clear_line(value: str, line: str) -> None:
-    with pytest.raises(LabError, match=line):
-        load_config("crazyflie", [f"robot.decks={value}"])
 
 
 # One-wire memories

@@ -90,23 +90,6 @@ def test_a_bad_spec_is_one_line_and_exit_code_two(
     assert list(tmp_path.iterdir()) == [tmp_path / "bad.toml"], "nothing was begun"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["nowhere.toml"], "campaign nowhere.toml: No such file"),
-        (["tabel"], "campaign 'tabel': neither the name of a campaign (did you mean table?) nor a path"),
-        (["table", "--shrink", "1000"], "--shrink 1000: the campaign has flights 0..999"),
-        (["table", "--workers", "2", "--cluster", "tcp://a:1"], "--workers 2: not together with --cluster"),
-    ],
-)
-def test_a_bad_option_is_one_line_and_exit_code_two(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, arguments: list[str], message: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert cli("campaign", *arguments) == 2
-    assert message in cli.err
-
-
 def test_files_that_a_spec_names_begin_at_its_folder(tmp_path: Path) -> None:
     path = tmp_path / "own.toml"
     path.write_text(

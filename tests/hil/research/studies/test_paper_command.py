@@ -171,18 +171,6 @@ def test_the_badges_name_their_kind_of_verdict(result: Row, tmp_path: Path) -> N
     assert studies.links == ["report.html", "t.html"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["paper", "--only", "fly-to-the-moon"], "--only fly-to-the-moon: no row matches; there are hover"),
-        (["paper", "--seeds", "0"], "--seeds"),
-        (["paper", "--only", "hover", "--out", "/proc/floaty"], "--out /proc/floaty: cannot be written"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: list[str], message: str) -> None:
-    assert message in cli.refusal(*arguments)
-
-
 @pytest.mark.long
 def test_every_claim_of_the_design_is_in_the_report_with_its_reason(tmp_path: Path) -> None:
     shape = analyse(point_of(load_config()))

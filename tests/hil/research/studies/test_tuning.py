@@ -34,23 +34,6 @@ def test_the_profile_cad_has_the_plate_model_on_board() -> None:
     assert cad.controller == load_config("as-flown").controller
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--profile", "nobody"], "neither the name of a profile"),
-        (["--profile", "lqr"], "tune makes gains for the built-in control law"),
-        (["--profile", "lqr", "--repeat", "1"], "tune makes gains for the built-in control law"),
-        (["--profile", "crazyflie"], "not for the Crazyflie's own firmware"),
-        (["--out", "gains.txt"], "--out gains.txt: a profile's name ends in .toml"),
-        (["--repeat", "0"], "--repeat"),
-        (["--board", "abacus"], "--board abacus: no such file; expected c, python"),
-        (["--runs", "/proc/floaty"], "--runs /proc/floaty: cannot be written"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: list[str], message: str) -> None:
-    assert message in cli.refusal("tune", *arguments)
-
-
 def test_an_axis_is_judged_by_old_and_new_gains_for_its_robot_and_by_the_worst_of_all() -> None:
     config = load_config()
     timing, old = Timing.of(config, 0.04), gains_in(config, ROLL)
