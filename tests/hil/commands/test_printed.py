@@ -362,7 +362,7 @@ def test_a_search_prints_each_number_and_the_metric_before_and_after_and_writes_
         assert (aim.options["profile"], aim.options["duration_s"], aim.options["board"]) == (
             "floaty",
             2.0,
-            "py",
+            "python",
         )
         report(1, 2, 0.0123)
         return Made(values=(-1.25, 3.5), before=0.02, after=0.01, better=better)
@@ -371,7 +371,7 @@ def test_a_search_prints_each_number_and_the_metric_before_and_after_and_writes_
     gains = load_config().controller
     code = cli("tune", "--vary", "controller.gain_y=-3..-0.5", "--vary", "controller.gain_z=1..5", "--metric", "rms_y",
     "--seeds", "2",
-               "--experiment", "yaw-step", "--duration", "2", "--flights", "30", "--seed", "4", "--board", "py", "--out",
+               "--experiment", "yaw-step", "--duration", "2", "--flights", "30", "--seed", "4", "--board", "python", "--out",
                "mine.toml")  # fmt: skip
     assert code == (0 if better else 1)
     cells = [["", "before", "found"], ["controller.gain_y", f"{gains.gain_y:g}", "-1.25"], ["controller.gain_z",

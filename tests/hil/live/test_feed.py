@@ -3,7 +3,6 @@
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pyarrow as pa
@@ -95,9 +94,7 @@ def test_a_silent_picture_does_not_delay_the_flight() -> None:
     view = LiveView(picture(NEVER_COMES_UP), said.append, start_timeout_s=0.01)
     assert said == ["the viewer has not opened within 0.01 s; the flight goes on without waiting"]
     view.rows(rows(0, 20))
-    begun = time.monotonic()
-    assert view.close() == 20
-    assert time.monotonic() - begun < feed.CATCH_UP_S / 2, "nor its end: it may never open"
+    assert view.close(catch_up_s=3600.0) == 20, "nor its end: it may never open"
 
 
 @pytest.mark.parametrize(("program", "why"), [(FAILS, "no such screen"), (DIES, "ended without a message")])
