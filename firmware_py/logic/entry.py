@@ -100,7 +100,8 @@ def compose(plugs: Sequence[Plug]) -> EntryText:
         calls = _hook_calls(plug)
         points |= {core: own.format(**calls) for core, own in POINTS[plug.point.name].items()}
     types = {**BLOCKS, **own_blocks(plugs)}
-    body = _exchanged(ast.parse(TEXT).body, points | {IMPORTS: head})
+    points[IMPORTS] = head
+    body = _exchanged(ast.parse(TEXT).body, points)
     taken = dict(CALLS)
     for node in body:
         if isinstance(node, ast.FunctionDef):
@@ -110,12 +111,13 @@ def compose(plugs: Sequence[Plug]) -> EntryText:
             used = {part.id for line in node.body for part in ast.walk(line) if isinstance(part, ast.Name)}
             taken[node.name] = tuple(block for block in types if block in used)
             node.args.args = [ast.arg(block, ast.Name(types[block])) for block in taken[node.name]]
+    assert not points, f"not in core/entry.py: {', '.join(points)}"
     return EntryText(ast.unparse(ast.Module(body, [])), taken)
 
 
-def _exchanged(body: Sequence[ast.stmt], points: Mapping[str, str]) -> list[ast.stmt]:
-    """Return statements; at a plug point, those in its place."""
-    return [new for line in map(ast.unparse, body) for new in ast.parse(points.get(line, line)).body]
+def _exchanged(body: Sequence[ast.stmt], points: dict[str, str]) -> list[ast.stmt]:
+    """Return statements; at a plug point, those that take its place out of `points`."""
+    return [new for line in map(ast.unparse, body) for new in ast.parse(points.pop(line, line)).body]
 
 
 def _hook_calls(plug: Plug) -> dict[str, str]:

@@ -31,7 +31,7 @@ FAULT = LANDING - 16  # where a fault stops
 VECTORS = FAULT - 4 * EXCEPTIONS
 COPROCESSORS, FLOATS = 0xE000_ED88, (0xF << 20).to_bytes(4, "little")  # CPACR: with the floating-point unit
 
-STOPS = {
+STOPS: dict[int, str] = {
     StopReason.TIME: "it has run for a second", StopReason.LOW_READ: "read near address 0",
     StopReason.LOW_WRITE: "write near address 0",
 }  # fmt: skip
@@ -148,12 +148,7 @@ class CortexM4Runner:
         chip, place = self._chip, self._chip.state.pc
         if place == FAULT:
             place = int.from_bytes(chip.read(chip.register("sp") + 24, 4), "little")  # stacked, B1.5.6
-        what = (
-            fault_reasons(chip)
-            if reason in (StopReason.BREAK, StopReason.LOCKUP)
-            else StopReason(reason).name
-        )
-        return f"0x{place:08x}: {what}"
+        return f"0x{place:08x}: {STOPS.get(reason) or fault_reasons(chip)}"
 
 
 def _microseconds(cycles: int) -> int:

@@ -229,6 +229,26 @@ def test_code_that_goes_astray_is_stopped(image: CoreImage) -> None:
         runner.call("control")
 
 
+@pytest.mark.parametrize(
+    ("statement", "reason"),
+    [
+        ("(void)*(volatile int32_t *)4;", "read near address 0"),
+        ("*(volatile int32_t *)4 = 1;", "write near address 0"),
+        ("for (volatile int32_t spin = 1; spin != 0;) { spin = 1; }", "it has run for a second"),
+        ("volatile int32_t zero = 0; zero = 7 / zero;", ""),  # is 0
+    ],
+)
+def test_a_call_that_cannot_end_names_its_reason(core: Translation, statement: str, reason: str) -> None:
+    begin = r"(void floaty_core_control\([^)]*\) \{\n)"
+    blocks, runner = started(build_image(re.sub(begin, rf"\1    {statement}\n", core.source), core.header))
+    if reason:
+        with pytest.raises(ExportError, match=rf"control stopped at 0x0800....: {reason}"):
+            runner.call("control")
+    else:
+        runner.call("control")
+        assert blocks.control.fields.count.all()
+
+
 def test_the_core_leaves_room_on_the_board(image: CoreImage) -> None:
     blocks, runner = started(image)
     for tick in range(50):
