@@ -11,7 +11,7 @@ from cflib.utils.encoding import compress_quaternion
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_py.wire import WireError, crtp, localisation, memories, parameters
+from firmware_py.wire import WireError, crtp, localisation, log, memories, parameters
 from firmware_py.wire.supervisor import State
 from support.crtp_client import LINK, LOC, LOG, MEM, PARAM, PLATFORM, SUPERVISOR, CrtpClient
 from support.firmware_bench import LEVEL
@@ -96,6 +96,9 @@ def test_the_board_survives_random_and_mutated_packets(packets: int) -> None:
 @settings(max_examples=300)
 def test_decoders_raise_nothing_but_their_own_error(data: bytes) -> None:
     for decode in (
+        crtp.decode,
+        crtp.decode_ext_pose,
+        log.decode_data,
         localisation.decode_packed_poses,
         memories.decode_config,
         parameters.decode_set_by_name,
