@@ -218,7 +218,9 @@ LAYOUTS = (HEAD, ABOUT, PLACE, PLACE_SIZE, CALL, CALLED, WHY, HEALTH, MODE, SAMP
 _HEAD, _ABOUT, _PLACE, _PLACE_SIZE, _CALL, _CALLED, _WHY, _HEALTH, _MODE, _SAMPLES, _LOOP = (
     layout.struct for layout in LAYOUTS
 )
-_ANSWERS = {Message.HELLO: _ABOUT, Message.CALL: _CALLED, Message.HEALTH: _HEALTH, Message.REFUSED: _WHY}
+_ANSWERS: dict[int, struct.Struct] = {
+    Message.HELLO: _ABOUT, Message.CALL: _CALLED, Message.HEALTH: _HEALTH, Message.REFUSED: _WHY,
+}  # fmt: skip
 _NARROW, _WIDE = struct.Struct("<I"), struct.Struct("<hhh")
 WRITE_MAX = MAX_DATA - _HEAD.size - _PLACE.size  # bytes in a packet
 READ_MAX = MAX_DATA - _HEAD.size
