@@ -4,6 +4,7 @@ import ctypes
 import shutil
 import subprocess
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from struct import pack_into
 
@@ -102,6 +103,25 @@ def test_lines_are_those_of_binutils() -> None:
     differ = [(a, b) for a, b in zip(ours, lines, strict=True) if a != b and "?" not in b]
     assert len(differ) < 8
     assert {a for a, _ in differ} <= {""}
+
+
+@pytest.mark.parametrize("compiler", ["clang", "gcc"])
+def test_a_line_has_its_first_address_also_in_units_of_many_pieces(compiler: str) -> None:
+    """Each function is a piece of its own; the rows of code are those of the coverage, which gcov confirms."""
+    debug = Image(stm32_firmware.build(compiler, ("-g", "-ffunction-sections"))).debug
+    first: dict[str, int] = {}
+    for row in debug.rows:
+        if row.line:
+            first.setdefault(f"{Path(row.path).name}:{row.line}", row.begin)
+    assert len(first) > 400
+    assert {place: debug.address_of(place) for place in first} == first
+    assert debug.address_of("firmware.c:1") == debug.address_of("other.c:200") == 0
+    pieces = sorted((low, high) for low, high, _ in debug._units if low < high)  # but for what was dropped
+    assert len(pieces) > 50
+    assert all(high <= low for (_, high), (low, _) in pairwise(pieces))
+    assert {place.partition(":")[0] for place in (debug.line_at(low) for low, _ in pieces)} <= {
+        "firmware.c", "exceptions.c", "measured.c",
+    }  # fmt: skip
 
 
 def test_an_address_between_functions_has_no_place() -> None:
