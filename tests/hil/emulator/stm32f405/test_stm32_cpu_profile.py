@@ -9,7 +9,7 @@ from hil.emulator.stm32f405.chip import SOFTWARE, StopReason
 from hil.emulator.stm32f405.cpu_profile import Calls, CpuProfile, Reader, functions_of
 from support.stm32_machine import FirmwareOnChip
 
-ASSERTION, MASKING, NESTED = 3, 2, 3  # a mistake and two scenarios
+ASSERTION, MASKING, NESTED, SLEEP = 3, 2, 3, 5  # a mistake and three scenarios
 
 
 class Profiled(FirmwareOnChip):
@@ -33,6 +33,10 @@ class Profiled(FirmwareOnChip):
 
 def calls_of(calls: Calls, name: str) -> int:
     return calls.calls * (calls.name == name) + sum(calls_of(child, name) for child in calls.children)
+
+
+def asleep(calls: Calls) -> int:
+    return calls.asleep + sum(map(asleep, calls.children))
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
@@ -86,3 +90,12 @@ def test_masked_interrupts_and_nested_exceptions_are_seen(scenario: int) -> None
     assert "exceptions.c" in masked["PRIMASK or FAULTMASK"].begin
     assert masked["PRIMASK or FAULTMASK"].cycles < 200
     assert ("BASEPRI" in masked) == (scenario == MASKING)
+
+
+def test_sleep_is_charged_once_to_the_function_that_waits() -> None:
+    """Two waits for the next tick of a millisecond."""
+    firmware = Profiled("gcc", scenario=SLEEP)
+    firmware.run(5_000)
+    profile = Reader(firmware.image, firmware.chip, [], 0).read()
+    assert sum(map(asleep, profile.roots)) == firmware.chip.state.sleeping
+    assert firmware.chip.state.sleeping == pytest.approx(2 * 168_000, rel=0.01)
