@@ -213,6 +213,58 @@ def untyped(numbers: Any) -> None:
 
 
 @kernel
+def unlike(numbers: F64s) -> None:
+    """Do."""
+    numbers[0] = 1.0 if numbers[1] > 0.0 else numbers[2] > 0.0
+
+
+@kernel
+def unknown(numbers: F64s) -> None:
+    """Do."""
+    numbers[0] = nothing(numbers[1])  # type: ignore[name-defined]  # noqa: F821
+
+
+@kernel
+def named(numbers: F64s) -> None:
+    """Do."""
+    reduced(numbers[0], by=1)
+
+
+@kernel
+def of_truth(numbers: F64s) -> None:
+    """Do."""
+    numbers[0] = f64(numbers[1] > 0.0)
+
+
+@kernel
+def too_many(numbers: F64s) -> None:
+    """Do."""
+    x, y = 1.0, 2.0, 3.0  # type: ignore[misc]
+    numbers[0] = x + y
+
+
+@kernel
+def of_nothing(numbers: F64s) -> None:
+    """Do."""
+    x: Any = library_sine(numbers)  # type: ignore[func-returns-value]
+    numbers[0] = x
+
+
+@kernel
+def over_a_number(numbers: F64s) -> None:
+    """Do."""
+    one: Any = numbers[0]
+    for x in one:
+        numbers[1] = x
+
+
+@kernel
+def fraction(numbers: F64s) -> float:
+    """Do."""
+    return numbers[0]
+
+
+@kernel
 def recursive(numbers: F64s) -> None:
     """Do."""
     recursive(numbers)
@@ -231,6 +283,14 @@ def recursive(numbers: F64s) -> None:
         (retyped, "i64 = f64"),
         (untyped, "typing.Any has no equal in C"),
         (recursive, "recursive calls itself: recursion"),
+        (unlike, "f64 or bool"),
+        (unknown, "call nothing(numbers[1])"),
+        (named, "call reduced(numbers[0], by=1)"),
+        (of_truth, "f64(numbers[1] > 0.0) of bool"),
+        (too_many, "2 places for 3 values"),
+        (of_nothing, "f64 = None"),
+        (over_a_number, "a loop runs over a range or a constant tuple"),
+        (fraction, "returns a float: a method of CPython returns whole numbers"),
         (swap, "takes 1 arguments, not 2"),
     ],
 )
