@@ -245,7 +245,8 @@ def test_a_board_that_restarted_by_itself_may_be_in_the_air(library: Path, tmp_p
 
 def test_with_hardware_in_the_loop_no_call_stops_the_scheduler(app: App) -> None:
     begun(app)
-    assert ask(app, BEGUN, loop(Hil.STILL)).kind == Message.LOOP
+    answer = ask(app, BEGUN, loop(Hil.STILL))
+    assert (answer.kind, answer.body) == (Message.LOOP, b"")
     step(app, range(1, 3))
     while app.sent():
         pass
