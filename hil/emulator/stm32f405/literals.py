@@ -17,6 +17,7 @@ WORD_LOADS = (
     0xF91F,
 )  # LDR (literal) of 32, 16 and 8 bits, but for its bit 7: add
 ADD = 0x80
+ODD = 0x40  # of VLDR: the register is s1, s3, ..
 TABLE_BRANCH = 0xE8DF
 COMPARE_WITHIN = 6  # half words before a table branch: CMP with its last index
 
@@ -60,8 +61,9 @@ def _of_wide(words: list[int], index: int) -> range:
         entries = next((1 + (word & 0xFF) for word in before if word >> 11 == 0b00101), 0)
         return range(index + 2, index + 2 + (entries if second & 0x10 else (entries + 1) // 2))
     if first & ~ADD in WORD_LOADS:
-        offset, size = second & 0xFFF, 2
-    elif first & ~ADD == 0xED1F and second & 0x0E00 == 0x0A00:  # VLDR
+        prefetches = first & ~ADD != WORD_LOADS[0] and second >> 12 == 15
+        offset, size = second & 0xFFF, 0 if prefetches else 2
+    elif first & ~(ADD | ODD) == 0xED1F and second & 0x0E00 == 0x0A00:  # VLDR
         offset, size = 4 * (second & 0xFF), 4 if second & 0x100 else 2
     elif first & ~ADD == 0xE95F:  # LDRD
         offset, size = 4 * (second & 0xFF), 4
