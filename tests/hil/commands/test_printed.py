@@ -109,15 +109,11 @@ def test_robots_that_fly_together_are_a_row_each_and_their_common_limits(
                             nearest="1 and 2 at 3 s", outcome="lost", hash="ab" * 32,
                             folder=tmp_path))  # type: ignore[arg-type]  # fmt: skip
     title, headings, *rows, limit, summary, report, recording = printed()
-    assert (title, headings[:2], headings[-2:]) == (
-        "3 robots, profile floaty",
-        ["robot", "seed"],
-        ["hash", "verdict"],
-    )
-    assert [[*one[:3], *one[-2:]] for one in rows] == [
-        ["1", "5", "1.00 2.00 3.00", "5" * 12, "ok"], ["2", "6", "2.00 4.00 6.00", "6" * 12, "fails: max_x, in_box"],
-        ["3", "7", "3.00 6.00 9.00", "7" * 12, "fell"],
-    ]  # fmt: skip
+    assert (title, headings[:2], headings[-2:]) == ("3 robots, profile floaty", ["robot", "seed"],
+        ["hash", "verdict"])  # fmt: skip
+    assert [[*one[:3], *one[-2:]] for one in rows] == [["1", "5", "1.00 2.00 3.00", "5" * 12, "ok"],
+        ["2", "6", "2.00 4.00 6.00", "6" * 12, "fails: max_x, in_box"],
+        ["3", "7", "3.00 6.00 9.00", "7" * 12, "fell"]]  # fmt: skip
     assert limit == f"{verdicts[0]}: FAILS; 1 and 2 at 3 s"
     assert summary == "lost; 1 of 3 robots hold all limits; hash abababababababab"
     assert (report, recording) == (
@@ -163,12 +159,10 @@ def test_two_boards_are_a_row_per_seed_and_the_largest_of_all(printed: Any) -> N
     rms = (np.array([0.01, 0.02, 0.04]), np.array([0.011, 0.02, 0.03]))
     seeds = [Seed(1, first, rms, 0.002, (50, 51)), Seed(2, None, rms[::-1], 0.0035, (52, 53))]
     assert compare._print_seeds(Path("a"), Path("b"), seeds) == 1
-    assert printed() == [
-        "a | b", ["seed", "rms x y z [cm]", "rms x y z [cm]", "apart [mm]", "poses", "first servo count", "why"],
-        ["1", "1.000 2.000 4.000", "1.100 2.000 3.000", "2.00", "50 | 51", "0.071 s motor.m1", "radio"],
-        ["2", "1.100 2.000 3.000", "1.000 2.000 4.000", "3.50", "52 | 53", "equal", ""],
-        "2 seeds: rms errors within 33.3 % of the first's, bodies within 3.50 mm",
-    ]  # fmt: skip
+    assert printed() == ["a | b", ["seed", "rms x y z [cm]", "rms x y z [cm]", "apart [mm]", "poses",
+        "first servo count", "why"], ["1", "1.000 2.000 4.000", "1.100 2.000 3.000", "2.00", "50 | 51",
+        "0.071 s motor.m1", "radio"], ["2", "1.100 2.000 3.000", "1.000 2.000 4.000", "3.50", "52 | 53",
+        "equal", ""], "2 seeds: rms errors within 33.3 % of the first's, bodies within 3.50 mm"]  # fmt: skip
     assert compare._print_seeds(Path("a"), Path("b"), seeds[1:]) == 0
 
 
@@ -180,13 +174,8 @@ def test_faults_are_listed_with_their_sizes_bounds_and_times(printed: Any) -> No
     for name, kind in KINDS.items():
         size = [f"{kind.size:g}", *kind.unit.split(), f"{kind.low:g}..{kind.high:g}"] * kind.sized
         lasts = ["to", "the", "end"] if kind.duration_s == inf else [f"{kind.duration_s:g}", "s"]
-        words = [
-            *size,
-            *lasts,
-            *kind.outcome.split(),
-            *kind.meaning.split(),
-            *f"({kind.needs})".split() * bool(kind.needs),
-        ]
+        words = [*size, *lasts, *kind.outcome.split(), *kind.meaning.split(),
+            *f"({kind.needs})".split() * bool(kind.needs)]  # fmt: skip
         assert told[name] == words[: len(told[name])]
         assert len(told[name]) > len(size) + len(lasts)
 
@@ -206,23 +195,12 @@ def test_a_round_of_tuning_prints_old_and_new_gains_margins_and_motion(printed: 
     def margins(n: float, stable: bool = True) -> Margins:
         return Margins(stable, n + 0.25, 1 / n, radians(10 * n), 0.001 * n, n + 0.125)
 
-    axis = Made(
-        axis=PITCH,
-        old=np.array([1.0, 2.0, 3.0, 4.0]),
-        new=np.array([1.5, 2.5, 3.5, 0.00045]),
-        old_margins=margins(2),
-        margins=margins(4),
-        least=margins(5),
-        late=0.006,
-        least_late=0.007,
-        old_motion=None,
-        motion=Made(main=0.011),
-        metric="rms_x",
-    )
+    axis = Made(axis=PITCH, old=np.array([1.0, 2.0, 3.0, 4.0]), new=np.array([1.5, 2.5, 3.5, 0.00045]),
+        old_margins=margins(2), margins=margins(4), least=margins(5), late=0.006, least_late=0.007,
+        old_motion=None, motion=Made(main=0.011), metric="rms_x")  # fmt: skip
     turn = Made(axis=YAW, old=np.array([5.0, 6.0]), new=np.array([5.5, 6.5]), old_margins=margins(8, False),
-    margins=margins(9),
-                least=margins(10), late=0.011, least_late=0.012, old_motion=Made(main=radians(1.5)),
-                motion=Made(main=radians(0.5)), metric="")  # fmt: skip
+        margins=margins(9), least=margins(10), late=0.011, least_late=0.012,
+        old_motion=Made(main=radians(1.5)), motion=Made(main=radians(0.5)), metric="")  # fmt: skip
 
     def flight(x: float, outcome: str = "completed") -> Row:
         return replace(row(1, 1.0, outcome), metrics={"rms_x": x, "rms_y": 0.0, "rms_z": 0.0})
@@ -240,21 +218,17 @@ def test_a_round_of_tuning_prints_old_and_new_gains_margins_and_motion(printed: 
         "5.1 ms",
         "rms distance from the goal: 3.00 cm, with the new gains 2.00 cm",
     ]  # fmt: skip
-    assert [one for one in found if isinstance(one, list)] == [
-        ["axis", "gains, old", "gains, new"],
+    assert [one for one in found if isinstance(one, list)] == [["axis", "gains, old", "gains, new"],
         [PITCH.label, f"{', '.join(PITCH.gains)} = 1, 2, 3, 4", "1.5, 2.5, 3.5, 0.00045"],
-        [YAW.label, f"{', '.join(YAW.gains)} = 5, 6", "5.5, 6.5"],
-        ["axis", "", "gain up", "gain down", "phase", "delay", "late poses", "peak of 1/(1+L)"],
-        [PITCH.label, "old", "2.25", "0.50", "20 deg", "2 ms", "", "2.12"],
-        ["", "new", "4.25", "0.25", "40 deg", "4 ms", "6 ms", "4.12"],
+        [YAW.label, f"{', '.join(YAW.gains)} = 5, 6", "5.5, 6.5"], ["axis", "", "gain up", "gain down",
+        "phase", "delay", "late poses", "peak of 1/(1+L)"], [PITCH.label, "old", "2.25", "0.50", "20 deg",
+        "2 ms", "", "2.12"], ["", "new", "4.25", "0.25", "40 deg", "4 ms", "6 ms", "4.12"],
         ["", "least of 4", "5.25", "0.20", "50 deg", "5 ms", "7 ms", "5.12"],
-        [YAW.label, "old", "not stable", *[""] * 5],
-        ["", "new", "9.25", "0.11", "90 deg", "9 ms", "11 ms", "9.12"],
-        ["", "least of 4", "10.25", "0.10", "100 deg", "10 ms", "12 ms", "10.12"],
+        [YAW.label, "old", "not stable", *[""] * 5], ["", "new", "9.25", "0.11", "90 deg", "9 ms", "11 ms",
+        "9.12"], ["", "least of 4", "10.25", "0.10", "100 deg", "10 ms", "12 ms", "10.12"],
         ["axis", "old, predicted", "old, flown", "new, predicted", "new, flown", "worst robots, flown"],
         [PITCH.label, "not stable", "3.00 cm", "1.10 cm", "2.00 cm", "5.00 cm, lost"],
-        [YAW.label, "1.50 deg", "", "0.50 deg", "", ""],
-    ]
+        [YAW.label, "1.50 deg", "", "0.50 deg", "", ""]]  # fmt: skip
     identify._print_round(Made(tuned=tuned, flown=(flight(0.04),), better=False))  # type: ignore[arg-type]
     assert (
         printed()[-1]
@@ -264,26 +238,19 @@ def test_a_round_of_tuning_prints_old_and_new_gains_margins_and_motion(printed: 
 
 def test_the_paper_s_rows_have_its_value_both_profiles_and_what_was_missed(printed: Any) -> None:
     claims = {"rms_x": MetricClaim("2 cm", 0.02), "max_y": MetricClaim("9 cm", 0.09)}
-    both = [
-        Trials(name, tuple(row(n, factor, in_box=n == 1 or factor < 2) for n in (1, 2)))
-        for name, factor in (("floaty", 1.0), ("lqr", 3.0))
-    ]
+    both = [Trials(name, tuple(row(n, factor, in_box=n == 1 or factor < 2) for n in (1, 2))) for name,
+        factor in (("floaty", 1.0), ("lqr", 3.0))]  # fmt: skip
     printed_row = PaperRow("hover", "claim", "place", claims, "because of the wind")
     paper._print_rows(Paper((("hover", printed_row, tuple(both)),), (), False))  # type: ignore[arg-type]
     title, headings, *rest = printed()
-    assert (title, headings[:3]) == (
-        "paper and laboratory: mean ± deviation over the seeds",
-        ["result", "figure", "paper"],
-    )
-    assert [one[:3] for one in rest if isinstance(one, list)] == [
-        ["hover", "rms_x", "2 cm"], ["", "max_y", "9 cm"], ["", "limits held", ""],
-    ]  # fmt: skip
-    assert [one[3:] for one in rest if isinstance(one, list)] == [
-        ["1 cm", "3 cm misses by 1 cm"], ["5 cm", "15 cm misses by 6 cm"], ["2 of 2", "1 of 2 FAILS"],
-    ]  # fmt: skip
-    assert rest[-3:] == [
-        "hover, lqr: rms_x misses by 1 cm; max_y misses by 6 cm; limits fail: in_box 1×", "", "because of the wind",
-    ]  # fmt: skip
+    assert (title, headings[:3]) == ("paper and laboratory: mean ± deviation over the seeds",
+        ["result", "figure", "paper"])  # fmt: skip
+    assert [one[:3] for one in rest if isinstance(one, list)] == [["hover", "rms_x", "2 cm"],
+        ["", "max_y", "9 cm"], ["", "limits held", ""]]  # fmt: skip
+    assert [one[3:] for one in rest if isinstance(one, list)] == [["1 cm", "3 cm misses by 1 cm"],
+        ["5 cm", "15 cm misses by 6 cm"], ["2 of 2", "1 of 2 FAILS"]]  # fmt: skip
+    assert rest[-3:] == ["hover, lqr: rms_x misses by 1 cm; max_y misses by 6 cm; limits fail: in_box 1×", "",
+        "because of the wind"]  # fmt: skip
 
 
 def test_a_design_prints_its_robot_inputs_and_claims(printed: Any) -> None:
@@ -292,20 +259,14 @@ def test_a_design_prints_its_robot_inputs_and_claims(printed: Any) -> None:
     design.show(
         Made(robot=[("mass", "0.3 kg")], inputs=[("u1: roll", "-1 to 1", "± 2")], claims=[claim, other])
     )  # type: ignore[arg-type]
-    assert printed() == [
-        "mass" + 35 * " " + "0.3 kg",
-        ["input", "alone, inside the flaps' range", "linear, in both directions about the hover"], ["u1: roll",
-        "-1 to 1", "± 2"],
-        "the paper's design", ["claim", "paper", "computed", ""], ["pole", "9.5", "9.4", "agrees"], ["lift", "1", "2",
-        "differs"],
-    ]  # fmt: skip
+    assert printed() == ["mass" + 35 * " " + "0.3 kg", ["input", "alone, inside the flaps' range",
+        "linear, in both directions about the hover"], ["u1: roll", "-1 to 1", "± 2"], "the paper's design",
+        ["claim", "paper", "computed", ""], ["pole", "9.5", "9.4", "agrees"], ["lift", "1", "2", "differs"]]  # fmt: skip
 
 
 @pytest.mark.usefixtures("empty_folder")
-@pytest.mark.parametrize(
-    ("gains", "code", "kept"),
-    [((True, False), 0, 0), ((False, False), 0, 0), ((False, True), 0, 1), ((), 2, None)],
-)
+@pytest.mark.parametrize(("gains", "code", "kept"), [((True, False), 0, 0), ((False, False), 0, 0),
+    ((False, True), 0, 1), ((), 2, None)])  # fmt: skip
 def test_rounds_of_tuning_are_printed_in_turn_and_the_last_that_gained_is_written(
     gains: tuple[bool, ...], code: int, kept: int | None, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -326,17 +287,12 @@ def test_rounds_of_tuning_are_printed_in_turn_and_the_last_that_gained_is_writte
     if kept is None:
         assert cli.err.endswith("no gains\n")
         return
-    printed = [
-        line for number, _ in enumerate(gains, 1) for line in (f"round {number}", profiles[number - 1])
-    ]
+    printed = [line for number, _ in enumerate(gains, 1) for line in (f"round {number}",
+        profiles[number - 1])]  # fmt: skip
     assert cli.out.splitlines() == [*printed, "  mine.toml   (floaty fly hover --profile mine.toml)"]
     assert cli.err.splitlines()[-1].endswith("no gains; the best earlier round counts")
-    assert asked[1] == (
-        Path("mine.toml"),
-        "floaty",
-        load_config(profiles[kept]),
-        "Model and gains by floaty tune.",
-    )
+    assert asked[1] == (Path("mine.toml"), "floaty", load_config(profiles[kept]),
+        "Model and gains by floaty tune.")  # fmt: skip
 
 
 @pytest.mark.usefixtures("empty_folder")
@@ -344,9 +300,8 @@ def test_rounds_of_tuning_are_printed_in_turn_and_the_last_that_gained_is_writte
 def test_one_round_of_tuning_is_judged_by_its_exit_code(
     better: bool, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "hil.research.studies.tuning.fly_round", lambda *what: Made(better=better, profile="floaty")
-    )
+    monkeypatch.setattr("hil.research.studies.tuning.fly_round", lambda *what: Made(better=better,
+        profile="floaty"))  # fmt: skip
     monkeypatch.setattr(identify, "_print_round", lambda one: None)
     assert cli("tune") == (0 if better else 1)
     assert cli.out == ""
@@ -359,24 +314,19 @@ def test_a_search_prints_each_number_and_the_metric_before_and_after_and_writes_
 ) -> None:
     def search(varied: Any, aim: Any, runner: Any, folder: Path, report: Any) -> Any:
         assert (aim.experiment, aim.metric, aim.seeds, aim.flights) == ("yaw-step", "rms_y", (4, 5), 30)
-        assert (aim.options["profile"], aim.options["duration_s"], aim.options["board"]) == (
-            "floaty",
-            2.0,
-            "python",
-        )
+        assert (aim.options["profile"], aim.options["duration_s"], aim.options["board"]) == ("floaty", 2.0,
+            "python")  # fmt: skip
         report(1, 2, 0.0123)
         return Made(values=(-1.25, 3.5), before=0.02, after=0.01, better=better)
 
     monkeypatch.setattr("hil.research.studies.search.search", search)
     gains = load_config().controller
-    code = cli("tune", "--vary", "controller.gain_y=-3..-0.5", "--vary", "controller.gain_z=1..5", "--metric", "rms_y",
-    "--seeds", "2",
-               "--experiment", "yaw-step", "--duration", "2", "--flights", "30", "--seed", "4", "--board", "python", "--out",
-               "mine.toml")  # fmt: skip
+    code = cli("tune", "--vary", "controller.gain_y=-3..-0.5", "--vary", "controller.gain_z=1..5", "--metric",
+        "rms_y", "--seeds", "2", "--experiment", "yaw-step", "--duration", "2", "--flights", "30", "--seed",
+        "4", "--board", "python", "--out", "mine.toml")  # fmt: skip
     assert code == (0 if better else 1)
-    cells = [["", "before", "found"], ["controller.gain_y", f"{gains.gain_y:g}", "-1.25"], ["controller.gain_z",
-    f"{gains.gain_z:g}", "3.5"],
-             ["rms_y", "2 cm", "1 cm"]]  # fmt: skip
+    cells = [["", "before", "found"], ["controller.gain_y", f"{gains.gain_y:g}", "-1.25"],
+        ["controller.gain_z", f"{gains.gain_z:g}", "3.5"], ["rms_y", "2 cm", "1 cm"]]  # fmt: skip
     last = (
         "mine.toml   (floaty fly yaw-step --profile mine.toml)"
         if better
@@ -396,12 +346,10 @@ def test_a_campaign_prints_its_rates_its_errors_and_its_three_worst_flights(
 ) -> None:
     """Of eight flights 1 and 3 break a limit, 5 is lost and 6 ends with an error."""
     spec = spec_of(flights=8)
-    changes: dict[int, dict[str, Any]] = {
-        1: {"holds": {"in_box": False}, "metrics": {"in_box": 0.5}}, 3: {"holds": {"in_box": False},
-        "metrics": {"in_box": 0.25}},
+    changes: dict[int, dict[str, Any]] = {1: {"holds": {"in_box": False}, "metrics": {"in_box": 0.5}},
+        3: {"holds": {"in_box": False}, "metrics": {"in_box": 0.25}},
         5: {"outcome": "lost", "error": "fell", "holds": {"in_box": False}, "metrics": {"flown": 0.2}},
-        6: {"outcome": "error", "error": "planted", "holds": {}},
-    }  # fmt: skip
+        6: {"outcome": "error", "error": "planted", "holds": {}}}  # fmt: skip
 
     def campaign(runner: Any, plan: Any, out: Path) -> Any:
         dataset = Dataset(out, plan, False)
@@ -432,7 +380,6 @@ def test_a_campaign_prints_its_rates_its_errors_and_its_three_worst_flights(
         ]
         return f"flight {number}: floaty fly hover --seed {number + 1} --duration 0.3 {' '.join(more)}"
 
-    assert [line for line in printed() if "0 of 0" not in line] == [
-        f"failed: {rate(4, 8)}", f"floaty, lost: {rate(1, 7)}", f"floaty, in_box: {rate(2, 6, ' that were not lost')}",
-        "did not end: 1×, first flight 6: planted", *map(command, (5, 3, 1)), "runs/x/report.html",
-    ]  # fmt: skip
+    assert [line for line in printed() if "0 of 0" not in line] == [f"failed: {rate(4, 8)}",
+        f"floaty, lost: {rate(1, 7)}", f"floaty, in_box: {rate(2, 6, ' that were not lost')}",
+        "did not end: 1×, first flight 6: planted", *map(command, (5, 3, 1)), "runs/x/report.html"]  # fmt: skip

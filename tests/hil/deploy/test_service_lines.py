@@ -44,10 +44,8 @@ def said(line: str, *answers: bytes | None) -> tuple[str | None, Bench]:
 
 def by_cflib(kind: Any, name: str, *arguments: Any, **options: Any) -> list[tuple[int, int, bytes]]:
     sent: list[tuple[int, int, bytes]] = []
-    link = SimpleNamespace(
-        platform=SimpleNamespace(get_protocol_version=lambda: 12),
-        send_packet=lambda packet: sent.append((packet.port, packet.channel, bytes(packet.data))),
-    )
+    link = SimpleNamespace(platform=SimpleNamespace(get_protocol_version=lambda: 12),
+        send_packet=lambda packet: sent.append((packet.port, packet.channel, bytes(packet.data))))  # fmt: skip
     getattr(kind(link), name)(*arguments, **options)
     return sent
 
@@ -87,8 +85,8 @@ RAD = pi / 180.0
         by_cflib(NOW, "send_stop_setpoint")),
         ("setpoint manual", [(7, 0, struct.pack("<BfffHB", 11, 0, 0, 0, 20_000, 0))]),
         ("stream velocity 0.1 0.2 0.3 40 0.125", 2 * by_cflib(NOW, "send_velocity_world_setpoint", 0.1, 0.2, 0.3, 40.0)),
-        ("notify", by_cflib(NOW, "send_notify_setpoint_stop")), ("disconnect", by_cflib(NOW, "send_setpoint", 0.0, 0.0,
-        0.0, 0)),
+        ("notify", by_cflib(NOW, "send_notify_setpoint_stop")), ("disconnect", by_cflib(NOW, "send_setpoint", 0, 0,
+        0, 0)),
         ("arm", [(9, 1, b"\1\1")]), ("disarm", [(9, 1, b"\1\0")]), ("recover", [(9, 1, b"\2")]), ("emergency", [(9, 1,
         b"\3")]), ("feed", [(9, 1, b"\4")]),
         ("ask 13 1 0a0b", [(13, 1, b"\x0a\x0b")]), ("read e.f", [(2, 1, b"\2\1")]), ("write e.f 0708", [(2, 2,
@@ -102,16 +100,14 @@ def test_a_line_sends_what_cflib_sends(line: str, expected: list[tuple[int, int,
     assert said(line)[1].sent == expected
 
 
-@pytest.mark.parametrize(
-    ("line", "answer", "text"),
-    [
-        ("takeoff 1 2", b"\1\2\3\x0b", "status 11"), ("goto 1 2 3 4 5", None, "nothing"), ("arm", b"\x01\xab", "01ab"),
-        ("ask 13 1 00", b"\1\2\3\4", "01020304"), ("ask 13 1 00 2", b"\1\2\3\4", "0102"), ("ask 13 1 00", None, "nothing"),
-        ("set a.b U8 1", b"\1\2\x07", "status 7"), ("set a.b U8 1", None, "nothing"), ("read e.f", b"\2\1\0\xcd", "00cd"),
-        ("write e.f 00", b"\2\1\xee", "ee"), ("write e.f 00", None, "nothing"), ("misc 5 e.f", b"\5\2\1\x09\x08", "0908"),
-        ("misc 5 e.f", None, "nothing"), ("log 5 0", b"\5\0\2", "050002"), ("servos 3", None, "1~3 20~3 300~3 4000~3"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("line", "answer", "text"), [("takeoff 1 2", b"\1\2\3\x0b", "status 11"),
+    ("goto 1 2 3 4 5", None, "nothing"), ("arm", b"\x01\xab", "01ab"),
+    ("ask 13 1 00", b"\1\2\3\4", "01020304"), ("ask 13 1 00 2", b"\1\2\3\4", "0102"),
+    ("ask 13 1 00", None, "nothing"), ("set a.b U8 1", b"\1\2\x07", "status 7"),
+    ("set a.b U8 1", None, "nothing"), ("read e.f", b"\2\1\0\xcd", "00cd"),
+    ("write e.f 00", b"\2\1\xee", "ee"), ("write e.f 00", None, "nothing"),
+    ("misc 5 e.f", b"\5\2\1\x09\x08", "0908"), ("misc 5 e.f", None, "nothing"),
+    ("log 5 0", b"\5\0\2", "050002"), ("servos 3", None, "1~3 20~3 300~3 4000~3")])  # fmt: skip
 def test_an_answer_is_text_without_what_differs_between_boards(
     line: str, answer: bytes | None, text: str
 ) -> None:
@@ -127,10 +123,8 @@ def test_times_pass_and_poses_come_as_a_line_says() -> None:
     assert [told[word].get("poses_as") for word in ("aged", "cut")] == ["aged", "cut"]
     assert (said("radio on")[1].__dict__["radio"], said("radio off")[1].__dict__["radio"]) == (True, False)
     bench = said("place 1 2 3 10 20 30")[1].__dict__
-    assert (bench["place"], bench["attitude"]) == (
-        (1, 2, 3),
-        (pytest.approx(10 * RAD), pytest.approx(20 * RAD), pytest.approx(30 * RAD)),
-    )
+    assert (bench["place"], bench["attitude"]) == ((1, 2, 3), (pytest.approx(10 * RAD),
+        pytest.approx(20 * RAD), pytest.approx(30 * RAD)))  # fmt: skip
     assert said("place 1 2 3")[1].__dict__["attitude"] == (0, 0, 0)
 
 
@@ -138,34 +132,26 @@ def test_trajectories_are_those_that_cflib_packs_and_go_up_in_pieces_of_24_bytes
     def line(*terms: float) -> Any:
         return Poly4D.Poly([*terms, *[0.0] * (8 - len(terms))])
 
-    corner = (
-        Poly4D(1.0, line(0.0, 0.08), line(), line(1.15), line()).pack()
-        + Poly4D(1.0, line(0.08), line(0, 0.06), line(1.15), line()).pack()
-    )
+    corner = (Poly4D(1.0, line(0.0, 0.08), line(), line(1.15), line()).pack() + Poly4D(1.0, line(0.08),
+        line(0, 0.06), line(1.15), line()).pack())  # fmt: skip
     assert TRAJECTORIES["corner"] == bytes(corner)
     turning = Poly4D(2.0, line(0.02, 0.03), line(0.01, -0.02), line(1.15), line(0.2, 0.3)).pack()
     assert TRAJECTORIES["turning"] == bytes(turning)
     end = struct.pack("<BH", 0, 0)
-    small = (
-        CompressedStart(0.0, 0.0, 1.15, 0.0).pack()
-        + CompressedSegment(2.0, [0.05], [], [], [60.001 * RAD]).pack()
-    )
+    small = (CompressedStart(0.0, 0.0, 1.15, 0.0).pack() + CompressedSegment(2.0, [0.05], [], [],
+        [60.001 * RAD]).pack())  # fmt: skip
     assert TRAJECTORIES["small"] == bytes(small) + end
-    curved = (
-        CompressedStart(0.0, 0.0, 1.15, 0.0).pack()
-        + CompressedSegment(1.0, [0.04, 0.08, 0.08], [0.0, 0.0, 0.06], [], []).pack()
-    )
+    curved = (CompressedStart(0.0, 0.0, 1.15, 0.0).pack() + CompressedSegment(1.0, [0.04, 0.08, 0.08],
+        [0.0, 0.0, 0.06], [], []).pack())  # fmt: skip
     assert TRAJECTORIES["curved"] == bytes(curved + CompressedSegment(0.5, [], [], [1.2], []).pack()) + end
     memories = (b"\1\2", b"\2\0\x01", b"\2\1\x12")  # the second one is that of trajectories
     data = TRAJECTORIES["straight"]
-    text, bench = said(
-        "upload straight 24", *memories, *(struct.pack("<BIB", 1, 0, n == 2) for n in range(6))
-    )
+    text, bench = said("upload straight 24", *memories, *(struct.pack("<BIB", 1, 0,
+        n == 2) for n in range(6)))  # fmt: skip
     assert text == "00 01", "each status once"
     assert bench.sent[:3] == [(4, 0, b"\1"), (4, 0, b"\2\0"), (4, 0, b"\2\1")]
-    assert bench.sent[3:] == [
-        (4, 2, struct.pack("<BI", 1, 24 + at) + data[at : at + 24]) for at in range(0, len(data), 24)
-    ]
+    assert bench.sent[3:] == [(4, 2, struct.pack("<BI", 1, 24 + at) + data[at : at + 24]) for at in range(0,
+        len(data), 24)]  # fmt: skip
 
 
 def test_means_of_log_variables_have_their_tolerances() -> None:
@@ -184,9 +170,8 @@ def test_a_pose_is_sent_as_the_client_of_its_kind_sends_it() -> None:
     half = 0.5**0.5
     pose = struct.pack("<B7f", 8, *place, 0.0, 0.0, half, half)
     sent = {name: make(place, q) for name, make in POSES.items()}
-    assert {name: one[:2] for name, one in sent.items()} == dict.fromkeys(sent, (6, 1)) | {
-        "app": sent["app"][:2]
-    }
+    assert {name: one[:2] for name, one in sent.items()} == dict.fromkeys(sent,
+        (6, 1)) | {"app": sent["app"][:2]}  # fmt: skip
     assert (sent["pose"][2], sent["app"][2], sent["cut"][2]) == (pose, pose, pose[:-1])
     assert sent["aged"][2][:-1].startswith(pose)
     assert len(sent["aged"][2]) > len(pose)
@@ -198,9 +183,8 @@ def test_goals_of_two_boards_are_compared_with_those_of_the_instants_around() ->
     path = [(0.1 * n, 0.0, 1.0, 0.0) for n in range(5)]
     late = [path[0], *path[:-1]]
     assert list(differences(Answers([], path), Answers([], late))) == []
-    assert list(
-        differences(Answers([], path), Answers([], [path[0], path[0], path[0], path[3], path[4]]))
-    ) == [f"goal {path[0]} after 0.4 s, expected {path[2]}"]
+    assert list(differences(Answers([], path), Answers([], [path[0], path[0], path[0], path[3],
+        path[4]]))) == [f"goal {path[0]} after 0.4 s, expected {path[2]}"]  # fmt: skip
     assert list(differences(Answers(["arm: 01"]), Answers(["arm: 02"]))) == ["arm: 02, expected 01"]
     assert list(differences(Answers(["x: nan"]), Answers(["x: nan"]))) == []
     assert np.isnan(services._numbers(["nan", "relative", "-inf", "1.5"])).tolist() == [True, False, False]
