@@ -561,6 +561,7 @@ def test_the_picture_of_the_paper_s_equations_has_each_flight_s_bins_and_estimat
         name in ((1.0, "a"), (2.0, "b"))]  # fmt: skip
     for axes, record in zip(_identity(tuple(records)).axes, records, strict=True):
         loop = closed_loop(record, ROLL)
+        assert loop.w[:19] == pytest.approx(2 * np.pi * 0.25 * np.arange(1, 20)), "windows of 4 s"
         bins, line, estimate = axes.lines
         assert bins.get_xydata() == pytest.approx(np.c_[loop.w**2, (loop.acceleration / loop.angle).real])
         assert line.get_ydata() == pytest.approx(-line.get_xdata())
@@ -585,3 +586,11 @@ def test_the_picture_of_one_step_has_its_error_after_the_filter_settled_and_a_wi
     assert np.mean(axes.get_ylim()) == pytest.approx(inside.mean())
     assert np.ptp(axes.get_ylim()) == pytest.approx(1.3 * np.ptp(inside))
     assert axes.lines[1].get_label() == "predicted 20 ms before"
+
+
+@pytest.mark.parametrize(("hertz", "found"), [(0.05, [1]), (20.0, [400]), (20.05, [])])
+def test_lines_are_looked_for_up_to_four_fifths_of_half_the_rows_rate(hertz: float, found: list[int]) -> None:
+    record = excited(100.0)
+    record.excitation[:, 0] = np.cos(2 * np.pi * hertz * record.t + 0.3)
+    lines = spectra.excited_lines(record, [4.0])
+    assert [one.tolist() for one in lines] == [found, [], [], []]
