@@ -219,6 +219,7 @@ def test_an_experiment_s_picture_has_its_flight_last_over_the_trials_and_then_th
             assert [(line.name, line.colour) for line in panel.series] == lines, panel.label
             assert [float(line.values[-1]) for line in panel.series] == pytest.approx(values,
                 abs=0.05), (panel.label)  # fmt: skip
+            assert [len(line.times) for line in panel.series] == [len(line.values) for line in panel.series]
             assert [line.dashed for line in panel.series] == [line.name in ("target",
                 "goal") for line in panel.series]  # fmt: skip
     assert [(one.lane, one.name, one.begin_s, one.end_s) for one in plots["take_off"].panels[3].bars] == [
