@@ -17,7 +17,7 @@ from hil.laboratory.request import Options
 from hil.testing import baselines
 from hil.testing.baselines import POSE, Pinned
 from hil.testing.board import BareBoard
-from hil.testing.choices import name_of
+from hil.testing.choices import name_of, why_not
 from hil.testing.flights import (
     NAME_MAX,
     PICTURE,
@@ -211,3 +211,11 @@ def test_an_unusual_choice_has_a_baseline_of_its_own_and_a_board_has_none(
 ) -> None:
     usual: Any = {"seed": 1, "board": "c", "profile": "floaty", "link": "radio"}
     assert Flights(tmp_path, tmp_path)._unusual(usual | changes) == name
+
+
+def test_a_flight_over_mavlink_needs_its_package_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    over: Options = {**choice(), "link": "mavlink"}
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
+    assert why_not(over, ()) == why_not(choice(), ()) == ""
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert (why_not(over, ()), why_not(choice(), ())) == ("link mavlink: pymavlink is not installed", "")
