@@ -256,7 +256,6 @@ class FirmwareEnv(gymnasium.Env[batch.Actions, batch.Actions]):
         self._previous[:] = limited
         self._run_until(flight.now_us + batch.CONTROL_US)
         body, goal = flight.robot.body, flight.line.trajectory.at(flight.now_us)
-        flight.robot.advance_truth(flight.now_us)
         distance = math.dist(body.p_WB.tolist(), goal.p_WG)
         x, y, z = rotation_matrix(tuple(body.q_WB.tolist()))[2].tolist()
         yaw = to_euler_zyx(tuple(body.q_WB.tolist()))[2]

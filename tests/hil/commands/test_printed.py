@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from hil.commands import compare, design, identify, listing, paper, tables
+from hil.commands import compare, deploy, design, identify, listing, paper, serve, station, tables
+from hil.commands import options as common
 from hil.config import load_config
 from hil.errors import LabError
 from hil.laboratory.fault_kinds import KINDS
@@ -23,6 +24,7 @@ from hil.research.campaigns.run import Runner
 from hil.research.campaigns.sampling import draw
 from hil.research.design.axes import PITCH, YAW
 from hil.research.design.margins import Margins
+from hil.research.identify.identify import IdentifiedConstant
 from hil.research.studies.paper import Paper, Trials
 from hil.research.studies.paper_rows import MetricClaim, PaperRow
 from hil.research.studies.two_boards import FirstCount, Seed
@@ -109,15 +111,11 @@ def test_robots_that_fly_together_are_a_row_each_and_their_common_limits(
                             nearest="1 and 2 at 3 s", outcome="lost", hash="ab" * 32,
                             folder=tmp_path))  # type: ignore[arg-type]  # fmt: skip
     title, headings, *rows, limit, summary, report, recording = printed()
-    assert (title, headings[:2], headings[-2:]) == (
-        "3 robots, profile floaty",
-        ["robot", "seed"],
-        ["hash", "verdict"],
-    )
-    assert [[*one[:3], *one[-2:]] for one in rows] == [
-        ["1", "5", "1.00 2.00 3.00", "5" * 12, "ok"], ["2", "6", "2.00 4.00 6.00", "6" * 12, "fails: max_x, in_box"],
-        ["3", "7", "3.00 6.00 9.00", "7" * 12, "fell"],
-    ]  # fmt: skip
+    assert (title, headings[:2], headings[-2:]) == ("3 robots, profile floaty", ["robot", "seed"],
+        ["hash", "verdict"])  # fmt: skip
+    assert [[*one[:3], *one[-2:]] for one in rows] == [["1", "5", "1.00 2.00 3.00", "5" * 12, "ok"],
+        ["2", "6", "2.00 4.00 6.00", "6" * 12, "fails: max_x, in_box"],
+        ["3", "7", "3.00 6.00 9.00", "7" * 12, "fell"]]  # fmt: skip
     assert limit == f"{verdicts[0]}: FAILS; 1 and 2 at 3 s"
     assert summary == "lost; 1 of 3 robots hold all limits; hash abababababababab"
     assert (report, recording) == (
@@ -163,12 +161,10 @@ def test_two_boards_are_a_row_per_seed_and_the_largest_of_all(printed: Any) -> N
     rms = (np.array([0.01, 0.02, 0.04]), np.array([0.011, 0.02, 0.03]))
     seeds = [Seed(1, first, rms, 0.002, (50, 51)), Seed(2, None, rms[::-1], 0.0035, (52, 53))]
     assert compare._print_seeds(Path("a"), Path("b"), seeds) == 1
-    assert printed() == [
-        "a | b", ["seed", "rms x y z [cm]", "rms x y z [cm]", "apart [mm]", "poses", "first servo count", "why"],
-        ["1", "1.000 2.000 4.000", "1.100 2.000 3.000", "2.00", "50 | 51", "0.071 s motor.m1", "radio"],
-        ["2", "1.100 2.000 3.000", "1.000 2.000 4.000", "3.50", "52 | 53", "equal", ""],
-        "2 seeds: rms errors within 33.3 % of the first's, bodies within 3.50 mm",
-    ]  # fmt: skip
+    assert printed() == ["a | b", ["seed", "rms x y z [cm]", "rms x y z [cm]", "apart [mm]", "poses",
+        "first servo count", "why"], ["1", "1.000 2.000 4.000", "1.100 2.000 3.000", "2.00", "50 | 51",
+        "0.071 s motor.m1", "radio"], ["2", "1.100 2.000 3.000", "1.000 2.000 4.000", "3.50", "52 | 53",
+        "equal", ""], "2 seeds: rms errors within 33.3 % of the first's, bodies within 3.50 mm"]  # fmt: skip
     assert compare._print_seeds(Path("a"), Path("b"), seeds[1:]) == 0
 
 
@@ -180,13 +176,8 @@ def test_faults_are_listed_with_their_sizes_bounds_and_times(printed: Any) -> No
     for name, kind in KINDS.items():
         size = [f"{kind.size:g}", *kind.unit.split(), f"{kind.low:g}..{kind.high:g}"] * kind.sized
         lasts = ["to", "the", "end"] if kind.duration_s == inf else [f"{kind.duration_s:g}", "s"]
-        words = [
-            *size,
-            *lasts,
-            *kind.outcome.split(),
-            *kind.meaning.split(),
-            *f"({kind.needs})".split() * bool(kind.needs),
-        ]
+        words = [*size, *lasts, *kind.outcome.split(), *kind.meaning.split(),
+            *f"({kind.needs})".split() * bool(kind.needs)]  # fmt: skip
         assert told[name] == words[: len(told[name])]
         assert len(told[name]) > len(size) + len(lasts)
 
@@ -206,23 +197,12 @@ def test_a_round_of_tuning_prints_old_and_new_gains_margins_and_motion(printed: 
     def margins(n: float, stable: bool = True) -> Margins:
         return Margins(stable, n + 0.25, 1 / n, radians(10 * n), 0.001 * n, n + 0.125)
 
-    axis = Made(
-        axis=PITCH,
-        old=np.array([1.0, 2.0, 3.0, 4.0]),
-        new=np.array([1.5, 2.5, 3.5, 0.00045]),
-        old_margins=margins(2),
-        margins=margins(4),
-        least=margins(5),
-        late=0.006,
-        least_late=0.007,
-        old_motion=None,
-        motion=Made(main=0.011),
-        metric="rms_x",
-    )
+    axis = Made(axis=PITCH, old=np.array([1.0, 2.0, 3.0, 4.0]), new=np.array([1.5, 2.5, 3.5, 0.00045]),
+        old_margins=margins(2), margins=margins(4), least=margins(5), late=0.006, least_late=0.007,
+        old_motion=None, motion=Made(main=0.011), metric="rms_x")  # fmt: skip
     turn = Made(axis=YAW, old=np.array([5.0, 6.0]), new=np.array([5.5, 6.5]), old_margins=margins(8, False),
-    margins=margins(9),
-                least=margins(10), late=0.011, least_late=0.012, old_motion=Made(main=radians(1.5)),
-                motion=Made(main=radians(0.5)), metric="")  # fmt: skip
+        margins=margins(9), least=margins(10), late=0.011, least_late=0.012,
+        old_motion=Made(main=radians(1.5)), motion=Made(main=radians(0.5)), metric="")  # fmt: skip
 
     def flight(x: float, outcome: str = "completed") -> Row:
         return replace(row(1, 1.0, outcome), metrics={"rms_x": x, "rms_y": 0.0, "rms_z": 0.0})
@@ -240,21 +220,17 @@ def test_a_round_of_tuning_prints_old_and_new_gains_margins_and_motion(printed: 
         "5.1 ms",
         "rms distance from the goal: 3.00 cm, with the new gains 2.00 cm",
     ]  # fmt: skip
-    assert [one for one in found if isinstance(one, list)] == [
-        ["axis", "gains, old", "gains, new"],
+    assert [one for one in found if isinstance(one, list)] == [["axis", "gains, old", "gains, new"],
         [PITCH.label, f"{', '.join(PITCH.gains)} = 1, 2, 3, 4", "1.5, 2.5, 3.5, 0.00045"],
-        [YAW.label, f"{', '.join(YAW.gains)} = 5, 6", "5.5, 6.5"],
-        ["axis", "", "gain up", "gain down", "phase", "delay", "late poses", "peak of 1/(1+L)"],
-        [PITCH.label, "old", "2.25", "0.50", "20 deg", "2 ms", "", "2.12"],
-        ["", "new", "4.25", "0.25", "40 deg", "4 ms", "6 ms", "4.12"],
+        [YAW.label, f"{', '.join(YAW.gains)} = 5, 6", "5.5, 6.5"], ["axis", "", "gain up", "gain down",
+        "phase", "delay", "late poses", "peak of 1/(1+L)"], [PITCH.label, "old", "2.25", "0.50", "20 deg",
+        "2 ms", "", "2.12"], ["", "new", "4.25", "0.25", "40 deg", "4 ms", "6 ms", "4.12"],
         ["", "least of 4", "5.25", "0.20", "50 deg", "5 ms", "7 ms", "5.12"],
-        [YAW.label, "old", "not stable", *[""] * 5],
-        ["", "new", "9.25", "0.11", "90 deg", "9 ms", "11 ms", "9.12"],
-        ["", "least of 4", "10.25", "0.10", "100 deg", "10 ms", "12 ms", "10.12"],
+        [YAW.label, "old", "not stable", *[""] * 5], ["", "new", "9.25", "0.11", "90 deg", "9 ms", "11 ms",
+        "9.12"], ["", "least of 4", "10.25", "0.10", "100 deg", "10 ms", "12 ms", "10.12"],
         ["axis", "old, predicted", "old, flown", "new, predicted", "new, flown", "worst robots, flown"],
         [PITCH.label, "not stable", "3.00 cm", "1.10 cm", "2.00 cm", "5.00 cm, lost"],
-        [YAW.label, "1.50 deg", "", "0.50 deg", "", ""],
-    ]
+        [YAW.label, "1.50 deg", "", "0.50 deg", "", ""]]  # fmt: skip
     identify._print_round(Made(tuned=tuned, flown=(flight(0.04),), better=False))  # type: ignore[arg-type]
     assert (
         printed()[-1]
@@ -264,26 +240,19 @@ def test_a_round_of_tuning_prints_old_and_new_gains_margins_and_motion(printed: 
 
 def test_the_paper_s_rows_have_its_value_both_profiles_and_what_was_missed(printed: Any) -> None:
     claims = {"rms_x": MetricClaim("2 cm", 0.02), "max_y": MetricClaim("9 cm", 0.09)}
-    both = [
-        Trials(name, tuple(row(n, factor, in_box=n == 1 or factor < 2) for n in (1, 2)))
-        for name, factor in (("floaty", 1.0), ("lqr", 3.0))
-    ]
+    both = [Trials(name, tuple(row(n, factor, in_box=n == 1 or factor < 2) for n in (1, 2))) for name,
+        factor in (("floaty", 1.0), ("lqr", 3.0))]  # fmt: skip
     printed_row = PaperRow("hover", "claim", "place", claims, "because of the wind")
     paper._print_rows(Paper((("hover", printed_row, tuple(both)),), (), False))  # type: ignore[arg-type]
     title, headings, *rest = printed()
-    assert (title, headings[:3]) == (
-        "paper and laboratory: mean ± deviation over the seeds",
-        ["result", "figure", "paper"],
-    )
-    assert [one[:3] for one in rest if isinstance(one, list)] == [
-        ["hover", "rms_x", "2 cm"], ["", "max_y", "9 cm"], ["", "limits held", ""],
-    ]  # fmt: skip
-    assert [one[3:] for one in rest if isinstance(one, list)] == [
-        ["1 cm", "3 cm misses by 1 cm"], ["5 cm", "15 cm misses by 6 cm"], ["2 of 2", "1 of 2 FAILS"],
-    ]  # fmt: skip
-    assert rest[-3:] == [
-        "hover, lqr: rms_x misses by 1 cm; max_y misses by 6 cm; limits fail: in_box 1×", "", "because of the wind",
-    ]  # fmt: skip
+    assert (title, headings[:3]) == ("paper and laboratory: mean ± deviation over the seeds",
+        ["result", "figure", "paper"])  # fmt: skip
+    assert [one[:3] for one in rest if isinstance(one, list)] == [["hover", "rms_x", "2 cm"],
+        ["", "max_y", "9 cm"], ["", "limits held", ""]]  # fmt: skip
+    assert [one[3:] for one in rest if isinstance(one, list)] == [["1 cm", "3 cm misses by 1 cm"],
+        ["5 cm", "15 cm misses by 6 cm"], ["2 of 2", "1 of 2 FAILS"]]  # fmt: skip
+    assert rest[-3:] == ["hover, lqr: rms_x misses by 1 cm; max_y misses by 6 cm; limits fail: in_box 1×", "",
+        "because of the wind"]  # fmt: skip
 
 
 def test_a_design_prints_its_robot_inputs_and_claims(printed: Any) -> None:
@@ -292,26 +261,20 @@ def test_a_design_prints_its_robot_inputs_and_claims(printed: Any) -> None:
     design.show(
         Made(robot=[("mass", "0.3 kg")], inputs=[("u1: roll", "-1 to 1", "± 2")], claims=[claim, other])
     )  # type: ignore[arg-type]
-    assert printed() == [
-        "mass" + 35 * " " + "0.3 kg",
-        ["input", "alone, inside the flaps' range", "linear, in both directions about the hover"], ["u1: roll",
-        "-1 to 1", "± 2"],
-        "the paper's design", ["claim", "paper", "computed", ""], ["pole", "9.5", "9.4", "agrees"], ["lift", "1", "2",
-        "differs"],
-    ]  # fmt: skip
+    assert printed() == ["mass" + 35 * " " + "0.3 kg", ["input", "alone, inside the flaps' range",
+        "linear, in both directions about the hover"], ["u1: roll", "-1 to 1", "± 2"], "the paper's design",
+        ["claim", "paper", "computed", ""], ["pole", "9.5", "9.4", "agrees"], ["lift", "1", "2", "differs"]]  # fmt: skip
 
 
 @pytest.mark.usefixtures("empty_folder")
-@pytest.mark.parametrize(
-    ("gains", "code", "kept"),
-    [((True, False), 0, 0), ((False, False), 0, 0), ((False, True), 0, 1), ((), 2, None)],
-)
+@pytest.mark.parametrize(("gains", "code", "kept"), [((True, False), 0, 0), ((False, False), 0, 0),
+    ((False, True), 0, 1), ((), 2, None)])  # fmt: skip
 def test_rounds_of_tuning_are_printed_in_turn_and_the_last_that_gained_is_written(
     gains: tuple[bool, ...], code: int, kept: int | None, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After them a round ends with an error: it is fatal only where it is the first."""
     asked: list[Any] = []
-    profiles = ("floaty", "lqr")
+    profiles = ("floaty", "as-flown")
 
     def rounds(profile: str, flights: Any, robots: int, count: int) -> Any:
         asked.append((profile, flights.seed, flights.board, robots, count))
@@ -326,17 +289,12 @@ def test_rounds_of_tuning_are_printed_in_turn_and_the_last_that_gained_is_writte
     if kept is None:
         assert cli.err.endswith("no gains\n")
         return
-    printed = [
-        line for number, _ in enumerate(gains, 1) for line in (f"round {number}", profiles[number - 1])
-    ]
+    printed = [line for number, _ in enumerate(gains, 1) for line in (f"round {number}",
+        profiles[number - 1])]  # fmt: skip
     assert cli.out.splitlines() == [*printed, "  mine.toml   (floaty fly hover --profile mine.toml)"]
     assert cli.err.splitlines()[-1].endswith("no gains; the best earlier round counts")
-    assert asked[1] == (
-        Path("mine.toml"),
-        "floaty",
-        load_config(profiles[kept]),
-        "Model and gains by floaty tune.",
-    )
+    assert asked[1] == (Path("mine.toml"), "floaty", load_config(profiles[kept]),
+        "Model and gains by floaty tune.")  # fmt: skip
 
 
 @pytest.mark.usefixtures("empty_folder")
@@ -344,9 +302,8 @@ def test_rounds_of_tuning_are_printed_in_turn_and_the_last_that_gained_is_writte
 def test_one_round_of_tuning_is_judged_by_its_exit_code(
     better: bool, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "hil.research.studies.tuning.fly_round", lambda *what: Made(better=better, profile="floaty")
-    )
+    monkeypatch.setattr("hil.research.studies.tuning.fly_round", lambda *what: Made(better=better,
+        profile="floaty"))  # fmt: skip
     monkeypatch.setattr(identify, "_print_round", lambda one: None)
     assert cli("tune") == (0 if better else 1)
     assert cli.out == ""
@@ -359,24 +316,19 @@ def test_a_search_prints_each_number_and_the_metric_before_and_after_and_writes_
 ) -> None:
     def search(varied: Any, aim: Any, runner: Any, folder: Path, report: Any) -> Any:
         assert (aim.experiment, aim.metric, aim.seeds, aim.flights) == ("yaw-step", "rms_y", (4, 5), 30)
-        assert (aim.options["profile"], aim.options["duration_s"], aim.options["board"]) == (
-            "floaty",
-            2.0,
-            "python",
-        )
+        assert (aim.options["profile"], aim.options["duration_s"], aim.options["board"]) == ("floaty", 2.0,
+            "python")  # fmt: skip
         report(1, 2, 0.0123)
         return Made(values=(-1.25, 3.5), before=0.02, after=0.01, better=better)
 
     monkeypatch.setattr("hil.research.studies.search.search", search)
     gains = load_config().controller
-    code = cli("tune", "--vary", "controller.gain_y=-3..-0.5", "--vary", "controller.gain_z=1..5", "--metric", "rms_y",
-    "--seeds", "2",
-               "--experiment", "yaw-step", "--duration", "2", "--flights", "30", "--seed", "4", "--board", "python", "--out",
-               "mine.toml")  # fmt: skip
+    code = cli("tune", "--vary", "controller.gain_y=-3..-0.5", "--vary", "controller.gain_z=1..5", "--metric",
+        "rms_y", "--seeds", "2", "--experiment", "yaw-step", "--duration", "2", "--flights", "30", "--seed",
+        "4", "--board", "python", "--out", "mine.toml")  # fmt: skip
     assert code == (0 if better else 1)
-    cells = [["", "before", "found"], ["controller.gain_y", f"{gains.gain_y:g}", "-1.25"], ["controller.gain_z",
-    f"{gains.gain_z:g}", "3.5"],
-             ["rms_y", "2 cm", "1 cm"]]  # fmt: skip
+    cells = [["", "before", "found"], ["controller.gain_y", f"{gains.gain_y:g}", "-1.25"],
+        ["controller.gain_z", f"{gains.gain_z:g}", "3.5"], ["rms_y", "2 cm", "1 cm"]]  # fmt: skip
     last = (
         "mine.toml   (floaty fly yaw-step --profile mine.toml)"
         if better
@@ -396,12 +348,10 @@ def test_a_campaign_prints_its_rates_its_errors_and_its_three_worst_flights(
 ) -> None:
     """Of eight flights 1 and 3 break a limit, 5 is lost and 6 ends with an error."""
     spec = spec_of(flights=8)
-    changes: dict[int, dict[str, Any]] = {
-        1: {"holds": {"in_box": False}, "metrics": {"in_box": 0.5}}, 3: {"holds": {"in_box": False},
-        "metrics": {"in_box": 0.25}},
+    changes: dict[int, dict[str, Any]] = {1: {"holds": {"in_box": False}, "metrics": {"in_box": 0.5}},
+        3: {"holds": {"in_box": False}, "metrics": {"in_box": 0.25}},
         5: {"outcome": "lost", "error": "fell", "holds": {"in_box": False}, "metrics": {"flown": 0.2}},
-        6: {"outcome": "error", "error": "planted", "holds": {}},
-    }  # fmt: skip
+        6: {"outcome": "error", "error": "planted", "holds": {}}}  # fmt: skip
 
     def campaign(runner: Any, plan: Any, out: Path) -> Any:
         dataset = Dataset(out, plan, False)
@@ -414,6 +364,7 @@ def test_a_campaign_prints_its_rates_its_errors_and_its_three_worst_flights(
         return dataset, Made(complete=True, flown=8)
 
     monkeypatch.setattr(Runner, "campaign", campaign)
+    monkeypatch.setattr("hil.research.campaigns.report.png", lambda draw: b"")
     Path("spec.toml").write_text(
         'experiments = ["hover"]\nduration_s = 0.3\nflights = 8\nparameters = {"actuators.tau" = {uniform = [0.04, 0.06]}}\n'
         '[[faults]]\nkind = "push.y"\nprobability = 0.5\nstart_s = 0.1\nsize = {uniform = [1.0, 12.0]}\n'
@@ -432,7 +383,187 @@ def test_a_campaign_prints_its_rates_its_errors_and_its_three_worst_flights(
         ]
         return f"flight {number}: floaty fly hover --seed {number + 1} --duration 0.3 {' '.join(more)}"
 
-    assert [line for line in printed() if "0 of 0" not in line] == [
-        f"failed: {rate(4, 8)}", f"floaty, lost: {rate(1, 7)}", f"floaty, in_box: {rate(2, 6, ' that were not lost')}",
-        "did not end: 1×, first flight 6: planted", *map(command, (5, 3, 1)), "runs/x/report.html",
+    assert [line for line in printed() if "0 of 0" not in line] == [f"failed: {rate(4, 8)}",
+        f"floaty, lost: {rate(1, 7)}", f"floaty, in_box: {rate(2, 6, ' that were not lost')}",
+        "did not end: 1×, first flight 6: planted", *map(command, (5, 3, 1)), "runs/x/report.html"]  # fmt: skip
+
+
+def test_a_check_prints_each_target_s_counts_and_where_it_first_differs(
+    printed: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def target(name: str, ticks: int, divergence: str | None = None) -> Any:
+        return Made(name=name, ticks=ticks, calls=10 * ticks, divergence=divergence)
+
+    def flight(name: str, faults: int, *targets: Any) -> Any:
+        request = Made(experiment=Made(name=name), seed=3, faults=("x",) * faults)
+        return Made(request=request, outcome="completed", targets=targets)
+
+    flights = [flight("hover", 0, target("plain", 100), target("c-O2", 90)),
+        flight("yaw", 2, target("plain", 5, "tick 7"), target("c-O2", 8))]  # fmt: skip
+    for one in flights:
+        deploy._print_flight(one)
+    monkeypatch.setattr("hil.deploy.check.reached", lambda checked: ("flying", "not finite"))
+    deploy._print_sum(flights, False)
+    deploy._print_sum(flights[:1], True)
+    assert printed() == [
+        "hover, seed 3: completed", f"plain     {100:>7} ticks {1000:>7} calls  equal",
+        f"c-O2      {90:>7} ticks {900:>7} calls  equal",
+        "yaw, seed 3, 2 faults: completed", f"plain     {5:>7} ticks {50:>7} calls  DIFFERS first in tick 7",
+        f"c-O2      {8:>7} ticks {80:>7} calls  equal",
+        "98 ticks, c beside plain, c-O2: plain DIFFERS", "supervisor: reached flying; not not finite",
+        "only a core with own logic has the guard that finds what is not finite",
+        "90 ticks, c beside plain, c-O2: no bit differs", "supervisor: reached flying; not not finite",
     ]  # fmt: skip
+
+
+def test_machine_code_is_printed_with_its_sizes_and_loads_beside_those_of_boards(printed: Any) -> None:
+    ticks = Made(calls=4, instructions=400, worst_instructions=150, worst_us=33.4)
+    deploy._print_machine_code(
+        Made(ticks=ticks, flash_bytes=1000, ram_bytes=200, stack_bytes=30, loads=(0.0123, 0.0456))
+    )  # type: ignore[arg-type]
+    deploy._print_machine_code(
+        Made(ticks=ticks, flash_bytes=None, ram_bytes=200, stack_bytes=30, loads=(0.0123, 0.0456))
+    )  # type: ignore[arg-type]
+    load, other, none = (Made(calls=c, cycles=12 * c, worst_cycles=w) for c, w in ((10, 20), (5, 40), (0, 0)))
+    deploy._print_measured(
+        "usb://0",
+        {"step": load, "idle": none, "own": other},
+        {"step": Made(calls=2, cycles=26, worst_cycles=15)},
+    )  # type: ignore[dict-item, arg-type]
+    for good in (True, False):
+        deploy.say_finding(Made(good=good, subject="gyro", text="0.1 rad/s"))  # type: ignore[arg-type]
+    assert printed() == [
+        "Cortex-M4 code: flash 1000 B, RAM 200 B, stack 30 B",
+        "instructions per tick: mean 100, worst 150; load at 168 MHz: mean 1.2%, worst tick 4.6% (33 us of 10 ms)",
+        "Cortex-M4 code: RAM 200 B, stack 30 B",
+        "instructions per tick: mean 100, worst 150; load at 168 MHz: mean 1.2%, worst tick 4.6% (33 us of 10 ms)",
+        "usb://0: cycles per call, mean and worst, as measured on the board",
+        "step           10 calls        12        20   counted        13        15",
+        "own             5 calls        12        40",
+        "gyro      0.1 rad/s", "! gyro      0.1 rad/s",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("app", "findings", "well"), [(False, (), True), (True, (True, True), True),
+    (True, (False, True), False)])  # fmt: skip
+def test_an_image_is_well_when_all_around_its_core_is_and_memory_only_warns(
+    app: bool, findings: tuple[bool, ...], well: bool, printed: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hil.deploy.image_check.has_app", lambda elf: (app, "memory"))
+    monkeypatch.setattr("hil.deploy.image_check.check_memory", lambda memory: Made(good=False, subject=memory,
+        text="full"))  # fmt: skip
+    made = [Made(good=good, subject="part", text=str(good)) for good in findings]
+    monkeypatch.setattr("hil.deploy.image_check.check_image", lambda elf, profile, overrides,
+        show: made if (profile, overrides) == ("p", ("o",)) else 1 / 0)  # fmt: skip
+    monkeypatch.setattr("hil.deploy.image_check.UNPROVEN", ("one", "two"))
+    assert deploy._check_around(Path("cf2.elf"), "p", ("o",)) == well
+    rest = [f"{'' if good else '! '}part      {good}" for good in findings] + ["unproven: one",
+        "unproven: two"]  # fmt: skip
+    assert printed() == [
+        "! memory    full",
+        *(rest if app else ["unproven: everything but the core: cf2.elf has no exported app"]),
+    ]
+
+
+def test_a_server_says_where_clients_find_each_of_its_robots() -> None:
+    said: list[str] = []
+    robots = [Made(dongles=7100, radio=f"radio://0/{n}", udp=f"udp://:{n}",
+        mavlink=f"mavlink:{n}") for n in (1, 2)]  # fmt: skip
+    serve._print_addresses(robots, said.append)  # type: ignore[arg-type]
+    assert said[0] == "radio  radio://0/1 radio://0/2"
+    assert said[1].startswith("use    env PYTHONPATH=/")
+    assert said[1].endswith("/hil/servers/dongle_site FLOATY_DONGLE=127.0.0.1:7100 PROGRAM")
+    assert said[2:] == ["udp    udp://:1 udp://:2", "mavlink mavlink:1 mavlink:2"]
+    serve._print_addresses([Made(dongles=0, udp="", mavlink="m")], said.append)  # type: ignore[list-item]
+    assert said[4:] == ["mavlink m"]
+
+
+@pytest.mark.parametrize(("options", "message"), [({"program": ("cfclient", "-x"), "usb": False},
+    "cfclient -x: only --usb takes a program"), ({"udp": 65535, "boards": 2},
+    "--udp 65535: there are no 2 ports from there on"), ({"udp": 65534, "boards": 2}, None),
+    ({"board": "a.elf", "mavlink": "x"}, "--mavlink x: a.elf speaks CRTP over its radio, not MAVLink"),
+    ({"elf": Path("b.elf")}, "--elf b.elf: goes with an image as --board"),
+    ({"elf": Path("b.elf"), "board": "a.bin"}, None), ({"gdb": 3333},
+    "--gdb 3333: needs one board and an image as --board"), ({"gdb": 3333, "board": "a.elf"}, None),
+    ({"gdb": 3333, "board": "a.elf", "boards": 2}, "--gdb 3333: needs one board and an image as --board")])  # fmt: skip
+def test_options_of_a_server_that_contradict_each_other_are_one_line(
+    options: dict[str, Any], message: str | None
+) -> None:
+    plain = {"udp": None, "board": None, "gdb": None, "boards": 1, "program": (), "usb": False,
+        "mavlink": None, "elf": None}  # fmt: skip
+    if message is None:
+        serve._check_options(Made(**plain | options))  # type: ignore[arg-type]
+    else:
+        with pytest.raises(LabError) as refused:
+            serve._check_options(Made(**plain | options))  # type: ignore[arg-type]
+        assert str(refused.value) == message
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+@pytest.mark.parametrize("shown", [True, False])
+def test_an_operator_s_console_prints_records_and_shows_each_text_where_it_belongs(
+    recorded: bool, shown: bool
+) -> None:
+    said: list[Any] = []
+    flight = Made(note=lambda *what: said.append(("note", *what)), log_us=7, on_loop="on loop")
+    view = Made(answer=lambda *what: said.append(("answer", *what)), lines=lambda: ["a", "b"])
+    console = station.OperatorConsole(flight if recorded else None, view if shown else None, said.append)  # type: ignore[arg-type]
+    console.report("x")
+    console.note("y")
+    console.reply("z")
+    expected = ["x", *[("note", "station", "x"), ("note", "operator", "y")] * recorded, "z"]
+    assert said == expected + [("answer", 7 if recorded else 0, "z")] * shown
+    queued: list[str] = []
+    take, *rest = console.hooks(Made(queue_line=queued.append))  # type: ignore[arg-type]
+    take(None, 0)  # type: ignore[arg-type]
+    assert (queued, rest) == (["a", "b"] * shown, ["on loop"] * recorded)
+
+
+def test_constants_are_printed_with_their_realisations_and_mean_flap_angles(printed: Any) -> None:
+    nothing = (nan, nan)
+    made = IdentifiedConstant("roll_u1", "1/s²", (230.0, 66.0), 188.6, nothing, (200.0, 12.0), (190.0, 3.0),
+        "identified", "± 2%")  # fmt: skip
+    seen = Made(axis=PITCH, record=1, spectra=Made(periods=5))
+    records = (Made(flap_angle=0.0), Made(flap_angle=radians(24.4)))
+    identify._print_constants(
+        Made(constants=(made,), excited=(seen,), records=records, estimate=Made(misfit=1.44))
+    )  # type: ignore[arg-type]
+    title, headings, cells, text = printed()
+    assert title == "constants, with the half width of their 95 % interval"
+    assert headings == ["constant", "paper", "truth", "instruments", "joint fit", "unit", "verdict"]
+    assert cells == ["roll_u1", "230 ± 66", "188.6", "200 ± 12", "190.0 ± 3.0", "1/s²", "identified: ± 2%"]
+    assert text == (
+        "realisations and mean flap angles, to which the constants refer: u2: 5 at 24.4 deg; the model "
+        "misses the log by 1.20 of its scatter"
+    )
+
+
+def test_studies_are_as_expected_or_their_surprises_are_named(printed: Any) -> None:
+    def study(name: str, holds: bool, *surprises: str) -> Any:
+        curves = [Made(variant=Made(name="v")), Made(variant=Made(name="w"))]
+        told = dict(zip(map(id, curves), (surprises, surprises[:1]), strict=True))
+        return Made(study=Made(name=name), holds=holds, curves=curves,
+            surprises=lambda curve: told[id(curve)])  # fmt: skip
+
+    paper._print_studies(
+        Made(studies=[study("a", True), study("b", False, "5 m/s: lost", "6"), study("c", False)])
+    )  # type: ignore[arg-type]
+    assert printed() == ["study a: as expected", "study b: v: 5 m/s: lost; v: 6; w: 5 m/s: lost",
+        "study c: not complete"]  # fmt: skip
+
+
+@pytest.mark.parametrize("missed", [0, 3])
+def test_a_picture_that_is_closed_reports_the_rows_that_it_missed_and_the_result_has_them(
+    missed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    written: list[Any] = []
+    monkeypatch.setattr("hil.laboratory.files.result.write_result", written.append)
+    monkeypatch.setattr(common, "replace", lambda result, **changes: (result, changes))
+    view: Any = Made(close=lambda: missed)
+    common.close_live(view, "result", said.append)  # type: ignore[arg-type]
+    common.close_live(view, None, said.append)
+    common.close_live(None, "result", said.append)  # type: ignore[arg-type]
+    text = f"the live viewer did not take {missed} rows of the flight"
+    assert said == [f"{text}; the log contains them all", text][: 2 * bool(missed)]
+    assert written == [("result", {"not_shown": missed})]

@@ -100,21 +100,15 @@ def test_viewers_in_a_browser_have_a_port_for_the_page_and_one_for_the_data(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     started: list[tuple[list[str], int]] = []
-    monkeypatch.setattr(
-        window, "_start", lambda arguments, port: started.append((arguments, port)) or "process"
-    )
+    monkeypatch.setattr(window, "_start", lambda arguments, port: started.append((arguments,
+        port)) or "process")  # fmt: skip
     monkeypatch.setattr(window, "free_port", lambda wanted: wanted + 1)
-    assert window.serve_web() == (
-        "http://127.0.0.1:9091/?url=rerun%2Bhttp://127.0.0.1:9877/proxy", "rerun+http://127.0.0.1:9877/proxy", "process",
-    )  # fmt: skip
+    assert window.serve_web() == ("http://127.0.0.1:9091/?url=rerun%2Bhttp://127.0.0.1:9877/proxy",
+        "rerun+http://127.0.0.1:9877/proxy", "process")  # fmt: skip
     assert window.serve_viewer("rerun+http://x") == (9091, "process")
-    assert started == [
-        (
-            ["--port", "9877", "--serve-web", "--web-viewer-port", "9091", "--server-memory-limit", "500MB"],
-            9877,
-        ),
-        (["--serve-web", "--web-viewer-port", "9091", "rerun+http://x"], 9091),
-    ]
+    assert started == [(["--port", "9877", "--serve-web", "--web-viewer-port", "9091",
+        "--server-memory-limit", "500MB"], 9877), (["--serve-web", "--web-viewer-port", "9091",
+        "rerun+http://x"], 9091)]  # fmt: skip
     monkeypatch.setattr(window, "is_open", lambda host, port: True)
     assert open_window() == "rerun+http://127.0.0.1:9876/proxy"
     assert len(started) == 2, "one is open"
@@ -124,13 +118,9 @@ def test_viewers_in_a_browser_have_a_port_for_the_page_and_one_for_the_data(
     assert started[2] == (["--port", "9876"], 9876)
 
 
-@pytest.mark.parametrize(
-    ("target", "screen"),
-    [
-        ("web", ("panel", "fly", print)), ("foxglove", ("foxglove", None)), ("foxglove:parameters", ("foxglove", print)),
-        ("window", ("rerun", "window")), ("connect:a:1", ("rerun", "connect:a:1")),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("target", "screen"), [("web", ("panel", "fly", print)),
+    ("foxglove", ("foxglove", None)), ("foxglove:parameters", ("foxglove", print)),
+    ("window", ("rerun", "window")), ("connect:a:1", ("rerun", "connect:a:1"))])  # fmt: skip
 def test_each_target_has_its_screen(
     target: str, screen: tuple[object, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -174,13 +164,8 @@ def test_a_run_is_shown_in_a_browser_at_its_instant_until_ctrl_c(
     monkeypatch.setattr(recording.signal, "signal", lambda *what: served.append(what))
     recording.browse(tmp_path, 1.5, said.append)
     page = "http://127.0.0.1:9091/?url=rerun%2Bhttp://x%3F"
-    assert served == [
-        (signal.SIGTERM, signal.default_int_handler),
-        "rerun+http://x?1.5",
-        f"{page}2",
-        "viewer",
-        "closed",
-    ]
+    assert served == [(signal.SIGTERM, signal.default_int_handler), "rerun+http://x?1.5", f"{page}2",
+        "viewer", "closed"]  # fmt: skip
     assert said == [
         f"view    {page}1.5",
         "report  http://127.0.0.1:9877/report.html, whose links lead here, as those of the file do, until Ctrl-C",

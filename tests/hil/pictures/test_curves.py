@@ -185,10 +185,8 @@ def trial(number: int, seconds: float) -> pa.Table:
         "goal.z": [1.049] * count,
         "truth.x": [0.01 * number] * count,
     }
-    columns |= {
-        "battery.power": np.repeat(np.arange(seconds + 1) * number, 100)[:count],
-        "flight.free": np.arange(count) >= 10.0,
-    }
+    columns |= {"battery.power": np.repeat(np.arange(seconds + 1) * number, 100)[:count],
+        "flight.free": np.arange(count) >= 10.0}  # fmt: skip
     table = flight([180.0] * count, **columns)
     return table.replace_schema_metadata(
         RELEASE | {b"config": json.dumps({"supervisor": {"low_battery_mv": 3200}}).encode()}
@@ -211,21 +209,19 @@ def test_an_experiment_s_picture_has_its_flight_last_over_the_trials_and_then_th
             [*own, ("mean 1.32 W", curves.GREY)], [0.3, 2.2, 2.1, 1.32]),
                       "charge [%]": (own, [60, 40, 20])},
     }  # fmt: skip
-    plots = {
-        "follow": trials.follow((trials.X, trials.Z), (0.5, 60.0), *flights), "disturbed": trials.disturbed(*flights),
-        "take_off": trials.take_off_and_landing(*flights), "discharge": trials.discharge(*flights),
-    }  # fmt: skip
+    plots = {"follow": trials.follow((trials.X, trials.Z), (0.5, 60.0), *flights),
+        "disturbed": trials.disturbed(*flights), "take_off": trials.take_off_and_landing(*flights),
+        "discharge": trials.discharge(*flights)}  # fmt: skip
     for name, plot in plots.items():
         assert [one.label for one in plot.panels] == list(expected[name])
         for panel in plot.panels:
             lines, values = expected[name][panel.label]
             assert [(line.name, line.colour) for line in panel.series] == lines, panel.label
-            assert [float(line.values[-1]) for line in panel.series] == pytest.approx(values, abs=0.05), (
-                panel.label
-            )
-            assert [line.dashed for line in panel.series] == [
-                line.name in ("target", "goal") for line in panel.series
-            ]
+            assert [float(line.values[-1]) for line in panel.series] == pytest.approx(values,
+                abs=0.05), (panel.label)  # fmt: skip
+            assert [len(line.times) for line in panel.series] == [len(line.values) for line in panel.series]
+            assert [line.dashed for line in panel.series] == [line.name in ("target",
+                "goal") for line in panel.series]  # fmt: skip
     assert [(one.lane, one.name, one.begin_s, one.end_s) for one in plots["take_off"].panels[3].bars] == [
         ("controller", "on", pytest.approx(2.2), pytest.approx(26.2)), ("controller", "off", pytest.approx(26.2),
         pytest.approx(26.2)),
@@ -240,10 +236,8 @@ def test_an_experiment_s_picture_has_its_flight_last_over_the_trials_and_then_th
         [0.0, pytest.approx(3.39)],
     )
     assert all(one.limits == (-10.0, 10.0) for one in plots["disturbed"].panels)
-    windows = [
-        trials.follow((trials.X,), asked, *flights).window_s
-        for asked in ((0.5, 60.0), (0.5, 2.0), (5.0, 60.0))
-    ]
+    windows = [trials.follow((trials.X,), asked, *flights).window_s for asked in ((0.5, 60.0), (0.5, 2.0),
+        (5.0, 60.0))]  # fmt: skip
     assert windows == [(0.5, pytest.approx(3.39)), (0.5, 2.0), (5.0, 5.1)]
     assert plots["discharge"].window_s is None
 

@@ -25,19 +25,14 @@ from support.html_page import lines_of
 def test_a_plot_is_drawn_as_its_values_say_and_its_marks_on_every_axes() -> None:
     t, values = np.array([-1.0, 0.5, 2.0]), np.array([[1.0, 2.0, 4.0], [0.5, 3.0, 0.25]])
     solid = Series("a", RED, t, values[0], width=1.7)
-    panels = (
-        Panel("z [cm]", (solid, Series("", BLUE, t, values[1], dashed=True)), 2.0, (-3.0, 4.0), -5.0, 6.0),
-        Panel("load [%]", tuple(Series(n, c, t, v) for n, c, v in zip("pq", (GREEN, ORANGE), values, strict=True)),
-              1.0, least=0.25, stacked=True),
-        Panel("states", height=0.5, bars=(
-            Bar("robot", "held", GREY, -1.0, 0.0), Bar("board", "wait", SKY, 0.5, 1.5), Bar("robot", "free", BLUE, 0.0, 2.0),
-            Bar("board", "held", PINK, 1.5, 1.75))),
-    )  # fmt: skip
-    marks = Marks(
-        (Interval("held", -1.0, -0.1), Interval("fault", 0.2, 0.45, "f" * 28), Interval("failsafe", 0.5, 0.6),
-         Interval("limit", 0.7, 0.95, "flap 1")),
-        (Instant("operator", 0.9, "o" * 29), Instant("lost", 1.9, "fell")),
-    )  # fmt: skip
+    panels = (Panel("z [cm]", (solid, Series("", BLUE, t, values[1], dashed=True)), 2.0, (-3.0, 4.0), -5.0,
+        6.0), Panel("load [%]", tuple(Series(n, c, t, v) for n, c, v in zip("pq", (GREEN, ORANGE), values,
+        strict=True)), 1.0, least=0.25, stacked=True), Panel("states", height=0.5,
+        bars=(Bar("robot", "held", GREY, -1.0, 0.0), Bar("board", "wait", SKY, 0.5, 1.5),
+        Bar("robot", "free", BLUE, 0.0, 2.0), Bar("board", "held", PINK, 1.5, 1.75))))  # fmt: skip
+    marks = Marks((Interval("held", -1.0, -0.1), Interval("fault", 0.2, 0.45, "f" * 28),
+        Interval("failsafe", 0.5, 0.6), Interval("limit", 0.7, 0.95, "flap 1")),
+        (Instant("operator", 0.9, "o" * 29), Instant("lost", 1.9, "fell")))  # fmt: skip
     figure = figure_of(Plot(panels, (-0.5, 1.5)), marks)
     name_marks(figure, marks)
     lines, stacked, states = figure.axes
@@ -49,10 +44,8 @@ def test_a_plot_is_drawn_as_its_values_say_and_its_marks_on_every_axes() -> None
     drawn = [(to_hex(one.get_color()), one.get_linestyle(), one.get_linewidth()) for one in lines.lines]
     assert drawn[:2] == [(RED, "-", 1.7), (BLUE, "--", 0.9)]
     assert [one.get_xydata().tolist() for one in lines.lines[:2]] == [np.c_[t, v].tolist() for v in values]
-    assert [(one.get_ydata()[0], one.get_linestyle()) for one in lines.lines[2:4]] == [
-        (-3.0, "--"),
-        (4.0, "--"),
-    ]
+    assert [(one.get_ydata()[0], one.get_linestyle()) for one in lines.lines[2:4]] == [(-3.0, "--"),
+        (4.0, "--")]  # fmt: skip
     for shape, colour, low, high in zip(
         stacked.collections, (GREEN, ORANGE), (0 * t, values[0]), (values[0], values.sum(axis=0)), strict=True
     ):
@@ -65,18 +58,10 @@ def test_a_plot_is_drawn_as_its_values_say_and_its_marks_on_every_axes() -> None
     assert [(one.get_x(), one.get_width(), one.get_y() + 0.5 * one.get_height(), to_hex(one.get_facecolor()))
             for one in bars] == [
         (-1.0, 1.0, 0.0, GREY), (0.5, 1.0, 1.0, SKY), (0.0, 2.0, 0.0, BLUE), (1.5, 0.25, 1.0, PINK)]  # fmt: skip
-    assert ([*states.get_yticks()], [one.get_text() for one in states.get_yticklabels()]) == (
-        [0, 1],
-        ["robot", "board"],
-    )
-    colours = {
-        "held": GREY,
-        "fault": RED,
-        "failsafe": PINK,
-        "limit": YELLOW,
-        "operator": BLUE,
-        "lost": "black",
-    }
+    assert ([*states.get_yticks()], [one.get_text() for one in states.get_yticklabels()]) == ([0, 1],
+        ["robot", "board"])  # fmt: skip
+    colours = {"held": GREY, "fault": RED, "failsafe": PINK, "limit": YELLOW, "operator": BLUE,
+        "lost": "black"}  # fmt: skip
     for axes in figure.axes:
         spans = [one for one in axes.patches if one not in bars]
         for one, mark in zip(spans, marks.intervals, strict=True):
@@ -125,9 +110,8 @@ def test_a_path_is_drawn_to_scale_from_three_sides_on_numbered_grids_behind_it(m
 
         drawn = [(tuple(float(n) for n in re.split("[ ,]", one.get("points", ""))), one.get("stroke"),
                   one.get("stroke-dasharray")) for one in group.iter("{*}polyline")]  # fmt: skip
-        strokes = {
-            stroke: [places for places, other, _ in drawn if other == stroke] for _, stroke, _ in drawn
-        }
+        strokes = {stroke: [places for places, other, _ in drawn if other == stroke] for _, stroke,
+            _ in drawn}  # fmt: skip
         assert strokes[BLUE] == [pytest.approx(seen(FLOWN), abs=0.11)]
         assert strokes[RED] == [pytest.approx(seen(FLOWN[1:3]), abs=0.11)]
         assert {dash for _, stroke, dash in drawn if stroke == "black"} == ({"4 3"} if moves else {"none"})
@@ -135,33 +119,24 @@ def test_a_path_is_drawn_to_scale_from_three_sides_on_numbered_grids_behind_it(m
             assert strokes["black"] == [pytest.approx(seen(goal), abs=0.11)]
         else:
             corners = np.reshape(np.concatenate(strokes["black"]), (-1, 2))
-            cube = {
-                seen(10.0 * np.array(signs))
-                for signs in np.ndindex(2, 2, 2)
-                for signs in [2 * np.array(signs) - 1]
-            }
+            cube = {seen(10.0 * np.array(signs)) for signs in np.ndindex(2, 2,
+                2) for signs in [2 * np.array(signs) - 1]}  # fmt: skip
             assert {tuple(one) for one in corners.tolist()} == cube
-        ends = [
-            (tuple(float(one.get(key, "")) for key in ("cx", "cy")), one.get("fill"))
-            for one in group.iter("{*}circle")
-        ]
+        ends = [(tuple(float(one.get(key, "")) for key in ("cx", "cy")),
+            one.get("fill")) for one in group.iter("{*}circle")]  # fmt: skip
         assert ends == [(seen(FLOWN[0]), "white"), (seen(FLOWN[-1]), BLUE)]
         names, grids = [], set()
         space = middle[1] == "150"
-        planes = (
-            [(0, 1, -1.0), (0, 2, 1.0), (1, 2, -1.0)] if space else [(0, 1 if middle[1] == "455" else 2, 0.0)]
-        )
+        planes = ([(0, 1, -1.0), (0, 2, 1.0), (1, 2, -1.0)] if space else [(0, 1 if middle[1] == "455" else 2,
+            0.0)])  # fmt: skip
         for one, other, place in planes:
             for along, across in ((one, other), (other, one)):
                 for tick in ticks:
                     line = np.full((2, 3), place * reach)
                     line[:, along], line[:, across] = tick, (-reach, reach)
                     grids.add(seen(line))
-        at = (
-            {0: (1, -1.25), 1: (0, 1.25), 2: (0, 1.25)}
-            if space
-            else {0: (planes[0][1], -1.15), planes[0][1]: (0, -1.2)}
-        )
+        at = ({0: (1, -1.25), 1: (0, 1.25), 2: (0, 1.25)} if space else {0: (planes[0][1], -1.15),
+            planes[0][1]: (0, -1.2)})  # fmt: skip
         for axis, (beside, share) in at.items():
             for tick, text in [
                 *((tick, f"{tick:g}") for tick in ticks),
@@ -171,15 +146,12 @@ def test_a_path_is_drawn_to_scale_from_three_sides_on_numbered_grids_behind_it(m
                 point[axis], point[beside] = tick, share * reach
                 names.append((text, *seen(point)))
         assert set(strokes["#cccccc"]) == grids
-        texts = [
-            (one.text, float(one.get("x", "")), float(one.get("y", "")) - 4.0)
-            for one in group.iter("{*}text")
-        ]
+        texts = [(one.text, float(one.get("x", "")), float(one.get("y",
+            "")) - 4.0) for one in group.iter("{*}text")]  # fmt: skip
         assert sorted(text for text, *_ in texts) == sorted(text for text, *_ in names)
         for text, x, y in names:
-            assert any(
-                other == text and (u, v) == pytest.approx((x, y), abs=0.16) for other, u, v in texts
-            ), (text, axis)
+            assert any(other == text and (u, v) == pytest.approx((x, y), abs=0.16) for other, u,
+                v in texts), (text, axis)  # fmt: skip
 
 
 def test_a_swarm_has_the_path_end_and_home_of_each_robot_and_the_distance_to_its_nearest_neighbour(
@@ -198,21 +170,16 @@ def test_a_swarm_has_the_path_end_and_home_of_each_robot_and_the_distance_to_its
             assert path.get_xydata() == pytest.approx(100 * places[n][:, [across, up]])
             assert (*end.get_xydata()[0], end.get_marker()) == (*100 * places[n][-1, [across, up]], "o")
             assert (*home.get_xydata()[0], home.get_marker()) == (*100 * homes[n][[across, up]], "+")
-            assert (path.get_color(), end.get_color(), end.get_label()) == (
-                *[(BLUE, ORANGE, GREEN)[n]] * 2,
-                str(n + 1),
-            )
+            assert (path.get_color(), end.get_color(), end.get_label()) == (*[(BLUE, ORANGE, GREEN)[n]] * 2,
+                str(n + 1))  # fmt: skip
     assert [axes.get_title() for axes in figure.axes] == ["from above", "from the side"]
     logs = [pa.table({"t": [1_000_000 + 10_000 * row for row in range(len(one))]}).replace_schema_metadata(
         {"release_us": "1010000"}) for one in places]  # fmt: skip
     result = SimpleNamespace(request=SimpleNamespace(config=SimpleNamespace(distance_min=0.35)))
     (panel,) = swarm._distances(result, logs, places).plot["panels"]
     assert (panel["label"], panel["limits"], panel["least"]) == ("distance [cm]", (35.0,), 0.0)
-    expected = {
-        "robot 1": (40.0, 10.0, np.nan),
-        "robot 2": (40.0, 40.0, 10.0),
-        "robot 3": (100.0, 10.0, 10.0),
-    }
+    expected = {"robot 1": (40.0, 10.0, np.nan), "robot 2": (40.0, 40.0, 10.0),
+        "robot 3": (100.0, 10.0, 10.0)}  # fmt: skip
     for name, (times, values) in lines_of(panel).items():
         assert times == pytest.approx([-0.01, 0.0, 0.01])
         assert values == pytest.approx(expected[name], rel=1e-6, nan_ok=True), name
@@ -225,17 +192,15 @@ def test_an_overload_has_the_misses_per_second_and_the_largest_error_at_each_sha
     misses = np.interp(row, [49, 52, 99, 109], [0, 3, 3, 13])
     zeros = np.zeros(150)
     offs = {"x": 0.01 * (1 + row // 50), "y": -0.02 * (row // 50), "z": np.where(row == 120, 0.3, 0.0)}
-    rows = pa.table(
-        {"t": 10_000.0 * row, "flight.free": zeros + 1, "goal.yaw": zeros, "cpu.THIEF": np.cumsum(10_000 * shares),
-         "late.KALMAN": misses, "late.STABILIZER": zeros}
-        | {f"truth.{axis}": values for axis, values in offs.items()} | {f"goal.{axis}": zeros for axis in "xyz"}
-    )  # fmt: skip
+    rows = pa.table({"t": 10_000.0 * row, "flight.free": zeros + 1, "goal.yaw": zeros,
+        "cpu.THIEF": np.cumsum(10_000 * shares), "late.KALMAN": misses,
+        "late.STABILIZER": zeros} | {f"truth.{axis}": values for axis,
+        values in offs.items()} | {f"goal.{axis}": zeros for axis in "xyz"})  # fmt: skip
     late, error = charts.overload(rows).axes
     drawn = {line.get_label(): line for line in late.lines}
     assert drawn["KALMAN"].get_xydata() == pytest.approx(np.array([(0, 0), (40, 6), (90, 20)]))
-    assert [(name, to_hex(line.get_color())) for name, line in drawn.items()] == [
-        (name, task_colour(name)) for name in ("KALMAN", "STABILIZER")
-    ]
+    assert [(name, to_hex(line.get_color())) for name, line in drawn.items()] == [(name,
+        task_colour(name)) for name in ("KALMAN", "STABILIZER")]  # fmt: skip
     worst = {line.get_label(): line.get_ydata() for line in error.lines[:3]}
     assert worst["x"] == pytest.approx([1.0, 2.0, 3.0])
     assert worst["y"] == pytest.approx([0.0, 2.0, 4.0])
@@ -249,8 +214,7 @@ def test_vehicles_have_their_power_per_mass_and_floaty_the_mean_of_its_flights()
     config = load_config()
     stored = json.dumps(config.model_dump(mode="json"))
     flights = [pa.table({"battery.power": [watts] * 2, "flight.free": [1.0,
-    1.0]}).replace_schema_metadata({"config": stored})
-               for watts in (3.0, 4.0)]  # fmt: skip
+        1.0]}).replace_schema_metadata({"config": stored}) for watts in (3.0, 4.0)]  # fmt: skip
     mass = weigh(config.geometry).mass * config.plant.mass_factor
     bars, scatter = charts.compare(*flights).axes
     names, values = ["Floaty"], [3.5 / mass]
@@ -265,11 +229,8 @@ def test_vehicles_have_their_power_per_mass_and_floaty_the_mean_of_its_flights()
     stars = [True, *(one.updraft for one in VEHICLES)]
     assert shown == [f"{value:.0f}" + " ★" * star for value, star in zip(values, stars, strict=True)]
     (whiskers,) = bars.collections
-    ends = {
-        row: half
-        for row, half in enumerate((np.ptp(one.power_range) / 2 / one.mass for one in VEHICLES), 1)
-        if half
-    }
+    ends = {row: half for row, half in enumerate((np.ptp(one.power_range) / 2 / one.mass for one in VEHICLES),
+        1) if half}  # fmt: skip
     found = {
         int(y): (high - low) / 2
         for (low, y), (high, _) in (p.vertices for p in whiskers.get_paths())

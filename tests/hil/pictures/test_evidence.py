@@ -55,26 +55,20 @@ def flown_log() -> pa.Table:
     """Two seconds in a wind, released at 1 s; each row of what follows has an effect of its own."""
     count, row = 301, np.arange(301)
     values: dict[str, np.ndarray] = {"t": 10_000.0 * row, "flight.free": (row >= 100).astype(float)}
-    values |= dict.fromkeys(
-        [f"{group}.{name}" for group in ("truth", "goal", "estimate") for name in ("x", "y", "z")]
-        + ["truth.qx", "truth.qy", "truth.vx", "truth.vy", "truth.vz", "goal.yaw", "estimate.roll", "estimate.pitch",
-        "estimate.yaw",
-           "tracker.refused", "link.late", "estimator.too_old"], np.zeros(count)
-    )  # fmt: skip
+    values |= dict.fromkeys([f"{group}.{name}" for group in ("truth", "goal", "estimate") for name in ("x",
+        "y", "z")] + ["truth.qx", "truth.qy", "truth.vx", "truth.vy", "truth.vz", "goal.yaw", "estimate.roll",
+        "estimate.pitch", "estimate.yaw", "tracker.refused", "link.late", "estimator.too_old"],
+        np.zeros(count))  # fmt: skip
     turned = np.where(row == 180, np.radians(30.0), 0.0)
     values |= {"truth.qw": np.cos(turned / 2), "truth.qz": np.sin(turned / 2)}
     values["truth.x"], values["truth.y"] = np.where(row == 150, 0.04, 0.0), np.where(row == 160, -0.123, 0.0)
-    values["estimate.z"], values["estimate.pitch"] = (
-        np.where(row == 170, 0.05, 0.0),
-        np.where(row == 175, np.radians(-7), 0.0),
-    )
+    values["estimate.z"], values["estimate.pitch"] = (np.where(row == 170, 0.05, 0.0),
+        np.where(row == 175, np.radians(-7), 0.0))  # fmt: skip
     values["truth.vx"], values["truth.vz"] = np.where(row == 155, 0.3, 0.0), np.where(row == 155, -0.4, 0.0)
     values["supervisor.state"] = np.select([row < 190, row < 210], [2, 3], 2)
     values["estimator.fused"] = np.where(row < 200, row, np.where(row < 225, 199, row))
-    values["estimator.refused"], values["tracker.refused"] = (
-        np.minimum(row // 100, 1),
-        1.0 * (row >= 120) + 2.0 * (row >= 130),
-    )
+    values["estimator.refused"], values["tracker.refused"] = (np.minimum(row // 100, 1),
+        1.0 * (row >= 120) + 2.0 * (row >= 130))  # fmt: skip
     for i, sign in enumerate((1, -1, 1, -1), 1):
         flap, command = np.full(count, 0.6 * sign), np.full(count, 0.6 * sign)
         if i == 2:
@@ -134,95 +128,63 @@ def judged(values: dict[str, float], limits: dict[str, float], outcome: str = "c
 
 def test_failures_come_in_the_order_of_their_instants_with_the_fault_before_each_and_what_they_mean() -> None:
     """Beyond 6 cm only y at 0.60 s, 30 deg at 0.80 s, failsafe from 0.90 to 1.10 s; a share has no value here."""
-    values = {
-        "max_y": 0.123,
-        "attitude_max": np.radians(30),
-        "uncontrolled": 0.2,
-        "rise": 9.0,
-        "lost": 1.0,
-        "within_6cm_y": 0.99,
-    }
-    limits = {
-        "rise": 1.0,
-        "uncontrolled": 0.105,
-        "attitude_max": 0.3,
-        "max_y": 0.1,
-        "lost": 0.0,
-        "within_6cm_y": 1.0,
-    }
+    values = {"max_y": 0.123, "attitude_max": np.radians(30), "uncontrolled": 0.2, "rise": 9.0, "lost": 1.0,
+        "within_6cm_y": 0.99}  # fmt: skip
+    limits = {"rise": 1.0, "uncontrolled": 0.105, "attitude_max": 0.3, "max_y": 0.1, "lost": 0.0,
+        "within_6cm_y": 1.0}  # fmt: skip
     failures = failures_of(flown_log(), judged(values, limits, "lost"))
     push, stuck = KINDS["push.y"].meaning, KINDS["servo.stuck.2"].meaning
     about = {name: METRICS[name].meaning for name in values} | {"lost": ""}
     late = 1.0  # the eleventh row of failsafe
-    expected = [
-        ("max_y", 0.60, f"0.10 s after the begin of push.y@0.5:0.2=1 (1 N: {push})"),
+    expected = [("max_y", 0.60, f"0.10 s after the begin of push.y@0.5:0.2=1 (1 N: {push})"),
         ("within_6cm_y", 0.60, f"0.10 s after the begin of push.y@0.5:0.2=1 (1 N: {push})"),
         ("attitude_max", 0.80, f"0.30 s after the begin of push.y@0.5:0.2=1 (1 N: {push})"),
         ("uncontrolled", late, f"{late - 0.5:.2f} s after the begin of push.y@0.5:0.2=1 (1 N: {push})"),
-        ("lost", 2.0, f"0.80 s after the begin of servo.stuck.2@1.2 ({stuck})"), ("rise", None, ""),
-    ]  # fmt: skip
+        ("lost", 2.0, f"0.80 s after the begin of servo.stuck.2@1.2 ({stuck})"), ("rise", None, "")]  # fmt: skip
     assert sorted(one.text.split()[0] for one in failures[:2]) == ["max_y", "within_6cm_y"]
     told = {one.text.split()[0]: one for one in failures}
     for name, at_s, cause in expected:
-        assert (told[name].at_s, told[name].cause) == (
-            None if at_s is None else pytest.approx(at_s),
-            cause,
-        ), name
+        assert (told[name].at_s, told[name].cause) == (None if at_s is None else pytest.approx(at_s),
+            cause), name  # fmt: skip
         assert told[name].meaning == about[name]
     assert [one.text.split()[0] for one in failures[2:]] == [name for name, *_ in expected[2:]]
 
 
 def test_a_story_tells_everything_once_in_order() -> None:
-    result = judged(
-        {"max_y": 0.123, "attitude_max": np.radians(30)}, {"max_y": 0.1, "attitude_max": 0.3}, "lost"
-    )
+    result = judged({"max_y": 0.123, "attitude_max": np.radians(30)}, {"max_y": 0.1, "attitude_max": 0.3},
+        "lost")  # fmt: skip
     result.failures = ("planted",)
     texts = ((1_898_000, "supervisor: failsafe, imu stale"), (2_400_000, "planted"), (2_500_000, "harmless"))
     events = [{"t_us": us, "text": text} for us, text in texts]
     told = [(round(float(one.t_s), 3), one.text) for one in story_of(flown_log(), result, events)]
-    assert told == [
-        (0.0, "released"), (0.5, "fault push.y@0.5:0.2=1 begins"), (0.6, "first limit passed: max_y"),
-        (0.6, "farthest from the goal: 12.3 cm (y)"), (0.61, "within 6 cm of the goal from here to the end"),
-        (0.7, "fault push.y@0.5:0.2=1 ends"), (0.9, "failsafe begins: the gyro delivers nothing new"), (1.1,
-        "failsafe ends"),
-        (1.2, "fault servo.stuck.2@1.2 begins"), (1.2, "flap 2 saturates for the first time"), (1.4, "planted"), (2.0,
-        "lost: fell"),
-    ]  # fmt: skip
+    assert told == [(0.0, "released"), (0.5, "fault push.y@0.5:0.2=1 begins"),
+        (0.6, "first limit passed: max_y"), (0.6, "farthest from the goal: 12.3 cm (y)"),
+        (0.61, "within 6 cm of the goal from here to the end"), (0.7, "fault push.y@0.5:0.2=1 ends"),
+        (0.9, "failsafe begins: the gyro delivers nothing new"), (1.1, "failsafe ends"),
+        (1.2, "fault servo.stuck.2@1.2 begins"), (1.2, "flap 2 saturates for the first time"),
+        (1.4, "planted"), (2.0, "lost: fell")]  # fmt: skip
 
 
 def test_a_report_s_rows_have_values_and_limits_in_customary_units_those_with_a_limit_first() -> None:
-    values = {
-        "rms_x": 0.012,
-        "max_y": 0.1234,
-        "attitude_max": np.radians(21),
-        "in_box": 0.5,
-        "rise": np.inf,
-        "flown": 1.5,
-        "settle": np.nan,
-    }
-    rows = metric_rows(
-        judged(values, {"max_y": 0.2, "attitude_max": np.radians(20), "in_box": 0.45, "settle": 3.0})
-    )
+    values = {"rms_x": 0.012, "max_y": 0.1234, "attitude_max": np.radians(21), "in_box": 0.5, "rise": np.inf,
+        "flown": 1.5, "settle": np.nan}  # fmt: skip
+    rows = metric_rows(judged(values, {"max_y": 0.2, "attitude_max": np.radians(20), "in_box": 0.45,
+        "settle": 3.0}))  # fmt: skip
     shown = {one.name: (one.value, one.unit, one.limit, one.mark) for one in rows}
-    assert shown == {
-        "rms_x": ("1.2", "cm", "", None), "max_y": ("12.34", "cm", "≤ 20", "ok"), "attitude_max": ("21", "deg", "≤ 20",
-        "FAILS"),
-        "in_box": ("50", "% of 1.5 s", "≥ 45", "ok"), "rise": ("never", "s", "", None), "flown": ("1.5", "s", "", None),
-        "settle": ("–", "s", "≤ 3", "FAILS"),
-    }  # fmt: skip
+    assert shown == {"rms_x": ("1.2", "cm", "", None), "max_y": ("12.34", "cm", "≤ 20", "ok"),
+        "attitude_max": ("21", "deg", "≤ 20", "FAILS"), "in_box": ("50", "% of 1.5 s", "≥ 45", "ok"),
+        "rise": ("never", "s", "", None), "flown": ("1.5", "s", "", None),
+        "settle": ("–", "s", "≤ 3", "FAILS")}  # fmt: skip
     assert [one.mark is None for one in rows] == [False] * 4 + [True] * 3
     assert all(one.meaning == METRICS[one.name].meaning for one in rows)
 
 
 def test_a_report_s_faults_have_their_times_and_their_sizes_with_units() -> None:
-    spans = spans_of(
-        {b"request": json.dumps({"faults": ["push.y@0.5:0.25=1.5", "servo.stuck.2@1.2"]}).encode()}
-    )
+    spans = spans_of({b"request": json.dumps({"faults": ["push.y@0.5:0.25=1.5",
+        "servo.stuck.2@1.2"]}).encode()})  # fmt: skip
     push, stuck = KINDS["push.y"].meaning, KINDS["servo.stuck.2"].meaning
-    assert fault_rows(spans) == [
-        FaultRow("push.y", "0.500", "0.750", "1.5 N", push), FaultRow("servo.stuck.2", "1.200", "with the flight", "",
-        stuck),
-    ]  # fmt: skip
+    assert fault_rows(spans) == [FaultRow("push.y", "0.500", "0.750", "1.5 N", push),
+        FaultRow("servo.stuck.2", "1.200", "with the flight", "", stuck)]  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -160,32 +160,24 @@ def counted(**per_row: float) -> dict[str, NDArray[np.float64]]:
 
 def known_log() -> pa.Table:
     """Two seconds of a robot whose every column has a value of its own; it is released after 1 s, counters grow by row."""
-    values = {
-        **{f"truth.{axis}": 0.01 * n for n, axis in enumerate("xyz", 1)}, "truth.qw": 1.0, **dict.fromkeys(("truth.qx",
-        "truth.qy", "truth.qz"), 0.0),
-        **{f"estimate.{name}": 0.1 * n for n, name in enumerate("xyz", 1)}, **{f"replay.{name}": 0.2 * n for n,
-        name in enumerate("xyz", 1)},
+    values = {**{f"truth.{axis}": 0.01 * n for n, axis in enumerate("xyz", 1)}, "truth.qw": 1.0,
+        **dict.fromkeys(("truth.qx", "truth.qy", "truth.qz"), 0.0), **{f"estimate.{name}": 0.1 * n for n,
+        name in enumerate("xyz", 1)}, **{f"replay.{name}": 0.2 * n for n, name in enumerate("xyz", 1)},
         **{f"estimate.{name}": np.radians(n) for n, name in enumerate(("roll", "pitch", "yaw"), 1)},
         **{f"replay.{name}": np.radians(10 * n) for n, name in enumerate(("roll", "pitch", "yaw"), 1)},
         **{f"replay.{name}": float(n) for n, name in enumerate(("refused", "too_old", "invalid"), 1)},
         **{f"estimator.{name}": 10.0 * n for n, name in enumerate(("refused", "too_old", "invalid"), 1)},
-        **dict.fromkeys(("goal.x", "goal.y", "goal.z", "goal.yaw"), 0.0),
-        "estimator.pose_age_us": 31_000.0, "estimator.horizon": 4.0, "battery.voltage": 3.7, "board.load": 41.0,
-        "flight.free": 1.0,
-        "rtos.measurements_high_water": 7.0, "rtos.measurements_dropped": 2.0, "logic.seen": 5.0,
-    }  # fmt: skip
+        **dict.fromkeys(("goal.x", "goal.y", "goal.z", "goal.yaw"), 0.0), "estimator.pose_age_us": 31_000.0,
+        "estimator.horizon": 4.0, "battery.voltage": 3.7, "board.load": 41.0, "flight.free": 1.0,
+        "rtos.measurements_high_water": 7.0, "rtos.measurements_dropped": 2.0, "logic.seen": 5.0}  # fmt: skip
     for i in (1, 2, 3, 4):
         values |= {f"truth.flap_{i}": np.radians(i), f"control.flap_{i}": np.radians(10 * i), f"rotor.thrust_{i}": 0.01 * i,
                    f"motor.m{i}": 655.35 * i}  # fmt: skip
-    counters = counted(
-        link__up_latency_sum=3000, link__down_latency_sum=5000, link__up_delivered=1, link__down_delivered=2,
-        link__up_dropped=0.1,
-        link__down_dropped=0.2, link__retried=0.3, link__late=0.4, serial__up_busy=600, serial__down_busy=700,
-        serial__overrun=1,
-        serial__no_room=2, serial__up_bad=3, serial__down_bad=4, station__unusable=0.5, station__malformed=0.6,
-        cpu__KALMAN=900,
-        cpu__APP=1.0, cpu__MEM=2.0, cpu__IDLE=5000,
-    )  # fmt: skip
+    counters = counted(link__up_latency_sum=3000, link__down_latency_sum=5000, link__up_delivered=1,
+        link__down_delivered=2, link__up_dropped=0.1, link__down_dropped=0.2, link__retried=0.3,
+        link__late=0.4, serial__up_busy=600, serial__down_busy=700, serial__overrun=1, serial__no_room=2,
+        serial__up_bad=3, serial__down_bad=4, station__unusable=0.5, station__malformed=0.6, cpu__KALMAN=900,
+        cpu__APP=1.0, cpu__MEM=2.0, cpu__IDLE=5000)  # fmt: skip
     counters["estimator.fused"] = np.minimum(np.arange(201) // 2, 95.0)  # the last in row 190
     constants = {name: np.full(201, value) for name, value in values.items()}
     times = {"t": 10_000.0 * np.arange(201), "supervisor.state": np.full(201, 2)}
@@ -239,15 +231,11 @@ def test_a_picture_shows_under_each_name_the_quantity_of_that_name_in_the_label_
         assert all(len(line.times) == len(line.values) for line in one.series)
         assert all(line.times[-1] == pytest.approx(1.0) for line in one.series)
     if picture.title == "Age":
-        assert plot.panels[1].series[0].values[-3:].tolist() == [10.0, 90.0, 100.0], (
-            "the longest of each tenth of a second"
-        )
+        assert plot.panels[1].series[0].values[-3:].tolist() == [10.0, 90.0,
+            100.0], ("the longest of each tenth of a second")  # fmt: skip
     limits = {one.label: one.limits for one in plot.panels if one.limits}
-    assert limits == (
-        {"position error [cm]": (-6, 6), "attitude error [deg]": (-20, 20)}
-        if picture.title == "Errors"
-        else {}
-    )
+    assert limits == ({"position error [cm]": (-6, 6), "attitude error [deg]": (-20,
+        20)} if picture.title == "Errors" else {})  # fmt: skip
     assert {one.label for one in plot.panels if one.stacked} == (
         {"processor [%]"} if picture.title == "Board" else set()
     )
@@ -263,18 +251,15 @@ def test_a_course_has_place_and_yaw_beside_their_goals_from_the_first_goal_and_a
         log.schema.metadata | {b"request": json.dumps({"faults": ["push.y@0.3:0.1=2"]}).encode()}
     )
     place, turn = figures.course(log).panels
-    assert {line.name: (line.values[-1], line.dashed) for line in place.series} == {
-        "x": (pytest.approx(-19), False), "goal x": (pytest.approx(30), True), "y": (pytest.approx(2), False),
-        "goal y": (0.0, True), "z": (pytest.approx(3), False), "goal z": (0.0, True),
-    }  # fmt: skip
-    assert [(line.name, line.values[-1], line.dashed) for line in turn.series] == [
-        ("yaw", pytest.approx(0), False), ("goal", pytest.approx(np.degrees(1.0)), True),
-    ]  # fmt: skip
+    assert {line.name: (line.values[-1], line.dashed) for line in place.series} == {"x": (pytest.approx(-19),
+        False), "goal x": (pytest.approx(30), True), "y": (pytest.approx(2), False), "goal y": (0.0, True),
+        "z": (pytest.approx(3), False), "goal z": (0.0, True)}  # fmt: skip
+    assert [(line.name, line.values[-1], line.dashed) for line in turn.series] == [("yaw", pytest.approx(0),
+        False), ("goal", pytest.approx(np.degrees(1.0)), True)]  # fmt: skip
     course = figures.course_of(log)
     assert (course.box, len(course.flown)) == (10.0, 150)
-    assert np.flatnonzero(course.troubled).tolist() == list(range(79, 90)), (
-        "0.3 to 0.4 s after row 100, from row 51 on"
-    )
+    assert np.flatnonzero(course.troubled).tolist() == list(range(79,
+        90)), ("0.3 to 0.4 s after row 100, from row 51 on")  # fmt: skip
     assert figures.goal_moves(log)
     assert not figures.goal_moves(log.slice(0, 52))
 
@@ -283,8 +268,7 @@ def test_a_latency_budget_stacks_the_stages_that_were_reported() -> None:
     ages = pa.table({"t": [1_020_000.0]} | {name: [float(n)] for n, name in enumerate(STAGES, 1)})
     ages = ages.replace_schema_metadata({"release_us": "1000000"})
     (panel,) = figures.latency_budget(ages).panels
-    assert [(line.name, line.values.tolist(), line.times.tolist()) for line in panel.series] == [
-        (name, [value], [pytest.approx(0.02)]) for name, value in (("camera", 1), ("processing", 2), ("network", 3),
-        ("station", 5), ("link", 6))
-    ]  # fmt: skip
+    assert [(line.name, line.values.tolist(), line.times.tolist()) for line in panel.series] == [(name,
+        [value], [pytest.approx(0.02)]) for name, value in (("camera", 1), ("processing", 2), ("network", 3),
+        ("station", 5), ("link", 6))]  # fmt: skip
     assert (panel.label, panel.stacked, panel.least) == ("age [ms]", True, 0.0)

@@ -10,6 +10,8 @@ from collections import Counter
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -39,6 +41,7 @@ from hil.pictures.viewer.layout import views_of
 from hil.pictures.viewer.plots import PLOTS, rates
 from hil.pictures.viewer.recording import RerunFlight, write_rrd, write_run_rrd
 from hil.pictures.viewer.scene import HIDDEN, METRES_PER_NEWTON, PUSH_SHOWN_US, SEEN
+from hil.pictures.viewer.swarm import write_swarm_rrd
 from hil.pictures.viewer.track import FROM_RELEASE, FROM_START, timeline_of
 from hil.world.config import GeometryConfig, NetConfig
 from hil.world.floaty.drawing import flap_axes, look_of, marker_places, stand_lines
@@ -394,3 +397,34 @@ def test_a_view_is_in_the_blueprint_when_the_log_has_its_curves(folder: Path) ->
     real = {path for _, path in views_of(real_log().schema)}
     assert {"position", "flaps", "age", "link/rate", "link/loss"} <= real
     assert not {"processor", "battery", "queue"} & real
+
+
+def test_robots_that_flew_together_are_in_one_recording_each_at_its_place_with_its_texts(
+    folder: Path, tmp_path: Path
+) -> None:
+    origins = ((1.0, 2.0, 3.0), (-4.0, 5.0, 6.0))
+    request = SimpleNamespace(title="two robots")
+    result: Any = SimpleNamespace(
+        folder=tmp_path, robots=[SimpleNamespace(folder=folder)] * 2, origins=origins, request=request
+    )
+    path = write_swarm_rrd(result)
+    assert (path, [one.name for one in tmp_path.iterdir()]) == (tmp_path / "flight.rrd", ["flight.rrd"])
+    found = [(chunk.entity_path, chunk.to_record_batch()) for chunk in RrdReader(path).stream()]
+    alone = rows_by_entity(write_run_rrd(folder))
+    counted = rows_by_entity(path)
+    texts = load_events(folder)
+    for number, origin in enumerate(origins, 1):
+        (place,) = [
+            batch
+            for entity, batch in found
+            if entity == f"/room/{number}/world" and "Transform3D:translation" in batch.schema.names
+        ]
+        assert place.column("Transform3D:translation").to_pylist() == [[list(origin)]]
+        (label,) = [batch for entity, batch in found if entity == f"/room/{number}/world/robot/number"]
+        assert label.column("Points3D:labels").to_pylist() == [[str(number)]]
+        assert counted[f"/room/{number}/world/robot"] == alone["/world/robot"]
+        told = [
+            text for entity, batch in found if entity.startswith(f"/room/{number}/text/")
+            for (text,) in batch.column("TextLog:text").to_pylist()
+        ]  # fmt: skip
+        assert sorted(told) == sorted(f"{number}: {one['source']}: {one['text']}" for one in texts)

@@ -1,18 +1,36 @@
 """Edges of the pytest plugin's choices and folders, without a flight."""
 
 import re
+from dataclasses import replace
+from math import nan
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
 import pytest
 
 from hil.board.imu import COS, SIN
 from hil.config import load_config
 from hil.laboratory.request import Options
+from hil.testing import baselines
+from hil.testing.baselines import POSE, Pinned
 from hil.testing.board import BareBoard
-from hil.testing.choices import name_of
-from hil.testing.flights import NAME_MAX, SHOWN, Item, folder_of, shown_of
+from hil.testing.choices import name_of, why_not
+from hil.testing.flights import (
+    NAME_MAX,
+    PICTURE,
+    SHOWN,
+    Flights,
+    Flown,
+    Item,
+    folder_of,
+    properties_of,
+    shown_of,
+    text_of,
+    without_deleted,
+)
 from hil.testing.strategies import _round_step
 from support.choices import choice
 
@@ -80,3 +98,124 @@ def test_an_expectation_goes_no_further_than_it_may() -> None:
     with pytest.raises(AssertionError, match=r"not printed within 2\.5 ms"):
         board.expect("never", within_ms=2.5)
     assert board.now_us == 2_500
+
+
+def flown(number: int, folder: Path, outcome: str = "completed", cause: str = "", **more: Any) -> Any:
+    """A flight of a test, in a folder of its own."""
+    bench = SimpleNamespace(board="c", link="radio", is_image=more.pop("is_image", False), in_lockstep=True)
+    request = SimpleNamespace(experiment=SimpleNamespace(name="hover"), seed=number + 4, profile="floaty", bench=bench,
+    faults=("push.y@1=2",), duration_s=2.5)  # fmt: skip
+    result = SimpleNamespace(outcome=outcome, cause=cause, failed=("max_x: 9 cm",), stood_still_ms=more.pop("still",
+    0.0), failures=(), own_metrics={})  # fmt: skip
+    run = SimpleNamespace(folder=folder / str(number), result=result, hash=f"{number}" * 8, outcome=outcome,
+        metrics={"rms_x": 0.25, "rise": nan, "flown": 2.0}, unit_of=lambda name: "m" * (name == "rms_x"))  # fmt: skip
+    return Flown(number, request, run)  # type: ignore[arg-type]
+
+
+def test_a_failed_test_tells_each_shown_flight_whole_relative_to_the_root(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "hil.testing.flights.command_of",
+        lambda request: "" if request.seed == 5 else f"floaty fly hover --seed {request.seed}",
+    )
+    item = Item("test_it[a]", tmp_path, tmp_path / "runs", {})
+    item.flown += [flown(1, tmp_path / "runs", still=12.4), flown(2, tmp_path / "runs", "lost", "fell",
+        is_image=True), flown(3, tmp_path / "runs", is_image=True)]  # fmt: skip
+    (tmp_path / "runs/2").mkdir(parents=True)
+    (tmp_path / "runs/2" / PICTURE).touch()
+    lines = text_of(item, True, "--floaty-seeds=2 ", tmp_path).splitlines()
+    middle = ["  limit    max_x: 9 cm", "  fault    push.y@1=2"]
+    texts = [
+        ["hover, seed 5, board c, profile floaty, radio: completed", *middle, "  folder   runs/1",
+         "  machine  was too slow: time stood still for 12 ms", "  again    pytest --floaty-seeds=2 'test_it[a]'"],
+        ["hover, seed 6, board c, profile floaty, radio: lost: fell", *middle, "  folder   runs/2",
+        f"  picture  runs/2/{PICTURE}",
+         "  again    floaty fly hover --seed 6", "  debug    floaty debug runs/2"],
+        ["hover, seed 7, board c, profile floaty, radio: completed", *middle, "  folder   runs/3",
+         "  again    floaty fly hover --seed 7", "  debug    floaty debug runs/3 --at 2.5"],
+    ]  # fmt: skip
+    assert lines == [line for text in texts for line in text]
+    dropped = text_of(item, False, "", tmp_path).splitlines()
+    assert not any(line.startswith(("  folder", "  debug")) for line in dropped)
+    item.flown.append(flown(4, tmp_path / "runs"))
+    last = text_of(item, True, "", tmp_path).splitlines()
+    assert (last[0], last[-1]) == (texts[0][0].replace("seed 5", "seed 8"),
+        "(3 flights before that are not shown)")  # fmt: skip
+    assert dict(properties_of(item, True, tmp_path)) == {"floaty.hash": "44444444",
+        "floaty.outcome": "completed", "floaty.folder": "runs/4", "floaty.again": "floaty fly hover --seed 8",
+        "floaty.rms_x [m]": "0.25", "floaty.flown": "2"}  # fmt: skip
+    item.flown[2:] = []
+    assert [name for name, _ in properties_of(item, False, tmp_path)] == [f"floaty.{n}.{name}" for n in (1,
+        2) for name in ("hash", "outcome", "again", "rms_x [m]", "flown")]  # fmt: skip
+    text = f"<Run a; {tmp_path}/runs/1> <Run b; {tmp_path}/runs/2>"
+    assert without_deleted(item, True, text) == text
+    assert without_deleted(item, False, text) == "<Run a> <Run b>"
+
+
+def test_a_baseline_reads_back_as_it_was_written_a_row_of_the_path_on_each_line(tmp_path: Path) -> None:
+    path = ((0.0, 1.0, 2.0), (0.1, 3.0, 4.5))
+    pinned = (Pinned("hover, seed 1", "completed", "ab", {"rms_x": 0.5}, path),
+        Pinned("yaw", "lost", "cd", {}))  # fmt: skip
+    file = tmp_path / "baselines" / "x.json"
+    baselines.write(file, pinned)
+    assert baselines.read(file) == pinned
+    lines = file.read_text().splitlines()
+    assert [line for line in lines if line.startswith("  [")] == ["  [0.0, 1.0, 2.0],", "  [0.1, 3.0, 4.5]"]
+    assert baselines.file_of(tmp_path, "x") == file
+
+
+def test_what_left_a_baseline_is_told_whole_and_the_first_row_that_differs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The metrics: max_y by a tenth, rms_x by less than what is allowed; the path differs in y of its second row."""
+    row = tuple(map(float, range(8)))
+    moved = (*row[:2], 7.5, *row[3:])
+    kept = Pinned("hover", "completed", "a", {"max_y": 0.1, "rms_x": 0.02, "flown": 2.0}, (row, row))
+    now = Pinned("hover", "completed", "b", {"max_y": 0.11, "rms_x": 0.0201, "flown": 2.0}, (row, moved))
+
+    def told(after: Pinned, rel: float = 0.05, metrics: tuple[str, ...] = ()) -> list[str]:
+        monkeypatch.setattr(Pinned, "of", lambda run: after)
+        run: Any = SimpleNamespace(result=SimpleNamespace(own_metrics={}))
+        return baselines.difference(kept, run, rel, metrics)
+
+    table = ["  metric  baseline   now  difference  unit", "  rms_x          2  2.01        0.01  cm",
+        "  max_y         10    11           1  cm", "1 metrics are equal."]  # fmt: skip
+    assert told(now)[0] == "hover, left by more than 5 %: max_y"
+    assert sorted(told(now)[1:5]) == sorted(table)
+    assert told(now)[-1] == "first difference: row at 0.00 s from the release, truth.y: 2.0 | 7.5"
+    assert told(now, 0.2) == told(now, 0.05, ("rms_x",)) == []
+    lost = replace(now, outcome="lost", path=kept.path[:1])
+    assert told(lost, 0.2)[:2] == ["hover", "outcome: completed | lost"]
+    assert told(lost, 0.2)[-1] == "the rows are equal; the last is at 0.00 s | 0.00 s"
+    assert told(replace(lost, path=kept.path), 0.2)[-1] == "1 metrics are equal."
+
+
+@pytest.mark.parametrize(("rows", "apart"), [(5, 10), (1000, 10), (1001, 20), (2500, 30)])
+def test_a_pinned_path_has_at_most_a_hundred_rows_in_seconds_from_its_first(rows: int, apart: int) -> None:
+    columns = {name: np.arange(rows) + n for n, name in enumerate(POSE)}
+    table = pa.table({"t": 5_000_000 + 10_000 * np.arange(rows)} | columns)
+    path = baselines._path_of(SimpleNamespace(free=table))  # type: ignore[arg-type]
+    assert [row[1] for row in path] == list(range(0, rows, apart))
+    assert [row[0] for row in path] == pytest.approx([0.01 * n for n in range(0, rows, apart)])
+    assert path[0][1:] == tuple(range(7))
+    assert baselines._path_of(SimpleNamespace(free=table.slice(0, 0))) == ()  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("changes", "name"), [({}, []), ({"link": "mavlink"}, ["mavlink"]),
+    ({"link": "udp://1:2"}, ["udp"]), ({"profile": "a/mine.toml"}, ["mine"]), ({"seed": 3}, ["seed3"]),
+    ({"faults": ("push.y@1=2",), "profile": "lqr", "link": "mavlink", "seed": 2, "board": "python"},
+    ["push.y-1-2", "lqr", "mavlink", "seed2"])])  # fmt: skip
+def test_an_unusual_choice_has_a_baseline_of_its_own_and_a_board_has_none(
+    changes: dict[str, Any], name: list[str], tmp_path: Path
+) -> None:
+    usual: Any = {"seed": 1, "board": "c", "profile": "floaty", "link": "radio"}
+    assert Flights(tmp_path, tmp_path)._unusual(usual | changes) == name
+
+
+def test_a_flight_over_mavlink_needs_its_package_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    over: Options = {**choice(), "link": "mavlink"}
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
+    assert why_not(over, ()) == why_not(choice(), ()) == ""
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert (why_not(over, ()), why_not(choice(), ())) == ("link mavlink: pymavlink is not installed", "")

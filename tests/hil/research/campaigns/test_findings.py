@@ -1,10 +1,13 @@
 """Edges of a campaign: its end, the flights with a fault, the worst and lost flights, how a figure is ranked."""
 
+import errno
 import json
+import os
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from hypothesis import strategies as st
 from SALib.analyze import pawn as pawn_of_salib
 from scipy.stats import bootstrap
 
+from hil.errors import LabError
 from hil.laboratory.metrics import METRICS
 from hil.research.campaigns import report
 from hil.research.campaigns.config import Distribution
@@ -28,7 +32,7 @@ from hil.research.campaigns.findings import (
     pawn,
     slices,
 )
-from hil.research.campaigns.jobs import Row, failed
+from hil.research.campaigns.jobs import Row, failed, row_of
 from hil.research.campaigns.report import write_report
 from hil.research.campaigns.run import STOP_FROM, Progress, Tally, interval
 from hil.research.campaigns.sampling import (
@@ -382,3 +386,25 @@ def test_an_index_whose_interval_is_too_wide_is_not_ranked() -> None:
     assert (found.ranked, found.unknown) == ([("c", -0.9), ("b", 0.4)], ["a"])
     assert found.text("b") == "b 0.4 ± 0.1"
     assert Influence("x", "", {"a": 1.0}, None, {"a": np.nan}, 1.0).unknown == ["a"]
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
+def test_any_kind_of_full_disk_ends_a_campaign_and_another_error_is_a_row(number: int) -> None:
+    job, cause = draw(spec_of(), 3), f"OSError: {os.strerror(number)}: x"
+
+    def ended(outcome: str, cause: str | None) -> Any:
+        verdicts = (
+            SimpleNamespace(metric="a", holds=True, applies=True),
+            SimpleNamespace(metric="b", holds=False, applies=False),
+        )
+        return SimpleNamespace(
+            outcome=outcome, cause=cause, verdicts=verdicts, hash="h", passed=False, metrics={"x": 1.0}
+        )
+
+    with pytest.raises(LabError, match=rf"^flight 3: .*: OSError: {os.strerror(number)}: x$"):
+        row_of(job, ended("error", cause))
+    assert row_of(job, ended("error", "broken")) == Row(
+        job, "error", "broken", False, "", {"x": 1.0}, {"a": True}
+    )
+    assert row_of(job, ended("lost", cause)) == Row(job, "lost", cause, False, "h", {"x": 1.0}, {"a": True})
+    assert row_of(job, ended("completed", None)).error == ""

@@ -45,12 +45,8 @@ LAWS = tuple(  # each exactly its power of its cause
 def angles(yaw: float = -1.0, pitch: float = 1.0) -> HoverAngles:
     """Constants that change by one per step; criteria with one best, and those within 5 % beside it."""
     steps = np.arange(float(N))
-    constants = {
-        "yaw": 90.0 + yaw * steps,
-        "roll": 2.0 + steps,
-        "pitch": pitch * (steps - 10.5),
-        "lift": 3.0 + steps,
-    }
+    constants = {"yaw": 90.0 + yaw * steps, "roll": 2.0 + steps, "pitch": pitch * (steps - 10.5),
+        "lift": 3.0 + steps}  # fmt: skip
     curves = {}
     for name, best in (("a", 20), ("b", 32)):  # 20 and 26 degrees
         curves[name] = np.full(N, 0.5)
@@ -68,9 +64,8 @@ def test_each_claim_has_the_robot_s_value_and_its_verdict(point: Point, stable: 
     """Floaty agrees; with flat flaps and the centre of mass in their plane it falls over, and other sweeps contradict."""
     robot = point if stable else flat_high(point)
     crossing = radians(33.7 if stable else 1.0)
-    sweep = Stability(
-        np.zeros((len(HEIGHTS), len(KINKS))), np.zeros(len(KINKS)), np.zeros((len(KINKS), 3)), crossing
-    )
+    sweep = Stability(np.zeros((len(HEIGHTS), len(KINKS))), np.zeros(len(KINKS)), np.zeros((len(KINKS), 3)),
+        crossing)  # fmt: skip
     swept = angles() if stable else angles(yaw=1.0, pitch=-1.0)
     found = claims(robot, sweep, swept, LAWS, 1e-10 if stable else 1e-9)
     told = {one.title: (one.ours, one.verdict) for one in found}
@@ -100,10 +95,8 @@ def test_each_claim_has_the_robot_s_value_and_its_verdict(point: Point, stable: 
         abs(f.y_u1) < 0.01 and abs(f.x_u2) < 0.01),
     }  # fmt: skip
     for name, (value, error) in PAPER_TABLE.items():
-        expected[name.replace("_", " per ")] = (
-            f"{getattr(f, name):.4g}",
-            abs(getattr(f, name) - value) <= error,
-        )
+        expected[name.replace("_", " per ")] = (f"{getattr(f, name):.4g}",
+            abs(getattr(f, name) - value) <= error)  # fmt: skip
     for title, (ours, holds) in expected.items():
         assert told.pop(title) == (ours, by[holds]), title
     assert {name: verdict for name, (_, verdict) in told.items()} == {
@@ -120,9 +113,8 @@ def test_each_claim_has_the_robot_s_value_and_its_verdict(point: Point, stable: 
 
 def test_a_robot_is_described_in_the_units_of_its_words(point: Point) -> None:
     lines, weight = dict(robot_lines(point)), weigh(point.geometry)
-    low, high = (
-        replace(point, opening=one).speed for one in (point.low + radians(8), point.high - radians(8))
-    )
+    low, high = (replace(point, opening=one).speed for one in (point.low + radians(8),
+        point.high - radians(8)))  # fmt: skip
     assert lines == {
         "mass, centre of mass below the flaps": f"{weight.mass:.3f} kg, {weight.axis_height * 100:.1f} cm",
         "inertia about x, y, z": ", ".join(f"{one * 1000:.3f}" for one in weight.inertia) + " g m²",
@@ -134,25 +126,16 @@ def test_a_robot_is_described_in_the_units_of_its_words(point: Point) -> None:
 
 def test_pictures_of_a_design_show_their_sweeps_by_name(point: Point) -> None:
     rng = np.random.default_rng(1)
-    sweep = Stability(
-        rng.normal(size=(len(HEIGHTS), len(KINKS))),
-        rng.normal(size=len(KINKS)),
-        rng.normal(size=(len(KINKS), 3)) + 1j,
-        0.5,
-    )
+    sweep = Stability(rng.normal(size=(len(HEIGHTS), len(KINKS))), rng.normal(size=len(KINKS)),
+        rng.normal(size=(len(KINKS), 3)) + 1j, 0.5)  # fmt: skip
     left, middle, right, _ = figures.stability(point, sweep).axes
-    kinks, own, height = (
-        np.degrees(KINKS),
-        degrees(point.geometry.kink_angle),
-        100 * weigh(point.geometry).axis_height,
-    )
+    kinks, own, height = (np.degrees(KINKS), degrees(point.geometry.kink_angle),
+        100 * weigh(point.geometry).axis_height)  # fmt: skip
     assert [tuple(line.get_xydata()[0]) for line in left.lines] == [pytest.approx((own, height)), (0.0, 0.0)]
     assert middle.lines[0].get_xydata() == pytest.approx(np.c_[kinks, sweep.along])
     assert [line.get_xdata()[0] for line in (middle.lines[2], right.lines[-1])] == [own, own]
-    assert (middle.lines[3].get_xydata().tolist(), middle.texts[0].get_text()) == (
-        [[degrees(0.5), 0.0]],
-        "28.6°",
-    )
+    assert (middle.lines[3].get_xydata().tolist(), middle.texts[0].get_text()) == ([[degrees(0.5), 0.0]],
+        "28.6°")  # fmt: skip
     poles = [part[:, index] for index in range(3) for part in (sweep.poles.real, sweep.poles.imag)]
     assert [line.get_ydata() for line in right.lines[:6]] == [pytest.approx(one) for one in poles]
     assert [to_hex(line.get_color()) for line in right.lines[:6]] == [BLUE, ORANGE] * 3
@@ -165,10 +148,8 @@ def test_pictures_of_a_design_show_their_sweeps_by_name(point: Point) -> None:
         assert shown.get_xydata() == pytest.approx(np.c_[np.degrees(OPENINGS), values / max(abs(values))])
         assert to_hex(shown.get_color()) == colour
     assert [line.get_label() for line in right.lines[::2][:2]] == ["a: 20.0°", "b: 26.0°"]
-    assert [line.get_xydata().tolist() for line in right.lines[1:4:2]] == [
-        [[pytest.approx(20.0), 1.0]],
-        [[pytest.approx(26.0), 1.0]],
-    ]
+    assert [line.get_xydata().tolist() for line in right.lines[1:4:2]] == [[[pytest.approx(20.0), 1.0]],
+        [[pytest.approx(26.0), 1.0]]]  # fmt: skip
     assert right.lines[2].get_ydata() == pytest.approx(swept.criteria["b"])
     cube = np.array(np.meshgrid(*[(-n, n) for n in (1.0, 2.0, 3.0, 4.0)])).reshape(4, -1).T
     reached = figures.reach(point, Attainable(cube, 0.5 * cube))
@@ -191,15 +172,10 @@ def test_pictures_of_a_design_show_their_sweeps_by_name(point: Point) -> None:
     assert [line.get_ydata()[2] for line in scaled["m / l², relative"].lines] == [1.0]
     tried, front = np.array([(1.0, 5.0), (2.0, 4.0), (3.0, 1.0)]), np.array([(1.0, 5.0), (3.0, 1.0)])
     (axes,) = figures.pareto(("across", "up"), tried, front, {"floaty": (2.0, 4.0), "best": (3.0, 1.0)}).axes
-    assert [(line.get_label(), to_hex(line.get_color())) for line in axes.lines] == [
-        ("tried", GREY), ("Pareto front", BLUE), ("floaty", RED), ("best", SERIES_COLOURS[2]),
-    ]  # fmt: skip
-    assert [line.get_xydata().tolist() for line in axes.lines] == [
-        tried.tolist(),
-        front.tolist(),
-        [[2.0, 4.0]],
-        [[3.0, 1.0]],
-    ]
+    assert [(line.get_label(), to_hex(line.get_color())) for line in axes.lines] == [("tried", GREY),
+        ("Pareto front", BLUE), ("floaty", RED), ("best", SERIES_COLOURS[2])]  # fmt: skip
+    assert [line.get_xydata().tolist() for line in axes.lines] == [tried.tolist(), front.tolist(),
+        [[2.0, 4.0]], [[3.0, 1.0]]]  # fmt: skip
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("across", "up")
 
 
@@ -212,10 +188,7 @@ def test_a_robot_is_drawn_in_centimetres_with_y_to_the_left_of_x(point: Point) -
     assert (above.get_xlabel(), above.get_ylabel(), above.get_title()) == ("y [cm]", "x [cm]", "from above")
     height = 100 * weigh(point.geometry).axis_height
     for axes, name, limits in ((along_x, "y", (13.8, -13.8)), (along_y, "x", (-13.8, 13.8))):
-        assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_xlim()) == (
-            f"{name} [cm]",
-            "z [cm]",
-            pytest.approx(limits),
-        )
+        assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_xlim()) == (f"{name} [cm]", "z [cm]",
+            pytest.approx(limits))  # fmt: skip
         assert axes.lines[0].get_xydata() == pytest.approx(np.array([(0, 0), (0, height)]))
         assert axes.lines[1].get_xydata().tolist() == [[0.0, 0.0]]

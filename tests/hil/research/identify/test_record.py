@@ -539,36 +539,29 @@ def test_the_pictures_of_an_axis_show_measured_and_fitted_response_over_frequenc
     assert fit.get_xydata()[[0, -1]] == pytest.approx(np.c_[hertz, np.abs(model[:, 0])][[0, -1]])
     fit, measured = phase.lines
     assert measured.get_ydata()[[0, -1]] == pytest.approx(fit.get_ydata()[[0, -1]] - 90.0)
-    assert (gain.get_ylabel(), phase.get_ylabel(), phase.get_xlabel()) == (
-        "roll rate per u1 [rad/s/rad]",
-        "phase [deg]",
-        "frequency [Hz]",
-    )
+    assert (gain.get_ylabel(), phase.get_ylabel(), phase.get_xlabel()) == ("roll rate per u1 [rad/s/rad]",
+        "phase [deg]", "frequency [Hz]")  # fmt: skip
     together = next(one for one in gain.figure.axes if one.get_ylabel().startswith("coherence"))
     assert together.lines[0].get_xydata() == pytest.approx(np.c_[hertz, [0.7, 0.8, 0.9]])
     left = whitened(seen, values, 0.0).reshape(2, 3, -1)[:, :, 0]
-    assert [line.get_xydata() for line in errors.lines] == [
-        pytest.approx(np.c_[hertz, part]) for part in left
-    ]
+    assert [line.get_xydata() for line in errors.lines] == [pytest.approx(np.c_[hertz,
+        part]) for part in left]  # fmt: skip
     _period(answer, seen, values)
     t = answer.lines[0].get_xdata()
     assert (t[0], t[-1], len(t)) == (0.0, spectra.PERIOD_S, 1001)
-    sums = [
-        (3.0 * amplitude * np.exp(1j * np.outer(t, w))).sum(axis=1).real
-        for amplitude in (Z[:, 1], model[:, 0])
-    ]
+    sums = [(3.0 * amplitude * np.exp(1j * np.outer(t, w))).sum(axis=1).real for amplitude in (Z[:, 1],
+        model[:, 0])]  # fmt: skip
     assert [line.get_ydata() for line in answer.lines] == [pytest.approx(one) for one in sums]
     assert [line.get_label() for line in answer.lines] == ["measured", "simulated from the input"]
     assert (answer.get_ylabel(), answer.get_xlim()) == ("roll rate [rad/s]", (0.0, 5.0))
 
 
 def test_the_picture_of_the_paper_s_equations_has_each_flight_s_bins_and_estimate() -> None:
-    records = [
-        replace(swinging(robot_of(CONFIG), hertz, 30.0), name=name)
-        for hertz, name in ((1.0, "a"), (2.0, "b"))
-    ]
+    records = [replace(swinging(robot_of(CONFIG), hertz, 30.0), name=name) for hertz,
+        name in ((1.0, "a"), (2.0, "b"))]  # fmt: skip
     for axes, record in zip(_identity(tuple(records)).axes, records, strict=True):
         loop = closed_loop(record, ROLL)
+        assert loop.w[:19] == pytest.approx(2 * np.pi * 0.25 * np.arange(1, 20)), "windows of 4 s"
         bins, line, estimate = axes.lines
         assert bins.get_xydata() == pytest.approx(np.c_[loop.w**2, (loop.acceleration / loop.angle).real])
         assert line.get_ydata() == pytest.approx(-line.get_xdata())
@@ -578,10 +571,8 @@ def test_the_picture_of_the_paper_s_equations_has_each_flight_s_bins_and_estimat
 
 
 def test_the_picture_of_one_step_has_its_error_after_the_filter_settled_and_a_window_in_the_middle() -> None:
-    record, values = (
-        swinging(robot_of(CONFIG), 0.8),
-        {**CONFIG.model.model_dump(), "lag": 0.05, "delay": 0.0145},
-    )
+    record, values = (swinging(robot_of(CONFIG), 0.8), {**CONFIG.model.model_dump(), "lag": 0.05,
+        "delay": 0.0145})  # fmt: skip
     axes, seen = Figure().subplots(), Excited(ROLL, 0, SimpleNamespace())  # type: ignore[arg-type]
     _one_step(axes, record, seen, values, 0.01)
     t, measured, predicted = one_step(record, 0, values, 0.01)
@@ -595,3 +586,11 @@ def test_the_picture_of_one_step_has_its_error_after_the_filter_settled_and_a_wi
     assert np.mean(axes.get_ylim()) == pytest.approx(inside.mean())
     assert np.ptp(axes.get_ylim()) == pytest.approx(1.3 * np.ptp(inside))
     assert axes.lines[1].get_label() == "predicted 20 ms before"
+
+
+@pytest.mark.parametrize(("hertz", "found"), [(0.05, [1]), (20.0, [400]), (20.05, [])])
+def test_lines_are_looked_for_up_to_four_fifths_of_half_the_rows_rate(hertz: float, found: list[int]) -> None:
+    record = excited(100.0)
+    record.excitation[:, 0] = np.cos(2 * np.pi * hertz * record.t + 0.3)
+    lines = spectra.excited_lines(record, [4.0])
+    assert [one.tolist() for one in lines] == [found, [], [], []]

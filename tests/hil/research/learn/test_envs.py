@@ -190,6 +190,29 @@ def test_observations_stay_within_their_space_however_wrong_the_estimate(many: b
     assert np.abs(found).max() == REACH.max(), "a bound was reached"
 
 
+def test_the_laboratory_rewards_the_truth_at_the_end_of_each_step() -> None:
+    """Distance, tilt and yaw of the goal at that instant, and the change of the limited action, by scipy's rotations."""
+    env = make_env("Hover", "firmware", duration_s=0.5)
+    assert isinstance(env, FirmwareEnv)
+    env.reset(seed=3)
+    before = np.zeros(4)
+    for action in actions(12, 0.5):
+        _, reward, *_ = env.step(action)
+        assert env.flight is not None
+        body, now_us = env.flight.robot.body, env.flight.now_us
+        env.flight.robot.advance_truth(now_us)  # changes nothing: it is there
+        goal, R = env.flight.line.trajectory.at(now_us), Rotation.from_quat(np.roll(body.q_WB, -1))
+        far, tilt = math.dist(body.p_WB, goal.p_WG), math.acos(R.as_matrix()[2, 2])
+        yaw = float(R.as_euler("ZYX")[0]) - goal.yaw
+        parts = [
+            weight / (1.0 + (x / scale) ** 2)
+            for weight, x, scale in ((0.6, far, 0.03), (0.2, tilt, 0.15), (0.2, yaw, 0.2))
+        ]
+        assert reward == pytest.approx(sum(parts) - 0.005 * ((action - before) ** 2).sum(), rel=1e-9)
+        before = np.array(action, float)
+    env.close()
+
+
 def test_the_laboratory_limits_actions_and_forgets_them_at_a_reset() -> None:
     limited, wild = (make_env("Hover", "firmware", duration_s=0.5) for _ in range(2))
     assert isinstance(wild, FirmwareEnv)

@@ -39,6 +39,7 @@ def test_every_flight_of_every_study_can_be_asked_for(study: Study) -> None:
 
 @pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
 def test_something_is_expected_of_every_variant_and_only_of_sizes_that_are_flown(study: Study) -> None:
+    assert [*study.sizes] in (up := sorted(set(study.sizes)), up[::-1]), "in an order"
     for variant in study.variants:
         said = set(dataclasses.astuple(variant.expected)) - {None}
         assert said, variant.name

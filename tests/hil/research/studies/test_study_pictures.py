@@ -41,17 +41,13 @@ def flight(
 
 
 def test_a_study_is_summed_up_by_variant_and_size_and_drawn_over_its_sizes() -> None:
-    variants = tuple(
-        Variant(name, lambda size: Options(), Expected(holds_to=0.5))
-        for name in ("first", "second", "unflown")
-    )
+    variants = tuple(Variant(name, lambda size: Options(), Expected(holds_to=0.5)) for name in ("first",
+        "second", "unflown"))  # fmt: skip
     study = Study("s", "q", "wind", "m/s", (0.0, 0.5, 2.0), variants)
-    flown = [
-        flight("second", 2.0, 9.0, "lost"), flight("first", 0.0, 1.0), flight("first", 0.5, 2.0, passed=False),
-        flight("first", 0.5, 4.0, failsafe=1.0),
-        flight("first", 0.5, 3.0, passed=False), flight("second", 0.0, 5.0), flight("second", 0.0, 9.0, "reset"),
-        flight("first", 2.0, 9.0, "error"),
-    ]  # fmt: skip
+    flown = [flight("second", 2.0, 9.0, "lost"), flight("first", 0.0, 1.0),
+        flight("first", 0.5, 2.0, passed=False), flight("first", 0.5, 4.0, failsafe=1.0),
+        flight("first", 0.5, 3.0, passed=False), flight("second", 0.0, 5.0),
+        flight("second", 0.0, 9.0, "reset"), flight("first", 2.0, 9.0, "error")]  # fmt: skip
     result = summarise(study, flown)
     root = 5.0**0.5  # of 1 and 2
     assert [[(cell.size, cell.outcomes, cell.errors) for cell in curve.cells] for curve in result.curves] == [
@@ -62,10 +58,8 @@ def test_a_study_is_summed_up_by_variant_and_size_and_drawn_over_its_sizes() -> 
     ]  # fmt: skip
     assert [curve.variant.name for curve in result.curves] == ["first", "second"]
     above, below = study_picture(result).axes
-    assert [(line.get_label(), to_hex(line.get_color())) for line in above.lines] == [
-        ("first", BLUE),
-        ("second", ORANGE),
-    ]
+    assert [(line.get_label(), to_hex(line.get_color())) for line in above.lines] == [("first", BLUE),
+        ("second", ORANGE)]  # fmt: skip
     assert above.lines[0].get_xydata() == pytest.approx(np.array([(0, root), (1, 3 * root)]))
     assert above.lines[1].get_xydata() == pytest.approx(np.array([(0, 5 * root)]))
     band = above.collections[0].get_paths()[0].vertices
@@ -87,10 +81,8 @@ def test_a_study_is_summed_up_by_variant_and_size_and_drawn_over_its_sizes() -> 
 def test_the_mounted_robot_s_table_and_picture_have_model_mean_and_deviation_of_each_quantity(
     tmp_path: Path,
 ) -> None:
-    rows = [
-        MountedRow("kinked", "u1", 10.0 * n, np.arange(6) + n, np.arange(6) + n + 0.5, np.full(6, 0.25 * n))
-        for n in (1, 2, 3)
-    ]
+    rows = [MountedRow("kinked", "u1", 10.0 * n, np.arange(6) + n, np.arange(6) + n + 0.5,
+        np.full(6, 0.25 * n)) for n in (1, 2, 3)]  # fmt: skip
     drag_model.write_csv(rows, tmp_path / "table.csv")
     header, *lines = csv.reader((tmp_path / "table.csv").read_text(encoding="utf-8").splitlines())
     assert header == [
@@ -111,17 +103,9 @@ def test_the_mounted_robot_s_table_and_picture_have_model_mean_and_deviation_of_
         assert axes.get_xlabel() == ("flap angle [deg]" if index > 2 else "")
 
 
-@pytest.mark.parametrize(
-    ("distance", "tilt", "yaw", "change", "reward"),
-    [
-        (0, 0, 0, 0, 1.0),
-        (0.03, 0, 0, 0, 0.7),
-        (0, 0.15, 0, 0, 0.9),
-        (0, 0, -0.2, 0, 0.9),
-        (0, 0, 0, 2.0, 0.99),
-        (0.06, 0.3, 0.4, 16.0, 0.12),
-    ],
-)
+@pytest.mark.parametrize(("distance", "tilt", "yaw", "change", "reward"),
+    [(0, 0, 0, 0, 1.0), (0.03, 0, 0, 0, 0.7), (0, 0.15, 0, 0, 0.9), (0, 0, -0.2, 0, 0.9),
+    (0, 0, 0, 2.0, 0.99), (0.06, 0.3, 0.4, 16.0, 0.12)])  # fmt: skip
 def test_a_reward_halves_its_parts_at_their_scales(
     distance: float, tilt: float, yaw: float, change: float, reward: float
 ) -> None:
@@ -137,11 +121,8 @@ def loop(states: list[float], u: float, size: float = 1e-6, radius: float = 0.9,
     """A loop that answers with these variances, open with an integrator's phase."""
     hertz = np.asarray(FREQUENCIES)
     L = size / (2j * np.pi * hertz) * np.exp(-2j * np.pi * hertz * late_s)
-    return Made(
-        radius=lambda gains: radius,
-        response_to=lambda flow, gains: (np.array(states), u),
-        open_loop=lambda gains: L,
-    )
+    return Made(radius=lambda gains: radius, response_to=lambda flow, gains: (np.array(states), u),
+        open_loop=lambda gains: L)  # fmt: skip
 
 
 def test_a_cost_is_motion_in_units_and_a_hundred_times_what_exceeds_each_condition() -> None:
@@ -159,15 +140,13 @@ def test_a_cost_is_motion_in_units_and_a_hundred_times_what_exceeds_each_conditi
     moved = np.add(states, [asked.offset(gains) ** 2, 0, 0, 0])
     spread = float(np.sqrt(moved[0]))
     far = 100 * max(0.0, tune.SIGMAS * spread / tune.BOX_M - 1.0)
-    by_hand = (
-        sum(v / tune.UNITS[state] ** 2 for v, state in zip(moved, names, strict=True)) + 1e-6 / allowed**2
-    )
+    by_hand = (sum(v / tune.UNITS[state] ** 2 for v, state in zip(moved, names,
+        strict=True)) + 1e-6 / allowed**2)  # fmt: skip
     assert calm == pytest.approx(by_hand + far)
     moving = motion(loop(states, 1e-6), asked, gains)
     assert (moving.main, moving.input) == pytest.approx((spread, 1e-3))
-    assert cost(loop(states, (1.5 * allowed) ** 2), asked, gains) - calm == pytest.approx(
-        50.0 + 2.25, rel=1e-3
-    )
+    assert cost(loop(states, (1.5 * allowed) ** 2), asked, gains) - calm == pytest.approx(50.0 + 2.25,
+        rel=1e-3)  # fmt: skip
     assert cost(loop(states, 1e-6, radius=1.0), asked, gains) == 2.0 * tune.TOO_MUCH
     gains[0] = small * 10.0  # twice the flaps
     near = np.add(states, [asked.offset(gains) ** 2, 0, 0, 0])
@@ -183,9 +162,8 @@ def test_a_cost_is_motion_in_units_and_a_hundred_times_what_exceeds_each_conditi
 
 
 def robots(*figures: tuple[float, float]) -> Any:
-    return tuple(
-        Made(stiffness=-stable, reached=lambda figure, value=value: value) for stable, value in figures
-    )
+    return tuple(Made(stiffness=-stable, reached=lambda figure, value=value: value) for stable,
+        value in figures)  # fmt: skip
 
 
 def test_a_front_has_the_robots_that_no_other_beats_in_both_the_most_stable_first() -> None:
