@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
+import pyarrow as pa
 import pytest
 from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.ioloop import IOLoop
@@ -129,3 +130,27 @@ def test_a_page_shows_only_the_newest_row(panel: PanelScreen, loop: IOLoop, tmp_
     assert message["state"]["goal"] == [0.0, 0.0, 1.15, 0.0]
     assert message["scene"].startswith("data:image/png;base64,")
     socket.close()
+
+
+def test_a_viewer_is_opened_once_when_it_is_asked_for_and_gets_the_rows_from_then_on(
+    panel: PanelScreen, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[object] = []
+    told: list[dict[str, object]] = []
+    viewer = SimpleNamespace(
+        address="http://viewer",
+        show_rows=lambda *what: shown.append(what),
+        close=lambda: shown.append("closed"),
+    )
+    monkeypatch.setattr("hil.live.panel.RerunScreen", lambda target: shown.append(target) or viewer)
+    monkeypatch.setattr(panel._server, "call", lambda call: told.append(call.args[0]))
+    rows, event = pa.table({"t": []}), {"t_us": 0, "source": "lab", "text": "x"}
+    panel.show_rows(rows, [event])
+    panel.wants_viewer = True
+    panel.show_rows(rows, iter([event]))
+    assert not panel.wants_viewer
+    panel.show_rows(rows, [])
+    assert shown == ["web", (rows, [event]), (rows, [])]
+    assert told == [{"texts": ["lab: x"]}, {"texts": ["lab: x"], "viewer": "http://viewer"}, {"texts": []}]
+    panel.close()
+    assert shown[-1] == "closed"
