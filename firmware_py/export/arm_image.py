@@ -16,7 +16,9 @@ SOURCES = Path(__file__).parent / "arm"
 TARGET_FLAGS = (
     "-target", "thumb-freestanding-eabihf", "-mcpu=cortex_m4+vfp4d16sp", "-std=c99", "-ffreestanding",
     "-ffp-contract=off", "-fno-math-errno", "-fno-sanitize=all", "-fno-stack-protector", "-fno-unwind-tables",
-    "-ffunction-sections", "-fdata-sections", "-g", "-static", "-nostdlib", "-w",  # own logic may compare n with n
+    "-ffunction-sections", "-fdata-sections", "-g", "-static", "-nostdlib",
+    "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Werror",
+    "-Wno-self-assign", "-Wno-tautological-compare",  # own logic may have x = x and n == n
 )  # fmt: skip
 
 
