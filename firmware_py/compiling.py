@@ -83,8 +83,12 @@ def bound_together(functions: Functions, *memory: Memory) -> list[Callable[..., 
         except (CompilerError, OSError) as error:
             fall_back(str(error))
     taken = [one.fields if isinstance(one, Block) else one for one in memory]
-    silent = np.errstate(all="ignore")  # C computes with infinities and NaN without a warning
-    return [partial(silent(function), *taken) for function in functions]
+    return [as_python(function, *taken) for function in functions]
+
+
+def as_python(function: Callable[..., Any], *taken: Any) -> Callable[..., Any]:
+    """Return the call of a kernel as plain Python: with infinities and NaN it computes without a warning, as C does."""
+    return partial(np.errstate(all="ignore")(function), *taken)
 
 
 def bound_in(library: Path, method: str, *arrays: NDArray[Any]) -> Callable[..., Any]:

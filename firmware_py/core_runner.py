@@ -9,10 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 
-import numpy as np
-
 from firmware_py import core, export, logic
-from firmware_py.compiling import PLAIN, SUFFIX, bound_in, fall_back, hash_of, kept_library
+from firmware_py.compiling import PLAIN, SUFFIX, as_python, bound_in, fall_back, hash_of, kept_library
 from firmware_py.config import CpuConfig
 from firmware_py.core import entry
 from firmware_py.core.structs import Control, Estimator, Input, Parameters, Report, Sampling, Supervisor
@@ -127,14 +125,13 @@ class PlainRunner:
     def __init__(self, blocks: CoreBlocks) -> None:
         module = entry if blocks.logic is None else blocks.logic.loaded.entry
         self._calls = {
-            name: partial(getattr(module, name), *(blocks.named[block].fields for block in taken))
+            name: as_python(getattr(module, name), *(blocks.named[block].fields for block in taken))
             for name, taken in blocks.calls.items()
         }
 
     def call(self, name: str) -> int:
         """Execute an entry point."""
-        with np.errstate(all="ignore"):  # the comparison deals with infinities and NaN
-            return int(self._calls[name]() or 0)
+        return int(self._calls[name]() or 0)
 
 
 def default_runner(blocks: CoreBlocks) -> CoreRunner:
