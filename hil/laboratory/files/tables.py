@@ -8,7 +8,6 @@ import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from io import BytesIO
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -75,32 +74,34 @@ def _csv(path: Path, content: bytes) -> Table:
 
     A few lines that are cut off or torn are left out. Names may end with the units in brackets.
     """
-    text = _decoded(content).lstrip()
-    lines = text.splitlines()
-    remarks = sum(1 for _ in takewhile(lambda line: line.startswith("#"), lines))
-    if "\0" in text or len(lines) < remarks + 2:
+    text, remark = _decoded(content).lstrip().replace("\r\n", "\n").replace("\r", "\n"), ""
+    while text.startswith("#"):
+        remark, _, text = text.partition("\n")
+    if remark and NUMBER.match(text):
+        text = f"{remark}\n{text}".lstrip("# \t")
+    names, _, rows = text.partition("\n")
+    if "\0" in text or not rows:
         raise LabError(f"{path}: expected {FORMATS}")
-    if remarks and NUMBER.match(lines[remarks]):
-        remarks -= 1
-    names, first = lines[remarks].lstrip("# \t"), lines[remarks + 1]
+    first = rows.partition("\n")[0]
     delimiter = max((",", ";", "\t"), key=names.count)
     comma = delimiter != "," and "," in first and "." not in first  # of German and French numbers
     torn: list[str] = []
 
     def leave_out(row: pa.csv.InvalidRow) -> str:
-        torn.append(f"expected {row.expected_columns} columns, got {row.actual_columns}: {row.text}")
+        torn.append(f"a row, expected {row.expected_columns} columns, got {row.actual_columns}: {row.text}")
         return "skip"
 
-    body = "\n".join((names, *lines[remarks + 1 :], "")).encode()
     with refusing(f"{path}: expected {FORMATS}: ", *ARROW):
         table = pa.csv.read_csv(
-            pa.BufferReader(body),
+            pa.BufferReader(text.encode()),
             read_options=pa.csv.ReadOptions(use_threads=False),  # `leave_out` counts
             parse_options=pa.csv.ParseOptions(delimiter=delimiter, invalid_row_handler=leave_out),
             convert_options=pa.csv.ConvertOptions(decimal_point="," if comma else ".", null_values=NO_VALUE),
         )
     if len(torn) > 1 + TORN * table.num_rows:
-        raise LabError(f"{path}: {len(torn)} of {len(torn) + table.num_rows} rows are torn: {torn[0]}")
+        raise LabError(
+            f"{path}: {len(torn)} of {len(torn) + table.num_rows} rows are torn: {torn[0].removeprefix('a row, ')}"
+        )
     for index, name in enumerate(table.column_names):
         if pa.types.is_string(table.column(index).type):
             numbers = _mostly_numbers(table.column(index).to_pylist(), comma)
@@ -109,10 +110,7 @@ def _csv(path: Path, content: bytes) -> Table:
                 torn += [f"{name.strip()}: no number: {one!r}" for one in wrong]
                 table = table.set_column(index, name, pa.array(values))
     found = _numbers(path, table)
-    notes = [
-        f"left out: a row, {one}" if one.startswith("expected") else f"left out: {one}"
-        for one in torn[:SHOWN]
-    ]
+    notes = [f"left out: {one}" for one in torn[:SHOWN]]
     notes += [f"left out: {len(torn) - SHOWN} more"] if len(torn) > SHOWN else []
     return replace(found, notes=tuple(notes))
 
