@@ -49,7 +49,7 @@ def printed(capsys: pytest.CaptureFixture[str]) -> Any:
 
 
 def row(seed: int, factor: float, outcome: str = "completed", error: str = "", **holds: bool) -> Row:
-    """A flight in which every figure of the tables has a value of its own."""
+    """Return a flight with a different value for every number of the tables."""
     names = [name for _, group, _, _ in tables.SEED_COLUMNS for name in group]
     metrics = {name: 0.01 * factor * n for n, name in enumerate(names, 1)} | {"attitude_max": radians(factor)}
     job = Job(0, "hover", {"profile": "floaty", "seed": seed}, {})

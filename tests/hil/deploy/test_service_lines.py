@@ -17,7 +17,7 @@ from hil.deploy.services import LINES, POSES, TRAJECTORIES, Answers, differences
 
 
 class Bench:
-    """Takes down what is sent and lets no time pass; answers what it was told to."""
+    """Records the packets that are sent, returns prepared answers, and lets no time pass."""
 
     def __init__(self, *answers: bytes | None) -> None:
         self.sent: list[tuple[int, int, bytes]] = []

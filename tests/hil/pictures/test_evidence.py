@@ -52,7 +52,7 @@ def test_a_motor_whose_command_is_at_the_top_is_named() -> None:
 
 
 def flown_log() -> pa.Table:
-    """Two seconds in a wind, released at 1 s; each row of what follows has an effect of its own."""
+    """Return a log of two seconds in a wind, released at 1 s; each fault below has a different effect in it."""
     count, row = 301, np.arange(301)
     values: dict[str, np.ndarray] = {"t": 10_000.0 * row, "flight.free": (row >= 100).astype(float)}
     values |= dict.fromkeys([f"{group}.{name}" for group in ("truth", "goal", "estimate") for name in ("x",

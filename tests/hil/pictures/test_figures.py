@@ -159,7 +159,7 @@ def counted(**per_row: float) -> dict[str, NDArray[np.float64]]:
 
 
 def known_log() -> pa.Table:
-    """Two seconds of a robot whose every column has a value of its own; it is released after 1 s, counters grow by row."""
+    """Return a log of two seconds with a different value in every column; released after 1 s, counters grow by row."""
     values = {**{f"truth.{axis}": 0.01 * n for n, axis in enumerate("xyz", 1)}, "truth.qw": 1.0,
         **dict.fromkeys(("truth.qx", "truth.qy", "truth.qz"), 0.0), **{f"estimate.{name}": 0.1 * n for n,
         name in enumerate("xyz", 1)}, **{f"replay.{name}": 0.2 * n for n, name in enumerate("xyz", 1)},

@@ -101,7 +101,7 @@ def test_an_expectation_goes_no_further_than_it_may() -> None:
 
 
 def flown(number: int, folder: Path, outcome: str = "completed", cause: str = "", **more: Any) -> Any:
-    """A flight of a test, in a folder of its own."""
+    """Return a flight of a test, with its own folder."""
     bench = SimpleNamespace(board="c", link="radio", is_image=more.pop("is_image", False), in_lockstep=True)
     request = SimpleNamespace(experiment=SimpleNamespace(name="hover"), seed=number + 4, profile="floaty", bench=bench,
     faults=("push.y@1=2",), duration_s=2.5)  # fmt: skip

@@ -107,7 +107,7 @@ def test_lines_are_those_of_binutils() -> None:
 
 @pytest.mark.parametrize("compiler", ["clang", "gcc"])
 def test_a_line_has_its_first_address_also_in_units_of_many_pieces(compiler: str) -> None:
-    """Each function is a piece of its own; the rows of code are those of the coverage, which gcov confirms."""
+    """With a section for each function, lines of code are those that coverage counts, as gcov confirms."""
     debug = Image(stm32_firmware.build(compiler, ("-g", "-ffunction-sections"))).debug
     first: dict[str, int] = {}
     for row in debug.rows:

@@ -23,7 +23,7 @@ WIDE = [
 
 
 def read(first: int, second: int = 0, at: int = 0) -> tuple[str, str]:
-    """Return mnemonic and operands; empty for what is no instruction."""
+    """Return mnemonic and operands, or an empty text if the bytes are not an instruction."""
     one = next(READER.disasm(pack("<2H", first, second), at), None)
     return (one.mnemonic.removesuffix(".w"), one.op_str) if one is not None else ("", "")
 
