@@ -1,8 +1,9 @@
 """An operator's requests over CRTP, sans I/O: the parameter, platform and supervisor ports of a Crazyflie."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
+from typing import Any, NamedTuple
 
 from firmware_py.table import OF_PROFILE
 from firmware_py.wire import crtp, parameters, supervisor
@@ -19,6 +20,24 @@ from ground_station.controls import (
 )
 
 PORTS = (crtp.PORT_PARAMETERS, crtp.PORT_PLATFORM, crtp.PORT_SUPERVISOR)  # whose packets `receive` takes
+
+
+class CommandPort(NamedTuple):
+    """Where a board takes requests to arm and to recover, and what its replies add to them."""
+
+    number: int
+    channel: int
+    arm: int
+    recover: int
+    reply: int
+
+
+OF_PLATFORM = CommandPort(
+    crtp.PORT_PLATFORM, supervisor.PLATFORM_COMMAND, supervisor.COMMAND_ARM, supervisor.COMMAND_RECOVER, 0
+)
+OF_SUPERVISOR = CommandPort(
+    crtp.PORT_SUPERVISOR, supervisor.SUPERVISOR_COMMAND, supervisor.ARM, supervisor.RECOVER, supervisor.REPLY
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,16 +118,26 @@ class CrtpControls(Dialogue[crtp.Packet]):
         for name, value in (("floaty.stop", 0.0), ("floaty.armed", 1.0)):
             if name in self._table():
                 yield from self._write(name, value)
+        port = yield from self._port_of_commands()
         locked = "arm; after an emergency stop it has to reboot first"
         for what, command in (
-            ("recover", bytes((supervisor.COMMAND_RECOVER,))),
-            (locked, bytes((supervisor.COMMAND_ARM, 1))),
+            ("recover", bytes((port.recover,))),
+            (locked, bytes((port.arm, 1))),
         ):
-            packet = crtp.Packet(crtp.PORT_PLATFORM, supervisor.PLATFORM_COMMAND, command)
-            reply = yield self._until(packet, lambda got, kind=command[:1]: got.data[:1] == kind)  # type: ignore[misc]
+            head = bytes((command[0] | port.reply,))
+            packet = crtp.Packet(port.number, port.channel, command)
+            reply = yield self._until(packet, lambda got, head=head: got.data[:1] == head)  # type: ignore[misc]
             if not any(reply.data[1:2]):
                 raise ControlsError(f"the board refuses to {what}")
         return ()
+
+    def _port_of_commands(self) -> Generator[Exchange[crtp.Packet], Any, "CommandPort"]:
+        """Return the port that takes commands: newer firmware warns of the older one, older has only that."""
+        ask = crtp.Packet(
+            crtp.PORT_PLATFORM, supervisor.PLATFORM_VERSION, bytes((supervisor.VERSION_PROTOCOL,))
+        )
+        reply = yield self._until(ask, lambda got: len(got.data) > 1 and got.data[:1] == ask.data)
+        return OF_SUPERVISOR if reply.data[1] >= supervisor.PORT_SINCE else OF_PLATFORM
 
     def _stop(self) -> Script[crtp.Packet]:
         """Send the stop of the localisation port, which every Crazyflie has; newer ones report that they are locked."""

@@ -1,11 +1,13 @@
 """A Crazyflie with its own firmware is flown by the packets that cflib would send, in the order of a flight."""
 
 import struct
+import warnings
 from math import pi, radians
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from cflib.crazyflie import Crazyflie
 from cflib.crazyflie.commander import Commander
 from cflib.crazyflie.high_level_commander import HighLevelCommander
 from cflib.crazyflie.localization import Localization
@@ -69,9 +71,11 @@ def test_commands_and_set_points_are_cflibs_bytes() -> None:
 class Flown:
     """A link at work for some seconds: what it sent, with the instant; `deaf` boards answer nothing."""
 
-    def __init__(self, trajectory, seconds: float, deaf: bool = False, refuse: bool = False) -> None:
+    def __init__(
+        self, trajectory, seconds: float, deaf: bool = False, refuse: bool = False, protocol: int = 10
+    ) -> None:
         self.sent: list[tuple[int, crtp.Packet]] = []
-        self.refuse = refuse
+        self.refuse, self.protocol = refuse, protocol
         self.link = CrazyflieLink(self.take, 1000, dict, TABLE, CONFIG, HOME, TIMES)
         self.deaf = deaf
         self.waiting: list[bytes] = []
@@ -89,9 +93,13 @@ class Flown:
             return
         if packet.port == crtp.PORT_PARAMETERS:
             self.waiting.append(raw)  # the value in force
-        if packet.port == crtp.PORT_PLATFORM:
-            granted = bytes((packet.data[0], not self.refuse))
-            self.waiting.append(crtp.encode(crtp.Packet(packet.port, packet.channel, granted)))
+        if packet.port in (crtp.PORT_PLATFORM, crtp.PORT_SUPERVISOR):
+            answer = bytes(
+                (packet.data[0] | (0x80 if packet.port == crtp.PORT_SUPERVISOR else 0), not self.refuse)
+            )
+            if (packet.port, packet.channel) == (crtp.PORT_PLATFORM, 1):  # its version
+                answer = struct.pack("<BI", packet.data[0], self.protocol)
+            self.waiting.append(crtp.encode(crtp.Packet(packet.port, packet.channel, answer)))
 
     def of(self, port: int) -> list[tuple[int, crtp.Packet]]:
         return [(us, packet) for us, packet in self.sent if packet.port == port]
@@ -110,7 +118,7 @@ def test_parameters_arming_take_off_landing_and_stop_come_in_their_order() -> No
     written = [packet.data for _, packet in flown.of(crtp.PORT_PARAMETERS)]
     assert written == [struct.pack("<HB", *pair) for pair in ((3, 2), (4, 3), (9, 1), (9, 0))]
     platform = flown.of(crtp.PORT_PLATFORM)
-    assert [packet.data[0] for _, packet in platform] == [2, 1]  # recover, arm
+    assert [packet.data for _, packet in platform] == [b"\0", b"\2", b"\1\1"]  # its version; recover, arm
     assert 2_000_000 < platform[0][0] < 3_000_000
     commands = [(us, high_level.decode(packet.data)[0].name) for us, packet in flown.of(high_level.PORT)]
     assert commands == [(3_000_000, "TAKE_OFF"), (11_700_000, "LAND"), (14_700_000, "STOP")]
@@ -119,6 +127,26 @@ def test_parameters_arming_take_off_landing_and_stop_come_in_their_order() -> No
         "stabilizer.estimator 2", "stabilizer.controller 3", "kalman.resetEstimation 1",
         "kalman.resetEstimation 0", "armed",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("protocol", [10, 11, 12, 13])
+def test_boards_that_have_the_supervisors_port_are_armed_there_as_by_cflib(protocol: int) -> None:
+    sent, client = [], Crazyflie()
+    client.send_packet = lambda packet, *_, **__: sent.append(
+        (packet.port, packet.channel, bytes(packet.data))
+    )
+    client.platform.get_protocol_version = lambda: protocol
+    with warnings.catch_warnings(action="ignore"):  # of older firmware
+        client.supervisor.send_crash_recovery_request()
+        client.supervisor.send_arming_request(True)
+    flown = Flown(Hold(HOME), 4.0, protocol=protocol)
+    ours = [
+        (packet.port, packet.channel, packet.data)
+        for _, packet in flown.sent
+        if packet.port in (crtp.PORT_PLATFORM, crtp.PORT_SUPERVISOR)
+    ]
+    assert ours[1:] == sent
+    assert flown.link.notices[-1] == "armed"
 
 
 def test_a_goal_that_leaves_home_is_sent_until_the_landing() -> None:
@@ -135,7 +163,9 @@ def test_a_goal_that_leaves_home_is_sent_until_the_landing() -> None:
 
 
 def test_a_board_that_refuses_or_is_silent_is_reported() -> None:
-    assert Flown(Hold(HOME), 4.0, refuse=True).link.notices[-1] == "the board refuses to recover"
+    for protocol in (10, 12):
+        refused = Flown(Hold(HOME), 4.0, refuse=True, protocol=protocol)
+        assert refused.link.notices[-1] == "the board refuses to recover"
     silent = Flown(Hold(HOME), 3.0, deaf=True)
     assert silent.link.notices == ["no answer within 2 s"]
     assert silent.of(high_level.PORT) == []
