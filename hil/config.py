@@ -345,7 +345,8 @@ def _explain(tree: Mapping[str, Any], detail: ErrorDetails) -> str:
         allowed = keys_at(LabConfig, location[:-1])
         return f"{name} = {value!r}: unknown key{f' ({hint(location[-1], allowed)})' if allowed else ''}"
     advice = "; still air is tunnel.fan_factor = 0" if name == "tunnel.speed" and value == 0 else ""
-    return f"{name} = {value!r}: {detail['msg'][0].lower()}{detail['msg'][1:]}{advice}"
+    why = detail["msg"].removeprefix("Value error, ")  # of a validator
+    return f"{name} = {value!r}: {why[0].lower()}{why[1:]}{advice}"
 
 
 def keys_at(model: Any, location: list[str]) -> list[str]:

@@ -72,8 +72,7 @@ class ModelledLine:
         self._to_peers: Receiver = nobody_listens
         self._peer_noise = streams.radio.spawn(1)[0]
         eeprom = new_eeprom()
-        if number:
-            eeprom[:CONFIG_SIZE] = factory_config(number, self._bits_per_second)
+        eeprom[:CONFIG_SIZE] = factory_config(number, config.radio)
         ports = Ports(
             self.radio.downlink,
             None if serial else air,
@@ -206,7 +205,7 @@ def lockstep_flight(
     telemetry: Path | None = None,
     executor: Executor = PYTHON_BOARD,
     clock: Clock | None = None,
-    number: int = 0,
+    number: int = 1,
     correct: Correct | None = None,
 ) -> Flight:
     """Return a flight over a modelled link. Without a clock it is paced if the request is in real time.

@@ -10,7 +10,7 @@ from firmware_py.wire import WireError
 from firmware_py.wire.memories import CONFIG_SIZE, decode_config
 from hil.board.clock import Readers
 from hil.board.dongle import VirtualDongle
-from hil.board.eeprom import CHANNEL, address_of, factory_config
+from hil.board.eeprom import address_of, factory_config
 from hil.board.image_settings import APP_PARAMETER, NO_APP, stock_contents
 from hil.board.pins import InjectFailure, new_eeprom, unsupported
 from hil.board.radio import VirtualRadio
@@ -98,11 +98,12 @@ class ServedRobot:
         self._dongles: DongleServer | None = None
         patient = config.radio.model_copy(update={"uplink_queue": UDP_QUEUE})
         self.udp_radio = VirtualRadio(patient, events, rng, air, wire_us)
-        settings = AirSettings(CHANNEL, config.radio.bits_per_second, address_of(number))
+        radio = config.radio
+        settings = AirSettings(radio.channel, radio.bits_per_second, address_of(number, radio.address))
         chip = bytes((number, 0x10, 0xA7, 0xF1, 0x0A, 0xC0))
         band = Band(events, rng.random, to_peers)
         self.nrf51 = Nrf51(settings, chip, config.radio.downlink_queue, band, self, air, wire_us)
-        eeprom[:CONFIG_SIZE] = factory_config(number, config.radio.bits_per_second)
+        eeprom[:CONFIG_SIZE] = factory_config(number, radio)
         self._file = BoardFile(state, number, eeprom) if state is not None else None
         if self._file is not None:
             self._file.load()

@@ -1,10 +1,13 @@
 """The keys of the section `radio` of a profile, with unit and source."""
 
-from typing import Literal
+import re
+from typing import Final, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from firmware_py.section import Section, number
+
+LAST_ADDRESS: Final = 0xFFE7E7E7E7 - 16  # the boards after the first stay below the address of all
 
 
 class RadioConfig(Section):
@@ -12,6 +15,12 @@ class RadioConfig(Section):
 
     bits_per_second: Literal[250_000, 1_000_000, 2_000_000] = Field(
         2_000_000, description="data rate on the air [bit/s]; the original's URI radio://0/80/2M"
+    )
+    channel: int = number(80, "[0, 125]", "channel of the boards, above 2400 MHz [MHz]; the original's URI")
+    address: str = Field(
+        "",
+        description="radio address of the first board, 10 hexadecimal digits; the next ones count up from it; "
+        "empty: E7E7E7E7E7, then E7E7E7E702 and on; Crazyflie firmware",
     )
     usb_us: int = number(
         250, "[0, 10_000]", "one USB transfer with the host's share [us]; emulation with cflib"
@@ -37,3 +46,12 @@ class RadioConfig(Section):
     downlink_jitter_us: int = number(
         0, "[0, 1_000_000]", "delay of every answer on the way to the host, uniform from 0 [us]; a fault"
     )
+
+    @field_validator("address", mode="before")
+    @classmethod
+    def _leaves_room(cls, address: object) -> object:
+        """Refuse an address that leaves other boards none, and digits that TOML takes for a number."""
+        digits = address if isinstance(address, str) else "number"
+        if digits and not (re.fullmatch("[0-9A-Fa-f]{10}", digits) and int(digits, 16) <= LAST_ADDRESS):
+            raise ValueError(f"expected 10 hexadecimal digits in quotation marks, at most {LAST_ADDRESS:X}")
+        return digits.upper()

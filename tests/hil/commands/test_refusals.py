@@ -83,7 +83,7 @@ fly take-off-landing --profile crazyflie --board empty.elf | has no effect on th
 fly airspeed-9 --profile crazyflie --board empty.elf | has no effect on the robot of profile crazyflie
 fly identify --profile crazyflie --board empty.elf | has no effect on the robot of profile crazyflie
 fly hover --profile crazyflie --set 'robot.decks=["flow3"]' | robot.decks[0] = 'flow3': input should be 'flow2' or 'multir
-fly hover --profile crazyflie --set 'robot.decks=["flow2", "flow2"]' | value error, each deck at most once
+fly hover --profile crazyflie --set 'robot.decks=["flow2", "flow2"]' | ['flow2', 'flow2']: each deck at most once
 fly hover --set plant.airspeed=nan | plant.airspeed = nan: input should be a finite number
 fly hover --set tracker.gate=0 | tracker.gate = 0: input should be greater than or equal to 3
 fly hover --set tracker.bridge_us=20000 | tracker.bridge_us
