@@ -221,6 +221,44 @@ def test_a_missing_acknowledgement_is_cleared_by_writing_0_and_nothing_else_is(b
     assert bench[I2C1 + 0x14] == 1
 
 
+def test_bytes_by_registers_raise_and_clear_the_flags_of_rm0090(bench: Bench) -> None:
+    """A write and a read, figures 241 to 244: a full shift register is BTF until the data register is used."""
+    memory = np.arange(256, dtype=np.uint8)
+    bench.chip.add_device(1, 0x50, memory)
+    bench[I2C1 + 0x1C], bench[I2C1] = 35, 1
+    sr1, data, byte_us = I2C1 + 0x14, I2C1 + 0x10, 16
+    sb, found, btf, rxne, txe = 1, 2, 4, 1 << 6, 1 << 7
+    address(bench, 0x50 << 1)
+    bench.until(sr1, found)
+    assert bench[I2C1 + 0x18] == 7  # master, busy, transmitter
+    flags = [bench[sr1]]
+    for byte in (5, 99, 98):  # the place, then two bytes
+        bench[data] = byte
+        flags.append(bench[sr1])
+        bench.wait(byte_us)
+        flags.append(bench[sr1])
+    assert flags == [txe, *[txe, txe | btf] * 3]
+    bench[data], bench[data] = 97, 96  # one in each register
+    assert bench[sr1] == 0
+    bench.until(sr1, txe)
+    assert bench[sr1] == txe
+    bench.until(sr1, btf)
+    assert memory[5:9].tolist() == [99, 98, 97, 96]
+    bench[I2C1] = 1 << 10 | 1 << 8 | 1  # start again, to read with acknowledgement
+    bench.until(sr1, sb)
+    bench[data] = 0x50 << 1 | 1
+    bench.until(sr1, found)
+    assert bench[I2C1 + 0x18] == 3
+    read, flags = [], []
+    for _ in range(2):
+        bench.wait(3 * byte_us)  # the second byte waits in the shift register
+        flags.append(bench[sr1])
+        read.append(bench[data])
+        flags.append(bench[sr1])
+    bench[I2C1] = 1 << 9 | 1
+    assert (read, flags) == ([9, 10], [rxne | btf, rxne] * 2)
+
+
 def test_dma_cannot_reach_the_core_coupled_memory(bench: Bench) -> None:
     stream = stream_of(1, 1)
     receive_by_dma(bench, 4, INCREMENT)
