@@ -186,3 +186,13 @@ def test_a_reset_chip_is_like_a_fresh_one(bench: Bench, seed: int) -> None:
         assert set(seen(bench).items()) == set(seen(fresh).items())
         for one in (bench, fresh):
             one.chip.run(fresh.chip.state.now + 100 * CYCLES_PER_US)
+
+
+def test_random_numbers_are_always_ready_differ_and_are_those_of_any_other_chip(bench: Bench) -> None:
+    status, data = 0x5006_0804, 0x5006_0808
+    ours, theirs = ([(one[status], one[data]) for _ in range(100)] for one in (bench, Bench()))
+    assert ours == theirs
+    assert {ready for ready, _ in ours} == {1}  # neither an error of the clock nor of the seed
+    numbers = [number for _, number in ours]
+    assert len(set(numbers)) == 100
+    assert 40 < np.mean([number.bit_count() for number in numbers]) / 32 * 100 < 60
