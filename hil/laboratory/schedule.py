@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pyarrow as pa
-import pyarrow.parquet
 
 from hil.board.board_firmware import BoardScheduler
 from hil.errors import LabError
@@ -53,10 +52,12 @@ class ScheduleTrace:
 
     def write(self, folder: Path) -> None:
         """Write `schedule.parquet`."""
+        from pyarrow.parquet import write_table
+
         columns = list(zip(*self._rows, strict=True)) or [()] * len(SCHEMA)
         table = pa.table([pa.array(c, f.type) for c, f in zip(columns, SCHEMA, strict=True)], schema=SCHEMA)
         with replacing(folder / FILE) as partial:
-            pa.parquet.write_table(table, partial, compression="zstd")
+            write_table(table, partial, compression="zstd")
 
     def _take(self, us: int, event: str, who: str, a: int, b: int) -> None:
         self._rows.append((us, event, who, a, b))
@@ -67,8 +68,10 @@ def load_schedule(folder: Path) -> pa.Table:
     path = folder / FILE
     if not path.exists():
         return SCHEMA.empty_table()
+    from pyarrow.parquet import ParquetFile
+
     try:
-        with pa.parquet.ParquetFile(path) as file:  # loads no datasets, as `read_table` does
+        with ParquetFile(path) as file:  # loads no datasets, as `read_table` does
             table = file.read()
             return table if table.schema == SCHEMA else table.cast(SCHEMA)  # loads 30 ms of functions
     except (*ARROW_ERRORS, OSError) as error:

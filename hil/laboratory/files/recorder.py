@@ -23,7 +23,6 @@ from weakref import WeakSet
 import numpy as np
 import pyarrow as pa
 import pyarrow.ipc
-import pyarrow.parquet
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
@@ -214,6 +213,8 @@ class Recorder:
 
 def finish_log(folder: Path, release_us: int | None = None, correct: Correct | None = None) -> None:
     """Convert the stream into `log.parquet`, even when the flight ended in the middle of a batch."""
+    from pyarrow.parquet import ParquetWriter  # loads TLS, which no flight needs
+
     stream = folder / STREAM
     pieces = _read_stream(stream)
     if correct is not None:
@@ -223,7 +224,7 @@ def finish_log(folder: Path, release_us: int | None = None, correct: Correct | N
     schema = _with_metadata(first, more).schema
     with (
         replacing(folder / PARQUET) as partial,
-        pa.parquet.ParquetWriter(partial, schema, compression="zstd", use_dictionary=False) as writer,
+        ParquetWriter(partial, schema, compression="zstd", use_dictionary=False) as writer,
     ):
         for table in chain([first], pieces):
             writer.write_table(table)
@@ -266,8 +267,10 @@ def log_pieces(folder: Path) -> Iterator[pa.Table]:
     """Yield the log in the order of time, at least one piece, each of some minutes; else like `load_log`."""
     pa.default_memory_pool().release_unused()  # what was done with a long log before has left hundreds of megabytes
     if (folder / PARQUET).is_file():
+        from pyarrow.parquet import ParquetFile
+
         try:
-            with pa.parquet.ParquetFile(folder / PARQUET, pre_buffer=False) as file:
+            with ParquetFile(folder / PARQUET, pre_buffer=False) as file:
                 yield _checked(folder / PARQUET, file.schema_arrow).empty_table()
                 for number in range(file.num_row_groups):
                     yield file.read_row_group(number, use_threads=False)
