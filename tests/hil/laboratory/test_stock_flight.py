@@ -81,7 +81,7 @@ def test_bits_of_the_stock_supervisor_are_our_states(bits: int, state: State, ca
 
 
 @needs_image
-@pytest.mark.parametrize("controller", [1, 2, 3], ids=["pid", "mellinger", "indi"])
+@pytest.mark.parametrize("controller", range(1, 6), ids=["pid", "mellinger", "indi", "brescianini", "lee"])
 def test_takes_off_holds_and_lands_with_each_controller(controller: int, tmp_path: Path) -> None:
     """INDI sinks a second behind its goal, and the firmware stops the motors when the goal has landed: so slowly."""
     settings = {"pilot.parameters.stabilizer.controller": controller, "pilot.land_s": 5.0}
