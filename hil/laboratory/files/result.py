@@ -62,7 +62,13 @@ class Program:
     @classmethod
     def of(cls, config: LabConfig) -> "Program":
         """Return this program with the modules of a configuration."""
-        return cls(versions(), commit(), digest_of(config.logic), digest_of_body(config))
+        return cls(*_loaded(), digest_of(config.logic), digest_of_body(config))
+
+
+@cache
+def _loaded() -> tuple[Mapping[str, str], str]:
+    """Return versions and commit of what this process has loaded: git takes as long as a short flight."""
+    return versions(), commit()
 
 
 def metadata_of(request: Request, program: Program, look: VisualModel) -> dict[str, str]:

@@ -4,24 +4,27 @@ import os
 import re
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
 from firmware_py.compiling import flies_as
+from hil.config import load_config
 from hil.errors import LabError
 from hil.laboratory.files import installation
 from hil.laboratory.files.installation import commit, describe
+from hil.laboratory.files.result import Program
 from hil.research.campaigns.dataset import about
 from hil.research.campaigns.jobs import Job, Plan
 from support.full_disk import small_files
 
-Program = Callable[[str, str], None]
+Write = Callable[[str, str], None]
 
 
 @pytest.fixture
-def program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Program:
+def program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Write:
     """Writes a shell script of a name; no other program is found."""
     monkeypatch.setenv("PATH", str(tmp_path))
 
@@ -37,13 +40,13 @@ def rows() -> dict[str, str]:
     return dict(re.split(" {2,}", line, maxsplit=1) for line in lines)
 
 
-def test_the_first_line_is_for_programs_and_the_others_are_aligned(program: Program) -> None:
+def test_the_first_line_is_for_programs_and_the_others_are_aligned(program: Write) -> None:
     first, *others = describe().splitlines()
     assert first == f"floaty, version {version('floaty-hil')}, {flies_as()}"
     assert len({len(row[0]) for line in others if (row := re.match(r"\w+( [\w-]+)? {2,}", line))}) == 1
 
 
-def test_what_flies_is_c_where_a_compiler_is(program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_flies_is_c_where_a_compiler_is(program: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)  # no ziglang
     assert flies_as() == "plain Python"
     program("clang", "true")
@@ -52,7 +55,7 @@ def test_what_flies_is_c_where_a_compiler_is(program: Program, monkeypatch: pyte
     assert flies_as() == "plain Python"
 
 
-def test_missing_git_and_tools_are_reported(program: Program) -> None:
+def test_missing_git_and_tools_are_reported(program: Write) -> None:
     found = rows()
     assert found["commit"] == "unknown"
     assert {name: text for name, text in found.items() if name.startswith("program")} == {
@@ -61,7 +64,7 @@ def test_missing_git_and_tools_are_reported(program: Program) -> None:
     }
 
 
-def test_a_program_reports_its_own_version_and_not_its_packagers(program: Program) -> None:
+def test_a_program_reports_its_own_version_and_not_its_packagers(program: Write) -> None:
     program("gcc", "echo 'gcc (Debian 12.2.0-14+deb12u1) 12.3.1'; echo 'Copyright (C) 2022.1'")
     program("clang", "echo 'Apple clang version 15.0.4 (clang-1500.3.9.4)'")
     program("git", "echo no number")
@@ -71,13 +74,13 @@ def test_a_program_reports_its_own_version_and_not_its_packagers(program: Progra
     assert found["program git"] == found["program gdb-multiarch"] == "found, of unknown version"
 
 
-def test_a_program_that_does_not_answer_is_left(program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_that_does_not_answer_is_left(program: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(installation, "PROGRAM_TIMEOUT_S", 0.05)
     program("gcc", "while :; do :; done")
     assert rows()["program gcc"] == "found, of unknown version"
 
 
-def test_a_missing_package_of_an_extra_is_named(program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_of_an_extra_is_named(program: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     requirements = [
         "numpy>=2.0",
         "no-such-radio[usb]>=0.1; extra == 'radio'",
@@ -91,7 +94,7 @@ def test_a_missing_package_of_an_extra_is_named(program: Program, monkeypatch: p
 
 
 def test_a_package_reports_the_commit_that_it_was_built_from(
-    program: Program, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    program: Write, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "commit.txt").write_text("0123456789ab\n")
     monkeypatch.setattr(installation, "COMMIT", tmp_path / "commit.txt")
@@ -115,8 +118,14 @@ def test_git_locks_nothing_in_the_repository(tmp_path: Path, monkeypatch: pytest
     assert re.fullmatch(r"[0-9a-f]{12}\+", commit())
 
 
+def test_all_flights_of_a_process_are_of_the_commit_that_it_has_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = Program.of(load_config())
+    monkeypatch.setattr(installation, "ROOT", installation.ROOT / "hil")
+    assert Program.of(load_config()) == first != replace(first, commit=commit())
+
+
 def test_a_campaign_is_not_stored_without_its_commit(
-    program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    program: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = Plan.of([Job(0, "hover", {}, {})])
     assert about(plan)["commit"] == "unknown", "no git"
