@@ -28,11 +28,12 @@ FLOATING = HEAD + "    def wrench(self, wind_B):\n        return (0.0, 0.0, 0.98
 
 
 def project(folder: Path, robot: str = "") -> str:
-    """Write the project of `floaty new --robot` with another robot.py, and return its profile."""
-    for name in ("controller.py", "profile.toml", "robot.py"):
-        (folder / name).write_text((PROJECT / f"{name}.in").read_text(encoding="utf-8"), encoding="utf-8")
-    if robot:
-        (folder / "robot.py").write_text(robot, encoding="utf-8")
+    """Write the project of `floaty new --robot` with another robot.py, and return its profile; all share one controller."""
+    profile = (PROJECT / "profile.toml.in").read_text(encoding="utf-8")
+    profile = profile.replace('"controller.py"', f'"{PROJECT / "controller.py.in"}"')
+    (folder / "profile.toml").write_text(profile, encoding="utf-8")
+    robot = robot or (PROJECT / "robot.py.in").read_text(encoding="utf-8")
+    (folder / "robot.py").write_text(robot, encoding="utf-8")
     return str(folder / "profile.toml")
 
 
