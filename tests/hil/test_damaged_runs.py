@@ -254,21 +254,23 @@ def test_the_line_that_was_being_written_is_no_damage(copy: Callable[[], Path]) 
 
 
 @pytest.mark.parametrize(
-    ("file", "words"),
+    ("files", "words"),
     [
-        ("report.html", ("report", "RUN")), ("compare.html", ("compare", "FLOWN", "RUN")),
-        ("compare.png", ("compare", "FLOWN", "RUN")), ("flight.csv", ("export", "RUN", "--csv")),
-        ("flight.mcap", ("export", "RUN", "--mcap")), ("flight.tlog", ("export", "RUN", "--tlog")),
+        (("report.html",), ("report", "RUN")),
+        (("compare.html", "compare.png"), ("compare", "FLOWN", "RUN")),
+        (("flight.csv", "flight.mcap", "flight.tlog"), ("export", "RUN", "--csv", "--mcap", "--tlog")),
     ],
-)  # fmt: skip
+)
 def test_a_link_in_a_run_folder_is_replaced_not_followed(
-    file: str, words: tuple[str, ...], flown: Path, copy: Callable[[], Path], tmp_path: Path
+    files: tuple[str, ...], words: tuple[str, ...], flown: Path, copy: Callable[[], Path], tmp_path: Path
 ) -> None:
     mine = tmp_path / "mine"
     mine.write_text("mine")
     run = copy()
-    (run / file).symlink_to(mine)
+    for file in files:
+        (run / file).symlink_to(mine)
     command(*words)(run, flown)
     assert mine.read_text() == "mine"
-    assert (run / file).is_file()
-    assert not (run / file).is_symlink()
+    assert [((run / file).is_file(), (run / file).is_symlink()) for file in files] == [(True, False)] * len(
+        files
+    )

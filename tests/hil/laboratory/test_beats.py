@@ -15,10 +15,11 @@ from hil.laboratory.lockstep import in_lockstep
 from hil.laboratory.request import Options, Request
 from hil.laboratory.run import fly
 
+RELEASE = ("flight.release_us=200000",)
 FLIGHTS: dict[str, Options] = {
     "silent": {"faults": ("imu.silent@0.2:0.15", "imu.freeze@0.6:0.1")},
     "busy": {"faults": ("cpu.load@0.1:0.4=0.7", "radio.cut@0.3:0.2")},
-    "plain core": {"board": "python"},
+    "plain core": {"board": "python", "duration_s": 0.1},
     "serial": {"link": "mavlink"},
     "traced": {"trace": True, "duration_s": 0.3},
 }
@@ -42,12 +43,12 @@ def with_greedy_task(flight: Flight) -> None:
 def without_power(flight: Flight) -> None:
     """Cut the power for a while; nothing is measured then."""
     board, kept = flight.robot.board, []
-    flight.events.at(1_100_300, lambda _: flight.robot.cut_power())
-    flight.events.at(1_101_000, lambda _: kept.extend(board.imu.tolist()))
-    flight.events.at(1_150_000, lambda _: kept.append(board.imu.tolist() == kept))
-    flight.events.at(1_150_700, lambda now_us: (flight.robot.boot(now_us), kept.append(True)))
-    flight.events.at(1_200_000, lambda _: kept.append(board.imu.tolist() != kept[:6]))
-    flight.events.at(1_200_000, lambda _: flight.note("lab", f"kept: {kept[6:]}"))
+    flight.events.at(400_300, lambda _: flight.robot.cut_power())
+    flight.events.at(401_000, lambda _: kept.extend(board.imu.tolist()))
+    flight.events.at(450_000, lambda _: kept.append(board.imu.tolist() == kept))
+    flight.events.at(450_700, lambda now_us: (flight.robot.boot(now_us), kept.append(True)))
+    flight.events.at(500_000, lambda _: kept.append(board.imu.tolist() != kept[:6]))
+    flight.events.at(500_000, lambda _: flight.note("lab", f"kept: {kept[6:]}"))
 
 
 CHANGES: dict[str, Callable[[Flight], None]] = {"greedy": with_greedy_task, "no power": without_power}
@@ -60,7 +61,7 @@ def flown(options: Options, folder: Path, change: Callable[[Flight], None] | Non
             change(flight)
         return flight
 
-    request = Request.of(EXPERIMENTS["hover"], **{"duration_s": 0.8, **options})
+    request = Request.of(EXPERIMENTS["hover"], **{"duration_s": 0.8, "overrides": RELEASE, **options})
     result = fly(request, folder, flight_of=made)
     schedule = hashlib.sha256((folder / "schedule.parquet").read_bytes()).hexdigest()
     return result.hash, schedule, (folder / "events.jsonl").read_text()

@@ -393,7 +393,7 @@ def test_a_change_between_two_faults_persists_beside_a_third() -> None:
 
 
 def test_the_log_counts_the_faults_in_force_and_names_them(tmp_path: Path) -> None:
-    result = go(tmp_path / "run", "push.x@0.5=0.1", "imu.noise@0.2:1=2", "push.x@9=1", duration_s=10.0)
+    result = go(tmp_path / "run", "push.x@0.5=0.1", "imu.noise@0.2:1=2", "push.x@1.5=1", duration_s=2.0)
     log = load_log(result.folder)
     assert log.schema.field("fault.active").type == pa.int8()
     expected, times = np.zeros(log.num_rows), since_release(log)
@@ -412,15 +412,6 @@ def test_the_log_counts_the_faults_in_force_and_names_them(tmp_path: Path) -> No
 
 def test_without_faults_the_log_has_no_column_of_them(tmp_path: Path) -> None:
     assert "fault.active" not in load_log(go(tmp_path / "run", duration_s=0.3).folder).column_names
-
-
-def test_same_seed_same_hash_with_faults(tmp_path: Path) -> None:
-    texts = ("mocap.outlier@0.2:0.5=0.3", "radio.loss@0.5", "wind.gusts@0.4", "cpu.load@0.3")
-    first, again, other = (
-        go(tmp_path / name, *texts, seed=seed, duration_s=1.0)
-        for name, seed in (("a", 1), ("b", 1), ("c", 2))
-    )
-    assert first.hash == again.hash != other.hash
 
 
 def test_an_experiments_faults_that_do_not_concern_the_flight_are_left_out(tmp_path: Path) -> None:

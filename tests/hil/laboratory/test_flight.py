@@ -15,7 +15,7 @@ from hil.commands.tables import print_result, print_seeds
 from hil.errors import LabError
 from hil.laboratory.experiments import EXPERIMENTS, find_again
 from hil.laboratory.files.recorder import load_events, load_log
-from hil.laboratory.files.result import read_result
+from hil.laboratory.files.result import Result, read_result
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import in_lockstep, lockstep_flight
 from hil.laboratory.metrics import ALWAYS, METRICS, column, judge
@@ -29,9 +29,15 @@ from support.full_disk import small_files
 HOVER = EXPERIMENTS["hover"]
 
 
+@pytest.fixture(scope="module")
+def hovered(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    """The hover of the paper, as long as its limits are for."""
+    return hover(tmp_path_factory.mktemp("hovered") / "run")
+
+
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (10, 1234))])
-def test_hover_holds_its_limits(tmp_path: Path, seed: int) -> None:
-    result = hover(tmp_path / "run", seed=seed)
+def test_hover_holds_its_limits(hovered: Result, tmp_path: Path, seed: int) -> None:
+    result = hovered if seed == 1 else hover(tmp_path / "run", seed=seed)
     assert result.passed, explain(result)
     assert {verdict.metric for verdict in result.verdicts} == {*HOVER.limits, *ALWAYS}
 
@@ -82,7 +88,7 @@ def test_an_estimate_that_is_not_finite_again_after_a_reset_is_reported_again() 
 
 
 def test_flight_makes_no_garbage_that_only_the_collector_frees() -> None:
-    for duration_s in (0.1, 2.0):  # the first one leaves what is made once per process
+    for duration_s in (0.1, 0.5):  # the first one leaves what is made once per process
         flight = lockstep_flight(Request.of(HOVER, duration_s=duration_s))
         gc.collect()
         gc.disable()
@@ -145,16 +151,6 @@ def test_the_tracker_refuses_no_healthy_pose(tmp_path: Path, name: str, faults: 
     assert column(log, "tracker.refused")[-1] == column(log, "tracker.restarts")[-1] == 0
 
 
-def test_same_seed_same_hash_other_seed_other_hash(tmp_path: Path) -> None:
-    first, again, other = (
-        hover(tmp_path / name, seed=seed, duration_s=3.0) for name, seed in (("a", 1), ("b", 1), ("c", 2))
-    )
-    assert first.hash == again.hash
-    assert first.hash != other.hash
-    assert load_log(first.folder).equals(load_log(again.folder))
-    assert (first.folder / "telemetry.csv").read_bytes() == (again.folder / "telemetry.csv").read_bytes()
-
-
 def test_pacing_changes_nothing_that_is_flown(tmp_path: Path) -> None:
     request = Request.of(HOVER, overrides=["flight.release_us=100000"], seed=3, duration_s=0.2)
     free = fly(request, tmp_path / "free")
@@ -200,8 +196,8 @@ def test_an_error_of_the_firmware_ends_the_flight_with_its_log(tmp_path: Path) -
     assert load_log(result.folder).num_rows > 140
 
 
-def test_log_carries_units_frames_and_origin(tmp_path: Path) -> None:
-    table = load_log(hover(tmp_path / "run", duration_s=0.5).folder)
+def test_log_carries_units_frames_and_origin(hovered: Result) -> None:
+    table = load_log(hovered.folder)
     assert table.schema.field("truth.x").metadata == {b"unit": b"m", b"frame": b"W"}
     assert table.schema.field("motor.m1").metadata[b"unit"] == b"counts"
     metadata = table.schema.metadata
@@ -210,8 +206,8 @@ def test_log_carries_units_frames_and_origin(tmp_path: Path) -> None:
     assert b"numpy" in metadata[b"program"]
 
 
-def test_estimate_follows_the_truth(tmp_path: Path) -> None:
-    table = load_log(hover(tmp_path / "run", duration_s=10.0).folder)
+def test_estimate_follows_the_truth(hovered: Result) -> None:
+    table = load_log(hovered.folder)
     late = column(table, "t") > 2_000_000
     for name, limit in (("x", 0.01), ("y", 0.01), ("vx", 0.08), ("vy", 0.08)):
         error = column(table, f"estimate.{name}") - column(table, f"truth.{name}")

@@ -91,7 +91,8 @@ def test_own_logic_s_log_is_recorded_and_drawn(failed: Result) -> None:
     assert "Own logic" in write_report(failed.folder).read_text()
 
 
-@pytest.mark.parametrize("board", ["python", pytest.param("cortex-m4", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("board", ["python", "cortex-m4"])
 def test_a_flight_on_another_board_is_bit_identical(failed: Result, tmp_path: Path, board: str) -> None:
     again = hover(
         tmp_path, *failed.request.overrides, profile=failed.request.profile, duration_s=0.5, board=board

@@ -42,16 +42,6 @@ def test_the_budget_is_stated_before_take_off(tmp_path: Path) -> None:
     assert "telemetry 25 Hz" in first["text"]
 
 
-def test_same_seed_same_hash_over_the_serial_line(tmp_path: Path) -> None:
-    noisy = ("serial.uplink_bit_error_rate=1e-4", "serial.downlink_bit_error_rate=1e-4")
-    first, again, other = (
-        hover(tmp_path / name, *noisy, seed=seed, duration_s=3.0, link=MAVLINK)
-        for name, seed in (("a", 1), ("b", 1), ("c", 2))
-    )
-    assert first.hash == again.hash != other.hash
-    assert (first.folder / "telemetry.csv").read_bytes() == (again.folder / "telemetry.csv").read_bytes()
-
-
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
     """Three seconds of hover over the line, for tests that read what is left of it."""

@@ -232,19 +232,14 @@ def flown() -> Path:
     return run.folder
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        ("report", "RUN"), ("compare", "RUN", "RUN"), ("runs",), ("export", "RUN", "--csv", "--mcap", "--tlog"),
-        ("identify", "RUN"), ("identify", "RUN", "--profile-out", "out.toml"),
-    ],
-    ids=" ".join,
-)  # fmt: skip
-def test_reading_a_run_executes_nothing_that_it_names(
-    command: tuple[str, ...], flown: Path, cli: Cli
-) -> None:
-    cli(*(str(flown) if word == "RUN" else word for word in command))
-    assert not Path("executed").exists()
+def test_reading_a_run_executes_nothing_that_it_names(flown: Path, cli: Cli) -> None:
+    """Nor do `report` and `compare`, below."""
+    for command in (
+        ("runs",), ("export", flown, "--csv", "--mcap", "--tlog"), ("identify", flown),
+        ("identify", flown, "--profile-out", "out.toml"),
+    ):  # fmt: skip
+        cli(*command)
+        assert not Path("executed").exists(), command
 
 
 def test_loading_a_run_executes_nothing_that_it_names(flown: Path) -> None:
@@ -268,6 +263,7 @@ def test_a_report_shows_what_needs_no_code_and_names_the_option_for_the_rest(flo
     page = (flown / "report.html").read_text(encoding="utf-8")
     assert f"--experiment {reference}" in page
     assert 'id="airspeed"' in page
+    assert not Path("executed").exists()
     assert 'id="mine"' not in page
 
 

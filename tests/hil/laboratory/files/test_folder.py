@@ -20,6 +20,7 @@ from support.command import Cli
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
 SHORT = 0.05  # [s]
+SOON = {"flight.release_us": 50_000}
 HOLDER = """
 import sys
 from pathlib import Path
@@ -103,7 +104,7 @@ def fly_until_killed(function: str, file: str, call: int) -> int:
 
         try:
             sys.setprofile(kill)
-            fly("hover", duration_s=SHORT)
+            fly("hover", duration_s=SHORT, overrides=SOON)
         finally:
             os._exit(1)
     return -os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
@@ -115,7 +116,7 @@ def fly_until_killed(function: str, file: str, call: int) -> int:
         (False, "__init__", "telemetry_log.py", 1),  # into an empty folder
         (False, "__init__", "ground_station/station.py", 1),  # the telemetry log is empty
         (False, "__init__", "recorder.py", 1),
-        (False, "row", "recorder.py", 20),  # before the first second is on disk
+        (False, "row", "recorder.py", 5),  # before the first second is on disk
         (False, "replacing", "whole_files.py", 1),  # before the log is converted
         (False, "replacing", "whole_files.py", 3),  # before the result is written
         (True, "rename", "pathlib", 3),  # the older run is half set aside
@@ -126,9 +127,9 @@ def fly_until_killed(function: str, file: str, call: int) -> int:
 )
 def test_a_killed_flight_is_repeated_in_its_folder(older: bool, function: str, file: str, call: int) -> None:
     if older:
-        fly("hover", duration_s=SHORT)
+        fly("hover", duration_s=SHORT, overrides=SOON)
     assert fly_until_killed(function, file, call) == signal.SIGKILL
-    again = fly("hover", duration_s=SHORT)
+    again = fly("hover", duration_s=SHORT, overrides=SOON)
     assert (again.folder, again.outcome) == (Path("runs/hover-1"), "completed")
     assert {path.name for path in again.folder.iterdir()} == {
         "log.parquet", "events.jsonl", "telemetry.csv", "schedule.parquet", "result.json"

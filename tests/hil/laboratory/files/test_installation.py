@@ -118,7 +118,9 @@ def test_git_locks_nothing_in_the_repository(tmp_path: Path, monkeypatch: pytest
     assert re.fullmatch(r"[0-9a-f]{12}\+", commit())
 
 
-def test_all_flights_of_a_process_are_of_the_commit_that_it_has_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_flights_of_a_process_are_of_the_commit_that_it_has_loaded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     first = Program.of(load_config())
     monkeypatch.setattr(installation, "ROOT", installation.ROOT / "hil")
     assert Program.of(load_config()) == first != replace(first, commit=commit())
