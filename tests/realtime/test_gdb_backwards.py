@@ -51,10 +51,7 @@ def gdb(address: str, elf: Path, *commands: str) -> subprocess.Popen[str]:
     every = ("set confirm off", "set remotetimeout 60", f"target remote {address}", *commands)
     words = [word for command in every for word in ("-ex", command)]
     return subprocess.Popen(
-        (GDB, "-nx", "-batch", *words, str(elf)),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
+        (GDB, "-nx", "-batch", *words, str(elf)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
 
 

@@ -384,11 +384,7 @@ def test_a_package_that_a_test_file_needs_is_one_line(
     result = pytester.runpytest_inprocess("--continue-on-collection-errors")
     result.assert_outcomes(failed=1, errors=2)
     shown = result.stdout.str()
-    for place, package in (
-        ("learn.py", "gymnasium"),
-        ("any.py", ".*hypothesis"),
-        ("late.py:2", "gymnasium"),
-    ):
+    for place, package in (("learn.py", "gymnasium"), ("any.py", ".*hypothesis"), ("late.py:2", "gymnasium")):
         assert re.search(rf"^test_{place}: {package} is missing: .* -m pip install ", shown, re.MULTILINE)
     assert "Traceback" not in shown
 
