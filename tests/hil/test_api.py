@@ -15,7 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import hil
-from hil import Along, Experiment, Kind, LabError, Metric, Request, fly, knob, load_run
+from hil import Along, Experiment, Kind, LabError, Metric, Request, Run, fly, knob, load_run
 from hil.api import command_of, request_of
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import KINDS
@@ -52,20 +52,23 @@ def test_every_name_of_the_package_is_there_and_no_other() -> None:
         _ = hil.flyy  # type: ignore[attr-defined]
 
 
-def test_a_run_is_read_again_as_it_was_flown() -> None:
-    run = fly("hover", duration_s=SHORT, faults=["push.y@0.1=1"])
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    folder = tmp_path_factory.mktemp("api") / "run"
+    return fly("hover", folder, duration_s=SHORT, faults=["push.y@0.1=3"])
+
+
+def test_a_run_is_read_again_as_it_was_flown(run: Run) -> None:
     again = load_run(run.folder)
     assert repr(again.result) == repr(run.result)
     assert again.experiment is EXPERIMENTS["hover"]
     assert again.log.equals(run.log)
-    assert [event["text"] for event in run.events if "begins" in event["text"]] == [
-        "fault push.y@0.1=1 begins"
-    ]
+    (begun,) = (event["text"] for event in run.events if "begins" in event["text"])
+    assert begun == "fault push.y@0.1=3 begins"
     assert set(run.paths) >= {"log.parquet", "result.json", "events.jsonl", "telemetry.csv"}
 
 
-def test_the_table_counts_seconds_from_the_release() -> None:
-    run = fly("hover", duration_s=SHORT)
+def test_the_table_counts_seconds_from_the_release(run: Run) -> None:
     frame = run.to_pandas()
     assert frame.index.name == "s"
     at_release = frame["flight.free"].to_numpy().argmax()
@@ -196,8 +199,7 @@ def test_names_and_values_are_short_in_a_notebook() -> None:
         assert " at 0x" not in repr(value)
 
 
-def test_a_plot_has_one_axis_per_unit_and_refuses_what_the_log_lacks() -> None:
-    run = fly("hover", duration_s=0.5, faults=["push.y@0.1=1"])
+def test_a_plot_has_one_axis_per_unit_and_refuses_what_the_log_lacks(run: Run) -> None:
     figure = run.plot("truth.y", "truth.vy", "goal.y", "estimator.pose_age_us", size=(4.0, 5.0))
     position, speed, age = figure.axes
     assert tuple(figure.get_size_inches()) == (4.0, 5.0)
@@ -220,8 +222,7 @@ def test_a_plot_has_one_axis_per_unit_and_refuses_what_the_log_lacks() -> None:
         run.plot("truth.yy")
 
 
-def test_angles_are_columns_although_the_log_has_quaternions() -> None:
-    run = fly("hover", duration_s=0.5, faults=["push.y@0.1=3"])
+def test_angles_are_columns_although_the_log_has_quaternions(run: Run) -> None:
     w, x, y, z = (run.log.column(f"truth.q{name}").to_numpy() for name in "wxyz")
     expected = Rotation.from_quat(np.stack((x, y, z, w), axis=1)).as_euler("ZYX")[:, ::-1]
     angles = [run.log.column(f"truth.{name}").to_numpy() for name in ("roll", "pitch", "yaw")]

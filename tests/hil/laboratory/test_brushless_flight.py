@@ -21,24 +21,18 @@ PROFILE = "crazyflie-brushless"
 ARM = bytes((0xD0, 1, 1))
 
 
-@pytest.mark.parametrize(("profile", "board", "other"), [
-    ("crazyflie", "CF21", "C21B"), (PROFILE, "C21B", "CF21"),
+@pytest.mark.parametrize(("profile", "device", "told"), [
+    ("crazyflie", "C21B", "elf: built for boards of device type C21B, .* is CF21; --profile crazyflie"),
+    (PROFILE, "CF21", "elf: built for boards of device type CF21, .* is C21B; --profile crazyflie"),
+    (PROFILE, "CF99", "built for boards of device type unknown here, but this robot's is C21B$"),
+    (PROFILE, "C21B", r"no log variable supervisor\.info"),  # the next thing that it lacks
 ])  # fmt: skip
 def test_firmware_of_another_board_is_one_clear_line(
-    profile: str, board: str, other: str, tmp_path: Path
+    profile: str, device: str, told: str, tmp_path: Path
 ) -> None:
-    flags = [("-g", f'-DDEVICE_TYPE="{name}"') for name in (other, board, "CF99")]
-    wrong, right, unknown = (str(build(flags=flag)) for flag in flags)
-    with pytest.raises(
-        LabError, match=f"elf: built for boards of device type {other}, .* is {board}; --profile crazyflie"
-    ):
-        fly("hover", tmp_path / "a", profile=profile, board=wrong)
-    with pytest.raises(
-        LabError, match=f"built for boards of device type unknown here, but this robot's is {board}$"
-    ):
-        fly("hover", tmp_path / "b", profile=profile, board=unknown)
-    with pytest.raises(LabError, match=r"no log variable supervisor\.info"):  # the next thing that it lacks
-        fly("hover", tmp_path / "c", profile=profile, board=right)
+    image = str(build(flags=("-g", f'-DDEVICE_TYPE="{device}"')))
+    with pytest.raises(LabError, match=told):
+        fly("hover", tmp_path / "run", profile=profile, board=image)
 
 
 @pytest.mark.parametrize(

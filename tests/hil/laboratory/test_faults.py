@@ -410,10 +410,6 @@ def test_the_log_counts_the_faults_in_force_and_names_them(tmp_path: Path) -> No
     assert len(texts) == 6
 
 
-def test_without_faults_the_log_has_no_column_of_them(tmp_path: Path) -> None:
-    assert "fault.active" not in load_log(go(tmp_path / "run", duration_s=0.3).folder).column_names
-
-
 def test_an_experiments_faults_that_do_not_concern_the_flight_are_left_out(tmp_path: Path) -> None:
     own = (*map(parse, ("push.x@0.2=0.1", "push.x@5=0.1", "serial.cut@0.1", "marker.swap@0.1")),)
     experiment = Experiment("hover", "", 10.0, {}, faults=own)

@@ -153,6 +153,11 @@ def test_a_profile_s_limits_replace_those_of_the_experiment_and_of_every_flight(
     assert limits_of({"rms_x": 1.0}, {"rms_y": 2.0, "unseen": 3.0}) == {"rms_y": 2.0, **ALWAYS, "unseen": 3.0}
 
 
+def test_a_limit_on_an_unknown_metric_is_refused() -> None:
+    with pytest.raises(LabError, match="no such metric; did you mean rms_"):
+        judge({"lost": 0.0}, {"rms_q": 1.0}, {})
+
+
 @pytest.mark.parametrize(("lost", "admitted", "applies"), [
     (0.0, None, True), (1.0, None, False), (1.0, 0.0, False), (1.0, 1.0, True), (0.0, 1.0, True),
 ])  # fmt: skip
@@ -164,6 +169,7 @@ def test_a_lost_flight_fails_all_limits_unless_the_loss_is_admitted(lost, admitt
         ("in_box", applies, applies),
     ]
     assert [one.holds for one in good[2:]] == ([] if admitted is None else [lost <= admitted])
+    assert str(good[1]) == f"in_box = 90 %{'' if applies else ' until the robot was lost'} (limit >= 90 %)"
     bad = judge({"lost": lost, "rms_x": 0.5001, "in_box": np.nan}, limits, {})
     assert [one.mark for one in bad[:2]] == ["FAILS" if applies else "lost"] * 2
 

@@ -27,9 +27,9 @@ APART = ("swarm.spacing=1.5",)
 
 
 def test_robots_apart_fly_bit_for_bit_as_alone(floaty: Flights, tmp_path: Path) -> None:
-    swarm = floaty.fly_swarm("hover", 2, duration_s=2.0, overrides=APART, seed=3)
+    swarm = floaty.fly_swarm("hover", 2, duration_s=0.5, overrides=APART, seed=3)
     alone = [
-        fly("hover", tmp_path / f"{seed}", duration_s=2.0, overrides=APART, seed=seed) for seed in (3, 4)
+        fly("hover", tmp_path / f"{seed}", duration_s=0.5, overrides=APART, seed=seed) for seed in (3, 4)
     ]
     assert [one.hash for one in swarm.robots] == [one.hash for one in alone]
     assert swarm.metrics["distance_min"] == pytest.approx(1.5 * math.sqrt(2.0), abs=0.1)
@@ -38,10 +38,8 @@ def test_robots_apart_fly_bit_for_bit_as_alone(floaty: Flights, tmp_path: Path) 
     assert [one["hash"] for one in written["robots"]] == [one.hash for one in swarm.robots]
     with pytest.raises(LabError, match="in it, but in robot-1, robot-2; expected a run folder"):
         load_run(swarm.folder)
-    again = fly_swarm("hover", 2, tmp_path / "again", duration_s=2.0, overrides=APART, seed=3)
-    assert again.hash == swarm.hash
-    pages = [tmp_path / "again" / place / "report.html" for place in ("", "robot-1", "robot-2")]
-    assert again.write_report() == pages[0]
+    pages = [swarm.folder / place / "report.html" for place in ("", "robot-1", "robot-2")]
+    assert swarm.write_report() == pages[0]
     assert [page.is_file() for page in pages] == [True] * 3
 
 

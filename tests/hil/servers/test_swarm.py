@@ -212,7 +212,7 @@ def test_a_peer_packet_of_one_board_reaches_those_of_all_other_processes() -> No
     assert len(heard) == 6
 
 
-@pytest.mark.parametrize("radius", [0.07, 0.0])
+@pytest.mark.parametrize("radius", [0.07, pytest.param(0.0, marks=pytest.mark.long)])
 def test_robots_of_several_processes_that_touch_push_each_other_apart(radius: float) -> None:
     settings = ("flight.spacing=0.1", f"swarm.radius={radius}")
     standing = [parse(f"motor.stop.{motor}@0") for motor in (1, 2, 3, 4)]

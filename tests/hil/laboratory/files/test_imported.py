@@ -14,14 +14,14 @@ import pytest
 from mcap_ros2.writer import Writer as Ros2Writer
 from scipy.spatial.transform import Rotation
 
-from hil import LabError, column, fly, load_run
+from hil import LabError, Run, column, fly, load_run
 from hil.laboratory.files.alignment import released_like
 from hil.laboratory.files.imported import import_log
 from hil.laboratory.files.joined import Joined, join
 from hil.laboratory.files.log_map import Map, guess
 from hil.laboratory.files.tables import Table, read_tables
 from hil.pictures.viewer.recording import recording_of
-from support.command import Cli
+from support.command import Cli, floaty
 
 ROWS = 40
 T = 0.02 * np.arange(ROWS)  # [s]
@@ -97,11 +97,18 @@ def test_names_units_and_sizes_give_time_place_and_attitude(name: str, tmp_path:
     assert done.result.verdicts == ()
 
 
-def test_a_table_of_this_laboratory_is_its_log_again(cli: Cli, tmp_path: Path) -> None:
-    run = fly("hover", tmp_path / "run", duration_s=0.3)
-    assert cli("export", tmp_path / "run", "--csv") == 0
-    assert cli("import", tmp_path / "run" / "flight.csv", "--out", tmp_path / "again") == 0
-    again = load_run(tmp_path / "again")
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A flight of ours, with all its exports."""
+    home = {"flight.home": (0.02, 0.03, 1.15)}
+    run = fly("hover", tmp_path_factory.mktemp("flown") / "run", duration_s=0.4, overrides=home)
+    assert floaty("export", str(run.folder), "--csv", "--mcap", "--tlog") == 0
+    return run
+
+
+def test_a_table_of_this_laboratory_is_its_log_again(run: Run, tmp_path: Path) -> None:
+    import_log([run.folder / "flight.csv"], tmp_path)
+    again = load_run(tmp_path)
     assert again.log.column_names == run.log.column_names
     for name in run.log.column_names[1:]:
         assert again.log.column(name).to_numpy() == pytest.approx(
@@ -148,11 +155,10 @@ def test_the_best_fit_is_found_between_the_steps_of_the_search(offset_us: int, l
     assert released_like("log", joined, chosen, like).release_s == pytest.approx(1e-6 * begin_us, abs=0.0021)
 
 
-def test_a_telemetry_log_of_mavlink_is_in_the_world_s_frame(cli: Cli, tmp_path: Path) -> None:
-    run = fly("hover", tmp_path / "run", duration_s=0.4, overrides={"flight.home": (0.02, 0.03, 1.15)})
-    assert cli("export", tmp_path / "run", "--tlog") == 0
-    tlog = tmp_path / "run" / "flight.tlog"
-    tlog.write_bytes(tlog.read_bytes() + b"\0" * 7 + b"\xfd\x05")  # cut off while it was written
+def test_a_telemetry_log_of_mavlink_is_in_the_world_s_frame(run: Run, tmp_path: Path) -> None:
+    tlog = tmp_path / "flight.tlog"
+    whole = (run.folder / "flight.tlog").read_bytes()
+    tlog.write_bytes(whole + b"\0" * 7 + b"\xfd\x05")  # cut off while it was written
     log = import_log([tlog], tmp_path / "again").log
     first_us = run.log.column("t")[0].as_py()
     sent = run.log.take(np.searchsorted(run.log.column("t"), log.column("t").to_numpy() + first_us))
@@ -463,13 +469,10 @@ def test_an_mcap_file_of_ros_2_gives_pose_and_goal(cli: Cli, tmp_path: Path) -> 
     assert not [name for name in log.column_names if "stamp" in name]
 
 
-def test_our_own_mcap_file_has_the_log_s_path_again(cli: Cli, tmp_path: Path) -> None:
-    flown = fly("hover", tmp_path / "flown", duration_s=0.5)
-    assert cli("export", flown.folder, "--mcap") == 0
-    assert cli("import", flown.folder / "flight.mcap", "--out", tmp_path / "run") == 0
-    log = load_run(tmp_path / "run").log
+def test_our_own_mcap_file_has_the_log_s_path_again(run: Run, tmp_path: Path) -> None:
+    log = import_log([run.folder / "flight.mcap"], tmp_path).log
     for name in ("x", "y", "z", "qw", "qx", "qy", "qz"):
-        assert column(log, f"cameras.{name}") == pytest.approx(column(flown.log, f"truth.{name}"), abs=1e-6)
+        assert column(log, f"cameras.{name}") == pytest.approx(column(run.log, f"truth.{name}"), abs=1e-6)
 
 
 def test_parquet_with_time_stamps_is_read(tmp_path: Path) -> None:
@@ -486,6 +489,7 @@ BAD: Mapping[str, tuple[Mapping[str, Any] | bytes, str, str]] = {
     "no clock": ({name: GOOD[name] for name in "xyz"}, "", 'no column of times among x, y, z; name it in a map: t = "NAME'),
     "no place": ({"t": T, "thrust": T}, "", f'nothing gives {PLACES}; name it in a map: "cameras.x" = "NAME [m]"'),
     "no such column": (GOOD, '"cameras.x" = "xx"', "cameras.x = 'xx': no such column; did you mean x?"),
+    "no unit of a clock": ({"t [min]": T, **place("x", "y", "z")}, "", "t = 't': unit 'min'; expected s, ms, us, µs, ns"),
     "no such unit": (GOOD, '"cameras.x" = "x [deg]"', "cameras.x = 'x': unit 'deg'; expected m, cm, mm"),
     "no unit": (GOOD, '"cameras.x" = "x"', "cameras.x = 'x': unit ''; expected m, cm, mm"),
     "no quaternion": ({**GOOD, "qw": T, "qx": T, "qy": T, "qz": T + 2}, "", "cameras.qw to qz: a quaternion of length"),
@@ -536,19 +540,17 @@ def test_a_wrong_map_is_refused(text: str | None, reason: str, tmp_path: Path) -
     assert reason.lower() in str(told.value).lower()
 
 
-@pytest.mark.parametrize("name", ["cfclient", "without attitude"])
-def test_an_imported_run_is_shown_compared_and_exported(name: str, cli: Cli, tmp_path: Path) -> None:
-    path = csv(tmp_path / "log.csv", GOOD if name == "without attitude" else STOCK)
-    run = tmp_path / "run"
-    assert cli("import", path, "--out", run) == 0
-    assert (run / "report.html").is_file()
-    assert 'class="verdict' not in (run / "report.html").read_text(encoding="utf-8")
-    assert cli("export", run, "--csv", "--mcap") == 0
-    assert recording_of(run).is_file()
-    fly("hover", tmp_path / "simulated", duration_s=0.5)
-    assert cli("compare", tmp_path / "simulated", run) == 1
+def test_an_imported_run_without_attitude_is_shown_compared_and_exported(
+    run: Run, cli: Cli, tmp_path: Path
+) -> None:
+    path, folder = csv(tmp_path / "log.csv", GOOD), tmp_path / "run"
+    assert cli("import", path, "--out", folder) == 0
+    assert 'class="verdict' not in (folder / "report.html").read_text(encoding="utf-8")
+    assert cli("export", folder, "--csv", "--mcap") == 0
+    assert recording_of(folder).is_file()
+    assert cli("compare", run.folder, folder) == 1
     assert "distance" in cli.out
-    assert cli("import", path, "--out", run) == 2
+    assert cli("import", path, "--out", folder) == 2
     assert "exists and is not empty" in cli.err
-    events = [json.loads(line) for line in (run / "events.jsonl").read_text(encoding="utf-8").splitlines()]
+    events = [json.loads(line) for line in (folder / "events.jsonl").read_text(encoding="utf-8").splitlines()]
     assert events[0]["text"] == f"imported from {path}"

@@ -33,9 +33,9 @@ def make(folder: Path, values: np.ndarray, observer: Observer | None = None) -> 
     )
 
 
-def test_rows_survive_the_way_to_parquet(tmp_path: Path) -> None:
-    values = np.zeros(2)
-    recorder = make(tmp_path, values)
+def test_rows_survive_the_way_to_parquet_and_to_an_observer_that_keeps_them(tmp_path: Path) -> None:
+    watcher, values = Watcher(), np.zeros(2)
+    recorder = make(tmp_path, values, watcher)
     for row in range(250):
         values[:] = row, -row
         recorder.row(row * 10)
@@ -46,6 +46,8 @@ def test_rows_survive_the_way_to_parquet(tmp_path: Path) -> None:
     assert table.column("n").to_pylist() == list(range(250))
     assert table.schema.metadata[b"seed"] == b"7"
     assert not (tmp_path / "log.arrows").exists()
+    assert pa.Table.from_batches(watcher.batches).equals(table)
+    assert watcher.notes == []
 
 
 @pytest.mark.parametrize("writable", [True, False])
@@ -63,17 +65,6 @@ def test_a_long_log_is_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert pa.total_allocated_bytes() - before < whole.nbytes / 10
     assert mapped.equals(whole, check_metadata=True)
     assert sorted(tmp_path.iterdir()) == files
-
-
-def test_rows_that_an_observer_keeps_stay_as_they_were_recorded(tmp_path: Path) -> None:
-    watcher, values = Watcher(), np.zeros(2)
-    recorder = make(tmp_path, values, watcher)
-    for row in range(250):
-        values[:] = row, -row
-        recorder.row(row)
-    recorder.close()
-    assert pa.Table.from_batches(watcher.batches).equals(load_log(tmp_path))
-    assert watcher.notes == []
 
 
 def test_a_long_log_is_readable_with_freed_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
