@@ -37,15 +37,15 @@ class UdpServer:
         self._readers = readers
         self._received = received
         self._socket: socket.socket | None = None
+        self._session: Address | None = None
+        self._heard_us = 0  # of the session's last packet
+        self._probed_us = -PROBE_PERIOD_US
         self.open()
 
     def open(self) -> None:
         """Listen (the board has power), without a session. Raises `LabError` when the port is taken."""
         if self._socket is not None:
             return
-        self._session: Address | None = None
-        self._heard_us = 0  # of the session's last packet
-        self._probed_us = -PROBE_PERIOD_US
         opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         opened.setblocking(False)
         if sys.platform == "linux":
@@ -60,7 +60,8 @@ class UdpServer:
         self._readers[opened] = self._read
 
     def close(self) -> None:
-        """Close the port (power off): clients get an error."""
+        """Close the port (power off): clients get an error, and the next session is a new one."""
+        self.end_session()
         if self._socket is not None:
             del self._readers[self._socket]
             self._socket.close()

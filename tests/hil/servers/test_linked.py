@@ -69,6 +69,22 @@ def test_the_station_gets_its_link_its_cameras_and_the_profile(
     assert (VARIABLE in line._environment) is link.startswith("radio")
 
 
+@pytest.mark.parametrize(
+    ("link", "told"),
+    [
+        ("udp://127.0.0.1:0", "expected radio, mavlink, radio://0/80/2M/E7E7E7E7E7, udp://127.0.0.1:PORT"),
+        ("udp://127.0.0.1:65536", "expected radio, mavlink"), ("udp://127.0.0.1:000001", "expected radio, mavlink"),
+        ("udp://127.0.0.2:6000", "expected radio, mavlink"), ("radio://0/80/2M/E7E7E7E7E8", "expected radio, mavlink"),
+        ("mavlink:line", "expected mavlink, mavlink:pty or mavlink:PATH with a name for a new pty"),
+        ("mavlink:./a,b", "expected mavlink, mavlink:pty or mavlink:PATH with a name for a new pty"),
+        ("mavlink:/dev/null", "/dev/null exists; a new pty gets that name. The board behind a line that is there"),
+    ],
+)  # fmt: skip
+def test_a_link_with_no_end_here_is_refused(stack: ExitStack, tmp_path: Path, link: str, told: str) -> None:
+    with pytest.raises(LabError, match=f"^--link {link}: {told}"):
+        line_of(stack, tmp_path, link)
+
+
 def test_whole_lines_of_the_station_are_heard_once_after_the_warm_up(
     stack: ExitStack, tmp_path: Path
 ) -> None:

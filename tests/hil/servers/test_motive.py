@@ -34,6 +34,7 @@ from ground_station.sources.natnet import (
 )
 from ground_station.sources.natnet_stream import NatnetStream
 from ground_station.unused import Reason
+from hil.board.markers import DIAMETER
 from hil.errors import LabError
 from hil.servers.dongle_server import HOST
 from hil.servers.motive import MAX_CLIENTS, Streaming, Up, VirtualMotive, in_axes
@@ -201,8 +202,11 @@ def test_with_z_up_markers_and_model_are_in_the_world_s_axes(start) -> None:
     lab.expose()
     frame = decode(client.hear(), (4, 1))
     assert np.array([marker.p for marker in frame.labelled]) == pytest.approx(sighted(1).points, abs=1e-6)
-    occluded = [bool(marker.parameters & 1) for marker in frame.labelled]  # NatNet's bit 0
-    assert occluded == [not seen for seen in sighted(1).seen]
+    # NatNet's bits: occluded 1, solved from the point cloud 2, filled from the model 4, of a model 8
+    assert [marker.parameters for marker in frame.labelled] == [
+        10 if seen else 13 for seen in sighted(1).seen
+    ]
+    assert [marker.size for marker in frame.labelled] == pytest.approx([DIAMETER] * 8)
     lab.expose()
     frame = decode(client.hear(), (4, 1))
     assert np.array(frame.unlabelled) == pytest.approx(sighted(2).ghosts, abs=1e-6)
@@ -215,6 +219,13 @@ def test_a_frame_is_stamped_with_its_exposure(lab: MotiveBench, client: NatNetSo
     frames = [decode(client.hear(), (4, 1)) for _ in range(20)]
     assert frames[-1].transmitted - frames[-1].mid_exposure == LATENCY_US * hz // 1_000_000
     assert frames[-1].timestamp_s == pytest.approx(frames[-1].mid_exposure / hz)
+    assert frames[-1].received == frames[-1].transmitted
+    assert frames[0].mid_exposure == 0, "not before the start"
+    lab.motive.stream_frame(
+        1, replace(seen(1), t_us=7_000_000, received_us=7_030_000), 7_000_000 + LATENCY_US
+    )
+    later = decode(client.hear(), (4, 1))
+    assert (later.transmitted - later.received) * 1_000_000 == (LATENCY_US - 30_000) * hz
     client.say(MessageId.ECHO_REQUEST, (2**63 + 5).to_bytes(8, "little"))
     echo = decode(client.hear(), (4, 1))
     assert isinstance(echo, Echo)
@@ -301,6 +312,29 @@ def test_a_body_whose_process_is_late_is_not_tracked_in_one_frame_and_is_in_time
     assert client.hears_nothing()
 
 
+@pytest.mark.parametrize(("off_us", "frames"), [(-5001, []), (-5000, [2]), (5000, [2]), (5001, [1])])
+def test_poses_of_half_a_period_apart_are_of_one_exposure(start, off_us: int, frames: list[int]) -> None:
+    """What is older is dropped, and what is newer begins the next frame."""
+    one = Streaming(0, (4, 1), False)
+    lab, client = start(lambda lab: VirtualMotive(one, 2, lab.readers, period_us=10_000))
+    client.connect()
+    for body, t_us in ((1, 1_000_000), (2, 1_000_000 + off_us)):
+        lab.motive.stream_frame(body, replace(seen(body), t_us=t_us), t_us)
+    heard = []
+    while not client.hears_nothing():
+        heard.append(sum(body.valid for body in decode(client.hear(), (4, 1)).bodies))
+    assert heard == frames
+
+
+def test_the_server_info_names_the_release_of_each_protocol_and_the_group_of_multicast(start) -> None:
+    for version, release in (((3, 1), (2, 2, 0, 0)), ((4, 1), (3, 1, 0, 0))):
+        for multicast, group in ((False, "0.0.0.0"), (True, MULTICAST_GROUP)):
+            _, client = start(version=version, multicast=multicast)
+            client.say(MessageId.CONNECT)
+            info = decode(client.hear(), (4, 1))
+            assert (info.app_version, info.multicast, info.group) == (release, multicast, group)
+
+
 def test_the_bitstream_is_changed_for_the_client_that_asks(lab: MotiveBench, client: NatNetSocket) -> None:
     client.connect()
     client.say(MessageId.REQUEST, b"Bitstream\0")
@@ -339,7 +373,11 @@ def test_a_seventeenth_client_displaces_the_longest_silent_one(lab: MotiveBench)
 
 
 def test_unreadable_packets_are_counted_and_not_answered(lab: MotiveBench, client: NatNetSocket) -> None:
+    longest = b"StartRecording".ljust(256, b"\0")
+    client.say(MessageId.REQUEST, longest)
+    assert client.hear() == packet(MessageId.UNRECOGNIZED)
     broken = [b"", b"\0", packet(MessageId.FRAME), packet(MessageId.ECHO_REQUEST, b"short")]
+    broken.append(packet(MessageId.REQUEST, longest + b"\0"))
     for data in (*broken, packet(MessageId.REQUEST, b"Bitstream")[:-1], b"\xff" * 2048):
         client.send(data)
     assert lab.motive.malformed == len(broken) + 2

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from hil.servers.udp_server import SESSION_TIMEOUT_US, UdpServer
+from hil.servers.udp_server import PROBE_PERIOD_US, SESSION_TIMEOUT_US, UdpServer
 
 PATIENCE_S = 10.0
 
@@ -61,6 +61,32 @@ def test_a_stranger_is_ignored_counted_and_reported_once(board: Board, clients: 
     probes = [first.recv(64), first.recv(64)]  # one look whether it is still there
     assert probes == [b"\xf3", b"\xf3"]
     assert first.recv(64) == b"answer"
+    for now_us in (PROBE_PERIOD_US - 1, PROBE_PERIOD_US):
+        second.send(b"\xf0b")
+        board.read(now_us)
+        board.server.send(b"answer")
+        probes = [] if now_us < PROBE_PERIOD_US else [b"\xf3"] * 2
+        assert [first.recv(64) for _ in range(len(probes) + 1)] == [*probes, b"answer"]
+
+
+def test_a_board_that_is_switched_off_and_on_has_forgotten_its_session(
+    board: Board, clients: list[socket.socket]
+) -> None:
+    port = board.server.port
+    for now_us in (0, 10):
+        first, second, _ = clients
+        for number, client in enumerate((first, second)):
+            client.send(b"\xf0a")
+            board.read(now_us + number)
+        assert (board.server.ignored, board.server.port) == (1, port)
+        board.server.close()
+        assert (board.server.has_session(now_us), board.readers) == (False, {})
+        board.server.send(b"nobody is there")
+        board.server.open()
+    told = [line.partition(": ")[2] for line in board.said]
+    ignored = [f"127.0.0.1:{second.getsockname()[1]} is ignored while 127.0.0.1:{first.getsockname()[1]} talks to the board",
+        "1 packets of others were ignored"]  # fmt: skip
+    assert told == ignored * 2
 
 
 def test_a_client_that_is_silent_for_long_loses_the_board(board: Board, clients: list[socket.socket]) -> None:
