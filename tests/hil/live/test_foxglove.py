@@ -56,6 +56,11 @@ def test_changed_parameter_is_shown(screen: FoxgloveScreen, client: FoxgloveClie
     screen.know({"extCtrl.y_P": 2.5})
     while values(client.receive("parameterValues")) != {"extCtrl.y_P": 2.5}:
         pass
+    client.send(op="unsubscribeParameterUpdates", parameterNames=["extCtrl.y_P"])
+    client.send(op="getParameters", parameterNames=["extCtrl.z_P"], id="one")
+    assert values(client.receive("parameterValues")) == {"extCtrl.z_P": 2.0}
+    screen.know({"extCtrl.y_P": 2.75})
+    screen.know({"extCtrl.y_P": 2.5})
     client.send(op="setParameters", parameters=[{"name": "extCtrl.y_P", "value": "stop"}])
     assert values(client.receive("parameterValues")) == {"extCtrl.y_P": 2.5}
     for malformed in ({"op": "format"}, {"op": "subscribe"}, {"parameters": 1}):
@@ -139,4 +144,13 @@ def test_the_rows_are_those_of_mcap(screen: FoxgloveScreen, client: FoxgloveClie
     screen.show_rows(log.slice(20, 1), [])
     time_ns, data = client.receive("message")
     assert time_ns == 1000 * log.column("t")[20].as_py()
+    client.send(op="unsubscribe", subscriptionIds=[1])
+    client.send(op="subscribe", subscriptions=[{"id": 2, "channelId": client.channels["/truth/pose"]}])
+    client.send(op="getParameters", parameterNames=[], id="changed")
+    client.receive("parameterValues")
+    screen.show_rows(log.slice(21, 1), [])
+    screen.show_rows(log.slice(22, 1), [])
+    assert [client.receive("message")[0] for _ in range(2)] == [
+        1000 * log.column("t")[row].as_py() for row in (21, 22)
+    ]
     assert json.loads(data)["battery_voltage"] == pytest.approx(log.column("battery.voltage")[20].as_py())

@@ -88,13 +88,17 @@ def test_a_foreign_socket_is_refused(panel: PanelScreen, loop: IOLoop, typed: li
 def test_lines_reach_the_flight_and_bad_ones_fail(panel: PanelScreen, loop: IOLoop, typed: list[str]) -> None:
     socket = connect(loop, panel, panel.token, panel.origin)
     assert receive(loop, socket)["texts"] == []
-    for line in ("mark one", "x" * (LINE_MOST + 1), "mark two"):
+    longest, bad = "x" * LINE_MOST, ("x" * (LINE_MOST + 1), "", "a\nb")
+    for line in ("mark one", longest, *bad, "mark two"):
         loop.run_sync(lambda line=line: socket.write_message(line))
-    (answer,) = receive(loop, socket)["texts"]
-    assert answer == f"panel: a line of {LINE_MOST + 1} characters: expected 1..{LINE_MOST} printable ones"
+    answers: list[str] = []
+    while len(answers) < len(bad):
+        answers += receive(loop, socket)["texts"]
+    told = f"expected 1..{LINE_MOST} printable ones"
+    assert answers == [f"panel: a line of {len(line)} characters: {told}" for line in bad]
     panel.know({"extCtrl.y_P": 1.6})
     assert receive(loop, socket)["values"] == {"extCtrl.y_P": 1.6}
-    assert typed == ["mark one", "mark two"]
+    assert typed == ["mark one", longest, "mark two"]
     socket.close()
 
 

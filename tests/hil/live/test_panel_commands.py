@@ -7,11 +7,13 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from firmware_py.table import OF_PROFILE
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.faults import spans_of
 from hil.laboratory.files.recorder import load_events, load_log
 from hil.laboratory.files.result import read_result
 from hil.laboratory.flight import Flight
+from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import column
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
@@ -101,6 +103,40 @@ def test_goal_fault_and_note_act_and_are_events(tmp_path: Path) -> None:
     assert view.answers[1].startswith("goal 1 2: expected goal X Y Z")
     assert "99: " in view.answers[2]
     assert view.answers[4] == "step 5: expected 10..60000 ms"
+
+
+def test_each_line_acts_up_to_its_bounds_and_no_further() -> None:
+    """One after the other, for the board has to answer before the next parameter is set."""
+    good = {
+        1: ["goal 1 -1 2.15 10", "goal -0.5 0 1", "push.x:inf=0.1", "imu.noise:inf=2"],
+        8: ["set controller.gain_y -20"], 16: ["set controller.gain_y 20"], 24: ["set predictor.horizon 1"],
+        32: ["set predictor.horizon 12"], 40: ["step 10", "step 60000"],
+    }  # fmt: skip
+    bad = [
+        "goal 1.01 0 1.15", "goal 0 -1.01 1.15", "goal 0 0 0.14", "goal 0 0 inf", "step 9.9", "step 60001",
+        "set controller.gain_y -20.1", "set controller.gain_y 20.1", "set predictor.horizon 0",
+        "set predictor.horizon 13",
+    ]  # fmt: skip
+    view = Script({**good, 3: bad})
+    flight = lockstep_flight(
+        Request.of(EXPERIMENTS["hover"], duration_s=0.6, overrides=["flight.release_us=10000"])
+    )
+    PanelCommands(view, flight)
+    flight.lab.run_to(100_000)
+    goal = flight.line.trajectory.at(100_000)
+    assert (goal.p_WG, goal.yaw) == ((-0.5, 0.0, 1.0), pytest.approx(np.radians(10.0))), (
+        "a goal without yaw keeps it"
+    )
+    assert [str(fault) for fault in flight.switchboard.active] == ["push.x:inf=0.1", "imu.noise=2"]
+    view._at[view._looks + 1] = ["clear"]
+    flight.lab.run_to(600_000)
+    assert flight.switchboard.active == []
+    words = [" ".join(line.split()[:2]) for line in bad]
+    assert [answer.startswith(word) for answer, word in zip(view.answers, words, strict=True)] == [
+        True
+    ] * len(bad)
+    assert (view.known["extCtrl.y_P"], view.known[OF_PROFILE["predictor.horizon"].name]) == (-20.0, 12.0)
+    flight.close()
 
 
 def test_a_parameter_is_set_over_the_radio_and_noted_when_the_board_has_it(tmp_path: Path) -> None:
