@@ -8,7 +8,6 @@ import pytest
 
 from hil import Along, Experiment, Goal, LabError, Request
 from hil.api import request_of
-from hil.laboratory.experiments import EXPERIMENTS
 
 Place = tuple[float, float, float]
 
@@ -64,8 +63,3 @@ def test_an_invalid_goal_is_refused(goal: Goal) -> None:
 
     with pytest.raises(LabError, match=r"expected three finite numbers and a yaw"):
         request_of("hover", trajectory=lambda home, start_us: Own())
-
-
-def test_every_experiment_that_ships_can_be_followed() -> None:
-    for experiment in EXPERIMENTS.values():
-        Request.of(experiment, duration_s=min(experiment.duration_s, 40.0))

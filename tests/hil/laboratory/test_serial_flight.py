@@ -61,7 +61,7 @@ def test_wrong_bits_cost_frames_and_nothing_else(tmp_path: Path) -> None:
 
 
 def test_a_signed_line_flies(tmp_path: Path) -> None:
-    result = hover(tmp_path / "run", f"mavlink.signing_key='{KEY}'", duration_s=4.0, link=MAVLINK)
+    result = hover(tmp_path / "run", f"mavlink.signing_key='{KEY}'", duration_s=1.0, link=MAVLINK)
     assert result.passed, explain(result)
     assert column(load_log(result.folder), "serial.up_bad")[-1] == 0
 

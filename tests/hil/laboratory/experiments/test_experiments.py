@@ -2,7 +2,6 @@
 
 import math
 import pickle
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,13 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import TransferFunction, lsim, step
 
-from ground_station.trajectory import Goal, Trajectory
 from hil.config import load_config, profile_names
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.experiments.airspeed import LIFT_PER_RAD, attainable, hover_angle
 from hil.laboratory.experiments.disturbances import FAULTS, PUSHES
 from hil.laboratory.experiments.measures import recoveries, response, steps, y_steps
-from hil.laboratory.experiments.position import BEGIN_S, jump_sideways, rise_and_sink
 from hil.laboratory.faults import Fault
 from hil.laboratory.files.recorder import load_events, load_log
 from hil.laboratory.metrics import ALWAYS, METRICS
@@ -237,13 +234,3 @@ def test_trials_are_drawn_behind_the_first_flight(tmp_path: Path) -> None:
     assert [line.name for line in lines] == ["", "trials", "flight", "target"]
     assert lines[2].values[-1] == pytest.approx(110.0, abs=3.0)
     assert lines[2].width > lines[0].width
-
-
-@pytest.mark.parametrize("path", [rise_and_sink, jump_sideways])
-def test_a_goal_that_moves_is_home_until_its_time_after_the_release(
-    path: Callable[[Goal, int], Trajectory],
-) -> None:
-    home, begin_us = Goal((0.0, 0.0, 1.15), 0.0), 2_000_000 + round(1e6 * BEGIN_S)
-    flown = path(home, 2_000_000)
-    assert flown.at(begin_us - 1) == home
-    assert flown.at(begin_us + 400_000) != home
