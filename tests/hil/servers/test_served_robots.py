@@ -1,5 +1,6 @@
 """What a server shows of its first robot, and where several start."""
 
+import os
 import re
 import select
 import socket
@@ -16,8 +17,10 @@ from hil.errors import LabError
 from hil.laboratory.files.recorder import stored_in
 from hil.laboratory.lockstep import image_at
 from hil.laboratory.robot import Site, Streams
+from hil.servers.motive import Streaming
+from hil.servers.serial_server import Address
 from hil.servers.served_robot import UDP_RETRY_US, ServedRobot
-from hil.servers.server import Server, Service
+from hil.servers.server import Endpoints, Server, Service, open_motive
 from hil.world.scene import VisualModel
 from support.stm32_firmware import build, flash_binary
 from support.watching import Watcher
@@ -33,6 +36,23 @@ def test_rows_of_a_served_robot_describe_its_look() -> None:
     own = server.robot.body.look
     assert [part.name for part in look.parts] == [part.name for part in own.parts]
     assert len(look.outline) == len(own.outline) > 0
+
+
+def test_no_end_of_a_server_blocks_where_nothing_has_arrived() -> None:
+    server = Server(Service(load_config(), mavlink=True), print)
+    readers = server.clock.readers
+    opened = server.open(Endpoints(0, 0, (Address("tcp"),)))
+    ends = (
+        open_motive(Streaming(0, (4, 1), True), server.robot, server.clock),
+        Address("pty").open(readers, max, print),
+    )
+    with socket.create_connection(("127.0.0.1", opened.dongles)):
+        while len(readers) < 6:
+            readers[select.select(readers, [], [], 20.0)[0][0]](0)
+        files = [one if isinstance(one, int) else one.fileno() for one in readers]
+        assert [os.get_blocking(file) for file in files] == [False] * 6
+    for one in (*ends, server):
+        one.close()
 
 
 def test_an_image_of_an_unsupported_release_is_not_served() -> None:
