@@ -1,5 +1,6 @@
 """Each number of a channel stands under its own name: every source has another value."""
 
+import math
 from collections.abc import Mapping
 from itertools import count
 from types import SimpleNamespace
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from firmware_py.wire.telemetry import ALL_BLOCKS, ATTITUDE, Sample
 from ground_station.trajectory import Goal, Hold
 from hil.laboratory.channels import (
     _stock_channels,
@@ -19,6 +21,7 @@ from hil.laboratory.channels import (
     serial_channel,
     tracker_channel,
 )
+from hil.laboratory.files.station_channels import station_channels
 from hil.world.body import Channel
 
 numbers = count(1)
@@ -97,6 +100,53 @@ def test_the_markers_of_the_last_exposure() -> None:
     assert columns(channel) == dict.fromkeys(names, 0.0)
     mocap.sighting = SimpleNamespace(bits=5, unlabelled=[None] * 3, error=0.25)
     assert columns(channel) == dict(zip(names, (5, 3, 0.25), strict=True))
+
+
+def test_all_that_a_ground_station_knows() -> None:
+    """The board's names in the order of the log's columns."""
+    told = {v.name: next(numbers) for block in ALL_BLOCKS for v in block.variables}
+    counters, frame, track = source("frames invalid samples malformed"), source("t_us"), SimpleNamespace()
+    frame.p_WB, frame.q_WB, track.v_WB, track.w_B, ages = (
+        [next(numbers) for _ in range(n)] for n in (3, 4, 3, 3, 6)
+    )
+    link = source("sent late quality rssi supervisor_state")
+    link.latency = source("us")
+    ground: Any = SimpleNamespace(counters=counters, frame=frame, track=track, tracker=None, telemetry={})
+    ground.budget = SimpleNamespace(last=lambda: ages)
+    session: Any = SimpleNamespace(link=link, ground=ground)
+    channels = station_channels(session, lambda: True, lambda: Goal((0.1, 0.2, 0.3), 0.4), 1000)
+    assert all(map(math.isnan, (channels[3].read(), *channels[5].read()))), "no block has a sample"  # type: ignore[misc]
+    for block in ALL_BLOCKS:
+        ground.telemetry[block.id] = Sample(block, 0, tuple(told[one.name] for one in block.variables))
+    found = {name: value for channel in channels for name, value in columns(channel).items()}
+    axes, four = ["x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw"], (1, 2, 3, 4)
+    names = [f"stateEstimate.{name}" for name in (*axes, *(f"{axis}_rate" for axis in axes[6:]))]
+    names += [f"{group}{n}" for group in ("stateEstimate.flap_", "motor.m", "controller.u") for n in four]
+    shown = [f"estimate.{name}" for name in (*axes, *"pqr")]
+    shown += [f"{group}{n}" for group in ("telemetry.flap_", "motor.m", "control.u") for n in four]
+    stages = ("camera", "processing", "network", "mocap", "station", "link")
+    assert list(found.items()) == [
+        ("flight.free", True), ("supervisor.state", link.supervisor_state), ("cameras.exposed", frame.t_us - 1000),
+        *zip((f"cameras.{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "p", "q", "r")),
+             (*frame.p_WB, *frame.q_WB, *track.v_WB, *track.w_B), strict=True),
+        ("goal.x", 0.1), ("goal.y", 0.2), ("goal.z", 0.3), ("goal.yaw", 0.4),
+        *zip(shown, (told[name] for name in names), strict=True),
+        ("estimator.pose_age_us", 100 * told["locSrv.age"]), ("estimator.poses", 0), ("estimator.rejected", 0),
+        ("link.sent", link.sent), ("link.late", link.late), ("station.frames", counters.frames),
+        ("station.unusable", counters.invalid), ("station.samples", counters.samples),
+        ("station.malformed", counters.malformed), ("link.latency", link.latency.us),
+        ("battery.voltage", told["pm.vbat"]), ("board.load", told["system.load"]),
+        ("link.quality", link.quality), ("link.rssi", link.rssi),
+        *zip((f"age.{stage}" for stage in stages), ages, strict=True),
+    ]  # fmt: skip
+    later = {"locSrv.poses": 3, "locSrv.rejected": 5}
+    sample = ground.telemetry[ATTITUDE.id]
+    values = tuple(told[one.name] + later.get(one.name, 0) for one in ATTITUDE.variables)
+    ground.telemetry[ATTITUDE.id] = Sample(ATTITUDE, 20, values)
+    assert (sample.values[4:], channels[3].read()[-2:]) == (
+        (told["locSrv.poses"], told["locSrv.rejected"]),
+        (3, 5),
+    )
 
 
 def test_the_excitation_of_each_input() -> None:
