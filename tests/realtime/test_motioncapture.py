@@ -301,12 +301,8 @@ def test_garbage_on_the_pipe_is_counted(stand_in: Callable[..., MotioncaptureSou
 def test_an_orphaned_process_ends() -> None:
     """Vicon's connect() goes on for ever, and lets no signal handler of Python's run."""
     command = [
-        sys.executable,
-        "-m",
-        "ground_station.sources.motioncapture_process",
-        "vicon",
-        "hostname=127.0.0.1",
-    ]
+        sys.executable, "-m", "ground_station.sources.motioncapture_process", "vicon", "hostname=127.0.0.1",
+    ]  # fmt: skip
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     try:
         assert process.wait(PATIENCE_S) == -signal.SIGALRM

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -30,9 +29,6 @@ from hil.laboratory.request import MAVLINK, RADIO, Request
 from hil.laboratory.run import fly
 from hil.pictures.curves import since_release
 from hil.pictures.report import write_report
-from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig
-from hil.world.floaty.plant import Plant
-from hil.world.tunnel import TunnelConfig
 from support.command import Cli
 from support.flights import hover
 
@@ -342,22 +338,6 @@ def test_faults_on_one_knob_add_up_and_leave_it_as_it_was() -> None:
     assert wind == pytest.approx([0.2, 1.2, 3.2, 3.2, 2.2, 0.2])
     assert pace == pytest.approx([0.8, 0.4, 0.0, 0.4, 0.8, 0.8])
     assert flight.robot.body.tunnel.side_wind == (0.1, 0.2, 0.3)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("kind", "axis"), [("wind.side_x", 0), ("wind.side_y", 1)])
-@given(wind=st.floats(-20.0, 20.0), more=st.floats(-30.0, 30.0))
-def test_side_wind_blows_both_ways_up_to_20_m_per_s(kind: str, axis: int, wind: float, more: float) -> None:
-    plant = Plant(
-        GeometryConfig(), PlantConfig(), TunnelConfig(), PlantServoConfig(), np.random.default_rng(1)
-    )
-    before = [1.0, -2.0, 3.0]
-    before[axis] = wind
-    plant.tunnel.set_side_wind(*before)
-    (knob,) = KINDS[kind].knobs
-    knob.turn(SimpleNamespace(body=plant), knob.blend(wind, more))  # type: ignore[arg-type]
-    before[axis] = min(max(wind + more, -20.0), 20.0)
-    assert plant.tunnel.side_wind == tuple(before)
 
 
 @pytest.mark.parametrize("link", [RADIO, MAVLINK])

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ground_station.tracker import Quality
 from hil.commands.tables import print_result, print_seeds
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.files.recorder import load_events, load_log
@@ -18,7 +17,6 @@ from hil.laboratory.lockstep import in_lockstep, lockstep_flight
 from hil.laboratory.metrics import ALWAYS, column
 from hil.laboratory.request import LOCKSTEP, Bench, Request
 from hil.laboratory.run import fly
-from hil.pictures.report import write_report
 from hil.research.campaigns.jobs import Job, row_of
 from support.flights import explain, flown, hover
 from support.full_disk import small_files
@@ -107,20 +105,6 @@ def test_hover_with_the_authors_gains_swings_in_y_and_survives(tmp_path: Path) -
     assert rms["y"] > rms["x"]
     for axis in "xyz":
         assert np.mean([result.metrics[f"within_6cm_{axis}"] for result in results]) > 0.95
-
-
-@pytest.mark.long
-def test_log_events_and_report_know_what_the_tracker_refused(tmp_path: Path) -> None:
-    result = hover(tmp_path / "run", duration_s=2.0, faults=["mocap.outlier@1:0.05=0.5"])
-    log = load_log(result.folder)
-    assert column(log, "tracker.refused")[-1] == result.metrics["frames_refused"] == 10
-    assert set(column(log, "tracker.quality")[20:]) == {Quality.REFUSED, Quality.TRACKED}
-    told = [event["text"] for event in load_events(result.folder) if event["source"] == "station"]
-    assert len(told) == 1
-    assert told[0].startswith("motion capture: 10 poses refused, up to 0.5")
-    assert '<tr id="frames_refused"><td>frames_refused</td><td class="number">10<' in write_report(
-        result.folder
-    ).read_text(encoding="utf-8")
 
 
 HEALTHY = (

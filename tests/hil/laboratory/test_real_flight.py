@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import hil.pictures.figures
 from firmware_py.wire.supervisor import State
-from firmware_py.wire.telemetry import BATTERY, Sample, state_in
+from firmware_py.wire.telemetry import state_in
 from ground_station.config import StationConfig
 from ground_station.latency import LinkLatency
 from ground_station.links.loopback import LoopbackLink
@@ -48,7 +48,6 @@ from hil.pictures.figures import PICTURES
 from hil.pictures.gallery import GALLERY
 from hil.pictures.panels import marks_of_flight
 from hil.pictures.report import write_report
-from support.command import Cli
 from support.full_disk import small_files
 from support.html_page import Page
 from support.watching import Watcher
@@ -129,21 +128,6 @@ def test_the_cameras_judge_a_flight_as_the_truth_does(both: tuple[Path, Path]) -
     assert measured[0]["unseen"] == 0.0
 
 
-def test_the_log_has_the_estimate_of_the_real_board(both: tuple[Path, Path]) -> None:
-    real, truth = (load_log(folder) for folder in both)
-    names = [f"estimate.{name}" for name in ("x", "vy", "z", "roll", "pitch", "yaw", "r")]
-    names += ["control.u3", "motor.m2", "supervisor.state"]
-    at = np.searchsorted(truth.column("t").to_numpy(), 3_500_000)
-    row = np.searchsorted(real.column("t").to_numpy(), 3_500_000)
-    for name in names:
-        ticks = truth.column(name).to_numpy()[at - 6 : at + 1]
-        means = (ticks[:-1] + ticks[1:]) / 2  # the board reports inputs as the mean of two ticks
-        recent = means if name == "control.u3" else ticks[1:]  # telemetry comes every 20 ms, and takes some
-        told = real.column(name).to_numpy()[row]
-        step = 2.0**-11 if name in ("estimate.r", "control.u3") else 1e-6  # half a float, or a whole one
-        assert np.abs(recent - told).min() == pytest.approx(0.0, abs=1e-5 + step * abs(told)), name
-
-
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of the same flight, simulated."""
@@ -161,17 +145,6 @@ def test_a_real_flight_lies_over_the_simulated_one(both: tuple[Path, Path], simu
     assert comparison.one_is_real
     assert "truth.x" in comparison.missing[0]
     assert "cameras.x" in comparison.missing[1]
-
-
-@pytest.mark.long
-def test_the_command_shows_both(cli: Cli, both: tuple[Path, Path], simulated: Path, tmp_path: Path) -> None:
-    assert cli("compare", both[0], simulated, "--out", tmp_path / "out") == 1
-    shown = cli.out
-    assert "not in " in shown
-    assert "cameras.x" in shown
-    assert "first difference" not in shown
-    page = Page((tmp_path / "out" / "compare.html").read_text(encoding="utf-8"))
-    assert len(page.tables["apart"]) == 11
 
 
 def test_the_report_of_a_real_flight_names_the_cameras(both: tuple[Path, Path], tmp_path: Path) -> None:
@@ -387,16 +360,6 @@ def test_a_killed_station_loses_only_the_last_second(tmp_path: Path, monkeypatch
     assert "ended before the flight did" in write_report(left).read_text(encoding="utf-8")
 
 
-def test_slow_cameras_do_not_make_more_than_a_second_be_lost(tmp_path: Path) -> None:
-    bench = StationBench(tmp_path / "run")
-    for _ in range(32):
-        bench.now_us += 95_000
-        bench.record.on_loop(bench.session, bench.now_us)
-    left = Path(shutil.copytree(tmp_path / "run", tmp_path / "left"))
-    bench.record.close()
-    assert load_log(left).column("t")[-1].as_py() > 32 * 95_000 - 1_100_000
-
-
 def test_a_flight_that_never_began_leaves_no_folder(tmp_path: Path) -> None:
     bench = StationBench(tmp_path / "run")
     bench.record.note("station", "no board")
@@ -460,22 +423,6 @@ def test_the_station_s_records_have_the_time_of_the_log(both: tuple[Path, Path],
     ]
     old = log.replace_schema_metadata({})
     assert ages_in_time_of(iter([old]), tmp_path / "run").num_rows == 0
-
-
-def test_battery_and_load_are_logged_and_shown_where_the_board_tells_them(tmp_path: Path) -> None:
-    bench = StationBench(tmp_path / "run")
-    bench.plan.start(bench.now_us)
-    bench.fly(1.0)
-    bench.ground.telemetry[BATTERY.id] = Sample(BATTERY, 0, (3.9,))
-    bench.fly(1.0)
-    bench.result()
-    log = load_log(tmp_path / "run")
-    for name, unit in (("battery.voltage", b"V"), ("board.load", b"%")):
-        assert log.schema.field(name).metadata[b"unit"] == unit
-    voltages = log.column("battery.voltage").to_numpy()
-    assert np.isnan(voltages[:95]).all()
-    assert voltages[105:] == pytest.approx(3.9)
-    assert [panel.label for panel in figures.station(log).panels] == ["not used [so far]", "battery [V]"]
 
 
 def test_a_counter_goes_on_where_it_wraps_and_after_a_reset_of_the_board() -> None:

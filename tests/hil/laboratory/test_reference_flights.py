@@ -29,30 +29,17 @@ POSES = (
     "mocap.latency@0.8",
 )
 RADIO = (
-    "radio.loss@0",
-    "radio.uplink_loss@0.2",
-    "radio.downlink_loss@0.2",
-    "radio.bit_errors@0.3",
-    "radio.jitter@0.4",
-)
+    "radio.loss@0", "radio.uplink_loss@0.2", "radio.downlink_loss@0.2", "radio.bit_errors@0.3", "radio.jitter@0.4",
+)  # fmt: skip
 IMU = ("imu.bias.p@0", "imu.bias.q@0.2=-4", "imu.bias.r@0.3=7", "imu.noise@0.4", "imu.saturation@0.6")
 SERVOS = (
-    "servo.stuck.1@0.5",
-    "servo.slow.2@0.1",
-    "servo.trim.3@0.2",
-    "servo.trim.4@0.3=-3",
-    "battery.sag@0.2=0.5",
+    "servo.stuck.1@0.5", "servo.slow.2@0.1", "servo.trim.3@0.2", "servo.trim.4@0.3=-3", "battery.sag@0.2=0.5",
     "cpu.load@0.1",
-)
+)  # fmt: skip
 AIR = ("wind.side_x@0.1", "wind.side_y@0.2", "wind.fan@0.5", "wind.occlusion@0.6", "wind.gusts@0.3")
 PUSHES = (
-    "push.x@0.1",
-    "push.y@0.2=-1",
-    "push.z@0.3",
-    "push.roll@0.4",
-    "push.pitch@0.5=-0.01",
-    "push.yaw@0.6",
-)
+    "push.x@0.1", "push.y@0.2=-1", "push.z@0.3", "push.roll@0.4", "push.pitch@0.5=-0.01", "push.yaw@0.6",
+)  # fmt: skip
 FLIGHTS: dict[str, tuple[str, dict[str, Any]]] = {
     "hover": ("hover", {"duration_s": 2.0}),
     "another seed": ("hover", {"seed": 7}),

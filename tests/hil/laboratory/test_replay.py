@@ -14,12 +14,8 @@ from support.command import Cli
 STATES = [*"xyz", "vx", "vy", "vz", "roll", "pitch", "yaw", *"pqr", *(f"flap_{n}" for n in (1, 2, 3, 4))]
 COUNTS = ["fused", "refused", "jumps", "too_old", "invalid", "bounded", "resets"]
 FAULTS = (
-    "mocap.outlier@0.3",
-    "mocap.dropout@0.5:0.1",
-    "imu.bias.r@0.2:0.4=10",
-    "push.y@0.6=2",
-    "imu.silent@0.9:0.1",
-)
+    "mocap.outlier@0.3", "mocap.dropout@0.5:0.1", "imu.bias.r@0.2:0.4=10", "push.y@0.6=2", "imu.silent@0.9:0.1",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

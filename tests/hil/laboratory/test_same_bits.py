@@ -31,12 +31,8 @@ from support.other_machine import TARGETS, CoreElsewhere, OtherMachine
 from support.paths import TESTS
 
 FAULTS = (
-    "servo.slow.2@0.1:0.5=0.5",
-    "imu.bias.p@0.2=3",
-    "mocap.outlier@0.4",
-    "radio.bit_errors@0.2",
-    "push.y@0.6=2",
-)
+    "servo.slow.2@0.1:0.5=0.5", "imu.bias.p@0.2=3", "mocap.outlier@0.4", "radio.bit_errors@0.2", "push.y@0.6=2",
+)  # fmt: skip
 NUMPY = " ".join(feature for feature in __cpu_dispatch__ if __cpu_features__[feature])
 SETTINGS = {
     "prescott": {"OPENBLAS_CORETYPE": "Prescott"},
@@ -84,11 +80,6 @@ def usual() -> list[str]:
     found = hashes({})
     assert len(set(found)) == 4
     return found
-
-
-@pytest.mark.long
-def test_oldest_blas_and_no_vector_instructions_make_the_same_flights(usual: list[str]) -> None:
-    assert hashes(SETTINGS["prescott"] | SETTINGS["numpy"] | SETTINGS["libm"]) == usual
 
 
 @pytest.mark.long

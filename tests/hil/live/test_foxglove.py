@@ -86,16 +86,12 @@ def test_parameters_that_nobody_asked_for_are_neither_shown_nor_changed() -> Non
 @pytest.mark.parametrize(
     ("refused", "token", "headers"),
     [
-        (True, "guessed", {}),
-        (True, None, {"Origin": "http://evil.example"}),
-        (True, None, {"Origin": "https://app.foxglove.dev.evil.example"}),
-        (True, None, {"Origin": "null"}),
-        (True, None, {"Host": "evil.example:8765"}),
-        (False, None, {"Origin": "https://app.foxglove.dev"}),
-        (False, None, {"Origin": "http://localhost:8080"}),
-        (False, None, {"Origin": "file://"}),
+        (True, "guessed", {}), (True, None, {"Origin": "http://evil.example"}),
+        (True, None, {"Origin": "https://app.foxglove.dev.evil.example"}), (True, None, {"Origin": "null"}),
+        (True, None, {"Host": "evil.example:8765"}), (False, None, {"Origin": "https://app.foxglove.dev"}),
+        (False, None, {"Origin": "http://localhost:8080"}), (False, None, {"Origin": "file://"}),
     ],
-)
+)  # fmt: skip
 def test_only_programs_with_the_token_and_foxglove_s_pages_connect(
     screen: FoxgloveScreen, refused: bool, token: str | None, headers: dict[str, str]
 ) -> None:

@@ -37,8 +37,8 @@ from ground_station.unused import Reason
 from hil.board.markers import DIAMETER
 from hil.errors import LabError
 from hil.servers.dongle_server import HOST
-from hil.servers.motive import MAX_CLIENTS, Streaming, Up, VirtualMotive, in_axes
-from hil.servers.natnet_bytes import encode_frame, encode_models, encode_server_info
+from hil.servers.motive import MAX_CLIENTS, Streaming, Up, VirtualMotive
+from hil.servers.natnet_bytes import encode_frame, encode_models
 from support.motive_bench import FROM_MOTIVE, LATENCY_US, PLACES, MotiveBench, needs, seen, sighted
 from support.paths import SUPPORT
 
@@ -76,24 +76,6 @@ def test_markers_have_no_names_before_version_4() -> None:
     found = decode(sent, (3, 1))
     assert b"nose" not in sent
     assert found.bodies[0].markers == (MarkerDescription((1, 2, 3), 4, ""),)
-
-
-def test_the_server_info_arrives_as_it_was_sent() -> None:
-    info = ServerInfo("Motive", (3, 1, 2, 4), (4, 1, 0, 7), 10**7, 1511, True, "239.255.42.99")
-    assert decode(encode_server_info(info), (4, 1)) == info
-
-
-def test_motives_axes_have_y_up() -> None:
-    """Against rotation matrices of scipy: nose x, left y, up z become nose x, up y, right z."""
-    q = Rotation.from_euler("zyx", [0.3, -0.5, 0.9])
-    p_M, (w, x, y, z) = in_axes("y", (1.0, 2.0, 3.0), tuple(q.as_quat()[[3, 0, 1, 2]]))
-    assert p_M == (1.0, 3.0, -2.0)
-    expected = FROM_MOTIVE.T @ q.as_matrix() @ FROM_MOTIVE
-    assert Rotation.from_quat([x, y, z, w]).as_matrix() == pytest.approx(expected)
-
-
-def test_with_z_up_motives_axes_are_those_of_the_world() -> None:
-    assert in_axes("z", (1.0, 2.0, 3.0), (0.5, 0.1, 0.7, 0.5)) == ((1.0, 2.0, 3.0), (0.5, 0.1, 0.7, 0.5))
 
 
 @pytest.fixture

@@ -93,18 +93,13 @@ def test_a_port_in_use_is_named() -> None:
 @pytest.mark.parametrize(
     ("text", "host", "ends"),
     [
-        ("pty", "127.0.0.1", ["pty", "pty"]),
-        ("pty:/tmp/a:b", "127.0.0.1", ["pty:/tmp/a:b", "pty:/tmp/a:b-2"]),
-        ("udp", "127.0.0.1", ["udp:14550", "udp:14551"]),
-        ("udp:1234", "127.0.0.1", ["udp:1234", "udp:1235"]),
-        ("udp:10.0.0.7:1234", "10.0.0.7", ["udp:1234", "udp:1235"]),
-        ("tcp", "127.0.0.1", ["tcp:5760", "tcp:5761"]),
-        ("tcp:0", "127.0.0.1", ["tcp:0", "tcp:0"]),
-        ("tcp:localhost:", "localhost", ["tcp:5760", "tcp:5761"]),
-        ("tcp:65535", "127.0.0.1", ["tcp:65535"]),
-        ("tcp:65534", "127.0.0.1", ["tcp:65534", "tcp:65535"]),
+        ("pty", "127.0.0.1", ["pty", "pty"]), ("pty:/tmp/a:b", "127.0.0.1", ["pty:/tmp/a:b", "pty:/tmp/a:b-2"]),
+        ("udp", "127.0.0.1", ["udp:14550", "udp:14551"]), ("udp:1234", "127.0.0.1", ["udp:1234", "udp:1235"]),
+        ("udp:10.0.0.7:1234", "10.0.0.7", ["udp:1234", "udp:1235"]), ("tcp", "127.0.0.1", ["tcp:5760", "tcp:5761"]),
+        ("tcp:0", "127.0.0.1", ["tcp:0", "tcp:0"]), ("tcp:localhost:", "localhost", ["tcp:5760", "tcp:5761"]),
+        ("tcp:65535", "127.0.0.1", ["tcp:65535"]), ("tcp:65534", "127.0.0.1", ["tcp:65534", "tcp:65535"]),
     ],
-)
+)  # fmt: skip
 def test_addresses_count_up_to_the_last_port(text: str, host: str, ends: list[str]) -> None:
     addresses = parse_addresses(text, len(ends))
     assert {end.host for end in addresses} == {host}

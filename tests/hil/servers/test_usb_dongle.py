@@ -264,12 +264,8 @@ def test_the_bus_has_the_kernel_s_files(tmp_path: Path) -> None:
         for name in ("idVendor", "idProduct", "bcdDevice", "serial", "speed")
     }
     assert shown == {
-        "idVendor": "1915",
-        "idProduct": "7777",
-        "bcdDevice": "0504",
-        "serial": "F10A7Y0001",
-        "speed": "12",
-    }
+        "idVendor": "1915", "idProduct": "7777", "bcdDevice": "0504", "serial": "F10A7Y0001", "speed": "12",
+    }  # fmt: skip
     assert (device / "uevent").read_text().splitlines() == [
         "MAJOR=189", "MINOR=1", "DEVNAME=bus/usb/001/002", "DEVTYPE=usb_device", "BUSNUM=001", "DEVNUM=002",
     ]  # fmt: skip
