@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad, solve_ivp
 
 from hil.config import load_config
-from hil.laboratory.experiments.power import VEHICLES, estimate, until_empty
+from hil.laboratory.experiments.power import estimate, until_empty
 from hil.laboratory.files.recorder import load_events, load_log
 from hil.laboratory.metrics import column, free_flight
 from hil.world.battery import Battery, endurance, open_circuit_voltage
@@ -150,23 +150,3 @@ def test_a_hover_draws_the_paper_s_power(tmp_path: Path) -> None:
     assert result.metrics["power"] == pytest.approx(3.4, rel=0.10)
     assert result.metrics["specific_power"] == pytest.approx(10.0, rel=0.10)
     assert result.metrics["endurance"] == pytest.approx(33.0, rel=0.10)
-
-
-# The author's plotting script: [W/kg], and how far our reading of the same method may lie from it
-AUTHOR = {
-    ("Crazyflie 2.1", False): (296, 0.01), ("Crazyflie 2.1", True): (244, 0.01),
-    ("custom quadcopter", False): (145, 0.001), ("custom quadcopter", True): (68, 0.001),
-    ("DJI Mini 4 Pro", False): (134, 0.01), ("DJI Air 3", False): (113, 0.01),
-    ("DJI Mavic 3 Pro", False): (112, 0.01), ("DJI Avata", False): (290, 0.01),
-    ("Robinson R22", False): (125, 0.10), ("Bell 206B", False): (114, 0.10),
-    ("Airbus H125", False): (184, 0.10), ("Sikorsky UH-60M", False): (170, 0.20),
-}  # fmt: skip
-
-
-def test_specific_power_of_other_vehicles_is_the_papers() -> None:
-    assert {(vehicle.name, vehicle.updraft) for vehicle in VEHICLES} == set(AUTHOR)
-    for vehicle in VEHICLES:
-        expected, tolerance = AUTHOR[vehicle.name, vehicle.updraft]
-        assert vehicle.specific_power == pytest.approx(expected, rel=tolerance), vehicle.name
-        low, high = vehicle.power_range
-        assert low <= vehicle.power <= high

@@ -59,7 +59,7 @@ def test_mass_centre_and_inertia_are_those_of_a_cloud_of_points() -> None:
     points, weights = [], []
     for surface in surfaces(geometry):
         a, b, c = surface.unfolded[:3]  # rectangles: a + s (b - a) + t (c - b)
-        s, t = rng.random((2, 200_000))
+        s, t = rng.random((2, 100_000))
         cloud = a + s[:, None] * (b - a) + t[:, None] * (c - b)
         area = np.linalg.norm(np.cross(b - a, c - b))
         for x in (1.0, -1.0):
@@ -71,8 +71,8 @@ def test_mass_centre_and_inertia_are_those_of_a_cloud_of_points() -> None:
     for place, box, mass in [((0.0, 0.0, -0.09), (0.03, 0.05, 0.08), 0.1)] + [
         ((0.03 * x, 0.04 * y, -0.01), (0.02, 0.01, 0.02), 0.01) for x in (1, -1) for y in (1, -1)
     ]:
-        points.append(place + (rng.random((200_000, 3)) - 0.5) * box)
-        weights.append(np.full(200_000, mass / 200_000))
+        points.append(place + (rng.random((100_000, 3)) - 0.5) * box)
+        weights.append(np.full(100_000, mass / 100_000))
     p, w = np.concatenate(points), np.concatenate(weights)
     centre = w @ p / w.sum()
     x, y, z = (p - centre).T
