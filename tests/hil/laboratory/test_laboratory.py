@@ -16,8 +16,7 @@ from hil.laboratory.laboratory import Laboratory
 from hil.laboratory.robot import Ports, Robot, Site, Streams, nobody_listens
 from hil.servers.built_in_station import fly_built_in
 from hil.servers.live_faults import LiveFaults
-from hil.servers.served_robot import ServedRobot
-from hil.servers.server import LaunchClamp, Server, Service
+from hil.servers.server import Server, Service
 
 SECOND_US = 1_000_000
 
@@ -252,19 +251,6 @@ def test_an_experiment_that_plans_events_at_one_instant_without_end_is_one_clear
 
 def site_in(lab: Laboratory) -> Site:
     return Site(load_config(), lab.events, Streams.of_seed(1), lambda source, text: None)
-
-
-def test_a_holder_releases_only_a_flying_robot() -> None:
-    lab = Laboratory(FreeRunning())
-    robot = ServedRobot(1, site_in(lab), print).robot
-    robot.body.hold()
-    lab.add(robot)
-    gone: list[int] = []
-    LaunchClamp(robot, gone.append)
-    robot.watch(0)
-    lab.end_at(3 * SECOND_US)
-    lab.run()
-    assert gone == []
 
 
 def test_a_rebooted_board_talks_on_its_serial_line_by_the_laboratorys_clock() -> None:

@@ -281,17 +281,6 @@ def test_time_without_poses_is_not_flown_and_fails_its_limit(tmp_path: Path, com
     assert not result.passed
 
 
-def test_a_real_board_that_calibrates_again_was_reset(tmp_path: Path) -> None:
-    bench = StationBench(tmp_path / "run")
-    bench.plan.start(bench.now_us)
-    for state in (State.FLYING, State.CALIBRATING, State.FLYING, State.CALIBRATING, State.FLYING):
-        bench.session.link.supervisor_state = state  # type: ignore[misc]
-        bench.fly(0.5)
-    result = bench.result()
-    assert (result.outcome, result.cause) == ("reset", "the board was reset 2 times")
-    assert result.metrics["uncontrolled"] == pytest.approx(1.0, abs=0.05)
-
-
 def test_a_comparison_shows_what_was_judged_and_a_second_around_it(tmp_path: Path) -> None:
     bench = StationBench(tmp_path / "run", "yaw-step")
     bench.fly(5.0)

@@ -186,6 +186,7 @@ def test_a_picture_stays_until_it_ends_by_itself() -> None:
     assert view.close() == 0
 
 
+@pytest.mark.long
 def test_nothing_is_imported_while_a_flight_is_recorded_and_shown() -> None:
     """An import takes up to seconds on a busy machine; pyarrow imports pandas when it first sees an array of numpy's."""
     program = f"""

@@ -143,6 +143,7 @@ def test_a_board_that_leaves_the_loop_waits_for_a_pose_of_its_own(host: Host) ->
     assert (host.app.supervisor.state, host.app.supervisor.cause) == (State.WAITING, Cause.NONE)
 
 
+@pytest.mark.long
 def test_a_mode_that_begins_while_a_sample_is_filed_begins_without_it(tmp_path: Path) -> None:
     """The stabilizer task preempts the receiving task between its reading `received` and its writing it."""
     preempted = (

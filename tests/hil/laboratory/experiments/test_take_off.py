@@ -31,16 +31,6 @@ def standing(**changes: float) -> Plant:
     return plant
 
 
-def test_a_robot_at_rest_sinks_in_by_its_weight() -> None:
-    plant = standing()
-    plant.place((0.0, 0.0, GROUND.foot_below), LEVEL)
-    plant.advance(1_000_000)
-    sunk = GROUND.foot_below - plant.p_WB[2]
-    assert sunk == pytest.approx(MASS * GRAVITY / (4 * GROUND.stiffness), rel=1e-4)
-    assert plant.p_WB[2] == pytest.approx(STANDING_Z, abs=1e-4)
-    assert plant.specific_force_B == pytest.approx([0.0, 0.0, GRAVITY], abs=1e-4)
-
-
 def test_a_drop_bounces_by_spring_and_damper() -> None:
     def motion(t: float, state: np.ndarray) -> list[float]:
         z, v = state
