@@ -175,15 +175,21 @@ def test_a_height_is_held_in_the_second_half_where_the_flaps_can_carry(
 
 
 def test_an_airspeed_limits_what_the_flaps_can_carry() -> None:
-    for speed, opening_deg in (
-        (8, 0.0),
-        (9.5, 0.0),
-        (9.75, 12.3),
-        (10, 25.0),
-        (10.25, 36.8),
-        (10.5, 47.7),
-        (11, 51.6),
-    ):
+    openings_deg = {
+        8: 0.0,
+        8.5: 0.0,
+        9: 0.0,
+        9.5: 0.0,
+        9.75: 12.3,
+        10: 25.0,
+        10.25: 36.8,
+        10.5: 47.7,
+        11: 51.6,
+    }
+    assert [name for name in EXPERIMENTS if "airspeed" in name] == [
+        f"airspeed-{one:g}" for one in openings_deg
+    ]
+    for speed, opening_deg in openings_deg.items():
         experiment = EXPERIMENTS[f"airspeed-{speed:g}"]
         carried = 9.5 <= speed <= 10.4
         held = {"lost": 0.0, "height_off": 0.06, "in_box": 0.85} if carried else {"lost": 1.0}
