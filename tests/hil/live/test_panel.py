@@ -17,7 +17,7 @@ from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.files.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
-from hil.live.panel import COMMANDS, LINE_MOST, ROWS_MOST, TEXTS_MOST, PanelScreen, _Socket
+from hil.live.panel import COMMANDS, LINE_MOST, ROWS_MOST, TEXTS_MOST, PanelScreen, _Socket, _state
 from support.foxglove_client import current_loop
 
 
@@ -133,6 +133,10 @@ def test_a_page_shows_only_the_newest_row(panel: PanelScreen, loop: IOLoop, tmp_
     assert message["state"]["supervisor"] == "flying"
     assert message["state"]["goal"] == [0.0, 0.0, 1.15, 0.0]
     assert message["scene"].startswith("data:image/png;base64,")
+    assert pa.concat_tables(panel._past).num_rows == 140, "the path of the last seconds"
+    at = log.column_names.index("truth.y")
+    unseen = log.slice(0, 1).set_column(at, "truth.y", [[float("nan")]])
+    assert _state(unseen)["body"] == [0.0, None, 1.15], "JSON has no NaN"
     socket.close()
 
 

@@ -15,6 +15,7 @@ from hil.live import recording, window
 from hil.live.feed import open_view
 from hil.live.local_server import LocalServer
 from hil.live.picture import open_screen
+from hil.live.rerun_screen import _there
 from hil.live.window import DISPLAYS, LOOPBACK, free_port, open_window, show
 
 
@@ -23,6 +24,19 @@ def test_a_missing_viewer_is_reported_before_the_flight() -> None:
     port = free_port(0)
     with pytest.raises(LabError, match=f"connect:127.0.0.1:{port}: no viewer listens there"):
         open_view(f"connect:127.0.0.1:{port}", "fly", [].append)
+
+
+@pytest.mark.parametrize(
+    ("target", "told"),
+    [
+        (f"connect:127.0.0.1{port}", "expected nothing, web, connect:HOST:PORT")
+        for port in ("", ":0", ":65536", ":x")
+    ]
+    + [("connect:127.0.0.1:1", r"no viewer listens there \(rerun --port 1 opens one\)")],
+)
+def test_a_viewer_is_joined_at_a_port_that_can_be(target: str, told: str) -> None:
+    with pytest.raises(LabError, match=f"^--view {target}: {told}"):
+        _there(target)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")

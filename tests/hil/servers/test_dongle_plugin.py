@@ -182,6 +182,7 @@ def test_a_process_that_ends_is_left_out_and_without_the_first_one_the_dongle_is
     with pytest.raises(usb.core.USBTimeoutError) as late:
         backend.bulk_read(dongle, 0x81, 0, buffer, 20)
     assert late.value.errno == errno.ETIMEDOUT
+    assert dongle._lines[0]._socket.gettimeout() == 0.02
     second.die()
     first.frames(1)
     first.answer(LOST)

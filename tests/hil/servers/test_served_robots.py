@@ -21,6 +21,7 @@ from hil.servers.motive import Streaming
 from hil.servers.serial_server import Address
 from hil.servers.served_robot import UDP_RETRY_US, ServedRobot
 from hil.servers.server import Endpoints, Server, Service, open_motive
+from hil.servers.shared_room import SharedRoom
 from hil.world.scene import VisualModel
 from support.stm32_firmware import build, flash_binary
 from support.watching import Watcher
@@ -158,6 +159,9 @@ def test_a_new_client_on_the_radio_ends_the_session_on_udp() -> None:
 @pytest.mark.parametrize(("spacing", "sides"), [(0.0, (0.0, 0.0, 0.0, 0.0)), (0.5, (0.0, 0.5, -0.5, 1.0))])
 def test_robots_of_one_room_start_side_by_side(spacing: float, sides: tuple[float, ...]) -> None:
     config = load_config("floaty", [f"flight.spacing={spacing}"])
+    room = SharedRoom(config, len(sides))
     for number, side in enumerate(sides, 1):
-        server = Server(Service(config, number), lambda line: None)
+        server = Server(Service(config, number), lambda line: None, room=room)
         assert server.robot.body.p_WB.tolist() == [0.0, side, 1.15]
+        room.pauses[number - 1] = number
+        assert server.clock.stood_still_us == number
