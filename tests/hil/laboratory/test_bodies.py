@@ -131,6 +131,7 @@ def test_a_torque_turns_it_and_a_push_moves_it(tmp_path: Path) -> None:
         (FLOATING + "\n    outputs = ((1, 1), (1, 3))\n", "Robot.outputs = ((1, 1), (1, 3)): expected four"),
         (FLOATING + "\n    outputs = ((1, 1),) * 4\n", "Robot.outputs = ((1, 1), (1, 1), (1, 1), (1, 1)): expected four"),
         (FLOATING + "\n    outputs = ((1, 4), (1, 1), (1, 2), (1, 3))\n", "Robot.outputs = ((1, 4),"),
+        (FLOATING + "\n    outputs = ((14, 1), (1, 1), (1, 2), (1, 3))\n", "Robot.outputs = ((14, 1),"),
         (FLOATING + "\n    outputs = 6\n", "Robot.outputs = 6: expected four (timer, channel), of the board's M1 to M4"),
         (FLOATING + "\n    parts = 3\n", "Robot.parts = 3: expected (ball(..), box(..), Part(..))"),
         (FLOATING + "\n    logged = {'spin': ('a', '')}\n", "'Robot' object has no attribute 'spin'"),

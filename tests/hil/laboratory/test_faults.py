@@ -391,11 +391,15 @@ def test_the_log_counts_the_faults_in_force_and_names_them(tmp_path: Path) -> No
 
 
 def test_an_experiments_faults_that_do_not_concern_the_flight_are_left_out(tmp_path: Path) -> None:
-    own = (*map(parse, ("push.x@0.2=0.1", "push.x@5=0.1", "serial.cut@0.1", "marker.swap@0.1")),)
+    own = (*map(parse, ("push.x@0.2=0.1", "push.x@1=0.1", "serial.cut@0.1", "marker.swap@0.1")),)
     experiment = Experiment("hover", "", 10.0, {}, faults=own)
-    fly(Request.of(experiment, duration_s=1.0, faults=[parse("push.y@0.5")]), tmp_path / "run")
+    fly(Request.of(experiment, duration_s=1.0, faults=[parse("push.y@0.5:0.5")]), tmp_path / "run")
     begun = [event["text"] for event in load_events(tmp_path / "run") if event["text"].startswith("fault")]
-    assert begun[::2] == ["fault push.x@0.2=0.1 begins", "fault push.y@0.5=2 begins"]
+    assert begun == [
+        "fault push.x@0.2=0.1 begins",
+        "fault push.x@0.2=0.1 ends",
+        "fault push.y@0.5:0.5=2 begins",
+    ]
 
 
 @pytest.mark.parametrize("link", [RADIO, MAVLINK])
@@ -542,8 +546,9 @@ def test_a_fault_that_was_switched_on_twice_has_two_spans() -> None:
 
     events = [
         event(1, "fault push.y=1 begins"), event(2, "fault push.x=1 begins"), event(3, "fault push.y=1 ends"),
-        event(4, "fault push.y=1 begins", "board"), event(5, "fault push.y=1 begins"), event(6, "fault push.y=1 ends"),
+        event(4, "fault push.y=1 begins", "board"), event(5, "fault push.y=1 begins"), event(6, "fault push.y=1 begins"),
+        event(7, "fault push.y=1 ends"), event(8, "fault push.y=1 ends"),
     ]  # fmt: skip
     assert json.loads(switched_on(events)[SWITCHED_ON]) == [
-        ["push.y=1", 1, 3], ["push.x=1", 2, math.inf], ["push.y=1", 5, 6],
+        ["push.y=1", 1, 3], ["push.x=1", 2, math.inf], ["push.y=1", 5, 7], ["push.y=1", 6, 8],
     ]  # fmt: skip

@@ -138,8 +138,9 @@ def test_ctrl_c_keeps_what_was_flown(tmp_path: Path) -> None:
         if now_us > 2_000_000:
             raise KeyboardInterrupt
 
-    request = Request.of(HOVER, duration_s=30.0)
+    request, thresholds = Request.of(HOVER, duration_s=30.0), gc.get_threshold()
     result = fly(request, tmp_path / "run", progress=interrupt)
+    assert gc.get_threshold() == thresholds, "a flight's own are of the flight"
     assert result.outcome == "interrupted"
     assert not result.passed
     assert load_log(result.folder).num_rows == pytest.approx(200, abs=30)

@@ -305,12 +305,26 @@ def test_a_robot_that_leaves_the_flow_is_lost_and_what_follows_is_not_judged(tmp
     bench.plan.start(bench.now_us)
     bench.fly(1.0)
     bench.fly(0.2, (0.0, 0.46, 1.15))
-    bench.fly(5.0)
+    bench.fly(EXPERIMENTS["hover"].duration_s)
     result = bench.result()
     assert (result.outcome, result.cause) == ("lost", "left the flow: 0.46 m from the axis; up to 0.45 m")
     assert result.metrics["lost"] == 1.0
     assert result.metrics["flown"] == pytest.approx(1.0, abs=0.05)
-    assert [event["text"] for event in load_events(tmp_path / "run")][-2].startswith("lost: left the flow")
+    texts = [event["text"] for event in load_events(tmp_path / "run")]
+    assert [text.partition(":")[0] for text in texts[-3:]] == [
+        "lost", "hover is over; what follows is not judged", "the station ends",
+    ]  # fmt: skip
+
+
+def test_rows_keep_their_period_when_turns_are_late(tmp_path: Path) -> None:
+    bench = StationBench(tmp_path / "run")
+    for _ in range(100):
+        bench.now_us += 7_000
+        bench.record.on_loop(bench.session, bench.now_us)
+    bench.record.close()
+    times_us = load_log(tmp_path / "run").column("t").to_numpy()
+    assert len(times_us) == 71
+    assert set(np.diff(times_us // 10_000).tolist()) == {1}
 
 
 @pytest.mark.parametrize(

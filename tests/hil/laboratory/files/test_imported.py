@@ -153,6 +153,10 @@ def test_the_best_fit_is_found_between_the_steps_of_the_search(offset_us: int, l
     )
     chosen = Map(columns={f"cameras.{axis}": f"{axis} [m]" for axis in "xyz"})
     assert released_like("log", joined, chosen, like).release_s == pytest.approx(1e-6 * begin_us, abs=0.0021)
+    one_row = Joined(t_us[:1], {axis: values[:1] for axis, values in joined.columns.items()}, {}, "t [us]")
+    for few, flight in ((joined, like.slice(0, 1)), (one_row, like)):
+        with pytest.raises(LabError, match="both flights need some rows after the release"):
+            released_like("log", few, chosen, flight)
 
 
 def test_a_telemetry_log_of_mavlink_is_in_the_world_s_frame(run: Run, tmp_path: Path) -> None:
