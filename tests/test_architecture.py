@@ -3,6 +3,8 @@
 import ast
 import re
 from collections import Counter
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -188,10 +190,16 @@ PRINTERS = (
 SUBSET = "firmware_py/core/subset.py"  # the border of the subset: it may use the standard library
 
 
-def imported(tree: ast.AST) -> list[tuple[int, str]]:
+@cache
+def nodes_of(source: str) -> tuple[ast.AST, ...]:
+    """Every node of a source, which is parsed once for all tests."""
+    return tuple(ast.walk(ast.parse(source)))
+
+
+def imported(source: str) -> list[tuple[int, str]]:
     """Line and full name of everything imported; `from a import b` counts as a.b."""
     found = []
-    for node in ast.walk(tree):
+    for node in nodes_of(source):
         if isinstance(node, ast.Import):
             found += [(node.lineno, alias.name) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -200,14 +208,27 @@ def imported(tree: ast.AST) -> list[tuple[int, str]]:
     return found
 
 
-def used_attributes(tree: ast.AST) -> list[tuple[int, str]]:
-    """Line and dotted name of attribute chains on names, with `np` written out."""
-    found = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute):
-            name = ast.unparse(node)
-            found.append((node.lineno, "numpy" + name[2:] if name.startswith("np.") else name))
-    return found
+def dotted(node: ast.AST) -> str:
+    """The name of a chain of attributes on a name, with `np` written out; empty for any other expression."""
+    parts = []
+    while isinstance(node, ast.Attribute):
+        parts.append(node.attr)
+        node = node.value
+    if not isinstance(node, ast.Name):
+        return ""
+    return ".".join(("numpy" if node.id == "np" else node.id, *reversed(parts)))
+
+
+def used_attributes(source: str) -> list[tuple[int, str]]:
+    """Line and dotted name of attribute chains on names."""
+    return [(node.lineno, dotted(node)) for node in nodes_of(source) if isinstance(node, ast.Attribute)]
+
+
+def beginnings(name: str) -> Iterator[str]:
+    """The name of an attribute, that of what has it, and so on."""
+    while name:
+        yield name
+        name = name.rpartition(".")[0]
 
 
 def below(name: str, prefix: str) -> bool:
@@ -239,11 +260,10 @@ def climbs(module: str, name: str) -> bool:
 
 def violations(path: str, source: str) -> list[str]:
     """What in a source file breaks the architecture; path is relative to the root, with slashes."""
-    tree = ast.parse(source)
     module = path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
     layer = next(layer for layer in LAYERS if below(module, layer))
     found = []
-    for line, name in imported(tree):
+    for line, name in imported(source):
         if any(below(name, package) for package in PACKAGES):
             if not any(below(name, allowed) for allowed in LAYERS[layer]):
                 found.append(f"{path}:{line}: {layer} must not import {name}")
@@ -253,12 +273,14 @@ def violations(path: str, source: str) -> list[str]:
                 found.append(f"{path}:{line}: {name} is not below {module}")
         elif layer == "firmware_py.core" and path != SUBSET and name.split(".")[0] not in CORE_LIBRARIES:
             found.append(f"{path}:{line}: the core must not import {name}")
-    for line, name in imported(tree) + used_attributes(tree):
-        for confined, files in CONFINED.items():
-            if below(name, confined) and not path.startswith(files or "-"):
-                found.append(f"{path}:{line}: {confined} belongs to {', '.join(files) or 'no file'}")
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "print" and path not in PRINTERS:
+    for line, name in imported(source) + used_attributes(source):
+        for confined in CONFINED.keys() & set(beginnings(name)):
+            if not path.startswith(CONFINED[confined] or "-"):
+                found.append(
+                    f"{path}:{line}: {confined} belongs to {', '.join(CONFINED[confined]) or 'no file'}"
+                )
+    for node in nodes_of(source):
+        if isinstance(node, ast.Call) and dotted(node.func) == "print" and path not in PRINTERS:
             found.append(f"{path}:{node.lineno}: {PRINTERS[0]} prints, without control characters")
         if (
             isinstance(node, ast.BinOp)
@@ -275,13 +297,19 @@ def violations(path: str, source: str) -> list[str]:
     return found
 
 
-def sources() -> list[Path]:
-    return sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+@cache
+def sources(*folders: str) -> dict[str, str]:
+    """The text of every file in some folders by its path from the root."""
+    paths = (path for folder in folders for path in (ROOT / folder).rglob("*.py"))
+    return {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in sorted(paths)}
 
 
-@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(ROOT)))
-def test_file_keeps_to_its_room(path: Path) -> None:
-    assert violations(path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")) == []
+OURS = sources(*PACKAGES)
+
+
+def test_every_file_keeps_to_its_room() -> None:
+    assert len(OURS) > 400
+    assert [found for path, source in OURS.items() for found in violations(path, source)] == []
 
 
 @pytest.mark.parametrize(
@@ -355,9 +383,7 @@ def test_the_architecture_s_floors_are_those_that_are_enforced() -> None:
 
 
 def test_hil_has_few_wings_and_each_its_floor_and_sentence() -> None:
-    wings = {
-        path.relative_to(ROOT / "hil").parts[0].removesuffix(".py") for path in (ROOT / "hil").rglob("*.py")
-    }
+    wings = {path.split("/")[1].removesuffix(".py") for path in OURS if path.startswith("hil/")}
     assert wings - {"__init__", "errors"} == set(FLOOR)
     assert len(wings) <= 15  # 14 beside `__init__`
     for wing in sorted(wings - {"__init__"}):
@@ -370,8 +396,8 @@ def test_hil_has_few_wings_and_each_its_floor_and_sentence() -> None:
 
 
 def test_no_room_has_more_than_eighteen_files() -> None:
-    sizes = Counter(path.parent for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-    assert {str(room): size for room, size in sizes.items() if size > 18 and room.parts[-2] == "hil"} == {}
+    sizes = Counter(path.rpartition("/")[0] for path in OURS)
+    assert {room: size for room, size in sizes.items() if size > 18 and room.startswith("hil/")} == {}
 
 
 def circles(imports: dict[str, set[str]]) -> list[set[str]]:
@@ -394,12 +420,8 @@ def circles(imports: dict[str, set[str]]) -> list[set[str]]:
 def imports_of_ours() -> dict[str, set[str]]:
     """Every module and the modules of ours that it imports, also only for types."""
     modules = {
-        path.relative_to(ROOT)
-        .as_posix()
-        .removesuffix(".py")
-        .removesuffix("/__init__")
-        .replace("/", "."): path
-        for path in sources()
+        path.removesuffix(".py").removesuffix("/__init__").replace("/", "."): source
+        for path, source in OURS.items()
     }
 
     def target(name: str) -> str | None:
@@ -407,11 +429,9 @@ def imports_of_ours() -> dict[str, set[str]]:
 
     return {
         module: {
-            found
-            for _, name in imported(ast.parse(path.read_text(encoding="utf-8")))
-            if (found := target(name)) is not None and found != module
+            found for _, name in imported(source) if (found := target(name)) is not None and found != module
         }
-        for module, path in modules.items()
+        for module, source in modules.items()
     }
 
 
@@ -427,9 +447,9 @@ def test_a_pose_has_the_shapes_that_the_architecture_names() -> None:
     """A class that holds a pose has a rotation, a frame or a correction among its fields."""
     shapes = {
         node.name
-        for path in sources()
-        if path.relative_to(ROOT).parts[0] != "hil"
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for path, source in OURS.items()
+        if not path.startswith("hil/")
+        for node in nodes_of(source)
         if isinstance(node, ast.ClassDef)
         for field in node.body
         if isinstance(field, ast.AnnAssign)
@@ -443,7 +463,7 @@ def asks_which_board(source: str) -> list[str]:
     """The places that choose by the class of a firmware; what a board cannot report is None instead."""
     return [
         ast.unparse(node)
-        for node in ast.walk(ast.parse(source))
+        for node in nodes_of(source)
         if isinstance(node, ast.Call)
         and isinstance(node.func, ast.Name)
         and node.func.id == "isinstance"
@@ -452,7 +472,7 @@ def asks_which_board(source: str) -> list[str]:
 
 
 def test_nobody_asks_which_board_it_has() -> None:
-    assert [found for path in sources() for found in asks_which_board(path.read_text(encoding="utf-8"))] == []
+    assert [found for source in OURS.values() for found in asks_which_board(source)] == []
 
 
 def test_a_planted_question_is_found() -> None:
@@ -469,14 +489,14 @@ WHOLE = (
 def completes_another(source: str) -> list[str]:
     """The assignments to attributes of a robot, a flight, a board, a line … from outside their class."""
     targets: list[ast.expr] = []
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes_of(source):
         if isinstance(node, ast.Assign):
             targets += [
                 one for target in node.targets for one in ast.walk(target) if isinstance(one, ast.expr)
             ]
         elif isinstance(node, ast.AugAssign | ast.AnnAssign):
             targets.append(node.target)
-        elif isinstance(node, ast.Call) and ast.unparse(node.func) == "setattr":
+        elif isinstance(node, ast.Call) and dotted(node.func) == "setattr":
             targets.append(ast.Attribute(node.args[0], "anything", ast.Store()))
     return [
         ast.unparse(target)
@@ -487,9 +507,8 @@ def completes_another(source: str) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(ROOT)))
-def test_nothing_is_assigned_to_a_robot_a_flight_a_board_or_a_line_from_outside(path: Path) -> None:
-    assert completes_another(path.read_text(encoding="utf-8")) == []
+def test_nothing_is_assigned_to_a_robot_a_flight_a_board_or_a_line_from_outside() -> None:
+    assert {path: found for path, source in OURS.items() if (found := completes_another(source))} == {}
 
 
 @pytest.mark.parametrize(
@@ -519,25 +538,28 @@ def watches_the_clock(source: str) -> list[str]:
     """The tests and helpers in `source` that sleep or read the wall clock, and are not marked as real-time tests."""
     return [
         function.name
-        for function in ast.walk(ast.parse(source))
+        for function in nodes_of(source)
         if isinstance(function, ast.FunctionDef)
         and "pytest.mark.realtime" not in map(ast.unparse, function.decorator_list)
-        and any(
-            isinstance(node, ast.Attribute) and ast.unparse(node) in ("time.sleep", "time.monotonic")
-            for node in ast.walk(function)
-        )
+        and any(dotted(node) in ("time.sleep", "time.monotonic") for node in ast.walk(function))
     ]
 
 
-def simulated_tests() -> list[Path]:
-    """The test files that need no wall clock."""
-    files = sorted((ROOT / "tests").rglob("test_*.py"))
-    return [path for path in files if not path.is_relative_to(ROOT / "tests" / "realtime")]
+TESTS = sources("tests")
 
 
-@pytest.mark.parametrize("path", simulated_tests(), ids=lambda path: path.name)
-def test_only_real_time_tests_look_at_the_wall_clock(path: Path) -> None:
-    assert watches_the_clock(path.read_text(encoding="utf-8")) == []
+def test_only_real_time_tests_look_at_the_wall_clock() -> None:
+    simulated = {
+        path: source
+        for path, source in TESTS.items()
+        if "/test_" in path and not path.startswith("tests/realtime/")
+    }
+    assert len(simulated) > 200
+    assert {
+        path: found
+        for path, source in simulated.items()
+        if "time." in source and (found := watches_the_clock(source))
+    } == {}
 
 
 def test_a_planted_sleep_is_caught() -> None:
@@ -545,14 +567,19 @@ def test_a_planted_sleep_is_caught() -> None:
     assert watches_the_clock("@pytest.mark.realtime\ndef test_x():\n    time.sleep(1)") == []
 
 
+SUSPECT = re.compile(r"^\s*(?:from|import) .*(?:test_|conftest)", re.MULTILINE)
+
+
 def borrows(source: str) -> list[str]:
     """What a file of the tests imports from a test file; what is shared stands in `support`."""
-    return [name for _, name in imported(ast.parse(source)) if re.search(r"(^|\.)(test_|conftest\b)", name)]
+    return [name for _, name in imported(source) if re.search(r"(^|\.)(test_|conftest\b)", name)]
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "tests").rglob("*.py")), ids=lambda path: path.name)
-def test_no_test_file_imports_from_another(path: Path) -> None:
-    assert borrows(path.read_text(encoding="utf-8")) == []
+def test_no_test_file_imports_from_another() -> None:
+    found = {
+        path: names for path, source in TESTS.items() if SUSPECT.search(source) and (names := borrows(source))
+    }
+    assert found == {}
 
 
 def test_a_planted_loan_is_caught() -> None:
@@ -575,10 +602,9 @@ def test_every_file_that_listens_and_every_port_is_in_the_table_of_who_can_conne
     rows = [
         line for line in page.split("## Who can connect")[1].split("## ")[0].splitlines() if line[:1] == "|"
     ]
-    read = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in sources()}
     named = set(re.findall(r"`([\w/]+\.py)`", "".join(rows)))
-    assert named == {name for name, source in read.items() if listens(source)}
-    ports = {port for name, source in read.items() for port in PORTS.findall(source)}
+    assert named == {name for name, source in OURS.items() if listens(source)}
+    ports = {port for name, source in OURS.items() for port in PORTS.findall(source)}
     assert len(ports) == 10
     assert {port for port in ports if port not in "".join(rows)} == set()
 
