@@ -12,6 +12,8 @@ from typing import Any
 
 import pytest
 import yaml
+from check_jsonschema import main as check_jsonschema
+from click.testing import CliRunner
 
 from support.examples import blocks
 from support.paths import ROOT
@@ -56,14 +58,13 @@ def test_files_for_ci_agree_with_their_published_schema(place: str, schema: str,
     named = {text.partition("\n")[0].rpartition("/")[2].removeprefix("# "): text for text in shown}
     text = {"tests.yml": OURS.read_text("utf-8"), **named}[place]
     (tmp_path / place).write_text(text, encoding="utf-8")
-    command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", f"vendor.{schema}", place]
-    command += ["--data-transform", "gitlab-ci"] if schema == "gitlab-ci" else []
-    ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert ran.returncode == 0, ran.stdout + ran.stderr
-    (tmp_path / place).write_text(
-        text.replace("timeout", "tiemout").replace("runs-on:", "run-on:"), encoding="utf-8"
-    )
-    assert subprocess.run(command, cwd=tmp_path, capture_output=True, check=False).returncode == 1
+    options = ["--builtin-schema", f"vendor.{schema}", str(tmp_path / place)]
+    options += ["--data-transform", "gitlab-ci"] if schema == "gitlab-ci" else []
+    ran = CliRunner().invoke(check_jsonschema, options)
+    assert ran.exit_code == 0, ran.output
+    wrong = text.replace("timeout", "tiemout").replace("runs-on:", "run-on:")
+    (tmp_path / place).write_text(wrong, encoding="utf-8")
+    assert CliRunner().invoke(check_jsonschema, options).exit_code == 1
 
 
 def test_the_files_for_ci_on_the_page_fly_alike_with_options_of_pytest() -> None:

@@ -67,9 +67,12 @@ def test_forty_thousand_weights_exceed_the_control_slot(cli: Cli) -> None:
     assert not Path("law").exists()
 
 
-def test_more_numbers_than_the_flash_has_room_for_are_one_line(cli: Cli) -> None:
-    file = write_onnx(Path("huge.onnx"), network(sizes=(256, 256)))
-    reason = "numbers in the constant arrays of this file: at most 65536"
+def test_more_numbers_than_the_flash_has_room_for_are_one_line(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("firmware_py.export.reading.MOST_NUMBERS", 4187)
+    file = write_onnx(Path("huge.onnx"), network())
+    reason = "4188 numbers in the constant arrays of this file: at most 4187"
     assert reason in cli.refusal("policy", file, "--out", "law")
     assert cli.err.startswith("floaty: policy huge.onnx: controller.py:")
 

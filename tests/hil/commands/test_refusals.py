@@ -17,6 +17,8 @@ import pytest
 from cflib.crtp.radiodriver import RadioManager
 
 from hil.commands.app import app
+from hil.errors import LabError
+from hil.live import rerun_screen
 from hil.servers.dongle_plugin import Backend
 from support.command import Cli
 from support.serving import CAMERAS, free_port
@@ -49,9 +51,6 @@ fly hover --profile crazyflie --board no.elf | --board no.elf
 fly hover --board no-such-board | expected c, python, cortex-m4, an image of a Crazyflie's firmware: an ELF file, a .bin or
 fly hover --board FILE | no vector table at 0x08004000: the stack pointer there
 fly hover --view wbe | --view wbe: expected nothing, web, connect:HOST:PORT or foxglove
-fly hover --view connect:here | --view connect:here: expected nothing, web, connect:HOST:PORT or foxglove
-fly hover --view connect:127.0.0.1:0 | --view connect:127.0.0.1:0: expected nothing, web, connect:HOST:PORT or foxglove
-fly hover --view connect:127.0.0.1:99999 | --view connect:127.0.0.1:99999: expected nothing, web
 fly | Missing argument 'EXPERIMENT': `floaty list` names them
 flyy | flyy: no such command; did you mean fly?
 zzzzzz | zzzzzz: no such command; see floaty --help
@@ -295,6 +294,16 @@ def test_every_option_with_a_number_or_a_choice_names_itself_and_what_it_is_not(
 
 def test_a_name_that_is_no_text_is_one_line(cli: Cli) -> None:
     assert "b'runs/\\xff': expected a name in UTF-8" in cli.refusal("fly", "hover", "--out", "runs/\udcff")
+
+
+@pytest.mark.parametrize(
+    ("target", "told"),
+    [("connect:here", "expected nothing, web, connect:HOST:PORT or foxglove"), ("connect:127.0.0.1:0", "expected nothing, "),
+     ("connect:127.0.0.1:65536", "expected nothing, "), ("connect:127.0.0.1:65535", "no viewer listens there ")],
+)  # fmt: skip
+def test_a_viewer_is_named_by_its_host_and_a_port(target: str, told: str) -> None:
+    with pytest.raises(LabError, match=f"^--view {target}: {told}"):
+        rerun_screen._there(target)
 
 
 def test_a_station_refuses_a_port_on_which_no_board_listens(cli: Cli) -> None:

@@ -48,11 +48,13 @@ def test_video_and_gif_last_as_long_as_the_flight_at_30_frames_per_second(folder
 
 
 def test_each_frame_shows_the_robot_of_its_instant_and_the_curves_up_to_it(folder: Path) -> None:
-    pictures = [np.asarray(picture).astype(int) for picture in video.frames(load_log(folder))]
+    log = load_log(folder)
+    pictures = [np.asarray(picture).astype(int) for picture in video.frames(log.slice(0, log.num_rows - 67))]
+    assert len(pictures) == 10
     scenes = [picture[:, : video.SIDE] for picture in pictures]
     assert all((np.abs(a - b).max(axis=2) > 40).any() for a, b in pairwise(scenes))
     ink = [(picture[:, video.SIDE :].min(axis=2) < 100).sum() for picture in pictures]
-    assert ink[0] < ink[15] < ink[-1]
+    assert ink[0] < ink[5] < ink[-1]
 
 
 @pytest.mark.long

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import rerun
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
@@ -212,6 +212,7 @@ SHAPES: tuple[dict[str, object], ...] = (
 
 
 @pytest.mark.parametrize("shape", SHAPES)
+@settings(max_examples=20)
 @given(angles, st.integers(0, 3))
 def test_a_drawn_flap_lies_where_the_plant_has_it(shape: dict[str, object], angle: float, flap: int) -> None:
     geometry, flaps = GeometryConfig.model_validate(shape), Flaps.allocate().fields

@@ -6,11 +6,10 @@ from typing import Any
 
 import pytest
 
-from hil.config import load_config
+from hil.errors import LabError
 from hil.laboratory.request import Options
 from hil.research.campaigns.jobs import Job, Row
 from hil.research.studies.search import LOST, UNSEEN, Aim, Interval, intervals, search
-from support.command import Cli
 from support.own_logic import LAW
 
 VARIED = (Interval("controller.gain_y", -4.0, -1.0, -1.5), Interval("controller.gain_z", 1.0, 5.0, 4.0))
@@ -98,20 +97,6 @@ def test_whole_numbers_stay_whole(tmp_path: Path) -> None:
     assert isinstance(after.value(7.6), int)
 
 
-def test_a_metric_that_the_experiment_lacks_is_one_line(cli: Cli, tmp_path: Path) -> None:
-    line = cli.refusal(
-        "tune", "--vary", "controller.gain_y=-3..-1", "--workers", "1", "--runs", str(tmp_path), "--metric", "settle",
-        "--flights", "10", "--duration", "0.5",
-    )  # fmt: skip
-    assert "--metric settle: hover does not measure it" in line
-
-
-def test_the_profile_that_it_writes_flies_with_what_it_found(cli: Cli, tmp_path: Path) -> None:
-    out = tmp_path / "found.toml"
-    flights = ("--flights", "10", "--duration", "0.5", "--workers", "1", "--runs", str(tmp_path / "runs"))
-    code = cli(
-        "tune", "--vary", "tunnel.gust_scale=0.1..0.9", "--metric", "rms_z", *flights, "--out", str(out)
-    )
-    assert code == 0
-    assert "rms_z of hover, on other seeds" in cli.out
-    assert 0.1 <= load_config(str(out)).tunnel.gust_scale <= 0.9
+def test_a_metric_that_the_experiment_lacks_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(LabError, match=r"^--metric settle: hover does not measure it in this time$"):
+        found(Runner(), aim("settle"), tmp_path)
