@@ -358,10 +358,10 @@ def test_inert_axes_exceed_the_threshold_of_chance_in_one_of_twenty_campaigns() 
     spec = spec_of(flights=60, parameters={name: {"uniform": [0.9, 1.1]} for name in varied})
     rng = np.random.default_rng(3)
     beyond = 0
-    for _ in range(25):
+    for _ in range(20):
         points, values = rng.random((60, len(axes(spec)))), rng.normal(size=60)
         beyond += bool(influence_of(spec, "max_y", points, values).ranked)
-    assert 1 <= beyond <= 3
+    assert 1 <= beyond <= 2
 
 
 @pytest.mark.parametrize(("failures", "mapped"), [(4, False), (5, True), (7, True), (8, False)])

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,8 @@ def simulated(inputs: Array, matrix: Array, column: Array) -> Array:
     return np.stack([lfilter(row, denominator, inputs) for row in numerators], axis=1)
 
 
-def flight(
+@cache
+def flown(
     seed: int, seconds: float = 136.0, rms: float = 0.05, disturbance: float = 1.0, **changed: float
 ) -> dict[str, Array]:
     """The columns of telemetry.csv of a robot that a multisine on u2 excites and gusts of 30 ms disturb."""
@@ -89,6 +91,11 @@ def flight(
         RATES[1]: rate[rows] + rng.normal(0, 0.02, len(rows)),
     }
     return columns | {"supervisor.state []": zero + 2}
+
+
+def flight(seed: int, seconds: float = 136.0, **changed: float) -> dict[str, Array]:
+    """The columns of a flight that may be changed."""
+    return dict(flown(seed, seconds, **changed))
 
 
 def written(folder: Path, columns: dict[str, Array], *changes: Change) -> Path:
