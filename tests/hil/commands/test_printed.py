@@ -1,5 +1,6 @@
 """What commands print, whole: tables cell by cell and every line, from values that are all different."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from math import inf, nan, radians
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from hil.commands import compare, deploy, design, identify, listing, paper, serve, station, tables
+from hil.commands import compare, deploy, identify, listing, paper, serve, station, tables
 from hil.commands import options as common
 from hil.config import load_config
 from hil.errors import LabError
@@ -255,15 +256,49 @@ def test_the_paper_s_rows_have_its_value_both_profiles_and_what_was_missed(print
         "because of the wind"]  # fmt: skip
 
 
-def test_a_design_prints_its_robot_inputs_and_claims(printed: Any) -> None:
+@pytest.mark.usefixtures("empty_folder")
+def test_a_design_prints_its_robot_inputs_claims_and_page(
+    cli: Cli, printed: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     claim = Made(title="pole", paper="9.5", ours="9.4", verdict="agrees")
     other = Made(title="lift", paper="1", ours="2", verdict="differs")
-    design.show(
-        Made(robot=[("mass", "0.3 kg")], inputs=[("u1: roll", "-1 to 1", "± 2")], claims=[claim, other])
-    )  # type: ignore[arg-type]
+    found = Made(robot=[("mass", "0.3 kg")], inputs=[("u1: roll", "-1 to 1", "± 2")], claims=[claim, other])
+    asked: list[Any] = []
+    monkeypatch.setattr("hil.research.design.analysis.analyse", lambda point: asked.append(point) or found)
+    monkeypatch.setattr("hil.research.design.analysis.write", lambda one, folder: folder / "design.html")
+    assert cli("design", "--angle", "22", "--out", "x") == 0
+    print(cli.out, end="")
     assert printed() == ["mass" + 35 * " " + "0.3 kg", ["input", "alone, inside the flaps' range",
         "linear, in both directions about the hover"], ["u1: roll", "-1 to 1", "± 2"], "the paper's design",
-        ["claim", "paper", "computed", ""], ["pole", "9.5", "9.4", "agrees"], ["lift", "1", "2", "differs"]]  # fmt: skip
+        ["claim", "paper", "computed", ""], ["pole", "9.5", "9.4", "agrees"], ["lift", "1", "2", "differs"],
+        "report  x/design.html"]  # fmt: skip
+    assert asked[0].opening == radians(22.0)
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize(("flown", "text"), [("a" * 64, "the same flight"),
+    ("a" * 63 + "b", "not the same flight: it was interrupted or changed")])  # fmt: skip
+@pytest.mark.parametrize(("from_us", "begin"), [(1_234_000, "1.23"), (-5, "0.00")])
+def test_a_debugged_flight_is_or_is_not_the_one_that_flew(
+    flown: str, text: str, from_us: int, begin: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = Made(hash="a" * 64, failures=())
+    asked: list[Any] = []
+    monkeypatch.setattr("hil.api.load_run", lambda run, named: Made(result=result))
+    monkeypatch.setattr("hil.laboratory.files.debugging.debugged_request", lambda one: "request")
+    monkeypatch.setattr(
+        "hil.laboratory.files.debugging.begin_us", lambda *what: asked.append(what) or from_us
+    )
+    monkeypatch.setattr("hil.laboratory.files.debugging.waiting_flight", lambda *what: what)
+    monkeypatch.setattr("hil.laboratory.files.folder.reserved", lambda request, folder: nullcontext())
+    ended = Made(hash=flown, outcome="completed", passed=True)
+    monkeypatch.setattr("hil.laboratory.run.fly", lambda *what, **more: asked.append((what, more)) or ended)
+    assert cli("debug", "runs/x", "--at", "2", "--before", "0.5", "--port", "9") == 0
+    assert cli.out.splitlines() == [
+        f"flying runs/x again up to {begin} s",
+        f"runs/x-debug: hash {'a' * 16}, {text}",
+    ]
+    assert asked == [(result, "2", 0.5), (("request", Path("runs/x-debug")), {"flight_of": (9, from_us)})]
 
 
 @pytest.mark.usefixtures("empty_folder")

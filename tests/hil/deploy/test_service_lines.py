@@ -10,6 +10,8 @@ import pytest
 from cflib.crazyflie.commander import Commander
 from cflib.crazyflie.high_level_commander import HighLevelCommander
 from cflib.crazyflie.mem.trajectory_memory import CompressedSegment, CompressedStart, Poly4D
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from firmware_py.geometry import from_euler_zyx
 from hil.deploy import services
@@ -189,3 +191,29 @@ def test_goals_of_two_boards_are_compared_with_those_of_the_instants_around() ->
     assert list(differences(Answers(["x: nan"]), Answers(["x: nan"]))) == []
     assert np.isnan(services._numbers(["nan", "relative", "-inf", "1.5"])).tolist() == [True, False, False]
     assert services._numbers(["-inf", "inf", "2"]) == [-np.inf, np.inf, 2.0]
+
+
+@example(period_us=1001, begun_us=1000)
+@given(
+    period_us=st.integers(services.STEP_US, 30_000),
+    begun_us=st.integers(0, 20).map(lambda n: n * services.STEP_US),
+)
+def test_poses_come_at_the_multiples_of_their_period_each_once(period_us: int, begun_us: int) -> None:
+    sent: list[int] = []
+    nothing = lambda *_: None  # noqa: E731
+    bench: Any = object.__new__(services.ServiceBench)
+    kernel = SimpleNamespace(now_us=0, run=nothing)
+    kernel.advance = lambda now_us: setattr(kernel, "now_us", now_us)
+    bench.firmware = SimpleNamespace(kernel=kernel, imu_ready=nothing, radio_polled=nothing)
+    bench._events, bench._pins = SimpleNamespace(run=nothing), SimpleNamespace(measure=nothing)
+    bench._boot_us, bench.now_us, bench.pose_us, bench.radio, bench._path_us, bench._noise = (
+        7,
+        begun_us,
+        period_us,
+        True,
+        None,
+        0,
+    )
+    bench._send_pose = lambda: sent.append(kernel.now_us - bench._boot_us)
+    bench.run(60_000)
+    assert sent == [us for us in range(0, begun_us + 60_001, period_us) if us > begun_us]

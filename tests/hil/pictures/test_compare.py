@@ -1,6 +1,5 @@
 """Comparing flights: the first difference is the first, and what differs besides is told."""
 
-import colorsys
 import json
 import shutil
 from dataclasses import replace
@@ -10,7 +9,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from matplotlib.colors import to_rgb
 
 from hil.config import load_config
 from hil.laboratory.experiments import EXPERIMENTS
@@ -18,7 +16,9 @@ from hil.laboratory.files.recorder import load_log
 from hil.laboratory.metrics import free_flight, measure, position_error
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
-from hil.pictures.compare import FlownRun, compare, difference, load_flown, pair, write_comparison
+from hil.pictures.compare import FlownRun, compare, difference, load_flown, shown_curves
+from hil.pictures.curves import ORANGE
+from hil.pictures.trials import DARK
 from support.command import Cli
 from support.html_page import Page
 
@@ -118,52 +118,33 @@ def test_the_difference_is_the_second_less_the_first_at_the_same_time(runs: dict
     assert difference(a.log, b.log.slice(0, 0)) is None
 
 
-@pytest.mark.long
-def test_two_robots_are_compared_by_position_and_attitude(runs: dict[str, Path], tmp_path: Path) -> None:
-    flaps = load_flown(runs["one"])
-    log = flaps.log.rename_columns(
-        [
-            f"rotor.thrust_{name[-1]}" if name.startswith("truth.flap_") else name
-            for name in flaps.log.column_names
-        ]
-    )
-    rotors = FlownRun(log, flaps.result)
-    for a, b in ((flaps, rotors), (rotors, flaps)):
-        page = Page(write_comparison(tmp_path, a, b, compare(a, b)).read_text(encoding="utf-8"))
-        labels = [panel["label"] for panel in page.plots["both"]["panels"]]
-        assert labels == ["x [cm]", "y [cm]", "z [cm]", "roll [deg]", "pitch [deg]", "yaw [deg]"]
-
-
-@pytest.mark.long
-def test_the_caption_names_the_colours_of_the_lines(runs: dict[str, Path], tmp_path: Path) -> None:
-    a, b = load_flown(runs["one"]), load_flown(runs["two"])
-    figure = pair((a.log, b.log), ("a", "b"))
-    hues = [colorsys.rgb_to_hsv(*to_rgb(line.colour))[0] * 360 for line in figure.panels[0].series]
-    assert [line.name for line in figure.panels[0].series] == ["a", "b"]
-    assert 180 < hues[0] < 260, "blue"
-    assert 20 < hues[1] < 50, "orange"
-    page = write_comparison(tmp_path, a, b, compare(a, b)).read_text(encoding="utf-8")
-    assert f"Blue: {a.result.folder}; orange: {b.result.folder}." in page
-
-
-@pytest.mark.long
-def test_the_exit_code_of_the_command_is_the_verdict(cli: Cli, runs: dict[str, Path], tmp_path: Path) -> None:
+def test_the_exit_code_of_the_command_is_the_verdict(
+    cli: Cli, runs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hil.pictures.compare.png", lambda draw: b"drawn")
     assert cli("compare", runs["one"], runs["again"], "--out", tmp_path) == 0
-    assert "identical" in cli.out
+    assert "\nidentical\n" in cli.out
     assert cli("compare", runs["one"], runs["two"], "--out", tmp_path / "new") == 1
-    shown = cli.out
-    assert "first difference: row " in shown
-    assert "seed: 1 | 2" in shown
-    assert (tmp_path / "new" / "compare.png").read_bytes().startswith(b"\x89PNG")
+    assert cli.out.startswith("seed: 1 | 2\n")
+    assert cli.out.endswith(f"\n  {tmp_path}/new/compare.html\n")
+    assert (tmp_path / "new" / "compare.png").read_bytes() == b"drawn"
     page = (tmp_path / "new" / "compare.html").read_text(encoding="utf-8")
-    assert "first differ in row" in page
     told = Page(page)
+    assert f"first differ in row {compare(*map(load_flown, (runs['one'], runs['two']))).first.row}" in page  # type: ignore[union-attr]
+    assert f"Blue: {runs['one']}; orange: {runs['two']}." in page
+    assert {line["colour"] for line in told.plots["both"]["panels"][0]["series"]} == {DARK, ORANGE}
     assert len(told.plots["both"]["panels"]) == 10
     assert len(told.plots["difference"]["panels"]) == 3
     assert ["seed", "1", "2"] in told.tables["settings"]
     assert page.index('id="settings"') < page.index('id="differing"') < page.index('id="both"')
     assert all(float(row[3]) != 0 for row in told.tables["differing"][1:])
     assert all(float(row[3]) == 0 for row in told.tables["equal"][1:])
+    flaps = load_log(runs["one"])
+    rotors = flaps.rename_columns(
+        [name.replace("truth.flap_", "rotor.thrust_") for name in flaps.column_names]
+    )
+    shown = [[name for name, _ in shown_curves(*logs)] for logs in ((flaps, rotors), (rotors, flaps))]
+    assert shown == [["position", "attitude"]] * 2, "a robot of flaps beside one of rotors"
 
 
 def test_flights_with_other_columns_differ_and_the_flight_without_them_is_named(

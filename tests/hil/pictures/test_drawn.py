@@ -100,7 +100,7 @@ def test_a_path_is_drawn_to_scale_from_three_sides_on_numbered_grids_behind_it(m
     reach = 13.2 if moves else 11.0  # a tenth more than the farthest coordinate, or than the box
     ticks = (-10.0, -5.0, 0.0, 5.0, 10.0) if not moves else (-10.0, 0.0, 10.0)
     svg = ElementTree.fromstring(still.content)
-    for group in svg.iter("{*}g"):
+    for group in svg.iterfind(".//{*}g"):
         middle = re.fullmatch(r"translate\((\d+) 145\)", group.get("transform", ""))
         assert middle is not None
         view = VIEWS[middle[1]] * 100.0 / reach * ((1.0,), (-1.0,))
@@ -109,7 +109,7 @@ def test_a_path_is_drawn_to_scale_from_three_sides_on_numbered_grids_behind_it(m
             return tuple((np.reshape(points, (-1, 3)) @ view.T).ravel().round(1).tolist())
 
         drawn = [(tuple(float(n) for n in re.split("[ ,]", one.get("points", ""))), one.get("stroke"),
-                  one.get("stroke-dasharray")) for one in group.iter("{*}polyline")]  # fmt: skip
+                  one.get("stroke-dasharray")) for one in group.iterfind(".//{*}polyline")]  # fmt: skip
         strokes = {stroke: [places for places, other, _ in drawn if other == stroke] for _, stroke,
             _ in drawn}  # fmt: skip
         assert strokes[BLUE] == [pytest.approx(seen(FLOWN), abs=0.11)]
@@ -123,7 +123,7 @@ def test_a_path_is_drawn_to_scale_from_three_sides_on_numbered_grids_behind_it(m
                 2) for signs in [2 * np.array(signs) - 1]}  # fmt: skip
             assert {tuple(one) for one in corners.tolist()} == cube
         ends = [(tuple(float(one.get(key, "")) for key in ("cx", "cy")),
-            one.get("fill")) for one in group.iter("{*}circle")]  # fmt: skip
+            one.get("fill")) for one in group.iterfind(".//{*}circle")]  # fmt: skip
         assert ends == [(seen(FLOWN[0]), "white"), (seen(FLOWN[-1]), BLUE)]
         names, grids = [], set()
         space = middle[1] == "150"
@@ -147,7 +147,7 @@ def test_a_path_is_drawn_to_scale_from_three_sides_on_numbered_grids_behind_it(m
                 names.append((text, *seen(point)))
         assert set(strokes["#cccccc"]) == grids
         texts = [(one.text, float(one.get("x", "")), float(one.get("y",
-            "")) - 4.0) for one in group.iter("{*}text")]  # fmt: skip
+            "")) - 4.0) for one in group.iterfind(".//{*}text")]  # fmt: skip
         assert sorted(text for text, *_ in texts) == sorted(text for text, *_ in names)
         for text, x, y in names:
             assert any(other == text and (u, v) == pytest.approx((x, y), abs=0.16) for other, u,

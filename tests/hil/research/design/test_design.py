@@ -207,19 +207,6 @@ def test_the_slowest_pole_is_never_hidden() -> None:
     assert spun.growth(ROLL) == 2.0
 
 
-@pytest.mark.long
-def test_command_writes_pictures_a_page_and_all_claims(cli: Cli, tmp_path: Path) -> None:
-    assert cli("design", "--out", tmp_path, "--angle", "22") == 0
-    content = json.loads((tmp_path / "design.json").read_text())
-    assert len(content["claims"]) > 35
-    assert content["robot"]["hover"].startswith("22.0° at 9.78 m/s")
-    page = (tmp_path / "design.html").read_text(encoding="utf-8")
-    for name in ("shape", "stability", "hover_angle", "attainable", "scaling"):
-        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-        assert f'id="{name}"' in page
-    assert "33.7° on" not in page, "the crossing is that of 22°"
-
-
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [

@@ -1,8 +1,8 @@
 """The drag model: the paper's equations by other means, the plant's plates, and what is measured in the tunnel."""
 
-import csv
 import math
-from itertools import islice
+import re
+from itertools import islice, product
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from hil.config import load_config
 from hil.research.design.authority import pressure_at, wrenches
-from hil.research.studies.drag_model import ANGLES_DEG, QUANTITIES, ROWS, SWEEPS, measure
+from hil.research.studies import drag_model
+from hil.research.studies.drag_model import SWEEPS, MountedRow, measure
 from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 from hil.world.floaty.plant import Plant
 from support.command import Cli
@@ -96,21 +97,26 @@ def test_the_sweeps_are_the_papers() -> None:
         assert flaps.tolist() == list(expected)
 
 
-@pytest.mark.long
-def test_the_command_writes_table_figures_and_page(cli: Cli, tmp_path: Path) -> None:
-    assert cli("drag-model", "--out", tmp_path / "out") == 0
-    with (tmp_path / "out" / "drag_model.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == ROWS == 4 * len(ANGLES_DEG)
-    at_hover = [row for row in rows if row["angle_deg"] == "25"]
-    for row in at_hover:
-        assert float(row["force_z_model"]) == pytest.approx(WEIGHT, rel=1e-5)
-        for name in QUANTITIES:
-            if name != "force_z":
-                assert float(row[f"{name}_model"]) == pytest.approx(0.0, abs=1e-9)
-    page = (tmp_path / "out" / "drag_model.html").read_text(encoding="utf-8")
-    assert page.count("data:image/png;base64,") == 4
-    for robot in ("flat", "kinked"):
-        for sweep in SWEEPS:
-            picture = (tmp_path / "out" / f"drag_model_{robot}_{sweep.name}.png").read_bytes()
-            assert picture.startswith(b"\x89PNG")
+SIZES = (0.02, 0.01, 0.03, 0.001, 0.005, 0.004)  # [N, N m]
+
+
+def test_the_page_has_a_picture_and_the_largest_misses_of_each_robot_and_sweep(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Misses grow from sweep to sweep; in flight forces miss by most at 0 deg, torques at 50; beyond all by ten times as much."""
+    monkeypatch.setattr("hil.pictures.drawing.png", lambda draw: b"drawn")
+    misses = {0: (1, 1, 1, 0.5, 0.5, 0.5), 50: (-0.5, -0.5, -0.5, -1, -1, -1), -1: (10,) * 6, 51: (-10,) * 6}
+    rows = [
+        MountedRow(robot, sweep.name, angle, np.zeros(6), number * np.multiply(SIZES, share), np.ones(6))
+        for number, (robot, sweep) in enumerate(product(("flat", "kinked"), SWEEPS), 1)
+        for angle, share in misses.items()
+    ]
+    monkeypatch.setattr(drag_model, "measure", lambda config, seed: iter(rows))
+    assert cli("drag-model", "--out", tmp_path) == 0
+    page = (tmp_path / "drag_model.html").read_text(encoding="utf-8")
+    largest = [f"{10 * n * miss:.4f}" for n in (1, 2, 3, 4) for miss in SIZES]
+    assert re.findall(r"<td>([\d.]+)</td>", page) == largest
+    captions = re.findall(r"differ by at most (\S+) N and (\S+) N m", page)
+    assert captions == [(f"{0.03 * n:.2f}", f"{0.005 * n:.3f}") for n in (1, 2, 3, 4)]
+    names = {f"drag_model_{robot}_{sweep.name}.png" for robot, sweep in product(("flat", "kinked"), SWEEPS)}
+    assert {path.name for path in tmp_path.iterdir()} == {"drag_model.csv", "drag_model.html", *names}
