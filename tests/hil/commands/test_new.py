@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import pytest
 
 import hil
-from hil import fly
+from hil.api import request_of
 from hil.laboratory.experiments import find_experiment
 from hil.laboratory.files.recorder import load_log
 from hil.laboratory.files.result import read_result
@@ -58,8 +58,8 @@ def test_files_that_an_editor_begins_with_the_mark_of_utf8_are_read(cli: Cli) ->
     for path in (Path("law/profile.toml"), Path("law/controller.py"), Path("law/experiments.py")):
         path.write_text(path.read_text(encoding="utf-8"), encoding="utf-8-sig")
     assert cli("check", "law/controller.py") == 0
-    flown = fly("law/experiments.py:figure_eight", duration_s=0.1, profile="law/profile.toml")
-    assert flown.result.outcome == "completed"
+    request = request_of("law/experiments.py:figure_eight", profile="law/profile.toml")
+    assert request.config.logic.controller.endswith("law/controller.py")
 
 
 def test_an_empty_folder_becomes_a_project(cli: Cli) -> None:

@@ -50,7 +50,6 @@ fly hover --profile crazyflie | --board FILE: the image, an ELF file
 fly hover --profile crazyflie --board no.elf | --board no.elf
 fly hover --board no-such-board | expected c, python, cortex-m4, an image of a Crazyflie's firmware: an ELF file, a .bin or
 fly hover --board FILE | no vector table at 0x08004000: the stack pointer there
-fly hover --view wbe | --view wbe: expected nothing, web, connect:HOST:PORT or foxglove
 fly | Missing argument 'EXPERIMENT': `floaty list` names them
 flyy | flyy: no such command; did you mean fly?
 zzzzzz | zzzzzz: no such command; see floaty --help
@@ -298,7 +297,8 @@ def test_a_name_that_is_no_text_is_one_line(cli: Cli) -> None:
 
 @pytest.mark.parametrize(
     ("target", "told"),
-    [("connect:here", "expected nothing, web, connect:HOST:PORT or foxglove"), ("connect:127.0.0.1:0", "expected nothing, "),
+    [("wbe", "expected nothing, web, "), ("connect:here", "expected nothing, web, connect:HOST:PORT or foxglove"),
+     ("connect:127.0.0.1:0", "expected nothing, "),
      ("connect:127.0.0.1:65536", "expected nothing, "), ("connect:127.0.0.1:65535", "no viewer listens there ")],
 )  # fmt: skip
 def test_a_viewer_is_named_by_its_host_and_a_port(target: str, told: str) -> None:

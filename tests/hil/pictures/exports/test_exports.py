@@ -70,8 +70,16 @@ def messages(path: Path) -> dict[str, list[tuple[int, Any]]]:
     return found
 
 
-def test_foxglove_reads_every_row_with_its_type_and_its_time(folder: Path) -> None:
-    log, found = load_log(folder), messages(write_mcap(folder))
+@pytest.fixture(scope="module")
+def found(folder: Path) -> dict[str, list[tuple[int, Any]]]:
+    """The messages of the flight's MCAP file."""
+    return messages(write_mcap(folder))
+
+
+def test_foxglove_reads_every_row_with_its_type_and_its_time(
+    folder: Path, found: dict[str, list[tuple[int, Any]]]
+) -> None:
+    log = load_log(folder)
     times = log.column("t").to_pylist()
     poses = {"/truth/pose", "/goal/pose", "/estimate/pose", "/tf"}
     assert poses | {"/truth/twist", "/estimate/twist", "/flaps", "/link", "/text", "/battery"} <= found.keys()
@@ -118,8 +126,8 @@ def test_numbers_of_an_mcap_file_cover_the_log_and_name_unit_and_frame(folder: P
     assert len(in_poses) == 1 + 7 + 4 + 6
 
 
-def test_frames_lead_from_the_world_to_the_estimate(folder: Path) -> None:
-    _, last = messages(write_mcap(folder))["/tf"][-1]
+def test_frames_lead_from_the_world_to_the_estimate(found: dict[str, list[tuple[int, Any]]]) -> None:
+    _, last = found["/tf"][-1]
     assert [(one.parent_frame_id, one.child_frame_id) for one in last.transforms] == [
         ("world", "body"), ("world", "goal"), ("goal", "estimate"),
     ]  # fmt: skip

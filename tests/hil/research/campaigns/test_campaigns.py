@@ -240,11 +240,11 @@ def test_the_interval_is_wilson_s() -> None:
 
 
 def test_the_planted_effect_is_found(tmp_path: Path) -> None:
-    spec = spec_of(flights=256, sampling="sobol", table={"constants": ["roll_u1"]})
+    spec = spec_of(flights=128, sampling="sobol", table={"constants": ["roll_u1"]})
     flown_into(tmp_path, spec, workers(2))
     found = find(spec, Dataset(tmp_path, plan_of(spec), resume=True).table())
-    expected = [not planted(draw(spec, n)).passed for n in range(256)]
-    assert (found.rate.failed, found.rate.flown) == (sum(expected), 256)
+    expected = [not planted(draw(spec, n)).passed for n in range(128)]
+    assert (found.rate.failed, found.rate.flown) == (sum(expected), 128)
     mapped, *others = found.influences
     assert mapped.method == "logistic map"
     strongest = {name for name, _ in mapped.ranked[:2]}

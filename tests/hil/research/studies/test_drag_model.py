@@ -103,7 +103,7 @@ SIZES = (0.02, 0.01, 0.03, 0.001, 0.005, 0.004)  # [N, N m]
 def test_the_page_has_a_picture_and_the_largest_misses_of_each_robot_and_sweep(
     cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Misses grow from sweep to sweep; in flight forces miss by most at 0 deg, torques at 50; beyond all by ten times as much."""
+    """Misses grow from sweep to sweep; in flight forces miss most at 0 deg, torques at 50; beyond, ten times more."""
     monkeypatch.setattr("hil.pictures.drawing.png", lambda draw: b"drawn")
     misses = {0: (1, 1, 1, 0.5, 0.5, 0.5), 50: (-0.5, -0.5, -0.5, -1, -1, -1), -1: (10,) * 6, 51: (-10,) * 6}
     rows = [
