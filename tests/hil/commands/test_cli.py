@@ -101,13 +101,6 @@ def test_list_names_experiments_and_profiles(cli: Cli) -> None:
 
 
 @pytest.mark.long
-def test_perfetto_writes_its_trace(cli: Cli) -> None:
-    assert cli("fly", "hover", "--duration", "0.5", "--perfetto", "--out", "run") == 0
-    assert "run/flight.perfetto-trace" in cli.out
-    assert Path("run/flight.perfetto-trace").stat().st_size > 10_000
-
-
-@pytest.mark.long
 def test_seeds_fly_in_other_processes_with_the_same_hash(cli: Cli) -> None:
     assert cli("fly", "hover", "--duration", "1", "--seed", "4", "--seeds", "2") == 0
     assert "2 seeds: 2 hold all limits, 0 lost" in cli.out

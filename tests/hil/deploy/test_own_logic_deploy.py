@@ -1,7 +1,6 @@
 """Own logic on its way to the board: checked, exported and compiled from a folder of the user's."""
 
 import json
-import re
 import runpy
 import subprocess
 import sys
@@ -39,28 +38,6 @@ def test_all_targets_are_equal_with_own_logic(cli: Cli, project: Path) -> None:
     assert cli("deploy", "check", *SHORT, "--set", "logic.after=60") == 0
     shown = cli.out
     assert "130 ticks, c beside plain, c-O0, c-O2, cortex-m4: no bit differs" in shown
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("right", "wrong", "where"),
-    [
-        ("memory->ticks + 1", "memory->ticks - 1", "Memory.ticks: 1 00000001 | -1 ffffffff (31 bits)"),
-        pytest.param(
-            "own->gain_iy * memory->integral",
-            "own->gain_iy - memory->integral",
-            "Control.u[0]",
-            marks=pytest.mark.long,
-        ),
-    ],
-)
-def test_changed_c_of_own_logic_is_named(cli: Cli, project: Path, right: str, wrong: str, where: str) -> None:
-    text = translation_of(LogicConfig(controller=str(project / "controller.py"))).source
-    assert text.count(right) == 1
-    (project / "changed.c").write_text(text.replace(right, wrong), encoding="utf-8")
-    assert cli("deploy", "check", *SHORT, "--targets", "c-O2", "--source", "changed.c") == 1
-    shown = cli.out
-    assert re.search(rf"c-O2 .* DIFFERS first in tick \d+, after control: {re.escape(where)}", shown)
 
 
 @pytest.mark.long

@@ -9,20 +9,17 @@ from typing import Any
 
 import pytest
 
-from hil.config import load_config
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.metrics import METRICS
 from hil.laboratory.request import Options
 from hil.pictures.panels import Instant
 from hil.research.campaigns.jobs import Job, Row, fly_job
-from hil.research.design.analysis import analyse
-from hil.research.design.linear import point_of
 from hil.research.studies.catalogue import PROFILES
 from hil.research.studies.paper import Paper, Trials
 from hil.research.studies.paper_report import write_paper
 from hil.research.studies.paper_rows import OUTSIDE, ROWS, MetricClaim, PaperRow
 from hil.research.studies.study import Curve, Expected, Study, StudyResult, Variant, VariantOutcome
-from support.command import Cli, floaty
+from support.command import floaty
 from support.html_page import Page
 
 
@@ -86,13 +83,6 @@ def test_the_table_is_the_mean_and_deviation_of_the_flights(flown: Path) -> None
         assert [flight["hash"] for flight in row["profiles"][profile]["flights"]] == [
             f["hash"] for f in flights
         ]
-
-
-@pytest.mark.long
-def test_a_flight_of_the_paper_is_the_flight_that_fly_flies(cli: Cli, flown: Path, tmp_path: Path) -> None:
-    cli("fly", "hover", "--profile", "as-flown", "--seed", "2", "--out", str(tmp_path / "run"))
-    alone = json.loads((tmp_path / "run" / "result.json").read_text())
-    assert content(flown)["rows"][0]["profiles"]["as-flown"]["flights"][1]["hash"] == alone["hash"]
 
 
 @pytest.mark.long
@@ -169,18 +159,3 @@ def test_the_badges_name_their_kind_of_verdict(result: Row, tmp_path: Path) -> N
     studies = Page((tmp_path / "studies.html").read_text(encoding="utf-8"))
     assert len(studies.pictures) == 1
     assert studies.links == ["report.html", "t.html"]
-
-
-@pytest.mark.long
-def test_every_claim_of_the_design_is_in_the_report_with_its_reason(tmp_path: Path) -> None:
-    shape = analyse(point_of(load_config()))
-    assert {claim.verdict for claim in shape.claims} == {"agrees", "differs"}
-    assert [claim.title for claim in shape.claims if claim.verdict == "differs" and not claim.why] == []
-    page = write_paper(tmp_path, Paper((), (), False), (), shape).read_text(encoding="utf-8")
-    for claim in shape.claims:
-        assert page.count(claim.ours.replace("'", "&#39;")) >= 1, claim.title
-    assert 'href="design/design.html"' in page
-    pictures = (tmp_path / "design" / "design.html").read_text(encoding="utf-8")
-    assert pictures.count('src="data:image/png') == len(shape.pictures)
-    assert content(tmp_path)["design"] == [dataclasses.asdict(claim) for claim in shape.claims]
-    assert (tmp_path / "design" / "stability.png").exists()
