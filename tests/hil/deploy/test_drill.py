@@ -1,0 +1,81 @@
+"""The drill takes the supervisor through its states as planned, and two boards are compared over it."""
+
+from pathlib import Path
+from types import SimpleNamespace as Made
+from typing import Any
+
+import pytest
+
+from hil.deploy import beside
+from hil.deploy.drill import DRILL
+from hil.laboratory.files.recorder import load_events
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
+
+PLANNED = (  # [s] of the record; released at 11 s
+    (0.52, "waiting"), (1.57, "flying"), (2.01, "failsafe, disarmed"), (2.21, "flying"),
+    (2.41, "failsafe, emergency stop"), (2.61, "flying"), (3.01, "failsafe, out of bounds"),
+    (3.41, "not followed: poses are corrections"), (3.46, "not followed: it leaves the box"), (3.5, "path refused"),
+    (3.7, "flying"), (9.8, "failsafe, low battery"), (10.21, "failsafe, emergency stop"), (10.41, "flying"),
+    (11.99, "failsafe, silence"), (12.21, "flying"), (13.02, "failsafe, imu stale"), (13.15, "flying"),
+    (15.08, "failsafe, emergency stop"),
+)  # fmt: skip
+
+
+def test_the_drill_s_states_and_refusals_come_when_they_are_planned(tmp_path: Path) -> None:
+    assert fly(Request.of(DRILL), tmp_path / "run").outcome == "completed"
+    told = [one for one in load_events(tmp_path / "run") if one["source"] == "board"]
+    told = [one for one in told if one["text"].startswith(("supervisor: ", "commander: "))]
+    for one, (t_s, text) in zip(told, PLANNED, strict=True):
+        assert text in one["text"]
+        assert 1e-6 * one["t_us"] == pytest.approx(t_s, abs=0.003), one
+    states = [text for _, text in PLANNED if text.split(",")[0] in ("waiting", "flying", "failsafe")]
+    assert beside.states_of(tmp_path / "run") == states
+
+
+@pytest.mark.parametrize(
+    ("changes", "resets", "expected"),
+    [
+        ({}, (0, 0), []), ({"outcome": "lost", "cause": "fell"}, (0, 0),
+        ["the flight ends otherwise: python completed, image lost (fell)"]),
+        ({}, (2, 3), ["the board reset 5 times in flight"]),
+    ],
+)  # fmt: skip
+def test_both_flights_of_an_image_and_their_ends_are_compared(
+    changes: dict[str, str], resets: tuple[int, int], expected: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flown: list[Any] = []
+
+    def fly_one(request: Request, folder: Path, progress: Any) -> Any:
+        progress(7, "flight")
+        image = Made(watchdog_resets=resets[0], software_resets=resets[1]) if folder.name == "image" else None
+        ended = Made(outcome="completed", cause=None, image=image, folder=folder)
+        flown.append(
+            (request.experiment.name, request.bench.board, request.duration_s, request.faults, folder.name)
+        )
+        vars(ended).update(changes if image and request.experiment is not DRILL else {})
+        return ended
+
+    monkeypatch.setattr(beside, "fly", fly_one)
+    monkeypatch.setattr(beside, "load_flown", lambda folder: f"{folder.parent.name}/{folder.name}")
+    monkeypatch.setattr(beside, "compare_flights", lambda *flights: flights)
+    monkeypatch.setattr(beside, "compare_states", lambda *folders: [one.name for one in folders])
+    shown: list[Any] = []
+    compared, ends, states = beside.fly_beside_python(
+        Path("a.elf"), "floaty", (), lambda *what: shown.append(what)
+    )
+    assert (compared, states) == (["hover/python", "hover/image"], ["python", "image"])
+    assert ends == (2 if resets[0] else 1) * expected, "resets in each of both flights"
+    hover, drilled = (
+        ("hover", "c", 4.0, beside.FAULTS),
+        ("supervisor", "c", 4.4, ("radio.cut@0.5:0.7", "imu.freeze@2:0.05")),
+    )
+    assert [one[:2] + one[4:] for one in flown] == [
+        (name, board, place)
+        for name, *_ in (hover, drilled)
+        for board, place in (("c", "python"), ("a.elf", "image"))
+    ]
+    assert {one[0]: one[2:4] for one in flown} == {one[0]: one[2:] for one in (hover, drilled)}
+    assert shown == [
+        (f"{name}, {board}", 7, "flight") for name, *_ in (hover, drilled) for board in ("python", "image")
+    ]
