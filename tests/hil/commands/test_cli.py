@@ -74,6 +74,7 @@ def test_pages_are_found_by_topic_and_by_words(cli: Cli, monkeypatch: pytest.Mon
     assert cli.out.startswith("# Your own logic\n")
     assert cli("docs", "Hypothesis", "shrink") == 0
     assert re.match(r"tests  Your own tests\n    .*\n    .* Sizes shrink ", cli.out)
+    assert "floaty docs TOPIC prints a page" not in cli.out
     assert cli("docs", "air-time") == 0, "hyphens are spaces"
     assert "did you mean tests?" in cli.refusal("docs", "tesst")
     launched: list[str] = []

@@ -1,13 +1,17 @@
 """The drill takes the supervisor through its states as planned, and two boards are compared over it."""
 
+import struct
 from pathlib import Path
 from types import SimpleNamespace as Made
 from typing import Any
 
 import pytest
+from cflib.crazyflie.high_level_commander import HighLevelCommander
+from cflib.crazyflie.localization import Localization
 
+from firmware_py.wire.crtp import decode
 from hil.deploy import beside
-from hil.deploy.drill import DRILL
+from hil.deploy.drill import DRILL, FEED, GO_TO, STOP, THRUST
 from hil.laboratory.files.recorder import load_events
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
@@ -31,6 +35,20 @@ def test_the_drill_s_states_and_refusals_come_when_they_are_planned(tmp_path: Pa
         assert 1e-6 * one["t_us"] == pytest.approx(t_s, abs=0.003), one
     states = [text for _, text in PLANNED if text.split(",")[0] in ("waiting", "flying", "failsafe")]
     assert beside.states_of(tmp_path / "run") == states
+
+
+def test_its_packets_are_those_that_cflib_sends() -> None:
+    sent: list[tuple[int, int, bytes]] = []
+    link = Made(platform=Made(get_protocol_version=lambda: 11),
+        add_port_callback=lambda *_: None,
+        send_packet=lambda packet: sent.append((packet.port, packet.channel, bytes(packet.data))))  # fmt: skip
+    HighLevelCommander(link).go_to(0.0, 0.0, 0.0, 0.0, 1.0, relative=True)
+    HighLevelCommander(link).stop()
+    with pytest.warns(DeprecationWarning, match="emergency_stop_watchdog"):
+        Localization(link).send_emergency_stop_watchdog()
+    assert [(one.port, one.channel, one.data) for one in map(decode, (GO_TO, STOP, FEED))] == sent
+    thrust = decode(THRUST)
+    assert (thrust.port, thrust.channel, struct.unpack("<3fH", thrust.data)) == (3, 0, (0.0, 0.0, 0.0, 257))
 
 
 @pytest.mark.parametrize(

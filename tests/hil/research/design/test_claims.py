@@ -111,6 +111,20 @@ def test_each_claim_has_the_robot_s_value_and_its_verdict(point: Point, stable: 
     assert [one.paper for one in found if one.title == "z per vz"] == ["-2 ± 0.1"]
 
 
+@pytest.mark.parametrize(("growth", "verdict"), [(-0.01, "agrees"), (0.0, "differs"), (0.01, "differs")])
+def test_an_axis_is_stable_where_nothing_grows(
+    point: Point, monkeypatch: pytest.MonkeyPatch, growth: float, verdict: str
+) -> None:
+    monkeypatch.setattr(type(point.linear), "growth", lambda linear, axis: growth)
+    sweep = Stability(
+        np.zeros((len(HEIGHTS), len(KINKS))), np.zeros(len(KINKS)), np.zeros((len(KINKS), 3)), 0.5
+    )
+    told = {one.title: one.verdict for one in claims(point, sweep, angles(), LAWS, 0.0)}
+    assert {
+        told[title] for title in ("flat flaps: pitch is stable by its V", "pitch stays stable by its V")
+    } == {verdict}
+
+
 def test_a_robot_is_described_in_the_units_of_its_words(point: Point) -> None:
     lines, weight = dict(robot_lines(point)), weigh(point.geometry)
     low, high = (replace(point, opening=one).speed for one in (point.low + radians(8),

@@ -5,6 +5,7 @@ import json
 import re
 import statistics
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from hil.laboratory.request import Options
 from hil.pictures.panels import Instant
 from hil.research.campaigns.jobs import Job, Row, fly_job
 from hil.research.studies.catalogue import PROFILES
-from hil.research.studies.paper import Paper, Trials
+from hil.research.studies.paper import Paper, Trials, fly_paper
 from hil.research.studies.paper_report import write_paper
 from hil.research.studies.paper_rows import OUTSIDE, ROWS, MetricClaim, PaperRow
 from hil.research.studies.study import Curve, Expected, Study, StudyResult, Variant, VariantOutcome
@@ -122,6 +123,36 @@ def test_every_seed_of_the_default_profile_must_hold(result: Row) -> None:
     assert not Paper((("hover", row, (good, good)),), (), True).holds, "interrupted"
     assert not Paper((("hover", row, (Trials("floaty", ()), good)),), (), False).holds, "nothing was flown"
     assert bad.failed == ["max_x 1×"]
+
+
+@pytest.mark.parametrize("ended", [99, 3])
+def test_each_flight_is_flown_once_for_all_rows_and_studies_that_need_it(tmp_path: Path, ended: int) -> None:
+    """Two studies have the same flights; without the last flights each has the cells that are complete."""
+    same = Variant("v", lambda size: Options(overrides=(f"tunnel.speed={10 + size:g}",)), Expected())
+    study = Study("s", "q", "a", "", (0.0, 1.0), (same,), duration_s=8.0)
+    asked: list[Job] = []
+
+    def fly(name: str, jobs: list[Job], out: Path) -> list[Row]:
+        asked.extend(jobs)
+        return [Row(job, "completed", "", True, f"{n}", {"failsafe": 0.0, "rms_x": 0.1 * n, "rms_y": 0.0, "rms_z": 0.0}, {})
+            for n, job in enumerate(jobs)][:ended]  # fmt: skip
+
+    runner: Any = SimpleNamespace(fly=fly, interrupted=ended < 99)
+    flown = fly_paper(["hover"], [study, dataclasses.replace(study, name="t")], 2, tmp_path, runner)
+    texts = [job.text for job in asked]
+    assert len(texts) == len(set(texts)) == 2 * len(PROFILES) + 4, "both studies share their flights"
+    assert [job.folder.name for job in asked if job.folder] == [
+        f"hover-{one}-{seed}" for one in PROFILES for seed in (1, 2)
+    ]
+    [(name, row, both)] = flown.rows
+    assert (name, row, flown.interrupted) == ("hover", ROWS["hover"], ended < 99)
+    hashes = [[one.hash for one in trials.results] for trials in both]
+    assert hashes == ([["0", "1"], ["2", "3"]] if ended == 99 else [["0", "1"], ["2"]])
+    cells = [
+        [(cell.size, cell.errors) for curve in one.curves for cell in curve.cells] for one in flown.studies
+    ]
+    expected = [(0.0, pytest.approx((0.4, 0.5))), (1.0, pytest.approx((0.6, 0.7)))]
+    assert cells == [expected, expected] if ended == 99 else cells == [[], []]
 
 
 @pytest.mark.long

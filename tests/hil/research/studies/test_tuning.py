@@ -1,6 +1,7 @@
 """`floaty tune`: what it refuses, and a whole round from the author's gains and the plate model."""
 
 import json
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +12,7 @@ import pytest
 
 from hil.commands.identify import _edges, _gains, _motion
 from hil.config import load_config
+from hil.errors import LabError
 from hil.laboratory.experiments import find_experiment
 from hil.laboratory.request import Options, Request
 from hil.laboratory.robot import Streams
@@ -109,6 +111,71 @@ def test_a_round_begins_with_the_gains_of_the_one_before_and_other_seeds(
     assert flown == [
         (Path(f"out/round-{n}"), seed + one, base) for n, seed, base in begun for one in range(4)
     ]
+
+
+def test_the_worst_robots_that_a_plant_can_be_are_flown_the_worst_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A robot is its peak; those with a constant of another sign or over four times the plant's are no plant's."""
+    config = load_config()
+    truth = asdict(tuning.plant_of(config).linearise())
+    given = config.plant.constant_factors
+    robots = [{name: value * share for name, value in truth.items()} | {"peak": peak, "flap_rate": 20.0 + peak}
+        for share, peak in ((1.0, 2.0), (0.5, 5.0), (3.99, 3.0), (4.01, 9.0), (1.5, 4.0), (0.25, 1.0))]  # fmt: skip
+    robots += [truth | {"roll_u1": -truth["roll_u1"], "peak": 8.0, "flap_rate": 20.0}]
+    monkeypatch.setattr(
+        tuning,
+        "build",
+        lambda axis, robot, *_: SimpleNamespace(open_loop=lambda gains: robot["peak"] * gains),
+    )
+    monkeypatch.setattr(tuning, "peak_of", lambda found: found)
+    axes = [SimpleNamespace(axis=n, new=n, margins=SimpleNamespace(peak=2.0)) for n in (1.0, 3.0)]
+    tuned: Any = SimpleNamespace(axes=axes, robots=SimpleNamespace(drawn=robots), age_s=0.04, config=config)
+    found = tuning.worst_settings(tuned, config)
+    for (factors, lag), (share, peak) in zip(found, ((0.5, 5.0), (1.5, 4.0), (3.99, 3.0)), strict=True):
+        assert f"roll_u1={share * given.get('roll_u1', 1.0):.5f}" in factors
+        assert lag == f"actuators.tau={1 / (20.0 + peak):.5f}"
+        assert load_config(overrides=[factors, lag])
+    assert tuning.worst_settings(tuned, load_config(overrides=["plant.variant=plate"])) == []
+
+
+def test_a_tuned_profile_has_what_differs_from_its_base(tmp_path: Path) -> None:
+    base = load_config()
+    new = {"model": {"roll_u1": 200.5}, "servo": {"trim": (1, 2, 3, 4)}, "controller": {"gain_y": -1.75}}
+    config = base.model_copy(
+        update={part: getattr(base, part).model_copy(update=one) for part, one in new.items()}
+    )
+    tuning.write_tuned(tmp_path / "t.toml", "floaty", config, "About.")
+    assert load_config(str(tmp_path / "t.toml")) == config
+    text = (tmp_path / "t.toml").read_text()
+    assert "About." in text
+    assert text.count(" = ") == 4, "the base and what differs"
+
+
+@pytest.mark.parametrize(("excited", "flown", "message"), [
+    ("lost", "completed", "round 1 ends: identify-u1 lost the robot: fell"),
+    ("completed", "lost", "round 1 ends: the new gains lose the robot: fell"), ("completed", "completed", "")])  # fmt: skip
+def test_a_lost_robot_ends_the_rounds(
+    monkeypatch: pytest.MonkeyPatch, excited: str, flown: str, message: str
+) -> None:
+    def row(outcome: str, name: str = "identify-u1") -> Any:
+        return SimpleNamespace(
+            outcome=outcome, error="fell", folder="f", job=SimpleNamespace(experiment=name)
+        )
+
+    one = SimpleNamespace(flown=(row(flown),), worth_another=False)
+    for name in ("load_record", "identify", "write_profile", "_tunable"):
+        monkeypatch.setattr(tuning, name, lambda *_: None)
+    monkeypatch.setattr(tuning, "fly_round", lambda *_: one)
+    own = TuningFlights(
+        5, "c", Path("out"), SimpleNamespace(log=lambda *_: [row("completed", "x"), row(excited)])
+    )  # type: ignore[arg-type]
+    done: list[Any] = []
+    with pytest.raises(LabError, match=f"^{message}$") if message else nullcontext():
+        done.extend(tuning.rounds("floaty", own, 3, 9))
+    assert done == [one] * (excited == "completed")
+    with pytest.raises(KeyboardInterrupt):
+        TuningFlights(5, "c", Path("out"), SimpleNamespace(log=lambda *_: [])).hover("a", "floaty")  # type: ignore[arg-type]
 
 
 @pytest.mark.long

@@ -1,6 +1,5 @@
 """Why two boards fly one seed differently: what was put into a log as a difference is told, with its size."""
 
-import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,8 +20,7 @@ from hil.laboratory.request import REAL, Bench, Request
 from hil.laboratory.run import fly
 from hil.laboratory.schedule import SCHEMA
 from hil.pictures.compare import FlownRun, load_flown
-from hil.research.studies.two_boards import CLOCK, RATES, comparable, seeds_of, two_boards
-from support.command import Cli
+from hil.research.studies.two_boards import CLOCK, RATES, _radio, comparable, seeds_of, two_boards
 
 Columns = dict[str, NDArray[np.generic]]
 RELEASE, FLOWN = 100, 30  # rows
@@ -143,8 +141,22 @@ def test_only_equal_requests_on_two_boards_are_comparable(flown: Path, tmp_path:
     assert not comparable(other(flown, tmp_path / "real", lambda columns: None, REAL), b)
 
 
-@pytest.mark.long
-def test_two_folders_of_runs_are_a_row_per_seed(cli: Cli, flown: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("down", "up", "expected"), [
+    ((4, 5), (2, 4), "packets take 1.50 | 0.50 ms up, beside 4 | 5 that come down"),
+    ((4, 4), (2, 4), ""), ((4, 5), (0, 4), ""), ((4, 5), (2, 0), ""), (None, None, "")])  # fmt: skip
+def test_packets_of_the_uplink_wait_beside_those_that_come_down(down: Any, up: Any, expected: str) -> None:
+    def log(n: int) -> pa.Table:
+        ends = (
+            {"up_delivered": up[n], "up_latency_sum": (3000, 2000)[n], "down_delivered": down[n]}
+            if up
+            else {}
+        )
+        return pa.table({f"link.{name}": [0, value] for name, value in ends.items()} | {"t": [0, 1]})
+
+    assert _radio([log(0), log(1)]) == expected
+
+
+def test_two_folders_of_runs_are_a_row_per_seed(flown: Path, tmp_path: Path) -> None:
     """The second body is 12.3 mm beside the first, and its board fuses three poses more."""
 
     def beside(columns: Columns) -> None:
@@ -152,37 +164,23 @@ def test_two_folders_of_runs_are_a_row_per_seed(cli: Cli, flown: Path, tmp_path:
         columns["truth.x"] += 0.0123
         columns["estimator.fused"] += 3
 
-    for name in ("first", "second"):
-        (tmp_path / name).mkdir()
-    for seed in (10, 2):
-        shutil.copytree(flown, tmp_path / "first" / f"hover-{seed}")
-        other(flown, tmp_path / "second" / f"hover-{seed}", beside)
-        for name in ("first", "second"):
-            folder = tmp_path / name / f"hover-{seed}"
-            result = read_result(folder)
+    first, second = tmp_path / "first", tmp_path / "second"
+    for seed in (10, 2, 3):  # the last has no partner
+        runs = [Path(shutil.copytree(flown, first / f"hover-{seed}"))]
+        runs += [other(flown, second / f"hover-{seed}", beside).result.folder] * (seed != 3)
+        for run in runs:
+            result = read_result(run)
             write_result(replace(result, request=replace(result.request, seed=seed)))
-    shutil.copytree(flown, tmp_path / "first" / "hover-3")  # has no partner
-    found = seeds_of(tmp_path / "first", tmp_path / "second")
+    found = seeds_of(first, second)
     assert [one.seed for one in found] == [2, 10]
-    assert all(one.first is not None and one.first.row == RELEASE + 1 for one in found)
-    assert cli("compare", tmp_path / "first", tmp_path / "second") == 1
     free = load_flown(flown).log.slice(RELEASE)
-    x, y, z = (column(free, f"truth.{axis}") - column(free, f"goal.{axis}") for axis in "xyz")
-    rms = [100 * np.sqrt((error**2).mean()) for error in (x, y, z, x + 0.0123)]
-    row = next(line for line in cli.out.splitlines() if "101" not in line and " 10 " in line)
-    assert [float(number) for number in re.findall(r"\d+\.\d+", row)] == pytest.approx(
-        [*rms[:3], rms[3], *rms[1:3], 12.3, 0.01], abs=0.01
-    )
+    errors = [column(free, f"truth.{axis}") - column(free, f"goal.{axis}") for axis in "xyz"]
+    rms = [float(np.sqrt((error**2).mean())) for error in (*errors, errors[0] + 0.0123)]
     fused = int(column(free, "estimator.fused")[-1])
-    assert f"{fused} | {fused + 3}" in row
-    worst = 100 * abs(rms[3] / rms[0] - 1)
-    assert f"2 seeds: rms errors within {worst:.1f} % of the first's, bodies within 12.30 mm" in cli.out
+    for one in found:
+        assert one.first is not None
+        assert str(one.first).startswith(f"first servo count: row {RELEASE + 1}, 0.01")
+        assert [*one.rms_m[0], *one.rms_m[1]] == pytest.approx([*rms[:3], rms[3], *rms[1:3]], rel=1e-6)
+        assert (one.apart_m, one.fused) == (pytest.approx(0.0123, rel=1e-6), (fused, fused + 3))
     with pytest.raises(LabError, match="neither two runs nor folders with runs of the same names"):
-        seeds_of(tmp_path / "first", flown.parent)
-    shutil.copytree(flown, tmp_path / "alone")
-    result = read_result(tmp_path / "alone")
-    write_result(replace(result, request=replace(result.request, seed=2)))
-    assert cli("compare", tmp_path / "alone", tmp_path / "second" / "hover-2") == 1
-    assert "first servo count: row 101" in cli.out
-    page = (tmp_path / "second" / "hover-2" / "compare.html").read_text(encoding="utf-8")
-    assert "<li>first servo count: row 101" in page
+        seeds_of(first, flown.parent)
