@@ -9,7 +9,7 @@ import pytest
 
 from firmware_py.core.structs import Control
 from firmware_py.export.profile_c import profile_hash
-from firmware_py.wire.core_port import HEAD, Hil, Message
+from firmware_py.wire.core_port import HEAD, READ_MAX, Hil, Message, read
 from ground_station.links import packets
 from ground_station.links.core_client import CoreClient
 from hil.config import load_config
@@ -199,7 +199,13 @@ def test_a_link_that_repeats_half_of_all_packets_is_judged_by_its_rate(
     client = CoreClient(AppPackets(app, mess=0.25), "board")
     client.begin()
     monkeypatch.setattr(doctor, "clock_us", count(0, 1_000_000).__next__)
+    executed: list[Any] = []
+    execute = client.execute
+    monkeypatch.setattr(client, "execute", lambda asked: executed.append(asked) or execute(asked))
     found = doctor._link(client, poses_hz)
+    assert executed == [[read(0, READ_MAX)]] * doctor.ROUND_TRIPS + [[read(0, READ_MAX)] * 600], (
+        "whole packets"
+    )
     assert found.good == good
     assert found.text.startswith("round trip 1000.0 ms, the longest 1000.0; 600 packets/s each way, ")
     assert text in found.text

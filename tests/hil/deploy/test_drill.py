@@ -48,7 +48,7 @@ def test_its_packets_are_those_that_cflib_sends() -> None:
         Localization(link).send_emergency_stop_watchdog()
     assert [(one.port, one.channel, one.data) for one in map(decode, (GO_TO, STOP, FEED))] == sent
     thrust = decode(THRUST)
-    assert (thrust.port, thrust.channel, struct.unpack("<3fH", thrust.data)) == (3, 0, (0.0, 0.0, 0.0, 257))
+    assert (thrust.port, thrust.channel, struct.unpack("<3fH", thrust.data)) == (3, 0, (0.0, 0.0, 0.0, 1))
 
 
 @pytest.mark.parametrize(

@@ -381,9 +381,11 @@ def test_faults_share_a_lane_and_a_push_is_an_arrow_that_can_be_seen(folder: Pat
     (arrow,) = [
         batch for batch in chunks(path, "/world/held/push_y") if "Arrows3D:vectors" in batch.schema.names
     ]
-    assert arrow.column("Arrows3D:vectors").to_pylist()[0] == [
-        [0.0, pytest.approx(2 * METRES_PER_NEWTON), 0.0]
-    ]
+    size = pytest.approx(2 * METRES_PER_NEWTON)
+    assert arrow.column("Arrows3D:vectors").to_pylist()[0] == [[0.0, size, 0.0]]
+    assert (-np.array(arrow.column("Arrows3D:origins").to_pylist()[0])).tolist() == [[0.0, size, 0.0]], (
+        "its tip is the robot"
+    )
     begun, gone = moments(path, "/world/held/push_y")
     assert gone - begun == 1000 * PUSH_SHOWN_US
 
