@@ -16,11 +16,19 @@ import pytest
 from firmware_py.core.structs import Input, Parameters
 from firmware_py.export.app_toc import AppParameter, app_parameters
 from firmware_py.wire.scalars import PARAMETER_SCALARS, Scalar
+from firmware_py.wire.supervisor import Cause
 from hil.board.board_firmware import PythonBoard
 from hil.config import load_config
 from hil.deploy import image_check
 from hil.deploy.beside import BOUNDS, Bound, Compared, _ends, compare_flights, compare_states
-from hil.deploy.image_check import TARGET, check_image, check_memory, check_parameters, check_services
+from hil.deploy.image_check import (
+    TARGET,
+    ImageBench,
+    check_image,
+    check_memory,
+    check_parameters,
+    check_services,
+)
 from hil.deploy.service_programs import PROGRAMS
 from hil.deploy.services import Answers, ServiceBench, differences, play_in_copies
 from hil.emulator.stm32f405.image import MemoryUse
@@ -106,6 +114,143 @@ def test_wrong_parameter_is_found(board: AppBoard, name: str, fields: dict[str, 
 def test_a_parameter_that_is_missing_is_found(board: AppBoard) -> None:
     missing = replace(TABLE[0], name="extCtrl.none")
     assert list(check_parameters((missing,), board)) == ["extCtrl.none: the image has no such parameter"]
+
+
+def words(bits: int, value: int, pins: tuple[int, ...]) -> int:
+    """A register with a value for each pin or channel."""
+    return sum(value << bits * pin for pin in pins)
+
+
+# Reference manual RM0090: 84 MHz / 4 / 52501 = 400 Hz, PWM mode 1 with preload, on PA2, PA3 (TIM5, channels 3 and 4) and
+# PB4, PB5 (TIM3, channels 1 and 2) as alternate function 2 with open drain.
+REGISTERS = {
+    base + offset: value
+    for base, channels, ccmr in ((0x4000_0400, (0, 1), 0x18), (0x4000_0C00, (2, 3), 0x1C))
+    for offset, value in ((0x00, 0x81), (0x28, 3), (0x2C, 52_500), (ccmr, words(8, 0x68, (0, 1))),
+                          (0x20, words(4, 1, channels)))
+} | {
+    base + offset: words(bits, value, pins)
+    for base, pins in ((0x4002_0000, (2, 3)), (0x4002_0400, (4, 5)))
+    for offset, bits, value in ((0x00, 2, 2), (0x04, 1, 1), (0x20, 4, 2))
+}  # fmt: skip
+
+
+def test_every_bit_of_timers_and_pins_that_servos_need_is_checked() -> None:
+    bench: Any = object.__new__(ImageBench)
+    memory = dict(REGISTERS)
+    bench.firmware = SimpleNamespace(
+        chip=SimpleNamespace(read=lambda place, size: memory[place].to_bytes(size, "little"))
+    )
+    assert list(bench.check_servo_outputs()) == []
+    for place, value in REGISTERS.items():
+        for bit in (one for one in range(16) if value >> one & 1):
+            memory[place] = value ^ 1 << bit
+            [found] = bench.check_servo_outputs()
+            assert re.match(r"servo outputs: (TIM|GPIO)\w\.\w+ = 0x", found)
+            memory[place] = value
+    for place in (one for one in REGISTERS if one & 0xFF in (0x20, 0x04) and one >= 0x4002_0000):
+        memory[place] = REGISTERS[place] | 1 << 31  # of a pin that is no servo's
+    assert list(bench.check_servo_outputs()) == []
+
+
+class Switches(ImageBench):
+    """A board whose request parameters act at once, but for those named."""
+
+    def __init__(self, *dead: str) -> None:
+        self.dead, self.at = (
+            dead,
+            {"tick": 900, "stopped": 0, "armed": 1, "stale_hovers": 7 * ("hovers" in dead), "cause": 0},
+        )
+        self.wrote: list[tuple[str, float]] = []
+
+    def scalar(self, name: str) -> Scalar | None:
+        return Scalar.U8
+
+    def value(self, name: str) -> float:
+        return 5.0
+
+    def write(self, name: str, value: float) -> None:
+        self.wrote.append((name, value))
+        name = name.removeprefix("floaty.").removeprefix("stabilizer.")
+        if name not in self.dead:
+            self.at |= {"tick": 2} if name == "reset" else {{"stop": "stopped"}.get(name, name): int(value)}
+            self.at["cause"] = Cause.NO_CONTROL if self.at.get("controller") == 1 else Cause.NONE
+
+    def run(self, duration_us: int) -> None:
+        """Let nothing happen."""
+
+    def memory(self, target: str, scalar: Scalar) -> float:
+        return self.at[target.partition(".")[2]]
+
+
+@pytest.mark.parametrize(
+    ("dead", "switches", "watch"),
+    [
+        ((), [], []),
+        (("stop",), ["floaty.stop = 1: floaty_supervisor.stopped = 0, expected 1"], []),
+        (("armed",), ["floaty.armed = 0: floaty_supervisor.armed = 1, expected 0"], []),
+        (("reset",), ["floaty.reset = 1: floaty_estimator.tick = 900 goes on, expected from 0 again"], []),
+        (
+            ("hovers",),
+            [],
+            ["servos put to hover 7 times for a controller that stands still, expected 0: none does"],
+        ),
+        (("controller",), [], ["stabilizer.controller = 1: cause NONE, expected NO_CONTROL"]),
+    ],
+)
+def test_switches_and_watch_of_the_controller_are_tried(
+    dead: tuple[str, ...], switches: list[str], watch: list[str]
+) -> None:
+    board = Switches(*dead)
+    assert list(board.check_switches()) == switches
+    assert list(board.check_watch()) == watch
+    assert board.wrote[-2:] == [("stabilizer.controller", 1), ("stabilizer.controller", 5.0)], "as before"
+
+
+@pytest.mark.parametrize(
+    "wrong", [(), ("services", "params", "switches", "watch", "servos", "states", "constants", "flight")]
+)
+def test_an_image_is_checked_on_the_bench_and_in_flight_and_each_part_has_its_finding(
+    wrong: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def faults(subject: str) -> Any:
+        return lambda *_: [f"{subject} 1", f"{subject} 2"] if subject in wrong else []
+
+    bench = SimpleNamespace(firmware=SimpleNamespace(differences=lambda config: "gain" * ("constants" in wrong)),
+        check_switches=faults("switches"), check_watch=faults("watch"), check_servo_outputs=faults("servos"))  # fmt: skip
+    monkeypatch.setattr(image_check, "image_at", lambda path, elf: "flashed")
+    monkeypatch.setattr(image_check, "ImageBench", lambda flashed, config: bench)
+    monkeypatch.setattr(image_check, "ServiceBench", lambda board, config: "python")
+    for name, subject in (("check_services", "services"), ("check_parameters", "params")):
+        monkeypatch.setattr(
+            image_check, name, lambda one, other, done, subject=subject: done(3) or faults(subject)()
+        )
+    rms = next(one for one in BOUNDS if one.name == "position")
+    compared = [Compared(rms, "truth.x", 2.1 if "flight" in wrong else 2.0)]
+
+    def flown(elf: Path, profile: str, overrides: tuple[str, ...], progress: Any) -> Any:
+        progress("hover", 5, SimpleNamespace(end_us=9))
+        return compared, ["ended"] * ("flight" in wrong), faults("states")()
+
+    monkeypatch.setattr(image_check, "fly_beside_python", flown)
+    shown: list[Any] = []
+    found = list(check_image(Path("a.elf"), "floaty", (), lambda *what: shown.append(what)))
+    assert shown == [
+        ("boot", 0, 1),
+        ("services", 3, len(PROGRAMS)),
+        ("parameters", 3, len(TABLE)),
+        ("flight, hover", 5, 9),
+    ]
+    subjects = ["constants", "params", "switches", "watch", "servos", "services", "flight", "states"]
+    assert list(dict.fromkeys(one.subject for one in found)) == subjects
+    assert {one.subject for one in found if not one.good} == set(wrong)
+    texts = [one.text for one in found if one.subject == "watch"]
+    assert texts == (
+        ["watch 1", "watch 2"] if wrong else ["acts when another controller runs, and only then"]
+    )
+    assert [one.text for one in found if one.subject == "flight"] == ["ended"] * ("flight" in wrong) + [
+        str(compared[0])
+    ]
 
 
 def test_programs_that_the_boards_answer_differently_are_named(monkeypatch: pytest.MonkeyPatch) -> None:

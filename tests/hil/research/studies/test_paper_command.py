@@ -155,8 +155,10 @@ def test_each_flight_is_flown_once_for_all_rows_and_studies_that_need_it(tmp_pat
     assert cells == [expected, expected] if ended == 99 else cells == [[], []]
 
 
-@pytest.mark.long
-def test_the_badges_name_their_kind_of_verdict(result: Row, tmp_path: Path) -> None:
+def test_the_badges_name_their_kind_of_verdict(
+    result: Row, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hil.pictures.drawing.png", lambda draw: b"\x89PNG")
     good = trials(result, True, True)
     marks = (Instant("paper", 0.5, "paper: settled"),)
     row = PaperRow("t", "c", "p", {"rms_x": MetricClaim("0", 0.0)}, "why", marks=marks)
