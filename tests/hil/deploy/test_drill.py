@@ -56,6 +56,7 @@ def test_its_packets_are_those_that_cflib_sends() -> None:
     [
         ({}, (0, 0), []), ({"outcome": "lost", "cause": "fell"}, (0, 0),
         ["the flight ends otherwise: python completed, image lost (fell)"]),
+        ({"cause": "odd"}, (0, 0), ["the flight ends otherwise: python completed, image completed (odd)"]),
         ({}, (2, 3), ["the board reset 5 times in flight"]),
     ],
 )  # fmt: skip

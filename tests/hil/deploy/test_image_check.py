@@ -20,7 +20,7 @@ from firmware_py.wire.supervisor import Cause
 from hil.board.board_firmware import PythonBoard
 from hil.config import load_config
 from hil.deploy import image_check
-from hil.deploy.beside import BOUNDS, Bound, Compared, _ends, compare_flights, compare_states
+from hil.deploy.beside import BOUNDS, Bound, Compared, compare_flights, compare_states
 from hil.deploy.image_check import (
     TARGET,
     ImageBench,
@@ -336,20 +336,6 @@ def test_the_first_state_that_one_board_does_not_reach_is_found(tmp_path: Path) 
         (folder / EVENTS).write_text("".join(f"{json.dumps(event)}\n" for event in events), encoding="utf-8")
     assert list(compare_states(folders[0], folders[0])) == []
     assert list(compare_states(*folders)) == ["number 3 differs: python failsafe, silence, image the end"]
-
-
-def test_flights_that_end_otherwise_and_all_resets_are_named() -> None:
-    def ended(outcome: str, cause: str | None, *resets: int) -> Any:
-        image = SimpleNamespace(watchdog_resets=resets[0], software_resets=resets[1]) if resets else None
-        return SimpleNamespace(outcome=outcome, cause=cause, image=image)
-
-    python = ended("lost", "fell")
-    assert list(_ends(python, ended("lost", "fell", 0, 0))) == []
-    assert list(_ends(python, ended("lost", "fell", 1, 2))) == ["the board reset 3 times in flight"]
-    for other, text in ((("lost", "tumbled"), "lost (tumbled)"), (("completed", None), "completed")):
-        assert list(_ends(python, ended(*other, 0, 0))) == [
-            f"the flight ends otherwise: python lost (fell), image {text}"
-        ]
 
 
 @pytest.mark.long

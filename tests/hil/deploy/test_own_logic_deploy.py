@@ -141,7 +141,6 @@ def test_the_lqr_s_gains_are_the_optimum_of_all_16_states_for_the_weights_that_i
     assert matrix(dict(declared)) == pytest.approx(K, abs=2e-3 * np.abs(K).max())
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("roll", [0.0, 0.05])
 def test_the_lqr_feeds_all_16_states_back(roll: float) -> None:
     config = load_config("lqr")

@@ -92,7 +92,6 @@ def test_metrics_of_unequal_flights_cover_the_common_time(runs: dict[str, Path])
     assert whole["flown"] == pytest.approx(long.result.metrics["flown"]), "nothing is cut of equal flights"
 
 
-@pytest.mark.long
 def test_flights_are_compared_by_the_time_since_their_release(runs: dict[str, Path]) -> None:
     a, b = load_flown(runs["one"]), load_flown(runs["two"])
     assert compare(a, b).apart == (), "row by row"

@@ -119,7 +119,6 @@ def test_the_latency_budget_adds_up_to_their_age_and_survives_a_cut_file(folder:
     report(folder)
 
 
-@pytest.mark.long
 @pytest.mark.usefixtures("few_pictures")
 def test_the_report_tells_where_the_age_of_the_poses_comes_from(folder: Path) -> None:
     stages = read_result(folder).ages
@@ -133,7 +132,6 @@ def test_the_report_tells_where_the_age_of_the_poses_comes_from(folder: Path) ->
         )
 
 
-@pytest.mark.long
 @pytest.mark.usefixtures("few_pictures")
 def test_the_report_tells_where_the_flight_comes_from(folder: Path) -> None:
     change_result(folder, overrides=["tunnel.turbulence=T1"], commit="0123456789ab")
@@ -164,7 +162,7 @@ def test_a_failed_limit_comes_first_and_its_instant_is_shown_close_up(folder: Pa
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("rows", [1, *(pytest.param(rows, marks=pytest.mark.long) for rows in (0, 15))])
+@pytest.mark.parametrize("rows", [0, 1, 15])
 def test_a_flight_that_never_began_has_a_report(folder: Path, rows: int) -> None:
     keep_rows(folder, rows)
     change_result(folder, metrics=dict.fromkeys(METRICS, None), verdicts=[], passed=False)
@@ -172,7 +170,6 @@ def test_a_flight_that_never_began_has_a_report(folder: Path, rows: int) -> None
     assert told == []
 
 
-@pytest.mark.long
 @pytest.mark.usefixtures("few_pictures")
 def test_a_killed_flight_has_a_report(folder: Path) -> None:
     (folder / "result.json").unlink()

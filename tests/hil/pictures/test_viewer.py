@@ -37,7 +37,7 @@ from hil.laboratory.schedule import SCHEMA
 from hil.live import window
 from hil.live.feed import open_view
 from hil.pictures import curves, scene
-from hil.pictures.viewer.layout import views_of
+from hil.pictures.viewer.layout import blueprint, views_of
 from hil.pictures.viewer.plots import PLOTS, rates
 from hil.pictures.viewer.recording import RerunFlight, write_rrd, write_run_rrd
 from hil.pictures.viewer.scene import HIDDEN, METRES_PER_NEWTON, PUSH_SHOWN_US, SEEN
@@ -400,6 +400,21 @@ def test_a_view_is_in_the_blueprint_when_the_log_has_its_curves(folder: Path) ->
     real = {path for _, path in views_of(real_log().schema)}
     assert {"position", "flaps", "age", "link/rate", "link/loss"} <= real
     assert not {"processor", "battery", "queue"} & real
+
+
+def test_every_view_of_a_flight_has_one_place_in_the_layout(folder: Path) -> None:
+    schema = load_log(folder).schema
+
+    def origins(part: Any) -> list[str]:
+        return (
+            [str(part.origin)]
+            if hasattr(part, "origin")
+            else [one for each in part.contents for one in origins(each)]
+        )
+
+    plots = [f"plot/{path}" for _, path in views_of(schema)]
+    assert origins(blueprint(schema).root_container) == ["world", "state", "text", "legend", *plots]
+    assert len(set(plots)) == len(plots) > 5
 
 
 def test_robots_that_flew_together_are_in_one_recording_each_at_its_place_with_its_texts(

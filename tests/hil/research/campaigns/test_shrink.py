@@ -12,7 +12,6 @@ from hil.laboratory.faults import Fault, parse
 from hil.research.campaigns.sampling import draw
 from hil.research.campaigns.shrink import Reflight, Trial, harmless, shrink
 from support.campaigns import spec_of
-from support.command import Cli
 
 FAULTS = (
     "mocap.dropout@1:2=1",
@@ -130,40 +129,6 @@ def test_harmless_sizes_can_be_written() -> None:
             assert str(Fault(name, 0.0, 1.0, size))
         else:
             assert size is None
-
-
-@pytest.mark.long
-def test_the_command_shrinks_a_lost_flight_and_prints_its_command(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: pytest.TempPathFactory
-) -> None:
-    monkeypatch.chdir(str(tmp_path))
-    text = """
-experiments = ["hover"]
-duration_s = 1.0
-flights = 1
-[parameters]
-"actuators.tau" = { uniform = [0.045, 0.055] }
-[[faults]]
-kind = "push.x"
-start_s = 0.1
-size = { uniform = [15, 20] }
-[[faults]]
-kind = "imu.noise"
-start_s = 0.0
-size = 2.0
-"""
-    with open("spec.toml", "w") as file:
-        file.write(text)
-    assert cli("campaign", "spec.toml", "--shrink", "0") == 0
-    command = cli.out.splitlines()[-1].split()
-    assert command[:3] == ["floaty", "fly", "hover"]
-    assert "--set" not in command
-    assert command.count("--fault") == 1
-    fault = parse(command[command.index("--fault") + 1])
-    assert fault.kind == "push.x"
-    assert fault.size * fault.duration_s < 1.0
-    assert "holds: " in cli.err
-    assert cli(*command[1:]) == 1, "it fails"
 
 
 def test_the_shrunk_flight_is_the_drawn_one() -> None:

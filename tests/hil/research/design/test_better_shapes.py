@@ -26,7 +26,6 @@ from hil.research.design.trim import balanced, coefficient_of, scaled
 from hil.world.config import PlantConfig, PlantServoConfig, TunnelConfig
 from hil.world.floaty.geometry import weigh
 from hil.world.floaty.plant import Plant
-from support.command import Cli
 
 CONFIG = load_config()
 PAPER = Point(CONFIG.geometry, coefficient_of(CONFIG), math.radians(28.0), 0.0, 0.9)
@@ -244,21 +243,6 @@ def test_the_steady_side_step_is_that_of_the_simulated_linear_model() -> None:
     flow = np.block([[A, b[:, None]], [np.zeros((1, 4))]])
     early, late = (expm(flow * t)[0, 3] for t in (10.0, 11.0))
     assert late - early == pytest.approx(model.steady(PITCH), rel=1e-3)
-
-
-@pytest.mark.long
-def test_command_writes_the_pareto_picture_and_a_profile_that_flies(cli: Cli, tmp_path: Path) -> None:
-    profile = tmp_path / "best.toml"
-    arguments = ["optimise", "--profile", "design-paper", "--generations", "3", "--out", str(tmp_path)]
-    assert cli("design", *arguments, "--write", str(profile)) == 0
-    assert (tmp_path / "pareto-least-authority.png").read_bytes().startswith(b"\x89PNG")
-    assert "1.375 are needed" in cli.out
-    assert "base = 0.15 of the footprint: at the lower bound of the search (it carries" in cli.out
-    request = Request.of(EXPERIMENTS["hover"], profile=str(profile), duration_s=4.0)
-    result = fly(request, tmp_path / "flight")
-    assert result.metrics["lost"] == 0.0
-    assert cli("design", *arguments, "--updrafts", "11", "8") == 2
-    assert "expected the least first" in cli.err
 
 
 @pytest.mark.parametrize("name", DESIGNS)
