@@ -29,6 +29,8 @@ class Runner:
         return [self._row(job) for job in jobs]
 
     def _row(self, job: Job) -> Row:
+        settings = dict(one.split("=") for one in job.options["overrides"])
+        assert {key: float(value) for key, value in settings.items()} == job.values
         y, z = job.values.values()
         value = (y - self._best[0]) ** 2 + (z - self._best[1]) ** 2 + 0.01 * (job.options["seed"] % 2)
         outcome = "lost" if y < self._lost_below else "completed"
