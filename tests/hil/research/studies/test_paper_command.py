@@ -2,8 +2,8 @@
 
 import dataclasses
 import json
+import math
 import re
-import statistics
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,16 +20,7 @@ from hil.research.studies.paper import Paper, Trials, fly_paper
 from hil.research.studies.paper_report import write_paper
 from hil.research.studies.paper_rows import OUTSIDE, ROWS, MetricClaim, PaperRow
 from hil.research.studies.study import Curve, Expected, Study, StudyResult, Variant, VariantOutcome
-from support.command import floaty
 from support.html_page import Page
-
-
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two seeds of the hover on both profiles."""
-    folder = tmp_path_factory.mktemp("paper") / "out"
-    assert floaty("paper", "--only", "hov*", "--seeds", "2", "--out", folder) == 0
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -55,55 +46,42 @@ def test_a_row_shows_existing_metrics_with_the_paper_s_source(name: str) -> None
     assert ROWS[name].place
 
 
-@pytest.mark.long
-def test_every_flight_keeps_its_log_and_nothing_big_besides(flown: Path) -> None:
-    folders = {path.name for path in flown.iterdir() if path.is_dir()}
-    flights = {f"hover-{profile}-{seed}" for profile in PROFILES for seed in (1, 2)}
-    assert folders == flights | {"campaigns"}
-    for name in flights:
-        assert {path.name for path in (flown / name).iterdir()} == {
-            "log.parquet",
-            "events.jsonl",
-            "result.json",
-        }
+def test_the_report_has_the_papers_value_and_the_spread_of_each_profile_s_flights(
+    result: Row, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hil.pictures.drawing.png", lambda draw: b"\x89PNG")
+    deg = math.radians(1.0)
+    spread = {"floaty": (1.0 * deg, 3.0 * deg), "as-flown": (4.0 * deg, 4.5 * deg)}
 
-
-@pytest.mark.long
-def test_the_table_is_the_mean_and_deviation_of_the_flights(flown: Path) -> None:
-    (row,) = content(flown)["rows"]
-    for profile in PROFILES:
-        flights = [
-            json.loads((flown / f"hover-{profile}-{seed}" / "result.json").read_text()) for seed in (1, 2)
-        ]
-        rms = [100 * flight["metrics"]["rms_y"] for flight in flights]
-        told = row["profiles"][profile]["metrics"]["rms_y"]
-        assert told["mean"] == pytest.approx(statistics.mean(rms))
-        assert told["deviation"] == pytest.approx(statistics.stdev(rms))
-        assert (told["low"], told["high"]) == pytest.approx((min(rms), max(rms)))
-        assert (told["unit"], told["count"]) == ("cm", 2)
-        assert [flight["hash"] for flight in row["profiles"][profile]["flights"]] == [
-            f["hash"] for f in flights
-        ]
-
-
-@pytest.mark.long
-def test_the_report_has_the_papers_value_and_ours(flown: Path) -> None:
-    page = Page((flown / "report.html").read_text(encoding="utf-8"))
-    rows = {row[0]: row[1:] for row in page.tables["paper"]}
-    told = content(flown)["rows"][0]["profiles"]
-    cells = rows[METRICS["attitude_max"].meaning]
-    assert cells[0] == ROWS["hover"].claims["attitude_max"].text
-    for cell, profile in zip(cells[1:], PROFILES, strict=True):
-        assert float(cell.split()[0]) == pytest.approx(
-            told[profile]["metrics"]["attitude_max"]["mean"], rel=0.01
+    def flight(name: str, size: float) -> Row:
+        return dataclasses.replace(
+            result, passed=True, hash=f"{name}{size}", metrics=result.metrics | {"attitude_max": size}
         )
-        assert cell.endswith(" deg")
+
+    both = tuple(Trials(name, tuple(flight(name, size) for size in each)) for name, each in spread.items())
+    page = Page(write_paper(tmp_path, Paper((("hover", ROWS["hover"], both),), (), False)).read_text("utf-8"))
+    rows = {row[0]: row[1:] for row in page.tables["paper"]}
+    found = ["2 ± 1.4 deg", "4.25 ± 0.35 deg"]
+    assert rows[METRICS["attitude_max"].meaning] == [ROWS["hover"].claims["attitude_max"].text, *found]
     assert rows["limits held"][1:] == ["2 of 2", "2 of 2"]
     assert page.links == ["hover.html"] * 2, "in the contents and in the table"
-    figures = Page((flown / "hover.html").read_text(encoding="utf-8"))
-    for profile in PROFILES:
-        assert f"{profile}-errors" in figures.plots
-    assert len(figures.pictures) == len(PROFILES), "the track"
+    told = content(tmp_path)["rows"][0]["profiles"]
+    for name, (low, high) in spread.items():
+        metric = told[name]["metrics"]["attitude_max"]
+        expected = {
+            "mean": (low + high) / 2,
+            "deviation": (high - low) / math.sqrt(2),
+            "low": low,
+            "high": high,
+        }
+        assert {key: metric[key] for key in expected} == {
+            key: pytest.approx(value / deg) for key, value in expected.items()
+        }
+        assert (metric["unit"], metric["count"]) == ("deg", 2)
+        assert [one["hash"] for one in told[name]["flights"]] == [f"{name}{one}" for one in (low, high)]
+    figures = Page((tmp_path / "hover.html").read_text(encoding="utf-8"))
+    assert {f"{name}-errors" for name in spread} <= figures.plots.keys()
+    assert len(figures.pictures) == 2, "the tracks"
     assert all(plot["alone"] for plot in figures.plots.values())
     assert {plot["marks"] for plot in figures.plots.values()} == {0, 1}, "each profile's flight has its own"
     assert figures.links == ["report.html"]

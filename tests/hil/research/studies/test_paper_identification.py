@@ -55,7 +55,6 @@ def test_the_papers_method_misses_what_the_others_find(tmp_path: Path) -> None:
     assert abs(number(b.paper_method) - -40.0) > 0.5 * 40.0, "it finds no damping"
 
 
-@pytest.mark.long
 def test_the_report_has_the_rows_of_the_identification(tmp_path: Path) -> None:
     rows = [PaperConstant("a", "230 ± 66", "230", "230", "43 ± 131", "211 ± 12", "226 ± 10")]
     text = write_paper(tmp_path, Paper((), (), False), (), None, rows).read_text(encoding="utf-8")
