@@ -2,9 +2,11 @@
 
 import json
 import re
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import asdict
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace as Made
 from typing import Any
@@ -32,23 +34,46 @@ class Asked(list[Any]):
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         super().__init__()
         self._patch = patch
+        self.patched: dict[str, Callable[..., Any]] = {}
 
     def answer(self, answers: Mapping[str, Any]) -> None:
         """Note the calls of functions of `hil`, and return an answer each."""
-        for place, answer in answers.items():
+        places = {
+            one if one.startswith("ground_station") else f"hil.{one}": answer
+            for one, answer in answers.items()
+        }
+        for (
+            place
+        ) in places:  # before anything is patched: a module that is loaded later would keep what it finds
+            import_module(place.rpartition(".")[0])
+        for place, answer in places.items():
             name = place.rpartition(".")[2]
 
             def called(*what: Any, name: str = name, answer: Any = answer, **more: Any) -> Any:
                 self.append((name, *what, *more.values()))
                 return answer(*what) if callable(answer) else answer
 
-            self._patch.setattr(place if place.startswith("ground_station") else f"hil.{place}", called)
+            self.patched[place] = called
+            self._patch.setattr(place, called)
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
-    """What the rooms are asked for; they are patched."""
-    return Asked(monkeypatch)
+def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[Asked]:
+    """What the rooms are asked for; they are patched, and nothing keeps that."""
+    loaded = ("hil.api", "ground_station.program", "hil.pictures.compare", "hil.research.studies.paper_report",
+        "hil.research.campaigns.report")  # fmt: skip
+    for name in loaded:
+        import_module(name)
+    asked = Asked(monkeypatch)
+    yield asked
+    kept = {
+        f"{module}.{name}"
+        for module, content in [*sys.modules.items()]
+        if module.startswith(("hil.", "ground_station."))
+        for name, value in vars(content).items()
+        if any(value is one for one in asked.patched.values())
+    }
+    assert kept == set(asked.patched)
 
 
 def failing(error: Exception) -> Callable[..., Any]:
