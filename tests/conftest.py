@@ -45,6 +45,8 @@ LIMITS_S = {
 GRACE_S = 60.0  # from a test's limit until its process ends, because C code lets no exception through
 
 
+# Workers share the cores: more threads of a linear algebra would only wait for one another. Read when numpy is loaded.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # The sessions that `pytester` starts have another home, but the same compiled code.
 os.environ.setdefault("XDG_CACHE_HOME", str(Path.home() / ".cache"))
 
