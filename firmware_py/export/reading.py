@@ -7,6 +7,7 @@ import ast
 import io
 import tokenize
 from collections.abc import Mapping
+from functools import lru_cache
 from math import prod
 from typing import Any
 
@@ -92,15 +93,24 @@ def _imported_modules(node: ast.stmt) -> list[str]:
     return []
 
 
-def read_comments(module: Module, text: str) -> None:
-    """Add the comments of a text to its module."""
+@lru_cache(maxsize=64)
+def _comments(text: str) -> tuple[dict[int, str], dict[int, str]]:
+    """Return the comments on lines of their own, and those behind code, by their lines."""
+    standing: dict[int, str] = {}
+    trailing: dict[int, str] = {}
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type == tokenize.COMMENT:
             own_line = not token.line[: token.start[1]].strip()
-            comments = module.standing if own_line else module.trailing
+            comments = standing if own_line else trailing
             words = token.string.lstrip("# ").split("  # ")[0]
             if not words.startswith(("fmt:", "noqa", "type:")):
                 comments[token.start[0]] = words
+    return standing, trailing
+
+
+def read_comments(module: Module, text: str) -> None:
+    """Add the comments of a text to its module."""
+    module.standing, module.trailing = _comments(text)
 
 
 class _Reader:

@@ -1,7 +1,5 @@
 """What every body keeps, also one of the user's own: held it feels its weight, it is pushed, draws power, can be drawn."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -16,10 +14,11 @@ OWN = ROOT / "hil" / "commands" / "robot_project"
 G = 9.81
 
 
-@pytest.fixture(params=[*PROFILES, OWN])
-def config(request: pytest.FixtureRequest, tmp_path: Path) -> LabConfig:
+@pytest.fixture(scope="module", params=[*PROFILES, OWN])
+def config(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> LabConfig:
     if request.param in PROFILES:
         return load_config(request.param)
+    tmp_path = tmp_path_factory.mktemp("own")
     for name in ("controller.py", "profile.toml", "robot.py"):
         (tmp_path / name).write_text((OWN / f"{name}.in").read_text(encoding="utf-8"), encoding="utf-8")
     return load_config(str(tmp_path / "profile.toml"))

@@ -134,7 +134,7 @@ class RecordingRunner:
 
 def record_flight(duration_s: float) -> Recording:
     """Return the core's calls in a hover with pushes and with gaps, outliers and late poses."""
-    faults = ["push.y@2=2", "push.roll@3=0.2", "mocap.dropout@4:0.4", "push.z@5=2"]
+    faults = ["push.y@1=2", "push.roll@1.5=0.2", "mocap.dropout@2:0.4", "push.z@2.6=2"]
     request = Request.of(HOVER, duration_s=duration_s, faults=faults)
     flight = lockstep_flight(request, executor=PythonBoard(RecordingRunner))
     flight.run()

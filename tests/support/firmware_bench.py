@@ -22,7 +22,7 @@ class FirmwareBench(VirtualBoard):
 
     now_us = 0  # of the hardware, which the test leads
 
-    def __init__(self) -> None:
+    def __init__(self, *overrides: str, mavlink: bool = False) -> None:
         self.writes: list[tuple[int, list[int]]] = []
         self.console: list[str] = []
         super().__init__(
@@ -40,7 +40,7 @@ class FirmwareBench(VirtualBoard):
         self.sent: list[tuple[int, bytes]] = []
         self.samples: list[Sample] = []  # of telemetry, once `stream` has asked for it
         self.resets_us: list[int] = []
-        self.firmware = Firmware(load_config(), self)
+        self.firmware = Firmware(load_config(overrides=overrides), self, mavlink=mavlink)
         self._to_station: list[bytes] = []
         self._logs = LogBlocks(
             lambda now_us, data: self.firmware.radio_received(data), lambda: self.firmware.log_numbers

@@ -6,8 +6,6 @@ from typing import Any
 
 import pymavlink.dialects.v20.development as dialect
 
-from firmware_py.firmware import Firmware
-from hil.config import load_config
 from support.firmware_bench import LEVEL, FirmwareBench
 
 STATION = (255, 190)
@@ -33,9 +31,8 @@ class MavlinkClient(FirmwareBench):
         self.uplink = bytearray()
         self.uart_room = 1 << 30  # bytes that the transmit buffer still takes
         self.clock_ahead_us: int | None = None  # of the station; None: it does not answer
-        super().__init__()
+        super().__init__(*overrides, mavlink=True)
         self.overrides = overrides
-        self.firmware = Firmware(load_config("floaty", overrides), self, mavlink=True)
         assert self.firmware.mavlink is not None
         self.stack = self.firmware.mavlink
 

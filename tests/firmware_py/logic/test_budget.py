@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 import pytest
@@ -15,6 +16,7 @@ from firmware_py.logic.budget import CLOCK_MHZ
 from firmware_py.logic.loading import load_logic
 from hil.board.cores.boards import BOARDS, runner_of
 from hil.board.cores.cortex_m4 import CortexM4Runner
+from hil.config import LabConfig
 from hil.errors import LabError
 from support.own_logic import ESTIMATOR, LAW, own_config
 from support.paths import ROOT
@@ -120,57 +122,83 @@ def test_loops_that_fit_alone_but_not_together_are_refused_where_the_function_be
 
 SLOW = dict.fromkeys(("c", "cortex-m4"), pytest.mark.long)  # all but python, which compiles nothing
 EVERY = [pytest.param(board, marks=SLOW.get(board, ())) for board in BOARDS]
-# the body of the law, the function with the loop, and a value of `after` with which it does not exceed its budget
-DATA = [
-    (SUM.format("own.after"), "", 3),
-    (SUM.format("-5, own.after"), "", 3),
-    (SUM.format("i32(memory.ticks - 2000000000), own.after"), "", None),
-    (
-        "n = i32(own.after + 1000)\nfor k in range(1000):\n    " + SUM.format("n").replace("\n", "\n    "),
-        "",
-        None,
-    ),
-    (
-        "memory.hidden = total(own.after)",
-        "@kernel\ndef total(n: i32) -> f32:\n    y = ZERO\n    for i in range(n):\n        y = y + DT\n    return y\n\n\n",
-        100,
-    ),
-    (
-        "fill(memory, own)",
-        "@kernel\ndef fill(  # of several lines\n    memory: Memory,\n    own: Gains,\n) -> None:\n"
-        "    for i in range(\n        own.after  # in all\n    ):\n        memory.hidden = sqrt(memory.hidden + DT)\n\n\n",
-        1000,
-    ),
+# Forms of loops: the law's lines, and a value of `after` with which they do not exceed the budget.
+FORMS = [
+    (SUM.format("own.after"), 3),
+    (SUM.format("-5, own.after"), 3),
+    (SUM.format("i32(memory.ticks - 2000000000), own.after"), None),
+    ("n = i32(own.after + 1000)\nfor k in range(1000):\n" + indent(SUM.format("n"), "    "), None),
+    ("memory.hidden = total(own.after)", 100),
+    ("fill(memory, own)", 1000),
 ]
+TOTAL = """@kernel
+def total(n: i32) -> f32:
+    y = ZERO
+    for i in range(n):
+        y = y + DT
+    return y
+
+
+"""
+FILL = """@kernel
+def fill(  # of several lines
+    memory: Memory,
+    own: Gains,
+) -> None:
+    for i in range(
+        own.after  # in all
+    ):
+        memory.hidden = sqrt(memory.hidden + DT)
+
+
+"""
+
+
+@pytest.fixture(scope="module")
+def forms(tmp_path_factory: pytest.TempPathFactory) -> LabConfig:
+    """A law with every form, of which `memory.ticks` chooses one."""
+    parts = [
+        f"{'el' if row else ''}if memory.ticks == {row}:\n{indent(form, '    ')}"
+        for row, (form, _) in enumerate(FORMS)
+    ]
+    text = law("\n".join(parts), TOTAL + FILL).replace("high=1000000)", "high=2000000000)")
+    return own_config(tmp_path_factory.mktemp("forms"), text)
 
 
 @pytest.mark.parametrize("board", EVERY)
-@pytest.mark.parametrize(("body", "before", "harmless"), DATA, ids=[body.split("\n")[0] for body, *_ in DATA])
+@pytest.mark.parametrize(("form", "harmless"), FORMS, ids=[form.split("\n")[0] for form, _ in FORMS])
 def test_a_data_dependent_loop_stops_equally_on_every_target(
-    blocks_of: Make, board: str, body: str, before: str, harmless: int | None
+    forms: LabConfig, board: str, form: str, harmless: int | None
 ) -> None:
-    text = law(body, before).replace("high=1000000)", "high=2000000000)")
-    blocks = blocks_of(text, board)
+    blocks = CoreBlocks(parameters_of(forms), runner_of(board, forms.logic), load_logic(forms.logic))
+    blocks.data.fields.mode = MODE_FLY
     own: Any = blocks.named["controller_own"].fields
+    memory: Any = blocks.named["controller_memory"].fields
     budget: Any = blocks.named["controller_loop_budget"].fields
     guard = blocks.named["guard"].fields
-    if harmless is not None:
-        own.after = harmless
+    row = FORMS.index((form, harmless))
+
+    def call(after: int) -> None:
+        own.after, memory.ticks = after, row - 1  # the law counts first
         blocks.run.call("control")
+
+    if harmless is not None:
+        call(harmless)
         assert (guard.controller_faults, overrun(blocks)) == (0, "")
-    own.after = 2000000000
-    blocks.run.call("control")
+    call(2000000000)
     assert guard.controller_faults == 1
     hover = float(blocks.parameters.fields.hover_angle)
     assert blocks.control.fields.flap.tolist() == pytest.approx([hover, -hover, hover, -hover])
     assert blocks.control.fields.u.tolist() == [0.0] * 4
     assert 0 < budget.cycles <= CALL_CYCLES
-    line = line_of(text, "    for i in range")
+    text = Path(forms.logic.controller).read_text(encoding="utf-8")
+    kernel = re.search(r"\b(total|fill)\(", form)
+    start = text.index(f"def {kernel[0]}" if kernel else f"if memory.ticks == {row}:")
+    line = text.count("\n", 0, text.index("for i in range", start)) + 1
     where = f"controller.py:{line}: the loop up to {budget.end} exceeds the 672000 cycles of a call"
     assert overrun(blocks).endswith(where)
     if harmless is not None:
-        own.after = harmless
-        blocks.run.call("control")
+        call(harmless)
         assert (guard.controller_faults, overrun(blocks)[-len(where) :]) == (1, where)
 
 
@@ -196,8 +224,7 @@ def test_an_estimator_that_exceeds_its_budget_has_no_estimate(blocks_of: Make, b
 
 
 def test_a_call_with_a_loop_in_an_expression_is_refused(tmp_path: Path) -> None:
-    total = DATA[4][1]
-    text = law("memory.hidden = ZERO + total(own.after)", total)
+    text = law("memory.hidden = ZERO + total(own.after)", TOTAL)
     with pytest.raises(
         LabError, match=r"total has a loop whose length depends on data: write x = total\(\.\.\) on a line"
     ):
@@ -211,10 +238,13 @@ def test_logic_without_such_loops_flies_as_it_is_written(blocks_of: Make) -> Non
     assert not any("budget" in name for name in blocks.named)
 
 
-@pytest.mark.parametrize("body", [DATA[0][0], DATA[5][0]])
-def test_the_cycles_counted_are_at_most_those_of_the_machine_code(blocks_of: Make, body: str) -> None:
-    before = DATA[5][1] if "fill" in body else ""
-    blocks = blocks_of(law(body, before), "cortex-m4")
+@pytest.mark.parametrize(
+    ("form", "before"), [(FORMS[0][0], ""), pytest.param(FORMS[5][0], FILL, marks=pytest.mark.long)]
+)
+def test_the_cycles_counted_are_at_most_those_of_the_machine_code(
+    blocks_of: Make, form: str, before: str
+) -> None:
+    blocks = blocks_of(law(form, before), "cortex-m4")
     own: Any = blocks.named["controller_own"].fields
     budget: Any = blocks.named["controller_loop_budget"].fields
     assert isinstance(blocks.run, CortexM4Runner)
