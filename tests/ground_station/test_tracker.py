@@ -123,7 +123,7 @@ def test_it_is_the_plain_kalman_filter_over_random_gaps() -> None:
     rng = np.random.default_rng(7)
     tracker, plain = Tracker(CONFIG, PERIOD_US), Plain(PERIOD_US * 1e-6)
     number = 0
-    while number < 3000:
+    while number < 1500:
         if number > 1 and rng.random() < 0.02:
             gap = int(rng.integers(1, 30))
             silent = rng.random() < 0.5

@@ -84,7 +84,7 @@ def test_the_app_takes_back_what_the_python_board_refuses_and_nothing_else(app: 
     ctypes.c_int32.in_dll(app.c, "stub_planner").value = FLYING if flying else 0
     waits, rng, refused = ctypes.c_int32.in_dll(app.c, "stub_waits"), np.random.default_rng(7), []
     waiting: list[bytes] = []
-    for command in 300 * list(LAYOUTS):
+    for command in 100 * list(LAYOUTS):
         if len(waiting) == 3 or rng.random() < 0.5:  # the firmware's commander gets its turn
             waiting, waits.value = [], 0
         data = drawn(command, rng)

@@ -335,28 +335,21 @@ def test_a_stopped_loop_moves_the_servos_to_hover(app: App) -> None:
         fly_on(app, 1200 + 100 * stop, 100)
 
 
-def test_the_firmwares_own_emergency_stop_stops_floaty(app: App) -> None:
-    app.boot()
-    hover = app.counts()
+@pytest.mark.parametrize("silent_steps", [0, 600])
+def test_the_firmwares_own_emergency_stop_stops_floaty_with_a_line_of_its_own(
+    app: App, silent_steps: int
+) -> None:
     flying(app)
+    stop_at = 1200 + silent_steps
+    for step in range(1200, stop_at):
+        app.step(step)
+    app.c.stub_run_app(1)
+    assert app.console().endswith("supervisor: failsafe, silence\n") == bool(silent_steps)
     app.locked.value = 1
-    for step in range(1200, 1211):
-        app.step(step)
-    assert app.counts() == hover
-    app.c.stub_run_app(1)
-    assert app.console().endswith("supervisor: failsafe, emergency stop\n")
-
-
-def test_another_cause_of_failsafe_is_another_line(app: App) -> None:
-    flying(app)
-    for step in range(1200, 1800):
+    for step in range(stop_at, stop_at + 11):
         app.step(step)
     app.c.stub_run_app(1)
-    assert app.console().endswith("supervisor: failsafe, silence\n")
-    app.locked.value = 1
-    for step in range(1800, 1811):
-        app.step(step)
-    app.c.stub_run_app(1)
+    assert app.counts() == hover_of(app)
     assert app.console().endswith("supervisor: failsafe, emergency stop\n")
 
 

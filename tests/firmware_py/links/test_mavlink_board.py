@@ -607,9 +607,9 @@ def test_more_streams_than_the_queue_takes_have_their_turns_too(client: MavlinkC
         client.command(511, number, 10_000)
     client.run(client.now_us + 3_000_000)
     client.messages.clear()
-    client.run(client.now_us + 30_000_000)
+    client.run(client.now_us + 15_000_000)
     counts = count(message for _, message in client.messages)
-    assert counts.pop("NAMED_VALUE_FLOAT") >= 5
+    assert counts.pop("NAMED_VALUE_FLOAT") >= 3
     assert len(counts) == len(numbers) - 1
     assert 2 * min(counts.values()) >= max(counts.values()) - 2
 
@@ -740,7 +740,7 @@ def test_a_list_comes_through_on_a_line_full_of_telemetry(client: MavlinkClient)
     slow_line(client)
     client.command(511, 30, 5000)  # 8 kB/s
     client.send("param_request_list", 1, 1)
-    client.run(client.now_us + 20_000_000)
+    client.run(client.now_us + 8_000_000)
     assert client.stack.dropped > 100
     indices = {message.param_index for message in client.of("PARAM_VALUE")}
     assert indices == set(range(client.of("PARAM_VALUE")[0].param_count))

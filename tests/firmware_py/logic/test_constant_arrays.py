@@ -8,6 +8,7 @@ import pytest
 from firmware_py.config import parameters_of
 from firmware_py.core.structs import MODE_FLY
 from firmware_py.core_runner import CoreBlocks, default_runner
+from firmware_py.export import reading
 from firmware_py.logic.loading import load_logic
 from hil.board.cores.boards import BOARDS, runner_of
 from hil.config import LabConfig
@@ -100,8 +101,8 @@ REFUSED = [
     (BIASES, "BIASES = constant(\n    (1.0, 2.0),\n    (3.0,),\n)", "    (3.0",
      "BIASES: a row of 1 numbers; the first has 2"),
     (BIASES, "BIASES = constant(((1.0,),))", "BIASES", "BIASES: (1.0,) is no number"),
-    (BIASES, f"BIASES = constant({'0,' * 65600})", "BIASES",
-     "BIASES: 65680 numbers in the constant arrays of this file: at most 65536"),
+    (BIASES, f"BIASES = constant({'0,' * 20})", "BIASES",
+     "BIASES: 100 numbers in the constant arrays of this file: at most 99"),
     (BIASES, "BIASES = [0.5, -1.0]", "BIASES", "constant BIASES is none of f32(number), a 32-bit integer and"),
     (BODY, BODY + "    WEIGHTS[0, 1] = f32(1.0)\n", "    WEIGHTS[", "WEIGHTS is a constant and is written"),
     (BODY, BODY + "    biases[1] = f32(1.0)\n", "    biases[1]", "BIASES is a constant and is written"),
@@ -114,8 +115,9 @@ REFUSED = [
 
 @pytest.mark.parametrize(("old", "new", "at", "reason"), REFUSED, ids=[case[3] for case in REFUSED])
 def test_a_bad_constant_array_is_refused_with_its_line(
-    tmp_path: Path, old: str, new: str, at: str, reason: str
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, old: str, new: str, at: str, reason: str
 ) -> None:
+    monkeypatch.setattr(reading, "MOST_NUMBERS", 99)  # 80 of them are the weights
     text = LAW.replace(old, new, 1)
     with pytest.raises(LabError) as error:
         own_config(tmp_path, text)
