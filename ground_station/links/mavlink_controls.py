@@ -96,10 +96,9 @@ class MavlinkControls(Dialogue[Message]):
             raise ControlsError(f"{refusal}: {reason}")
         return ()
 
-    def _list_once(self) -> Script[Message]:
+    def _list_once(self) -> Generator[Exchange[Message], Any, None]:
         if not self._names:
             yield from self._list()
-        return ()
 
     def _find(self, name: str) -> Generator[Exchange[Message], Any, str]:
         yield from self._list_once()

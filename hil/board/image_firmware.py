@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from firmware_py.board import ImuCounts
 from firmware_py.config import FirmwareConfig, parameters_of
+from firmware_py.core.structs import Parameters
 from firmware_py.export.elf import ERASED, FLASH, read
 from firmware_py.logic.loading import Logic, SensedField, load_logic, sensed_by
 from firmware_py.rtos import TaskReport
@@ -46,6 +47,7 @@ IMU_PERIOD_US = 1_000
 OWN_LOGIC = "floaty_guard"  # exists in images with the user's own logic
 FLYING, TUMBLED, CRASHED = 1 << 4, 1 << 5, 1 << 7  # of `supervisor.info`, beside LOCKED
 DEGREE = radians(1.0)
+PARAMETERS = Parameters.dtype
 # Name and factor to SI of the estimate's twelve numbers.
 ESTIMATE = (
     *((f"stateEstimate.{name}", 1.0) for name in ("x", "y", "z", "vx", "vy", "vz")),
@@ -107,6 +109,23 @@ def stock_signals(table: Mapping[str, ImageVariable]) -> Signals:
     motors = np.array([read(name, 0.0) for name in MOTORS], np.int32)
     supervisor = StockSupervisor(int(read("supervisor.info", 0.0)))
     return Signals(estimate, NO_COUNTS, NO_FLOATS, NO_FLOATS, motors, supervisor)
+
+
+def differences(built: NDArray[Any], config: FirmwareConfig, has: Callable[[str], bool]) -> str:
+    """Return what an app's parameters, (1,), and its symbols are not as in a profile; empty: nothing."""
+    parameters = parameters_of(config).memory
+    found = [
+        f"{name} = {built[name][0].tolist()}, in the profile {parameters[name][0].tolist()}"
+        for name in PARAMETERS.names or ()
+        if not np.array_equal(built[name], parameters[name])
+    ]
+    own = bool(config.logic.controller or config.logic.estimator)
+    if own != has(OWN_LOGIC):
+        found.append("control law, the profile has " + ("one of the user's" if own else "the core's"))
+    for block in sorted({field.block for field in sensed_by(load_logic(config.logic))}):
+        if not has(f"floaty_{block}"):
+            found.append(f"own sensors, the image has no floaty_{block}")
+    return "; ".join(found)
 
 
 def read_image(path: Path, elf: Path | None) -> tuple[Image, list[str]]:
@@ -237,20 +256,7 @@ class ImageFirmware:
     def differences(self, config: FirmwareConfig) -> str:
         if not self.image.has("floaty_parameters"):
             return ""
-        parameters = parameters_of(config).memory
-        built = self._struct("floaty_parameters", parameters.dtype)
-        found = [
-            f"{name} = {built[name][0].tolist()}, in the profile {parameters[name][0].tolist()}"
-            for name in parameters.dtype.names or ()
-            if not np.array_equal(built[name], parameters[name])
-        ]
-        own = bool(config.logic.controller or config.logic.estimator)
-        if own != self.image.has(OWN_LOGIC):
-            found.append("control law, the profile has " + ("one of the user's" if own else "the core's"))
-        for block in sorted({field.block for field in sensed_by(load_logic(config.logic))}):
-            if not self.image.has(f"floaty_{block}"):
-                found.append(f"own sensors, the image has no floaty_{block}")
-        return "; ".join(found)
+        return differences(self._struct("floaty_parameters", PARAMETERS), config, self.image.has)
 
     # Interrupts and time
 

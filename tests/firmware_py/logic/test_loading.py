@@ -207,11 +207,11 @@ MISTAKES = [
     (IMPORTS, f"{IMPORTS}from os import path\n", "from os", "import from os"),
     (
         *(GUARD, GUARD.replace("guard", "controller"), GUARD.replace("guard", "controller")),
-        ": write allocate, from firmware_py.core.guard",
+        ": write allocate, from firmware_py.core.guard: it does not make a number of NaN",
     ),
     (
         *(DT, f"from firmware_py.core import controller\n_mix = controller.allocate\n{DT}", "_mix"),
-        ": write allocate, from firmware_py.core.guard",
+        ": write allocate, from firmware_py.core.guard: it does not make a number of NaN",
     ),
     (DT, "DT = f32(0.01", "DT", "'(' was never closed"),
     (DT, f"{DT}\0", "", "source code string cannot contain null bytes"),

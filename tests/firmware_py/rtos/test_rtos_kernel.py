@@ -698,15 +698,17 @@ def test_a_response_exactly_at_its_deadline_is_no_miss(deadline_us, misses, end_
     assert statistics.reports()[0].deadline_misses == misses
 
 
+@pytest.mark.parametrize("first", [True, False])
 @pytest.mark.parametrize(("place", "bound_us"), list(enumerate(LATENCY_BOUNDS_US)))
-def test_a_latency_equal_to_a_class_bound_belongs_to_the_class_above(place, bound_us):
+def test_a_latency_equal_to_a_class_bound_belongs_to_the_class_above(place, bound_us, first):
+    """Of the activation with which a task begins, or of the next one."""
     kernel = Kernel()
 
     def low():
         yield from kernel.delay(1)
 
     def high():
-        yield from kernel.delay(1)
+        yield from kernel.delay(0 if first else 1)
         yield from kernel.work(bound_us)
 
     kernel.create_task("low", 2, low)

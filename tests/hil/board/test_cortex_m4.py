@@ -6,7 +6,9 @@ Bits are compared with Python; instructions and cycles with capstone's reading o
 import re
 from collections import Counter, OrderedDict
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import capstone
 import numpy as np
@@ -21,7 +23,7 @@ from firmware_py.export.cycles import count
 from firmware_py.export.elf import FLASH
 from firmware_py.export.errors import ExportError
 from firmware_py.export.usage import CLOCK_MHZ
-from hil.board.cores.cortex_m4 import CortexM4Runner
+from hil.board.cores.cortex_m4 import ALIGNMENT, ROOM, STACK_LEAST, CortexM4Runner
 from hil.config import load_config
 from hil.emulator.stm32f405.chip import build_machine
 
@@ -247,6 +249,16 @@ def test_a_call_that_cannot_end_names_its_reason(core: Translation, statement: s
     else:
         runner.call("control")
         assert blocks.control.fields.count.all()
+
+
+def test_memory_that_leaves_no_room_for_the_stack_is_refused(image: CoreImage) -> None:
+    blocks, runner = started(image)
+    most = ROOM - STACK_LEAST
+    for size, fits in ((most - runner._stack_end, True), (most - runner._stack_end + 1, False)):
+        blocks.named["spare"] = SimpleNamespace(memory=np.zeros(size, np.uint8))  # type: ignore[assignment]
+        reason = f"the core's memory is {most + ALIGNMENT} bytes: at most {most} fit"
+        with nullcontext() if fits else pytest.raises(ExportError, match=reason):
+            runner_of(image)(blocks)
 
 
 def test_the_core_leaves_room_on_the_board(image: CoreImage) -> None:

@@ -10,6 +10,7 @@ from firmware_py.config import parameters_of
 from firmware_py.links.parameters import TYPE_READ_ONLY
 from firmware_py.wire.scalars import PARAMETER_SCALARS, Scalar
 from ground_station.config import PilotConfig
+from hil.board.image_firmware import differences
 from hil.board.image_settings import ImageSettings, stock_contents
 from hil.config import LabConfig, load_config
 from hil.emulator.crazyflie.log_table import ImageParameter
@@ -87,8 +88,7 @@ class Told(CrtpClient):
         self.settings.begin(self.now_us)
 
     def differences(self, config: LabConfig) -> str:
-        here, there = self.constants.memory, parameters_of(config).memory
-        return ", ".join(name for name in here.dtype.names if (here[name] != there[name]).any())
+        return differences(self.constants.memory, config, lambda symbol: False)
 
     def _up(self, now_us: int, data: bytes) -> None:
         self.writes_up += 1
@@ -115,7 +115,8 @@ def test_a_board_given_a_profile_has_its_constants_bit_for_bit() -> None:
     assert board.writes_up == len(OTHER) + 3  # one packet each, four for the trims
     differs, said = board.said
     assert differs.startswith("the image was built with other constants: ")
-    assert {"opening_min", "limit_u3", "trim"} <= set(differs.split(": ")[1].split(", "))
+    names = [one.partition(" = ")[0] for one in differs.split(": ")[1].split("; ")]
+    assert {"opening_min", "limit_u3", "trim"} <= set(names) <= set(board.constants.memory.dtype.names)
     assert said.startswith("set over the radio: ")
     assert "RandConsts.openMin -0.192" in said
 
@@ -147,9 +148,10 @@ def test_values_without_a_parameter_are_reported_in_one_line() -> None:
     board = Told(load_config("floaty", ["predictor.age=fixed", "controller.limit_u3=0.6"]))
     board.listen(50_000)
     assert board.said == [
-        "the image was built with other constants: age_measured, limit_u3",
+        "the image was built with other constants: age_measured = 1, in the profile 0; "
+        "limit_u3 = 0.46000000834465027, in the profile 0.6000000238418579",
         "set over the radio: extCtrl.limU3 0.6",
-        "the image keeps its own age_measured",
+        "the image keeps its own age_measured = 1, in the profile 0",
     ]
 
 
