@@ -7,6 +7,7 @@ import os
 import select
 import tty
 from math import pi
+from types import SimpleNamespace
 
 import numpy as np
 import pymavlink.dialects.v20.development as dialect
@@ -300,6 +301,34 @@ def test_a_line_that_is_opened_again_has_forgotten_the_board():
         bench.sent.clear()
     os.close(master)
     os.close(slave)
+
+
+def of_a_station():
+    return dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
+
+
+@pytest.mark.parametrize(
+    ("key", "board_key", "message", "why"),
+    [
+        (b"", b"", None, "no heartbeat within 1 s: no bytes arrive"),
+        (b"", b"", "noise", "no heartbeat within 1 s: 40 bytes, not one frame: wrong baud rate?"),
+        (b"", b"", heartbeat(), "system 1 answers no command within 1 s: does it want signed frames (mavlink.signing_key)?"),
+        (KEY, KEY, heartbeat(), "system 1 answers no command within 1 s"),
+        (KEY, b"", heartbeat(), "no heartbeat within 1 s: 1 frames not signed with mavlink.signing_key"),
+        (KEY, KEY[::-1], heartbeat(), "no heartbeat within 1 s: 1 frames not signed with mavlink.signing_key"),
+        (b"", b"", of_a_station(), "no heartbeat of an autopilot within 1 s: 1 frames of system 1 component 1"),
+    ],
+)  # fmt: skip
+def test_a_connection_that_fails_names_what_was_heard(key, board_key, message, why):
+    link, board = (
+        MavlinkSerialLink("mavlink:COM3", LinkSettings(50.0, 900, 921_600, key)),
+        LinkWithCodec(key=board_key),
+    )
+    board.codec.signing.timestamp = link._settings.signing_start + clock_us() // 10
+    data = b"" if message is None else bytes(40) if message == "noise" else message.pack(board.codec)
+    link.receive(clock_us(), data)
+    link._port = SimpleNamespace(bytes=len(data))
+    assert link._why_no_connection(clock_us(), "within 1 s") == why
 
 
 def test_texts_and_refusals_are_collected():

@@ -106,12 +106,6 @@ def silent(peer: Peer) -> None:
     time.sleep(0.02)
 
 
-def noisy(peer: Peer) -> None:
-    broken = peer.codec.heartbeat_encode(0, 0, 1, 2, 4, 3).pack(peer.codec)
-    peer.write(bytes(range(256)) + broken[:-1] + bytes((broken[-1] ^ 1,)))
-    time.sleep(0.02)
-
-
 def beats(peer: Peer) -> None:
     peer.codec.heartbeat_send(0, 0, 1, 2, 4, 3)
     time.sleep(0.02)
@@ -119,11 +113,6 @@ def beats(peer: Peer) -> None:
 
 def board(peer: Peer) -> None:
     beats(peer)
-
-
-def mute_station(peer: Peer) -> None:
-    peer.codec.heartbeat_send(dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
-    time.sleep(0.02)
 
 
 @pytest.fixture
@@ -147,16 +136,7 @@ def link_to(peer: Peer, key: str = "") -> MavlinkSerialLink:
     ("talk", "station_key", "board_key", "message"),
     [
         (silent, "", "", "no heartbeat within 1 s: no bytes arrive"),
-        (noisy, "", "", r"no heartbeat within 1 s: \d+ bytes, not one frame: wrong baud rate\?"),
-        (beats, "", "", r"system 1 answers no command within 1 s: does it want signed frames"),
-        (board, KEY, "", r"no heartbeat within 1 s: \d+ frames not signed with mavlink.signing_key"),
         (board, KEY, KEY[::-1], r"no heartbeat within 1 s: \d+ frames not signed with mavlink.signing_key"),
-        (
-            mute_station,
-            "",
-            "",
-            r"no heartbeat of an autopilot within 1 s: \d+ frames of system 1 component 1",
-        ),
     ],
 )
 def test_a_failed_connection_gives_its_reason(
