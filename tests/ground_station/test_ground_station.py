@@ -69,16 +69,6 @@ class StationWithPackets:
         return [round(crtp.decode_ext_pose(data[1:]).p_GB[0] * 1000) for _, data in self.sent]
 
 
-def test_correction_of_one_two_three_seen_from_a_goal_that_looks_left():
-    # The goal looks along +y, so world x is to its right and world y ahead.
-    correction = correct(
-        MocapFrame(1000, (1.0, 2.0, 3.0), UPRIGHT, True), Goal((0.0, 0.0, 0.0), pi / 2), 41_000
-    )
-    assert correction.p_GB == pytest.approx((2.0, -1.0, 3.0))
-    assert correction.q_GB == pytest.approx((np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)))
-    assert correction.age_us == 40_000
-
-
 @given(st.tuples(metres, metres, metres), st.tuples(metres, metres, metres), angle, angle, angle, angle)
 def test_correction_is_scipys_pose_in_the_goal_frame(p, goal, goal_yaw, roll, pitch, yaw):
     correction = correct(MocapFrame(0, p, from_euler_zyx(roll, pitch, yaw), True), Goal(goal, goal_yaw), 0)
@@ -89,20 +79,13 @@ def test_correction_is_scipys_pose_in_the_goal_frame(p, goal, goal_yaw, roll, pi
     assert (ours.inv() * R_GW * R_WB).magnitude() < 1e-7
 
 
-@pytest.mark.parametrize("camera_hz", [50, 60, 90, 100, 120, 180, 200, 240, 360, 1000])
-def test_fifty_corrections_leave_per_second_whatever_the_cameras_rate(camera_hz):
+@pytest.mark.parametrize("camera_hz", [10, 25, 40, 45, 50, 60, 90, 100, 120, 180, 200, 240, 360, 1000])
+def test_fifty_corrections_leave_per_second_or_as_many_as_slower_cameras_have(camera_hz):
     bench = StationWithPackets()
     bench.frames(10 * camera_hz, period_us=1e6 / camera_hz)
-    assert len(bench.sent) == pytest.approx(500, abs=2)
+    assert len(bench.sent) == pytest.approx(min(500, 10 * camera_hz), abs=2 * (camera_hz >= 50))
     gaps_us = np.diff([now_us for now_us, _ in bench.sent])
-    assert gaps_us.max() <= 20_000 + 1e6 / camera_hz
-
-
-@pytest.mark.parametrize("camera_hz", [10, 25, 40, 45])
-def test_slower_cameras_lose_no_frame(camera_hz):
-    bench = StationWithPackets()
-    bench.frames(10 * camera_hz, period_us=1e6 / camera_hz)
-    assert len(bench.sent) == 10 * camera_hz
+    assert gaps_us.max() <= max(20_000 + 1e6 / camera_hz, 1 + 1e6 / camera_hz)
 
 
 @given(

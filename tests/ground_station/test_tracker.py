@@ -62,29 +62,6 @@ def motion(t: float) -> tuple[NDArray[np.float64], NDArray[np.float64], Rotation
     )
 
 
-def test_velocity_and_rate_are_those_of_a_known_trajectory() -> None:
-    tracker, rng = Tracker(CONFIG, PERIOD_US), np.random.default_rng(3)
-    errors = []
-    for number in range(1000):
-        p, v, R, w = motion(number * PERIOD_US * 1e-6)
-        track = tracker.track_frame(noisy(rng, number, p, R.as_quat(scalar_first=True)))
-        if number > 20:
-            assert track.quality is Quality.TRACKED
-            errors.append([*(track.v_WB - v), *(track.w_B - w)])
-    bias, spread = np.mean(errors, axis=0), np.std(errors, axis=0)
-    assert np.abs(bias[:3]).max() < 0.01
-    assert np.abs(bias[3:]).max() < 0.1
-    # Two noisy poses tell 0.0005 * sqrt(2) / 0.005 = 0.14 m/s and 1.1 rad/s.
-    assert spread[:3].max() < 0.1
-    assert spread[3:].max() < 0.7
-
-
-def test_a_good_pose_passes_unchanged() -> None:
-    tracker = tracking()
-    seen = noisy(np.random.default_rng(9), 100)
-    assert tracker.track_frame(seen).frame is seen
-
-
 # The same as a plain filter
 
 
@@ -289,19 +266,6 @@ def test_an_invalid_pose_counts_as_not_seen(p, q) -> None:
     assert tracker.track_frame(noisy(np.random.default_rng(2), 101)).quality is YES
     assert tracker.counters.refused == 0
     assert qualities(*[frame(n, p, q) for n in range(5)]) == [NOT_YET] * 5
-
-
-def test_a_push_of_20_newton_is_accepted() -> None:
-    """59 m/s^2 for 0.1 s on each axis and its opposite, and 0.2 N m (154 rad/s^2) at the same time."""
-    for axis in np.vstack((np.eye(3), -np.eye(3))):
-        tracker, rng = tracking(), np.random.default_rng(6)
-        for number in range(100, 140):
-            t = (number - 100.3) * PERIOD_US * 1e-6
-            pushed, after = max(0.0, min(t, 0.1)), max(0.0, t - 0.1)
-            way = 0.5 * pushed**2 + pushed * after
-            turn = Rotation.from_rotvec(154.0 * way * axis).as_quat(scalar_first=True)
-            seen = noisy(rng, number, (0.1, -0.2, 1.15) + 20.0 / 0.34 * way * axis, turn)
-            assert tracker.track_frame(seen).quality is Quality.TRACKED, f"{axis} {number}"
 
 
 # Gaps

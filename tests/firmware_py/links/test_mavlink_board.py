@@ -67,12 +67,6 @@ def test_the_correction_is_the_pose_as_seen_from_the_goal(client: MavlinkClient)
     assert (R_GB.inv() * (R_GW * R_WB)).magnitude() < 1e-6
 
 
-def test_without_a_goal_the_board_flies_to_its_home(client: MavlinkClient) -> None:
-    client.pose(((0.1, 0.2, 1.45), LEVEL))
-    client.run(client.now_us + 2000)
-    assert last_pose(client)[0] == pytest.approx((0.1, 0.2, 0.3), abs=1e-6)
-
-
 def test_masked_parts_of_a_goal_stay_unchanged(client: MavlinkClient) -> None:
     target(client, (1.0, -2.0, -3.0), -math.pi / 2)
     target(client, (0.0, 0.0, 0.0), math.pi / 2, IGNORE_REST | IGNORE_POSITION)
@@ -83,19 +77,6 @@ def test_masked_parts_of_a_goal_stay_unchanged(client: MavlinkClient) -> None:
     client.pose(((2.0, 2.5, 3.0), LEVEL))
     client.run(client.now_us + 2000)
     assert last_pose(client)[0] == pytest.approx((-0.5, 0.0, 0.0), abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("estimator", "expected"),
-    [(dialect.MAV_ESTIMATOR_TYPE_MOCAP, State.FLYING), (dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT, State.WAITING)],
-)
-def test_odometry_closes_the_loop_unless_it_is_an_autopilots(estimator: int, expected: State) -> None:
-    client, unknown = MavlinkClient(), [math.nan] + [0.0] * 20
-    fields = (1, 12, 0, 0, -1.15, LEVEL, 0, 0, 0, 0, 0, 0, unknown, unknown, 0, estimator)
-    for at_us in range(GYRO_ZERO_US, 1_000_000, 20_000):
-        client.events.at(at_us, lambda now_us: client.send("odometry", now_us, *fields))
-    client.run(1_000_000)
-    assert client.firmware.signals.supervisor.state is expected
 
 
 def test_poses_close_the_loop_and_silence_opens_it() -> None:
@@ -450,16 +431,6 @@ def test_the_reported_velocity_is_the_derivative_of_the_reported_position(goal_y
     )
 
 
-def test_a_new_goal_does_not_move_the_robot() -> None:
-    client = MavlinkClient()
-    client.poses(100_000, 1_000_000)
-    client.run(1_000_000)
-    target(client, (1.0, 1.0, -2.0), 1.0)
-    position, attitude = client.command(512, 32)[-1], client.command(512, 30)[-1]
-    assert (position.x, position.y, position.z) == pytest.approx((0.0, 0.0, -1.15), abs=1e-3)
-    assert attitude.yaw == pytest.approx(0.0, abs=0.01)
-
-
 @pytest.mark.parametrize("absolute", [False, True])
 def test_place_and_goal_are_those_in_the_world_whatever_the_poses_over_crtp_are(absolute: bool) -> None:
     home, away = np.array((0.2, -0.1, 1.15)), np.array((0.06, 0.03, -0.04))
@@ -734,16 +705,6 @@ def test_a_list_takes_what_the_line_has_left_and_starts_again_when_asked(client:
     assert indices.count(0) == 2
     assert set(indices) == set(range(client.of("PARAM_VALUE")[0].param_count))
     assert client.stack.dropped == 0
-
-
-def test_a_list_comes_through_on_a_line_full_of_telemetry(client: MavlinkClient) -> None:
-    slow_line(client)
-    client.command(511, 30, 5000)  # 8 kB/s
-    client.send("param_request_list", 1, 1)
-    client.run(client.now_us + 8_000_000)
-    assert client.stack.dropped > 100
-    indices = {message.param_index for message in client.of("PARAM_VALUE")}
-    assert indices == set(range(client.of("PARAM_VALUE")[0].param_count))
 
 
 # Commands
