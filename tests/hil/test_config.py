@@ -7,7 +7,7 @@ import pytest
 
 from firmware_py.config import parameters_of
 from firmware_py.core.structs import Parameters
-from hil.config import load_config, profile_names
+from hil.config import LabConfig, load_config, profile_names
 from hil.errors import LabError
 
 
@@ -17,7 +17,10 @@ def test_shipped_profiles_load() -> None:
         "design-double", "design-flat", "design-half", "design-paper", "floaty", "lqr", "original",
     ]  # fmt: skip
     for name in profile_names():
-        load_config(name)
+        config = load_config(name)
+        assert LabConfig.model_validate(config.model_dump()) == config, (
+            "each value, also a default, is in its range"
+        )
 
 
 def test_as_flown_differs_from_floaty_in_gains_limits_and_tracker_only() -> None:

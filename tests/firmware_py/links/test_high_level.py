@@ -126,7 +126,12 @@ def test_take_off_go_to_and_land_move_the_goal_and_the_estimator_gets_the_error(
     assert absolute.goal() == pytest.approx([0.3, -0.2, 1.0], abs=1e-5)
     assert absolute.estimate() == pytest.approx([0, 0, 0.4], abs=0.01)
     assert absolute.order(absolute.commander.go_to, 0.1, 0.1, 1.5, 0.5, 1.0) == 0
-    absolute.wait(1.2)
+    absolute.wait(0.5)
+    velocity = [f"stateEstimate.v{axis}" for axis in "xyz"]
+    assert absolute.log(absolute.logs, *velocity) == pytest.approx([0, 0, 0], abs=0.3), (
+        "it stands; its goal moves"
+    )
+    absolute.wait(0.7)
     assert absolute.goal() == pytest.approx([0.1, 0.1, 1.5])
     assert absolute.log(absolute.logs, "controller.yaw") == pytest.approx([28.65], abs=0.01)
     c, s = 0.87758, 0.47943  # of the goal's yaw

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from cflib.crtp.radiodriver import _RadioDriverThread
 from cflib.drivers.crazyradio import _radio_ack
+from hypothesis import given
+from hypothesis import strategies as st
 
 from hil.board.dongle import VirtualDongle
 from hil.emulator.crazyflie import syslink
@@ -25,6 +27,7 @@ class Stm:
     """Records what reaches the STM32."""
 
     battery_V = 3.75
+    running = True
 
     def __init__(self) -> None:
         self.packets: list[bytes] = []
@@ -34,10 +37,14 @@ class Stm:
         self.stops: list[int] = []
 
     def start(self, now_us: int) -> None:
+        assert not self.running
         self.starts.append(now_us)
+        self.running = True
 
     def stop(self, now_us: int) -> None:
+        assert self.running
         self.stops.append(now_us)
+        self.running = False
 
     def catch_up(self, now_us: int) -> None:
         pass
@@ -366,23 +373,36 @@ def test_other_commands_to_the_radio_chip_do_nothing(command: bytes) -> None:
     assert (bench.board.power, bench.stm.stops) == (Power.RUNNING, [])
 
 
+ACTS = {
+    "all off": lambda bench: bench.exchange(b"\xf3\xfe\x01"),
+    "system off": lambda bench: bench.exchange(b"\xf3\xfe\x02"),
+    "system on": lambda bench: bench.exchange(b"\xf3\xfe\x03"),
+    "reset": lambda bench: (bench.exchange(b"\xff\xfe\xff"), bench.exchange(b"\xff\xfe\xf0\x01")),
+    "bootloader": lambda bench: (bench.exchange(b"\xff\xfe\xff"), bench.exchange(b"\xff\xfe\xf0\x00")),
+    "power cycle": lambda bench: bench.board.power_cycle(bench.events.now_us),
+    "button": lambda bench: bench.board.press_button(bench.events.now_us),
+}
+
+
 def test_power_switch() -> None:
     bench = DongleAndBoard()
-    board, stm = bench.board, bench.stm
-    bench.exchange(b"\xf3\xfe\x03")
-    assert stm.starts == []  # it is on
-    bench.exchange(b"\xf3\xfe\x02")
-    assert (board.power, len(stm.stops), len(stm.starts)) == (Power.RADIO_ONLY, 1, 0)
-    assert bench.exchange(b"\x10lost")[0] & 1  # the radio chip still answers
-    bench.exchange(b"\xf3\xfe\x03")
-    assert (board.power, len(stm.stops), len(stm.starts)) == (Power.RUNNING, 1, 1)
-    bench.wait(1000)
-    assert stm.packets == []
-    bench.exchange(b"\xf3\xfe\x01")
-    assert (board.power, len(stm.stops)) == (Power.OFF, 2)
-    assert bench.exchange(NULL) == b"\x00"
-    board.press_button(bench.events.now_us)
-    assert (board.power, len(stm.starts)) == (Power.RUNNING, 2)
+    powers = Power.RUNNING, Power.RADIO_ONLY, Power.RUNNING, Power.OFF, Power.RUNNING
+    for act, power in zip(("system on", "system off", "system on", "all off", "button"), powers, strict=True):
+        ACTS[act](bench)
+        assert bench.board.power is power
+        assert bool(bench.exchange(b"\x10hello")[0] & 1) == (power is not Power.OFF)
+        bench.wait(1000)
+    assert len(bench.stm.packets) == 3
+
+
+@given(st.lists(st.sampled_from(sorted(ACTS)), max_size=8))
+def test_the_processor_runs_exactly_while_the_board_is_on_whatever_is_switched(acts: list[str]) -> None:
+    """It is neither started while it runs nor stopped while it does not."""
+    bench = DongleAndBoard()
+    for act in acts:
+        ACTS[act](bench)
+        bench.wait(RESET_DELAY_US + 1000)
+        assert bench.stm.running == (bench.board.power is Power.RUNNING)
 
 
 @pytest.mark.parametrize("how", ["reset", "power cycle", "button"])
