@@ -272,7 +272,8 @@ def test_own_logic_flies_and_fails_in_the_app_as_in_the_laboratory(tmp_path: Pat
 def test_an_app_with_own_logic_compiles_as_the_default_does(tmp_path: Path) -> None:
     if shutil.which(ARM) is None:
         pytest.skip(f"no {ARM} here: apt-get install gcc-arm-none-eabi")
-    source = compile_for_arm(own_config(tmp_path, ENDLESS, ESTIMATOR, "after = 7"), tmp_path / "app")
+    write_app(own_config(tmp_path, ENDLESS, ESTIMATOR, "after = 7"), "floaty", tmp_path / "app")
+    source = compile_for_arm(tmp_path / "app")
     assert (source / "floaty_core.o").is_file()
     assert ".after = 7," in (source / "floaty_profile.c").read_text()
     assert (
@@ -901,11 +902,19 @@ def test_poses_are_read_as_the_laboratory_reads_them(app: App, data: bytes) -> N
 # The folder and its build for the board
 
 
-def test_only_an_empty_folder_or_an_app_is_written_to(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of an app."""
+    folder = tmp_path_factory.mktemp("written")
+    write_app(load_config(), "floaty", folder)
+    return folder
+
+
+def test_only_an_empty_folder_or_an_app_is_written_to(written: Path, tmp_path: Path) -> None:
     config = load_config()
-    assert len(write_app(config, "floaty", tmp_path / "new")) == len(
-        write_app(config, "floaty", tmp_path / "new")
-    )
+    before = {path: path.read_bytes() for path in (written / "src").glob("*.[ch]")}
+    write_app(config, "floaty", written)
+    assert {path: path.read_bytes() for path in (written / "src").glob("*.[ch]")} == before
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("mine")
     with pytest.raises(ExportError, match="neither empty nor an app"):
@@ -914,14 +923,14 @@ def test_only_an_empty_folder_or_an_app_is_written_to(tmp_path: Path) -> None:
         write_app(config, "floaty", tmp_path / "full" / "thesis.tex")
 
 
-def test_every_source_is_built_and_every_include_is_there(tmp_path: Path) -> None:
-    write_app(load_config(), "floaty", tmp_path)
-    kbuild = (tmp_path / "src" / "Kbuild").read_text()
+def test_every_source_is_built_and_every_include_is_there(written: Path) -> None:
+    source = written / "src"
+    kbuild = (source / "Kbuild").read_text()
     objects = {name.removesuffix(".o") for name in re.findall(r"^obj-y \+= (\S+)$", kbuild, re.M)}
-    assert objects == {path.stem for path in (tmp_path / "src").glob("*.c")}
-    for path in (tmp_path / "src").iterdir():
+    assert objects == {path.stem for path in source.glob("*.c")}
+    for path in source.glob("*.[ch]"):
         for name in re.findall(r'#include "(\S+)"', path.read_text()):
-            assert (tmp_path / "src" / name).is_file() or (STUBS / name).is_file(), name
+            assert (source / name).is_file() or (STUBS / name).is_file(), name
 
 
 def test_the_stubs_are_as_the_firmwares_headers(tmp_path: Path) -> None:
@@ -960,15 +969,14 @@ def names_in(c: str) -> set[str]:
 
 
 @pytest.fixture(scope="module")
-def arm_build(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def arm_build(written: Path) -> Path:
     if shutil.which(ARM) is None:
         pytest.skip(f"no {ARM} here: apt-get install gcc-arm-none-eabi")
-    return compile_for_arm(load_config(), tmp_path_factory.mktemp("arm"))
+    return compile_for_arm(written)
 
 
-def compile_for_arm(config: LabConfig, folder: Path) -> Path:
-    """Export an app and compile its files as the Crazyflie's firmware is; returns their folder."""
-    write_app(config, "floaty", folder)
+def compile_for_arm(folder: Path) -> Path:
+    """Compile an app's files as the Crazyflie's firmware is; returns their folder."""
     kbuild = (folder / "src" / "Kbuild").read_text()
     for name in re.findall(r"^obj-y \+= (\S+)$", kbuild, re.M):
         own = re.findall(rf"^CFLAGS_{re.escape(name)} := (.*)$", kbuild, re.M)
