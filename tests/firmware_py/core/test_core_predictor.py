@@ -240,40 +240,26 @@ def test_senseless_horizon_parameter_acts_as_the_nearest_one(horizon: int, measu
     assert core.estimator.bytes() == nearest.estimator.bytes()
 
 
-def test_growing_horizon_neither_loses_nor_repeats_history() -> None:
-    """When poses become older, the past is estimated with the same bits as by a filter that waited from the start."""
-    follows, waited = Core(), Core(horizon=12)
-    estimates: dict[Core, dict[int, bytes]] = {follows: {}, waited: {}}
-    kept = True
-    for tick in range(300):
-        age_us = 40_000 if tick < 60 else 110_000 if 120 < tick < 180 else 70_000
+def test_a_horizon_that_grows_and_shrinks_neither_loses_nor_repeats_history() -> None:
+    """The past is estimated with the same bits as by a filter that waited from the start and goes on to."""
+    follows, waits = Core(), Core(horizon=12)
+    estimates: dict[Core, dict[int, bytes]] = {follows: {}, waits: {}}
+    kept, horizons = True, set()
+    for tick in range(600):
+        age_us = 110_000 if 120 < tick < 180 else 70_000 if 60 <= tick < 250 else 40_000
         t = (tick + 1) * 0.01 - age_us * 1e-6
         for core, seen in estimates.items():
             if tick % 2 == 0 and t > 0 and (core is follows or kept):  # both get what the first kept
                 kept = core.pose(VELOCITY * t, quaternion(yaw=YAW_RATE * t), age_us) == POSE_ON_TIME
             core.tick(counts((0, 0, YAW_RATE)), 10, commands(tick))
             seen[int(core.fields.filtered_tick)] = core.fields.x.tobytes() + core.fields.P.tobytes()
+        waits.fields.quiet_ticks = 0
+        horizons.add(int(follows.fields.horizon))
     assert follows.counters["too_old"] == 4
-    common = estimates[follows].keys() & estimates[waited].keys()
-    assert len(common) > 270
-    assert all(estimates[follows][tick] == estimates[waited][tick] for tick in common)
-
-
-def test_shrinking_horizon_neither_loses_nor_repeats_history() -> None:
-    shrinks, stays = Core(horizon=8), Core(horizon=8)
-    estimates: dict[Core, dict[int, bytes]] = {shrinks: {}, stays: {}}
-    for tick in range(450):
-        t = (tick + 1) * 0.01 - 0.04
-        for core, seen in estimates.items():
-            if tick % 2 == 0:
-                core.pose(VELOCITY * t, quaternion(yaw=YAW_RATE * t), 40_000)
-            core.tick(counts((0, 0, YAW_RATE)), 10, commands(tick))
-            seen[int(core.fields.filtered_tick)] = core.fields.x.tobytes() + core.fields.P.tobytes()
-        stays.fields.quiet_ticks = 0
-    assert (shrinks.fields.horizon, stays.fields.horizon) == (4, 8)
-    common = estimates[shrinks].keys() & estimates[stays].keys()
-    assert len(common) > 430
-    assert all(estimates[shrinks][tick] == estimates[stays][tick] for tick in common)
+    assert (horizons, follows.fields.horizon, waits.fields.horizon) == ({4, 7, 8, 9, 10, 11}, 7, 12)
+    common = estimates[follows].keys() & estimates[waits].keys()
+    assert len(common) > 570
+    assert all(estimates[follows][tick] == estimates[waits][tick] for tick in common)
 
 
 @pytest.mark.parametrize(("first", "then"), [(4, 9), (9, 4), (1, 12), (12, 1)])
