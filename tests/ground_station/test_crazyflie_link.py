@@ -16,7 +16,7 @@ from firmware_py.wire import crtp, high_level, setpoints
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.telemetry import CRAZYFLIE_BLOCKS
 from ground_station.config import PilotConfig
-from ground_station.links.crazyflie_link import CrazyflieLink, FlightTimes, FromFloor, smooth
+from ground_station.links.crazyflie_link import AWAY, CrazyflieLink, FlightTimes, FromFloor, smooth
 from ground_station.links.crtp_controls import TocEntry
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal, Hold, Offsets, Square, Step
@@ -160,6 +160,12 @@ def test_a_goal_that_leaves_home_is_sent_until_the_landing() -> None:
     assert position == pytest.approx((0.0, 0.2, 1.0))
     assert yaw == pytest.approx(radians(30))
     assert (last_us, end.channel) == (11_700_000, setpoints.CHANNEL_NOTICE)
+
+
+@pytest.mark.parametrize(("away", "sent"), [(AWAY, False), (1.01 * AWAY, True)])
+def test_a_goal_within_a_millimetre_of_home_is_home(away: float, sent: bool) -> None:
+    flown = Flown(Offsets(HOME, 8_000_000, y=Step(away)), 13.0)
+    assert bool(flown.of(crtp.PORT_GENERIC_SETPOINT)) == sent
 
 
 def test_a_board_that_refuses_or_is_silent_is_reported() -> None:
