@@ -11,9 +11,7 @@ from firmware_py.errors import FirmwareError
 from firmware_py.firmware import Firmware
 from firmware_py.supervisor import wrapped
 from firmware_py.tasks import MEASUREMENT_QUEUE
-from firmware_py.wire import crtp, telemetry
 from firmware_py.wire.parameters import ABSOLUTE
-from firmware_py.wire.supervisor import State
 from hil.config import load_config
 from support.firmware_bench import HOVER_COUNTS, FirmwareBench
 
@@ -40,38 +38,6 @@ def test_controller_writes_counts_every_ten_milliseconds(bench: FirmwareBench) -
     cost = load_config().cpu
     assert len(late_us) == 19
     assert set(late_us) == {cost.stabilizer_us + cost.controller_us}
-
-
-def test_a_pose_reaches_the_flaps_within_eleven_milliseconds(bench: FirmwareBench) -> None:
-    bench.poses(605_000, 800_000)
-    bench.run(800_000)
-    before = bench.writes[-1][1]
-    bench.pose(805_000, (0.0, 0.05, 0.0))
-    bench.run(830_000)
-    changed = next(t for t, counts in bench.writes if t > 805_000 and counts != before)
-    assert 805_000 < changed <= 816_000
-
-
-def test_telemetry_leaves_at_fifty_hertz_with_the_running_values(bench: FirmwareBench) -> None:
-    bench.poses(605_000, 1_000_000, (0.01, 0.02, -0.03))
-    bench.run(500_000)
-    assert [data for _, data in bench.sent if data[0] >> 4 == crtp.PORT_LOG] == []  # nothing comes unasked
-    bench.stream(507_000)
-    bench.run(1_000_000)
-    of = {block: [s for s in bench.samples if s.block is block] for block in telemetry.ALL_BLOCKS}
-    begin_ms = of[telemetry.CONTROL][0].timestamp_ms
-    assert 527 <= begin_ms <= 560  # some thirty requests and answers, and the first period
-    for block in telemetry.BLOCKS:
-        assert [s.timestamp_ms for s in of[block]][:-1] == list(range(begin_ms, 980, 20))[
-            : len(of[block]) - 1
-        ]
-        assert len(of[block]) in (len(range(begin_ms, 1000, 20)), len(range(begin_ms, 980, 20)))
-    motion, attitude, flaps, control = (of[block][-1].values for block in telemetry.BLOCKS)
-    assert motion[:3] == pytest.approx((0.01, 0.02, -0.03), abs=2e-3)
-    assert list(flaps[4:]) == pytest.approx(bench.writes[-2][1], abs=600)
-    assert attitude[:3] == pytest.approx(bench.firmware.signals.estimate[6:9].tolist(), abs=2e-3)
-    assert control[1:4] == pytest.approx(bench.firmware.signals.estimate[9:12].tolist(), abs=2e-3)
-    assert control[0] == State.FLYING
 
 
 def test_measurement_queue_has_the_originals_length(bench: FirmwareBench) -> None:

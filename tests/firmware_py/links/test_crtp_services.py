@@ -30,7 +30,7 @@ from firmware_py.wire.localisation import pack_quaternion, unpack_quaternion
 from firmware_py.wire.scalars import LOG_SCALARS, Scalar
 from firmware_py.wire.toc import Toc
 from hil.config import load_config
-from support.crtp_client import LOC, LOG, MEM, PARAM, PLATFORM, SUPERVISOR, CrtpClient
+from support.crtp_client import LOC, LOG, MEM, PARAM, PLATFORM, CrtpClient
 from support.firmware_bench import HOVER_COUNTS
 from support.paths import VECTORS
 
@@ -122,17 +122,6 @@ def test_floatys_own_names_are_there_beside_those_of_the_stock_firmware(logs, pa
     assert set(own.split()) <= params.keys()
 
 
-def test_telemetry_has_the_types_and_units_of_the_table_of_contents(client: CrtpClient, logs) -> None:
-    for block in telemetry.ALL_BLOCKS:
-        for variable in block.variables:
-            stored = (
-                Scalar.F32 if variable.type is Scalar.F16 else variable.type
-            )  # halves are made as they are sent
-            assert logs[variable.name][1] == stored.log_number
-            unit = "deg" if variable.scale else variable.unit
-            assert client.firmware.variables[logs[variable.name][0]].unit == unit
-
-
 def test_attitudes_are_shown_in_degrees_with_the_nose_up_positive_as_the_stock_firmware_shows_them(
     client: CrtpClient,
 ) -> None:
@@ -208,28 +197,6 @@ def test_without_polls_a_packet_per_second_keeps_rows_coming(
     client.sent.clear()
     client.run(client.now_us + 2_000_000)
     assert 99 <= len(client.packets(LOG, 2)) <= 101
-
-
-def test_block_at_ten_milliseconds_comes_at_a_hundred_hertz(client: CrtpClient, logs) -> None:
-    client.poses(605_000, 2_000_000, (0.01, 0.02, -0.03))
-    client.run(1_000_000)
-    names = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "pm.vbat")
-    assert client.create(7, *(logs[name][::-1] for name in names)) == 0
-    assert client.one(LOG, 1, bytes((3, 7, 1))) == bytes((3, 7, 0))
-    assert client.packets(LOG, 2) == []  # the first one comes after a period
-    client.sent.clear()
-    client.run(client.now_us + 1_000_000)
-    rows = client.packets(LOG, 2)
-    stamps = [int.from_bytes(row[1:4], "little") for row in rows]
-    assert len(rows) == 100
-    assert set(np.diff(stamps)) == {10}
-    x, y, z, volts = struct.unpack("<4f", rows[-1][4:])
-    assert (x, y, z) == pytest.approx((0.01, 0.02, -0.03), abs=2e-3)
-    assert volts == pytest.approx(3.9)
-    assert client.one(LOG, 1, bytes((4, 7))) == bytes((4, 7, 0))
-    client.sent.clear()
-    client.run(client.now_us + 100_000)
-    assert client.packets(LOG, 2) == []
 
 
 def test_the_load_that_is_logged_is_what_the_tasks_took_of_each_period(client: CrtpClient, logs) -> None:
@@ -682,14 +649,3 @@ def test_packets_to_the_board_are_counted_beyond_a_byte(client: CrtpClient, logs
         client.run(client.now_us + 1_000)
     (after,) = client.log(logs, "radio.numRxUc")
     assert 300 <= after - before < 310
-
-
-def test_poses_come_in_while_nothing_goes_out(client: CrtpClient) -> None:
-    client.poses(605_000, 2_000_000)
-    client.radio_open = False
-    for at_us in range(610_000, 1_990_000, 5000):
-        client.run(at_us)
-        client.send(SUPERVISOR, 0, b"\x0c")
-        client.send(PARAM, 1, b"\0\0")
-    assert client.firmware.signals.supervisor.state.name == "FLYING"
-    assert client.firmware.link.dropped > 100
