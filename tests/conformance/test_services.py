@@ -130,7 +130,7 @@ def bits_of(answer: str) -> tuple[int, Sequence[str]]:
     return int(words[words.index("bits") + 1], 16), words
 
 
-@settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=5, deadline=None, suppress_health_check=list(HealthCheck))
 @given(GENERATED)
 def test_bits_and_states_fit_together_whatever_a_client_does(python: ServiceBench, program: str) -> None:
     answers = played(python, program)

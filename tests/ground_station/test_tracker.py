@@ -387,7 +387,7 @@ def test_a_frame_between_two_periods_counts_as_the_nearer_one(after: float, peri
 
 
 @given(st.integers(0, 2**32), st.integers(0, 9))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_a_track_after_a_loss_is_that_of_a_new_tracker(seed: int, missing: int) -> None:
     lost, fresh = tracking(), Tracker(CONFIG, PERIOD_US)
     for number in range(100, 150):  # poses that are refused for long, and then none

@@ -1,7 +1,9 @@
 """The exported app on a board of memory: compiled for this machine with the stubs, and driven step by step."""
 
 import ctypes
+import hashlib
 import os
+import shutil
 import struct
 import subprocess
 from collections.abc import Iterator, Mapping
@@ -15,6 +17,7 @@ from firmware_py.export.compilers import compilers
 from firmware_py.export.crazyflie import write_app
 from hil.config import LabConfig, load_config
 from support.paths import STUBS
+from support.stm32_firmware import BUILD
 
 TIMER_REGISTERS = "CR1 CR2 SMCR DIER SR EGR CCMR1 CCMR2 CCER CNT PSC ARR RCR CCR1 CCR2 CCR3 CCR4"
 PIN_REGISTERS = "MODER OTYPER OSPEEDR PUPDR IDR ODR BSRR LCKR"
@@ -57,7 +60,8 @@ def build_app(
 ) -> Path:
     """Export the app, of the default profile unless told otherwise, and return it as a shared library.
 
-    `plant` is a mistake: in a file, the first of two texts is replaced by the second, once.
+    `plant` is a mistake: in a file, the first of two texts is replaced by the second, once. The same sources are compiled
+    once.
     """
     write_app(config or load_config(), "floaty", folder)
     if plant is not None:
@@ -68,7 +72,15 @@ def build_app(
     # The system's, if there is one: it is faster.
     compiler = min(compilers(), key=lambda one: one.name == "zig")
     sources = sorted((folder / "src").glob("*.c"))
+    texts = [
+        path.read_text() for path in (*sorted((folder / "src").glob("*.[ch]")), *sorted(STUBS.iterdir()))
+    ]
+    digest = hashlib.sha256(repr((compiler, texts)).encode()).hexdigest()[:16]
+    kept = BUILD / f"app-{digest}.so"
     library = folder / "app.so"
+    if kept.is_file():
+        shutil.copy2(kept, library)
+        return library
     flags = (
         "-std=gnu11", "-fshort-enums", "-O1", "-Wall", "-Werror", "-Wdouble-promotion", "-fno-math-errno",
         "-shared", "-fPIC",
@@ -82,6 +94,10 @@ def build_app(
         ),
         check=True, env=os.environ | caches,
     )  # fmt: skip
+    BUILD.mkdir(parents=True, exist_ok=True)
+    partial = kept.with_suffix(f".{os.getpid()}")
+    shutil.copy2(library, partial)
+    partial.replace(kept)
     return library
 
 

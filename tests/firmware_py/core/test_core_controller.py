@@ -32,7 +32,7 @@ SIGNS = np.array([1, -1, 1, -1])
 HOVER = math.radians(25)
 SMALL = 3e-6  # float32 against float64
 TABLE_SINE = 4e-5  # the original interpolates a table of 512 sines: 1.9e-5, times the gains
-law = settings(deadline=None, max_examples=200)
+law = settings(deadline=None, max_examples=100)
 
 number = st.floats(-1.375, 1.375, width=32)
 four = st.tuples(*4 * (number,))

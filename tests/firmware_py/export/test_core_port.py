@@ -315,16 +315,15 @@ class Silence(AppPackets):
         return None
 
 
-@pytest.mark.parametrize("mess", [0.0, 0.1])
-def test_a_flight_on_the_app_equals_python_bitwise_at_any_loss(app: App, mess: float) -> None:
-    client, _ = client_of(app, mess)
+def test_a_flight_on_the_app_equals_python_bitwise_whatever_is_lost(app: App) -> None:
+    client, _ = client_of(app, 0.1)
     request = Request.of(find_experiment("hover"), duration_s=2.0, faults=(parse("mocap.outlier@1"),))
     checked = check_flight(request, lambda stack: {"app": partial(RealCore, client=client)}, lambda *_: None)
     (target,) = checked.targets
     assert checked.equal
     assert (checked.outcome, target.ticks) == ("completed", 300)
     assert target.calls > 700
-    assert (client.repeated > 100) == (mess > 0)
+    assert client.repeated > 100
 
 
 @pytest.mark.long
