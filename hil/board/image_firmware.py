@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from firmware_py.board import ImuCounts
 from firmware_py.config import FirmwareConfig, parameters_of
-from firmware_py.core.structs import Parameters
 from firmware_py.export.elf import ERASED, FLASH, read
 from firmware_py.logic.loading import Logic, SensedField, load_logic, sensed_by
 from firmware_py.rtos import TaskReport
@@ -47,7 +46,6 @@ IMU_PERIOD_US = 1_000
 OWN_LOGIC = "floaty_guard"  # exists in images with the user's own logic
 FLYING, TUMBLED, CRASHED = 1 << 4, 1 << 5, 1 << 7  # of `supervisor.info`, beside LOCKED
 DEGREE = radians(1.0)
-PARAMETERS = Parameters.dtype
 # Name and factor to SI of the estimate's twelve numbers.
 ESTIMATE = (
     *((f"stateEstimate.{name}", 1.0) for name in ("x", "y", "z", "vx", "vy", "vz")),
@@ -116,7 +114,7 @@ def differences(built: NDArray[Any], config: FirmwareConfig, has: Callable[[str]
     parameters = parameters_of(config).memory
     found = [
         f"{name} = {built[name][0].tolist()}, in the profile {parameters[name][0].tolist()}"
-        for name in PARAMETERS.names or ()
+        for name in parameters.dtype.names or ()
         if not np.array_equal(built[name], parameters[name])
     ]
     own = bool(config.logic.controller or config.logic.estimator)
@@ -256,7 +254,8 @@ class ImageFirmware:
     def differences(self, config: FirmwareConfig) -> str:
         if not self.image.has("floaty_parameters"):
             return ""
-        return differences(self._struct("floaty_parameters", PARAMETERS), config, self.image.has)
+        built = self._struct("floaty_parameters", parameters_of(config).memory.dtype)
+        return differences(built, config, self.image.has)
 
     # Interrupts and time
 
