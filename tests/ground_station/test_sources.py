@@ -2,14 +2,17 @@
 
 import socket
 import time
+from types import SimpleNamespace as Made
 
 import pytest
 
 from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
+from ground_station.links.crazyradio import CrazyradioLink
 from ground_station.mocap import MocapFrame
 from ground_station.sources.address import find_source
 from ground_station.sources.alignment import Alignment
+from ground_station.sources.motioncapture_client import MotioncaptureSource
 from ground_station.sources.natnet import MULTICAST_GROUP
 from ground_station.sources.natnet_stream import MISTIMED_FRAMES, NatnetStream, ServerClock
 from ground_station.sources.optitrack import OptitrackSource
@@ -317,3 +320,17 @@ def test_packets_from_another_port_of_the_server_s_computer_change_nothing(multi
         (line,) = [line for line in source.notices() if "ignored" in line]
         name = "{}:{}".format(*other.getsockname())
         assert line == f"motion capture: packets of {name} are ignored: not the server's"
+
+
+def test_a_summary_names_each_count_of_cameras_and_links() -> None:
+    counted = Made(lost=1, dropped=2, malformed=3)
+    assert (
+        OptitrackSource.summary(Made(_stream=Made(counters=counted)))
+        == "mocap 1 lost, 2 dropped, 3 malformed"
+    )
+    cameras = Made(_age_us=2500, _lost=1, _malformed=2)
+    assert MotioncaptureSource.summary(cameras) == "mocap 2.5 ms old (assumed), 1 lost, 2 malformed"
+    link = Made(sent=4, late=5, quality=6.0, _rate=7.0)
+    assert CrazyradioLink.summary(link) == "corrections 4 sent, 5 late  quality 6 %  7 exchanges/s"
+    link._rate = 0.0
+    assert CrazyradioLink.summary(link) == "corrections 4 sent, 5 late"

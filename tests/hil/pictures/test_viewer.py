@@ -30,7 +30,7 @@ from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import MARKERS_ON
 from hil.laboratory.faults import parse
 from hil.laboratory.files.recorder import load_events, load_log
-from hil.laboratory.metrics import column
+from hil.laboratory.metrics import body, column
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.laboratory.schedule import SCHEMA
@@ -263,6 +263,13 @@ def test_drag_acts_on_the_turned_flaps(folder: Path) -> None:
         turn = Rotation.from_rotvec(flaps[:, flap, None] * flap_axes(GeometryConfig())[flap])
         expected = np.add(turn.apply(scene.centre_of(part.triangles)), (0, 0, 0.07))
         np.testing.assert_allclose(scene.force_origin(part, scene.turn_of(part, log)), expected, atol=1e-12)
+    path, (p_WB, q_WB) = write_run_rrd(folder), (body(log, "x", "y", "z"), body(log, "qw", "qx", "qy", "qz"))
+    starts, forces = (values(path, "/world/drag", f"Arrows3D:{name}") for name in ("origins", "vectors"))
+    for row, part in enumerate((base, *parts)):
+        begins = p_WB + scene.rotated(q_WB, scene.force_origin(part, scene.turn_of(part, log)))
+        np.testing.assert_allclose(starts[:, row], begins, atol=1e-6)
+        force = column(log, *(f"{part.force}_{axis}" for axis in "xyz"))
+        np.testing.assert_allclose(forces[:, row], METRES_PER_NEWTON * force, atol=1e-6)
 
 
 def test_a_look_is_stored_and_read_back_equal() -> None:
