@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from ground_station.latency import STAGES
 from hil.laboratory.experiments.overload import loads_that_hurt
 from hil.laboratory.schedule import runs
-from hil.pictures import curves, figures
-from hil.pictures.panels import Picture
+from hil.pictures import curves, figures, pages
+from hil.pictures.panels import Interval, Marks, Picture, Still
 
 RELEASE_US = 1_000_000
 # Machado, Oliveira, Fernandes 2009: what is seen without the red, without the green receptors; of linear RGB.
@@ -272,3 +272,22 @@ def test_a_latency_budget_stacks_the_stages_that_were_reported() -> None:
         [value], [pytest.approx(0.02)]) for name, value in (("camera", 1), ("processing", 2), ("network", 3),
         ("station", 5), ("link", 6))]  # fmt: skip
     assert (panel.label, panel.stacked, panel.least) == ("age [ms]", True, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("about", "shaded", "folded"),
+    [
+        ((), [], False), (("radio",), [], True), (("radio",), [("fault", "radio.loss")], False),
+        (("radio",), [("fault", "serial.cut"), ("fault", "mocap.dropout")], True),
+        (("mocap", "radio"), [("fault", "push.x"), ("fault", "radio.cut")], False),
+        (("radio",), [("failsafe", "radio.loss")], True), (("loss",), [("fault", "radio.loss")], True),
+    ],
+)  # fmt: skip
+def test_a_figure_about_some_faults_is_folded_unless_one_of_their_group_acted(
+    about: tuple[str, ...], shaded: list[tuple[str, str]], folded: bool
+) -> None:
+    marks = Marks(intervals=tuple(Interval(kind, 0.0, 1.0, text) for kind, text in shaded))
+    picture = Picture("Two Words", "what it shows", lambda: Still(b"content", "gif"), about=about)
+    figure = pages.draw(picture, marks)
+    assert (figure.name, figure.title, figure.caption) == ("two-words", "Two Words", "what it shows")
+    assert (figure.folded, figure.source) == (folded, "data:image/gif;base64,Y29udGVudA==")
