@@ -218,6 +218,8 @@ def test_a_cell_names_its_failed_flights_first_and_whether_its_fault_happens() -
     assert [names[column] for column in drawn.shown] == ["fault 1 push.y size", "actuators.tau"]
     axes_shown = drawn.figure.axes[0]
     assert (axes_shown.get_xlabel(), axes_shown.get_ylabel()) == ("fault 1 push.y size", "actuators.tau")
+    told = [one.get_text() for one in (*axes_shown.get_xticklabels(), *axes_shown.get_yticklabels())]
+    assert told == [text for column in drawn.shown for text in report._ticks(axes(spec)[column])[1]]
     shades = axes_shown.collections[0]
     for place in ((0.1, 0.2), (0.9, 0.2), (0.2, 0.9)):  # with the fault, and other numbers in their middle
         point = np.full((1, len(names)), 0.5)

@@ -16,7 +16,7 @@ from hil.research.design import sweeps
 from hil.research.design.authority import attainable, pressure_at, single, wrenches
 from hil.research.design.axes import ROLL
 from hil.research.design.claims import claims
-from hil.research.design.linear import Linear, Point, linear
+from hil.research.design.linear import Linear, Point, linear, stiffness
 from hil.research.design.margins import Margins, margins_of, worst
 from hil.research.design.sweeps import HoverAngles
 from hil.research.design.trim import OPENINGS, balanced, changed, coefficient_of, opening_at, scaled, speed_at
@@ -271,6 +271,8 @@ def test_roll_becomes_stable_where_its_stiffness_falls_through_zero(monkeypatch:
     assert found.along[0] > 0.0 >= found.along[stable]
     assert sweeps.KINKS[stable - 1] < found.crossing < sweeps.KINKS[stable]
     assert sweeps._stiffness(PAPER, G0, found.crossing) == pytest.approx(0.0, abs=1e-3)
+    hover = G0, speed_at(G0, COEFFICIENT, HOVER), HOVER
+    assert stiffness(*hover) == pytest.approx(linear(*hover).constants.roll_roll, rel=1e-5)
 
 
 @pytest.mark.parametrize(
