@@ -3,7 +3,7 @@
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Any, NamedTuple
+from typing import Any
 
 from firmware_py.table import OF_PROFILE
 from firmware_py.wire import crtp, parameters, supervisor
@@ -22,22 +22,9 @@ from ground_station.controls import (
 PORTS = (crtp.PORT_PARAMETERS, crtp.PORT_PLATFORM, crtp.PORT_SUPERVISOR)  # whose packets `receive` takes
 
 
-class CommandPort(NamedTuple):
-    """Where a board takes requests to arm and to recover, and what its replies add to them."""
-
-    number: int
-    channel: int
-    arm: int
-    recover: int
-    reply: int
-
-
-OF_PLATFORM = CommandPort(
-    crtp.PORT_PLATFORM, supervisor.PLATFORM_COMMAND, supervisor.COMMAND_ARM, supervisor.COMMAND_RECOVER, 0
-)
-OF_SUPERVISOR = CommandPort(
-    crtp.PORT_SUPERVISOR, supervisor.SUPERVISOR_COMMAND, supervisor.ARM, supervisor.RECOVER, supervisor.REPLY
-)
+# Where boards take requests to arm and to recover, which have the same numbers at both, and what their replies add.
+OF_PLATFORM = crtp.PORT_PLATFORM, supervisor.PLATFORM_COMMAND, 0
+OF_SUPERVISOR = crtp.PORT_SUPERVISOR, supervisor.SUPERVISOR_COMMAND, supervisor.REPLY
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,20 +105,20 @@ class CrtpControls(Dialogue[crtp.Packet]):
         for name, value in (("floaty.stop", 0.0), ("floaty.armed", 1.0)):
             if name in self._table():
                 yield from self._write(name, value)
-        port = yield from self._port_of_commands()
+        port, channel, reply_bit = yield from self._port_of_commands()
         locked = "arm; after an emergency stop it has to reboot first"
         for what, command in (
-            ("recover", bytes((port.recover,))),
-            (locked, bytes((port.arm, 1))),
+            ("recover", bytes((supervisor.RECOVER,))),
+            (locked, bytes((supervisor.ARM, 1))),
         ):
-            head = bytes((command[0] | port.reply,))
-            packet = crtp.Packet(port.number, port.channel, command)
+            head = bytes((command[0] | reply_bit,))
+            packet = crtp.Packet(port, channel, command)
             reply = yield self._until(packet, lambda got, head=head: got.data[:1] == head)  # type: ignore[misc]
             if not any(reply.data[1:2]):
                 raise ControlsError(f"the board refuses to {what}")
         return ()
 
-    def _port_of_commands(self) -> Generator[Exchange[crtp.Packet], Any, "CommandPort"]:
+    def _port_of_commands(self) -> Generator[Exchange[crtp.Packet], Any, tuple[int, int, int]]:
         """Return the port that takes commands: newer firmware warns of the older one, older has only that."""
         ask = crtp.Packet(
             crtp.PORT_PLATFORM, supervisor.PLATFORM_VERSION, bytes((supervisor.VERSION_PROTOCOL,))
