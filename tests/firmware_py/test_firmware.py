@@ -1,5 +1,7 @@
 """The firmware as a whole against a board of plain numbers: timing, hand-over, queues, failsafe."""
 
+from itertools import pairwise
+
 import pytest
 
 from firmware_py.config import parameters_of
@@ -38,6 +40,27 @@ def test_controller_writes_counts_every_ten_milliseconds(bench: FirmwareBench) -
     cost = load_config().cpu
     assert len(late_us) == 19
     assert set(late_us) == {cost.stabilizer_us + cost.controller_us}
+
+
+def test_a_pose_reaches_the_flaps_within_eleven_milliseconds(bench: FirmwareBench) -> None:
+    bench.poses(605_000, 800_000)
+    bench.run(800_000)
+    before = bench.writes[-1][1]
+    bench.pose(805_000, (0.0, 0.05, 0.0))
+    bench.run(830_000)
+    changed = next(t for t, counts in bench.writes if t > 805_000 and counts != before)
+    assert 805_000 < changed <= 816_000
+
+
+def test_controller_goes_on_when_the_imu_falls_silent(bench: FirmwareBench) -> None:
+    bench.poses(605_000, 2_000_000)
+    bench.run(1_000_000)
+    bench.imu_alive = False
+    bench.run(1_500_000)
+    times = [t for t, _ in bench.writes if t > 1_010_000]
+    gaps = [later - earlier for earlier, later in pairwise(times)]
+    assert times[-1] > 1_480_000
+    assert max(gaps) <= 20_000
 
 
 def test_measurement_queue_has_the_originals_length(bench: FirmwareBench) -> None:

@@ -268,6 +268,19 @@ def test_an_invalid_pose_counts_as_not_seen(p, q) -> None:
     assert qualities(*[frame(n, p, q) for n in range(5)]) == [NOT_YET] * 5
 
 
+def test_a_push_of_20_newton_is_accepted() -> None:
+    """59 m/s^2 for 0.1 s on each axis and its opposite, and 0.2 N m (154 rad/s^2) at the same time."""
+    for axis in np.vstack((np.eye(3), -np.eye(3))):
+        tracker, rng = tracking(), np.random.default_rng(6)
+        for number in range(100, 140):
+            t = (number - 100.3) * PERIOD_US * 1e-6
+            pushed, after = max(0.0, min(t, 0.1)), max(0.0, t - 0.1)
+            way = 0.5 * pushed**2 + pushed * after
+            turn = Rotation.from_rotvec(154.0 * way * axis).as_quat(scalar_first=True)
+            seen = noisy(rng, number, (0.1, -0.2, 1.15) + 20.0 / 0.34 * way * axis, turn)
+            assert tracker.track_frame(seen).quality is Quality.TRACKED, f"{axis} {number}"
+
+
 # Gaps
 
 

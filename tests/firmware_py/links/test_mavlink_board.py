@@ -79,6 +79,19 @@ def test_masked_parts_of_a_goal_stay_unchanged(client: MavlinkClient) -> None:
     assert last_pose(client)[0] == pytest.approx((-0.5, 0.0, 0.0), abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("estimator", "expected"),
+    [(dialect.MAV_ESTIMATOR_TYPE_MOCAP, State.FLYING), (dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT, State.WAITING)],
+)
+def test_odometry_closes_the_loop_unless_it_is_an_autopilots(estimator: int, expected: State) -> None:
+    client, unknown = MavlinkClient(), [math.nan] + [0.0] * 20
+    fields = (1, 12, 0, 0, -1.15, LEVEL, 0, 0, 0, 0, 0, 0, unknown, unknown, 0, estimator)
+    for at_us in range(GYRO_ZERO_US, 1_000_000, 20_000):
+        client.events.at(at_us, lambda now_us: client.send("odometry", now_us, *fields))
+    client.run(1_000_000)
+    assert client.firmware.signals.supervisor.state is expected
+
+
 def test_poses_close_the_loop_and_silence_opens_it() -> None:
     client = MavlinkClient()
     client.poses(GYRO_ZERO_US, 1_000_000)

@@ -2,6 +2,8 @@
 
 import gc
 import json
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -145,6 +147,21 @@ def test_ctrl_c_keeps_what_was_flown(tmp_path: Path) -> None:
     assert not result.passed
     assert load_log(result.folder).num_rows == pytest.approx(200, abs=30)
     assert read_result(result.folder).outcome == "interrupted"
+
+
+def test_an_error_of_the_firmware_ends_the_flight_with_its_log(tmp_path: Path) -> None:
+    def burn(counts: Sequence[int]) -> None:
+        raise ValueError("no pin is left")
+
+    def sabotage(now_us: int, flight: Flight) -> None:
+        if now_us > 1_500_000:
+            flight.robot.board.write_compare = burn  # type: ignore[method-assign]
+
+    request = Request.of(HOVER, duration_s=30.0)
+    result = fly(request, tmp_path / "run", progress=sabotage)
+    assert result.outcome == "error"
+    assert re.search(r"task STABILIZER at 1\d{3}\.\d+ ms: ValueError: no pin is left", str(result.cause))
+    assert load_log(result.folder).num_rows > 140
 
 
 def test_log_carries_units_frames_and_origin(hovered: Result) -> None:

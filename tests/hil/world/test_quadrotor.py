@@ -45,6 +45,14 @@ def hover_volts(mass: float = 0.029) -> float:
     return float(next(root.real for root in roots if abs(root.imag) < 1e-9))
 
 
+def test_falls_freely_without_thrust_and_feels_nothing() -> None:
+    body = make()
+    assert body.acceleration_W.tolist() == [0.0, 0.0, -G]
+    assert body.specific_force_B == pytest.approx([0.0, 0.0, 0.0])
+    body.advance(300_000)
+    assert body.p_WB[2] == pytest.approx(2.0 - 0.5 * G * 0.3**2, rel=1e-6)
+
+
 @pytest.mark.parametrize("volts", [1.0, 2.0, 3.0])
 def test_thrust_is_bitcrazes_measurement_and_torque_its_share(volts: float) -> None:
     body = spun_up((0.75, 0.75, 0.75, 0.75), volts / 0.75)
