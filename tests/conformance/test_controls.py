@@ -266,7 +266,7 @@ def test_a_new_request_replaces_the_one_before(bench: Bench) -> None:
 
 
 def test_every_value_of_a_profile_is_the_board_s_times_the_factor() -> None:
-    """A board that boots with the values, and one that is told them, believe the same."""
+    """A board that boots with the values has the same parameters as one to which they are written."""
     bench, values = CrtpBench(), {}
     for row, key in enumerate(table.OF_PROFILE):
         section, _, field = key.partition(".")

@@ -75,21 +75,20 @@ def build_app(
     texts = [
         path.read_text() for path in (*sorted((folder / "src").glob("*.[ch]")), *sorted(STUBS.iterdir()))
     ]
-    digest = hashlib.sha256(repr((compiler, texts)).encode()).hexdigest()[:16]
+    flags = (
+        "-std=gnu11", "-fshort-enums", "-O1", "-Wall", "-Werror", "-Wdouble-promotion", "-fno-math-errno",
+        "-shared", "-fPIC", *(("-fno-sanitize=all", "-Wl,--no-gc-sections") if compiler.name == "zig" else ()),
+    )  # fmt: skip
+    digest = hashlib.sha256(repr((compiler, flags, texts)).encode()).hexdigest()[:16]
     kept = BUILD / f"app-{digest}.so"
     library = folder / "app.so"
     if kept.is_file():
         shutil.copy2(kept, library)
         return library
-    flags = (
-        "-std=gnu11", "-fshort-enums", "-O1", "-Wall", "-Werror", "-Wdouble-promotion", "-fno-math-errno",
-        "-shared", "-fPIC",
-    )  # fmt: skip
-    zig = ("-fno-sanitize=all", "-Wl,--no-gc-sections") if compiler.name == "zig" else ()
     caches = {name: str(folder / "zig") for name in ("ZIG_LOCAL_CACHE_DIR", "ZIG_GLOBAL_CACHE_DIR")}
     subprocess.run(
         (
-            *compiler.command, *flags, *zig, "-I", str(STUBS), "-o", str(library),
+            *compiler.command, *flags, "-I", str(STUBS), "-o", str(library),
             *map(str, sources), str(STUBS / "board.c"), "-lm",
         ),
         check=True, env=os.environ | caches,
