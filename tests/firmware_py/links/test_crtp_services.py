@@ -27,7 +27,8 @@ from firmware_py.links.crtp_stack import PORT_QUEUE
 from firmware_py.links.parameters import ParameterStorage
 from firmware_py.wire import crtp, telemetry
 from firmware_py.wire.localisation import pack_quaternion, unpack_quaternion
-from firmware_py.wire.scalars import LOG_SCALARS, Scalar
+from firmware_py.wire.parameters import TYPE_READ_ONLY
+from firmware_py.wire.scalars import LOG_SCALARS, PARAMETER_SCALARS, Scalar
 from firmware_py.wire.toc import Toc
 from hil.config import load_config
 from support.crtp_client import LOC, LOG, MEM, PARAM, PLATFORM, CrtpClient
@@ -402,6 +403,32 @@ def test_stored_parameter_survives_a_reboot_and_cleared_one_does_not(client: Crt
     assert client.one(PARAM, 3, b"\5" + ident) == b"\5" + ident + b"\0"
     client.reboot()
     assert client.read(params, "extCtrl.z_P") == 3.0
+
+
+@pytest.mark.parametrize(
+    ("command", "persistent", "plain", "constant", "absent"),
+    [
+        (2, "01", "02", "02", "02"),  # EXTENDED_TYPE: errno 2 is ENOENT
+        (7, "0001", "02", "02", "02"),  # with a status
+        (6, "{default}", "{default}", "02", "02"),  # DEFAULT
+        (8, "00{default}", "00{default}", "02", "02"),  # with a status
+        (4, "00{default}", "00{default}", "00{default}", "02"),  # STATE: nothing is stored
+        (3, "00", "02", "02", "02"),  # STORE
+        (5, "02", "02", "02", "02"),  # CLEAR: the same
+    ],
+)
+def test_each_request_about_a_parameter_has_the_firmware_s_answer_to_its_kind(
+    client: CrtpClient, params, command: int, persistent: str, plain: str, constant: str, absent: str
+) -> None:
+    read_only = next(name for name, (_, kind) in params.items() if kind & TYPE_READ_ONLY)
+    for name, form in (("extCtrl.z_P", persistent), ("setpoint.X", plain), (read_only, constant)):
+        number, kind = params[name]
+        size = PARAMETER_SCALARS[kind & 0x0F].layout.size
+        head = struct.pack("<BH", command, number)
+        default = client.one(PARAM, 1, head[1:])[-size:].hex()  # nothing was set since the boot
+        assert client.one(PARAM, 3, head).hex() == head.hex() + form.format(default=default), name
+    head = struct.pack("<BH", command, len(params))
+    assert client.one(PARAM, 3, head).hex() == head.hex() + absent
 
 
 @given(st.binary(max_size=80), st.integers(0, 200))

@@ -69,6 +69,16 @@ def test_the_link_to_a_pty_is_made_and_removed(tmp_path: Path) -> None:
     assert not os.path.lexists(path)
 
 
+def test_a_client_that_slept_reads_what_is_sent_after_its_line_was_full(tmp_path: Path) -> None:
+    bench = OpenEnd(Address("pty", path=tmp_path / "floaty").open)
+    with serial.Serial(bench.end.master, 921_600, timeout=10.0) as client:
+        bench.end.send(bytes(1_000_000))  # more than a line holds
+        bench.end.send(b"fresh")
+        assert client.read(5) == b"fresh"
+        assert client.in_waiting == 0
+    bench.close()
+
+
 def test_the_link_of_a_killed_server_is_replaced_but_nothing_else(tmp_path: Path) -> None:
     stale, file, other = tmp_path / "stale", tmp_path / "file", tmp_path / "other"
     stale.symlink_to("/dev/pts/99999")

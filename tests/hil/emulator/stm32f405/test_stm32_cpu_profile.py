@@ -1,12 +1,16 @@
 """Where the cycles of an image go: all of them, to the functions and tasks that the firmware itself counts."""
 
+from types import SimpleNamespace as Record
+
+import numpy as np
 import pytest
 
 pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
+from firmware_py.export.elf import FLASH
 from hil.emulator.stm32f405.chip import SOFTWARE, StopReason
-from hil.emulator.stm32f405.cpu_profile import Calls, CpuProfile, Reader, functions_of
+from hil.emulator.stm32f405.cpu_profile import ROOT, Calls, CpuProfile, Part, Reader, functions_of
 from support.stm32_machine import FirmwareOnChip
 
 ASSERTION, MASKING, NESTED, SLEEP = 3, 2, 3, 5  # a mistake and three scenarios
@@ -99,3 +103,36 @@ def test_sleep_is_charged_once_to_the_function_that_waits() -> None:
     profile = Reader(firmware.image, firmware.chip, [], 0).read()
     assert sum(map(asleep, profile.roots)) == firmware.chip.state.sleeping
     assert firmware.chip.state.sleeping == pytest.approx(2 * 168_000, rel=0.01)
+
+
+def test_a_function_has_the_callers_of_its_longest_call_and_the_cycles_of_all() -> None:
+    """`rest` is called by `first` for 30 cycles and by `second` for 7, in the longest activation of a task."""
+    first, second, rest = 1, 2, 3
+    nodes = [Record(function=of, site=site, parent=up) for of, site, up in (
+        (ROOT, 0, 0), (first, 0x10, 0), (second, 0x20, 0), (rest, 0x30, 1), (rest, 0x40, 2), (ROOT + 1, 0, 0),
+    )]  # fmt: skip
+    worst = Record(
+        node=[4, 3, 1, 2, 5],
+        recent=[7, 30, 2, 1, 9],
+        count=5,
+        others=[0, 50, 60],
+        begin=1680,
+        end=1848,
+        cycles=40,
+    )
+    reader = Reader.__new__(Reader)
+    reader._profile, reader._tasks, reader._ahead_us = Record(worst=[worst]), ("A", "B", "C"), 4
+    reader._functions = [
+        Record(name=name, address=FLASH + 16 * at, size=16)
+        for at, name in enumerate(("first", "second", "rest"))
+    ]
+    reader._line_cycles = np.array(8 * [0] + 8 * [1] + [0, 5, 0, 2, 3, 3, 0, 3])
+    reader._image = Record(debug=Record(line_at=lambda address: f"c:{(address - FLASH) // 4}"))
+    found = reader._longest(nodes, 0)
+    assert found.parts == (
+        Part("rest", 37, "c:10", "first (c:11)"),
+        Part("first", 2, "", ""),
+        Part("second", 1, "c:4", ""),
+    )
+    assert found.others == (("C", 60), ("B", 50))
+    assert (found.begin_us, found.us, found.cycles) == (6.0, 1.0, 40)

@@ -10,6 +10,9 @@ from hil.config import load_config
 from hil.laboratory.request import Options
 from hil.pictures.drawing import png
 from hil.research.campaigns.jobs import fly_job
+from hil.research.design.linear import point_of
+from hil.research.design.sweeps import RESERVE
+from hil.research.design.trim import speed_at
 from hil.research.studies.catalogue import STUDIES
 from hil.research.studies.paper_report import study_picture
 from hil.research.studies.study import (
@@ -51,6 +54,20 @@ def test_sizes_of_a_study_change_the_flight(study: Study) -> None:
     for variant in study.variants:
         changes = {str(variant.change(size)) for size in study.sizes}
         assert len(changes) == len(study.sizes), "no two sizes are the same"
+
+
+@pytest.mark.parametrize("variant", STUDIES["design-updrafts"].variants, ids=lambda variant: variant.name)
+def test_an_updraft_is_flown_at_its_hover_angle_or_the_nearest_that_leaves_the_reserve(
+    variant: Variant,
+) -> None:
+    point, found = point_of(load_config(variant.profile)), []
+    fast = speed_at(point.geometry, point.coefficient, point.high - 0.5 * RESERVE)
+    for speed in (5.0, 9.5, round(fast, 3)):
+        config = load_config(variant.profile, variant.change(speed)["overrides"])
+        assert config.tunnel.speed == speed
+        found.append(config.allocation.hover_angle)
+    assert (found[0], found[2]) == pytest.approx((point.low, point.high - RESERVE), abs=1e-4)
+    assert speed_at(point.geometry, point.coefficient, found[1]) == pytest.approx(9.5, rel=1e-3)
 
 
 def test_a_model_error_scales_the_constants_of_its_part_and_no_other() -> None:
