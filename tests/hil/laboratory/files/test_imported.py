@@ -267,6 +267,18 @@ def test_what_is_missing_is_unknown_or_said(tmp_path: Path) -> None:
     )
 
 
+def test_a_flight_lasts_from_the_first_row_to_the_last_and_its_hash_is_of_its_numbers(tmp_path: Path) -> None:
+    def done(name: str, x: float) -> tuple[float, str]:
+        columns = {"t": T, **place("x", "y", "z")}
+        columns["x"] = np.append(columns["x"][:-1], x)
+        result = import_log([csv(tmp_path / f"{name}.csv", columns)], tmp_path / name).result
+        return result.request.duration_s, result.hash
+
+    first, again, other = done("first", 0.5), done("again", 0.5), done("other", 0.500001)
+    assert first == again != other
+    assert first[0] == T[-1]
+
+
 def test_a_map_chooses_scales_turns_and_releases(tmp_path: Path) -> None:
     path = csv(
         tmp_path / "log.csv", {"clock": 10 + T, "a": PLACE[:, 0], "b": 1e3 * PLACE[:, 1], "c": -PLACE[:, 2]}
