@@ -245,3 +245,10 @@ def empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """A new folder, which is the current one."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Show why each test that was repeated had failed."""
+    for report in terminalreporter.stats.get("rerun", ()):
+        terminalreporter.section(f"why it was repeated: {report.nodeid}", sep="_")
+        terminalreporter.write_line(report.longreprtext)
