@@ -118,7 +118,7 @@ def write_project(command: str, templates: Iterable[Path], folder: Path, **value
                 for source in (ANY_TEMPLATES, *templates)
                 for path in source.rglob("*.in")
             }
-            for name, template in sorted(known.items()):
+            for name, template in known.items():
                 place = name.with_suffix("")
                 path = Path(scratch) / NAMED.get(str(place), place)
                 path.parent.mkdir(parents=True, exist_ok=True)

@@ -13,6 +13,7 @@ import pymavlink.dialects.v20.development as dialect
 import pytest
 from scipy.spatial.transform import Rotation
 
+from firmware_py.config import StreamRates
 from firmware_py.links.parameters import Parameter, ParameterStorage
 from firmware_py.signals import COUNTERS
 from firmware_py.wire import crtp, telemetry
@@ -546,6 +547,15 @@ def test_manual_control_of_this_board_is_refused_and_long_texts_are_numbered_fro
 def test_the_interval_of_a_rate_is_the_nearest_whole_tick(rate_hz: int, interval_us: int) -> None:
     client = MavlinkClient(f"mavlink.rates.attitude={rate_hz}")
     assert client.command(510, NUMBERS["ATTITUDE"])[1].interval_us == interval_us
+
+
+def test_each_message_has_the_rate_of_its_own_setting() -> None:
+    settings = StreamRates.model_fields.items()
+    messages = {name: re.split("[ ,;]", field.description or "")[0] for name, field in settings}
+    rates = {name: 1 + number for number, name in enumerate(messages)}
+    client = MavlinkClient(*(f"mavlink.rates.{name}={rate}" for name, rate in rates.items()))
+    told = {name: client.command(510, NUMBERS[message])[1].interval_us for name, message in messages.items()}
+    assert told == {name: 1000 * round(1000 / rate) for name, rate in rates.items()}
 
 
 def test_on_a_full_line_replies_wait_and_streams_are_dropped(client: MavlinkClient) -> None:

@@ -92,6 +92,7 @@ class Told(CrtpClient):
 
     def _up(self, now_us: int, data: bytes) -> None:
         self.writes_up += 1
+        assert now_us == self.now_us
         if not self.lossy():
             self.firmware.radio_received(data)
 

@@ -197,6 +197,7 @@ tune --profile lqr | tune makes gains for the built-in control law
 tune --profile lqr --repeat 1 | tune makes gains for the built-in control law
 tune --profile crazyflie | not for the Crazyflie's own firmware
 tune --out gains.txt | --out gains.txt: a profile's name ends in .toml
+tune --out FILE/gains.toml | is not a folder)
 tune --repeat 0 | --repeat
 tune --board abacus | --board abacus: no such file; expected c, python
 tune --vary controller.gain_y=-3..-1 --board abacus | --board abacus: no such file; expected c, python

@@ -99,6 +99,7 @@ def test_evidence_tells_the_largest_and_its_instant_of_everything() -> None:
         "The board's estimate was up to 5.0 cm (z, at 0.70 s) and 30.0 deg (yaw, at 0.80 s) wrong.",
         "Its supervisor: flying all the time.",
     ]
+    assert "Its supervisor: flying from 0.80 s, failsafe from 0.90 s." in evidence(log.slice(180, 20))
     assert "Pose refused on board: once." in evidence(log.slice(90, 20))
     assert evidence(log.slice(100, 1)) == []
     known = pa.array(metrics.column(log, "truth.flap_2") + 0.6)

@@ -4,6 +4,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
@@ -16,10 +17,11 @@ from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.pictures import curves, video
 from hil.world.floaty.drawing import look_of
-from hil.world.scene import VisualModel
+from hil.world.scene import Part, VisualModel
 from support.command import Cli
 
 av = pytest.importorskip("av")
+COLOURS = [(0, 255, 0), (0, 0, 255), video.PATH, video.GOAL, video.SKY]
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +90,26 @@ def test_the_robot_has_its_plates_where_the_geometry_has_them() -> None:
     assert np.ptp(corners[:, :2], axis=0) == pytest.approx([geometry.footprint] * 2, rel=0.06)
     assert corners[:, :2].mean(axis=0) == pytest.approx([1.0, 2.0], abs=1e-6)
     assert len({colour for _, colour in shown}) == 5
+
+
+def test_what_is_nearer_hides_what_is_behind_and_paths_have_the_colours_of_goal_and_robot() -> None:
+    triangle = 0.1 * np.array([[(0.0, 1.0, -1.0), (0.0, -1.0, -1.0), (0.0, 0.0, 1.0)]])
+    eye, ground = 0.1 * video.EYE, pa.table(
+        {f"{group}.{name}": [0.0] for group in ("truth", "goal") for name in ("x", "y", "z")}
+        | {"truth.qw": [1.0], "truth.qx": [0.0], "truth.qy": [0.0], "truth.qz": [0.0], "goal.yaw": [0.0]}
+    )  # fmt: skip
+    parts = [Part("near", triangle, "#00ff00", tuple(eye)), Part("far", triangle, "#0000ff", tuple(-eye))]
+    places = np.zeros((1, 3))
+    trail, course = (np.array([(-0.2, 0.0, z), (0.2, 0.0, z)]) for z in (0.2, -0.2))
+    for order in (parts, parts[::-1]):
+        view = video.VideoScene(VisualModel(tuple(order)), places, places)
+        picture = view.at(ground, trail, course)
+        middles = view._seen(np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 0.2), (0.0, 0.0, -0.2)]))[0]
+        shown = [picture.getpixel(tuple((place // video.SHARPER).astype(int))) for place in middles]
+        for colour, wanted in zip(shown, ((0, 255, 0), video.PATH, video.GOAL), strict=True):
+            assert np.argmin([np.abs(np.subtract(colour, one)).sum() for one in COLOURS]) == COLOURS.index(
+                wanted
+            )
 
 
 def test_a_flight_that_never_began_or_is_too_long_for_a_gif_is_one_line(

@@ -1,9 +1,11 @@
 """A board without a world: what it is fed, what it says and sends, and when."""
 
 import math
+from collections.abc import Iterator
 
 import pytest
 
+from firmware_py.rtos.errors import WatchdogError
 from firmware_py.wire import crtp
 from firmware_py.wire.crtp import Packet
 from hil.config import load_config
@@ -91,6 +93,18 @@ def test_a_silent_imu_finds_no_zero(board: BareBoard) -> None:
     board.imu_running = False
     board.run(ms=300)
     assert board.console == []
+
+
+def test_a_task_that_takes_the_processor_for_ever_ends_in_a_watchdog_reset(board: BareBoard) -> None:
+    kernel = board.firmware.kernel
+
+    def hog() -> Iterator[int]:
+        yield from kernel.work(10_000_000)
+
+    board.run(ms=100)
+    kernel.create_task("HOG", 6, hog)
+    with pytest.raises(WatchdogError, match="STABILIZER has not run"):
+        board.run(ms=1000)
 
 
 def test_tasks_battery_and_counts_are_those_of_the_firmware(board: BareBoard) -> None:

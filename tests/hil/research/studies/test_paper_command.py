@@ -17,7 +17,7 @@ from hil.pictures.panels import Instant
 from hil.research.campaigns.jobs import Job, Row, fly_job
 from hil.research.studies.catalogue import PROFILES
 from hil.research.studies.paper import Paper, Trials, fly_paper
-from hil.research.studies.paper_report import write_paper
+from hil.research.studies.paper_report import _trials, write_paper
 from hil.research.studies.paper_rows import OUTSIDE, ROWS, MetricClaim, PaperRow
 from hil.research.studies.study import Curve, Expected, Study, StudyResult, Variant, VariantOutcome
 from support.html_page import Page
@@ -85,6 +85,16 @@ def test_the_report_has_the_papers_value_and_the_spread_of_each_profile_s_flight
     assert all(plot["alone"] for plot in figures.plots.values())
     assert {plot["marks"] for plot in figures.plots.values()} == {0, 1}, "each profile's flight has its own"
     assert figures.links == ["report.html"]
+
+
+def test_the_result_tells_of_each_flight_how_it_ended(result: Row) -> None:
+    told = _trials(ROWS["hover"], trials(result, True, False))
+    assert (told["holds"], list(told["missed"])) == (False, ["y_over_x"])
+    assert [(one["passed"], one["failed"]) for one in told["flights"]] == [(True, []), (False, ["max_x"])]
+    lost = Trials("floaty", (dataclasses.replace(result, outcome="lost", error="it fell"),))
+    (one,) = _trials(ROWS["hover"], lost)["flights"]
+    assert (one["outcome"], one["cause"]) == ("lost", "it fell")
+    assert (one["seed"], one["folder"]) == (result.seed, result.folder.name)
 
 
 def trials(result: Row, *passed: bool) -> Trials:
