@@ -1,6 +1,7 @@
 """Own logic on its way to the board: checked, exported and compiled from a folder of the user's."""
 
 import json
+import re
 import runpy
 import subprocess
 import sys
@@ -63,6 +64,12 @@ def test_exporting_from_a_user_s_folder_writes_the_c_that_is_checked(cli: Cli, p
     assert core == translation_of(LogicConfig(controller=str(project / "controller.py"))).source
     assert str(project) not in core  # the same law is the same C wherever it lies
     assert ".gain_iy = 0.5f," in (project / "app" / "src" / "floaty_profile.c").read_text(encoding="utf-8")
+    calls = (project / "app" / "src" / "floaty_calls.h").read_text(encoding="utf-8")
+    hover = calls.partition("call_hover(")[2].partition("}")[0]
+    assert re.findall(r"static \w+ (\w+);", hover) == ["guard", "controller_memory"], (
+        "the gains are those in flight"
+    )
+    assert "&guard, &floaty_controller_own, &controller_memory)" in hover
 
 
 # The laws that ship
