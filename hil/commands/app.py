@@ -104,7 +104,7 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Return the command that the arguments name. Raises `LabError` with the nearest name for an unknown one."""
-        if args[0] not in COMMANDS and not args[0].startswith("-") and " ".join(args[:2]) not in MOVED:
+        if args[0] not in COMMANDS and not args[0].startswith("-"):
             raise LabError(f"{args[0]}: no such command; {hint(args[0], COMMANDS, 'see floaty --help')}")
         return super().resolve_command(ctx, args)
 

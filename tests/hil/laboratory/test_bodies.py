@@ -101,12 +101,14 @@ def test_it_may_be_heavier_than_designed_but_has_no_constants_of_floaty(tmp_path
         falls("plant.constant_factors={yaw_u3=1.1}")
 
 
-def test_a_torque_turns_it_and_a_push_moves_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("factor", [1.0, 1.25])
+def test_a_torque_turns_it_and_a_push_moves_it(tmp_path: Path, factor: float) -> None:
     robot = FLOATING.replace("(0.0, 0.0, 0.0)", "(0.0, 0.0, 1e-3)")
-    body = make_body(load_config(project(tmp_path, robot)), np.random.default_rng(1), (0.0, 0.0, 1.15))
+    config = load_config(project(tmp_path, robot), [f"plant.inertia_factor={factor}"])
+    body = make_body(config, np.random.default_rng(1), (0.0, 0.0, 1.15))
     body.push((0.0, 0.2, 0.0))
     body.advance(500_000)
-    assert body.omega_B == pytest.approx([0.0, 0.0, 0.5])
+    assert body.omega_B == pytest.approx([0.0, 0.0, 0.5 / factor])
     assert body.p_WB == pytest.approx([0.0, 0.5 * 2.0 * 0.25, 1.15], abs=1e-6)
 
 

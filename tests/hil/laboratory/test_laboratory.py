@@ -112,10 +112,15 @@ def test_power_off_stops_a_board_which_boots_with_its_memories_and_a_new_clock()
     assert bytes(robot.board.eeprom[100:103]) == b"abc"
     assert 0 < robot.firmware.kernel.now_us <= 60_000
     assert robot.booted_us > 3 * SECOND_US
-    served.nrf51.hear(bench.server.lab.now_us, b"\xff\xfe\x01")  # all off
-    for duration_s, power in ((4.95, Power.OFF), (0.1, Power.RUNNING)):  # until somebody presses the button
-        bench.fly(duration_s)
-        assert served.nrf51.power is power
+    for requests, off in (
+        ((b"\xff\xfe\x01",), Power.OFF),
+        ((b"\xff\xfe\xff", b"\xff\xfe\xf0\x00"), Power.BOOTLOADER),
+    ):
+        for request in requests:
+            served.nrf51.hear(bench.server.lab.now_us, request)
+        for duration_s, power in ((4.95, off), (0.1, Power.RUNNING)):  # until somebody presses the button
+            bench.fly(duration_s)
+            assert served.nrf51.power is power
 
 
 def test_a_processor_that_hangs_is_reset_by_its_watchdog_and_goes_on_under_the_same_load() -> None:

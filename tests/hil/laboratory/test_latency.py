@@ -15,6 +15,7 @@ from ground_station.latency import (
     STAGES,
     LatencyBudget,
     LinkLatency,
+    Stage,
     budget_line,
     budget_of,
     columns_of,
@@ -131,6 +132,16 @@ def test_a_flight_has_its_budget(tmp_path: Path, link: str, name: str, off_us: f
     log = load_log(tmp_path / "run")
     delivered, sum_us = (log.column(f"link.up_{what}")[-1].as_py() for what in ("delivered", "latency_sum"))
     assert means[name] == pytest.approx(sum_us / delivered, abs=off_us)
+
+
+def test_a_budget_has_mean_and_99th_of_the_pose_and_the_means_of_its_parts() -> None:
+    stages = [
+        Stage("pose", 39_440.0, 40_300.0),
+        Stage("camera", 20_000.0, 21_000.0),
+        Stage("radio", 1_390.0, 2_000.0),
+    ]
+    told = "pose 39.4 ms old on arrival (99 %: 40.3): camera 20.0 + radio 1.4"
+    assert (budget_line(stages), budget_line([])) == (told, "no pose sent")
 
 
 def test_cut_telemetry_is_read_up_to_the_cut(tmp_path: Path) -> None:

@@ -97,6 +97,11 @@ def test_a_recording_holds_every_row_of_the_log(folder: Path) -> None:
     )
     xyzw = column(log, "truth.qx", "truth.qy", "truth.qz", "truth.qw")
     np.testing.assert_allclose(values(path, "/world/robot", "Transform3D:quaternion")[:, 0], xyzw, atol=1e-6)
+    held = [
+        values(path, "/world/held", f"Transform3D:{what}")[:, 0] for what in ("translation", "quaternion")
+    ]
+    np.testing.assert_allclose(held[0], truth, atol=1e-6)
+    assert (held[1] == (0.0, 0.0, 0.0, 1.0)).all(), "pushes along axes of the world"
 
 
 def test_texts_and_changes_of_state_are_recorded_once(folder: Path) -> None:

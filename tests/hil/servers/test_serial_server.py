@@ -85,9 +85,11 @@ def test_the_link_of_a_killed_server_is_replaced_but_nothing_else(tmp_path: Path
     OpenEnd(Address("pty", path=stale).open).close()
     file.write_text("mine")
     other.symlink_to(file)
+    opened = len(os.listdir("/proc/self/fd"))
     for path in (file, other, tmp_path / "no" / "folder"):
         with pytest.raises(LabError, match=f"mavlink pty {path}: "):
             Address("pty", path=path).open({}, lambda now_us, data: None, print)
+    assert len(os.listdir("/proc/self/fd")) == opened
     assert file.read_text() == "mine"
     assert other.is_symlink()
 
