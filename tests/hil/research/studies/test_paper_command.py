@@ -17,7 +17,7 @@ from hil.pictures.panels import Instant
 from hil.research.campaigns.jobs import Job, Row, fly_job
 from hil.research.studies.catalogue import PROFILES
 from hil.research.studies.paper import Paper, Trials, fly_paper
-from hil.research.studies.paper_report import _trials, write_paper
+from hil.research.studies.paper_report import _figures, _trials, write_paper
 from hil.research.studies.paper_rows import OUTSIDE, ROWS, MetricClaim, PaperRow
 from hil.research.studies.study import Curve, Expected, Study, StudyResult, Variant, VariantOutcome
 from support.html_page import Page
@@ -92,6 +92,9 @@ def test_the_result_tells_of_each_flight_how_it_ended(result: Row) -> None:
     assert (told["holds"], list(told["missed"])) == (False, ["y_over_x"])
     assert [(one["passed"], one["failed"]) for one in told["flights"]] == [(True, []), (False, ["max_x"])]
     lost = Trials("floaty", (dataclasses.replace(result, outcome="lost", error="it fell"),))
+    for trials_of, marked in ((lost, {"it fell"}), (trials(result, True), set())):
+        ((_, figures),) = _figures(ROWS["hover"], (trials_of,))
+        assert {instant.text for figure in figures for instant in figure.marks.instants} == marked
     (one,) = _trials(ROWS["hover"], lost)["flights"]
     assert (one["outcome"], one["cause"]) == ("lost", "it fell")
     assert (one["seed"], one["folder"]) == (result.seed, result.folder.name)
