@@ -220,12 +220,18 @@ def test_the_load_that_is_logged_is_what_the_tasks_took_of_each_period(client: C
     assert 1.0 < min(told) <= max(told) < 50.0
 
 
-def test_newer_start_counts_in_milliseconds_and_period_zero_sends_once(client: CrtpClient, logs) -> None:
+def test_newer_start_counts_in_milliseconds_a_stop_ends_it_and_period_zero_sends_once(
+    client: CrtpClient, logs
+) -> None:
     assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
     assert client.one(LOG, 1, struct.pack("<BBH", 8, 1, 4)) == bytes((8, 1, 0))
     client.sent.clear()
     client.run(client.now_us + 100_000)
     assert len(client.packets(LOG, 2)) == 25
+    assert client.one(LOG, 1, bytes((4, 1))) == bytes((4, 1, 0)), "stopped"
+    client.sent.clear()
+    client.run(client.now_us + 100_000)
+    assert client.packets(LOG, 2) == []
     assert client.one(LOG, 1, struct.pack("<BBH", 8, 1, 0)) == bytes((8, 1, 0))
     client.sent.clear()
     client.run(client.now_us + 100_000)

@@ -276,7 +276,10 @@ def test_a_rebooted_board_talks_on_its_serial_line_by_the_laboratorys_clock() ->
     assert sum(now_us > 3 * SECOND_US for now_us in heard) > 20
 
 
-@pytest.mark.parametrize(("kind", "powered"), [(syslink.SWITCH_OFF, False), (syslink.RADIO_POWER, True)])
+@pytest.mark.parametrize(
+    ("kind", "powered"),
+    [(syslink.SWITCH_OFF, False), (syslink.STM32_OFF, False), (syslink.RADIO_POWER, True)],
+)
 def test_a_firmware_without_a_client_can_switch_its_board_off(kind: int, powered: bool) -> None:
     lab = Laboratory(FreeRunning())
     robot = Robot(site_in(lab), Ports(nobody_listens))
