@@ -62,7 +62,8 @@ class ModelledLine:
         serial = request.bench.link == MAVLINK
         self.correct = correct
         self._release_us = config.flight.release_us
-        self.trajectory = FlightPlan(Goal(config.flight.home, 0.0), lambda *_: request.trajectory)
+        self._home = Goal(config.flight.home, 0.0)
+        self.trajectory = FlightPlan(self._home, lambda *_: request.trajectory)
         self.trajectory.start(self._release_us)
         self._bits_per_second, self._wire_us = config.radio.bits_per_second, site.executor.wire_us
         self.tracker = tracker_of(config.tracker, config.mocap.period_us)
@@ -139,7 +140,7 @@ class ModelledLine:
             lambda: self.robot.firmware.log_numbers,
             entries,
             config.pilot,
-            Goal(config.flight.home, 0.0),
+            self._home,
             times,
         )
 

@@ -9,7 +9,6 @@ import json
 import struct
 from math import inf, nan
 from types import SimpleNamespace
-from zlib import crc32
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from cflib.crazyflie.log import LogTocElement
 from cflib.crazyflie.mem.i2c_element import I2CElement
 from cflib.crazyflie.param import ParamTocElement
 from cflib.utils.encoding import compress_quaternion
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -452,14 +451,31 @@ def test_a_spoilt_store_is_an_empty_one(noise: bytes, place: int) -> None:
     assert storage.load() == (values if eeprom[1024:end] == before[1024:end] else {})
 
 
-def test_a_store_with_foreign_names_can_be_written() -> None:
-    eeprom = bytearray(b"\xff" * 8192)
-    records = b"\4\xff\x80\0\xe9\2ab"
-    eeprom[1024 : 1034 + len(records)] = struct.pack("<4sHI", b"FPS1", len(records), crc32(records)) + records
-    storage = ParameterStorage(eeprom)
-    assert storage.store("a.b", b"\1")
-    assert storage.load()["a.b"] == b"\1"
-    assert len(storage.load()) == 2
+CHANGE = st.tuples(st.sampled_from(("a.b", "a.longer", "\xff\x80")), st.none() | st.binary(max_size=255))
+
+
+@given(st.lists(CHANGE, max_size=12), st.integers(0, 600))
+@example(
+    [("a.b", bytes(7)), ("a.b", bytes(8)), ("a.b", b""), ("a.b", None), ("a.b", None)], 12
+)  # at 8 a byte too many
+@settings(deadline=None)
+def test_a_store_has_the_last_value_of_each_name_and_refuses_what_does_not_fit(
+    changes: list[tuple[str, bytes | None]], size: int
+) -> None:
+    storage, kept = ParameterStorage(bytearray(b"\xff" * (1034 + size))), dict[str, bytes]()
+    assert storage.size == 10 + size
+    for name, value in changes:
+        wanted = {**kept, name: value or b""}
+        if value is None:
+            del wanted[name]
+        used = sum(2 + len(one) + len(wanted[one]) for one in wanted)
+        done = storage.clear(name) if value is None else storage.store(name, value)
+        assert done == (name in kept if value is None else used <= size)
+        kept = wanted if done else kept
+        assert (storage.load(), storage.used) == (
+            kept,
+            10 + sum(2 + len(one) + len(kept[one]) for one in kept),
+        )
 
 
 def test_of_a_store_only_persistent_parameters_of_the_right_size_count(client: CrtpClient, params) -> None:
@@ -477,14 +493,6 @@ def test_of_a_store_only_persistent_parameters_of_the_right_size_count(client: C
     client.reboot()
     assert {name: client.read(params, name) for name in before} == before
     assert client.read(params, "extCtrl.yaw_P") == 0.5
-
-
-def test_a_full_store_refuses_and_keeps_what_it_has(client: CrtpClient) -> None:
-    storage = ParameterStorage(bytearray(b"\xff" * 1124))
-    stored = 0
-    while storage.store(f"g.{stored:02}", b"1234"):
-        stored += 1
-    assert len(storage.load()) == stored == (100 - 10) // 10
 
 
 # Memories
@@ -541,16 +549,6 @@ def test_memory_tester_gives_the_address_and_counts_wrong_bytes(client: CrtpClie
     assert [len(client.one(MEM, 0, bytes((2, number)))) for number in (4, 5)] == [15, 2]  # the last, and none
     client.write(params, "memTst.resetW", 1)
     assert client.log(logs, "memTst.errCntW") == [0]
-
-
-def test_a_store_counts_its_bytes_to_the_last_one() -> None:
-    storage = ParameterStorage(bytearray(b"\xff" * 2048))
-    assert (storage.size, storage.used) == (1024, 10)
-    for size, fits in ((255, True), (255, True), (255, True), (223, False), (222, True)):
-        before = storage.used
-        assert storage.store(f"g.{before}", bytes(size)) == fits
-        assert storage.used == before + fits * (4 + len(str(before)) + size)
-    assert storage.used == 1024
 
 
 def test_a_refused_kind_is_reported_with_the_count_of_what_was_withheld_since_its_last_line() -> None:

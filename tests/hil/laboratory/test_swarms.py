@@ -3,6 +3,7 @@
 import json
 import math
 import os
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -98,13 +99,32 @@ def test_a_wake_carries_the_momentum_of_the_thrust(below: float) -> None:
     assert not neighbours((0.0, 0.0, 1.0), (0.0, 0.0, 1.5), wake=1.0).wake_W[1].any()  # above it
 
 
-def test_spheres_push_each_other_apart_alike() -> None:
-    near = neighbours((0.0, 0.0, 1.0), (0.06, 0.08, 1.0), (5.0, 0.0, 1.0), radius=0.07)
-    assert near.touch_W[1] == pytest.approx((150 * 0.04 * 0.6, 150 * 0.04 * 0.8, 0.0))
-    assert near.touch_W[0] == pytest.approx(-near.touch_W[1])
-    assert (near.least, near.one, near.other) == (pytest.approx(0.1), 0, 1)
-    assert not near.touch_W[2].any()
-    assert not neighbours((0.0, 0.0, 1.0), (0.06, 0.08, 1.0), radius=0.0).touch_W.any()
+@pytest.mark.parametrize("seed", range(20))
+def test_wakes_contacts_and_the_nearest_two_are_those_of_the_formulas_for_vectors(seed: int) -> None:
+    rng, count = np.random.default_rng(seed), 2 + seed % 4
+    flies = np.r_[True, True, rng.random(count - 2) < 0.7]
+    p, v, lift = rng.normal(0.0, 0.06, (count, 3)), rng.normal(size=(count, 3)), rng.normal(size=(count, 3))
+    block = Neighbours.allocate()
+    near = block.fields
+    near.count, near.radius, near.stiffness, near.damping = i32(count), 0.07, 150.0, 2.0
+    near.wake, near.wake_radius, near.wake_spread = 0.9, 0.065, 0.1
+    near.flies[:count], near.p_WB[:count], near.v_WB[:count], near.lift_W[:count] = flies, p, v, lift
+    wakes, touches, distances = np.zeros((count, 3)), np.zeros((count, 3)), {}
+    for a, b in permutations(np.flatnonzero(flies).tolist(), 2):
+        away, thrust = p[b] - p[a], np.linalg.norm(lift[a])
+        distance, down = np.linalg.norm(away), -lift[a] / thrust
+        distances[distance] = sorted((a, b))
+        force = 150.0 * (0.14 - distance) - 2.0 * (v[b] - v[a]) @ away / distance
+        touches[b] += (distance < 0.14) * max(force, 0.0) * away / distance
+        width = 0.065 + 0.1 * (away @ down)
+        speed = 0.9 * math.sqrt(2.0 * thrust / (AIR_DENSITY * math.pi)) / width
+        aside = np.linalg.norm(np.cross(away, down))
+        wakes[b] += (away @ down > 0.0) * speed * math.exp(-((aside / width) ** 2)) * down
+    for _ in range(2):  # nothing is left of the time before
+        bound(interact, block)()
+    assert near.touch_W[:count] == pytest.approx(touches, abs=1e-9)
+    assert near.wake_W[:count] == pytest.approx(wakes, abs=1e-9)
+    assert (near.least, [near.one, near.other]) == (pytest.approx(min(distances)), distances[min(distances)])
 
 
 @pytest.mark.skipif(
