@@ -231,7 +231,7 @@ class Firmware:
             self._notices.refuse("frozen", "poses frozen: they stay the same although the robot turns")
         elif answer == POSE_TOO_OLD and (age_us := self._core.data.fields.pose_age_us) > OLDEST_POSE_US:
             self._notices.refuse(
-                "age", f"poses {age_us / 1000:.0f} ms old: at most {OLDEST_POSE_US / 1000:.0f} ms"
+                "age", f"poses {(age_us + 500) // 1000} ms old: at most {OLDEST_POSE_US // 1000} ms"
             )
 
     def _pose_gated(self) -> None:

@@ -570,6 +570,18 @@ def test_core_and_firmware_arm_and_disarm_each_other_each_time(app: App) -> None
         assert go_on(core=1) == (True, True)
 
 
+@pytest.mark.parametrize("requests", [("armed", 0, 1), ("armed", 1, 0), ("stop", 0, 1), ("stop", 1, 0)])
+def test_of_two_requests_between_two_steps_the_one_to_stop_lasts(
+    app: App, requests: tuple[str, int, int]
+) -> None:
+    flying(app)
+    name, *values = requests
+    for value in values:
+        app.set(f"floaty.{name}", value)
+    app.step(1200)
+    assert (app.supervisor.armed, app.supervisor.stopped) == ((0, 0) if name == "armed" else (1, 1))
+
+
 def test_the_watchdog_of_the_stop_is_the_firmwares(app: App) -> None:
     app.boot()
     app.radio(b"\x04")
@@ -765,6 +777,20 @@ def test_a_pose_refused_soon_after_a_line_is_in_no_later_line(app: App) -> None:
         fly_on(app, first, length)
         app.c.stub_run_app(1)
     assert app.console().count("for absolute poses set extPose.absolute 1") == 1
+
+
+@pytest.mark.parametrize(
+    ("sent_us", "lines"), [(110_000, []), (110_500, ["poses 121 ms old: at most 120 ms"])]
+)
+def test_poses_are_named_too_old_above_the_limit(app: App, sent_us: int, lines: list[str]) -> None:
+    flying(app)
+    before = app.log("kalman.too_old")
+    app.radio(crtp.encode_ext_pose((0.01, -0.02, 0.05), yaw_quaternion(0.0), sent_us)[1:])  # waits 10 ms
+    for step in (1201, 1202):
+        app.step(step)
+    app.c.stub_run_app(1)
+    assert app.log("kalman.too_old") == before + 1  # for a horizon that is short so far
+    assert re.findall(r"poses .* old: .*", app.console()) == lines
 
 
 def test_a_packet_of_packed_poses_without_any_is_malformed(app: App) -> None:

@@ -137,9 +137,13 @@ def test_the_zero_of_the_boards_own_gyro_does_not_act_in_the_loop(app: App) -> N
 
 
 def test_a_board_that_leaves_the_loop_waits_for_a_pose_of_its_own(host: Host) -> None:
-    host.run(1000, poses=True)
+    host.run(1004, poses=True)  # near a tick: a pose would count
     assert host.app.supervisor.state == State.FLYING
-    host.run(1000 + HIL_WAITING + 600, sending=False)
+    host.client.execute([loop(Hil.OFF)])
+    host.app.radio(
+        encode_ext_pose((0.01, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)[1:]
+    )  # the host's last, which waits
+    host.run(600, sending=False)
     assert (host.app.supervisor.state, host.app.supervisor.cause) == (State.WAITING, Cause.NONE)
 
 
@@ -172,6 +176,9 @@ def test_servos_stay_at_hover_unless_they_are_to_move(library: Path, tmp_path: P
         host.run(1000, poses=True)
         assert list(host.looped[-1].counts) != hover
         assert app.counts() == (hover if mode == Hil.STILL else list(host.looped[-1].counts))
+        host.client.execute([loop(Hil.OFF)])
+        host.run(1, sending=False)
+        assert app.counts() == hover
 
 
 def test_a_board_that_flies_is_not_taken_into_the_loop(app: App) -> None:
@@ -207,6 +214,12 @@ def test_without_a_sample_the_flight_pauses_and_is_counted(host: Host) -> None:
     assert host.app.estimator() == stood != state
     host.run(100, poses=True)
     assert (host.looped[-1].state, host.looped[-1].late, host.looped[-1].fresh) == (State.FLYING, 0, 1)
+    for _ in range(10):  # each step of the tick is the last one before a pause
+        host.run(41)
+        host.run(HIL_WAITING, sending=False)
+        host.looped.clear()
+        host.run(20, sending=False)
+        assert [told.fresh for told in host.looped] == [0, 0]
 
 
 def test_a_loop_with_gaps_and_pauses_that_begins_again_is_like_the_first(host: Host) -> None:
