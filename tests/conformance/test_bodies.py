@@ -70,6 +70,26 @@ def test_a_push_moves_it_and_being_put_back_ends_that(body: Body, config: LabCon
     assert body.lost is None
 
 
+def test_it_is_lost_outside_its_limits_by_the_first_cause_and_flies_again_when_it_is_put_back(
+    body: Body, config: LabConfig
+) -> None:
+    for turn in range(2):
+        body.release()
+        body.push((30.0, 0.0, 60.0))
+        at_us = 5_000_000 * turn
+        while body.lost is None:
+            at_us += 10_000
+            body.advance(at_us)
+            assert at_us < 5_000_000 * turn + 3_000_000
+        first = body.lost
+        body.push((0.0, -90.0, -90.0))
+        body.advance(at_us + 500_000)
+        assert body.lost == first
+        body.push((0.0, 0.0, 0.0))
+        body.put_back(config.flight.home)
+        assert body.lost is None
+
+
 def test_it_draws_at_least_what_its_electronics_do(body: Body, config: LabConfig) -> None:
     body.advance(10_000)
     assert body.draw(10_000, 3.9) >= config.battery.electronics_power

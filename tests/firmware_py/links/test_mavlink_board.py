@@ -654,8 +654,10 @@ assert dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST == MISSING
 @pytest.mark.parametrize(
     ("asked", "error", "text"),
     [
-        *((("param_set", b"EXT_Z_P", value, 9), OUTSIDE, "EXT_Z_P") for value in (math.nan, -math.inf, 1e9)),
-        *((("param_set", b"DLY_ACTIVATE", value, 9), OUTSIDE, "DLY_ACTIVATE") for value in (2.0, 0.5, math.nan)),
+        *((("param_set", b"EXT_Z_P", value, 9), OUTSIDE, f"EXT_Z_P: {value:g} refused, -20..20")
+          for value in (math.nan, -math.inf, 1e9)),
+        *((("param_set", b"DLY_ACTIVATE", value, 9), OUTSIDE, f"DLY_ACTIVATE: {value:g} refused, 0..1")
+          for value in (2.0, 0.5, math.nan)),
         *((("param_set", b"EXT_Z_P", 2.0, kind), error, f"EXT_Z_P: type {name} refused, REAL32 is needed")
           for kind, error, name in ((6, FLOAT_NEEDED, "INT32"), (1, FLOAT_NEEDED, "UINT8"), (10, UNKNOWN_TYPE, "REAL64"),
                                     (99, UNKNOWN_TYPE, "99"))),

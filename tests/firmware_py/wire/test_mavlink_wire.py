@@ -210,7 +210,12 @@ def test_each_part_beside_position_and_yaw_is_seen_unless_its_group_is_masked(na
                 mavlink.read_target(over_the_wire(message))
 
 
-def test_station_is_a_station() -> None:
+def test_station_is_a_station_whose_requests_are_addressed_to_the_board() -> None:
+    for request in (
+        services.parameter_list(7), services.parameter_read(7, "A"), services.parameter_set(7, "A", 1.0),
+        services.command(7, 400), mavlink.target(0, V, 0.0, 7, 1),
+    ):  # fmt: skip
+        assert vector(over_the_wire(request), "target_system target_component") == [7, 1]
     message = over_the_wire(services.station_heartbeat())
     assert (message.type, message.autopilot) == (dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID)
     assert not message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED

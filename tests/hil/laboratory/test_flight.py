@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hil.board.clock import FreeRunning
 from hil.commands.tables import print_result, print_seeds
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.files.recorder import load_events, load_log
@@ -40,10 +41,17 @@ def test_hover_holds_its_limits(hovered: Result, tmp_path: Path, seed: int) -> N
 
 
 def test_flight_without_a_recorder_keeps_what_is_noted() -> None:
-    flight = lockstep_flight(Request.of(HOVER, duration_s=0.1))
+    class Late(FreeRunning):
+        said = iter([["late"]])
+
+        def notices(self) -> list[str]:
+            return next(self.said, [])
+
+    flight = lockstep_flight(Request.of(HOVER, duration_s=0.1), clock=Late())
     flight.note("lab", "before the start")
     assert flight.run().lost is None
     flight.close()
+    assert [flight._early.count(("lab", text)) for text in ("before the start", "late")] == [1, 1]
 
 
 @pytest.mark.parametrize(("board", "faults"), [("python", ()), ("c", ("push.y@0.6=20",))])

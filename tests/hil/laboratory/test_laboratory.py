@@ -1,18 +1,28 @@
 """Robots on one time line, without a wall clock: let go, lost, put back, rebooted, faulted; alone and beside others."""
 
 from collections.abc import Callable
+from itertools import count
+from types import SimpleNamespace
+from typing import ClassVar
 
 import pytest
 
+from firmware_py.firmware import Firmware
 from firmware_py.wire.crtp import PORT_CONSOLE
+from hil.board.board_firmware import PowerOn, PythonBoard
 from hil.board.clock import FreeRunning, Paced
 from hil.board.uart import VirtualSerial
 from hil.config import load_config
 from hil.emulator.crazyflie import syslink
 from hil.emulator.crazyflie.nrf51 import Power
+from hil.emulator.crazyflie.shockburst import TURN_ROUND_US, air_us, syslink_us
+from hil.emulator.events import EventQueue
 from hil.errors import LabError
+from hil.laboratory.experiments import find_experiment
 from hil.laboratory.faults import Fault, parse
 from hil.laboratory.laboratory import Laboratory
+from hil.laboratory.lockstep import ModelledLine, lockstep_flight
+from hil.laboratory.request import Request
 from hil.laboratory.robot import Ports, Robot, Site, Streams, nobody_listens
 from hil.servers.built_in_station import fly_built_in
 from hil.servers.live_faults import LiveFaults
@@ -129,6 +139,46 @@ def test_a_processor_that_hangs_is_reset_by_its_watchdog_and_goes_on_under_the_s
     assert sum("watchdog" in text for text in said) == 1
     assert sum("gyro zero found" in text for text in said) == 2  # it booted again
     assert bench.robot.thief.share == 0.0
+
+
+class Failing(PythonBoard):
+    """An executor whose firmware fails at each boot, as an image can."""
+
+    boots: ClassVar = count(1)
+
+    def boot(self, start: PowerOn) -> Firmware:
+        firmware = super().boot(start)
+        firmware.flashed = SimpleNamespace(failures=[f"boot {next(self.boots)}"], resets=0)  # type: ignore[misc]
+        return firmware
+
+
+def test_after_every_boot_the_failures_before_are_known_and_the_same_load_takes_its_share() -> None:
+    site = Site(load_config(), EventQueue(), Streams.of_seed(0), lambda *_: None, Failing())
+    robot = Robot(site, Ports(nobody_listens))
+    robot.thief.share = 0.5
+    for boots in (1, 2, 3):
+        assert robot.failures == tuple(f"boot {number}" for number in range(1, boots + 1))
+        robot.run(robot.booted_us + 20_000)
+        scheduler = robot.firmware.scheduler
+        times = dict(zip((task.name for task in scheduler.tasks), scheduler.run_times_us(), strict=True))
+        assert times["THIEF"] == pytest.approx(10_000, abs=500)
+        robot.boot(robot.booted_us + SECOND_US)
+
+
+def test_a_line_passes_the_pilots_notices_once_and_a_peers_packet_after_its_time() -> None:
+    flight = lockstep_flight(Request.of(find_experiment("hover"), duration_s=0.1))
+    line, heard = flight.line, []
+    assert isinstance(line, ModelledLine)
+    line._pilot = SimpleNamespace(notices=["armed"])  # type: ignore[assignment]
+    assert [line.new_messages(0).count(("station", "armed")) for _ in range(2)] == [1, 0]
+    line.robot.packet_received = lambda *what: heard.append(what)  # type: ignore[method-assign]
+    packet = bytes(10)
+    line.hear_peer(7_000, packet)
+    line.radio.medium.uplink_loss = 1.0
+    line.hear_peer(8_000, b"lost")
+    flight.run()
+    at_us = 7_000 + TURN_ROUND_US + air_us(10, 2_000_000) + syslink_us(packet)
+    assert [one for one in heard if one[2:]] == [(at_us, packet, True)]
 
 
 def test_the_battery_of_a_served_robot_empties() -> None:

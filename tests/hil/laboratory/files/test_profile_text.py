@@ -1,6 +1,7 @@
 """The files of a processor profile and of coverage from values written by hand, and the instants of `floaty debug`."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,9 +20,12 @@ from hil.emulator.stm32f405.cpu_profile import (
     TaskTimes,
 )
 from hil.errors import LabError
+from hil.laboratory.experiments.position import HOVER
+from hil.laboratory.files import debugging
 from hil.laboratory.files.coverage import Executed, add_executed, base_of, check_coverage, read_executed
 from hil.laboratory.files.cpu_profile import files_of, write_profile
 from hil.laboratory.files.debugging import begin_us
+from hil.laboratory.request import Bench, Request
 
 US = 168  # cycles
 MS = 1000 * US
@@ -130,3 +134,31 @@ def test_a_flight_is_debugged_from_before_its_crash_or_a_time(tmp_path: Path) ->
     (tmp_path / "events.jsonl").unlink()
     with pytest.raises(LabError, match="has no crash"):
         begin_us(crashed, "crash", 0.5)
+
+
+def test_only_a_flight_of_the_same_image_in_lockstep_is_flown_again_and_waits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(debugging, "read_image", lambda path, elf: [SimpleNamespace(sha256="same")])
+    bench = Bench(board=str(tmp_path / "cf2.bin"))
+    request = Request(HOVER, "crazyflie", (), 3, 8.0, (), bench)
+
+    def asked(image: str | None, **options: Any) -> Request:
+        found = image and SimpleNamespace(sha256=image)
+        flown: Any = SimpleNamespace(
+            request=replace(request, bench=replace(bench, **options)), folder=tmp_path, image=found
+        )
+        return debugging.debugged_request(flown)
+
+    again = replace(request, bench=replace(bench, gdb=0))
+    assert asked("same") == asked(None) == again  # None: the process was killed
+    with pytest.raises(LabError, match=r"another image than the one that flew in .*: fly it again"):
+        asked("other")
+    for option in ({"board": "c"}, {"link": "mavlink:udp"}, {"realtime": True}):
+        with pytest.raises(LabError, match="only flights of an image in lockstep are debugged"):
+            asked("same", **option)
+    monkeypatch.setattr(debugging, "in_lockstep", lambda *given: given)
+    flight_of = debugging.waiting_flight(3333, 7_000_000)
+    assert flight_of(again, tmp_path, None) == (  # type: ignore[arg-type, comparison-overlap]
+        replace(request, bench=replace(bench, gdb=3333)), tmp_path, None, 7_000_000,
+    )  # fmt: skip
