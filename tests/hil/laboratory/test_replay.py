@@ -6,9 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from firmware_py.config import parameters_of
+from firmware_py.core.structs import MODE_FLY
+from firmware_py.core.subset import i32
+from firmware_py.core_runner import CoreBlocks
 from hil import LabError, Run, fly, load_run
 from hil.config import load_config
-from hil.laboratory.replay import misses, replay
+from hil.laboratory.replay import Shadowed, misses, replay
 from support.command import Cli
 
 STATES = [*"xyz", "vx", "vy", "vz", "roll", "pitch", "yaw", *"pqr", *(f"flap_{n}" for n in (1, 2, 3, 4))]
@@ -53,6 +57,19 @@ def test_another_core_gets_the_inputs_of_the_flight_and_moves_nothing(flown: Run
     lqr = replayed(flown, tmp_path / "lqr", "logic.controller=lqr")
     assert misses(lqr.folder)[0] == misses(lqr.folder)[1]  # the commands that flew moved the flaps
     assert not np.array_equal(lqr.log.column("replay.u1"), lqr.log.column("control.u1"))
+
+
+def test_the_second_core_keeps_its_own_commands_and_estimates_with_those_that_flew() -> None:
+    beside = load_config(overrides=("logic.controller=lqr",))
+    made = CoreBlocks(parameters_of(load_config()), lambda blocks: Shadowed(blocks, beside))
+    shadow = made.run._shadow  # type: ignore[attr-defined]
+    for name in ("reset", "estimate", "control", "estimate"):
+        made.data.fields.mode, made.data.fields.pose_quaternion[0] = i32(MODE_FLY), 1.0
+        made.estimator.fields.now[:3] = shadow.estimator.fields.now[:3] = (0.02, -0.03, 0.05)
+        own = shadow.control.bytes()
+        made.run.call(name)
+    assert shadow.control.bytes() == own != made.control.bytes()
+    assert shadow.estimator.bytes() == made.estimator.bytes()
 
 
 def test_the_command_shows_both_and_the_report_draws_them(flown: Run, cli: Cli, tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """Laws of the air: mean profile, gust statistics, and the knobs of the tunnel."""
 
 import math
+import re
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from pydantic import ValidationError
 from hil.errors import LabError
 from hil.world.config import GeometryConfig, PlantConfig, PlantServoConfig, TunnelConfig
 from hil.world.floaty.plant import Plant
+from hil.world.tunnel import Tunnel
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 
@@ -112,17 +115,30 @@ def test_gusts_grow_towards_the_edge_and_then_no_more() -> None:
     assert flow(plant, 0, 0, 1.0)[0] == pytest.approx(0.5 * u)
 
 
-def test_knobs_refuse_invalid_wind() -> None:
+@pytest.mark.parametrize(
+    ("knob", "low", "high"),
+    [
+        (Tunnel.set_fan_factor, 0.0, 2.0),
+        (Tunnel.set_gust_scale, 0.0, 5.0),
+        (lambda tunnel, wind: tunnel.set_side_wind(wind, 0.0), -20.0, 20.0),
+        (lambda tunnel, wind: tunnel.set_side_wind(0.0, 0.0, wind), -20.0, 20.0),
+        (lambda tunnel, x: tunnel.block(x, 0.0, 0.1, 0.5), -2.0, 2.0),
+        (lambda tunnel, y: tunnel.block(0.0, y, 0.1, 0.5), -2.0, 2.0),
+        (lambda tunnel, radius: tunnel.block(0.0, 0.0, radius, 0.5), 0.01, 5.0),
+        (lambda tunnel, depth: tunnel.block(0.0, 0.0, 0.1, depth), 0.0, 1.0),
+    ],
+)
+def test_knobs_take_what_is_within_their_bounds_and_nothing_else(
+    knob: Callable[[Tunnel, float], None], low: float, high: float
+) -> None:
     tunnel = make().tunnel
-    for turn in (
-        lambda: tunnel.set_fan_factor(math.nan),
-        lambda: tunnel.set_fan_factor(-0.1),
-        lambda: tunnel.set_gust_scale(6.0),
-        lambda: tunnel.set_side_wind(math.inf, 0.0),
-        lambda: tunnel.block(0.0, 0.0, 0.0, 0.5),
-        lambda: tunnel.block(0.0, 0.0, 0.1, 1.5),
-    ):
-        with pytest.raises(LabError, match="outside"):
-            turn()
+    for value in (low, high):
+        knob(tunnel, value)
+        for outside in (math.nextafter(low, -math.inf), math.nextafter(high, math.inf), math.nan):
+            with pytest.raises(LabError, match=re.escape(f"= {outside}: outside {low:g}..{high:g}")):
+                knob(tunnel, outside)
+
+
+def test_an_unknown_turbulence_is_refused() -> None:
     with pytest.raises(ValidationError):
         TunnelConfig.model_validate({"turbulence": "T2"})
