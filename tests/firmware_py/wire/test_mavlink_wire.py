@@ -189,7 +189,10 @@ GROUPS = ({"vx", "vy", "vz"}, {"afx", "afy", "afz"}, {"yaw_rate"})
 @pytest.mark.parametrize("name", BESIDE)
 def test_each_part_beside_position_and_yaw_is_seen_unless_its_group_is_masked(name: str) -> None:
     group = next(sum(BESIDE[one] for one in group) for group in GROUPS if name in group)
-    for value, ignored, moves in ((1.0, 0, True), (nan, 0, False), (0.0, 0, False), (1.0, group, False)):
+    others = group - BESIDE[name]
+    for value, ignored, moves in (
+        (1.0, 0, True), (nan, 0, False), (0.0, 0, False), (1.0, group, False), (1.0, others, True),
+    ):  # fmt: skip
         fields = {one: value * (one == name) for one in BESIDE} | {name: value}
         mask = (sum(BESIDE.values()) - group) | ignored
         message = dialect.MAVLink_set_position_target_local_ned_message(
@@ -278,6 +281,10 @@ def test_status_has_the_standards_units() -> None:
     stale = over_the_wire(mavlink.sys_status(3900, 0.05, 0, 0.25, imu_alive=False))
     failed = dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO | dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL
     assert stale.onboard_control_sensors_health == message.onboard_control_sensors_health & ~failed
+    pulses, counts = [1499, 1500, 1500, 1501], (31_489, 31_490, 31_510, 31_511)  # 21 a microsecond
+    raw = over_the_wire(mavlink.servo_outputs(7, counts))
+    assert vector(raw, "servo1_raw servo2_raw servo3_raw servo4_raw") == pulses
+    assert over_the_wire(mavlink.actuator_outputs(7, counts)).actuator[:5] == [*pulses, 0]
 
 
 def test_estimator_tells_health_and_accuracy() -> None:
