@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from hil.config import LabConfig, load_config
 from hil.laboratory.bodies import BODIES, make_body
 from hil.world.body import Body
+from hil.world.in_tunnel import TunnelBody
 from hil.world.scene import VisualModel
 from support.paths import ROOT
 
@@ -88,6 +90,18 @@ def test_it_is_lost_outside_its_limits_by_the_first_cause_and_flies_again_when_i
         body.push((0.0, 0.0, 0.0))
         body.put_back(config.flight.home)
         assert body.lost is None
+
+
+def test_each_foot_stands_on_the_floor_however_it_is_tilted(body: Body) -> None:
+    assert isinstance(body, TunnelBody)
+    memory = body._body
+    for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        foot = np.array((x * memory.foot_spread, y * memory.foot_spread, -memory.foot_below))
+        turn, _ = Rotation.align_vectors([[0.0, 0.0, -1.0]], [foot])
+        for above in (-1e-4, 1e-4):
+            height = body.room.floor + float(np.linalg.norm(foot)) + above
+            body.place((0.0, 0.0, height), tuple(turn.as_quat(scalar_first=True)))
+            assert (memory.ground[2] > 0.0) == (above < 0.0)
 
 
 def test_it_draws_at_least_what_its_electronics_do(body: Body, config: LabConfig) -> None:

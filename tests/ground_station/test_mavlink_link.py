@@ -345,6 +345,11 @@ def test_a_text_in_pieces_is_one_line_unless_its_beginning_was_lost():
     assert list(bench.link.texts) == []
     bench.hear(10, last, *services.status_text(6, "short"), *services.status_text(6, line[:60], 10))
     assert list(bench.link.texts) == [f"board: {line}", "board: short", f"board: {line[:60]}"]
+    for length in (50, 51, 100, 101):
+        pieces = services.status_text(6, line[:length], length)
+        assert (len(pieces) == 1) == (length == 50)
+        bench.hear(20, *pieces)
+        assert bench.link.texts[-1] == f"board: {line[:length]}"
 
 
 @pytest.mark.parametrize(("result", "word"), [(2, "denied"), (5, "in progress"), (77, "77")])

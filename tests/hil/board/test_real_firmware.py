@@ -126,6 +126,18 @@ def test_a_loop_s_delay_is_that_of_the_samples_between_and_half_of_what_no_buffe
     assert link.sent[sent:] == [other], "a packet of its port that is no pose is passed on"
 
 
+def test_a_correction_waits_for_the_link_until_a_newer_one_replaces_it_and_is_sent_once() -> None:
+    link = Link()
+    link.ready = False
+    for x in (0.1, 0.2):
+        link.firmware.radio_received(encode_ext_pose((x, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 30_000))
+    assert link.sent == []
+    link.ready = True
+    link.samples(3)
+    poses = [decode_ext_pose(packet.data) for packet in map(decode, link.sent) if packet.port != PORT_CORE]
+    assert [pose.p_GB[0] for pose in poses] == [pytest.approx(0.2)]
+
+
 @pytest.mark.parametrize(("waiting", "shift_us"), [(8, 0), (9, 25), (7, -25), (48, 1000), (49, 1000)])
 def test_the_plant_is_shifted_by_the_samples_that_wait_on_board(waiting: int, shift_us: int) -> None:
     link = Link()
