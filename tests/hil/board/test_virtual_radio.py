@@ -262,6 +262,10 @@ def test_uplink_jitter_delays_within_its_bound_and_can_be_switched_in_flight():
     assert max(latencies) < 15_000 + 2000
     assert np.std(latencies) == pytest.approx(15_000 / np.sqrt(12), rel=0.1)
     assert bench.radio.air.exchanges == 500
+    up = bench.radio.up
+    assert (up.latency_sum_us, up.latency_max_us) == (sum(latencies), max(latencies)), (
+        "also of the wait at the host"
+    )
     bench.radio.medium.uplink_jitter_us = 0
     bench.radio.uplink(9_999_999, bytes(POSE))
     bench.events.run(10_002_000)
@@ -293,6 +297,7 @@ def test_downlink_jitter_delays_answers_and_keeps_their_order() -> None:
         for number in range(4):
             assert bench.radio.downlink(bench.events.now_us, bytes((number,)))
         bench.events.run(1_000_000)
+        assert bench.radio.down.latency_sum_us == sum(now_us for now_us, _ in bench.on_ground)
         assert bench.radio.down.delivered == 4
     assert shaken.radio.down.latency_max_us > calm.radio.down.latency_max_us + 5_000
 

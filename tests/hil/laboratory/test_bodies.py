@@ -140,7 +140,9 @@ def test_a_torque_turns_it_and_a_push_moves_it(tmp_path: Path, factor: float) ->
     ],
 )  # fmt: skip
 def test_a_mistake_in_the_file_is_one_line(robot: str, line: str, tmp_path: Path) -> None:
-    assert made(tmp_path, robot).startswith(f"robot.body = robot.py: {line}")
+    text = made(tmp_path, robot)
+    assert text.startswith(f"robot.body = robot.py: {line}")
+    assert not text.endswith(" s"), "it is no instant of a flight"
 
 
 def test_a_missing_file_and_an_unknown_name_are_one_line(tmp_path: Path) -> None:
@@ -172,6 +174,18 @@ def test_a_body_that_fails_in_flight_is_lost_with_the_cause(value: str, cause: s
     result = hover(tmp_path / "run", "flight.release_us=100000", profile=profile, duration_s=0.2)
     assert result.outcome == "lost"
     assert str(result.cause).startswith(f"{cause} at 0.2")
+
+
+def test_a_body_that_has_failed_is_clamped_where_it_is(tmp_path: Path) -> None:
+    robot = FLOATING.replace("0.981", "1.5 if self.time_s < 0.2 else 1 / 0")
+    body = make_body(load_config(project(tmp_path, robot)), np.random.default_rng(1), (0.0, 0.0, 1.15))
+    body.advance(300_000)
+    place = body.state.tolist()
+    assert place[2] > 1.2
+    assert str(body.lost).endswith("division by zero at 0.20 s")
+    body.advance(600_000)
+    assert body.state.tolist() == place
+    assert body.specific_force_B == pytest.approx([0.0, 0.0, 9.81])
 
 
 def test_the_tutorial_shows_the_robot_that_a_new_project_has() -> None:

@@ -1,9 +1,7 @@
 """Robots on one time line, without a wall clock: let go, lost, put back, rebooted, faulted; alone and beside others."""
 
 from collections.abc import Callable
-from itertools import count
 from types import SimpleNamespace
-from typing import ClassVar
 
 import pytest
 
@@ -141,28 +139,32 @@ def test_a_processor_that_hangs_is_reset_by_its_watchdog_and_goes_on_under_the_s
     assert bench.robot.thief.share == 0.0
 
 
-class Failing(PythonBoard):
-    """An executor whose firmware fails at each boot, as an image can."""
+def test_each_boot_has_the_failures_before_the_same_load_and_a_board_whose_time_begins() -> None:
+    begun: list[int] = []
+    sent: list[bytes] = []
 
-    boots: ClassVar = count(1)
+    class Failing(PythonBoard):
+        """An executor whose firmware fails at each boot, as an image can."""
 
-    def boot(self, start: PowerOn) -> Firmware:
-        firmware = super().boot(start)
-        firmware.flashed = SimpleNamespace(failures=[f"boot {next(self.boots)}"], resets=0)  # type: ignore[misc]
-        return firmware
+        def boot(self, start: PowerOn) -> Firmware:
+            begun.append(start.board.now_us)  # type: ignore[attr-defined]
+            assert start.board.radio_send(b"lost: it boots")
+            firmware = super().boot(start)
+            firmware.flashed = SimpleNamespace(failures=[f"boot {len(begun)}"], resets=0)  # type: ignore[misc]
+            return firmware
 
-
-def test_after_every_boot_the_failures_before_are_known_and_the_same_load_takes_its_share() -> None:
     site = Site(load_config(), EventQueue(), Streams.of_seed(0), lambda *_: None, Failing())
-    robot = Robot(site, Ports(nobody_listens))
+    robot = Robot(site, Ports(lambda now_us, data: not sent.append(data)))
     robot.thief.share = 0.5
     for boots in (1, 2, 3):
         assert robot.failures == tuple(f"boot {number}" for number in range(1, boots + 1))
+        assert begun[-1] == robot.booted_us
         robot.run(robot.booted_us + 20_000)
         scheduler = robot.firmware.scheduler
         times = dict(zip((task.name for task in scheduler.tasks), scheduler.run_times_us(), strict=True))
         assert times["THIEF"] == pytest.approx(10_000, abs=500)
         robot.boot(robot.booted_us + SECOND_US)
+    assert sent == []
 
 
 def test_a_line_passes_the_pilots_notices_once_and_a_peers_packet_after_its_time() -> None:
