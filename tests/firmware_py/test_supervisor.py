@@ -244,6 +244,7 @@ def test_every_cause_ends_as_documented_each_time_and_by_nothing_else(
         assert bench.view.recover() == (cause is not Cause.LOW_BATTERY)
         bench.data.battery_mv = bench.parameters.low_battery_mv
         assert bench.view.recover()
+        bench.data.battery_mv -= cause is Cause.LOW_BATTERY  # its five seconds begin anew
 
     actions: dict[str, Callable[[SupervisorBench], object]] = {
         "pose": lambda bench: bench.fly(10_000),

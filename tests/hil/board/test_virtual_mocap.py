@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from ground_station.mocap import MocapFrame
 from ground_station.unused import Reason
 from hil.board.cameras import VirtualMocap
-from hil.board.config import MocapConfig
+from hil.board.config import MarkersConfig, MocapConfig
+from hil.board.markers import VirtualMarkers
 from hil.world.floaty.plant import Plant
 from support.still_plant import still_plant
 
@@ -102,6 +103,13 @@ def test_frozen_frames_repeat_the_last_pose_with_new_stamps_until_it_thaws_to_th
     # As a station judges OptiTrack's.
     assert [frame.valid for frame in seen[5:15]] == [True] * 2 + [False] * 8
     assert {frame.unused[0] for frame in seen[7:15]} == {Reason.FROZEN}
+    markers = VirtualMarkers(MarkersConfig(), plant.markers, np.random.default_rng(1))
+    mocap = VirtualMocap(MocapConfig(), np.random.default_rng(1), markers)
+    mocap.expose(0, plant)
+    kept = mocap.sighting
+    mocap.frozen = 1.0
+    mocap.expose(5000, plant)
+    assert mocap.sighting is kept is not None
 
 
 def test_a_system_that_freezes_without_the_body_does_not_see_it() -> None:
