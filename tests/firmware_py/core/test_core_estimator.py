@@ -549,12 +549,20 @@ def test_state_beyond_its_bounds_is_held_there_and_counted() -> None:
     assert core.now[0] == pytest.approx(0.1, abs=1e-3)
 
 
-def test_estimated_flaps_are_held_within_their_bounds() -> None:
-    core = settled()
-    for _ in range(100):
-        core.tick(command=(9, -9, 9, -9))
-    assert core.x[12:16] == pytest.approx([1.6, -1.6, 1.6, -1.6])
-    assert "resets" not in core.counters
+BOUNDS = np.repeat(np.float32([1.1, 2.2, 0.7, 3.3, 1.6]), (3, 3, 3, 3, 4))
+
+
+@pytest.mark.parametrize("state", [state for state in range(16) if state != 8])  # not the yaw
+@pytest.mark.parametrize("sign", [1, -1])
+def test_each_state_is_held_at_its_own_bound_and_counted(state: int, sign: int) -> None:
+    core = Core(bound_position=1.1, bound_velocity=2.2, bound_tilt=0.7, bound_rate=3.3)
+    for far in (9.0, 0.5):
+        core.fields.x[:] = 0.1
+        core.fields.x[state] = far * sign
+        estimator.keep_sane(core.parameters.fields, core.fields)
+        held = np.where(np.arange(16) == state, sign * min(far, BOUNDS[state]), np.float32(0.1))
+        assert core.x.tolist() == held.astype(np.float32).tolist()
+        assert core.counters["bounded"] == 1
 
 
 def test_variances_do_not_grow_beyond_their_bound() -> None:
