@@ -43,6 +43,16 @@ def test_words_and_counts_of_300_flap_positions_are_the_original_firmwares() -> 
         assert fields.count.tolist() == row["counts"]
 
 
+def test_a_word_from_outside_is_that_of_its_servo_whatever_its_trim_and_direction() -> None:
+    core = CoreBlocks(parameters_of(CONFIG), default_runner)
+    core.parameters.fields.trim[:], core.parameters.fields.direction[:] = (0, 300, -700, 0), (1, -1, 1, -1)
+    core.data.fields.mode, core.data.fields.by_words = MODE_MANUAL, 1
+    for word in range(0, 65_536, 97):
+        core.data.fields.words[:] = words = (word, 65_535 - word, (word + 20_000) % 65_536, word)
+        core.run.call("control")
+        assert core.control.fields.word.tolist() == list(words)
+
+
 def test_every_word_has_the_count_of_the_original_firmwares_timer() -> None:
     got = [int(servo.count_of_word(np.int32(word))) for word in WORDS["words"]]
     assert got == WORDS["counts"]

@@ -105,6 +105,7 @@ def test_the_app_takes_back_what_the_python_board_refuses_and_nothing_else(app: 
         app.radio(data, PORT, 0)
         waiting.append(data)
         answers = list(iter(app.sent, b""))
+        assert app.suspended.value == 0
         refused.append(bool(answers))
         if answers:
             errors = (*[EBUSY] * (len(waiting) - 1), ENOEXEC)

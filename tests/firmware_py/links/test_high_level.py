@@ -8,6 +8,8 @@ from cflib.crazyflie.commander import Commander
 from cflib.crazyflie.high_level_commander import HighLevelCommander
 from scipy.spatial.transform import Rotation
 
+from firmware_py.core.structs import GOAL_OF_CORRECTIONS
+from firmware_py.core.subset import i32
 from firmware_py.signals import COUNTERS
 from firmware_py.wire import crtp
 from support.crtp_client import LOG, PARAM, CrtpClient
@@ -98,6 +100,27 @@ def test_what_cannot_be_flown_is_named_once_on_the_console(absolute: Flyer) -> N
         "commander: high-level command 63: unknown",
         "commander: set-point not followed: only positions are",
     ]
+
+
+def test_a_reason_that_comes_again_after_a_followed_set_point_is_named_again(absolute: Flyer) -> None:
+    line = "commander: set-point not followed: only positions are"
+    for times in (1, 2):
+        absolute.post(absolute.low_level.send_velocity_world_setpoint, 0.0, 0.0, 1.0, 0.0)
+        absolute.wait(0.02)
+        assert absolute.console.count(line) == times
+        for _ in range(21):  # longer than lines of one kind are withheld
+            absolute.post(absolute.low_level.send_position_setpoint, *HERE, 0.0)
+            absolute.wait(0.48)
+
+
+def test_to_ask_whether_a_place_is_admitted_changes_nothing_that_flies(absolute: Flyer) -> None:
+    data = absolute.firmware._core.data.fields
+    data.goal[:], data.goal_velocity[:], data.goal_kind = (1, 2, 3, 4), (5, 6, 7), i32(GOAL_OF_CORRECTIONS)
+    before = {name: absolute.firmware.inputs[name].tolist() for name in absolute.firmware.inputs.dtype.names}
+    for goal in (None, (0.1, 0.2, 0.3)):
+        absolute.firmware.pilot.admits_place((9.0, 9.0, 9.0), goal, absolute=True)
+    after = {name: absolute.firmware.inputs[name].tolist() for name in before}
+    assert {name for name in before if before[name] != after[name]} == {"setpoint"}
 
 
 def test_a_stream_that_stops_without_the_notice_is_reported_before_the_board_locks(absolute: Flyer) -> None:

@@ -7,7 +7,9 @@ from typing import Any
 import pytest
 
 from firmware_py.config import parameters_of
-from firmware_py.core.structs import MODE_FLY
+from firmware_py.core.guard import Guard, note_faults
+from firmware_py.core.structs import MODE_FLY, Supervisor
+from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks
 from firmware_py.firmware import Firmware
 from firmware_py.links.parameters import Parameter
@@ -154,3 +156,16 @@ def test_not_a_number_is_stopped_everywhere(loop: CoreBlocks, wrong: float, plac
     hover = float(loop.parameters.fields.hover_angle)
     assert loop.control.fields.flap.tolist() == pytest.approx([hover, -hover, hover, -hover])
     assert loop.control.fields.u.tolist() == loop.control.fields.command.tolist() == [0.0] * 4
+
+
+def test_the_failures_of_each_module_are_noted_once_each_time() -> None:
+    supervisor, guarded = Supervisor.allocate().fields, Guard.allocate().fields
+    for estimator, controller, cause in (
+        (1, 0, Cause.ESTIMATOR_NOT_FINITE), (0, 0, Cause.NONE), (0, 2, Cause.CONTROLLER_NOT_FINITE), (0, 0, Cause.NONE),
+        (1, 1, Cause.ESTIMATOR_NOT_FINITE), (0, 0, Cause.NONE), (0, 1, Cause.CONTROLLER_NOT_FINITE),
+    ):  # fmt: skip
+        guarded.estimator_faults = i32(guarded.estimator_faults + estimator)
+        guarded.controller_faults = i32(guarded.controller_faults + controller)
+        supervisor.not_finite = i32(Cause.NONE)
+        note_faults(supervisor, guarded)
+        assert supervisor.not_finite == cause

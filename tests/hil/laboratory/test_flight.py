@@ -173,6 +173,7 @@ def test_an_error_of_the_firmware_ends_the_flight_with_its_log(tmp_path: Path) -
 
 
 def test_log_carries_units_frames_and_origin(hovered: Result) -> None:
+    assert hovered.real_time_factor == round(hovered.real_time_factor, 2)
     table = load_log(hovered.folder)
     assert table.schema.field("truth.x").metadata == {b"unit": b"m", b"frame": b"W"}
     assert table.schema.field("motor.m1").metadata[b"unit"] == b"counts"

@@ -8,6 +8,8 @@ import pytest
 
 from hil import Along, Experiment, Goal, LabError, Request
 from hil.api import request_of
+from hil.config import load_config
+from hil.laboratory.request import why_left
 
 Place = tuple[float, float, float]
 
@@ -53,6 +55,30 @@ def test_a_goal_that_cannot_be_followed_is_refused_in_one_line(
 )
 def test_a_goal_that_can_be_followed_is_not(path: Callable[[float], Place]) -> None:
     request_of("hover", duration_s=6.0, trajectory=Along(path))
+
+
+LIMITS = {
+    "floaty": (
+        "tunnel.hover_height=1",
+        "plant.limits.radius=0.5",
+        "plant.limits.below=0.75",
+        "plant.limits.above=0.75",
+    ),
+    "crazyflie": ("quadrotor.room=0.5", "quadrotor.ceiling=1.75"),
+}
+
+
+@pytest.mark.parametrize(("profile", "lowest"), [("floaty", 0.25), ("crazyflie", 0.0)])
+@pytest.mark.parametrize("axis", range(3))
+def test_a_place_on_the_limit_is_inside_and_the_next_one_outside(
+    axis: int, profile: str, lowest: float
+) -> None:
+    config = load_config(profile, LIMITS[profile])
+    low, high = (lowest, 1.75) if axis == 2 else (-0.5, 0.5)
+    for at, inside in ((low, True), (high, True), (low - 1e-9, False), (high + 1e-9, False)):
+        place = [0.0, 0.0, 1.0]
+        place[axis] = at
+        assert (why_left(config, place) == "") == inside
 
 
 @pytest.mark.parametrize("goal", [Goal((0.0, math.nan, 1.15), 0.0), Goal((0.0, 0.0, 1.15), math.inf)])

@@ -61,7 +61,10 @@ def test_a_robot_flies_in_its_holder_for_a_second_before_each_release() -> None:
 
     flying_s, released_s = heard_s("supervisor: flying"), heard_s("released")
     assert released_s - flying_s == pytest.approx(1.0, abs=0.03)
-    lost_s, released_s = heard_s("it is put back"), heard_s("released")
+    lost_s = heard_s("it is put back")
+    assert not bench.robot.free
+    released_s = heard_s("released")
+    assert bench.robot.free
     assert released_s - lost_s == pytest.approx(2.0, abs=0.03)
     assert sum("supervisor" in text for text in bench.said) == 1
     assert not any(
@@ -292,6 +295,15 @@ def test_a_packet_to_a_board_without_power_is_lost() -> None:
     bench.robot.packet_received(0, bytes((PORT_CONSOLE << 4,)))
     bench.robot.uart_ready(0)
     assert bench.fly(0.1) == []
+
+
+def test_progress_is_shown_at_most_every_quarter_of_a_second_also_after_a_gap() -> None:
+    lab, shown = Laboratory(FreeRunning()), list[int]()
+    for ms in (20, 100, 900, 910, 920, 1_149, 1_151):
+        lab.events.at(1_000 * ms, lambda _: None)
+    lab.end_at(1_160_000)
+    lab.run(shown.append)
+    assert shown == [100_000, 900_000, 1_151_000]
 
 
 def test_an_experiment_that_plans_events_at_one_instant_without_end_is_one_clear_line() -> None:
