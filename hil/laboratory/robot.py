@@ -270,10 +270,9 @@ class Robot:
         self.free = False
 
     def put_back(self, now_us: int) -> None:
-        """Return the body to the holder, as at the start; actuators, air and faults stay unchanged."""
+        """Return a caught body to the holder, as at the start; actuators, air and faults stay unchanged."""
         self.body.advance(now_us)
         self.body.put_back(self.start_W)
-        self.free = False
 
     def advance_truth(self, now_us: int) -> str | None:
         """Advance the truth and the battery to this time; return why the flight is over, None while it is not."""

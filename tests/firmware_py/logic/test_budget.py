@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from firmware_py.config import parameters_of
-from firmware_py.core.budget import CALL_CYCLES
+from firmware_py.core.budget import CALL_CYCLES, LoopBudget, begin_call, charged_end
 from firmware_py.core.structs import MODE_FLY
+from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks
 from firmware_py.logic.budget import CLOCK_MHZ
 from firmware_py.logic.loading import load_logic
@@ -200,6 +201,18 @@ def test_a_data_dependent_loop_stops_equally_on_every_target(
     if harmless is not None:
         call(harmless)
         assert (guard.controller_faults, overrun(blocks)[-len(where) :]) == (1, where)
+
+
+@pytest.mark.parametrize("start", [0, 3, -3, -9, -(2**31)])
+def test_a_loop_fits_to_the_last_cycle_and_the_first_that_does_not_is_named(start: int) -> None:
+    budget = LoopBudget.allocate().fields
+    begin_call(budget, i32(CALL_CYCLES - 70))
+    assert charged_end(budget, i32(start), i32(start + 7), i32(10), i32(11)) == start + 7
+    assert (budget.cycles, budget.exceeded, budget.line) == (CALL_CYCLES, 0, 0)
+    for line, cycles in ((12, 69), (13, 0)):
+        begin_call(budget, i32(CALL_CYCLES - cycles))
+        assert charged_end(budget, i32(start), i32(start + line - 5), i32(10), i32(line)) == start
+        assert (budget.exceeded, budget.line, budget.end) == (1, 12, start + 7)
 
 
 @pytest.mark.parametrize("board", EVERY)
