@@ -5,7 +5,9 @@ import pytest
 from cflib.utils.encoding import compress_quaternion
 from scipy.spatial.transform import Rotation
 
+from firmware_py.core import repetition
 from firmware_py.core.structs import POSE_FROZEN, POSE_ON_TIME
+from firmware_py.core.subset import i32
 from support.core_bench import LEVEL, Core, counts, quaternion
 
 PLACE = (0.1, -0.2, 0.3)
@@ -63,6 +65,23 @@ def test_poses_from_before_the_turn_are_used(age_us: int, known: bool) -> None:
     first_us = 10_000 * PERIOD * kicked.index(POSE_FROZEN)
     oldest_us = age_us if known else 120_000
     assert oldest_us <= first_us <= oldest_us + 20_000
+
+
+@pytest.mark.parametrize(
+    ("ticks", "age_us", "frozen"),
+    [(0, 0, False), (4, 40_000, True), (4, 40_001, False), (12, -1, False), (13, -1, True)],
+)
+def test_a_repeated_pose_is_frozen_when_it_was_exposed_after_the_turn(
+    ticks: int, age_us: int, frozen: bool
+) -> None:
+    core = Core()
+    sampling = core.sampling.fields
+    core.data.fields.pose_age_us, sampling.turned_ticks = i32(age_us), i32(ticks)
+    assert repetition.frozen(core.data.fields, sampling) == frozen
+    repetition.add_turn(core.parameters.fields, core.data.fields, sampling)
+    assert sampling.turned_ticks == (min(ticks + 1, 13) if ticks else 0), (
+        "no more are counted than may matter"
+    )
 
 
 def test_a_turn_by_half_of_the_limit_changes_the_coarsest_pose() -> None:

@@ -12,6 +12,7 @@ import pytest
 from firmware_py.export.usage import EntryLoad, Usage
 from firmware_py.rtos import TaskReport
 from ground_station.latency import Stage
+from hil.board.board_firmware import ImageReport
 from hil.errors import LabError
 from hil.laboratory.experiment import Source, unknown
 from hil.laboratory.experiments import EXPERIMENTS, find_again
@@ -53,6 +54,7 @@ def result(tmp_path: Path) -> Result:
         tasks=(TaskReport("KALMAN", 2, 50, 100, 900, 30, (1,) * 12, None, 0),), queues=(QueueReport("log", 5, 2, 0),),
         usage=Usage(7530, 4820, 256, {"estimate": EntryLoad(3, 100, 120, 50, 60)}), ages=(Stage("pose", 40.5, 41.0),),
         hash="ab" * 32, real_time_factor=12.34, stood_still_ms=0.0, folder=tmp_path,
+        image=ImageReport("cd" * 32, {"KALMAN": 400}, 900, 300, 1, 2), failures=("hard fault",), not_shown=3,
     )  # fmt: skip
 
 
