@@ -78,6 +78,8 @@ def test_a_repeated_pose_is_frozen_when_it_was_exposed_after_the_turn(
     sampling = core.sampling.fields
     core.data.fields.pose_age_us, sampling.turned_ticks = i32(age_us), i32(ticks)
     assert repetition.frozen(core.data.fields, sampling) == frozen
+    core.data.fields.gyro_bias[:] = 2000.0
+    core.data.fields.gyro_sum[:], core.data.fields.gyro_samples = 20_000, i32(10)  # its zero is no turn
     repetition.add_turn(core.parameters.fields, core.data.fields, sampling)
     assert sampling.turned_ticks == (min(ticks + 1, 13) if ticks else 0), (
         "no more are counted than may matter"
