@@ -101,6 +101,18 @@ def test_it_may_be_heavier_than_designed_but_has_no_constants_of_floaty(tmp_path
         falls("plant.constant_factors={yaw_u3=1.1}")
 
 
+@pytest.mark.parametrize("decks", [(), ("flow2",), ("flow2", "multiranger")])
+def test_a_crazyflie_is_as_heavy_as_itself_and_its_decks(decks: tuple[str, ...]) -> None:
+    config = load_config("crazyflie")
+    robot = config.robot.model_copy(update={"decks": decks})
+    body = make_body(config.model_copy(update={"robot": robot}), np.random.default_rng(1), (0.0, 0.0, 1.0))
+    body.push((1.0, 0.0, 0.0))
+    body.advance(1_000)
+    mass = {"flow2": 1.6e-3, "multiranger": 2.3e-3}  # [kg] Bitcraze's
+    expected = config.quadrotor.mass + sum(mass[name] for name in decks)
+    assert 1.0 / body.acceleration_W[0] == pytest.approx(expected, rel=1e-3)  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize("factor", [1.0, 1.25])
 def test_a_torque_turns_it_and_a_push_moves_it(tmp_path: Path, factor: float) -> None:
     robot = FLOATING.replace("(0.0, 0.0, 0.0)", "(0.0, 0.0, 1e-3)")

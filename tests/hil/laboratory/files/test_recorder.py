@@ -10,12 +10,14 @@ import pytest
 from hil.errors import LabError
 from hil.laboratory.files.recorder import (
     BATCHES_PER_PIECE,
+    RELEASE_US,
     ROWS_PER_BATCH,
     Observer,
     Recorder,
     forget_read_columns,
     load_events,
     load_log,
+    release_of,
 )
 from hil.world.body import Channel, Quantity
 from support.watching import Watcher
@@ -87,12 +89,12 @@ def mapped_bytes() -> int:
     return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("RssFile:"))
 
 
-def killed(folder: Path, lost_bytes: int = 0) -> Path:
-    """What lies on disk of a run of 250 rows when the process dies, and when the disk lost the last bytes."""
+def killed(folder: Path, lost_bytes: int = 0, rows: int = 250, period_us: int = 1) -> Path:
+    """What lies on disk of a run when the process dies, and when the disk lost the last bytes."""
     (folder / "run").mkdir()
     recorder = make(folder / "run", np.zeros(2))
-    for row in range(250):
-        recorder.row(row)
+    for row in range(rows):
+        recorder.row(row * period_us)
     recorder.note(5, "lab", "half way")
     left = folder / "left"
     shutil.copytree(folder / "run", left)
@@ -106,6 +108,15 @@ def test_a_killed_process_leaves_all_complete_seconds(tmp_path: Path) -> None:
     left = killed(tmp_path)
     assert load_log(left).num_rows == 200
     assert load_events(left) == [{"t_us": 5, "source": "lab", "text": "half way"}]
+
+
+def test_rows_that_are_a_second_apart_are_on_disk(tmp_path: Path) -> None:
+    assert load_log(killed(tmp_path, rows=21, period_us=100_000)).num_rows == 11
+
+
+def test_a_flight_that_was_not_released_counts_from_its_planned_release() -> None:
+    planned = {b"config": b'{"flight": {"release_us": 5}}'}
+    assert [release_of(known) for known in ({}, planned, planned | {RELEASE_US: b"-7"})] == [0, 5, -7]
 
 
 def test_a_batch_cut_in_the_middle_is_dropped(tmp_path: Path) -> None:
