@@ -214,8 +214,8 @@ void enter(struct machine *m, unsigned exception, uint32_t return_address)
         lock_up(m, return_address);
         return;
     }
-    m->pc = *vector;
-    set_register(m, R_PC, m->pc);
+    m->pc = *vector & ~1u;
+    set_register(m, R_PC, *vector);
 }
 
 /* Whether a task is not ready. */

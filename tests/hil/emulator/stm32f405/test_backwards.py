@@ -1,9 +1,25 @@
 """Going back in time: a chip's saved state comes back whole, and a search ends where it has to."""
 
+import os
+import re
+import signal
+import socket
+import sys
+import threading
+from contextlib import suppress
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
 import pytest
 
 from hil.emulator.stm32f405.backwards import NEAR, PERIOD, TRAIL, Goal, Position, Search
-from hil.emulator.stm32f405.chip import SOFTWARE
+from hil.emulator.stm32f405.checkpoints import LIMIT, SIZE_BYTES, Checkpoint, Checkpoints, why_none
+from hil.emulator.stm32f405.chip import CYCLES_PER_US, SOFTWARE, StopReason
+from hil.emulator.stm32f405.debugged_chip import DebuggedChip
+from hil.emulator.stm32f405.freertos import FreeRtos
+from hil.emulator.stm32f405.gdb import GdbServer
+from hil.emulator.stm32f405.gdb_protocol import framed
 from support.stm32_machine import FirmwareOnChip
 
 END = Position(1, 500, 3, 0x0800_1000, 9_000, 8_000)
@@ -98,6 +114,7 @@ def test_the_trail_has_the_last_instants_each_once() -> None:
     assert Search.of(search.stored()) == search
 
 
+NULL_CALL = 5  # of `enum planted`
 FAR = 80 * PERIOD
 
 
@@ -115,3 +132,183 @@ def test_checkpoints_are_an_eighth_of_the_way_apart_at_least_a_period_and_one_is
 ) -> None:
     search = Search(Goal.THERE, Position(0, 1, 0, 0, FAR, FAR))
     assert search.is_due(last, last + after) is due
+
+
+class Flight:
+    """A flight in a process of its own that can go back in time, whose debugger the test is.
+
+    It reports each millisecond in a file, reaches 130 ms and exits with 7. `outlived` ends when all of its processes have.
+    """
+
+    machine = cache(FirmwareOnChip)  # at power-on: it only flies in other processes
+
+    def __init__(self, path: Path, planted: int = 0) -> None:
+        self.path, self.image, self._received = path, Flight.machine().image, b""
+        server = GdbServer(0, checkpoints=Checkpoints())
+        self.line = socket.create_connection(("127.0.0.1", server.port), 60.0)
+        self.outlived, held = os.pipe()
+        self.pid = os.fork()
+        if not self.pid:
+            code = 1
+            try:
+                for number in map(int, os.listdir("/proc/self/fd")):  # the tests' own files never go back
+                    if number > 2 and number not in (held, server._listener.fileno()):
+                        with suppress(OSError):
+                            os.close(number)
+                self._fly(server, planted)
+                code = 7
+            except KeyboardInterrupt:
+                code = 130
+            finally:
+                os._exit(code)
+        server._listener.close()
+        os.close(held)
+        self.ask(b"QStartNoAckMode")
+
+    def _fly(self, server: GdbServer, planted: int) -> None:
+        machine, end = Flight.machine(), CYCLES_PER_US * 1000
+        machine.poke("planted", planted)
+        machine.chip.crash_points.add(self.place("Stuck_Handler"))
+        chip = DebuggedChip(machine.chip, server, FreeRtos(machine.image, machine.chip.read))
+        with self.path.open("w", buffering=1) as file:
+            while machine.chip.now_us < 130_000:
+                if chip.run(end) & StopReason.BREAK:
+                    machine.chip.crash_points.clear()  # the crash is reported
+                if machine.chip.state.now >= end:
+                    file.write(f"{machine.chip.now_us // 1000}\n")
+                    end += CYCLES_PER_US * 1000
+            server.close()
+
+    def place(self, name: str) -> int:
+        return self.image.symbol(name).address
+
+    def ask(self, packet: bytes) -> bytes:
+        """Return the answer to a packet; of one that resumes, the next stop."""
+        self.line.sendall(framed(packet))
+        while (found := re.search(rb"\$([^#]*)#..", self._received)) is None:
+            data = self.line.recv(1 << 16)
+            assert data, "the flight has ended"
+            self._received += data
+        self._received = self._received[found.end() :]
+        return found[1]
+
+    def instant(self) -> tuple[bytes, bytes]:
+        """Return the registers of the stopped chip and what the firmware keeps in memory."""
+        ticks, tasks = map(self.place, ("xTickCount", "tasks"))
+        return self.ask(b"g"), self.ask(b"m%x,4" % ticks) + self.ask(b"m%x,200" % tasks)
+
+    def stop(self, packet: bytes) -> tuple[tuple[bytes, bytes], bytes]:
+        """Return the instant at which the chip stops after a packet, and the report."""
+        report = self.ask(packet)
+        return self.instant(), re.sub(rb";?thread:.*", b"", report)
+
+    def end(self, packet: bytes = b"D") -> int:
+        """Return the exit code, once all processes have ended."""
+        if packet:
+            self.line.sendall(framed(packet))
+        _, status = os.waitpid(self.pid, 0)
+        assert os.read(self.outlived, 1) == b""
+        os.close(self.outlived)
+        self.line.close()
+        return os.waitstatus_to_exitcode(status)
+
+
+def test_time_runs_backwards_through_the_instants_at_which_it_ran_forward(tmp_path: Path) -> None:
+    flight = Flight(tmp_path / "log")
+    begin, line = flight.instant(), b"0,%x,2" % flight.place("send_line")
+    assert flight.ask(b"Z" + line) == b"OK"
+    there = [flight.stop(b"c")[0] for _ in range(7)]
+    assert [flight.stop(b"bc") for _ in range(2)] == [(instant, b"T05") for instant in there[-2:-4:-1]]
+    steps = [flight.stop(b"bs")[0] for _ in range(3)]
+    assert len({there[-3], *steps}) == 4
+    assert [flight.stop(b"s")[0] for _ in range(3)] == [*steps[-2::-1], there[-3]]
+    assert flight.ask(b"z" + line) == b"OK"
+    assert [flight.stop(packet) for packet in (b"bc", b"bs")] == [(begin, b"T05replaylog:begin")] * 2
+    assert flight.ask(b"Z" + line) == b"OK"
+    assert [flight.stop(b"c")[0] for _ in range(7)] == there
+    assert flight.end() == 7
+    assert flight.path.read_text() == "".join(f"{number}\n" for number in range(1, 131))
+
+
+def test_the_way_back_passes_each_access_of_a_watchpoint_and_ends_at_the_last_change(tmp_path: Path) -> None:
+    flight = Flight(tmp_path / "log")
+    ticks = flight.place("xTickCount")
+    watched = b"T05watch:%x" % ticks
+    assert flight.ask(b"Z2,%x,4" % ticks) == b"OK"
+
+    def tick(packet: bytes) -> tuple[int, bytes]:
+        (_, memory), report = flight.stop(packet)
+        return int.from_bytes(bytes.fromhex(memory[:8].decode()), "little"), report
+
+    assert [tick(b"c") for _ in range(5)] == [(number, watched) for number in range(5)]
+    assert tick(b"bc") == (4, watched)  # behind the access: GDB itself steps back over it
+    assert [tick(packet) for packet in (b"bs", b"bc", b"bs", b"c")] == [
+        (3, b"T05"), (3, watched), (2, b"T05"), (3, watched),
+    ]  # fmt: skip
+    assert flight.ask(b"M%x,4:40000000" % ticks) == b"OK"
+    assert [tick(b"c") for _ in range(2)] == [(65, watched), (66, watched)]
+    assert [tick(packet) for packet in (b"bc", b"bs", b"bc", b"bs")] == [
+        (66, watched), (65, b"T05"), (65, watched), (64, b"T05"),
+    ]  # fmt: skip
+    assert [tick(b"bc") for _ in range(2)] == [(64, b"T05replaylog:begin")] * 2
+    assert flight.end() == 7
+
+
+def test_a_crash_stops_once_and_the_way_back_leads_to_its_instruction(tmp_path: Path) -> None:
+    flight = Flight(tmp_path / "log", planted=NULL_CALL)
+    crash = flight.stop(b"c")
+    assert crash[1] == b"T06"
+
+    def pc() -> int:
+        return int.from_bytes(bytes.fromhex(flight.ask(b"pf").decode()), "little")
+
+    assert pc() == flight.place("Stuck_Handler")
+    flight.ask(b"bs")
+    assert flight.image.function_at(pc()) == "go_wrong"
+    assert flight.stop(b"s") == (crash[0], b"T05")
+    assert flight.end() == 7
+    assert flight.path.read_text() == "".join(f"{number}\n" for number in range(1, 131))
+
+
+@pytest.mark.parametrize(("how", "code"), [
+    ("interrupted", 130), ("killed", -signal.SIGKILL), ("killed by the debugger", 130), ("hung up", 7),
+])  # fmt: skip
+def test_no_process_of_a_flight_outlives_it(tmp_path: Path, how: str, code: int) -> None:
+    flight = Flight(tmp_path / "log")
+    assert flight.ask(b"Z0,%x,2" % flight.place("send_line")) == b"OK"
+    for packet in (b"c", b"bc"):
+        flight.stop(packet)
+    if number := {"interrupted": signal.SIGINT, "killed": signal.SIGKILL}.get(how):
+        os.kill(flight.pid, number)
+    elif how == "hung up":
+        flight.line.shutdown(socket.SHUT_RDWR)
+    assert flight.end(b"k" if how == "killed by the debugger" else b"") == code
+
+
+def test_checkpoints_are_the_closer_the_nearer_to_the_present_and_the_oldest_stays() -> None:
+    checkpoints, others = Checkpoints(), dict[int, socket.socket]()
+    for number in range(1, 10 * LIMIT):
+        ours, others[number] = socket.socketpair()
+        checkpoints.kept.append(Checkpoint((number,), number * PERIOD, 0, ours))
+        checkpoints._thin_out(number * PERIOD)
+        kept = [one.position[0] for one in checkpoints.kept]
+        assert (len(kept), kept[0], kept[-1]) == (min(number, LIMIT), 1, number)
+        ages = [number - one for one in kept]
+        assert all(older - younger <= 1 + 0.4 * older for older, younger in pairwise(ages))
+    told_to_end = {number: other.recv(SIZE_BYTES) for number, other in others.items() if number not in kept}
+    assert set(told_to_end.values()) == {bytes(SIZE_BYTES)}
+    for other in others.values():
+        other.close()
+    for one in checkpoints.kept:
+        one.line.close()
+
+
+def test_a_process_with_threads_cannot_be_copied_nor_any_of_another_system(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(threading, "active_count", lambda: 2)
+    assert why_none() == "the flight's process is copied for it, which its other threads would not survive"
+    monkeypatch.setattr(threading, "active_count", lambda: 1)
+    assert why_none() == ""
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert why_none() == "the flight's process is copied for it, which darwin cannot"
