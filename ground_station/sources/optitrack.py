@@ -45,7 +45,7 @@ class OptitrackSource:
         try:
             self._address = socket.gethostbyname(self._host)
             self._interface = self._interface_to_server()
-            self._frames_from, self._warned = 0, False
+            self._frames_from, self._frame_us, self._warned = 0, 0, False
             self._add_socket(self._interface, 0)
             self._connect()
         except OSError as error:

@@ -1,6 +1,6 @@
 """Laws of every `ground_station.mocap.MocapSource` that sees a body move about, of which no two poses are alike.
 
-Replays need no server and pass however busy the machine is; what connects to a Motive does so in real time.
+What connects to a Motive through the package `motioncapture` does so in real time, all else on a simulated clock.
 """
 
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from ground_station.mocap import MocapFrame, MocapSource
 from ground_station.sources.motioncapture_client import MotioncaptureSource
 from ground_station.sources.optitrack import OptitrackSource
 from ground_station.sources.replay import COLUMNS, MocapLog, RecordingSource, ReplaySource
-from support.motive_bench import moving, needs, seen
+from support.motive_bench import MotiveBench, StationClock, moving, needs, seen
 
 FRAMES = 20
 PATIENCE_S = 20.0
@@ -48,8 +48,11 @@ def recorded(folder: Path) -> Iterator[MocapSource]:
 
 @contextmanager
 def optitrack(folder: Path) -> Iterator[MocapSource]:
-    with moving() as lab:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        lab = MotiveBench()
+        StationClock(monkeypatch).turns = lab.turn
         yield OptitrackSource(CaptureConfig(host="127.0.0.1", port=lab.motive.port, body="floaty"))
+        lab.motive.close()
 
 
 @contextmanager
@@ -63,7 +66,7 @@ def motioncapture(folder: Path) -> Iterator[MocapSource]:
     params=[
         replay,
         recorded,
-        pytest.param(optitrack, marks=pytest.mark.realtime),
+        optitrack,
         pytest.param(motioncapture, marks=[pytest.mark.realtime, needs("motioncapture")]),
     ]
 )

@@ -1,7 +1,5 @@
 """Poses out of a NatNet stream: their age, what is no pose, and what goes wrong with the server."""
 
-import socket
-import time
 from types import SimpleNamespace as Made
 
 import pytest
@@ -10,16 +8,13 @@ from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
 from ground_station.links.crazyradio import CrazyradioLink
 from ground_station.mocap import MocapFrame
-from ground_station.sources.address import find_source
 from ground_station.sources.alignment import Alignment
 from ground_station.sources.motioncapture_client import MotioncaptureSource
-from ground_station.sources.natnet import MULTICAST_GROUP
 from ground_station.sources.natnet_stream import MISTIMED_FRAMES, NatnetStream, ServerClock
 from ground_station.sources.optitrack import OptitrackSource
 from ground_station.sources.silence import SILENCE_US, Silence
 from ground_station.unused import Reason
 from support import natnet_packets as packets
-from support.motive_bench import moving
 
 V = (4, 1)
 TICKS_PER_US = packets.CLOCK_HZ // 1_000_000
@@ -278,48 +273,6 @@ def test_silence_is_reported_at_its_begin_and_end() -> None:
         "motion capture: no frames; calling the server again", "motion capture: frames arrive again after 10.0 s",
         "motion capture: no frames; calling the server again", "motion capture: frames arrive again after 2.5 s",
     ]  # fmt: skip
-
-
-@pytest.mark.realtime
-def test_a_server_that_is_not_there_or_not_so_is_one_line_within_four_seconds() -> None:
-    begin_s = time.monotonic()
-    with pytest.raises(MocapError, match=r"^127\.0\.0\.1:9: no NatNet server answers\Z"):
-        find_source("optitrack:127.0.0.1:9", CaptureConfig()).open()
-    assert time.monotonic() - begin_s < 4
-    with moving() as lab, pytest.raises(MocapError, match="does not stream by multicast"):
-        find_source(f"optitrack:127.0.0.1:{lab.motive.port},multicast", CaptureConfig()).open()
-
-
-@pytest.mark.realtime
-@pytest.mark.parametrize("multicast", [False, True], ids=["unicast", "multicast"])
-def test_packets_from_another_port_of_the_server_s_computer_change_nothing(multicast: bool) -> None:
-    """Another program on that computer sends frames, bodies and server descriptions to every open port."""
-    with moving(multicast=multicast) as lab, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        source = OptitrackSource(CaptureConfig(port=lab.motive.port, body="floaty", axes="z-up"))
-        source.open()
-        while source.receive(1.0) is None:
-            pass
-        assert all(own.getsockname()[0] in ("127.0.0.1", MULTICAST_GROUP) for own in source._sockets)
-        other.bind(("127.0.0.1", 0))
-        other.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
-        frames = []
-        for number in range(30):
-            for own in source._sockets:
-                for packet in (
-                    packets.frame(10**6 + number, V, (number, number, number), 1, pose=((9.0, 9.0, 9.0), (0, 0, 0, 1))),
-                    packets.model_definition({"floaty": 2}, V),
-                    packets.server_info((3, 1)),
-                ):  # fmt: skip
-                    other.sendto(packet, own.getsockname())
-            frames.append(source.receive(1.0))
-        source.close()
-        heard = [frame.p_WB for frame in frames if frame is not None]
-        assert len(heard) == 30
-        assert (9.0, 9.0, 9.0) not in heard
-        assert all(frame.valid for frame in frames)
-        (line,) = [line for line in source.notices() if "ignored" in line]
-        name = "{}:{}".format(*other.getsockname())
-        assert line == f"motion capture: packets of {name} are ignored: not the server's"
 
 
 def test_a_summary_names_each_count_of_cameras_and_links() -> None:

@@ -7,65 +7,22 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ground_station.clock import clock_us
 from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
-from ground_station.mocap import MocapFrame, MocapSource, judged
+from ground_station.mocap import MocapFrame, MocapSource
 from ground_station.sources.address import find_source
-from ground_station.sources.motioncapture_client import MotioncaptureSource, settings_of
-from ground_station.sources.motioncapture_process import Arrival, decode_line, encode_arrival, encode_error
+from ground_station.sources.motioncapture_client import MotioncaptureSource
 from support.motive_bench import MotiveBench, moving, needs, seen
-from support.paths import ROOT
 from support.qualisys_server import qualisys_server
 from support.serving import PATIENCE_S
 from support.vrpn_server import vrpn_server
-
-names = st.text(max_size=10)
-body = st.tuples(*[st.floats()] * 7)
-
-
-@given(st.integers(0, 2**63 - 1), st.dictionaries(names, body, max_size=3))
-@settings(max_examples=50)
-def test_a_line_reports_a_pose(t_us: int, bodies: dict[str, tuple[float, ...]]) -> None:
-    line = encode_arrival(Arrival(t_us, bodies))
-    assert line.count("\n") == 1
-    decoded = decode_line(line.encode())
-    assert isinstance(decoded, Arrival)
-    assert repr(decoded) == repr(Arrival(t_us, bodies))  # NaN is as NaN here
-
-
-def test_a_line_reports_the_end() -> None:
-    assert decode_line(encode_error("no\nway").encode()) == "no\nway"
-
-
-json = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=8) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
-    max_leaves=12,
-)
-
-
-@given(st.binary(max_size=60) | json.map(lambda value: repr(value).replace("'", '"').encode()))
-def test_no_bytes_of_the_other_process_do_harm(line: bytes) -> None:
-    with contextlib.suppress(MocapError):
-        decode_line(line)
-
-
-@pytest.mark.parametrize(
-    "line", [b"[" * 100_000, b"[" + b"9" * 5000 + b", {}]", b'[1, {"a": [1e999]}]', b"[true]"]
-)
-def test_extreme_lines_are_refused(line: bytes) -> None:
-    with pytest.raises(MocapError, match="not a line"):
-        decode_line(line)
 
 
 @contextlib.contextmanager
@@ -219,82 +176,6 @@ def test_a_server_that_is_not_there_is_one_line_within_six_seconds() -> None:
     with pytest.raises(MocapError, match=r"^127\.0\.0\.1: no frames of a vrpn server\Z"):
         find_source("vrpn:127.0.0.1:9", CaptureConfig()).open()
     assert time.monotonic() - begin_s < 9
-
-
-@pytest.fixture
-def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., MotioncaptureSource]:
-    """A source whose process finds a module of this text in place of the package."""
-
-    def make(text: str, body: str = "") -> MotioncaptureSource:
-        (tmp_path / "motioncapture.py").write_text(text)
-        monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{ROOT}")
-        capture = CaptureConfig(system="qualisys", body=body)
-        return MotioncaptureSource(capture.system, settings_of(capture), capture)
-
-    return make
-
-
-CAMERAS = """
-import os, time
-from types import SimpleNamespace as Thing
-import numpy as np
-
-class connect:
-    number = 0
-    def __init__(self, system, settings):
-        assert settings == {"hostname": "127.0.0.1"} and system == "qualisys"
-    def waitForNextFrame(self):
-        time.sleep(0.005)
-        self.number += 1
-    @property
-    def rigidBodies(self):
-        return self.bodies(self.number)
-    def body(self, x, w=1.0):
-        return Thing(position=np.array([x, 2.0, 3.0]), rotation=Thing(w=w, x=0.0, y=0.0, z=0.0))
-    def bodies(self, number):
-        return {"one": self.body(float(number))}
-"""
-GOOD_BODIES = CAMERAS[CAMERAS.index("        return {") :]
-
-
-def test_a_missing_package_is_one_line_with_the_remedy(stand_in: Callable[..., MotioncaptureSource]) -> None:
-    with pytest.raises(
-        MocapError, match=r"No module named 'motioncapture': .*-m pip install 'motioncapture>="
-    ):
-        stand_in("raise ImportError(\"No module named 'motioncapture'\")").open()
-
-
-def test_of_several_bodies_one_must_be_named(stand_in: Callable[..., MotioncaptureSource]) -> None:
-    two = "        return {'one': self.body(0.0), 'two': self.body(1.0)} if number > 9 else {'one': self.body(0.0)}\n"
-    with pytest.raises(MocapError, match="body=NAME is missing; there are: one, two"):
-        stand_in(CAMERAS.replace(GOOD_BODIES, two)).open()
-
-
-def test_invalid_poses_are_never_valid(stand_in: Callable[..., MotioncaptureSource]) -> None:
-    """Twenty frames each: good, lost, the same over and over, not a number, not a rotation, good."""
-    cases = """
-        return [{"one": self.body(number / 100)}, {"two": self.body(1.0)}, {"one": self.body(5.0)},
-                {"one": self.body(float("nan"))}, {"one": self.body(number / 100, 2.0)}][number // 20 % 5]
-"""
-    with opened(stand_in(CAMERAS.replace(GOOD_BODIES, cases), "one")) as source:  # takes the first one
-        frames = received(source, 118)
-    valid = [number for number, frame in enumerate(frames, 2) if judged(frame).valid]
-    assert valid == [*range(2, 20), 40, *range(100, 120)]
-
-
-def test_garbage_on_the_pipe_is_counted(stand_in: Callable[..., MotioncaptureSource]) -> None:
-    """The standard output was moved away: the module finds the pipe by trying."""
-    garbage = """
-    def waitForNextFrame(self):
-        time.sleep(0.005)
-        self.number += 1
-        if self.number < 20:
-            os.write(3, os.urandom(20_000) + b"[1, {}]\\n[[[\\n" + b"x" * 70_000 + b"\\n")
-"""
-    with opened(stand_in(CAMERAS + garbage, "one")) as source:
-        assert all(frame.valid for frame in received(source, 30))
-        malformed = int(source.summary().split()[-2])
-    assert malformed > 40
 
 
 @needs("motioncapture")

@@ -3,6 +3,7 @@
 import contextlib
 import importlib.util
 import select
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from ground_station.mocap import MocapFrame
+from ground_station.sources import optitrack
 from ground_station.unused import Reason
 from hil.board.markers import NO_POINTS, Sighting
 from hil.servers.dongle_server import Readers
@@ -68,6 +70,11 @@ class MotiveBench:
             for reader in ready:
                 self.readers[reader](0)
 
+    def turn(self) -> None:
+        """Answer and stream a frame."""
+        self.answer()
+        self.expose()
+
     def run(self, stopping: Callable[[], bool]) -> None:
         """Expose at 200 Hz and answer."""
         deadline = time.monotonic() + PATIENCE_S
@@ -76,6 +83,24 @@ class MotiveBench:
             self.expose()
             select.select(self.readers, (), (), PERIOD_S)
             self.answer()
+
+
+class StationClock:
+    """A simulated clock of a client of NatNet: its server has a turn when the client would wait in vain."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now_us = 50_000_000
+        self.turns: Callable[[], None] = lambda: None
+        monkeypatch.setattr(optitrack, "clock_us", lambda: self.now_us)
+        monkeypatch.setattr(optitrack, "readable", self.readable)
+
+    def readable(self, sockets: list[socket.socket], timeout_s: float) -> list[socket.socket]:
+        ready = select.select(sockets, (), (), 0)[0]
+        if not ready and timeout_s:
+            self.turns()
+            ready = select.select(sockets, (), (), 0)[0]
+            self.now_us += 300 if ready else round(timeout_s * 1e6)
+        return ready
 
 
 def needs(client: str) -> pytest.MarkDecorator:
