@@ -1,6 +1,7 @@
 """Flashing page by page, on a bootloader whose flash is an array and whose answers may come late."""
 
 import struct
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,16 +11,19 @@ pytest.importorskip("cflib")
 
 from cflib.bootloader.boottypes import TargetTypes
 
+from ground_station import flashing
 from ground_station.errors import LinkError
-from ground_station.flashing import READ_TRIES, _verify, _write
+from ground_station.flashing import READ_TRIES, _verify, _write, check_image, flash
 
+URI = "radio://0/80/2M/E7E7E7E7E7"
 SIZE, PAGES, START = 8, 3, 16
+BASE = 0x0800_4000
 
 
 class Loader:
     """Three pages of buffer; reads fail `failing` times, each with two more answers on their way."""
 
-    uri, error_code = "radio", 7
+    uri, error_code = URI, 7
 
     def __init__(self, failing: int = 0) -> None:
         target = SimpleNamespace(page_size=SIZE, buffer_pages=PAGES, start_page=START)
@@ -72,3 +76,116 @@ def test_what_is_not_written_or_not_read_names_its_bytes() -> None:
         _verify(loader, bytes(19), lambda *news: None)
     with pytest.raises(LinkError, match=r"differs from the image in bytes 0..7"):
         _verify(Loader(failing=READ_TRIES), bytes(8), lambda *news: None)  # type: ignore[arg-type]
+
+
+class Board(Loader):
+    """A board that can be flashed but for one step, which `fails`; `steps` are those it was asked for."""
+
+    def __init__(self, uri: str, fails: str) -> None:
+        super().__init__()
+        self.steps: list[str] = []
+        self.fails, self.late = fails, []
+        assert uri == URI
+
+    def step(self, name: str, *of: object) -> bool:
+        self.steps.append(" ".join((name, *map(str, of))))
+        return name != self.fails
+
+    def open_bootloader_uri(self, uri: str) -> None:
+        if not self.step("open", uri):
+            raise Exception("Couldn't load link driver: Cannot find a Crazyradio Dongle\nTraceback")
+        if self.fails == "driver":
+            self.link = None
+
+    def reset_to_bootloader(self, target: int) -> bool:
+        return self.step("stop", target)
+
+    def check_link_and_get_info(self, target: int) -> bool:
+        return self.step("info", target)
+
+    def reset_to_firmware(self, target: int) -> bool:
+        return self.step("start", target)
+
+    def write_flash(self, target: int, page: int, first: int, count: int) -> bool:
+        return self.step("write", target) and super().write_flash(target, page, first, count)
+
+    def read_flash(self, target: int, page: int) -> bytes:
+        content = super().read_flash(target, page)
+        return content if self.step("read", target) else content[:2] + b"?" + content[3:]
+
+    def close(self) -> None:
+        self.step("close")
+
+
+NRF, STM = TargetTypes.NRF51, TargetTypes.STM32
+ALL = [
+    f"open {URI}",
+    f"stop {NRF}",
+    f"info {STM}",
+    f"write {STM}",
+    f"read {STM}",
+    f"read {STM}",
+    f"start {NRF}",
+    "close",
+]
+
+
+@pytest.mark.parametrize(("fails", "why"), [
+    ("", ""), ("open", "Cannot find a Crazyradio Dongle"), ("driver", "no driver for this link"),
+    ("stop", "no answer: is the board on?"), ("info", "its bootloader does not answer"),
+    ("write", "writing at byte 0 failed (bootloader's code 7)"),
+    ("read", "the flash differs from the image in bytes 0..7"),
+    ("start", "flashed and verified, but it does not restart: press its button"),
+])  # fmt: skip
+def test_a_flash_takes_every_step_or_says_which_one_failed_and_closes_the_radio(
+    monkeypatch: pytest.MonkeyPatch, fails: str, why: str
+) -> None:
+    boards: list[Board] = []
+
+    def loader(uri: str) -> Board:
+        boards.append(Board(uri, fails))
+        return boards[0]
+
+    monkeypatch.setattr(flashing, "Cloader", loader)
+    said = ""
+    try:
+        flash(URI, struct.pack("<II", 0x2002_0000, BASE + 9) + bytes(4), lambda *news: None)
+    except LinkError as error:
+        said = str(error)
+    assert said == (f"{URI}: {why}" if why else "")
+    taken = [step for step, before in pairwise([*boards[0].steps[::-1], ""]) if step != before][::-1]
+    expected = [step for step, before in pairwise([*ALL[::-1], ""]) if step != before][::-1]
+    last = next((n for n, step in enumerate(expected) if step.split()[0] == (fails or "start")), 0)
+    assert taken == [*expected[: last + 1], "close"]
+
+
+def image_of(size: int) -> bytes:
+    return struct.pack("<II", 0x2002_0000, BASE + 9) + bytes(size - 8)
+
+
+@pytest.mark.parametrize("uri", ["udp://127.0.0.1:19850", "usb://0", "radio://0/80/3M", ""])
+def test_only_radio_flashes(uri: str) -> None:
+    with pytest.raises(LinkError, match="expected radio://"):
+        flash(uri, image_of(100), lambda *news: None)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        b"", b"\x7fELF" + bytes(100), bytes(1000), image_of(2000)[:-1999],
+        struct.pack("<II", 0x2002_0000, BASE + 100) + bytes(200),  # no Thumb address
+        struct.pack("<II", 0x2002_0000, 0x0800_0101) + bytes(200),  # starts the bootloader
+        struct.pack("<II", 0x3000_0000, BASE + 101) + bytes(200),
+        struct.pack("<II", 0x2000_0000, BASE + 101) + bytes(200),  # an empty stack
+        struct.pack("<II", 0x2002_0000, BASE + 209) + bytes(200),  # starts behind its end
+    ],
+)  # fmt: skip
+def test_an_invalid_firmware_is_not_sent(image: bytes) -> None:
+    with pytest.raises(LinkError, match="not an image for the board"):
+        check_image(image)
+
+
+def test_an_image_must_fit() -> None:
+    check_image(image_of(1008 * 1024))
+    with pytest.raises(LinkError, match="1032192 fit"):
+        check_image(image_of(1008 * 1024 + 1))
