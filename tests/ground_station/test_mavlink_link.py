@@ -6,6 +6,7 @@ import io
 import os
 import select
 import tty
+from contextlib import suppress
 from math import pi
 from types import SimpleNamespace
 
@@ -26,7 +27,7 @@ from ground_station.errors import LinkError
 from ground_station.links.mavlink import MavlinkLink
 from ground_station.links.mavlink_budget import TELEMETRY_HZ, link_budget
 from ground_station.links.mavlink_controls import REASON_US, MavlinkControls
-from ground_station.links.mavlink_serial import MavlinkSerialLink, named
+from ground_station.links.mavlink_serial import MavlinkSerialLink, named, parse_uri
 from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation
 from ground_station.telemetry_log import TelemetryLog
@@ -263,33 +264,120 @@ def test_the_summary_names_each_figure_and_texts_are_notices_once():
     assert (link.notices(), link.notices()) == (["board: hello"], [])
 
 
-def test_a_line_that_is_opened_again_has_forgotten_the_board():
-    """Telemetry is requested in each connection, which is none before the board's heartbeat and its answer."""
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    link, bench = (
-        MavlinkSerialLink(f"mavlink:{os.ttyname(slave)}", LinkSettings(50.0, 900, 921_600)),
-        LinkWithCodec(),
-    )
+class Line:
+    """A board at the other end of a pseudo terminal, which acknowledges at once; `heard` are the frames that it has read."""
 
-    def board_answers():
-        os.write(
-            master,
-            heartbeat().pack(bench.codec) + dialect.MAVLink_command_ack_message(511, 0).pack(bench.codec),
-        )
+    def __init__(self):
+        self.master, self.slave = os.openpty()
+        tty.setraw(self.slave)
+        self.uri, self.bench = f"mavlink:{os.ttyname(self.slave)}", LinkWithCodec()
+
+    def link(self):
+        return MavlinkSerialLink(self.uri, LinkSettings(50.0, 900, 921_600))
+
+    def put(self, *messages):
+        os.write(self.master, b"".join(message.pack(self.bench.codec) for message in messages))
+
+    def acknowledge(self):
+        self.put(heartbeat(), dialect.MAVLink_command_ack_message(511, 0))
         return False
 
+    def open(self):
+        link = self.link()
+        link.open(self.acknowledge)
+        return link
+
+    def wait_for(self, number):
+        """Read frames until one with the number of a message has come; return that."""
+        while True:
+            for _, message in self.bench.sent:
+                if message.get_msgId() == number:
+                    self.bench.sent.clear()
+                    return message
+            assert select.select((self.master,), (), (), 10.0)[0], "nothing is sent"
+            self.bench._transmit(0, os.read(self.master, 4096))
+
+    def close(self):
+        for end in (self.master, self.slave):
+            with suppress(OSError):
+                os.close(end)
+
+
+@pytest.fixture
+def line():
+    line = Line()
+    yield line
+    line.close()
+
+
+def test_a_line_that_is_opened_again_has_forgotten_the_board(line):
+    """Telemetry is requested in each connection, which is none before the board's heartbeat and its answer."""
+    link = line.link()
     for _ in range(2):
         with pytest.raises(LinkError, match="stopped while connecting"):
             link.open(lambda: True)
-        link.open(board_answers)
-        while not any(message.get_msgId() == COMMAND for _, message in bench.sent):
-            assert select.select((master,), (), (), 10.0)[0], "no request"
-            bench._transmit(0, os.read(master, 4096))
+        link.open(line.acknowledge)
+        line.wait_for(COMMAND)
         link.close()
-        bench.sent.clear()
-    os.close(master)
-    os.close(slave)
+
+
+def test_poses_and_requests_leave_by_the_line_and_its_end_is_reported_once(line):
+    link = line.open()
+    line.wait_for(COMMAND)  # for telemetry
+    now_us = clock_us()
+    link.send(now_us, MocapFrame(now_us, (0.5, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), True), HOME)
+    assert line.wait_for(POSE).x == 0.5
+    link.ask(now_us, ControlRequest(ControlAction.STOP))
+    assert link.answer(now_us) is None
+    assert line.wait_for(COMMAND).command == dialect.MAV_CMD_DO_FLIGHTTERMINATION
+    acknowledged = dialect.MAVLink_command_ack_message(dialect.MAV_CMD_DO_FLIGHTTERMINATION, 0)
+    link.receive(now_us, acknowledged.pack(line.bench.codec))
+    assert link.answer(now_us) == Answer(())
+    link.check()
+    with pytest.raises(LinkError, match=f"^{line.uri}: Resource temporarily unavailable$"):
+        line.link().open(lambda: False)  # a line has one user
+    reader = link._port._reader
+    line.close()
+    reader.join(30.0)
+    link._port.write(b"late")
+    with pytest.raises(LinkError, match=f"^{line.uri}: lost: "):
+        link.check()
+    assert not reader.is_alive()
+    link.close()
+    with pytest.raises(LinkError, match=f"^{line.uri}: lost: closed$"):
+        link.check()
+
+
+@pytest.mark.parametrize(
+    ("uri", "expected"),
+    [
+        ("mavlink:/dev/ttyUSB0", ("/dev/ttyUSB0", 921_600)),
+        ("mavlink:/dev/ttyUSB0,57600", ("/dev/ttyUSB0", 57_600)),
+        ("mavlink:COM3,115200", ("COM3", 115_200)),
+        ("mavlink:socket://127.0.0.1:65535", ("socket://127.0.0.1:65535", 921_600)),
+        ("mavlink:rfc2217://[::1]:4000,9600", ("rfc2217://[::1]:4000", 9600)),
+        ("mavlink:rfc2217://host:4000?logging=debug", ("rfc2217://host:4000?logging=debug", 921_600)),
+    ],
+)
+def test_a_uri_names_device_and_baud_rate(uri: str, expected: tuple[str, int]) -> None:
+    assert parse_uri(uri, 921_600) == expected
+
+
+@pytest.mark.parametrize("text", ["9599", "3000001", "", "1e6", "12345678"])
+def test_a_baud_rate_outside_its_range_is_refused(text):
+    with pytest.raises(
+        LinkError, match=rf"^mavlink:COM3,{text}: baud rate '{text}': expected 9600..3000000$"
+    ):
+        parse_uri(f"mavlink:COM3,{text}", 57_600)
+    for uri in (
+        "mavlink:",
+        "mavlink:socket://host",
+        "mavlink:socket://host:0",
+        "mavlink:socket://host:65536",
+        "COM3",
+    ):
+        with pytest.raises(LinkError, match=r": expected mavlink:DEVICE\[,BAUD\] with a DEVICE like"):
+            parse_uri(uri, 57_600)
 
 
 BROKEN = heartbeat().pack(LinkWithCodec().codec)[:-1] + b"x"

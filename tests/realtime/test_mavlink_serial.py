@@ -23,8 +23,7 @@ from serial.rfc2217 import PortManager
 from ground_station.clock import clock_us
 from ground_station.config import LinkSettings
 from ground_station.errors import LinkError
-from ground_station.links import live_link
-from ground_station.links.mavlink_serial import MavlinkSerialLink, parse_uri
+from ground_station.links.mavlink_serial import MavlinkSerialLink
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 from support.serving import CAMERAS, FLOATY, PATIENCE_S, Served, serve, station
@@ -33,24 +32,6 @@ from support.telemetry_rows import is_whole
 KEY = hashlib.sha256(b"floaty").hexdigest()
 HOME = Goal((0.0, 0.0, 1.15), 0.0)
 Talk = Callable[["Peer"], None]
-
-
-# A URI
-
-
-@pytest.mark.parametrize(
-    ("uri", "expected"),
-    [
-        ("mavlink:/dev/ttyUSB0", ("/dev/ttyUSB0", 921_600)),
-        ("mavlink:/dev/ttyUSB0,57600", ("/dev/ttyUSB0", 57_600)),
-        ("mavlink:COM3,115200", ("COM3", 115_200)),
-        ("mavlink:socket://127.0.0.1:65535", ("socket://127.0.0.1:65535", 921_600)),
-        ("mavlink:rfc2217://[::1]:4000,9600", ("rfc2217://[::1]:4000", 9600)),
-        ("mavlink:rfc2217://host:4000?logging=debug", ("rfc2217://host:4000?logging=debug", 921_600)),
-    ],
-)
-def test_a_uri_names_device_and_baud_rate(uri: str, expected: tuple[str, int]) -> None:
-    assert parse_uri(uri, 921_600) == expected
 
 
 def refused(link: str, message: str, *arguments: str) -> None:
@@ -66,7 +47,7 @@ def refused(link: str, message: str, *arguments: str) -> None:
 class Peer:
     """What is at the other end of a pty, on pymavlink's codec; `talk` is called every 20 ms."""
 
-    def __init__(self, talk: Talk, key: str = "") -> None:
+    def __init__(self, talk: Talk) -> None:
         self.master, slave = os.openpty()
         tty.setraw(slave)
         self.uri = f"mavlink:{os.ttyname(slave)}"
@@ -75,9 +56,6 @@ class Peer:
         self.reads = True
         self.codec = dialect.MAVLink(self, srcSystem=1, srcComponent=1)
         self.codec.robust_parsing = True
-        if key:
-            self.codec.signing.secret_key = bytes.fromhex(key)
-            self.codec.signing.sign_outgoing = True
         self._talk = talk
         self._stopping = False
         self._thread = threading.Thread(target=self._loop)
@@ -102,10 +80,6 @@ class Peer:
         os.close(self.master)
 
 
-def silent(peer: Peer) -> None:
-    time.sleep(0.02)
-
-
 def beats(peer: Peer) -> None:
     peer.codec.heartbeat_send(0, 0, 1, 2, 4, 3)
     time.sleep(0.02)
@@ -128,39 +102,8 @@ def peers() -> Iterator[Callable[..., Peer]]:
         peer.close()
 
 
-def link_to(peer: Peer, key: str = "") -> MavlinkSerialLink:
-    return MavlinkSerialLink(peer.uri, LinkSettings(50.0, 0, 921_600, bytes.fromhex(key)))
-
-
-@pytest.mark.parametrize(
-    ("talk", "station_key", "board_key", "message"),
-    [
-        (silent, "", "", "no heartbeat within 1 s: no bytes arrive"),
-        (board, KEY, KEY[::-1], r"no heartbeat within 1 s: \d+ frames not signed with mavlink.signing_key"),
-    ],
-)
-def test_a_failed_connection_gives_its_reason(
-    peers: Callable[..., Peer],
-    talk: Talk,
-    station_key: str,
-    board_key: str,
-    message: str,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(live_link, "ANSWER_TIMEOUT_US", 1_000_000)
-    with pytest.raises(LinkError, match=message):
-        link_to(peers(talk, board_key), station_key).open(lambda: False)
-
-
-def test_a_port_has_one_user(peers: Callable[..., Peer]) -> None:
-    peer = peers(board)
-    link = link_to(peer)
-    link.open(lambda: False)
-    with pytest.raises(LinkError, match="Resource temporarily unavailable"):
-        link_to(peer).open(lambda: False)
-    link.close()
-    link.open(lambda: False)
-    link.close()
+def link_to(peer: Peer) -> MavlinkSerialLink:
+    return MavlinkSerialLink(peer.uri, LinkSettings(50.0, 0, 921_600))
 
 
 # Sending
