@@ -61,8 +61,12 @@ class Terminal:
 
     def _leave(self) -> None:
         assert self._session is not None
-        with suppress(Exception):  # a line was just finished: the thread checks whether to go on
+        with suppress(Exception):  # a line was just finished: the next prompt ends at once
             self._session.app.exit(exception=EOFError)
+
+    def _leave_if_closing(self) -> None:
+        if self._closing:
+            self._leave()
 
     def _put(self, line: str) -> None:
         with suppress(queue.Full):
@@ -83,7 +87,7 @@ class Terminal:
         with patch_stdout():  # output appears above the line that is being typed
             while not self._closing:
                 try:
-                    self._put(self._session.prompt("> "))
+                    self._put(self._session.prompt("> ", pre_run=self._leave_if_closing))
                 except KeyboardInterrupt:  # typed here, meant for the program
                     signal.raise_signal(signal.SIGINT)
                 except EOFError:

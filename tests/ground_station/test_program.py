@@ -3,20 +3,25 @@
 from collections.abc import Callable
 from math import inf
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from firmware_py.extras import install_command
+from firmware_py.wire import WireError
 from firmware_py.wire.supervisor import State
-from firmware_py.wire.telemetry import Sample
+from firmware_py.wire.telemetry import CONTROL, Sample
 from ground_station import program
-from ground_station.config import GroundConfig
-from ground_station.errors import LinkError
+from ground_station.config import GroundConfig, LinkSettings
+from ground_station.controls import Answer, ControlAction, ControlRequest
+from ground_station.errors import LinkError, MocapError
 from ground_station.latency import LinkLatency
 from ground_station.mocap import MocapFrame
 from ground_station.program import LoopHook, Session, StationSession, fly, run_until
 from ground_station.trajectory import Goal, Offsets, Step, Trajectory
 
 FRAME_US = 20_000
+EPOCH_US = 1_700_000_000_000_000
 
 
 class Room:
@@ -33,6 +38,8 @@ class Room:
         self.goals: list[tuple[int, Goal]] = []
         self.ages_us: list[int] = []  # of the poses, when the link got them
         self.connects_s = 0.0
+        self.sends: tuple[Sample, ...] = ()  # by the board in each turn
+        self.settings: LinkSettings | None = None
         self._next_us, self._muted_us = 0, inf
 
     def say(self, text: str) -> None:
@@ -48,7 +55,7 @@ class Room:
 
     def receive(self, timeout_or_us: float, data: bytes | None = None) -> MocapFrame | list[Sample] | None:
         if data is not None:  # of the link
-            return []
+            return list(self.sends)
         end_us = self.now_us + round(1e6 * timeout_or_us)
         if self._in(self.blind):
             self._next_us = max(self._next_us, end_us // FRAME_US * FRAME_US + FRAME_US)
@@ -93,7 +100,7 @@ class Room:
         self.say("closed")
 
     def received(self) -> list[tuple[int, bytes]]:
-        return []
+        return [(self.now_us, b"")] if self.sends else []
 
     def notices(self) -> list[str]:
         return []
@@ -115,7 +122,13 @@ def flown(
         return Offsets(home, start_us, x=Step(0.1))
 
     monkeypatch.setattr(program, "clock_us", lambda: room.now_us)
-    monkeypatch.setattr(program, "find_link", lambda uri, settings: room)
+
+    def find_link(uri: str, settings: LinkSettings) -> Room:
+        room.settings = settings
+        return room
+
+    monkeypatch.setattr(program, "find_link", find_link)
+    monkeypatch.setattr(program, "epoch_us", lambda: EPOCH_US)
     monkeypatch.setattr(program, "_open_source", lambda mocap, capture: room)
     stopping = run_until(lambda: False, until_s)
     fly(GroundConfig(), Session("room", None, step, start_s=1.5, **more), room.say, stopping, hooks)  # type: ignore[arg-type]
@@ -181,3 +194,95 @@ def test_what_happened_to_the_files_of_a_flight_is_said_while_it_flies(
     assert (tmp_path / "frames.csv").read_text().count("\n") == pytest.approx(
         177, abs=2
     )  # 3.5 s with the title
+
+
+def test_telemetry_and_frames_of_mavlink_are_in_their_files_whole(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    room = Room((inf, inf), (inf, inf))
+    names = [variable.name for variable in CONTROL.variables]
+
+    def talks(session: StationSession, now_us: int) -> None:
+        room.sends = (Sample(CONTROL, now_us // 1000, tuple(range(len(names)))),)
+        assert room.settings is not None
+        assert room.settings.note_frame is not None
+        room.settings.note_frame(now_us, b"frame")
+
+    log, tlog = tmp_path / "telemetry.csv", tmp_path / "link.tlog"
+    flown(room, monkeypatch, 6.0, (talks,), log=log, tlog=tlog)
+    header, *rows = (row.split(",") for row in log.read_text().splitlines())
+    columns = {title.partition(" ")[0]: index for index, title in enumerate(header)}
+    assert [float(rows[0][columns[name]]) for name in names] == [*range(len(names))]
+    stamps_ms = [int(row[0]) for row in rows]
+    assert stamps_ms == sorted(set(stamps_ms))
+    assert (stamps_ms[0], stamps_ms[-1]) == (20, 6020)
+    frames = tlog.read_bytes()
+    assert [frames[at + 8 : at + 13] for at in range(0, len(frames), 13)] == [b"frame"] * (len(frames) // 13)
+    times_us = [int.from_bytes(frames[at : at + 8], "big") - EPOCH_US for at in range(0, len(frames), 13)]
+    assert [time_us // 1000 for time_us in times_us] == stamps_ms
+    (state,) = [text for _, text in room.says if text.startswith("poses ")]
+    assert state.endswith(f"telemetry {sum(stamp_ms < 5000 for stamp_ms in stamps_ms)}")
+
+
+def test_a_request_is_repeated_until_its_answer_or_the_loss_of_the_link(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    request, answer = ControlRequest(ControlAction.SAVE), Answer((("gain", 1.0),))
+    now_us, turns, heard = 7_000_000, iter(range(9)), list[tuple[int, bytes]]()
+
+    def wait(duration_s: float) -> None:
+        nonlocal now_us
+        now_us += round(1e6 * duration_s)
+
+    class Line:
+        uri = "line"
+
+        def ask(self, t_us: int, asked: ControlRequest) -> None:
+            assert (t_us, asked) == (7_000_000, request)
+
+        def answer(self, t_us: int) -> Answer | None:
+            assert t_us == now_us
+            return answer if t_us == 7_006_000 else None
+
+        def received(self) -> list[tuple[int, bytes]]:
+            return [(now_us, b"bad"), (now_us, b"good")]
+
+        def receive(self, t_us: int, data: bytes) -> None:
+            if data == b"bad":
+                raise WireError("bad")
+            heard.append((t_us, data))
+
+        def check(self) -> None:
+            if next(turns) > 2:
+                raise LinkError("line: lost")
+
+    monkeypatch.setattr(program, "clock_us", lambda: now_us)
+    monkeypatch.setattr(program, "wait", wait)
+    line: Any = Line()
+    assert program.ask(line, request) is answer
+    assert heard == [(7_000_000 + 2000 * turn, b"good") for turn in range(3)]
+    now_us = 7_000_000
+    with pytest.raises(LinkError, match="line: lost"):
+        program.ask(line, request)
+
+
+@pytest.mark.parametrize(("error", "line"), [
+    (LinkError("udp://1: lost"), "--link udp://1: lost"), (MocapError("--mocap vrpn:a: lost"), "--mocap vrpn:a: lost"),
+    (PermissionError(13, "Permission denied", "a/log.csv"), "a/log.csv: Permission denied"),
+    (OSError(28, "No space left on device"), "No space left on device"), (OSError("odd"), "odd"),
+    (ImportError("no serial"), f"--link mavlink:COM3: no serial: {install_command('mavlink')}"),
+])  # fmt: skip
+def test_why_a_flight_ended_is_one_line(error: Exception, line: str) -> None:
+    assert program.why(error, "mavlink:COM3") == line
+
+
+def test_a_source_that_is_not_there_is_named_as_it_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Gone:
+        def open(self) -> None:
+            raise MocapError("cave: no answer")
+
+    monkeypatch.setattr(program, "find_source", lambda mocap, capture: Gone())
+    for mocap, begin in (("vrpn:cave", "--mocap vrpn:cave"), (None, "capture.system = optitrack")):
+        with pytest.raises(MocapError) as caught:
+            program._open_source(mocap, GroundConfig().capture)
+        assert str(caught.value) == f"{begin}: cave: no answer"
