@@ -1,0 +1,151 @@
+"""A whole board with the tests' own firmware, which goes wrong: what is reported once, after each reset, and not at all."""
+
+import re
+from collections.abc import Sequence
+from functools import cache
+from struct import pack
+
+import pytest
+
+pytest.importorskip("unicorn")
+pytest.importorskip("cffi")
+
+from hil.emulator.crazyflie import crazyflie
+from hil.emulator.crazyflie.crazyflie import Crazyflie
+from hil.emulator.stm32f405.chip import SOFTWARE, WATCHDOG, build_machine
+from hil.emulator.stm32f405.image import Image
+from support.stm32_firmware import build
+
+(
+    NOTHING, BUS_FAULT, UNDEFINED, ASSERTION, HUNGRY_WATCHDOG, NULL_CALL, NULL_READ, NULL_WRITE, DIVISION, HANG, OVERFLOW,
+) = range(11)  # fmt: skip
+IN_REPORT = r", in task REPORT: go_wrong \(firmware.c:\d+\) < report \(firmware.c:\d+\)"
+BUSY = (
+    r"hang: busy for 10 ms without waiting for anything, in task SPIN-0: .*"  # that it is, from its start on
+)
+
+
+@cache
+def image() -> Image:
+    return Image(build())
+
+
+class Board:
+    """A Crazyflie in a room of its own; `said` are the lines of its console."""
+
+    def __init__(self, planted: int = NOTHING) -> None:
+        self.eeprom, self.said = bytearray(b"\xff" * 8192), list[str]()
+        self.counts: list[tuple[int, ...]] = []
+        self.crazyflie = Crazyflie(image(), build_machine(), self, False, outputs=((2, 0), (2, 1)))
+        self.crazyflie.chip.write(image().symbol("planted").address, pack("<I", planted))
+
+    def run(self, begin_ms: int, end_ms: int) -> list[str]:
+        """Return what it says until then."""
+        before = len(self.said)
+        for ms in range(begin_ms, end_ms):
+            self.crazyflie.processor.run(1000 * (ms + 1))
+        return self.said[before:]
+
+    def read_battery_mv(self) -> int:
+        return 3700
+
+    def radio_send(self, data: bytes) -> bool:
+        return True
+
+    def radio_command(self, kind: int, data: bytes) -> None: ...
+
+    def debug_write(self, text: str) -> None:
+        self.said.append(text)
+
+    def write_compare(self, counts: Sequence[int]) -> None:
+        self.counts.append(tuple(counts))
+
+
+@pytest.mark.parametrize(("planted", "line"), [
+    (BUS_FAULT, f"HardFault: access to where there is no memory at 0x30000000{IN_REPORT}"),
+    (UNDEFINED, f"HardFault: undefined instruction{IN_REPORT}"),
+    (NULL_CALL, r"HardFault: jump to an even address: not Thumb code, in task REPORT: 0x00000000, .* < go_wrong .*"),
+])  # fmt: skip
+def test_a_fault_is_a_failure_once_and_what_kept_other_tasks_from_running_comes_first(
+    planted: int, line: str
+) -> None:
+    board = Board(planted)
+    said = board.run(0, 60)
+    assert [bool(re.fullmatch(pattern, text)) for pattern, text in zip((BUSY, line), said, strict=True)] == [
+        True
+    ] * 2
+    assert board.crazyflie.failures == said
+    assert board.run(60, 120) == []
+    assert board.crazyflie.resets == {WATCHDOG: 0, SOFTWARE: 0}
+
+
+def test_each_assertion_and_its_reset_are_reported_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    board = Board(ASSERTION)
+    said = board.run(0, 60)
+    failed = r"assertion how != ASSERTION failed at firmware.c:\d+" + IN_REPORT
+    by_itself = r"reset by software, in task REPORT: assertFail .* < go_wrong .* < report .*"
+    expected = (BUSY, failed, by_itself) * 5
+    assert [bool(re.fullmatch(pattern, text)) for pattern, text in zip(expected, said, strict=True)] == [
+        True
+    ] * 15
+    assert board.crazyflie.resets == {WATCHDOG: 0, SOFTWARE: 5}
+    assert board.crazyflie.failures == said
+
+
+def test_a_watchdog_that_nobody_feeds_resets_and_names_who_ran_each_time() -> None:
+    board = Board(HANG)
+    said = board.run(0, 450)
+    hang = r"hang: busy for 201 ms without waiting for anything, in task REPORT: hang \(firmware.c:\d+\) < go_wrong .*"
+    reset = r"watchdog reset: nobody fed it in time; this ran then, in task REPORT: hang \(.*"
+    expected = (hang, reset) * 2
+    assert [bool(re.fullmatch(pattern, text)) for pattern, text in zip(expected, said, strict=True)] == [
+        True
+    ] * 4
+    assert board.crazyflie.resets == {WATCHDOG: 2, SOFTWARE: 0}
+
+
+@pytest.mark.parametrize(("planted", "line"), [
+    (NULL_READ, f"null pointer: read at 0x00000008, where the chip has its flash again; .*{IN_REPORT}"),
+    (NULL_WRITE, f"null pointer: write to 0x0000000c, which has no effect and causes no fault{IN_REPORT}"),
+    (DIVISION, f"division by zero: its result is 0; no fault follows, .*{IN_REPORT}"),
+])  # fmt: skip
+def test_what_has_no_effect_is_reported_once_and_is_no_failure(planted: int, line: str) -> None:
+    board = Board(planted)
+    (said,) = board.run(0, 60)
+    assert re.fullmatch(line, said)
+    assert (board.crazyflie.failures, board.crazyflie.known) == ([], [])
+
+
+def test_a_mistake_that_bitcraze_s_firmware_is_known_for_is_kept_and_not_printed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for known, printed in (({("go_wrong", 0x0C)}, False), ({("go_wrong", 0x08)}, True), ({("report", 0x0C)}, False),
+                           ({("ledInit", 0x0C)}, True)):  # fmt: skip
+        monkeypatch.setattr(crazyflie, "KNOWN_WRITES", known)
+        board = Board(NULL_WRITE)
+        assert len(board.run(0, 15)) == printed
+        assert len(board.crazyflie.known) == (not printed)
+
+
+def test_a_stack_that_overflows_is_the_first_failure() -> None:
+    board = Board(OVERFLOW)
+    assert re.fullmatch(r"stack overflow, in task REPORT: dig \(.*", board.run(0, 15)[0])
+    assert board.crazyflie.failures[0] == board.said[0]
+
+
+def test_outputs_are_told_when_one_has_changed_and_a_missing_peripheral_once() -> None:
+    board = Board()
+    assert board.run(0, 100) == []
+    assert len(board.counts) > 5
+    assert all(before != after for before, after in zip(board.counts, board.counts[1:], strict=False))
+    assert all(1000 <= first < 2000 and second == 0 for first, second in board.counts[1:])
+    state = board.crazyflie.chip.state
+    for address in (0x4001_2000, 0x4000_5401):
+        state.unknown[state.unknown_count] = address
+        state.unknown_count += 1
+        board.crazyflie.report_unknown()
+        board.crazyflie.report_unknown()
+    assert board.said == [
+        "the image uses a peripheral that is not modelled, at 0x40012000: it reads as 0",
+        "the image uses a peripheral whose clock is off (RCC), at 0x40005400: it reads as 0 and keeps nothing",
+    ]
