@@ -13,6 +13,7 @@ from hil.config import load_config
 from hil.errors import LabError
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.request import Request
+from hil.servers import linked
 from hil.servers.dongle_plugin import VARIABLE
 from hil.servers.linked import LISTEN_PERIOD_US, RELEASE_TIMEOUT_US, WARM_UP_US, linked_flight
 
@@ -31,7 +32,9 @@ def stack() -> Iterator[ExitStack]:
 def line_of(stack: ExitStack, folder: Path, link: str, program: str = "", **options: Any) -> Any:
     """Return the line of a linked flight, whose station is a program in Python."""
     request = Request.of(EXPERIMENTS["yaw-step"], link=link, **options)
-    line: Any = stack.enter_context(closing(linked_flight(request, folder / "telemetry.csv", stack))).line
+    flight = stack.enter_context(closing(linked_flight(request, folder / "telemetry.csv", stack)))
+    line: Any = flight.line
+    line.lab = flight.lab
     line.started_by = line._command
     line._command = [sys.executable, "-c", program]
     return line
@@ -122,3 +125,59 @@ def test_the_goal_is_at_home_until_the_release_and_its_own_parts_cannot_be_steer
         line.steer(None)
     with pytest.raises(LabError, match="set parameters there"):
         line.listen(print)
+
+
+LEAVES = """
+import signal, sys
+
+def leave(number, frame):
+    print("leaving")
+    sys.exit(0)
+
+signal.signal(signal.SIGTERM, leave)
+print("ready")
+print("set", flush=True)
+signal.pause()
+"""
+STAYS = LEAVES.replace("sys.exit(0)", "sys.stdout.flush()").replace(
+    "signal.pause()", "while True: signal.pause()"
+)
+
+
+@pytest.mark.parametrize(("program", "code"), [(LEAVES, 0), (STAYS, -9)], ids=["leaves", "stays"])
+def test_a_station_may_end_in_order_and_is_killed_after_a_while(
+    stack: ExitStack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, code: int
+) -> None:
+    monkeypatch.setattr(linked, "STATION_EXIT_TIMEOUT_US", 60_000_000 if code == 0 else 200_000)
+    line, said = line_of(stack, tmp_path, UDP, program), list[tuple[str, str]]()
+    line._say = lambda *note: said.append(note)
+    heard(line, WARM_UP_US)
+    line.lab.end_at(10_000)
+    line.lab.run()
+    line.finish(line.lab)
+    assert line._station.returncode == code
+    assert said == [("station", "leaving")] or code  # a killed one may not have come to say it
+    assert line.lab.now_us == 210_000 if code else line.lab.now_us < 60_000_000
+
+
+def test_the_release_begins_the_trajectory_and_the_counters_are_those_of_the_link(
+    stack: ExitStack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clamps: list[Any] = []
+    monkeypatch.setattr(linked, "LaunchClamp", lambda robot, let_go: clamps.append((robot, let_go)))
+    counted = {}
+    for link in (UDP, "mavlink:pty", "radio://0/80/2M/E7E7E7E7E7"):
+        line, released = line_of(stack, tmp_path, link), list[int]()
+        line.begin(released.append)
+        robot, let_go = clamps.pop()
+        assert robot is line.robot
+        let_go(7_000_000)
+        assert (released, line._release_us) == ([7_000_000], 7_000_000)
+        board, clock = line.channels()
+        counted[link.partition(":")[0]] = [
+            quantity.names for channel in board for quantity in channel.quantities
+        ]
+        assert [quantity.unit for quantity in clock[0].quantities] == ["us"]
+    assert counted["radio"] == []
+    assert "link.unanswered" in counted["udp"][0]
+    assert counted["udp"] != counted["mavlink"] != []

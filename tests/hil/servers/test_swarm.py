@@ -1,7 +1,5 @@
 """Robots of one server, each in a separate process: dongles, UDP, typed lines, failures and shutdown, at any pace."""
 
-import os
-import signal
 import socket
 from collections.abc import Iterator
 from contextlib import closing, suppress
@@ -14,6 +12,7 @@ from firmware_py.firmware import Firmware
 from hil.board.board_firmware import PowerOn, PythonBoard
 from hil.config import load_config
 from hil.emulator.crazyflie import syslink
+from hil.errors import LabError
 from hil.laboratory.faults import parse
 from hil.servers.dongle_plugin import CONTROL, VARIABLE, WRITE, Connection, frame
 from hil.servers.dongle_server import AHEAD
@@ -155,24 +154,6 @@ def test_ctrl_c_ends_all_processes_in_order_and_keeps_every_robots_eeprom(tmp_pa
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"board-{number}.eeprom" for number in (1, 2)]
 
 
-@pytest.mark.long
-def test_a_robot_whose_process_dies_is_named_and_the_others_continue() -> None:
-    with serve("--boards", "3", "--radio", "--radio-port", "0") as served, closing(Dongle(served)) as dongle:
-        assert [dongle.send(last) for last in (0xE7, 0x02, 0x03)] == [1, 1, 1]
-        os.kill(others(served)[0], signal.SIGKILL)
-        served.wait_for(r"^robot 2: its process has ended; the others continue$", PATIENCE_S)
-        with closing(Dongle(served)) as later:
-            for client in (dongle, later, dongle):
-                assert [client.send(last) for last in (0xE7, 0x02, 0x03)] == [1, 0, 1]
-        served.forget()
-        served.type("2 status")
-        served.wait_for(r"^robot 2: its process has ended$", PATIENCE_S)
-        served.type("3 status")
-        served.wait_for(r"^robot 3: held, ", PATIENCE_S)
-        assert served.interrupt() == 0
-        assert served.lines[-1].startswith("stopped; time stood still for")
-
-
 def test_robots_do_not_outlive_a_server_that_is_killed() -> None:
     with serve("--boards", "2", "--udp", "0") as served:
         served.process.kill()
@@ -210,6 +191,45 @@ def test_a_peer_packet_of_one_board_reaches_those_of_all_other_processes() -> No
                     server.run(lambda expected=expected: expected <= set(said))
     heard = [line for line in said if "peer says" in line]
     assert len(heard) == 6
+
+
+class Cameras:
+    """A Motive that keeps what it gets."""
+
+    def __init__(self) -> None:
+        self.lost: list[int] = []
+        self.streamed: set[int] = set()
+
+    def lose(self, number: int) -> None:
+        self.lost.append(number)
+
+    def stream_frame(self, number: int, *frame: object) -> None:
+        self.streamed.add(number)
+
+
+def test_a_robot_whose_process_dies_is_named_and_lost_and_the_others_continue() -> None:
+    said, motive = list[str](), Cameras()
+    plan, endpoints = Service(load_config()), Endpoints(udp=0, motive=True)
+    with closing(Swarm(plan, 3, endpoints, said.append)) as swarm:
+        assert [robot.radio[-2:] for robot in swarm.wait()] == ["02", "03"]
+        answers: list[str] = []
+        with closing(Server(plan, lambda line: None, None, swarm.to_peers, swarm.room)) as server:
+            swarm.listen(server, answers.append, motive)  # type: ignore[arg-type]
+            swarm.room.rows[:] = 1.0
+            server.run(lambda: motive.streamed == {2, 3})
+            swarm._processes[3].kill()
+            typing = swarm.terminals
+            dead = "robot 3: its process has ended; the others continue"
+            server.run(lambda: any(line.startswith("robot ") for line in said))
+            assert [line for line in said if line.startswith("robot ")] == [dead]
+            assert motive.lost == [3]
+            assert [row.any() for row in swarm.room.rows] == [True, True, False]
+            with pytest.raises(LabError, match=r"^robot 3: its process has ended$"):
+                typing[3]("3 status")
+            assert set(swarm.terminals) == {2}
+            typing[2]("2 status")
+            server.run(lambda: bool(answers))
+            assert answers[0].startswith("robot 2: held, ")
 
 
 @pytest.mark.parametrize("radius", [0.07, pytest.param(0.0, marks=pytest.mark.long)])
