@@ -1,10 +1,13 @@
 """The program's end of the virtual Crazyradio: as pyusb sees it, and its frames to each process of a server."""
 
+import atexit
 import errno
 import socket
+import time
 from array import array
 from collections.abc import Iterator
 from threading import Thread
+from typing import Any
 
 import pytest
 import usb.core
@@ -15,12 +18,14 @@ from hil.servers.dongle_plugin import (
     PAUSES,
     PORTS,
     READ,
+    VARIABLE,
     WRITE,
     Backend,
     Connection,
     SimulatedClock,
     all_descriptors,
     frame,
+    install,
     standard_request,
 )  # fmt: skip
 
@@ -224,3 +229,65 @@ def test_a_sleep_lasts_longer_by_what_simulated_time_stood_still() -> None:
     plain = SimulatedClock(("127.0.0.1", process.port), sleep)
     plain.sleep(1.0)
     assert slept[4:] == [1.0], "without a server"
+
+
+def test_a_dongle_whose_server_leaves_while_it_connects_keeps_no_line() -> None:
+    first, second = Process(), Process()
+
+    def leave() -> None:
+        first.accept(frame(PORTS, 0, second.port.to_bytes(2))[:3])
+        first.die()
+
+    leaving = Thread(target=leave)
+    leaving.start()
+    with pytest.raises(usb.core.USBError) as gone:
+        Backend(f"127.0.0.1:{first.port}").open_device(None)
+    assert gone.value.errno == errno.ENODEV
+    leaving.join()
+    first.listener.close()
+    with pytest.raises(usb.core.USBError):
+        Backend(f"127.0.0.1:{first.port}").open_device(None)
+    second.listener.close()
+
+
+def test_pyusb_s_requests_reach_the_dongle_and_there_is_one_of_everything(
+    dongle: Connection, processes: tuple[Process, Process]
+) -> None:
+    backend: Any = Backend("127.0.0.1:1")
+    assert list(backend.enumerate_devices()) == []
+    assert (backend.get_configuration(dongle), backend.is_kernel_driver_active(dongle, 0)) == (1, False)
+    for asked in (
+        lambda: backend.get_configuration_descriptor(None, 1),
+        lambda: backend.get_interface_descriptor(None, 1, 0, 0),
+        lambda: backend.get_interface_descriptor(None, 0, 1, 0),
+    ):
+        with pytest.raises(IndexError):
+            asked()
+    assert backend.ctrl_transfer(dongle, 0x40, 2, 0x1234, 0, array("B", b"\xe7\xe7"), 0) == 2
+    assert backend.ctrl_transfer(dongle, 0x40, 6, 0x0100, 0, b"", 0) == 0
+    backend.bulk_write(dongle, 1, 0, b"x", 0)
+    requests = [(CONTROL, b"\x02\x34\x12\xe7\xe7"), (CONTROL, b"\x06\x00\x01"), (WRITE, b"x")]
+    for process in processes:
+        assert process.frames(3) == requests
+    backend.close_device(dongle)
+    with pytest.raises(usb.core.USBError) as gone:
+        backend.bulk_write(dongle, 1, 0, b"y", 0)
+    assert gone.value.errno == errno.ENODEV
+
+
+@pytest.mark.parametrize(("named", "server"), [("10.0.0.1:7", ("10.0.0.1", 7)), ("", ("127.0.0.1", 19840))])
+def test_installed_it_is_the_only_bus_and_the_clock_of_sleeps(
+    monkeypatch: pytest.MonkeyPatch, named: str, server: tuple[str, int]
+) -> None:
+    libusb_package: Any = pytest.importorskip("libusb_package")
+    at_end: list[Any] = []
+    sleep = time.sleep
+    monkeypatch.setattr(time, "sleep", sleep)
+    monkeypatch.setattr(libusb_package, "get_libusb1_backend", None)
+    monkeypatch.setattr(atexit, "register", at_end.append)
+    monkeypatch.setenv(VARIABLE, named)
+    install()
+    assert libusb_package.get_libusb1_backend()._server == server
+    clock: Any = time.sleep.__self__  # type: ignore[attr-defined]
+    assert isinstance(clock, SimulatedClock)
+    assert (clock._server, clock._sleep, at_end) == (server, sleep, [clock.close])

@@ -3,8 +3,10 @@
 import ctypes
 import errno
 import os
+import signal
 import socket
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from ctypes import c_char, c_int, c_ubyte, c_uint, c_uint16, c_void_p, sizeof
 from pathlib import Path
 from threading import Thread
@@ -279,3 +281,94 @@ def test_the_bus_has_the_kernel_s_files(tmp_path: Path) -> None:
     assert os.readlink(tmp_path / "dev/.node/bus_usb_001_002") == "189:1"
     assert place == tmp_path / "ioctl/dev/bus/usb/001/002"
     assert place.parent.is_dir()
+
+
+# Programs
+
+
+def test_each_opened_node_is_answered_by_itself_until_its_program_ends(tmp_path: Path) -> None:
+    place, ends = str(tmp_path / "ioctls"), list[socket.socket]()
+    speed = usb_dongle.WORDS.pack(1, ioc(0, 31), 0)
+
+    def steps() -> Iterator[bool]:
+        """Act as programs do between two looks of the server."""
+        for _ in range(2):
+            ends.append(socket.socket(socket.AF_UNIX))
+            ends[-1].connect(place)
+        for end in (1, 0, 0):
+            ends[end].sendall(speed)
+            yield from [True] * 3
+            assert ends[end].recv(24, socket.MSG_DONTWAIT) == usb_dongle.WORDS.pack(3, 2, 0)
+            if end:
+                ends[end].close()
+        ends[0].close()
+        yield True
+        yield False
+
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(place)
+        listening.listen()
+        usb_dongle._serve(listening, Dongle, steps().__next__)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def on_bus() -> Iterator[Callable[..., int]]:
+    """Run a shell's command with a dongle on its bus."""
+    before = signal.getsignal(signal.SIGTERM)
+    yield lambda command: usb_dongle.run(("127.0.0.1", 9), ["/bin/sh", "-c", command])
+    signal.signal(signal.SIGTERM, before)
+
+
+def test_a_program_has_the_bus_and_its_exit_code_is_that_of_the_run(
+    on_bus: Callable[..., int], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(usb_dongle, "TURN_S", 0.01)
+    monkeypatch.setenv("LD_PRELOAD", "")
+    sysfs = (
+        'test -d "$UMOCKDEV_DIR/sys/bus/usb/devices/1-1" && test -S "$UMOCKDEV_DIR/ioctl/dev/bus/usb/001/002"'
+    )
+    assert on_bus(f'{sysfs} && echo "$LD_PRELOAD"; exit 7') == 7
+    assert capfd.readouterr().out == f"{usb_dongle.PRELOAD}\n"
+    assert on_bus("kill -9 $$") == 137
+    monkeypatch.setenv("LD_PRELOAD", "libother.so")
+    on_bus('echo "$LD_PRELOAD"')
+    assert capfd.readouterr().out == f"{usb_dongle.PRELOAD}:libother.so\n"
+    assert usb_dongle.run(("127.0.0.1", 9), ["/no/program"]) == 127
+    assert capfd.readouterr().err.splitlines()[-1] == "/no/program: No such file or directory"
+
+
+@pytest.mark.parametrize(("program", "runs", "code"), [("exit 3", False, 3), ("sleep 100", True, 0)])
+def test_a_program_that_still_runs_is_ended_without_an_error(
+    monkeypatch: pytest.MonkeyPatch, program: str, runs: bool, code: int
+) -> None:
+    monkeypatch.setattr(usb_dongle, "command_of", lambda port: ["/bin/sh", "-c"] if port == 7100 else [])
+    client = usb_dongle.start(7100, [program])
+    if not runs:
+        client.wait()
+    assert usb_dongle.end(client) == code
+    assert client.returncode == (-signal.SIGTERM if runs else code)
+
+
+def test_what_a_program_needs_is_said_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refused(*arguments: str) -> str:
+        assert usb_dongle.main(arguments) == 2
+        return capsys.readouterr().err
+
+    assert usb_dongle.command_of(7100)[1:] == ["-m", "hil.servers.usb_dongle", "127.0.0.1:7100"]
+    usage = "usage: python -m hil.servers.usb_dongle HOST:PORT PROGRAM ...\n"
+    assert refused("127.0.0.1:1") == refused("here", "true") == usage
+    monkeypatch.setattr(usb_dongle, "PRELOAD", "libnothere.so")
+    assert refused("127.0.0.1:1", "true") == f"{usb_dongle.MISSING}\n"
+    monkeypatch.setattr(sys, "byteorder", "big")
+    assert usb_dongle.why_not() == "needs a 64-bit little-endian machine"
+    monkeypatch.setattr(usb_dongle, "why_not", lambda: "")
+    for address in ("127.0.0.1:1", "127.0.0.1:x"):
+        assert refused(address, "true").startswith(f"{address}: no `floaty serve --radio` there (")
+    ran: list[object] = []
+    monkeypatch.setattr(usb_dongle, "run", lambda server, program: ran.append((server, program)) or 5)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        assert usb_dongle.main([f"127.0.0.1:{port}", "radio", "E7"]) == 5
+    assert ran == [(("127.0.0.1", port), ["radio", "E7"])]
