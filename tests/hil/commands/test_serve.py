@@ -1,0 +1,137 @@
+"""`floaty serve` in this process: what it opens and says, whose exit code it has, and when it ends."""
+
+import signal
+from types import SimpleNamespace as Made
+from typing import Any
+
+import pytest
+
+from ground_station import records, stops
+from hil.commands import options
+from hil.servers import server, usb_dongle
+from support.command import Cli
+
+ALONE = ("--no-motive", "--radio-port", "0")
+
+
+@pytest.fixture
+def _ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the server end at once, as by Ctrl-C."""
+    monkeypatch.setattr(stops, "stop_signals", lambda: [signal.SIGINT])
+
+
+def started(monkeypatch: pytest.MonkeyPatch, code: int) -> list[tuple[int, list[str]]]:
+    """Return the programs that a server has started, each of which has ended with a code."""
+    programs: list[tuple[int, list[str]]] = []
+
+    def start(port: int, program: list[str]) -> Any:
+        programs.append((port, list(program)))
+        return Made(poll=lambda: code, wait=lambda: code)
+
+    monkeypatch.setattr(usb_dongle, "start", start)
+    monkeypatch.setattr(usb_dongle, "why_not", lambda: "")
+    return programs
+
+
+@pytest.mark.parametrize("code", [0, 5])
+def test_a_server_with_a_program_on_its_bus_ends_with_it(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    programs = started(monkeypatch, code)
+    assert cli("serve", *ALONE, "--usb", "--", "radio", "E7") == code
+    lines = cli.out.splitlines()
+    assert [line.split()[0] for line in lines] == ["radio", "use", "serving;", "stopped;"]
+    port = int(lines[1].partition("FLOATY_DONGLE=127.0.0.1:")[2].split()[0])
+    assert programs == [(port, ["radio", "E7"])]
+    assert lines[-1] == "stopped; time stood still for 0 ms"
+
+
+@pytest.mark.usefixtures("_ctrl_c")
+def test_a_server_says_how_a_program_gets_the_bus_and_where_its_cameras_are(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    programs = started(monkeypatch, 5)
+    assert cli("serve", "--usb", "--radio-port", "0", "--set", "capture.port=0") == 0
+    (usb,) = [line for line in cli.out.splitlines() if line.startswith("usb ")]
+    assert usb.endswith(" PROGRAM")
+    assert "-m hil.servers.usb_dongle 127.0.0.1:" in usb
+    (motive,) = [line for line in cli.out.splitlines() if line.startswith("motive ")]
+    assert motive.split(":")[:2] == ["motive optitrack", "127.0.0.1"]
+    assert motive.split(":")[2].isdecimal()
+    assert programs == []
+    monkeypatch.setattr(usb_dongle, "why_not", lambda: "no bus")
+    assert cli.refusal("serve", "--usb") == "floaty: --usb: no bus\n"
+
+
+@pytest.mark.usefixtures("_ctrl_c")
+@pytest.mark.parametrize(("settings", "options"), [
+    (("multicast=true", "axes=z-up"), ",multicast,z-up"), (("axes=z-up",), ",z-up"), (("axes=y-up",), ""),
+])  # fmt: skip
+def test_the_cameras_options_are_those_of_their_stream(
+    cli: Cli, settings: tuple[str, ...], options: str
+) -> None:
+    chosen = [word for setting in ("port=0", *settings) for word in ("--set", f"capture.{setting}")]
+    assert cli("serve", "--udp", "0", *chosen) == 0
+    (motive,) = [line for line in cli.out.splitlines() if line.startswith("motive ")]
+    assert motive.partition(",")[2] == options.removeprefix(",")
+    assert [line.split()[0] for line in cli.out.splitlines()] == ["udp", "motive", "serving;", "stopped;"]
+
+
+class View:
+    """A picture in whose panel lines were typed; it keeps the answers."""
+
+    def __init__(self, *lines: str) -> None:
+        self._lines, self.answers = [*lines], list[tuple[int, str]]()
+
+    def lines(self) -> list[str]:
+        lines, self._lines = self._lines, []
+        return lines
+
+    def answer(self, now_us: int, text: str) -> None:
+        self.answers.append((now_us, text))
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *what, **more: None
+
+
+def test_lines_of_the_panel_are_answered_at_the_terminal_and_in_the_picture(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    view = View("status", "2 status")
+    monkeypatch.setattr(options, "open_live", lambda target, say: view)
+    monkeypatch.setattr(stops, "stop_signals", lambda: Answers(view))
+    assert cli("serve", "--udp", "0", "--no-motive") == 0
+    said = [line for line in cli.out.splitlines() if line.startswith("robot ")]
+    assert [line.split()[1] for line in said] == ["1:", "2:"]
+    assert [text for _, text in view.answers] == said
+    assert view.answers[0][0] > 0
+
+
+class Answers(list[int]):
+    """Ctrl-C once all lines of a picture's panel are answered."""
+
+    def __init__(self, view: View) -> None:
+        super().__init__()
+        self._view = view
+
+    def __bool__(self) -> bool:
+        return len(self._view.answers) == 2
+
+
+@pytest.mark.usefixtures("_ctrl_c")
+def test_the_cameras_track_every_robot_and_a_lost_output_is_told_by_the_exit_code(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counts: list[int] = []
+    open_motive = server.open_motive
+
+    def open_counted(streaming: Any, robot: Any, clock: Any, count: int = 1) -> Any:
+        counts.append(count)
+        return open_motive(streaming, robot, clock, count)
+
+    monkeypatch.setattr(server, "open_motive", open_counted)
+    monkeypatch.setattr(records, "is_writable", lambda stream: False)
+    arguments = ("serve", "--set", "capture.port=0", "--boards", "2", "--udp", "0")
+    assert (cli(*arguments), cli.out, counts) == (records.INCOMPLETE, "", [2])
+    started(monkeypatch, 5)
+    assert cli("serve", *ALONE, "--usb", "--", "radio") == 5
