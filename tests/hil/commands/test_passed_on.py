@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_station.controls import ControlAction
+from ground_station.controls import ControlAction, ControlsError
 from ground_station.errors import LinkError
 from hil.commands import fly, identify, paper, param
 from hil.config import load_config
+from hil.laboratory.experiments import EXPERIMENTS
 from hil.research.campaigns.run import Runner
 from hil.research.design import analysis
 from hil.research.design.analysis import Analysis
@@ -307,3 +308,83 @@ def test_an_analysis_is_written_as_page_pictures_and_numbers(monkeypatch: pytest
     assert all(part in text for part in ('id="shape"', "0.3 kg", "9.5", "9.4"))
     assert told == {"geometry": json.loads(point.geometry.model_dump_json()), "constants": asdict(point.linear.constants),
         "robot": {"mass": "0.3 kg"}, "claims": [asdict(claim)]}  # fmt: skip
+
+
+STATION = (
+    "station",
+    "--link",
+    "mavlink:COM3",
+    "yaw-step",
+    "--start",
+    "2.5",
+    "--set",
+    "controller.gain_r=0.08",
+)
+
+
+@pytest.mark.parametrize("out", [True, False])
+def test_a_station_flies_with_its_files_and_ends_with_the_result_of_its_record(
+    cli: Cli, asked: Asked, monkeypatch: pytest.MonkeyPatch, out: bool
+) -> None:
+    result = Made(outcome="completed", passed=False, folder=Path("run"))
+    flight = Made(telemetry=Path("run/telemetry.csv"), on_loop="row", note=lambda *note: asked.append(note))
+    flight.close = lambda failure, interrupted: asked.append(("close", failure, interrupted)) or result
+    asked.answer({
+        "laboratory.real_flight.RealFlight": flight, "commands.options.write_pictures": None,
+        "commands.station.print_result": None, "ground_station.operator.fly_with": ("", True),
+    })  # fmt: skip
+    files = (
+        "--record",
+        "seen.csv",
+        "--tlog",
+        "link.tlog",
+        *(("--out", "run") if out else ("--log", "log.csv")),
+    )
+    assert cli(*STATION, *files) == (1 if out else 0)
+    if out:
+        _, folder, request, records, _, view = asked.pop(0)
+        assert (folder, view, records.incomplete) == (Path("run"), None, False)
+        assert (request.experiment.name, request.profile, request.seed) == ("yaw-step", "floaty", 0)
+        assert (request.overrides, request.duration_s) == (
+            ("controller.gain_r=0.08",),
+            request.experiment.duration_s,
+        )
+        assert (request.bench.link, request.bench.board) == ("mavlink:COM3", "real")
+    _, _, settings, session, _, duration_s, hooks, names = asked.pop(0)
+    assert (session.uri, session.mocap, session.start_s, duration_s) == ("mavlink:COM3", None, 2.5, None)
+    assert session.log == Path("run/telemetry.csv" if out else "log.csv")
+    assert (session.record, session.tlog) == (Path("seen.csv"), Path("link.tlog"))
+    assert settings == load_config(overrides=("controller.gain_r=0.08",)).ground
+    assert ("row" in hooks, len(hooks)) == (out, 1 + out)
+    assert {"hover", "yaw-step"} <= set(names)
+    if out:
+        assert asked == [("close", "", True), ("write_pictures", Path("run"), session_experiment(session)),
+                         ("print_result", result)]  # fmt: skip
+        result.passed, result.outcome = True, "interrupted"
+        assert cli(*STATION, *files) == 130
+    else:
+        assert asked == []
+
+
+def session_experiment(session: Any) -> Any:
+    """Return the experiment whose trajectory a session flies."""
+    return next(one for one in EXPERIMENTS.values() if one.trajectory is session.trajectory)
+
+
+def test_a_station_that_failed_says_why_and_one_that_lost_a_file_says_so_in_its_exit_code(
+    cli: Cli, asked: Asked
+) -> None:
+    asked.answer({"ground_station.operator.fly_with": ("--link mavlink:COM3: gone", False)})
+    assert cli.refusal(*STATION) == "floaty: --link mavlink:COM3: gone\n"
+
+    def full(operator: Any, settings: Any, session: Any, *_: Any) -> tuple[str, bool]:
+        session.records.write("log.csv", failing(OSError(28, "")))
+        return "", False
+
+    asked.answer({"ground_station.operator.fly_with": full})
+    assert cli(*STATION) == 3
+    assert cli.out == "log.csv: No space left on device; no more is written to it\n"
+    find = asked[-1][1]._find
+    assert find("hover") is EXPERIMENTS["hover"].trajectory
+    with pytest.raises(ControlsError, match="hovar"):
+        find("hovar")
