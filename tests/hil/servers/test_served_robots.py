@@ -4,19 +4,26 @@ import os
 import re
 import select
 import socket
+from itertools import pairwise
 from struct import pack
 
 import pytest
 
+from firmware_py.config import parameters_of
+from firmware_py.export.elf import Symbol
+from hil.board import image_firmware
 from hil.board.clock import Readers
 from hil.board.image_firmware import ChipImage
 from hil.config import load_config
 from hil.emulator.crazyflie.bootloader import CHUNK, LOAD_BUFFER, PAGE_SIZE, WRITE_FLASH
 from hil.emulator.events import EventQueue
+from hil.emulator.stm32f405.chip import build_machine
+from hil.emulator.stm32f405.image import Image
 from hil.errors import LabError
 from hil.laboratory.files.recorder import stored_in
 from hil.laboratory.lockstep import image_at
-from hil.laboratory.robot import Site, Streams
+from hil.laboratory.robot import Robot, Site, Streams
+from hil.servers import served_robot
 from hil.servers.motive import Streaming
 from hil.servers.serial_server import Address
 from hil.servers.served_robot import UDP_RETRY_US, ServedRobot
@@ -25,6 +32,12 @@ from hil.servers.shared_room import SharedRoom
 from hil.world.scene import VisualModel
 from support.stm32_firmware import build, flash_binary
 from support.watching import Watcher
+
+
+@pytest.fixture(autouse=True)
+def _short_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tests' firmware is ready sooner than a Crazyflie's."""
+    monkeypatch.setattr(image_firmware, "WARM_UP_US", 20_000)
 
 
 def test_rows_of_a_served_robot_describe_its_look() -> None:
@@ -68,6 +81,30 @@ def test_firmware_without_the_app_is_reported() -> None:
     lines: list[str] = []
     Server(Service(load_config(), executor=image_at(str(build()), None)), lines.append).close()
     assert [line for line in lines if "the image lacks Floaty's app" in line]
+
+
+def test_constants_that_stay_the_images_are_said_and_it_is_polled_while_a_client_on_udp_listens(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(served_robot, "APP_PARAMETER", "test.gain")
+    config, said, polled = load_config(), list[str](), list[int]()
+    layout, image = parameters_of(config).memory.dtype, Image(build())
+    image._variables["floaty_parameters"] = [
+        Symbol("floaty_parameters", 0x2001_0000, layout.itemsize, False, True)
+    ]
+    monkeypatch.setattr(Robot, "polled", lambda robot, now_us: polled.append(now_us))
+    server = Server(Service(config, executor=ChipImage.flashed(image, build_machine())), said.append)
+    (line,) = [line for line in said if "has its own" in line]
+    assert line.startswith(f"the image has its own {layout.names[0]} = ")
+    port = int(server.open(Endpoints(udp=0)).udp.rpartition(":")[2])
+    server.lab.end_at(10_000)
+    server.lab.run()
+    assert polled == []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.sendto(b"\x30\x01", ("127.0.0.1", port))
+        server.run(lambda: len(polled) > 3)
+    assert {later - earlier for earlier, later in pairwise(polled)} == {served_robot.POLL_PERIOD_US}
+    server.close()
 
 
 def test_a_flashed_image_starts_at_the_next_start_and_one_that_cannot_run_is_named() -> None:
