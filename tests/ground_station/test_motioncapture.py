@@ -166,9 +166,9 @@ def test_the_process_gets_the_system_and_its_address_in_a_session_of_its_own(sys
 def test_of_several_bodies_the_wanted_one_is_taken_at_once_and_a_single_one_after_a_second(
     system: System,
 ) -> None:
-    def find(body: str, *seen: dict[str, tuple[float, ...]]) -> tuple[str, float]:
+    def find(body: str, *seen: dict[str, tuple[float, ...]] | None) -> tuple[str, float]:
         source, begin_us = source_of(body=body), system.now_us
-        system.sent = iter([system.line(**bodies) for bodies in seen])
+        system.sent = iter([None if bodies is None else system.line(**bodies) for bodies in seen])
         try:
             source.open()
             (line,) = source.notices()
@@ -182,7 +182,7 @@ def test_of_several_bodies_the_wanted_one_is_taken_at_once_and_a_single_one_afte
     one, two = {"one": POSE}, {"two": POSE}
     line, took_s = find("two", one, {}, two, one)
     assert ("body two" in line, took_s) == (True, pytest.approx(0.003))
-    line, took_s = find("", one, {}, one)
+    line, took_s = find("", one, {}, None, None, None, one)
     assert ("body one" in line, took_s) == (True, pytest.approx(1.0, abs=0.11))
     assert find("", one, two)[0] == "cave: body=NAME is missing; there are: one, two"
     assert find("six", one, two)[0] == "cave: no body 'six'; there are: one, two"
@@ -263,7 +263,7 @@ def test_lines_may_arrive_in_pieces_and_garbage_is_counted(system: System) -> No
 def test_a_process_that_ended_is_started_again_after_two_seconds_and_again(system: System) -> None:
     source = opened(system)
     for count in (2, 3):
-        system.sent, ended_us = iter((b"",)), system.now_us + 1000
+        system.sent, ended_us = iter((b'[7, {"floaty"', b"")), system.now_us + 2000
         assert source.receive(1.0) is None
         assert system.processes[-1].ended == ["kill", "wait"]
         while len(system.processes) < count:
@@ -274,6 +274,7 @@ def test_a_process_that_ended_is_started_again_after_two_seconds_and_again(syste
         calls, again = source.notices()
         assert calls == "motion capture: no frames; calling the server again"
         assert again.startswith("motion capture: frames arrive again after ")
+    assert source.summary().endswith("0 malformed")
 
 
 STAND_IN = """
