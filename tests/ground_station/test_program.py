@@ -224,6 +224,30 @@ def test_telemetry_and_frames_of_mavlink_are_in_their_files_whole(
     assert state.endswith(f"telemetry {sum(stamp_ms < 5000 for stamp_ms in stamps_ms)}")
 
 
+def test_full_files_end_by_themselves_and_not_the_flight(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    room = Room((inf, inf), (inf, inf))
+    full = {name: tmp_path / name for name in ("log", "record", "tlog")}
+    for path in full.values():
+        path.symlink_to("/dev/full")
+
+    def talks(session: StationSession, now_us: int) -> None:
+        room.sends = (Sample(CONTROL, now_us // 1000, (0,) * len(CONTROL.variables)),)
+        assert room.settings is not None
+        assert room.settings.note_frame is not None
+        room.settings.note_frame(now_us, bytes(1000))
+
+    records = program.Records()
+    flown(room, monkeypatch, 6.0, (talks,), records=records, **full)
+    ended = [text for _, text in room.says if "No space left" in text]
+    assert sorted(ended) == sorted(
+        f"{path}: No space left on device; no more is written to it" for path in full.values()
+    )
+    assert records.incomplete
+    assert len(room.ages_us) == pytest.approx(300, abs=5)
+
+
 def test_a_request_is_repeated_until_its_answer_or_the_loss_of_the_link(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -245,7 +269,7 @@ def test_a_request_is_repeated_until_its_answer_or_the_loss_of_the_link(
             return answer if t_us == 7_006_000 else None
 
         def received(self) -> list[tuple[int, bytes]]:
-            return [(now_us, b"bad"), (now_us, b"good")]
+            return [(now_us - 700, b"bad"), (now_us - 300, b"good")]
 
         def receive(self, t_us: int, data: bytes) -> None:
             if data == b"bad":
@@ -260,7 +284,7 @@ def test_a_request_is_repeated_until_its_answer_or_the_loss_of_the_link(
     monkeypatch.setattr(program, "wait", wait)
     line: Any = Line()
     assert program.ask(line, request) is answer
-    assert heard == [(7_000_000 + 2000 * turn, b"good") for turn in range(3)]
+    assert heard == [(6_999_700 + 2000 * turn, b"good") for turn in range(3)]
     now_us = 7_000_000
     with pytest.raises(LinkError, match="line: lost"):
         program.ask(line, request)

@@ -2,6 +2,7 @@
 
 import resource
 import socket
+import struct
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -160,3 +161,35 @@ def test_a_client_without_a_free_descriptor_is_refused_and_the_next_one_is_serve
     client.sendall(b"M")
     bench.serve()
     assert client.recv(2000) == ANSWER
+
+
+def reset(client: socket.socket) -> None:
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    client.close()
+
+
+def test_a_client_that_resets_its_connection_is_forgotten_whoever_notices(bench: Bench) -> None:
+    read, written = bench.connect(), bench.connect()
+    first, second = bench.port.clients
+    reset(read)
+    bench.serve()
+    assert [*bench.port.clients] == [second]
+    reset(written)
+    assert [second.offer(b"x"), second.offer(b"x")] == [0, 0]
+    assert [*bench.port.clients] == [] == bench.said
+    second.listen(lambda now_us, data: None)
+    first.send(0, b"x")
+    assert [*bench.port.readers] == [bench.port._listener]
+
+
+def test_where_nothing_has_arrived_nothing_is_read_and_nobody_closed(bench: Bench) -> None:
+    bench.connect()
+    (client,) = bench.port.clients
+    for reader in [*bench.port.readers.values()]:
+        reader(0)
+    assert ([*bench.port.clients], bench.said) == ([client], [])
+    client.pause()
+    client.listen(lambda now_us, data: bench.received.extend(data))
+    bench.clients[0].sendall(b"M")
+    bench.serve()
+    assert bench.received == b"M"
