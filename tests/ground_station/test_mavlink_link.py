@@ -353,7 +353,8 @@ def test_poses_and_requests_leave_by_the_line_and_its_end_is_reported_once(line)
     [
         ("mavlink:/dev/ttyUSB0", ("/dev/ttyUSB0", 921_600)),
         ("mavlink:/dev/ttyUSB0,57600", ("/dev/ttyUSB0", 57_600)),
-        ("mavlink:COM3,115200", ("COM3", 115_200)),
+        ("mavlink:COM3,9600", ("COM3", 9600)),
+        ("mavlink:COM3,3000000", ("COM3", 3_000_000)),
         ("mavlink:socket://127.0.0.1:65535", ("socket://127.0.0.1:65535", 921_600)),
         ("mavlink:rfc2217://[::1]:4000,9600", ("rfc2217://[::1]:4000", 9600)),
         ("mavlink:rfc2217://host:4000?logging=debug", ("rfc2217://host:4000?logging=debug", 921_600)),

@@ -1,6 +1,7 @@
 """The whole life of a station on a simulated clock: lines and their instants, a lost link, and the end."""
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,14 @@ from firmware_py.extras import install_command
 from firmware_py.wire import WireError
 from firmware_py.wire.supervisor import State
 from firmware_py.wire.telemetry import CONTROL, Sample
-from ground_station import program
+from ground_station import operator, program
 from ground_station.config import GroundConfig, LinkSettings
-from ground_station.controls import Answer, ControlAction, ControlRequest
+from ground_station.controls import Answer, ControlAction, ControlRequest, ControlsError
 from ground_station.errors import LinkError, MocapError
 from ground_station.latency import LinkLatency
 from ground_station.mocap import MocapFrame
 from ground_station.program import LoopHook, Session, StationSession, fly, run_until
+from ground_station.terminal import Terminal
 from ground_station.trajectory import Goal, Offsets, Step, Trajectory
 
 FRAME_US = 20_000
@@ -118,9 +120,18 @@ def flown(
     hooks: tuple[LoopHook, ...] = (),
     **more: object,
 ) -> Room:
-    def step(home: Goal, start_us: int) -> Trajectory:
-        return Offsets(home, start_us, x=Step(0.1))
+    in_room(room, monkeypatch)
+    stopping = run_until(lambda: False, until_s)
+    fly(GroundConfig(), Session("room", None, step, start_s=1.5, **more), room.say, stopping, hooks)  # type: ignore[arg-type]
+    return room
 
+
+def step(home: Goal, start_us: int) -> Trajectory:
+    return Offsets(home, start_us, x=Step(0.1))
+
+
+def in_room(room: Room, monkeypatch: pytest.MonkeyPatch) -> Room:
+    """Let stations fly there."""
     monkeypatch.setattr(program, "clock_us", lambda: room.now_us)
 
     def find_link(uri: str, settings: LinkSettings) -> Room:
@@ -130,8 +141,6 @@ def flown(
     monkeypatch.setattr(program, "find_link", find_link)
     monkeypatch.setattr(program, "epoch_us", lambda: EPOCH_US)
     monkeypatch.setattr(program, "_open_source", lambda mocap, capture: room)
-    stopping = run_until(lambda: False, until_s)
-    fly(GroundConfig(), Session("room", None, step, start_s=1.5, **more), room.say, stopping, hooks)  # type: ignore[arg-type]
     return room
 
 
@@ -246,6 +255,49 @@ def test_full_files_end_by_themselves_and_not_the_flight(
     )
     assert records.incomplete
     assert len(room.ages_us) == pytest.approx(300, abs=5)
+
+
+class Read(Terminal):
+    """The terminal, once all of its input was read."""
+
+    def __init__(self, words: Callable[[], Sequence[str]]) -> None:
+        super().__init__(words)
+        self._thread.join()
+
+
+def test_every_line_of_the_terminal_is_executed_and_what_ended_the_flight_is_returned(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    room = in_room(Room((inf, inf), (inf, inf)), monkeypatch)
+    (tmp_path / "typed").write_text("mark one\n mark two \nfly nowhere\nhelp\nmark three")
+    said, notes, stops = list[str](), list[str](), list[int]()
+
+    def find(name: str) -> Callable[[Goal, int], Trajectory]:
+        raise ControlsError(f"no {name}")
+
+    def fly(until_s: float, session: Session, *hooks: LoopHook) -> tuple[str, bool]:
+        person = operator.Operator(find, said.append, notes.append)
+        return operator.fly_with(person, GroundConfig(), session, room.say, until_s, hooks)
+
+    monkeypatch.setattr(operator, "Terminal", Read)
+    monkeypatch.setattr(operator, "stop_signals", lambda: stops)
+    with (tmp_path / "typed").open() as typed:
+        monkeypatch.setattr(sys, "stdin", typed)
+        assert fly(3.0, Session("room", None, step)) == ("", False)
+        assert notes == ["mark one", "mark two", "mark three"]
+        assert said == [
+            "mark one",
+            "mark two",
+            "fly nowhere: no nowhere",
+            *operator.HELP.splitlines(),
+            "mark three",
+        ]
+        room.lost = (room.now_us * 1e-6, inf)
+        assert fly(3.0, Session("room", None, step)) == ("--link not there", False)
+        gone = Session("room", None, step, log=tmp_path / "no" / "log.csv")
+        assert fly(3.0, gone) == (f"{tmp_path / 'no' / 'log.csv'}: No such file or directory", False)
+        room.lost = (inf, inf)
+        assert fly(3.0, Session("room", None, step), lambda live, now_us: stops.append(2)) == ("", True)
 
 
 def test_a_request_is_repeated_until_its_answer_or_the_loss_of_the_link(

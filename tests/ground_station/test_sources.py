@@ -227,6 +227,35 @@ def test_unreadable_packets_have_their_reason_now_and_then() -> None:
     assert bench.stream.counters.malformed == 1000
 
 
+def test_a_server_is_called_until_it_answers_and_then_for_its_bodies() -> None:
+    stream = NatnetStream("floaty", AS_STREAMED)
+
+    def called(now_us: int) -> list[tuple[int, bytes]]:
+        stream.outgoing.clear()
+        stream.call(now_us, packets_wait=False)
+        return [(data[0], data[4:]) for data in stream.outgoing]
+
+    def alive(now_us: int) -> list[tuple[int, bytes]]:
+        return [(10, b"\0"), (12, now_us.to_bytes(8, "little"))]
+
+    assert called(500_000) == [(0, b"Ping\0"), *alive(500_000)]
+    assert stream.missing() == "no NatNet server answers"
+    assert called(999_999) == []
+    stream.on_packet(packets.server_info(V), 0)
+    assert called(1_000_000) == [(4, b"\0"), *alive(1_000_000)]
+    assert stream.missing() == "the server names no bodies"
+    stream.on_packet(packets.model_definition({"floaty": 7}, V), 0)
+    assert called(1_500_000) == alive(1_500_000)
+
+
+def test_an_answer_without_a_clock_is_unreadable_from_a_server_that_should_have_one() -> None:
+    stream = NatnetStream("floaty", AS_STREAMED)
+    stream.on_packet(packets.old_server_info((3, 1)), 0)
+    (line,) = stream.notices
+    assert line.endswith("NatNet 3.1 server 'Motive': its answer lacks clock and data port")
+    assert (stream.server, stream.counters.malformed) == (None, 1)
+
+
 def test_changed_models_are_asked_for() -> None:
     bench = ServedStream()
     bench.frame(parameters=2)

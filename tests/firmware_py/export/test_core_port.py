@@ -21,6 +21,7 @@ from firmware_py.wire.core_port import (
     NAME_SIZE,
     PORT_CORE,
     READ_MAX,
+    VERSION,
     WHY,
     WRITE_MAX,
     Call,
@@ -431,6 +432,39 @@ def test_a_session_number_that_was_in_use_is_not_taken(app: App) -> None:
     client._session -= 1  # an earlier program had the number that would come next
     assert client.begin().done == 0
     assert client.execute([read(0, 4)])[0].body == bytes(4)
+
+
+class Hello(AppPackets):
+    """A board that answers with this, after packets that answer nothing."""
+
+    def __init__(self, about: tuple[int, ...]) -> None:
+        self.about, self.heard, self.waiting = about, 0, list[bytes]()
+
+    def send(self, data: bytes) -> None:
+        self.heard += 1
+        head = bytes((Message.HELLO,)) + data[1:4]
+        self.waiting = [
+            b"\0\7",
+            head[:1] + bytes((data[1] ^ 1,)) + head[2:],
+            head + struct.pack("<BBHH", *self.about).ljust(ABOUT.struct.size, b"\0"),
+        ]
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        return self.waiting.pop(0) if self.waiting else None
+
+
+def test_an_app_of_another_protocol_or_without_a_free_session_is_refused_in_one_line() -> None:
+    for version in (VERSION - 1, VERSION + 1):
+        told = (
+            rf"^app: its app has protocol version {version}, expected {VERSION}: export and flash it again$"
+        )
+        with pytest.raises(LinkError, match=told):
+            CoreClient(Hello((version, 0, 4, 0)), "app").begin()
+    used = Hello((VERSION, 0, 4, 1))
+    with pytest.raises(LinkError, match=r"^app: it starts no session$"):
+        CoreClient(used, "app").begin()
+    assert used.heard == 255
+    assert CoreClient(Hello((VERSION, 1, 4, 0)), "app").begin().size == 4
 
 
 def test_requests_are_repeated_ever_more_seldom_until_three_seconds_are_silent() -> None:

@@ -118,6 +118,15 @@ def test_packets_of_peers_carry_port_and_signal_strength(line: Line) -> None:
     ]
 
 
+def test_the_radio_chip_answers_for_its_version_and_the_decks_memories(line: Line) -> None:
+    line.say(syslink.VERSION)
+    line.say(syslink.SCAN_MEMORIES)
+    (version, memories) = line.received()
+    assert version == (syslink.VERSION, b"emulated (CF21)\0")
+    assert memories == (syslink.SCAN_MEMORIES, b"\0")  # there are none
+    assert [kind for kind, _ in line.commands] == [syslink.VERSION, syslink.SCAN_MEMORIES]
+
+
 def test_settings_are_echoed_and_commands_reach_the_radio(line: Line) -> None:
     settings = [
         (syslink.RADIO_CHANNEL, b"\x50"),

@@ -192,12 +192,13 @@ class Flight:
         self._received = self._received[found.end() :]
         return found[1]
 
-    def instant(self) -> tuple[bytes, bytes]:
-        """Return the registers of the stopped chip and what the firmware keeps in memory."""
+    def instant(self) -> tuple[bytes, bytes, bytes]:
+        """Return the registers of the stopped chip, what the firmware keeps in memory, and what the flight has written."""
         ticks, tasks = map(self.place, ("xTickCount", "tasks"))
-        return self.ask(b"g"), self.ask(b"m%x,4" % ticks) + self.ask(b"m%x,200" % tasks)
+        memory = self.ask(b"m%x,4" % ticks) + self.ask(b"m%x,200" % tasks)
+        return self.ask(b"g"), memory, self.path.read_bytes()
 
-    def stop(self, packet: bytes) -> tuple[tuple[bytes, bytes], bytes]:
+    def stop(self, packet: bytes) -> tuple[tuple[bytes, bytes, bytes], bytes]:
         """Return the instant at which the chip stops after a packet, and the report."""
         report = self.ask(packet)
         return self.instant(), re.sub(rb";?thread:.*", b"", report)
@@ -237,7 +238,7 @@ def test_the_way_back_passes_each_access_of_a_watchpoint_and_ends_at_the_last_ch
     assert flight.ask(b"Z2,%x,4" % ticks) == b"OK"
 
     def tick(packet: bytes) -> tuple[int, bytes]:
-        (_, memory), report = flight.stop(packet)
+        (_, memory, _), report = flight.stop(packet)
         return int.from_bytes(bytes.fromhex(memory[:8].decode()), "little"), report
 
     assert [tick(b"c") for _ in range(5)] == [(number, watched) for number in range(5)]

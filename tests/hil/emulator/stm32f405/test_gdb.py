@@ -379,6 +379,36 @@ def test_a_stop_selects_the_running_thread() -> None:
     assert ask(protocol, b"p0f") == pack("<I", place).hex().encode()
 
 
+def test_a_task_that_does_not_run_shows_its_saved_registers_which_cannot_be_changed() -> None:
+    machine = FirmwareOnChip()
+    chip = machine.chip
+    machine.run(30_000)
+    kernel = FreeRtos(machine.image, chip.read)
+    protocol = RemoteProtocol(chip, kernel)
+    running = kernel.current_block
+    blocks = {task.name: task.block for task in kernel.tasks()}
+    assert set(ask(protocol, b"qfThreadInfo")[1:].split(b",")) == {b"%x" % block for block in blocks.values()}
+    (other,) = (block for name, block in blocks.items() if name == "FILTER" and block != running)
+    saved = kernel.saved_registers(other)
+    number = {name: index for index, (name, _) in enumerate(REGISTERS)}
+    assert ask(protocol, b"Hg%x" % other) == b"OK"
+    for name in ("r0", "r4", "r11", "sp", "lr", "pc"):
+        assert ask(protocol, b"p%x" % number[name]) == pack("<I", saved[name]).hex().encode()
+    assert machine.image.function_at(saved["pc"]) in ("filter", "receive", "unmask")
+    assert ask(protocol, b"p%x" % number["d3"]) == b"xx" * 8  # not on its stack
+    assert ask(protocol, b"p%x" % number["msp"]) == pack("<I", chip.register("msp")).hex().encode()
+    before = chip.register("r4")
+    assert ask(protocol, b"P4=01000000") == b"E0e"
+    assert (chip.register("r4"), protocol.take_changes()) == (before, False)
+    for machine_s in (b"Hg0", b"Hg-1", b"Hg%x" % running):
+        assert ask(protocol, b"Hg%x" % other) == ask(protocol, machine_s) == b"OK"
+        assert ask(protocol, b"p4") == pack("<I", before).hex().encode()
+    assert ask(protocol, b"P4=01000000") == b"OK"
+    assert chip.register("r4") == 1
+    extra = bytes.fromhex(ask(protocol, b"qThreadExtraInfo,%x" % other).decode())
+    assert re.fullmatch(rb"FILTER, (blocked|suspended), priority 3", extra)
+
+
 def test_the_chip_waits_for_its_debugger_at_its_first_instruction() -> None:
     machine, answers = on_chip(lambda _: [b"QStartNoAckMode", b"pf", b"me000ed28,4", b"D"], 2_000)
     reset = framed(pack("<I", machine.image.reset).hex().encode())
