@@ -1,6 +1,7 @@
 """The ends of a served serial line: bytes pass both ways, nobody who comes, leaves or sleeps holds the server up."""
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,20 @@ def test_one_client_s_message_is_not_split_by_another() -> None:
     assert bytes(bench.received) in (long + short, short + long)
     first.close()
     second.close()
+    bench.close()
+
+
+def test_a_client_of_a_pty_reads_nothing_from_before_it_came() -> None:
+    bench = OpenEnd(Address("pty").open)
+    bench.end.send(bytes(100_000))  # more than the line holds
+    with suppress(BlockingIOError):
+        while True:
+            os.write(bench.end._master, bytes(4096))
+    bench.end.send(b"lost")
+    client = os.open(bench.end.master, os.O_RDWR | os.O_NOCTTY)
+    bench.end.send(b"now")
+    assert os.read(client, 4096) == b"now"
+    os.close(client)
     bench.close()
 
 

@@ -214,11 +214,16 @@ class Flight:
         return os.waitstatus_to_exitcode(status)
 
 
+def children(pid: int) -> list[int]:
+    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
 def test_time_runs_backwards_through_the_instants_at_which_it_ran_forward(tmp_path: Path) -> None:
     flight = Flight(tmp_path / "log")
     begin, line = flight.instant(), b"0,%x,2" % flight.place("send_line")
     assert flight.ask(b"Z" + line) == b"OK"
     there = [flight.stop(b"c")[0] for _ in range(7)]
+    assert len(children(*children(flight.pid))) == 2  # checkpoints, 50 ms apart
     assert [flight.stop(b"bc") for _ in range(2)] == [(instant, b"T05") for instant in there[-2:-4:-1]]
     steps = [flight.stop(b"bs")[0] for _ in range(3)]
     assert len({there[-3], *steps}) == 4
@@ -273,12 +278,18 @@ def test_a_crash_stops_once_and_the_way_back_leads_to_its_instruction(tmp_path: 
 
 @pytest.mark.parametrize(("how", "code"), [
     ("interrupted", 130), ("killed", -signal.SIGKILL), ("killed by the debugger", 130), ("hung up", 7),
+    ("out of memory", 128 + signal.SIGKILL),
 ])  # fmt: skip
 def test_no_process_of_a_flight_outlives_it(tmp_path: Path, how: str, code: int) -> None:
     flight = Flight(tmp_path / "log")
     assert flight.ask(b"Z0,%x,2" % flight.place("send_line")) == b"OK"
-    for packet in (b"c", b"bc"):
-        flight.stop(packet)
+    flight.stop(b"c")
+    (flying,) = children(flight.pid)
+    assert len(children(flying)) == 1  # the checkpoint at its begin
+    if how == "out of memory":
+        os.kill(flying, signal.SIGKILL)
+    else:
+        flight.stop(b"bc")
     if number := {"interrupted": signal.SIGINT, "killed": signal.SIGKILL}.get(how):
         os.kill(flight.pid, number)
     elif how == "hung up":
