@@ -114,7 +114,7 @@ def test_the_trail_has_the_last_instants_each_once() -> None:
     assert Search.of(search.stored()) == search
 
 
-NULL_CALL = 5  # of `enum planted`
+ASSERTION, NULL_CALL = 3, 5  # of `enum planted`
 FAR = 80 * PERIOD
 
 
@@ -168,12 +168,13 @@ class Flight:
     def _fly(self, server: GdbServer, planted: int) -> None:
         machine, end = Flight.machine(), CYCLES_PER_US * 1000
         machine.poke("planted", planted)
-        machine.chip.crash_points.add(self.place("Stuck_Handler"))
+        machine.chip.crash_points |= {self.place(name) for name in ("Stuck_Handler", "assertFail")}
         chip = DebuggedChip(machine.chip, server, FreeRtos(machine.image, machine.chip.read))
         with self.path.open("w", buffering=1) as file:
             while machine.chip.now_us < 130_000:
                 if chip.run(end) & StopReason.BREAK:
-                    machine.chip.crash_points.clear()  # the crash is reported
+                    machine.chip.crash_points.clear()  # a handler may be a loop
+                    file.write("crash\n")
                 if machine.chip.state.now >= end:
                     file.write(f"{machine.chip.now_us // 1000}\n")
                     end += CYCLES_PER_US * 1000
@@ -228,6 +229,9 @@ def test_time_runs_backwards_through_the_instants_at_which_it_ran_forward(tmp_pa
     steps = [flight.stop(b"bs")[0] for _ in range(3)]
     assert len({there[-3], *steps}) == 4
     assert [flight.stop(b"s")[0] for _ in range(3)] == [*steps[-2::-1], there[-3]]
+    assert flight.stop(b"c")[0] == there[-2]
+    assert flight.stop(b"bs")[0] not in (*there, *steps)
+    assert flight.stop(b"s")[0] == there[-2]
     assert flight.ask(b"z" + line) == b"OK"
     assert [flight.stop(packet) for packet in (b"bc", b"bs")] == [(begin, b"T05replaylog:begin")] * 2
     assert flight.ask(b"Z" + line) == b"OK"
@@ -260,20 +264,27 @@ def test_the_way_back_passes_each_access_of_a_watchpoint_and_ends_at_the_last_ch
     assert flight.end() == 7
 
 
-def test_a_crash_stops_once_and_the_way_back_leads_to_its_instruction(tmp_path: Path) -> None:
-    flight = Flight(tmp_path / "log", planted=NULL_CALL)
+@pytest.mark.parametrize(("planted", "at", "before"), [
+    (NULL_CALL, "Stuck_Handler", "go_wrong"), (ASSERTION, "assertFail", "go_wrong"),
+])  # fmt: skip
+def test_a_crash_stops_once_and_the_way_back_leads_to_its_instruction(
+    tmp_path: Path, planted: int, at: str, before: str
+) -> None:
+    flight = Flight(tmp_path / "log", planted)
     crash = flight.stop(b"c")
     assert crash[1] == b"T06"
 
     def pc() -> int:
         return int.from_bytes(bytes.fromhex(flight.ask(b"pf").decode()), "little")
 
-    assert pc() == flight.place("Stuck_Handler")
+    assert pc() == flight.place(at)
     flight.ask(b"bs")
-    assert flight.image.function_at(pc()) == "go_wrong"
+    assert flight.image.function_at(pc()) == before
     assert flight.stop(b"s") == (crash[0], b"T05")
     assert flight.end() == 7
-    assert flight.path.read_text() == "".join(f"{number}\n" for number in range(1, 131))
+    lines = flight.path.read_text().split()
+    assert lines.count("crash") == 1  # reported as if there had been no debugger
+    assert [line for line in lines if line != "crash"] == [f"{number}" for number in range(1, 131)]
 
 
 @pytest.mark.parametrize(("how", "code"), [
