@@ -362,6 +362,9 @@ def test_a_station_flies_with_its_files_and_ends_with_the_result_of_its_record(
                          ("print_result", result)]  # fmt: skip
         result.passed, result.outcome = True, "interrupted"
         assert cli(*STATION, *files) == 130
+        asked.answer({"commands.options.write_pictures": failing(OSError(28, ""))})
+        assert cli(*STATION, *files) == 3
+        assert cli.out == "run: No space left on device; no more is written to it\n"
     else:
         assert asked == []
 
