@@ -1,5 +1,6 @@
 """Where the cycles of an image go: all of them, to the functions and tasks that the firmware itself counts."""
 
+import re
 from types import SimpleNamespace as Record
 
 import numpy as np
@@ -67,6 +68,10 @@ def test_every_cycle_and_call_is_charged_to_the_task_that_the_firmware_counts(co
     assert longest.cycles + sum(cycles for _, cycles in longest.others) == round(168 * longest.us)
     assert longest.parts[0].name == "filter"
     assert longest.parts[0].hottest.startswith("firmware.c:")
+    called = {part.name: part.callers for part in tasks["REPORT"].longest.parts}
+    assert called["report"] == ""
+    if compiler == "gcc":  # clang puts the call in line
+        assert re.fullmatch(r"report \(firmware\.c:\d+\)", called["delay"])
     handlers = {one.name.split()[-1]: one for one in profile.handlers}
     assert handlers["SysTick_Handler"].count == firmware.peek("xTickCount")
     for one in handlers.values():
