@@ -3,16 +3,17 @@
 import atexit
 import errno
 import socket
-import time
 from array import array
 from collections.abc import Iterator
 from threading import Thread
+from types import SimpleNamespace as Made
 from typing import Any
 
 import pytest
 import usb.core
 import usb.util
 
+from hil.servers import dongle_plugin
 from hil.servers.dongle_plugin import (
     CONTROL,
     PAUSES,
@@ -281,13 +282,13 @@ def test_installed_it_is_the_only_bus_and_the_clock_of_sleeps(
 ) -> None:
     libusb_package: Any = pytest.importorskip("libusb_package")
     at_end: list[Any] = []
-    sleep = time.sleep
-    monkeypatch.setattr(time, "sleep", sleep)
+    system: Any = Made(sleep=print)
+    monkeypatch.setattr(dongle_plugin, "time", system)
     monkeypatch.setattr(libusb_package, "get_libusb1_backend", None)
     monkeypatch.setattr(atexit, "register", at_end.append)
     monkeypatch.setenv(VARIABLE, named)
     install()
     assert libusb_package.get_libusb1_backend()._server == server
-    clock: Any = time.sleep.__self__  # type: ignore[attr-defined]
+    clock = system.sleep.__self__
     assert isinstance(clock, SimulatedClock)
-    assert (clock._server, clock._sleep, at_end) == (server, sleep, [clock.close])
+    assert (clock._server, clock._sleep, at_end) == (server, print, [clock.close])

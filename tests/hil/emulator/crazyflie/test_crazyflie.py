@@ -14,6 +14,7 @@ from hil.emulator.crazyflie import crazyflie
 from hil.emulator.crazyflie.crazyflie import Crazyflie
 from hil.emulator.stm32f405.chip import SOFTWARE, WATCHDOG, build_machine
 from hil.emulator.stm32f405.image import Image
+from hil.emulator.stm32f405.stopped_tasks import SETTLED_US
 from support.stm32_firmware import build
 
 (
@@ -89,6 +90,9 @@ def test_each_assertion_and_its_reset_are_reported_anew(monkeypatch: pytest.Monk
         True
     ] * 15
     assert board.crazyflie.resets == {WATCHDOG: 0, SOFTWARE: 5}
+    watch = board.crazyflie._watch
+    assert watch is not None
+    assert 50_000 < watch._from_us - SETTLED_US < 60_000  # from the last reset on
     assert board.crazyflie.failures == said
 
 
