@@ -4,6 +4,7 @@ import os
 import re
 import select
 import socket
+from contextlib import closing
 from itertools import pairwise
 from struct import pack
 
@@ -12,7 +13,7 @@ import pytest
 from firmware_py.config import parameters_of
 from firmware_py.export.elf import Symbol
 from hil.board import image_firmware
-from hil.board.clock import Readers
+from hil.board.clock import Paced, Readers
 from hil.board.image_firmware import ChipImage
 from hil.config import load_config
 from hil.emulator.crazyflie.bootloader import CHUNK, LOAD_BUFFER, PAGE_SIZE, WRITE_FLASH
@@ -202,3 +203,35 @@ def test_robots_of_one_room_start_side_by_side(spacing: float, sides: tuple[floa
         assert server.robot.body.p_WB.tolist() == [0.0, side, 1.15]
         room.pauses[number - 1] = number
         assert server.clock.stood_still_us == number
+
+
+@pytest.mark.parametrize(("sent", "calls"), [(None, []), ("corrections", [False]), ("poses", [True])])
+def test_the_built_in_station_sends_what_was_asked_for(
+    monkeypatch: pytest.MonkeyPatch, sent: str | None, calls: list[bool]
+) -> None:
+    flown: list[bool] = []
+    monkeypatch.setattr("hil.servers.server.fly_built_in", lambda robot, absolute: flown.append(absolute))
+    with closing(Server(Service(load_config()), lambda line: None)) as server:
+        server.open(Endpoints(udp=0, station=sent))
+    assert flown == calls
+
+
+def test_a_radio_port_that_is_taken_is_named() -> None:
+    with (
+        socket.create_server(("127.0.0.1", 0)) as taken,
+        closing(Server(Service(load_config()), print)) as server,
+    ):
+        port = taken.getsockname()[1]
+        with pytest.raises(LabError, match=f"^radio port {port}: Address already in use"):
+            server.open(Endpoints(radio=port))
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_that_time_stood_still_is_said_once_for_all_robots(
+    monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(Paced, "notices", lambda clock: ["slow"])
+    with closing(Server(Service(load_config(), number), said.append)) as server:
+        server.run(lambda: server.lab.now_us > 0)
+    assert ("slow" in said) is (number == 1)
