@@ -1,197 +1,314 @@
-"""Flights on worker processes, here and of a scheduler: the same rows as without them, whatever becomes of a worker."""
+"""Workers of which the test decides when a flight ends and how, and the runner that conducts plans with them."""
 
-import multiprocessing
+import io
+import os
+import re
 import signal
-import subprocess
 import sys
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Future
+from concurrent.futures.process import BrokenProcessPool
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
-import dask
 import pytest
-from distributed import LocalCluster
 from rich.console import Console
 
 from hil.errors import LabError
 from hil.laboratory.request import Options
-from hil.research.campaigns.config import Spec
-from hil.research.campaigns.dataset import Dataset
-from hil.research.campaigns.jobs import Job, Row, failed, fly_job
-from hil.research.campaigns.run import InterimResult, Runner, conduct
-from hil.research.campaigns.sampling import draw, plan_of
-from hil.research.campaigns.workers import DIED, FlyOne, Workers
-from support.campaigns import hanging, killing, planted, raising, spec_of
-from support.command import Cli
-from support.html_page import Page
-from support.paths import ROOT
-
-pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("default")]
+from hil.research.campaigns import run, workers
+from hil.research.campaigns.config import FlightLimits
+from hil.research.campaigns.jobs import LOG_AND_TELEMETRY, Job, Row, failed
+from hil.research.campaigns.run import Runner
+from hil.research.campaigns.workers import DIED, Workers
+from support.campaigns import planted, raising
 
 
-@pytest.fixture(scope="module")
-def crew() -> Iterator[Workers]:
-    workers = Workers(2)
-    yield workers
-    workers.close()
+def job(index: int) -> Job:
+    return Job(index, "hover", Options(faults=()), {})
 
 
-def cluster(workers: int, threads: int = 1) -> LocalCluster:
-    return LocalCluster(workers, threads, dashboard_address=":0", silence_logs=50)
+class Pool:
+    """One process, or a cluster: a flight ends when the test rings, and as `ends` says for its number."""
+
+    status = "running"
+
+    def __init__(self, ends: Callable[[int], Row | BaseException | None], single: bool) -> None:
+        self.ends, self.single, self.dead = ends, single, False
+        self.given: list[Any] = []
+        self.open: list[tuple[Future[Row], Job]] = []
+        self.workers: dict[str, int] = {"a": 2, "b": 1}
+
+    def submit(self, run: Any, job: Job, fly_one: Any, **more: Any) -> Future[Row]:
+        assert not self.dead, "a dead process flies nothing"
+        self.given.append(job.index)
+        self.open.append((future := Future[Row](), job))
+        return future
+
+    def end(self) -> None:
+        """End the flights that are under way."""
+        for future, job in self.open:
+            found = self.ends(job.index)
+            if isinstance(found, BaseException):
+                self.dead = self.single and isinstance(found, BrokenProcessPool)
+                future.set_exception(found)
+            else:
+                future.set_result(found or planted(job))
+        self.open.clear()
+
+    def shutdown(self, **how: bool) -> None:
+        self.given.append(how)
+
+    def nthreads(self) -> dict[str, int]:
+        return self.workers
+
+    def scheduler_info(self) -> dict[str, Any]:
+        return {"workers": self.workers}
+
+    def wait_for_workers(self, count: int, timeout: float) -> None:
+        self.given.append((count, timeout))
+
+    def close(self) -> None:
+        self.given.append("close")
 
 
-def rows_of(crew: Workers, spec: Spec, fly_one: FlyOne) -> dict[int, Row]:
-    plan = plan_of(spec)
-    rows = list(crew.fly(map(plan.job, range(spec.flights)), lambda: 0, fly_one))
-    assert len({row.job.index for row in rows}) == len(rows), "none twice"
-    return {row.job.index: row for row in rows}
+class Crew:
+    """Processes of this computer or a cluster; each look ends what flies, after a check by the test."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, ends: Any = lambda index: None, count: int = 2) -> None:
+        self.pools: list[Pool] = []
+        patch.setattr(workers, "LOOK_S", 0.001)
+        patch.setattr(workers, "_process", lambda: self.pools.append(Pool(ends, True)) or self.pools[-1])
+        cluster = ModuleType("distributed")
+        cluster.__spec__ = ModuleSpec("distributed", None)
+        cluster.Client = lambda address, timeout: self.pools.append(Pool(ends, False)) or self.pools[-1]  # type: ignore[attr-defined]
+        patch.setitem(sys.modules, "distributed", cluster)
+        self.looks: list[Any] = []
+        self.workers = Workers(count) if count else Workers(0, "tcp://x:1")
+        done = self.workers._done
+
+        def look(flying: Any) -> Any:
+            self.looks.append([sorted(job.index for _, job in pool.open) for pool in self.pools])
+            for pool in self.pools:
+                pool.end()
+            return done(flying)
+
+        patch.setattr(self.workers, "_done", look)
+
+    def fly(self, count: int, stopped: Callable[[], int] = lambda: 0) -> list[Row]:
+        return list(self.workers.fly(map(job, range(count)), stopped))
 
 
-def test_flights_are_the_same_as_in_this_process(crew: Workers) -> None:
-    spec = spec_of(flights=4)
-    rows = rows_of(crew, spec, fly_job)
-    assert len({row.hash for row in rows.values()}) == 4
-    for index in (0, 3):
-        assert str(fly_job(draw(spec, index)).columns()) == str(rows[index].columns())
+def test_each_process_flies_one_at_a_time_and_a_cluster_two_for_each_of_its_threads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    crew = Crew(monkeypatch)
+    assert [(row.job.index, row.hash) for row in crew.fly(5)] == [(n, f"{n:064x}") for n in range(5)]
+    assert crew.looks == [[[1], [0]], [[2], [3]], [[], [4]]]
+    crew.workers.close()
+    assert [pool.given[-1] for pool in crew.pools] == [{"wait": False, "cancel_futures": True}] * 2
+    crew = Crew(monkeypatch, count=0)
+    assert sorted(row.job.index for row in crew.fly(8)) == [*range(8)]
+    assert crew.looks == [[[0, 1, 2, 3, 4, 5]], [[6, 7]]], "of three threads"
+    crew.workers.close()
+    assert (crew.pools[0].given[0], crew.pools[0].given[-1]) == ((1, workers.CONNECT_S), "close")
 
 
-def test_a_flight_that_raises_is_a_row_with_its_error(crew: Workers) -> None:
-    spec = spec_of(flights=8)
-    rows = rows_of(crew, spec, raising)
-    assert (rows[3].outcome, rows[3].error, rows[3].passed) == ("error", "ZeroDivisionError: planted", False)
-    assert all(rows[n].hash == planted(draw(spec, n)).hash for n in range(8) if n != 3)
+@pytest.mark.parametrize("count", [2, 0])
+@pytest.mark.parametrize(
+    "death", [BrokenProcessPool(), CancelledError(), type("KilledWorker", (Exception,), {})()]
+)
+def test_flights_whose_process_died_are_repeated_alone_at_the_end_and_become_a_row_if_it_dies_again(
+    monkeypatch: pytest.MonkeyPatch, count: int, death: BaseException
+) -> None:
+    deaths = {2: 1, 3: 9}
+
+    def ends(index: int) -> Any:
+        deaths[index] = deaths.get(index, 0) - 1
+        return death if deaths[index] >= 0 else None
+
+    crew = Crew(monkeypatch, ends, count)
+    rows = crew.fly(7)
+    assert sorted(row.job.index for row in rows) == [*range(7)]
+    assert {row.job.index: row.error for row in rows if row.error} == {3: DIED}
+    assert sorted(row.job.index for row in rows[-2:]) == [2, 3], "after all others"
+    alone = [sorted(one for pool in look for one in pool) for look in crew.looks[-2:]]
+    assert sorted(alone) == [[2], [3]]
+    assert len(crew.pools) == (2 + 3 if count else 1), "a dead process is replaced each time"
 
 
-def test_a_flight_that_always_kills_its_worker_is_a_row_beside_others(crew: Workers, tmp_path: Path) -> None:
-    spec = spec_of(flights=10, settings=[str(tmp_path / "once")])
-    rows = rows_of(crew, spec, killing)
-    assert sorted(rows) == list(range(10))
-    assert [n for n, row in rows.items() if row.outcome == "error"] == [3]
-    assert "the process that flew it died" in rows[3].error
+def test_an_error_of_a_flight_is_its_row_and_one_of_the_user_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = Crew(monkeypatch, lambda index: ValueError("odd") if index == 1 else None).fly(3)
+    assert {row.job.index: (row.outcome, row.error) for row in rows if row.job.index == 1} == {
+        1: ("error", "ValueError: odd")}  # fmt: skip
+    with pytest.raises(LabError, match=r"^full$"):
+        Crew(monkeypatch, lambda index: LabError("full") if index == 1 else None).fly(3)
+    crew = Crew(monkeypatch, count=0)
+    late = Future[Row]()
+    monkeypatch.setattr(crew.pools[0], "submit", lambda *_, **more: late)
+    flown = crew.workers.fly(map(job, range(1)), lambda: 0)
+    late.set_result(planted(job(0)))
+
+    def comes_late(wait_s: float) -> BaseException | None:
+        monkeypatch.undo()
+        raise TimeoutError
+
+    monkeypatch.setattr(late, "exception", comes_late)
+    assert [row.job.index for row in flown] == [0], "a row that was lost on its way comes again"
 
 
-def test_a_flight_that_never_ends_is_a_row_and_the_workers_go_on(crew: Workers) -> None:
-    spec = spec_of(flights=6, limits={"wall_s": 1.0})
-    rows = rows_of(crew, spec, hanging)
-    assert sorted(rows) == list(range(6))
-    assert [n for n, row in rows.items() if row.outcome == "error"] == [3]
+def test_the_first_request_to_end_starts_no_flight_and_the_second_waits_for_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    crew, stops = Crew(monkeypatch, lambda index: BrokenProcessPool() if index == 0 else None), [0]
+    flown = crew.workers.fly(map(job, range(9)), lambda: stops[0])
+    rows = [next(flown)]
+    stops[0] = 1
+    assert [row.job.index for row in (*rows, *flown)] == [1], "no repetition of the other either"
+    crew = Crew(monkeypatch)
+    assert list(crew.workers.fly(map(job, range(9)), lambda: 2 if crew.looks else 0)) != []
+    assert len(crew.looks) == 1
+    assert list(Crew(monkeypatch).workers.fly(map(job, range(9)), lambda: 2)) == []
 
 
-def test_a_worker_killed_from_outside_costs_no_flight(crew: Workers) -> None:
-    flights = crew.fly(map(plan_of(spec_of(flights=30)).job, range(30)), lambda: 0, planted)
-    rows = [next(flights)]
-    multiprocessing.active_children()[0].kill()
-    rows += flights
-    assert sorted(row.job.index for row in rows) == list(range(30))
-    assert {row.outcome for row in rows} == {"completed"}
+@pytest.mark.parametrize("lost", ["status", "workers", "back"])
+def test_a_cluster_that_is_lost_or_stays_without_workers_ends_it_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, lost: str
+) -> None:
+    crew = Crew(monkeypatch, count=0)
+    (cluster,) = crew.pools
+    monkeypatch.setattr(workers, "LOST_S", 0.0031)  # three looks
+    looks = 0
 
+    def idle() -> None:
+        nonlocal looks
+        looks += 1
+        cluster.workers = {"a": 1} if lost == "back" and looks % 4 == 0 else {}
+        cluster.status = "closed" if lost == "status" and looks == 2 else "running"
+        if looks == 30:
+            Pool.end(cluster)
 
-def test_an_interrupt_ends_it_with_what_is_there(crew: Workers) -> None:
-    stops: list[int] = []
-    rows = []
-    for row in crew.fly(map(plan_of(spec_of(flights=500)).job, range(500)), lambda: len(stops), planted):
-        rows.append(row)
-        if len(rows) == 5:
-            stops.append(signal.SIGINT)
-    assert 5 <= len(rows) < 20
-
-
-def test_workers_end_with_a_program_that_is_killed() -> None:
-    code = (
-        "import time\n"
-        "from hil.research.campaigns.sampling import draw\n"
-        "from hil.research.campaigns.workers import Workers\n"
-        "from support.campaigns import planted, spec_of\n"
-        "print(len(list(Workers(2).fly((draw(spec_of(), n) for n in range(4)), lambda: 0, planted))), flush=True)\n"
-        "time.sleep(60)\n"
-    )
-    program = subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT / "tests"
-    )
-    assert program.stdout is not None
-    assert program.stdout.readline() == "4\n"
-    program.kill()
-    assert program.communicate(timeout=20.0)[0] == "", (
-        "the workers, which have this output as well, have closed it"
-    )
-
-
-def test_a_cluster_that_is_there_flies_the_same_dataset(tmp_path: Path) -> None:
-    spec = spec_of(flights=20)
-    with cluster(1, 2) as there:
-        crew = Workers(0, there.scheduler_address)
-        flyer = partial(crew.fly, stopped=lambda: 0, fly_one=planted)
-        dataset = Dataset(tmp_path / "cluster", plan_of(spec), False)
-        conduct(dataset, flyer, _nothing)
-        crew.close()
-    assert dataset.table()["index"].to_pylist() == list(range(20))
-
-
-def test_a_flight_that_kills_the_cluster_s_worker_each_time_is_a_row(tmp_path: Path) -> None:
-    once = tmp_path / "once"
-    once.touch()  # only the third flight kills: two of three workers, because Dask does not always replace one
-    spec = spec_of(flights=6, settings=[str(once)])
-    with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
-        cluster(3) as there,
+    monkeypatch.setattr(cluster, "end", idle)
+    if lost == "back":
+        assert len(crew.fly(3)) == 3
+        return
+    with pytest.raises(
+        LabError, match=r"^--cluster tcp://x:1: lost; --resume continues with the flights that are kept$"
     ):
-        crew = Workers(0, there.scheduler_address)
-        rows = rows_of(crew, spec, killing)
-        crew.close()
-    assert sorted(rows) == list(range(6))
-    assert {n: row.error for n, row in rows.items() if row.error} == {3: DIED}, (
-        "none that was on the same worker"
+        crew.fly(3)
+    assert looks == (2 if lost == "status" else 4)
+
+
+def test_a_hanging_flight_ends_its_process_after_twice_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    watch = SimpleNamespace(
+        dump_traceback_later=lambda after, exit, file: asked.append((after, exit, file.name)),
+        cancel_dump_traceback_later=lambda: asked.append("cancelled"),
     )
+    monkeypatch.setattr(workers, "faulthandler", watch)
+    limits = FlightLimits(wall_s=3.0)
+    limited = Job(4, "hover", Options(faults=()), {}, limits=limits)
+    assert workers.fly_alone(limited, lambda one: asked.append(one.index) or planted(one)).job is limited  # type: ignore[func-returns-value]
+    assert asked == [(6.0, True, os.devnull), 4, "cancelled"]
+    with pytest.raises(ZeroDivisionError):
+        workers.fly_alone(job(3), raising)
+    assert asked[3:] == ["cancelled"]
+    assert not workers._ALONE.locked()
 
 
-def test_a_cluster_that_loses_its_workers_or_itself_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    for loss in (lambda there: there.scale(0), lambda there: there.close()):
-        with cluster(1) as there:
-            crew = Workers(0, there.scheduler_address)
-            flights = crew.fly(map(plan_of(spec_of(flights=500)).job, range(500)), lambda: 0, planted)
-            next(flights)
-            monkeypatch.setattr("hil.research.campaigns.workers.LOST_S", 1.0)
-            loss(there)
-            with pytest.raises(
-                LabError, match=r"^--cluster tcp://127\.0\.0\.1:\d+: lost; --resume continues"
-            ):
-                list(flights)
-            monkeypatch.undo()
-            crew.close()
+class Flown:
+    """Workers of a runner, which fly at once; the test may interrupt before a flight."""
+
+    made: list[Any] = []  # noqa: RUF012
+    before: Callable[[Job], object] = staticmethod(lambda one: None)
+
+    def __init__(self, count: int, address: str) -> None:
+        self.made.append((count, address))
+
+    def fly(self, jobs: Iterator[Job], stopped: Callable[[], int]) -> Iterator[Row]:
+        for one in jobs:
+            if stopped():
+                return
+            Flown.before(one)
+            yield planted(one)
+
+    def close(self) -> None:
+        self.made.append("closed")
 
 
-def _nothing(interim: InterimResult) -> None:
-    """Show nothing."""
+@pytest.fixture
+def flown(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    monkeypatch.setattr(run, "Workers", Flown)
+    monkeypatch.setattr(Flown, "made", [])
+    return Flown.made
 
 
-def test_a_cluster_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hil.research.campaigns.workers.CONNECT_S", 1.0)
-    with pytest.raises(LabError, match=r"--cluster tcp://127\.0\.0\.1:9: no workers"):
-        list(Runner(Console(), cluster="tcp://127.0.0.1:9")._flown(map(plan_of(spec_of()).job, range(1))))
+def jobs(*pushes: float) -> list[Job]:
+    return [
+        Job(9, "hover", Options(faults=(f"push.y@1={push}",), seed=n), {}) for n, push in enumerate(pushes)
+    ]  # type: ignore[arg-type]
 
 
-def test_the_command_flies_and_resumes(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("tiny.toml").write_text(
-        'experiments = ["hover"]\nprofiles = ["floaty", "as-flown"]\nduration_s = 0.3\nflights = 4\n'
-        '[parameters]\n"actuators.tau" = { uniform = [0.04, 0.06] }\n'
+def test_a_runner_flies_its_plans_with_the_same_workers_and_shows_how_far_it_is(
+    flown: list[Any], tmp_path: Path
+) -> None:
+    shown = Console(file=io.StringIO(), force_terminal=True, width=150)
+    with Runner(shown, 3) as runner:
+        rows = runner.fly("one", jobs(9.0, 1.0, 2.0), tmp_path)
+        assert [(row.job.index, row.seed, row.passed) for row in rows] == [
+            (0, 0, False),
+            (1, 1, True),
+            (2, 2, True),
+        ]
+        both = {"a": ("hover", Options(faults=(), seed=5)), "b/c": ("yaw-step", Options(faults=()))}
+        logged = runner.log("two", both, tmp_path)
+        assert [(row.folder, row.job.files) for row in logged] == [
+            (tmp_path / name, LOG_AND_TELEMETRY) for name in ("a", "b/c")]  # fmt: skip
+        assert [row.seed for row in logged] == [5, 1]
+        assert flown == [(3, "")]
+        again = runner.fly("one", jobs(1.0), tmp_path)
+        assert [row.passed for row in again] == [True], "an earlier plan of this name is replaced"
+    assert flown == [(3, ""), "closed"]
+    assert {path.name for path in (tmp_path / "campaigns").iterdir()} == {"one", "two"}
+    text = shown.file.getvalue()  # type: ignore[attr-defined]
+    assert re.search(r"flying.*3/3.*1 failed: 6\.1\.\.79\.2 %", text)
+    resumed = Runner(Console(quiet=True), cluster="tcp://x:1", resume=True)
+    assert len(resumed.fly("two", [row.job for row in logged], tmp_path)) == 2
+    assert flown[2:] == [], "no workers for what is there"
+    with pytest.raises(LabError, match=r"^--workers 2: not together with --cluster tcp://x:1$"):
+        Runner(shown, 2, "tcp://x:1")
+    Runner(Console(quiet=True)).fly("three", jobs(1.0), tmp_path)
+    assert flown[2:] == [(len(os.sched_getaffinity(0)), "")]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_a_signal_completes_the_flight_and_no_other_plan_is_flown(
+    flown: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, number: int
+) -> None:
+    before = [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    monkeypatch.setattr(
+        Flown, "before", staticmethod(lambda one: one.index == 1 and os.kill(os.getpid(), number))
     )
-    assert cli("campaign", "tiny.toml", "--workers", "1") == 0
-    out = Path("runs/campaign-tiny")
-    assert {path.name for path in out.iterdir()} == {"campaign.json", "flights", "report.html", "result.json"}
-    assert "of 4: " in cli.out
-    for name in ("floaty", "as-flown"):
-        assert f"  hover, {name}: 0 of 2" in cli.out
-        assert f"  hover, {name}, within_6cm_x: 0 of 2" in cli.out
-    page = Page((out / "report.html").read_text(encoding="utf-8"))
-    assert [row[1] for row in page.tables["cells"][1:]] == ["floaty", "as-flown"]
-    before = (out / "flights" / "all.parquet").read_bytes()
-    assert cli("campaign", "tiny.toml", "--resume", "--cluster", "tcp://127.0.0.1:9") == 0
-    assert (out / "flights" / "all.parquet").read_bytes() == before, "nothing was left to fly"
-    assert cli("campaign", "tiny.toml") == 2
-    assert "--resume continues it" in cli.err
+    with Runner(Console(quiet=True), 1) as runner:
+        assert not runner.interrupted
+        assert len(runner.fly("one", jobs(1.0, 2.0, 3.0), tmp_path)) == 2
+        assert runner.interrupted
+        assert runner.fly("two", jobs(1.0), tmp_path) == []
+        assert runner.log("one", {"a": ("hover", Options())}, tmp_path) == []
+    assert [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)] == before
+
+
+def test_a_logged_flight_that_ends_with_an_error_is_one_line(
+    flown: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(run, "Workers", lambda *_: SimpleNamespace(
+        fly=lambda jobs, stopped: (failed(one, "no such body") for one in jobs), close=lambda: None))  # fmt: skip
+    with pytest.raises(LabError, match=f"^{tmp_path}/a: no such body$"):
+        Runner(Console(quiet=True)).log("one", {"a": ("hover", Options())}, tmp_path)
 
 
 def test_a_flight_without_a_seed_has_that_of_a_request() -> None:
-    job = Job(0, "hover", Options(), {})
-    assert failed(job, "").columns()["seed"] == job.request().seed == 1
+    plain = Job(0, "hover", Options(), {})
+    assert failed(plain, "").columns()["seed"] == plain.request().seed == 1
