@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hil.config import load_config
 from hil.errors import LabError
-from hil.research.design import sweeps
+from hil.research.design import analysis, sweeps
 from hil.research.design.authority import attainable, pressure_at, single, wrenches
 from hil.research.design.axes import ROLL
 from hil.research.design.claims import claims
@@ -273,6 +273,89 @@ def test_roll_becomes_stable_where_its_stiffness_falls_through_zero(monkeypatch:
     assert sweeps._stiffness(PAPER, G0, found.crossing) == pytest.approx(0.0, abs=1e-3)
     hover = G0, speed_at(G0, COEFFICIENT, HOVER), HOVER
     assert stiffness(*hover) == pytest.approx(linear(*hover).constants.roll_roll, rel=1e-5)
+
+
+def test_hover_angles_are_swept_with_constants_of_each_opening_and_three_readings_of_authority(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    openings = np.radians([12.0, 24.0, 36.0])
+    monkeypatch.setattr(sweeps, "OPENINGS", openings)
+    found = sweeps.hover_angles(PAPER)
+    each = [replace(PAPER, opening=one).linear.constants for one in openings]
+    signed = {"roll": "roll_u1", "pitch": "pitch_u2", "yaw": "yaw_u3", "lift": "z_u4"}
+    assert {name: values.tolist() for name, values in found.constants.items()} == {
+        name: [getattr(one, constant) for one in each] for name, constant in signed.items()}  # fmt: skip
+    assert found.constants["pitch"][0] < 0.0, "a sign that no authority has"
+    roll, pitch, yaw, lift = (np.maximum(found.constants[name], 0.0) for name in signed)
+    four = [one / one.max() for one in (roll, pitch, yaw, lift)]
+    reach = np.minimum(openings, 0.9 - openings)
+    expected = {"√(yaw · lift)": np.sqrt(yaw * lift), "mean of four × flaps' reach": np.prod(four, axis=0) ** 0.25 * reach,
+        "least of four, each by its largest": np.min(four, axis=0)}  # fmt: skip
+    assert list(found.criteria) == list(expected)
+    for name, curve in expected.items():
+        assert found.criteria[name] == pytest.approx(curve / curve.max())
+
+
+def test_size_and_mass_have_the_powers_of_their_quantities(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each law over its cause in SI units; airspeed over both sweeps; fitted and the paper's exponent."""
+    monkeypatch.setattr(sweeps, "FACTORS", np.array([1.0, 2.0]))
+    found = {(one.quantity, one.cause): one for one in sweeps.scaling(PAPER)}
+    turns = dict.fromkeys((f"{name} acceleration per input" for name in ("roll", "pitch", "yaw")), -1.0)
+    papers = {(name, "l"): power for name, power in (turns | {"lift acceleration per input": 0.0,
+        "lift acceleration / l per input": -1.0, "Reynolds number": 0.0}).items()}  # fmt: skip
+    papers |= {
+        ("roll acceleration per input", "m"): 0.0,
+        ("airspeed", "m / l²"): 0.5,
+        ("Reynolds number", "m"): 0.5,
+    }
+    assert {key: one.paper for key, one in found.items()} == papers
+    for (_, cause), law in found.items():
+        first = {"l": G0.footprint, "m": 0.34, "m / l²": 0.34 / G0.footprint**2}[cause]
+        assert law.x[:2] == pytest.approx([first, first * (0.25 if "/" in cause else 2.0)])
+        assert law.exponent == pytest.approx(law.paper, abs=1e-4)
+    f = PAPER.linear.constants
+    values = [f.roll_u1, f.pitch_u2, f.yaw_u3, f.z_u4, f.z_u4 / G0.footprint, f.roll_u1, 10.0,
+        *2 * [1.225 * 10.0 * G0.footprint / 1.81e-5]]  # fmt: skip
+    assert [one.y[0] for one in found.values()] == pytest.approx(np.abs(values))
+    assert len(found["airspeed", "m / l²"].x) == 4
+
+
+def test_the_flown_plant_differs_from_the_plate_equations_by_what_is_wrong_in_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert analysis.model_error(PAPER) < 1e-12
+    equations = analysis.wrenches
+    for place, off in ((2, 0.25), (5, -0.5)):
+        wrong = np.zeros((analysis.CHECKED, 6))
+        wrong[123, place] = off
+        monkeypatch.setattr(analysis, "wrenches", lambda *what, wrong=wrong: equations(*what) + wrong)
+        assert analysis.model_error(PAPER) == pytest.approx(abs(off))
+
+
+def test_an_analysis_names_inputs_by_their_units_and_its_pictures_by_what_they_draw(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names = ("stability", "hover_angles", "scaling", "attainable")
+    for name in names:
+        monkeypatch.setattr(analysis, name, lambda point, name=name: name)
+    ends = {"roll": (-1.0, 2.0), "pitch": (-3.0, 4.0), "yaw": (-5.0, 6.0), "lift": (0.25, 7.0)}
+    monkeypatch.setattr(analysis, "single", lambda point: ends)
+    monkeypatch.setattr(
+        analysis, "authorities", lambda point: dict(zip(ends, (10.0, 20.0, 30.0, 40.0), strict=True))
+    )
+    monkeypatch.setattr(analysis, "model_error", lambda point: 0.5)
+    monkeypatch.setattr(analysis, "claims", lambda *what: [what])
+    for name in ("shape", "stability", "hover", "reach", "scale"):
+        monkeypatch.setattr(analysis.figures, name, lambda *what, name=name: (name, *what))
+    found = analysis.analyse(PAPER)
+    assert found.inputs == [
+        ("u1: roll", "-1 to 2 rad/s²", "± 10 rad/s²"), ("u2: pitch", "-3 to 4 rad/s²", "± 20 rad/s²"),
+        ("u3: yaw", "-5 to 6 rad/s²", "± 30 rad/s²"), ("u4: lift", "0.25 to 7 weights", "± 40 m/s²")]  # fmt: skip
+    assert {name: draw() for name, _, _, draw in found.pictures} == {
+        "shape": ("shape", PAPER), "stability": ("stability", PAPER, "stability"),
+        "hover_angle": ("hover", PAPER, "hover_angles"), "attainable": ("reach", PAPER, "attainable"),
+        "scaling": ("scale", "scaling")}  # fmt: skip
+    assert found.claims == [(PAPER, "stability", "hover_angles", "scaling", 0.5)]
 
 
 @pytest.mark.parametrize(

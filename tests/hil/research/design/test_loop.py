@@ -1,15 +1,32 @@
 """The design model: margins against a plant whose margins are known, its predictions against scipy's Lyapunov equation."""
 
+from math import inf, radians
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.linalg import solve_discrete_lyapunov
+from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from scipy.optimize import brentq
 
 from hil.config import load_config
 from hil.errors import LabError
-from hil.research.design.axes import AXES, DELAY, HEIGHT, PITCH, ROLL, STEP_S, Axis, gains_in, robot_of
-from hil.research.design.loop import FREQUENCIES, Timing, build
+from hil.research.design import tune
+from hil.research.design.axes import (
+    AXES,
+    DELAY,
+    HEIGHT,
+    PITCH,
+    ROLL,
+    STEP_S,
+    YAW,
+    Axis,
+    dynamics,
+    gains_in,
+    robot_of,
+)
+from hil.research.design.loop import FREQUENCIES, Timing, build, held
 from hil.research.design.margins import margins, margins_of, pose_delay_margin
 from hil.research.design.tune import Flow, GainTask, by_regulator, cost, delay_margin, design, motion
 
@@ -181,3 +198,136 @@ def test_the_integral_removes_the_offset_at_rest() -> None:
         GainTask(HEIGHT, Flow(flat(HEIGHT), 0.02, 0.0), CONFIG, NOW, 0.001).offset(np.array([3.0, 1.0, 1.0]))
         == 0.0
     )
+
+
+class Planted:
+    """A loop with given variances of its states and input, radius and open-loop response."""
+
+    def __init__(
+        self, axis: Axis, radius: float = 0.9, u: float = 0.0, peak: float = 1.0, main: float = 0.0
+    ) -> None:
+        self._states, self._u, self._radius = np.full(len(axis.states), 1e-4), u, radius
+        self._states[0] += main
+        self._L = np.full(len(FREQUENCIES), -1.0 - 1.0 / peak + 0j)  # never of size 1
+
+    def radius(self, gains: Array) -> float:
+        return self._radius
+
+    def response_to(self, spectrum: Any, gains: Array) -> tuple[Array, float]:
+        return self._states.copy(), self._u
+
+    def open_loop(self, gains: Array) -> Any:
+        return self._L
+
+
+@pytest.mark.parametrize("axis", AXES, ids=NAMES)
+def test_the_cost_is_motion_in_units_and_much_more_for_each_violated_condition(
+    axis: Axis, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each condition costs nothing at its limit and 100 times the excess above; an unstable loop more than all."""
+    allocation, controller = CONFIG.allocation, CONFIG.controller
+    share = min(
+        allocation.opening_max - allocation.hover_angle, allocation.hover_angle - allocation.opening_min
+    )
+    units = {"position": 0.02, "velocity": 0.3, "angle": radians(5.0), "rate": 2.0}
+    moved = sum(1e-4 / units[state] ** 2 for state in axis.states)
+    gains = np.zeros(len(axis.gains))
+    gains[0] = 1e-6
+    assert task(axis).flap_range == pytest.approx(share)
+
+    def extra(gains: Array = gains, task: GainTask = task(axis), **planted: float) -> float:  # noqa: B008
+        return cost(Planted(axis, **planted), task, gains) - moved  # type: ignore[arg-type]
+
+    assert extra() == pytest.approx(0.0, abs=1e-9)
+    for u in (0.25, 0.35):
+        costs = u**2 / 0.25**2 + 100.0 * (u / 0.25 - 1.0)
+        assert extra(u=(u * share) ** 2) == pytest.approx(costs)
+    assert extra(peak=1.9) == pytest.approx(0.0, abs=1e-9)
+    assert extra(peak=2.0) == pytest.approx(100.0 * (2.0 / 1.9 - 1.0))
+    turns = "angle" in axis.states
+    for factor in (1.0, 1.5):
+        steep = np.zeros(len(axis.gains))
+        steep[0] = -factor * share / controller.limit_xy
+        assert extra(gains=steep) == pytest.approx(100.0 * (factor - 1.0) if turns else 0.0, abs=1e-6)
+    far = (0.1 / 3.0) ** 2 - 1e-4  # three times the rms of 3.3 cm reach the end of the box
+    assert extra(main=far) == pytest.approx(far / units[axis.states[0]] ** 2)
+    wide = (0.15 / 3.0) ** 2 - 1e-4
+    outside = 50.0 if axis.main == "position" else 0.0
+    assert extra(main=wide) - wide / units[axis.states[0]] ** 2 == pytest.approx(outside)
+    monkeypatch.setattr(GainTask, "offset", lambda task, gains: far**0.5)
+    assert extra() == pytest.approx(far / units[axis.states[0]] ** 2), "the offset counts as motion"
+    monkeypatch.setattr(tune, "delay_margin", lambda L: 0.02)
+    assert extra(task=task(axis, 0.01)) == pytest.approx(extra(task=task(axis, 0.0)))
+    assert extra(task=task(axis, 0.015)) - extra(task=task(axis, 0.01)) == pytest.approx(50.0), (
+        "twice the delay"
+    )
+    assert extra(radius=1.0) + moved == 2000.0
+    assert extra(radius=1.25) > extra(radius=1.0)
+    assert extra(radius=0.999) < 10.0
+
+
+def test_the_offset_is_held_by_the_first_gain_and_of_a_position_after_the_turn_that_it_needs() -> None:
+    flow = Flow(flat(ROLL), 0.02, 0.01)
+    for axis, expected in ((ROLL, 0.015), (YAW, 0.01)):
+        still = GainTask(axis, flow, CONFIG, NOW, 0.0)
+        gains = np.array([-2.0, *np.ones(len(axis.gains) - 1)])
+        assert still.offset(gains) == pytest.approx(expected)
+        gains[0] = 0.0
+        assert still.offset(gains) == inf
+
+
+@pytest.mark.parametrize("worst", [(3.0, 1.0, 2.0), (1.0, 3.0, 2.5)])
+def test_gains_are_the_best_for_the_worst_robots_and_their_integral_is_a_third(
+    monkeypatch: pytest.MonkeyPatch, worst: tuple[float, ...]
+) -> None:
+    """Loops of height whose costs are distances from a wish: between the two extremes, whatever the order."""
+    wishes = [np.array([1.0, 1.0]), *(np.array([place, 0.5 * place]) for place in worst)]
+    asked: list[int] = []
+
+    def distance(loop: Any, task: GainTask, gains: Array) -> float:
+        asked.append(loop.number)
+        assert gains[2] == pytest.approx(gains[0] / 3.0)
+        return float(np.sum((gains[:2] - loop.wish) ** 2)) + (1e3 if loop.lost else 0.0)
+
+    monkeypatch.setattr(tune, "cost", distance)
+    loops: list[Any] = [SimpleNamespace(wish=wish, number=n, lost=False) for n, wish in enumerate(wishes)]
+    start = [np.array([one, 0.0, one / 3.0]) for one in (7.0, 1.5)]
+    found = design(task(HEIGHT), loops, start)
+    assert found == pytest.approx([2.0, 1.0, 2.0 / 3.0], abs=0.02)
+    assert [float(f"{gain:.4g}") for gain in found] == found.tolist(), "as a profile has them"
+    assert asked[:2] == [0, 0], "both starts"
+    alone = design(task(HEIGHT), loops[:1], start)
+    assert alone == pytest.approx([1.0, 1.0, 1.0 / 3.0], abs=0.005)
+    loops[2].lost = True
+    with pytest.raises(
+        LabError, match=r"^no gains: height: 1 of 4 robots that the intervals allow are unstable with"
+    ):
+        design(task(HEIGHT), loops, start)
+
+
+@pytest.mark.parametrize("axis", AXES, ids=NAMES)
+def test_the_regulator_s_gains_hold_the_robot_with_its_flap_angle_fed_back_too(axis: Axis) -> None:
+    """Of the design's weights: 2 cm, 0.3 m/s, 5 degrees, 2 rad/s and 0.1 rad of flaps cost one each."""
+    robot = robot_of(CONFIG)
+    Phi, Gamma = held(*dynamics(axis, robot), STEP_S)
+    units = {"position": 0.02, "velocity": 0.3, "angle": radians(5.0), "rate": 2.0}
+    Q = np.diag([*(units[state] ** -2 for state in axis.states), 0.0])
+    P = solve_discrete_are(Phi, Gamma[:, :1], Q, [[100.0]])
+    K = np.linalg.solve(100.0 + Gamma[:, :1].T @ P @ Gamma[:, :1], Gamma[:, :1].T @ P @ Phi)[0]
+    n = len(axis.states)
+    gains = by_regulator(axis, robot)
+    assert gains[:n] == pytest.approx(K[:n], rel=1e-6)
+    assert gains[n:].tolist() == pytest.approx([K[0] / 3.0] * (len(axis.gains) - n))
+
+
+def test_loops_that_bear_less_delay_than_poses_have_are_refused_in_one_line() -> None:
+    one: Any = SimpleNamespace(axis=ROLL, least=SimpleNamespace(delay=0.020), least_late=0.015)
+    other: Any = SimpleNamespace(axis=YAW, least=SimpleNamespace(delay=0.0141), least_late=0.030)
+    tune.refuse_late([one, other], 0.0141)
+    with pytest.raises(LabError) as refused:
+        tune.refuse_late([one, other], 0.0142)
+    assert str(refused.value) == (
+        "refused: yaw tolerates 14.1 ms of delay, and poses arrive up to 14.2 ms later than on the mean"
+    )
+    with pytest.raises(LabError, match=r"^refused: roll, y tolerates 15\.0 ms"):
+        tune.refuse_late([one, other], 0.0151)

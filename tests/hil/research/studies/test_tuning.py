@@ -18,7 +18,7 @@ from hil.laboratory.request import Options, Request
 from hil.laboratory.robot import Streams
 from hil.laboratory.run import fly
 from hil.research.campaigns.jobs import Job, Row
-from hil.research.design.axes import DELAY, ROLL, gains_in, robot_of
+from hil.research.design.axes import AXES, DELAY, ROLL, gains_in, robot_of
 from hil.research.design.loop import FREQUENCIES, Timing, build
 from hil.research.design.margins import margins, pose_delay_margin, worst
 from hil.research.design.tune import Flow, GainTask, judged, motion
@@ -68,6 +68,69 @@ def test_an_axis_is_judged_by_old_and_new_gains_for_its_robot_and_by_the_worst_o
 def hovered(rms_m: float, outcome: str = "completed") -> Row:
     metrics = {"rms_x": 0.48 * rms_m, "rms_y": 0.6 * rms_m, "rms_z": 0.64 * rms_m}
     return Row(Job(0, "hover", Options(), {}, Path("run")), outcome, "", True, "", metrics, {})
+
+
+def test_a_round_designs_each_axis_from_the_hover_s_flow_and_flies_its_gains_and_the_worst(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    config = load_config()
+    robots = SimpleNamespace(nominal="nominal", drawn=("a", "b"), about="within")
+    age = SimpleNamespace(mean_us=41_000.0, p99_us=52_000.0)
+    asked: list[Any] = []
+
+    def judge(task: GainTask, every: Any, loops: Any, old: Any, new: Any) -> Any:
+        flow, delay = f"flow of record, {task.axis.name}, nominal", task.delay
+        assert (task.flow, task.config, task.timing, delay) == (flow, config, Timing.of(config, 0.041),
+            pytest.approx(0.011))  # fmt: skip
+        assert every == ["nominal", "a", "b"]
+        assert loops == [f"{task.axis.name} of {one}, 0.04" for one in every]
+        assert (old.tolist(), new.tolist()) == (gains_in(config, task.axis).tolist(), (2.0 * old).tolist())
+        delays = {"roll": (0.03, 0.025), "pitch": (0.02, 0.024), "yaw": (0.05, 0.022), "height": (0.04, 0.05)}
+        delay, late = delays[task.axis.name]
+        return SimpleNamespace(axis=task.axis, new=new, least=SimpleNamespace(delay=delay), least_late=late)
+
+    def design(task: GainTask, loops: Any, start: Any) -> Any:
+        assert start[0] == f"regulator of {task.axis.name}, nominal"
+        return 2.0 * start[1]
+
+    for name, answer in {
+        "robots_of": lambda profile, known, count: robots if (profile, known, count) == ("mine", config, 2) else None,
+        "load_config": lambda profile: config, "read_result": lambda folder: SimpleNamespace(ages=[age, None]),
+        "load_record": lambda folder, profile: "record",
+        "flow_of": lambda record, axis, robot: f"flow of {record}, {axis.name}, {robot}",
+        "build": lambda axis, robot, known, timing: f"{axis.name} of {robot}, {timing.age_s:g}", "design": design,
+        "by_regulator": lambda axis, robot: f"regulator of {axis.name}, {robot}", "judged": judge,
+        "refuse_late": lambda axes, jitter: asked.append((len(axes), round(jitter, 6))),
+        "write_tuned": lambda *what: asked.append(what[:2]), "worst_settings": lambda *what: [("x=1",), ("y=2",)],
+    }.items():  # fmt: skip
+        monkeypatch.setattr(tuning, name, answer)
+
+    def log(name: str, flights: Any, folder: Path) -> list[Row]:
+        asked.append({place: (one["profile"], one["overrides"]) for place, (_, one) in flights.items()})
+        return [hovered(0.01 * (1 + n), outcome) for n in range(len(flights))]
+
+    outcome = "completed"
+    flights = TuningFlights(5, "c", tmp_path, SimpleNamespace(log=log))  # type: ignore[arg-type]
+    one = tuning.fly_round("mine", flights, 2)
+    path = tmp_path / "tuned.toml"
+    flown = {"after": (str(path), ()), "after-1": (str(path), ("x=1",)), "after-2": (str(path), ("y=2",))}
+    assert asked == [{"before": ("mine", ())}, (4, 0.011), (path, "mine"), flown]
+    assert (one.given, one.written, len(one.flown), rms(one.flown[2])) == (
+        "mine",
+        path,
+        3,
+        pytest.approx(0.03),
+    )
+    assert one.tuned.least_delay_s == 0.02
+    assert (one.tuned.age_s, one.tuned.jitter_s) == (pytest.approx(0.041), pytest.approx(0.011))
+    tuned, usual = one.tuned.config.controller.model_dump(), config.controller.model_dump()
+    gains = {gain for axis in AXES for gain in axis.gains}
+    assert tuned == usual | {name: pytest.approx(2.0 * usual[name]) for name in gains}
+    outcome = "lost"
+    with pytest.raises(
+        LabError, match=r"^mine: its own gains lose the robot \(\): no hover to measure the flow with$"
+    ):
+        tuning.fly_round("mine", flights, 2)
 
 
 @pytest.mark.parametrize(
