@@ -11,6 +11,10 @@ import pytest
 
 from firmware_py.geometry import from_euler_zyx, yaw_quaternion
 from hil.errors import LabError
+from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.files.recorder import load_log
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
 from hil.pictures import compare, curves, trials
 from hil.pictures.panels import TOGETHER_S, marks_of_flight, saturated
 from hil.pictures.viewer.plots import RATES
@@ -105,6 +109,38 @@ def test_a_curve_shows_the_member_of_a_group_that_its_name_says(name: str) -> No
                 set(members) & found for found in (words(label), set().union(*map(words, columns)))
             )
             assert not named or not shown or shown == named, (label, columns)
+
+
+# Of a column's unit, the shown one, and one in the other.
+SCALES = {("m", "cm"): 100.0, ("rad", "deg"): np.degrees(1.0), ("us", "ms"): 1e-3, ("N", "mN"): 1e3, ("V", "V"): 1.0,
+    ("ticks", "ms"): 10.0, ("counts", "%"): 100.0 / 65535, ("%", "%"): 1.0}  # fmt: skip
+OTHERWISE = {"rotor.thrust_1": "N", "rotor.command_1": "N", "estimator.horizon": "ticks", "board.load": "%"}
+
+
+@pytest.fixture(scope="module")
+def units(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The units of the columns of a log."""
+    folder = tmp_path_factory.mktemp("units") / "run"
+    fly(Request.of(EXPERIMENTS["hover"], duration_s=0.05), folder)
+    log = load_log(folder)
+    return {one.name: (one.metadata or {}).get(b"unit", b"").decode() for one in log.schema} | OTHERWISE
+
+
+@pytest.mark.parametrize("name", PLOTTED)
+def test_a_curve_is_in_the_unit_that_it_names(name: str, units: dict[str, str]) -> None:
+    """Others count: events so far or per second, packets, poses, or have units of their own in their names."""
+    plot = PLOTTED[name]
+    assert len(plot.names) == len(set(plot.names)) == len(plot.colours)
+    if plot.unit in ("so far", "1/s", "packets", "measurements", ""):
+        assert name in ("AIR", "latency", "line_load") or plot.unit
+        assert name != "AIR" or plot.names == ("link quality [%]", "RSSI [-dBm]")
+        return
+    assert len(set(plot.colours)) == len(plot.colours)
+    for column in (one for one in columns_of(plot) - {"t"} if units.get(one)):
+        ones, twos = (probed(columns_of(plot)).set_column(probed(columns_of(plot)).column_names.index(column), column,
+            pa.array([value] * 3)) for value in (0.0, 1e-3))  # fmt: skip
+        change = np.abs(plot.read(twos) - plot.read(ones)).max()
+        assert change == pytest.approx(1e-3 * SCALES.get((units[column], plot.unit), 0.0), rel=1e-3), column
 
 
 def test_the_time_since_the_last_fused_pose_grows_until_the_next_one() -> None:

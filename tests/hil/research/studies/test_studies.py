@@ -2,11 +2,16 @@
 
 import dataclasses
 import json
+import math
+import re
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 from hil.config import load_config
+from hil.laboratory.fault_kinds import KINDS
+from hil.laboratory.faults import parse
 from hil.laboratory.request import Options
 from hil.pictures.drawing import png
 from hil.research.campaigns.jobs import fly_job
@@ -28,16 +33,6 @@ from hil.research.studies.study import (
     summarise,
 )
 from support.command import Cli
-
-
-@pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
-def test_every_flight_of_every_study_can_be_asked_for(study: Study) -> None:
-    flights = list(flights_of(study, 1))
-    assert len(flights) == len(study.variants) * len(study.sizes)
-    for job in flights:
-        request = job.request()
-        assert request.config == load_config(job.options["profile"], request.overrides)
-        assert request.duration_s == study.duration_s, job.values
 
 
 @pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
@@ -68,6 +63,61 @@ def test_an_updraft_is_flown_at_its_hover_angle_or_the_nearest_that_leaves_the_r
         found.append(config.allocation.hover_angle)
     assert (found[0], found[2]) == pytest.approx((point.low, point.high - RESERVE), abs=1e-4)
     assert speed_at(point.geometry, point.coefficient, found[1]) == pytest.approx(9.5, rel=1e-3)
+
+
+profile_of = cache(load_config)
+SIZES = {  # what the flight has at a size, by study: a setting, or the size of a fault in its kind's unit
+    "latency": (lambda config, size: config.mocap.latency_us + 2000 if size else 2000, lambda size: max(2000, 1000 * size)),
+    "loss": (lambda config, size: config.radio.uplink_loss, lambda size: 0.01 * size),
+    "jitter": (lambda config, size: config.radio.uplink_jitter_us, lambda size: 1000 * size),
+    "outliers": (lambda config, size: config.mocap.outlier, lambda size: 0.01 * size),
+    "design-updrafts": (lambda config, size: config.tunnel.speed, lambda size: size),
+}  # fmt: skip
+FAULTS = {"dropout": "mocap.dropout", "swap": "mocap.swap", "gyro-noise": "imu.noise", "gyro-range": "imu.saturation",
+    "servo-stuck": "servo.stuck.1", "servo-slow": "servo.slow.1", "servo-trim": "servo.trim.1", "battery": "battery.sag",
+    "design-pushes": "push.roll"}  # fmt: skip
+
+
+@pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
+def test_a_flight_has_the_size_of_its_study_and_what_the_variant_s_name_says(study: Study) -> None:
+    """Sizes are in the study's unit; faults begin 2 s after the release, and last to the end or for the size."""
+    mid = {f"gain_{name}": gain for name, gain in (("y", -2.5), ("vy", -0.8), ("roll", 0.3), ("p", 0.18), ("x", -3.5),
+        ("vx", -0.8), ("pitch", 0.15), ("q", 0.03), ("yaw", 0.4), ("r", 0.07))}  # fmt: skip
+    flights = list(flights_of(study, 1))
+    assert len(flights) == len(study.variants) * len(study.sizes)
+    for job in flights:
+        request, size, name = job.request(), float(job.values["size"]), str(job.values["variant"])
+        config, base = request.config, profile_of(request.profile)
+        assert request.duration_s == study.duration_s
+        assert request.profile == ("floaty" if name.startswith("mid") else re.split(r"[, ]", name)[0])
+        assert config.predictor.enabled == ("no predictor" not in name)
+        assert config.predictor.age == ("fixed" if "fixed" in name else "measured")
+        assert config.predictor.horizon * 10.0 == (40.0 if "40 ms" in name else 10.0 * base.predictor.horizon)
+        assert config.tracker.enabled == (base.tracker.enabled and "no tracker" not in name)
+        gains = config.controller.model_dump()
+        assert gains == base.controller.model_dump() | (mid if name.startswith("mid") else {})
+        if study.name in SIZES:
+            found, wanted = SIZES[study.name]
+            assert (found(config, size), request.faults) == (pytest.approx(wanted(size)), ())
+        elif study.name == "model-error":
+            ratio = 1.0 + (size if "+" in name else -size) / 100.0
+            assert config.model.z_u4 == pytest.approx(
+                load_config().model.z_u4 * (1.0 if "couplings" in name else ratio)
+            )
+            assert config.model.z_vz == pytest.approx(
+                load_config().model.z_vz * (1.0 if "inputs" in name else ratio)
+            )
+        elif not request.faults:
+            assert size == {"gyro-noise": 1, "gyro-range": 2000, "servo-slow": 100}.get(study.name, 0)
+        else:
+            (fault,) = map(parse, map(str, request.faults))
+            kind = f"imu.bias.{name[-1]}" if study.name == "gyro-bias" else FAULTS[study.name]
+            assert (fault.kind, fault.start_s) == (kind, 2.0)
+            lasts = study.unit == "s"
+            assert fault.duration_s == (size if lasts else 0.1 if kind == "push.roll" else math.inf)
+            unit = KINDS[kind].unit
+            assert lasts or fault.size == pytest.approx(0.01 * size if study.unit == "%" else size)
+            assert lasts or unit == study.unit or study.unit in ("", "%"), (unit, study.unit)
 
 
 def test_a_model_error_scales_the_constants_of_its_part_and_no_other() -> None:
