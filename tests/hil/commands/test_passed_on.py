@@ -14,16 +14,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from firmware_py.policy.measuring import LawFigures
 from ground_station.controls import ControlAction, ControlsError
 from ground_station.errors import LinkError
 from hil.commands import fly, identify, paper, param
 from hil.config import load_config
 from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.replay import Misses
 from hil.research.campaigns.run import Runner
 from hil.research.design import analysis
 from hil.research.design.analysis import Analysis
 from hil.research.design.claims import Claim
 from hil.research.design.linear import point_of
+from hil.research.studies.paper_identification import COLUMNS, WHY, PaperConstant
 from support.command import Cli
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -391,3 +394,146 @@ def test_a_station_that_failed_says_why_and_one_that_lost_a_file_says_so_in_its_
     assert find("hover") is EXPERIMENTS["hover"].trajectory
     with pytest.raises(ControlsError, match="hovar"):
         find("hovar")
+
+
+@pytest.mark.parametrize("address", ["", "page"])
+def test_a_flight_is_written_drawn_traced_printed_and_its_viewer_stays_until_it_is_closed(
+    asked: Asked, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], address: str
+) -> None:
+    """In this order; then the lines on time that stood still, on the processor and on coverage; a trace only if asked."""
+    view = Made(address=address, stay=lambda: asked.append("stay"))
+    result = Made(passed=True, outcome="completed", stood_still_ms=12.4)
+    bench = Made(gdb=None, in_lockstep="lockstep", trace=True, profile_cpu=Path("cpu"), coverage=Path("cov"))
+    request: Any = Made(experiment=Made(name="hover"), seed=3, bench=bench)
+
+    def flown(request: Any, folder: Any, show: Any, *more: Any) -> Any:
+        for now_us in (1, 2):
+            show(now_us, Made(end_us=9))
+        return result
+
+    asked.answer({
+        "commands.options.open_live": view, "laboratory.run.fly": flown, "api.maker_of": "maker",
+        "live.panel_commands.PanelCommands": None, "commands.options.write_pictures": None,
+        "pictures.exports.perfetto.write_perfetto": None, "commands.options.close_live": None,
+        "laboratory.files.cpu_profile.files_of": [Path("cpu.txt"), Path("cpu.folded")],
+        "pictures.exports.coverage.write_coverage": ("9 of 10", Path("cov.info"), Path("cov.html")),
+    })  # fmt: skip
+    monkeypatch.setattr(fly, "print_result", lambda result: asked.append("printed"))
+    monkeypatch.setattr(type(fly.common.notices), "is_terminal", True)
+    monkeypatch.setattr(fly.common, "progress_bar", lambda *columns, wanted: nullcontext(
+        Made(add_task=lambda *what, **more: 0, update=lambda *what, **more: None)))  # fmt: skip
+    assert fly._fly_one(request, Path("x"), "web") == 0
+    fly._cover(request)
+    order = [one if isinstance(one, str) else one[0] for one in asked]
+    stays = ["stay"] * bool(address)
+    assert order == ["open_live", "maker_of", "fly", "PanelCommands", "write_pictures", "write_perfetto", "printed", *stays,
+        "close_live", "files_of", "write_coverage"]  # fmt: skip
+    assert asked[3][1] is view
+    assert asked[3][3] == "lockstep"
+    assert asked[order.index("close_live")] == ("close_live", view, result)
+    told = capsys.readouterr()
+    assert told.out.splitlines() == ["this machine was too slow: time stood still for 12 ms", "processor time:", "  cpu.txt",
+        "  cpu.folded", "coverage: 9 of 10", "  cov.info", "  cov.html"]  # fmt: skip
+    assert told.err == "the flight can be viewed until Ctrl-C\n" * len(stays)
+
+
+def test_a_replay_prints_what_each_estimate_missed_in_the_units_of_its_rows(cli: Cli, asked: Asked) -> None:
+    request = Made(profile="mine", overrides=("a=1",), experiment="hover")
+    misses = [Misses(0.01, 0.02, 0.03, 0.04, 5, 6), Misses(0.07, 0.08, 0.09, 0.1, 11, 12)]
+    asked.answer({"api.load_run": Made(request=request, hash="h"), "laboratory.replay.replay": None,
+        "config.load_config": lambda profile, overrides: (profile, *overrides),
+        "commands.options.write_pictures": None, "laboratory.replay.misses": misses})  # fmt: skip
+    for options, profile in (((), "mine"), (("--profile", "floaty"), "floaty")):
+        assert cli("replay", "runs/x", "--set", "b=2", *options) == 0
+        cells = [
+            [cell.strip() for cell in re.split("[│┃]", line)[1:-1]]
+            for line in cli.out.splitlines()
+            if line[0] in "│┃"
+        ]
+        assert cells == [["estimate less truth", "flown", "replayed", "unit"], ["position, rms", "1", "7", "cm"],
+            ["position, largest", "2", "8", "cm"], ["attitude, rms", "1.719", "5.157", "deg"],
+            ["attitude, largest", "2.292", "5.73", "deg"], ["poses fused", "5", "11", ""],
+            ["poses refused", "6", "12", ""]]  # fmt: skip
+        assert cli.out.splitlines()[-1] == "  runs/x-replay/report.html"
+        assert ("replay", request, "h", (profile, "a=1", "b=2"), Path("runs/x-replay")) in asked
+
+
+@pytest.mark.parametrize(
+    ("cycles", "difference", "told"),
+    [
+        (604_800, 1e-4, ""),
+        (604_801, 1e-4, "20-4: 604801 cycles per call (3600 us of a Cortex-M4), 90% of its control slot of 672000; flash "
+         "3 B, RAM 4 B; at most 90% of the slot are allowed"),
+        (672, 1.1e-4, "the law's actions differ by 0.00011 from the file's: at most 0.0001"),
+        (672, float("nan"), "the law's actions differ by nan from the file's: at most 0.0001"),
+    ],
+)  # fmt: skip
+def test_a_policy_is_written_where_it_fits_its_slot_and_acts_as_its_file(
+    cli: Cli, asked: Asked, monkeypatch: pytest.MonkeyPatch, cycles: int, difference: float, told: str
+) -> None:
+    Path("law.json").touch()
+    asked.answer({
+        "commands.new.write_project": None, "config.load_config": Made(logic="logic"),
+        "board.cores.boards.runner_of": "runner",
+    })  # fmt: skip
+    figures = LawFigures(cycles, 3, 4, difference)
+    monkeypatch.setattr("firmware_py.policy.reading.read_policy", lambda file: Made(shape="20-4", numbers=84))
+    monkeypatch.setattr(
+        "firmware_py.policy.measuring.measure", lambda *what: asked.append(what[2]) or figures
+    )
+    if told:
+        assert cli.refusal("policy", "law.json", "--out", "my law") == f"floaty: policy law.json: {told}\n"
+        return
+    assert cli("policy", "law.json", "--out", "my law") == 0
+    assert cli.out.splitlines() == [f"20-4, 84 constants: {figures}",
+        "largest difference from law.json: 1.0e-04 of an action",
+        "floaty fly hover --profile my law/profile.toml"]  # fmt: skip
+    first, *_, last = asked  # of `write_project`, whose own `name` is the project's
+    assert (first[0], first[-1], last[0], last[3]) == (
+        "my-law",
+        LawFigures(0, 0, 0, 0.0),
+        "my-law",
+        Path("my law"),
+    )
+    assert first[3] != last[3]
+    assert (last[4], last[-1]) == ("law.json", figures)
+    assert ("runner_of", "cortex-m4", "logic") in asked
+    assert "runner" in asked
+
+
+def test_a_campaign_of_an_image_adds_its_coverage_in_each_flight_and_prints_it_if_one_flew(
+    cli: Cli, asked: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Path("spec.toml").write_text(SPEC, encoding="utf-8")
+    interims = [Made(flown=2, complete=True), Made(flown=0, complete=False)]
+    monkeypatch.setattr(
+        Runner, "campaign", lambda runner, plan, out: asked.append(plan) or ("set", interims.pop(0))
+    )
+    findings = Made(rate="1 of 2", cells=[], errors=(), worst=())
+    asked.answer({
+        "research.campaigns.report.write_report": ("page", findings), "commands.campaign._check_coverage": None,
+        "pictures.exports.coverage.write_coverage": ("9 of 10", Path("cov.info"), Path("cov.html")),
+    })  # fmt: skip
+    lines = ["failed: 1 of 2", "  page", "coverage: 9 of 10", "  cov.info", "  cov.html"]
+    for shown in (5, 2):
+        assert cli("campaign", "spec.toml", "--coverage", "cov") == 0
+        assert cli.out.splitlines() == lines[:shown]
+    _, plan, *_ = asked
+    assert asked[0] == ("_check_coverage", Path("cov"), "c")
+    assert [plan.job(n).options["coverage"] for n in (0, 2)] == [Path("cov").absolute()] * 2
+    assert plan.job(2).options["seed"] == 3
+
+
+def test_rows_of_the_paper_s_identification_are_printed_in_their_columns_with_the_reason(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shown: list[Any] = []
+    monkeypatch.setattr(paper, "say", shown.append)
+    monkeypatch.setattr(paper.common, "wide_console", lambda width: Made(print=shown.append))
+    paper._print_constants([PaperConstant(*"abcdefg")])
+    paper._print_constants([])
+    table, why = shown
+    assert [(column.header, *column.cells) for column in table.columns] == [
+        *zip(COLUMNS, "abcdefg", strict=True)
+    ]
+    assert why == WHY

@@ -146,6 +146,12 @@ param set extCtrl.y_P=two --link udp://127.0.0.1:1 | extCtrl.y_P=two: expected N
 
 serve --gdb 3333 | --gdb 3333: needs one board and an image as --board
 serve --baud 9600 | --baud: now --set serial.baud=N
+serve --natnet | --natnet: now --set capture.natnet=3.1
+serve --natnet-port | --natnet-port: now --set capture.port=PORT
+serve --multicast | --multicast: now --set capture.multicast=true
+serve --up | --up: now --set capture.axes=z-up
+station --trajectory | --trajectory: now floaty station EXPERIMENT
+view --web | --web: now --view web
 serve --set radio.uplink_loss=2 | radio.uplink_loss = 2
 serve --set quadrotor.mass=0.03 | quadrotor.mass=0.03: has no effect on the robot of profile floaty
 serve --boards 11 | 11

@@ -90,12 +90,15 @@ def test_seeds_count_up_and_one_that_fails_is_exit_code_one(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     jobs: list[Job] = []
+    names: list[str] = []
 
     def fly_all(runner: Runner, name: str, wanted: list[Job], out: Path) -> list[Row]:
         jobs.extend(wanted)
+        names.append(name)
         return [made(0.01, holds) for holds in passed]
 
     monkeypatch.setattr(Runner, "fly", fly_all)
     assert cli("fly", "hover", "--seeds", "3", "--seed", "5") == code
     assert [job.options["seed"] for job in jobs] == [5, 6, 7]
     assert len({job.folder for job in jobs}) == 3
+    assert names == ["hover-5-7"]

@@ -2,14 +2,19 @@
 
 import io
 import json
+import os
+import signal
+import sys
 from collections.abc import Iterable, Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import pyarrow as pa
 import pytest
 
+from hil.errors import LabError
 from hil.live import picture
-from hil.live.feed import EVENTS, PARAMETERS, READY, TAKEN
+from hil.live.feed import EVENTS, PARAMETERS, READY, TAKEN, TYPED
 
 
 class Screen:
@@ -48,3 +53,63 @@ def test_a_picture_shows_what_comes_and_counts_all_that_it_took(monkeypatch: pyt
     assert screen.shown == [
         ("rows", [1, 2, 3], ["a"]), ("values", {"b": 2.0}), ("rows", [4, 5], []), ("rows", [], ["c"]), "closed",
     ]  # fmt: skip
+
+
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning"
+)  # its answers end with the process
+@pytest.mark.parametrize(
+    ("error", "told", "code"),
+    [
+        (None, "taken 7", 0),
+        (LabError("--view x: expected nothing"), "failed --view x: expected nothing", 1),
+        (ModuleNotFoundError("no rerun", name="rerun.sdk"), "failed --view window: rerun is missing: ", 1),
+        (ImportError("cannot import x", name="x"), "failed ImportError: cannot import x", 1),
+        (ZeroDivisionError("odd"), "failed ZeroDivisionError: odd", 1),
+    ],
+)
+def test_the_process_answers_in_lines_and_what_libraries_print_is_not_among_them(
+    error: Exception | None,
+    told: str,
+    code: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    asked: list[Any] = []
+
+    def run(target: str, program: str, rows: Any, say: picture.Say) -> None:
+        asked.append((target, program, rows))
+        os.write(1, b"a library's words\n")
+        if error is not None:
+            raise error
+        say(TAKEN, "7")
+
+    monkeypatch.setattr(picture, "run", run)
+    monkeypatch.setattr(picture.os, "nice", asked.append)
+    monkeypatch.setattr(picture.signal, "signal", lambda *what: asked.append(what))
+    monkeypatch.setattr(sys, "argv", ["picture", "window", "fly"])
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer="rows"))
+    places = {"stdout": 1, "stderr": 2}
+    for name, number in places.items():
+        monkeypatch.setattr(
+            sys, name, SimpleNamespace(fileno=lambda number=number: number, write=len, flush=list)
+        )
+    kept = os.dup(1)
+    try:
+        assert picture.main() == code
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+    out, err = capfd.readouterr()
+    assert out.startswith(told)
+    assert out.count("\n") == 1
+    assert err == "a library's words\n"
+    assert asked == [(signal.SIGINT, signal.SIG_IGN), picture.NICE, ("window", "fly", "rows")]
+
+
+def test_a_stream_that_breaks_off_closes_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = Screen()
+    monkeypatch.setattr(picture, "open_screen", lambda target, program, typed: typed("goal 1 2 3") or screen)
+    said: list[Any] = []
+    picture.run("web", "fly", io.BytesIO(b"\xff\xff\xff\xff\x10"), lambda *what: said.append(what))
+    assert (said, screen.shown) == ([(TYPED, "goal 1 2 3"), (READY, "here")], ["closed"])

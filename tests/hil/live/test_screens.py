@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from hil.errors import LabError
-from hil.live import recording, window
+from hil.live import recording, rerun_screen, window
 from hil.live.feed import open_view
 from hil.live.local_server import LocalServer
 from hil.live.picture import open_screen
@@ -184,3 +184,46 @@ def test_a_run_is_shown_in_a_browser_at_its_instant_until_ctrl_c(
         f"view    {page}1.5",
         "report  http://127.0.0.1:9877/report.html, whose links lead here, as those of the file do, until Ctrl-C",
     ]
+
+
+def test_a_flight_in_rerun_s_viewer_has_its_layout_once_and_the_server_of_a_page_ends(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[object] = []
+    stuck = [RuntimeError("the viewer has gone")]
+
+    def flush(timeout_sec: float) -> None:
+        asked.append(("flush", timeout_sec))
+        raise stuck.pop()
+
+    def flight(recording: object, schema: object) -> SimpleNamespace:
+        asked.append(("flight", schema))
+        return SimpleNamespace(
+            add_rows=lambda rows: asked.append(("rows", rows.number)), add_events=asked.append
+        )
+
+    patch = {"open_window": lambda: "at the window", "serve_web": lambda: ("page", "at the page", "server"),
+        "is_open": lambda host, port: (host, port) == ("here", 65535), "end": asked.append, "RerunFlight": flight,
+        "blueprint": lambda schema, live: (schema, live)}  # fmt: skip
+    for name, value in patch.items():
+        monkeypatch.setattr(rerun_screen, name, value)
+
+    def stream_to(address: str) -> SimpleNamespace:
+        asked.append(address)
+        return SimpleNamespace(send_blueprint=asked.append, flush=flush)
+
+    monkeypatch.setattr(rerun_screen, "stream_to", stream_to)
+    for target, taker, page, server in (
+        ("window", "at the window", "", []), ("web", "at the page", "page", ["server"]),
+        ("connect:here:65535", "rerun+http://here:65535/proxy", "", []),
+    ):  # fmt: skip
+        asked.clear()
+        stuck[:] = [RuntimeError()]
+        screen = rerun_screen.RerunScreen(target)
+        assert screen.address == page
+        for number in (1, 2):
+            screen.show_rows(SimpleNamespace(schema="columns", number=number), [f"text {number}"])  # type: ignore[arg-type, list-item]
+        screen.know({"a": 1.0})
+        screen.close()
+        assert asked == [taker, ("columns", True), ("flight", "columns"), ("rows", 1), ["text 1"], ("rows", 2),
+            ["text 2"], ("flush", rerun_screen.CATCH_UP_S), *server]  # fmt: skip

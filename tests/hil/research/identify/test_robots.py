@@ -2,6 +2,8 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,11 +11,13 @@ from scipy.signal import cont2discrete, dlsim
 
 from hil.config import load_config
 from hil.errors import LabError
-from hil.research.design.axes import DELAY, PITCH, dynamics, robot_of
+from hil.research.design.axes import DELAY, PITCH, ROLL, Axis, dynamics, robot_of
 from hil.research.design.loop import FREQUENCIES
+from hil.research.identify import pages, two_controllers
 from hil.research.identify.flow import flow_of
 from hil.research.identify.record import Record
 from hil.research.identify.robots import UNKNOWN_SHARE, KnownModel, beside, robots_of
+from hil.research.identify.two_controllers import ClosedLoop
 
 CONFIG = load_config()
 MS = 1e-3
@@ -98,3 +102,126 @@ def test_what_the_model_does_not_explain_is_the_flow() -> None:
     band = (FREQUENCIES > 0.3) & (FREQUENCIES < 8.0)
     assert np.mean(found[band, 1, 1].real) == pytest.approx(per_hz, rel=0.25)
     assert np.mean(found[band & (FREQUENCIES < 1.0), 0, 0].real) < 0.05
+
+
+def test_two_controllers_give_the_open_loop_by_the_paper_s_equations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of closed loops whose constants are those of a robot with two gains on the angle; both intervals add up."""
+    truth = {ROLL: (230.0, -40.0, -16.0, 1.5), PITCH: (-150.0, -30.0, -20.0, -3.0)}
+    config = load_config()
+
+    def record(name: str, excited: bool = False, **gains: float) -> Any:
+        controller = config.controller.model_copy(update=gains)
+        return SimpleNamespace(
+            name=name,
+            excitation=np.full((3, 4), float(excited)),
+            config=SimpleNamespace(controller=controller),
+        )
+
+    def loop(record: Any, axis: Axis) -> ClosedLoop:
+        a, *rest = truth[axis]
+        names = {ROLL: ("gain_p", "gain_roll", "gain_vy"), PITCH: ("gain_q", "gain_pitch", "gain_vx")}[axis]
+        own = [-getattr(record.config.controller, gain) for gain in names]
+        none = np.zeros(0)
+        starred = np.array([value + a * gain for value, gain in zip(rest, own, strict=True)])
+        errors = {"first": (1.0, 3.0, 5.0), "other": (2.0, 4.0, 6.0)}[record.name]
+        return ClosedLoop(starred, np.array(errors), none, none, none)
+
+    monkeypatch.setattr(two_controllers, "closed_loop", loop)
+    base = record("first", gain_roll=0.2, gain_p=0.3, gain_vy=-0.5)
+    others = [record("excited", True, gain_roll=0.9), record("same", gain_roll=0.2),
+        record("other", gain_roll=0.15, gain_p=0.1)]  # fmt: skip
+    found = two_controllers.two_controllers([base, *others])
+    assert [one[0] for one in found.values()] == pytest.approx(truth[ROLL])
+    assert list(found) == ["roll_u1", "roll_rate", "roll_roll", "roll_vy"], "of pitch no two gains differ"
+    spread = 5.0 / 0.05  # of a: both errors of c*, over the difference of the gains
+    halves = [
+        spread,
+        *(np.hypot(error, spread * gain) for error, gain in ((1.0, 0.3), (3.0, 0.2), (5.0, 0.5))),
+    ]
+    assert [one[1] for one in found.values()] == pytest.approx([1.96 * one for one in halves])
+    both = two_controllers.two_controllers([record("first", gain_pitch=0.1), record("other", gain_pitch=0.2)])
+    assert {name: one[0] for name, one in both.items()} == pytest.approx(
+        dict(zip(("pitch_u2", "pitch_rate", "pitch_pitch", "pitch_vx"), truth[PITCH], strict=True)))  # fmt: skip
+    assert two_controllers.two_controllers([base]) == two_controllers.two_controllers([]) == {}
+
+
+def test_a_closed_loop_s_constants_are_those_of_two_lines_of_which_y_has_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """At the first line c* is -w² of the angle, whatever the robot; the second adds d*; b* has nothing left."""
+    monkeypatch.setattr(two_controllers, "TAPER", (1.0, 1.0, 1.0))
+    t = np.arange(4100) / 100.0
+    rng = np.random.default_rng(1)
+    (first, second), ratio = 2 * np.pi * np.array([1.0, 3.0]), 2.5
+    slopes = 50.0 * np.sin(np.array([first, second]) / 50.0)  # of differences over 40 ms
+    pose = 1e-6 * rng.normal(size=(len(t), 6))
+    pose[:, 3] += np.cos(first * t) + 0.7 * np.cos(second * t + 0.4)
+    pose[:, 1] += 0.7 * ratio / slopes[1] * np.sin(second * t + 0.4)
+    record: Any = SimpleNamespace(name="r", pose_t=t + 3.0, pose=pose)
+    found = two_controllers.closed_loop(record, ROLL)
+    assert found.w == pytest.approx(np.tile(2 * np.pi * 0.25 * np.arange(1, 20), 10))
+    c, other = -first * slopes[0], -second * slopes[1]
+    assert found.starred == pytest.approx([0.0, c, (other - c) / ratio], rel=0.01, abs=0.1)
+    assert found.acceleration.reshape(10, 19)[:, 3] == pytest.approx(
+        c * found.angle.reshape(10, 19)[:, 3], rel=0.02
+    )
+    with pytest.raises(LabError, match=r"^r: 4\.0 s of flight; the paper's method takes windows of 4 s$"):
+        two_controllers.closed_loop(cut(record, 402), ROLL)
+    assert len(two_controllers.closed_loop(cut(record, 405), ROLL).w) == 19
+
+
+def cut(record: Any, rows: int) -> Any:
+    """The record's first rows."""
+    return SimpleNamespace(name="r", pose_t=record.pose_t[:rows], pose=record.pose[:rows])
+
+
+def test_a_page_shows_each_axis_by_a_flight_that_was_not_fitted_where_there_is_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Of two axes the second was excited twice, and only it in the new flight; constants by whether they are identified."""
+    asked: list[Any] = []
+    for name in ("_responses", "_period", "_one_step"):
+        monkeypatch.setattr(
+            pages,
+            name,
+            lambda *what, name=name: asked.append((name, *what[3 if name == "_responses" else 1 :])),
+        )
+    monkeypatch.setattr(pages, "_identity", lambda records: ("identity", records))
+    monkeypatch.setattr(pages, "rows_of", lambda constants: [one.name for one in constants])
+    monkeypatch.setattr(pages, "saved", lambda out, name, title, text, draw: (name, title, draw))
+    monkeypatch.setattr(pages, "write_page", lambda path, template, **content: (path, content))
+    monkeypatch.setattr(pages, "excited_axes", lambda records: [SimpleNamespace(axis=PITCH, record=0)])
+
+    def one(axis: Axis, record: int) -> Any:
+        return SimpleNamespace(axis=axis, record=record)
+
+    fitted = [one(ROLL, 1), one(PITCH, 0), one(PITCH, 2)]
+    records = tuple(SimpleNamespace(name=f"r{n}") for n in range(3))
+    estimate = SimpleNamespace(values="values", late=(0.1, 0.2, 0.3))
+    constants = [SimpleNamespace(name=name, verdict=verdict) for name, verdict in
+        (("a", "identified"), ("b", "weak"), ("c", "identified"), ("d", "unknown"))]  # fmt: skip
+    found: Any = SimpleNamespace(excited=fitted, records=records, free=(SimpleNamespace(name="f"),), constants=constants,
+        estimate=estimate)  # fmt: skip
+    held: Any = SimpleNamespace(name="new")
+    path, content = pages.write_pages(tmp_path, found, held)
+    assert (path, content["known"], content["others"], content["names"]) == (
+        tmp_path / "identify.html", ["a", "c"], ["b", "d"], "r0, r1, r2, f")  # fmt: skip
+    titles = [(name, title) for name, title, _ in content["figures"]]
+    why = "why the paper's equations contain no information about the robot"
+    assert titles == [
+        ("identify_roll", "roll, from u1"),
+        ("identify_pitch", "pitch, from u2"),
+        ("identify_paper", why),
+    ]
+    drawn = [draw() for _, _, draw in content["figures"]]
+    assert drawn[2] == ("identity", found.free)
+    assert [axes.get_title() for figure in drawn[:2] for axes in figure.axes[-1:]] == [
+        "the fitted flight; --validate RUN: another", "a flight that was not fitted"]  # fmt: skip
+    (_, *first), (_, *period), (_, *step), (_, *second), (_, *later), (_, *last) = asked
+    assert (first, second) == ([fitted[:1], estimate], [fitted[1:], estimate])
+    assert (period, step) == ([fitted[0], "values"], [records[1], fitted[0], "values", 0.2])
+    assert (later[0].axis, last[0], last[3]) == (PITCH, held, 0.1)
+    asked.clear()
+    _, content = pages.write_pages(tmp_path, found, None)
+    content["figures"][1][2]()
+    assert asked[2][1:] == (records[0], fitted[1], "values", 0.1)
