@@ -1,6 +1,7 @@
 """Edges of the pytest plugin's choices and folders, without a flight."""
 
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 from math import nan
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 
 from hil.board.imu import COS, SIN
 from hil.config import load_config
+from hil.errors import LabError
 from hil.laboratory.request import Options
 from hil.testing import baselines
 from hil.testing.baselines import POSE, Pinned
@@ -25,10 +27,12 @@ from hil.testing.flights import (
     Flights,
     Flown,
     Item,
+    draw,
     folder_of,
     properties_of,
     shown_of,
     text_of,
+    trim,
     without_deleted,
 )
 from hil.testing.strategies import _round_step
@@ -145,6 +149,12 @@ def test_a_failed_test_tells_each_shown_flight_whole_relative_to_the_root(
     assert dict(properties_of(item, True, tmp_path)) == {"floaty.hash": "44444444",
         "floaty.outcome": "completed", "floaty.folder": "runs/4", "floaty.again": "floaty fly hover --seed 8",
         "floaty.rms_x [m]": "0.25", "floaty.flown": "2"}  # fmt: skip
+    crashed = flown(5, tmp_path / "runs", is_image=True)
+    crashed.run.result.failures = ("assert",)
+    assert (
+        text_of(replace(item, flown=[crashed]), True, "", tmp_path).splitlines()[-1]
+        == "  debug    floaty debug runs/5"
+    )
     item.flown[2:] = []
     assert [name for name, _ in properties_of(item, False, tmp_path)] == [f"floaty.{n}.{name}" for n in (1,
         2) for name in ("hash", "outcome", "again", "rms_x [m]", "flown")]  # fmt: skip
@@ -219,3 +229,123 @@ def test_a_flight_over_mavlink_needs_its_package_alone(monkeypatch: pytest.Monke
     assert why_not(over, ()) == why_not(choice(), ()) == ""
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert (why_not(over, ()), why_not(choice(), ())) == ("link mavlink: pymavlink is not installed", "")
+
+
+@pytest.fixture
+def flights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The fixture of a test on python with seed 7 and two faults; each flight's folder is made, nothing flies."""
+
+    def request_of(experiment: str, **options: Any) -> Any:
+        bench = SimpleNamespace(
+            board=options["board"], link=options["link"], is_image=False, in_lockstep=True
+        )
+        return SimpleNamespace(experiment=experiment, options=options, bench=bench)
+
+    def fly(request: Any, place: Path, flight_of: str) -> Any:
+        assert flight_of == "maker"
+        place.mkdir(parents=True)
+        return SimpleNamespace(request=request, place=place)
+
+    def fly_swarm(experiment: str, robots: int, place: Path, **options: Any) -> Any:
+        request = request_of(experiment, **options)
+        each = [SimpleNamespace(request=request, folder=place / f"robot-{n}") for n in range(robots)]
+        return SimpleNamespace(robots=each)
+
+    patched = {"request_of": request_of, "fly": fly, "fly_swarm": fly_swarm, "maker_of": lambda request: "maker",
+        "reserved": lambda request, place: nullcontext(), "command_of": lambda request: "", "why_no_board": lambda one: "",
+        "Run": lambda result: SimpleNamespace(request=result.request, folder=result.place)}  # fmt: skip
+    for name, value in patched.items():
+        monkeypatch.setattr(f"hil.testing.flights.{name}", value)
+    made = Flights(tmp_path, tmp_path / "runs", "usual", coverage=tmp_path / "cov")
+    made.begin(
+        "t.py::test[a]",
+        tmp_path / "t.py",
+        {**choice(7, "python", "mine"), "faults": ("push.y@1=2", "push.x@2=1")},
+    )
+    return made
+
+
+def test_flights_of_a_test_have_numbers_folders_and_options_of_the_mark_before_their_own(
+    flights: Any, tmp_path: Path
+) -> None:
+    """Coverage only for an image; robots of a swarm have a number each, and a folder together."""
+    (tmp_path / "mine.toml").touch()
+    item = flights._item
+    first = flights.fly("hover", faults=["push.z@3=1"], seed=8)
+    flights.fly("x.py:y", board="cf2.elf", profile="mine.toml")
+    flights.fly_swarm("hover", 2)
+    last = flights.fly()
+    assert [one.number for one in item.flown] == [1, 2, 3, 4, 5]
+    place = item.folder
+    assert place == tmp_path / "runs" / folder_of("t.py::test[a]")
+    assert [one.run.folder for one in item.flown] == [place / "1", place / "2", place / "3" / "robot-0",
+        place / "3" / "robot-1", place / "5"]  # fmt: skip
+    both = ("push.y@1=2", "push.x@2=1")
+    assert first.request.options == {**choice(8, "python", "mine"), "faults": (*both, "push.z@3=1")}
+    image = item.flown[1].request
+    assert image.experiment == "x.py:y"
+    assert image.options == {
+        **choice(7, "cf2.elf", f"{tmp_path}/mine.toml"),
+        "faults": both,
+        "coverage": tmp_path / "cov",
+    }
+    assert item.flown[2].request.options == {**choice(7, "python", "mine"), "faults": both}
+    assert (last.request.experiment, flights.seed, flights.profile, flights.target, flights.link, flights.faults) == (
+        "hover", 7, "mine", "python", "radio", both)  # fmt: skip
+    trim(item, False)
+    assert [path.name for path in place.iterdir()] == ["5"]
+    assert item.flown == []
+    flights.begin("t.py::test[a]", tmp_path / "t.py", choice())
+    assert not place.exists(), "of an earlier session"
+    flights.fly()
+    assert flights._item.flown[0].number == 1
+    trim(flights._item, True)
+    assert (place / "1").exists()
+
+
+def test_a_baseline_is_of_as_many_flights_and_of_metrics_that_there_are(
+    flights: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unknown: list[str] = []
+    kept: list[Any] = []
+    monkeypatch.setattr(baselines.Pinned, "of", lambda run: run)
+    monkeypatch.setattr(
+        baselines, "write", lambda path, runs: kept.extend(runs) or path.parent.mkdir() or path.touch()
+    )
+    monkeypatch.setattr(baselines, "read", lambda path: kept)
+    monkeypatch.setattr(baselines, "difference", lambda old, run, rel, metrics: ["left"] * (old is not run))
+    with pytest.raises(LabError, match=r"^baseline 'a': this test has not flown yet$"):
+        flights.baseline("a")
+    flights.fly().unit_of = lambda name: ""
+    flights.fly().unit_of = unknown.append
+    again = "`pytest --floaty-update 't.py::test[a]'`"
+    shown = "baselines/a-push.y-1-2-push.x-2-1-mine-seed7.json"
+    with pytest.raises(LabError, match="there is none") as missing:
+        flights.baseline("a", metrics=["rms_x"])
+    assert str(missing.value) == f"baseline {shown}: there is none; {again} writes it, then commit it"
+    assert unknown == ["rms_x"], "of the last flight"
+    flights._update = True
+    flights.baseline("a")
+    assert (flights._item.written, [run.folder.name for run in kept]) == ([shown], ["1", "2"])
+    flights._update = False
+    flights.baseline("a")
+    kept.reverse()
+    with pytest.raises(
+        AssertionError, match=f"^baseline {shown}:\nleft\nleft\naccept the new flights: pytest"
+    ):
+        flights.baseline("a")
+    for change, count in ((kept.pop, 1), (lambda: kept.extend([1, 2]), 3)):
+        change()
+        with pytest.raises(LabError, match=rf"json: of {count} flights, now 2; `pytest .*` writes it again$"):
+            flights.baseline("a")
+
+
+def test_only_shown_flights_with_rows_are_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hil.pictures.drawing.png", lambda draw, log: f"{log.num_rows}".encode())
+    item = Item("a", tmp_path, tmp_path, choice())
+    for number, rows in ((1, 1), (2, 2), (3, 3)):
+        (tmp_path / str(number)).mkdir()
+        item.flown.append(flown(number, tmp_path))
+        item.flown[-1].run.log = SimpleNamespace(num_rows=rows)  # type: ignore[misc]
+    draw(item)
+    assert {path.parent.name: path.read_text() for path in tmp_path.rglob(PICTURE)} == {"2": "2", "3": "3"}
