@@ -4,6 +4,7 @@ import ctypes
 import json
 import os
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -181,6 +182,86 @@ class Switches(ImageBench):
 
     def memory(self, target: str, scalar: Scalar) -> float:
         return self.at[target.partition(".")[2]]
+
+
+def bench_of(chip: Any, **more: Any) -> Any:
+    """A bench whose memory is read by `chip`, with symbols at places of their own."""
+    bench: Any = object.__new__(ImageBench)
+    places = {"floaty_parameters": 0x100, "floaty_stop": 0x200}
+    debug = SimpleNamespace(variable=lambda name, at: {"trim": SimpleNamespace(offset=8 * (at == 7))})
+    image = SimpleNamespace(
+        symbol=lambda name: SimpleNamespace(address=places[name]), debug=debug, path="cf2.elf"
+    )
+    bench.firmware = SimpleNamespace(chip=chip, image=image)
+    bench._of_parameters = 7
+    for name, value in more.items():
+        setattr(bench, name, value)
+    return bench
+
+
+def test_a_number_in_memory_is_found_by_its_expression_in_c() -> None:
+    memory = SimpleNamespace(read=lambda place, size: bytes((place % 256, place >> 8))[:size])
+    bench = bench_of(memory)
+    for target, scalar, place in (
+        ("floaty_stop", Scalar.U8, 0x200), ("floaty_parameters.trim", Scalar.U16, 0x108),
+        ("floaty_parameters.trim[3]", Scalar.U16, 0x10E), ("floaty_stop[1]", Scalar.U16, 0x202),
+    ):  # fmt: skip
+        assert bench.memory(target, scalar) == (place % 256 if scalar is Scalar.U8 else place)
+
+
+@pytest.mark.parametrize(("answers_after", "answered"), [(1, True), (200, True), (201, False)])
+def test_a_written_parameter_is_answered_within_a_fifth_of_a_second(
+    answers_after: int, answered: bool
+) -> None:
+    posted: list[Any] = []
+    bench = bench_of(None, received=["an old answer"], _table={"a.b": SimpleNamespace(number=513, scalar=Scalar.U16,
+        read=lambda: 4.0)}, ran=0, post=lambda *what: posted.append(what))  # fmt: skip
+
+    def packet(port: int, channel: int, data: bytes) -> Any:
+        return SimpleNamespace(port=port, channel=channel, data=data)
+
+    def run(duration_us: int) -> None:
+        bench.ran += duration_us // 1000
+        own = bench.ran >= answers_after
+        bench.received += [packet(2, 1, b"\1\2\0\7\0"), packet(2, 2, b"\2\2\7\0"), packet(5, 2, b"\1\2\7\0"),
+            *[packet(2, 2, b"\1\2\7\0")] * own]  # fmt: skip
+
+    bench.run = run
+    late = r"^cf2\.elf: does not answer to a\.b = 7 within 200 ms$"
+    with nullcontext() if answered else pytest.raises(LabError, match=late):
+        bench.write("a.b", 7.0)
+    assert posted == [(2, 2, b"\1\2\7\0")]
+    assert "an old answer" not in bench.received
+    assert bench.ran == min(answers_after, 200)
+    assert (bench.scalar("a.b"), bench.scalar("c.d"), bench.value("a.b")) == (Scalar.U16, None, 4.0)
+    bench.field = bench_of(SimpleNamespace(read=lambda place, size: bytes((place % 256, 0)))).field
+    assert (
+        bench.field(
+            replace(TABLE[0], target="floaty_parameters.trim[1]", place=SimpleNamespace(scalar=Scalar.U16))
+        )
+        == 10
+    )
+    requested: list[Any] = []
+    bench.write, bench.run = lambda *what: requested.append(what), requested.append
+    for known in (None, Scalar.U8):
+        bench.scalar = lambda name, known=known: known
+        bench._request("stop", 1)
+    assert requested == [("floaty.stop", 1), image_check.ACT_US]
+
+
+@pytest.mark.parametrize("name", ["extCtrl.z_P", "motorShifts.m2", "delayComp.horizon"])
+def test_values_that_are_tried_are_inside_but_not_the_default_and_just_outside(name: str) -> None:
+    (one,) = [one for one in TABLE if one.name == name]
+    inside, *outside = image_check._values(one, one.scalar)
+    assert one.low <= inside <= one.high
+    assert inside != one.scalar.cast(one.initial)
+    low, high = (np.float32(limit) for limit in (one.low, one.high))
+    beside = [np.nextafter(low, -np.float32(np.inf)), np.nextafter(high, np.float32(np.inf))]
+    edges = [float(edge) for edge in beside] if one.scalar.is_float else [low - 1.0, high + 1.0]
+    assert outside == [edge for edge in edges if one.scalar.cast(edge) == edge]
+    assert image_check._behind(replace(one, scale=0.1), 3.0) == one.place.scalar.cast(
+        float(np.float32(0.1) * np.float32(3.0))
+    )
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -12,7 +13,7 @@ from PIL import Image
 from hil.config import load_config
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.files.recorder import load_log
-from hil.laboratory.metrics import free_flight
+from hil.laboratory.metrics import body, column, free_flight, known
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.pictures import curves, video
@@ -121,3 +122,75 @@ def test_a_flight_that_never_began_or_is_too_long_for_a_gif_is_one_line(
     assert "never began" in cli.refusal("export", tmp_path / "held", "--video")
     monkeypatch.setattr(video, "GIF_MOST", 20)
     assert "1 s: a GIF holds at most 0 s; use --video" in cli.refusal("export", folder, "--gif")
+
+
+def test_a_frame_has_the_path_of_the_last_seconds_and_the_goal_s_whole_course(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def at(scene: video.VideoScene, row: pa.Table, trail: np.ndarray, course: np.ndarray) -> Image.Image:
+        shown.append((row["t"].to_numpy(), trail, course))
+        return Image.new("RGB", (1, 1))
+
+    monkeypatch.setattr(video, "TRAIL_S", 0.1)
+    monkeypatch.setattr(video.VideoScene, "at", at)
+    monkeypatch.setattr(video, "_Graph", lambda *_: SimpleNamespace(at=lambda at_s: Image.new("RGB", (1, 1))))
+    log = load_log(folder)
+    flight = known(free_flight(log))
+    places, goals = body(flight, "x", "y", "z"), column(flight, *video.GOAL_COLUMNS)
+    assert len(list(video.frames(log, np.array([0.02, 0.5])))) == 2
+    for (t, trail, course), row in zip(shown, (2, 50), strict=True):
+        assert t.tolist() == [flight["t"][row].as_py()]
+        assert trail.tolist() == places[max(0, row - 10) : row + 1 : 3].tolist()
+        assert course.tolist() == goals[::5].tolist()
+
+
+def test_a_scene_draws_the_goal_turned_and_the_robot_s_nearest_parts_last(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The robot is drawn at its place and attitude, over its path; the goal with an arrow along its yaw."""
+    drawn: list[tuple[str, object]] = []
+    pen = SimpleNamespace(polygon=lambda points, fill: drawn.append(("polygon", fill)))
+    monkeypatch.setattr(video.ImageDraw, "Draw", lambda picture: pen)
+    monkeypatch.setattr(
+        video.VideoScene, "_line",
+        lambda scene, draw, points, colour, width: drawn.append((("path", "goal")[colour == video.GOAL], points)),
+    )  # fmt: skip
+    asked: list[list[float]] = []
+
+    def faces(
+        parts: object, turns: object, p_WB: np.ndarray, q_WB: np.ndarray
+    ) -> list[tuple[np.ndarray, str]]:
+        asked.extend([p_WB.tolist(), q_WB.tolist()])
+        return [
+            (p_WB + away * video.EYE + np.zeros((3, 3)), f"#{n}")
+            for n, away in ((1, -0.1), (2, 0.2), (3, 0.1))
+        ]
+
+    monkeypatch.setattr(video, "faces", faces)
+    names = [
+        "goal.x",
+        "goal.y",
+        "goal.z",
+        "goal.yaw",
+        *(f"truth.{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz")),
+    ]
+    values = [0.1, 0.2, 0.3, 0.5, 0.4, 0.5, 0.6, 0.5, 0.5, -0.5, 0.5]
+    row = pa.table({name: [value] for name, value in zip(names, values, strict=True)})
+    goals = np.array([(0.1, 0.2, 0.3), (0.0, 0.0, 0.0)])
+    trail = np.array([(0.4, 0.5, 0.5), (0.4, 0.5, 0.6)])
+    picture = video.VideoScene(VisualModel(outline=(np.ones((2, 3)),)), goals, trail).at(row, trail, goals)
+    assert picture.size == (video.SIDE, video.HEIGHT)
+    assert [what for what, _ in drawn] == ["goal"] * 9 + ["path"] + ["polygon"] * 3
+    course, *_, outline, arrow = (points for what, points in drawn if what == "goal")
+    c, s = np.cos(0.5), np.sin(0.5)
+    assert np.array_equal(course, goals)
+    assert arrow[1] - arrow[0] == pytest.approx([0.16 * c, 0.16 * s, 0.0])
+    assert (arrow[0], outline[0]) == (
+        pytest.approx(values[:3]),
+        pytest.approx([0.1 + c - s, 0.2 + s + c, 1.3]),
+    )
+    assert np.array_equal(drawn[9][1], trail)
+    assert asked == [values[4:7], values[7:]]
+    assert [colour for what, colour in drawn if what == "polygon"] == ["#1", "#3", "#2"], "the nearest last"

@@ -104,16 +104,29 @@ def test_a_fault_that_the_flights_end_cuts_off_lasts_no_longer_than_to_there() -
     assert max(span for span in tried if span != 9.0) <= DURATION_S - 8.0
 
 
-def test_a_flight_that_fails_differently_is_not_the_shrunk_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    results = [
-        SimpleNamespace(passed=False, outcome=name, verdicts=(), failed=(), cause="")
-        for name in ("lost", "completed")
-    ]
-    monkeypatch.setattr("hil.research.campaigns.shrink.fly_within", lambda request, limits: results.pop(0))
-    spec = spec_of()
-    reflight = Reflight(spec, draw(spec, 0), lambda line: None)
-    assert reflight.fails(reflight.whole)
-    assert not reflight.fails(reflight.whole)
+def test_a_flight_that_fails_differently_is_not_the_shrunk_one_and_each_is_reported(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def flown(outcome: str, *failed: str, cause: str = "") -> SimpleNamespace:
+        broken = [SimpleNamespace(metric=name) for name in failed]
+        return SimpleNamespace(passed=not failed, outcome=outcome, failed=broken, cause=cause)
+
+    results = [flown("completed", "max_x", "in_box"), flown("lost", "lost", cause="fell"), flown("completed"),
+        flown("completed", "max_x")]  # fmt: skip
+    limits: list[object] = []
+    monkeypatch.setattr(
+        "hil.research.campaigns.shrink.fly_within",
+        lambda request, limit: limits.append(limit) or results.pop(0),
+    )
+    spec, told = spec_of(limits={"wall_s": 7.0}), []
+    reflight = Reflight(spec, draw(spec, 0), told.append)
+    whole = Trial(("a=1",), (parse("push.y@1=2"), parse("push.x@2=3")))
+    monkeypatch.setattr(Reflight, "request", lambda reflight, trial: trial)
+    assert [reflight.fails(one) for one in (whole, whole, Trial((), ()), whole)] == [True, False, False, True]
+    parts = "push.y@1=2 push.x@2=3 a=1"
+    assert told == [f"fails: {parts} (max_x, in_box)", f"fails otherwise: {parts} (fell)", "holds: nothing but its seed",
+        f"fails: {parts} (max_x)"]  # fmt: skip
+    assert limits == [spec.limits] * 4
 
 
 def test_a_passing_flight_cannot_be_shrunk() -> None:

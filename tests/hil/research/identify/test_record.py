@@ -112,16 +112,25 @@ def test_inputs_within_the_flaps_limits_are_what_was_commanded(tmp_path: Path) -
     assert record.saturated == 0.0
 
 
+def folder_profile(folder: Path, text: str) -> str:
+    """A profile of Floaty with a section changed."""
+    (folder / "profile.toml").write_text(f'base = "floaty"\n{text}')
+    return str(folder / "profile.toml")
+
+
 @pytest.mark.parametrize("limit", ["opening_min", "opening_max"])
 @pytest.mark.parametrize("beyond", [0.0, 0.05])
 def test_flaps_at_their_limit_count_like_those_that_would_exceed_it(
     tmp_path: Path, limit: str, beyond: float
 ) -> None:
-    room = CONFIG.allocation.hover_angle - getattr(CONFIG.allocation, limit)
+    profile = folder_profile(tmp_path, "[allocation]\nopening_min = 0.1\n")
+    allocation = load_config(profile).allocation
+    room = allocation.hover_angle - getattr(allocation, limit)
     u4 = np.where(
         np.arange(150) % 3 == 0, room + np.copysign(beyond, room), 0.0
     )  # on board u4 gives way at a limit
-    record = loaded(tmp_path, columns(150, **{INPUTS[3]: np.float16(u4).astype(float)}))
+    loaded(tmp_path, columns(150, **{INPUTS[3]: np.float16(u4).astype(float)}))
+    record = load_record(tmp_path / "telemetry.csv", profile)
     assert record.saturated == pytest.approx(1 / 3)
     assert np.abs(record.u[::3, 3]) == pytest.approx(abs(room), abs=1e-3)
 
