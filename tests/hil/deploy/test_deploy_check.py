@@ -15,6 +15,7 @@ from firmware_py.core import structs
 from firmware_py.core_runner import CoreBlocks, CoreRunner, NativeRunner, RunnerFactory, default_runner
 from firmware_py.export.c99 import translate
 from firmware_py.logic.plugs import CALLS
+from firmware_py.wire.supervisor import Cause, State
 from hil.board.board_firmware import PythonBoard
 from hil.commands.deploy import _print_flight, _print_sum
 from hil.deploy.check import Checked, check_flight, plan, reached
@@ -110,11 +111,24 @@ def test_a_target_that_has_differed_does_not_hide_the_others(capsys: pytest.Capt
     assert [target.ticks for target in checked.targets] == [20, 150]
     assert not checked.equal
     assert checked.targets[1].divergence is None
+    assert Cause.NO_CONTROL in {cause for _, cause in checked.reached}, "after the last step"
     _print_sum([checked, checked], True)
     assert capsys.readouterr().out.startswith("40 ticks, c beside spoilt, python: spoilt DIFFERS\n")
     _print_flight(checked)
     calls = checked.targets[1].calls
     assert capsys.readouterr().out.endswith(f"\n  python        150 ticks {calls:>7} calls  equal\n")
+
+
+def test_states_and_causes_that_flights_reached_are_told_from_those_that_none_did() -> None:
+    one = frozenset({(State.CALIBRATING, Cause.NONE), (State.FAILSAFE, Cause.OUT_OF_BOUNDS)})
+    other = frozenset({(State.FLYING, Cause.NONE), (State.FAILSAFE, Cause.SILENCE)})
+    seen, missed = reached(
+        [Checked(plan("hover", False)[0], "completed", (), pairs) for pairs in (one, other)]
+    )
+    words = {cause.name.lower().replace("_", " ") for cause in Cause} - {"none"}
+    assert seen.split(", ")[:3] == ["calibrating", "flying", "failsafe"]
+    assert set(seen.split(", ")[3:]) == {"silence", "out of bounds"}
+    assert set(missed.split(", ")) == {"waiting", *words} - {"silence", "out of bounds"}
 
 
 def test_default_flights_are_ten_thousand_ticks_with_every_fault_in_time() -> None:

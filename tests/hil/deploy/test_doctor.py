@@ -3,13 +3,14 @@
 import ctypes
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from firmware_py.core.structs import Control
 from firmware_py.export.profile_c import profile_hash
-from firmware_py.wire.core_port import HEAD, READ_MAX, Hil, Message, read
+from firmware_py.wire.core_port import HEAD, READ_MAX, Health, Hil, Message, read
 from ground_station.links import packets
 from ground_station.links.core_client import CoreClient
 from hil.config import load_config
@@ -209,3 +210,63 @@ def test_a_link_that_repeats_half_of_all_packets_is_judged_by_its_rate(
     assert found.good == good
     assert found.text.startswith("round trip 1000.0 ms, the longest 1000.0; 600 packets/s each way, ")
     assert text in found.text
+
+
+@pytest.mark.parametrize(("repeated", "advice"), [(60, ""), (61, ": poses are lost or late in a flight; move the antenna, "
+    "or change the channel")])  # fmt: skip
+def test_a_link_that_repeats_more_than_a_tenth_of_the_packets_gets_advice(
+    monkeypatch: pytest.MonkeyPatch, repeated: int, advice: str
+) -> None:
+    client: Any = SimpleNamespace(repeated=5)
+    times = iter([*(us for n in range(100) for us in (0, 1000 * (1 + n))), 0, 2_000_000])
+    monkeypatch.setattr(doctor, "clock_us", lambda: next(times))
+
+    def execute(asked: list[Any]) -> None:
+        client.repeated += repeated * (len(asked) > 1)
+
+    client.execute = execute
+    expected = (
+        f"round trip 50.5 ms, the longest 100.0; 300 packets/s each way, {repeated} of 600 repeated{advice}"
+    )
+    assert doctor._link(client, 50.0) == doctor.Finding("link", expected)
+
+
+def test_a_gyro_s_zero_is_that_of_the_last_look_and_a_loop_reports_what_it_held_lost_and_doubled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looks = [
+        Health(n, 2, -3, n == 60, 3900, 7000, *(21_000 + 21 * m for m in range(4))) for n in range(1, 61)
+    ]
+    pending = iter(looks)
+    client: Any = SimpleNamespace(execute=lambda asked: [SimpleNamespace(health=lambda: next(pending))])
+    found = {one.subject: one for one in doctor._health(client)}
+    assert found["gyro"].text == "alive: zero at 30 2 -3 counts, noise 17.3"
+    assert found["servos"].text == "pulses of 1000 1001 1002 1003 us"
+    looks[-1] = looks[-1]._replace(calibrated=False)
+    pending = iter(looks)
+    assert {one.subject: one for one in doctor._health(client)}["gyro"].text.endswith(
+        "noise 17.3, zero not found yet"
+    )
+
+    class Window:
+        """A window of which the board takes 250 samples at each look."""
+
+        used, full = 0, True
+
+    asked: list[Any] = []
+    client = SimpleNamespace(execute=asked.append, packets=SimpleNamespace(ready=False))
+    monkeypatch.setattr(doctor, "SampleWindow", Window)
+    monkeypatch.setattr(doctor, "clock_us", count(0, 100_000).__next__)
+    report = SimpleNamespace(held=3, lost=5, doubled=7)
+    for taken, held in ((250, report), (10, report), (0, None)):
+
+        def last_report(client: Any, window: Any, taken: int = taken, held: Any = held) -> Any:
+            window.used += taken
+            return held
+
+        monkeypatch.setattr(doctor, "_last_report", last_report)
+        loop = doctor._loop(client)
+        texts = {250: "carries 1667 samples/s of 1000", 10: "carries 96 samples/s of 1000"}
+        assert (loop.text, loop.good) == (f"{texts[taken]}: 3 ms held, 5 lost, 7 doubled" if held else "does not answer",
+            taken == 250)  # fmt: skip
+    assert asked == [[doctor.loop(Hil.STILL)], [doctor.loop(Hil.OFF)]] * 3

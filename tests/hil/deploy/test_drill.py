@@ -9,9 +9,12 @@ import pytest
 from cflib.crazyflie.high_level_commander import HighLevelCommander
 from cflib.crazyflie.localization import Localization
 
+from firmware_py.table import OF_PROFILE, value_in
 from firmware_py.wire.crtp import decode
+from firmware_py.wire.scalars import PARAMETER_SCALARS
+from hil.config import load_config
 from hil.deploy import beside
-from hil.deploy.drill import DRILL, FEED, GO_TO, STOP, THRUST
+from hil.deploy.drill import DRILL, FEED, GO_TO, STOP, THRUST, drill, fail
 from hil.laboratory.files.recorder import load_events
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
@@ -98,3 +101,43 @@ def test_both_flights_of_an_image_and_their_ends_are_compared(
     assert shown == [
         (f"{name}, {board}", 7, "flight") for name, *_ in (hover, drilled) for board in ("python", "image")
     ]
+
+
+def test_what_a_drill_changes_is_as_before_at_its_end_and_each_failure_is_recovered_from() -> None:
+    """Each parameter is written twice and has the profile's value last; a flight recovers within the 0.6 s after a stop."""
+    config, own = load_config(), {one.name: key for key, one in OF_PROFILE.items()}
+    before = {"floaty.armed": 1.0, "floaty.stop": 0.0, "logic.law_fails": 0.0, "logic.filter_fails": 0.0,
+        "extCtrl.manual": 0.0, "extPose.absolute": 0.0}  # fmt: skip
+    for script in (drill, fail):
+        writes: list[tuple[int, str, float]] = []
+        cameras: list[float] = []
+        robot = Made(mocap=Made(_dropout=0.0))
+        planned: list[tuple[int, Any]] = []
+
+        def command(now_us: int, packet: bytes, writes: Any = writes) -> None:
+            got = decode(packet)
+            if (got.port, got.channel) == (2, 3):
+                _, group, name, rest = got.data.split(b"\0", 3) if got.data[0] == 0 else (b"", b"", b"", b"")
+                kind, value = PARAMETER_SCALARS[rest[0]], rest[1:]
+                writes.append((now_us, f"{group.decode()}.{name.decode()}", kind.unpack(value)))
+
+        flight: Any = Made(config=config, robot=robot, release_us=11_000_000, line=Made(command=command),
+            events=Made(at=lambda at_us, act, planned=planned: planned.append((at_us, act))))  # fmt: skip
+        knob = Made(turn=lambda robot, value, cameras=cameras: cameras.append(value))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("hil.deploy.drill.KINDS", {"mocap.dropout": Made(knobs=[knob])})
+            script(flight)
+            for at_us, act in sorted(planned, key=lambda one: one[0]):
+                act(at_us)
+        assert cameras == ([1.0, 0.0] if script is drill else [])
+        last = {name: value for _, name, value in writes}
+        for name, value in last.items():
+            profile = value_in(config, own[name]) if name in own else before[name]
+            assert value == pytest.approx(profile), name
+            assert len([one for one in writes if one[1] == name]) % 2 == (name == "extCtrl.manual")
+        stops = [at_us for at_us, name, value in writes if name == "floaty.stop" and value]
+        goes = [at_us for at_us, name, value in writes if name == "floaty.stop" and not value]
+        assert [after - at for at, after in zip(stops, goes, strict=True)] == [200_000] * len(stops)
+        if script is fail:
+            failures = [at_us for at_us, name, value in writes if name.startswith("logic.") and value]
+            assert [stop - at for at, stop in zip(failures, stops, strict=True)] == [400_000] * 2
