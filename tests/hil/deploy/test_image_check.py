@@ -163,6 +163,7 @@ class Switches(ImageBench):
             {"tick": 900, "stopped": 0, "armed": 1, "stale_hovers": 7 * ("hovers" in dead), "cause": 0},
         )
         self.wrote: list[tuple[str, float]] = []
+        self.ran: list[int] = []
 
     def scalar(self, name: str) -> Scalar | None:
         return Scalar.U8
@@ -179,6 +180,7 @@ class Switches(ImageBench):
 
     def run(self, duration_us: int) -> None:
         """Let nothing happen."""
+        self.ran.append(duration_us)
 
     def memory(self, target: str, scalar: Scalar) -> float:
         return self.at[target.partition(".")[2]]
@@ -286,6 +288,9 @@ def test_switches_and_watch_of_the_controller_are_tried(
     assert list(board.check_switches()) == switches
     assert list(board.check_watch()) == watch
     assert board.wrote[-2:] == [("stabilizer.controller", 1), ("stabilizer.controller", 5.0)], "as before"
+    assert board.ran == [20_000] * 5 + [150_000] * 2, (
+        "until a request is served, and the app sees a controller that stands"
+    )
 
 
 @pytest.mark.parametrize(

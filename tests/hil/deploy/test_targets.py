@@ -1,14 +1,16 @@
 """What the machine code of a check costs: per tick, per entry point and in memory, over all its flights."""
 
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
 from firmware_py.config import LogicConfig, parameters_of
-from firmware_py.core_runner import CoreBlocks
+from firmware_py.core_runner import CoreBlocks, PlainRunner
 from firmware_py.logic.loading import load_logic
 from hil.board.cores.cortex_m4 import CortexM4Runner
 from hil.config import load_config
+from hil.deploy import targets
 from hil.deploy.targets import CORTEX_M4, TARGETS, TICK_HZ, Toolbox, target_names
 
 TICK = ("file_pose", "file_pose", "estimate", "supervise", "control")
@@ -57,3 +59,17 @@ def test_every_cycle_after_the_first_tick_belongs_to_one_tick_and_flights_add_up
 def test_targets_are_named_once_each_with_or_without_spaces() -> None:
     assert target_names("plain, c-O2 ,plain,udp://127.0.0.1:9") == ("plain", "c-O2", "udp://127.0.0.1:9")
     assert target_names(None) == TARGETS
+
+
+def test_c_is_built_with_the_optimisation_that_its_target_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    built: list[str] = []
+    monkeypatch.setattr(
+        targets, "build", lambda c, optimisation: built.append(optimisation) or Path(optimisation)
+    )
+    box = Toolbox(["c-O0", "c-O2", "plain"], LogicConfig())
+    assert built == ["-O0", "-O2"]
+    with ExitStack() as flown:
+        factories = box.factories(flown)
+    assert {name: one.keywords["library"].name for name, one in factories.items() if name != "plain"} == {  # type: ignore[attr-defined]
+        "c-O0": "-O0", "c-O2": "-O2"}  # fmt: skip
+    assert (factories["plain"], box.machine_code) == (PlainRunner, None)

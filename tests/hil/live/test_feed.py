@@ -129,7 +129,8 @@ except StopIteration:
     pass
 """
     view = LiveView(picture(program), [].append)
-    view.know([("a.b", 1.0), ("a.b", 2.0)])
+    view.know([("a.b", 1.0), ("c.d", 3.0)])
+    view.know([("a.b", 2.0)])
     view.note(7, "lab", "released")
     view.rows(rows(0, 20))
     view.note(30, "lab", "over")
@@ -139,8 +140,8 @@ except StopIteration:
         '{"t_us": 30, "source": "lab", "text": "over"}',
     )
     assert " ".join(view.lines()) in (
-        f'20 [{first}] {{"a.b": 2.0}} 0 [{last}] {{}}',
-        f'20 [{first}, {last}] {{"a.b": 2.0}}',  # both waited
+        f'20 [{first}] {{"a.b": 2.0, "c.d": 3.0}} 0 [{last}] {{}}',
+        f'20 [{first}, {last}] {{"a.b": 2.0, "c.d": 3.0}}',  # both waited
     )
 
 
@@ -210,3 +211,36 @@ view.close()
 """
     shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert shown.stdout.splitlines() == ["view   here", "[]"]
+
+
+ANSWERS = """
+import json, pyarrow as pa, sys
+print('ready', flush=True)
+reader, taken = pa.ipc.open_stream(sys.stdin.buffer), 0
+for number in range(2):
+    batch, metadata = reader.read_next_batch_with_custom_metadata()
+    taken += batch.num_rows
+    print('taken', taken, flush=True)
+    print('typed', batch.num_rows, *[one['text'] for one in json.loads(metadata[b'events'])], flush=True)
+print('failed out of words', flush=True)
+"""
+
+
+def test_a_picture_that_opened_late_catches_up_and_what_ends_it_later_is_said_at_once() -> None:
+    """An answer goes with no rows; nobody waits for a picture that has ended."""
+    said: list[str] = []
+    view = LiveView(picture(ANSWERS), said.append, start_timeout_s=0.0)
+    view.rows(rows(0, 20))
+    assert view.wait() == ["20"]
+    view.answer(7, "set a.b: refused")
+    assert view.wait() == ["0 set a.b: refused"]
+    view.stay()
+    assert view.wait() == []
+    assert view.close() == 0
+    assert said == ["the viewer has not opened within 0 s; the flight goes on without waiting",
+        "the viewer has ended: out of words"]  # fmt: skip
+    late = LiveView(picture(ANSWERS), said.append, start_timeout_s=0.0)
+    late.rows(rows(0, 20))
+    assert late.wait() == ["20"]
+    late.rows(rows(20, 20))
+    assert late.close() == 0, "it has time for the rest"

@@ -105,8 +105,8 @@ def test_goal_fault_and_note_act_and_are_events(tmp_path: Path) -> None:
     assert view.answers[4] == "step 5: expected 10..60000 ms"
 
 
-def test_each_line_acts_up_to_its_bounds_and_no_further() -> None:
-    """One after the other, for the board has to answer before the next parameter is set."""
+def test_each_line_acts_up_to_its_bounds_and_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One after the other, for the board has to answer before the next parameter is set; all answers come to one ear."""
     good = {
         1: ["goal 1 -1 2.15 10", "goal -0.5 0 1", "push.x:inf=0.1", "imu.noise:inf=2"],
         8: ["set controller.gain_y -20"], 16: ["set controller.gain_y 20"], 24: ["set predictor.horizon 1"],
@@ -121,6 +121,11 @@ def test_each_line_acts_up_to_its_bounds_and_no_further() -> None:
     flight = lockstep_flight(
         Request.of(EXPERIMENTS["hover"], duration_s=0.6, overrides=["flight.release_us=10000"])
     )
+    listened: list[object] = []
+    listen = type(flight.line).listen
+    monkeypatch.setattr(
+        type(flight.line), "listen", lambda line, ear: listened.append(ear) or listen(line, ear)
+    )
     PanelCommands(view, flight)
     flight.lab.run_to(100_000)
     goal = flight.line.trajectory.at(100_000)
@@ -131,6 +136,7 @@ def test_each_line_acts_up_to_its_bounds_and_no_further() -> None:
     view._at[view._looks + 1] = ["clear"]
     flight.lab.run_to(600_000)
     assert flight.switchboard.active == []
+    assert len(listened) == 1
     words = [" ".join(line.split()[:2]) for line in bad]
     assert [answer.startswith(word) for answer, word in zip(view.answers, words, strict=True)] == [
         True
