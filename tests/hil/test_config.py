@@ -7,7 +7,7 @@ import pytest
 
 from firmware_py.config import parameters_of
 from firmware_py.core.structs import Parameters
-from hil.config import LabConfig, load_config, profile_names
+from hil.config import LabConfig, load_config, profile_names, settings_of
 from hil.errors import LabError
 
 
@@ -59,6 +59,32 @@ def test_a_profile_builds_on_another(tmp_path: Path) -> None:
     (tmp_path / "mine2.toml").write_text('base = "mine.toml"\n[controller]\ngain_z = 2.5\n')
     config = load_config(str(tmp_path / "mine2.toml"))
     assert (config.tunnel.speed, config.controller.gain_z, config.controller.gain_roll) == (9.75, 2.5, 0.2)
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "far.toml").write_text('base = "near.toml"\n')
+    (tmp_path / "below" / "near.toml").write_text('base = "../mine2.toml"\n')
+    assert load_config(str(tmp_path / "below" / "far.toml")) == config, (
+        "each base is looked for beside its own file"
+    )
+    (tmp_path / "mine.toml").write_text('base = "below/near.toml"\n')
+    with pytest.raises(LabError, match=r"leads back to itself$"):
+        load_config(str(tmp_path / "below" / "far.toml"))
+
+
+def test_the_first_three_of_many_mistakes_are_named_and_values_that_no_profile_has_are_refused() -> None:
+    wrong = [f"controller.{name}=nan" for name in ("gain_y", "gain_z", "gain_roll", "gain_p")]
+    with pytest.raises(LabError) as refused:
+        load_config(overrides=wrong)
+    assert len({text.partition(" = ")[0] for text in str(refused.value).split("; ")} & {
+        one.partition("=")[0] for one in wrong}) == 3  # fmt: skip
+    for value, shown in ((None, "None"), ({1}, "{1}"), ([1, None], "None"), ({}, "{}")):
+        with pytest.raises(LabError) as refused:
+            settings_of({"a.b": value})  # type: ignore[dict-item]
+        allowed = "expected a number, text, True, False, or a list of them"
+        assert str(refused.value) == f"overrides: a.b = {shown}: {allowed}"
+    with pytest.raises(
+        LabError, match=r"^--set servo\.trim\[4\]=1: trim has no element \[4\] in this profile$"
+    ):
+        load_config(overrides=["servo.trim[4]=1"])
 
 
 @pytest.mark.parametrize(

@@ -13,11 +13,24 @@ from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.ioloop import IOLoop
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
+from firmware_py.table import OF_PROFILE
+from ground_station import operator
 from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.files.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
-from hil.live.panel import COMMANDS, LINE_MOST, ROWS_MOST, TEXTS_MOST, PanelScreen, _Socket, _state
+from hil.live.panel import (
+    BATCHES_KEPT,
+    COMMANDS,
+    LINE_MOST,
+    ROWS_MOST,
+    TEXTS_MOST,
+    PanelScreen,
+    _Socket,
+    _state,
+)
+from hil.servers import live_faults
 from support.foxglove_client import current_loop
 
 
@@ -63,6 +76,14 @@ def test_a_program_s_panel_has_its_commands(program: str) -> None:
     assert bool(content["faults"]) == (program != "station")
     assert bool(content["parameters"]) == (program != "serve")
     assert "uPlot=function" in page
+    known = {"fly": {"goal", "set", "clear", "mark", "pause", "step", "go", "stop"}, "serve": {*live_faults.COMMANDS},
+        "station": {*operator.COMMANDS}}[program]  # fmt: skip
+    assert set(content["commands"]) - {"fault"} <= known
+    assert {one["name"]: (one["low"], one["high"], one["scale"], one["board"]) for one in content["parameters"]} == {
+        key: (*one.bounds, one.scale, one.name) for key, one in OF_PROFILE.items() if program != "serve"}  # fmt: skip
+    assert {one["name"]: (one["low"], one["high"], one["size"], one["unit"], one["sized"]) for one in content["faults"]} == {
+        name: (one.low, one.high, one.size, one.unit, one.sized) for name, one in KINDS.items() if program != "station"
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("wrong", ["token", "host"])
@@ -137,6 +158,11 @@ def test_a_page_shows_only_the_newest_row(panel: PanelScreen, loop: IOLoop, tmp_
     at = log.column_names.index("truth.y")
     unseen = log.slice(0, 1).set_column(at, "truth.y", [[float("nan")]])
     assert _state(unseen)["body"] == [0.0, None, 1.15], "JSON has no NaN"
+    turned = log.slice(0, 1).set_column(log.column_names.index("goal.yaw"), "goal.yaw", [[0.5]])
+    assert _state(turned)["goal"] == [0.0, 0.0, 1.15, 28.65], "degrees"
+    for first in range(140, 140 + BATCHES_KEPT):
+        panel.show_rows(log.slice(first % 150, 1), [])
+    assert [len(panel._past), panel._past[-1]["t"][0]] == [BATCHES_KEPT, log["t"][(139 + BATCHES_KEPT) % 150]]
     socket.close()
 
 

@@ -227,3 +227,12 @@ def test_a_flight_in_rerun_s_viewer_has_its_layout_once_and_the_server_of_a_page
         screen.close()
         assert asked == [taker, ("columns", True), ("flight", "columns"), ("rows", 1), ["text 1"], ("rows", 2),
             ["text 2"], ("flush", rerun_screen.CATCH_UP_S), *server]  # fmt: skip
+
+
+def test_a_viewer_prints_errors_only_unless_the_user_wants_more_and_sends_no_usage_statistics(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for own, level in (({}, "error"), ({"RUST_LOG": "info", "CI": "", "A": "b"}, "info")):
+        monkeypatch.setattr(window.os, "environ", own)
+        settings = {"RUST_LOG": level, "CI": "1", "NO_COLOR": "1", "RERUN_APP_ONLY": "true"}
+        assert window._environment() == own | settings
