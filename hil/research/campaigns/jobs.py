@@ -163,7 +163,8 @@ def fly_job(job: Job) -> Row:
             raise LabError(f"flight {job.index}: {tempfile.gettempdir()}: {error.strerror}") from None
         return failed(job, blame(error))
     except Exception as error:
-        return failed(job, f"{type(error).__name__}: {blame(error)}")
+        kind, text = type(error).__name__, blame(error)  # which names the kind of an error of the user's code
+        return failed(job, text if kind in text else f"{kind}: {text}")
 
 
 def _flown(job: Job, request: Request) -> Result:

@@ -1,5 +1,6 @@
 """A campaign of planted flights: the same dataset for any order, nothing lost or repeated, and what is found in it."""
 
+import errno
 import gc
 import io
 import itertools
@@ -8,10 +9,14 @@ import os
 import random
 import re
 import signal
+import tempfile
 from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -22,6 +27,7 @@ from scipy.stats import binomtest
 
 from hil.errors import LabError
 from hil.laboratory.request import Options
+from hil.research.campaigns import jobs
 from hil.research.campaigns.config import Spec
 from hil.research.campaigns.dataset import ARRIVING, FLIGHTS, Dataset
 from hil.research.campaigns.findings import Findings, find
@@ -383,3 +389,57 @@ def test_a_flight_beyond_its_time_limit_is_a_row_that_names_it(
         return
     assert (row.outcome, row.passed, row.hash) == ("error", False, "")
     assert row.error == f"TooLongError: limits.{limit} = {value:g}: the flight had not ended"
+
+
+@pytest.mark.parametrize(
+    ("error", "limited", "row"),
+    [
+        (LabError("no such body"), True, "no such body"), (LabError("no such body"), False, None),
+        (OSError(errno.ENOSPC, "No space left"), True, None), (OSError(errno.EDQUOT, "Quota exceeded"), False, None),
+        (OSError(errno.EACCES, "denied"), False, r"test_campaigns\.py:\d+: PermissionError: \[Errno 13\] denied"), (ZeroDivisionError("odd"), False,
+        r"test_campaigns\.py:\d+: ZeroDivisionError: odd"),
+    ],
+)  # fmt: skip
+def test_a_flight_s_error_is_its_row_but_for_a_user_s_in_a_plan_without_limits_and_a_full_disk(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, limited: bool, row: str | None
+) -> None:
+    def flown(job: Job, request: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(jobs, "_flown", flown)
+    job = draw(spec_of(), 7)
+    if not limited:
+        job = replace(job, limits=None)
+    if row is not None:
+        found = fly_job(job)
+        assert (found.outcome, found.passed, found.hash) == ("error", False, "")
+        assert re.fullmatch(row, found.error)
+        return
+    full = rf"^flight 7: {tempfile.gettempdir()}: " if isinstance(error, OSError) else "^no such body$"
+    with pytest.raises(LabError, match=full):
+        fly_job(job)
+    monkeypatch.setattr(jobs, "find_again", lambda name, source: None)
+    with pytest.raises(LabError, match=r"^experiment hover: its file has changed since the first flight$"):
+        fly_job(job)
+
+
+@pytest.mark.parametrize("files", [None, ("a.json", "c.csv")])
+def test_of_a_flight_s_files_those_that_are_asked_for_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, files: tuple[str, ...] | None
+) -> None:
+    asked: list[object] = []
+
+    def fly(request: object, folder: Path) -> str:
+        folder.mkdir()
+        for name in ("a.json", "b.parquet", "c.csv"):
+            (folder / name).touch()
+        return "result"
+
+    monkeypatch.setattr(jobs, "fly", fly)
+    monkeypatch.setattr(jobs, "reserved", lambda *what, replace: asked.append(replace) or nullcontext())
+    job = Job(0, "hover", Options(), {}, tmp_path / "x", files)
+    assert jobs._flown(job, "request") == "result"  # type: ignore[arg-type, comparison-overlap]
+    assert sorted(path.name for path in job.folder.iterdir()) == sorted(
+        files or ("a.json", "b.parquet", "c.csv")
+    )  # type: ignore[union-attr]
+    assert asked == [files is not None]
