@@ -396,8 +396,8 @@ def test_a_flight_beyond_its_time_limit_is_a_row_that_names_it(
     [
         (LabError("no such body"), True, "no such body"), (LabError("no such body"), False, None),
         (OSError(errno.ENOSPC, "No space left"), True, None), (OSError(errno.EDQUOT, "Quota exceeded"), False, None),
-        (OSError(errno.EACCES, "denied"), False, r"test_campaigns\.py:\d+: PermissionError: \[Errno 13\] denied"), (ZeroDivisionError("odd"), False,
-        r"test_campaigns\.py:\d+: ZeroDivisionError: odd"),
+        (OSError(errno.EACCES, "denied"), False, r"test_campaigns\.py:\d+: PermissionError: \[Errno 13\] denied"),
+        (ZeroDivisionError("odd"), False, r"test_campaigns\.py:\d+: ZeroDivisionError: odd"),
     ],
 )  # fmt: skip
 def test_a_flight_s_error_is_its_row_but_for_a_user_s_in_a_plan_without_limits_and_a_full_disk(
