@@ -537,3 +537,47 @@ def test_rows_of_the_paper_s_identification_are_printed_in_their_columns_with_th
         *zip(COLUMNS, "abcdefg", strict=True)
     ]
     assert why == WHY
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "around", "code"),
+    [(("completed",) * 3, True, 0), (("completed",) * 3, False, 1), (("completed", "error: gone", "completed"), True, 1),
+     (("completed", "interrupted", "completed"), True, 130)],
+)  # fmt: skip
+def test_a_check_flies_the_last_flight_with_targets_of_its_own_logic_and_ends_with_the_first_error(
+    cli: Cli,
+    asked: Asked,
+    monkeypatch: pytest.MonkeyPatch,
+    outcomes: tuple[str, ...],
+    around: bool,
+    code: int,
+) -> None:
+    logics = ("usual", "usual", "failing")
+    flights = [
+        Made(config=Made(logic=logic), experiment=Made(name=f"flight {n}")) for n, logic in enumerate(logics)
+    ]
+    endings = iter(outcomes)
+    Path("cf2.elf").touch()
+
+    def checked(request: Any, factories: Any, show: Any) -> Any:
+        outcome = next(endings)
+        return Made(outcome=outcome, failed=outcome.startswith("error"), equal=True)
+
+    boxes = {logic: Made(factories=f"for {logic}", machine_code=None, boards={}) for logic in logics}
+    asked.answer({
+        "deploy.check.plan": flights, "deploy.check.check_flight": checked, "commands.deploy._print_flight": None,
+        "deploy.targets.Toolbox": lambda names, logic, *more: boxes[logic], "commands.deploy._print_sum": None,
+        "commands.deploy._check_around": around,
+    })  # fmt: skip
+    assert cli("deploy", "check", "--elf", "cf2.elf", "--set", "a.b=1") == code
+    flown = [one[1:3] for one in asked if one[0] == "check_flight"]
+    ended = [n for n, outcome in enumerate(outcomes, 1) if outcome != "completed"][:1] or [3]
+    assert (
+        flown == [(flight, f"for {logic}") for flight, logic in zip(flights, logics, strict=True)][: ended[0]]
+    )
+    boxed = [one[1:] for one in asked if one[0] == "Toolbox"]
+    assert boxed == [(("cortex-m4",), "usual", None, Path("cf2.elf")), (("cortex-m4",), "failing")]
+    plan = next(one for one in asked if one[0] == "plan")
+    assert plan[1:4] == (None, False, False), "a linked image is not built afresh"
+    judged = [one for one in asked if one[0] == "_check_around"]
+    assert judged == ([] if code == 130 else [("_check_around", Path("cf2.elf"), "floaty", ("a.b=1",))])

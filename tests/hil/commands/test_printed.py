@@ -59,7 +59,7 @@ def row(seed: int, factor: float, outcome: str = "completed", error: str = "", *
 
 def test_flights_of_many_seeds_are_a_row_each_and_the_means_of_the_completed(printed: Any) -> None:
     tables.print_seeds([row(5, 1.0, in_box=True), row(6, 3.0, rms_x=False, in_box=True, resets=False),
-                        row(7, 9.0, "lost", "fell", lost=False)])  # fmt: skip
+                        row(7, 9.0, "lost", "fell", lost=False), row(8, 0.1, "error", "board gone", lost=False)])  # fmt: skip
     assert printed() == [
         "hover, profile floaty",
         [
@@ -84,7 +84,8 @@ def test_flights_of_many_seeds_are_a_row_each_and_the_means_of_the_completed(pri
             "fails: rms_x, resets",
         ],
         ["7", "9.00 18.00 27.00", "36.0 45.0 54.0", "63.0 72.0 81.0", "90.0", "9.0", "7" * 12, "fell"],
-        "3 seeds: 1 hold all limits, 1 lost",
+        ["8", "0.10 0.20 0.30", "0.4 0.5 0.6", "0.7 0.8 0.9", "1.0", "0.1", "8" * 12, "board gone"],
+        "4 seeds: 1 hold all limits, 1 lost",
         "mean of the completed: rms x 2.00 y 4.00 z 6.00 cm; < 6 cm x 14.0 y 16.0 z 18.0 % of the time",
     ]
     tables.print_seeds([row(7, 9.0, "lost", "fell", lost=False)])
@@ -381,12 +382,13 @@ def test_a_search_prints_each_number_and_the_metric_before_and_after_and_writes_
 def test_a_campaign_prints_its_rates_its_errors_and_its_three_worst_flights(
     cli: Cli, printed: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of eight flights 1 and 3 break a limit, 5 is lost and 6 ends with an error."""
+    """Of eight flights 1, 3 and 7 break a limit, 5 is lost and 6 ends with an error."""
     spec = spec_of(flights=8)
     changes: dict[int, dict[str, Any]] = {1: {"holds": {"in_box": False}, "metrics": {"in_box": 0.5}},
         3: {"holds": {"in_box": False}, "metrics": {"in_box": 0.25}},
         5: {"outcome": "lost", "error": "fell", "holds": {"in_box": False}, "metrics": {"flown": 0.2}},
-        6: {"outcome": "error", "error": "planted", "holds": {}}}  # fmt: skip
+        6: {"outcome": "error", "error": "planted", "holds": {}},
+        7: {"holds": {"in_box": False}, "metrics": {"in_box": 0.4}}}  # fmt: skip
 
     def campaign(runner: Any, plan: Any, out: Path) -> Any:
         dataset = Dataset(out, plan, False)
@@ -418,9 +420,9 @@ def test_a_campaign_prints_its_rates_its_errors_and_its_three_worst_flights(
         ]
         return f"flight {number}: floaty fly hover --seed {number + 1} --duration 0.3 {' '.join(more)}"
 
-    assert [line for line in printed() if "0 of 0" not in line] == [f"failed: {rate(4, 8)}",
-        f"floaty, lost: {rate(1, 7)}", f"floaty, in_box: {rate(2, 6, ' that were not lost')}",
-        "did not end: 1×, first flight 6: planted", *map(command, (5, 3, 1)), "runs/x/report.html"]  # fmt: skip
+    assert [line for line in printed() if "0 of 0" not in line] == [f"failed: {rate(5, 8)}",
+        f"floaty, lost: {rate(1, 7)}", f"floaty, in_box: {rate(3, 6, ' that were not lost')}",
+        "did not end: 1×, first flight 6: planted", *map(command, (5, 3, 7)), "runs/x/report.html"]  # fmt: skip
 
 
 def test_a_check_prints_each_target_s_counts_and_where_it_first_differs(

@@ -69,12 +69,18 @@ def test_a_table_into_a_closed_pipe_is_an_error_that_a_flight_handles(
 
 
 def test_a_held_limit_is_ok_and_a_missed_one_fails(flown: Result, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("report.html", "flight.rrd"):
+        (flown.folder / name).touch()
     for holds, mark in ((True, "ok"), (False, "FAILS")):
         verdict = Verdict("rms_x", 0.01, 0.02, holds, "m", "max")
         judged = replace(flown, metrics=flown.metrics | {"rms_x": 0.01}, verdicts=(verdict,))
         print_result(judged)
         assert exit_code(judged) == (0 if holds else 1)
-        (line,) = [line for line in capsys.readouterr().out.splitlines() if "rms_x" in line]
+        told = capsys.readouterr().out.splitlines()
+        (line,) = [line for line in told if "rms_x" in line]
+        files = [f"  {flown.folder / name}" for name in ("report.html", "flight.rrd", "log.parquet")]
+        files[1] += f"   (floaty view {flown.folder})"
+        assert told[-3:] == files
         assert [cell.strip() for cell in line.split("│")[-3:-1]] == ["<= 2 cm", mark]
 
 
