@@ -26,6 +26,7 @@ from hil.research.design import analysis
 from hil.research.design.analysis import Analysis
 from hil.research.design.claims import Claim
 from hil.research.design.linear import point_of
+from hil.research.studies.catalogue import STUDIES
 from hil.research.studies.paper_identification import COLUMNS, WHY, PaperConstant
 from support.command import Cli
 
@@ -294,6 +295,7 @@ def test_the_paper_is_flown_measured_and_identified_unless_only_a_row_is_asked_f
     assert cli.out.splitlines() == shown
     assert ("interrupted: the report has the flights that were complete" in cli.err) == interrupted
     assert asked[0][3:5] == (2, Path("x"))
+    assert [*asked[0][2]] == ([*STUDIES.values()] if only is None else [])
 
 
 def test_an_analysis_is_written_as_page_pictures_and_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -581,3 +583,13 @@ def test_a_check_flies_the_last_flight_with_targets_of_its_own_logic_and_ends_wi
     assert plan[1:4] == (None, False, False), "a linked image is not built afresh"
     judged = [one for one in asked if one[0] == "_check_around"]
     assert judged == ([] if code == 130 else [("_check_around", Path("cf2.elf"), "floaty", ("a.b=1",))])
+
+
+def test_a_study_flies_alone_into_a_folder_of_its_name(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(paper, "_fly", lambda *what, **more: asked.append(what) or 0)
+    crew = {"workers": None, "cluster": "", "resume": True}
+    assert cli("study", "loss", "--seeds", "3", "--resume") == 0
+    assert cli("study", "loss", "--out", "x") == 0
+    assert asked == [([], [STUDIES["loss"]], 3, Path("runs/study-loss"), crew),
+        ([], [STUDIES["loss"]], 5, Path("x"), crew | {"resume": False})]  # fmt: skip
