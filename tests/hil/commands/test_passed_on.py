@@ -593,3 +593,19 @@ def test_a_study_flies_alone_into_a_folder_of_its_name(cli: Cli, monkeypatch: py
     assert cli("study", "loss", "--out", "x") == 0
     assert asked == [([], [STUDIES["loss"]], 3, Path("runs/study-loss"), crew),
         ([], [STUDIES["loss"]], 5, Path("x"), crew | {"resume": False})]  # fmt: skip
+
+
+def test_the_exit_code_is_that_of_the_paper_s_rows_or_of_studies_alone(
+    cli: Cli, asked: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    studies = "research.studies."
+    for name in ("_print_rows", "_print_studies"):
+        monkeypatch.setattr(paper, name, lambda what: None)
+    flown = Made(holds=True, studies=[])
+    asked.answer({f"{studies}paper.fly_paper": flown, f"{studies}paper_report.write_paper": "page"})
+    for rows, studied, words, code in (
+        (True, [True, False], ("study", "loss"), 1), (False, [True, True], ("study", "loss"), 0),
+        (True, [False], ("paper", "--only", "hover"), 0), (False, [True], ("paper", "--only", "hover"), 1),
+    ):  # fmt: skip
+        flown.holds, flown.studies = rows, [Made(holds=one) for one in studied]
+        assert cli(*words) == code
