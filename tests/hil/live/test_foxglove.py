@@ -48,7 +48,7 @@ def test_changed_parameter_is_shown(screen: FoxgloveScreen, client: FoxgloveClie
     screen.know({"extCtrl.y_P": 1.6, "extCtrl.z_P": 2.0})
     client.send(op="getParameters", parameterNames=[], id="all")
     assert values(client.receive("parameterValues")) == {"extCtrl.y_P": 1.6, "extCtrl.z_P": 2.0}
-    client.send(op="subscribeParameterUpdates", parameterNames=["extCtrl.y_P"])
+    client.send(op="subscribeParameterUpdates", parameterNames=["extCtrl.y_P", "extCtrl.z_P"])
     wish = [{"name": "extCtrl.y_P", "value": 2.5}, {"name": "no.such", "value": 1.0}]
     client.send(op="setParameters", parameters=wish, id="wish")
     assert values(client.receive("parameterValues")) == {"extCtrl.y_P": 1.6}
@@ -60,6 +60,10 @@ def test_changed_parameter_is_shown(screen: FoxgloveScreen, client: FoxgloveClie
     client.send(op="getParameters", parameterNames=["extCtrl.z_P"], id="one")
     assert values(client.receive("parameterValues")) == {"extCtrl.z_P": 2.0}
     screen.know({"extCtrl.y_P": 2.75})
+    screen.know({"extCtrl.z_P": 2.25})
+    assert values(client.receive("parameterValues")) == {"extCtrl.z_P": 2.25}, (
+        "the other one is still subscribed to"
+    )
     screen.know({"extCtrl.y_P": 2.5})
     client.send(op="setParameters", parameters=[{"name": "extCtrl.y_P", "value": "stop"}])
     assert values(client.receive("parameterValues")) == {"extCtrl.y_P": 2.5}
@@ -67,6 +71,13 @@ def test_changed_parameter_is_shown(screen: FoxgloveScreen, client: FoxgloveClie
         client.send(**malformed)
         assert client.receive("status")["level"] == 2
     assert typed == ["set extCtrl.y_P 2.5"]
+    other = FoxgloveClient(screen.address)
+    other.receive("serverInfo")
+    assert len(screen.clients) == 2
+    other.close()
+    while len(screen.clients) > 1:  # until the server has read it
+        client.send(op="getParameters", parameterNames=["extCtrl.z_P"], id="one")
+        client.receive("parameterValues")
 
 
 def test_parameters_that_nobody_asked_for_are_neither_shown_nor_changed() -> None:
