@@ -63,9 +63,19 @@ def test_the_first_difference_is_the_first_by_row_then_by_column(runs: dict[str,
 
 
 def test_only_differing_settings_are_reported(runs: dict[str, Path]) -> None:
-    comparison = compare(load_flown(runs["one"]), load_flown(runs["strong"]))
+    a, b = load_flown(runs["one"]), load_flown(runs["strong"])
+    comparison = compare(a, b)
     gain = load_config().controller.gain_z
     assert ("controller.gain_z", str(gain), "3.5") in comparison.settings
+    lost, old = (
+        replace(b.result, outcome="lost"),
+        replace(b.result.program, commit="x", versions={"numpy": "1"}),
+    )
+    other = {
+        name: values for name, *values in compare(a, replace(b, result=replace(lost, program=old))).settings
+    }
+    assert other["outcome"] == ["completed", "lost"]
+    assert (other["commit"][1], other["versions.numpy"][1]) == ("x", "1")
     assert {name for name, _, _ in comparison.settings} <= {"controller.gain_z", "overrides", "commit"}
 
 

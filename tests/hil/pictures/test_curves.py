@@ -291,6 +291,11 @@ def test_logs_differ_first_where_they_do_a_gap_equals_a_gap_and_a_longer_one_goe
         "truth.y",
         (0.0, 9.0),
     )
+    found = compare._first_difference(
+        a, a.set_column(names.index("truth.x"), "truth.x", [[0.0, 0.5, 1, 2, 3]]), names
+    )
+    assert found is not None
+    assert (found.row, found.values[1]) == (1, 0.5), "a gap is no number"
     for first, second, values in ((a, a.slice(0, 4), (40_000, None)), (a.slice(0, 4), a, (None, 40_000))):
         found = compare._first_difference(first, second, names)
         assert found is not None

@@ -388,6 +388,7 @@ def test_an_index_whose_interval_is_too_wide_is_not_ranked() -> None:
     assert (found.ranked, found.unknown) == ([("c", -0.9), ("b", 0.4)], ["a"])
     assert found.text("b") == "b 0.4 ± 0.1"
     assert Influence("x", "", {"a": 1.0}, None, {"a": np.nan}, 1.0).unknown == ["a"]
+    assert Influence("x", "", {"a": 1.0}, None, {"a": 1.0}, 1.0).unknown == []
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
