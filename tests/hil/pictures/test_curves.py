@@ -194,6 +194,12 @@ def test_a_failsafe_that_ends_for_less_than_a_tenth_of_a_second_is_one_interval(
 def test_an_interval_to_the_end_ends_with_the_last_row() -> None:
     marks = marks_of_flight(flight([0.0] * 3, **{"supervisor.state": [2, 3, 3]}))
     assert [(one.begin_s, one.end_s) for one in marks.intervals] == [(0.01, 0.02)]
+    faults = json.dumps({"faults": ["push.y@0.01:9=1", "push.x@0.02=1", "push.z@0.03=1"]}).encode()
+    log = flight([0.0] * 3).replace_schema_metadata(RELEASE | {b"request": faults})
+    marked = [(one.text, one.begin_s, one.end_s) for one in marks_of_flight(log).intervals]
+    assert marked == [("push.y@0.01:9=1", 0.01, 0.02)], (
+        "those that begin with the end or after it have no time"
+    )
 
 
 def test_a_trial_shows_the_true_value_beside_its_target_and_the_mean_opening_each_flap_in_its_sense() -> None:
