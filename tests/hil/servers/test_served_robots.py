@@ -230,8 +230,8 @@ def test_a_radio_port_that_is_taken_is_named() -> None:
 def test_that_time_stood_still_is_said_once_for_all_robots(
     monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    said: list[str] = []
+    said, config = list[str](), load_config()
     monkeypatch.setattr(Paced, "notices", lambda clock: ["slow"])
-    with closing(Server(Service(load_config(), number), said.append)) as server:
+    with closing(Server(Service(config, number), said.append, room=SharedRoom(config, 2))) as server:
         server.run(lambda: server.lab.now_us > 0)
     assert ("slow" in said) is (number == 1)
