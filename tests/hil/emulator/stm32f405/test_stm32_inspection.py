@@ -145,6 +145,15 @@ def test_an_assertion_that_is_a_functions_last_call_names_the_function(compiler:
     assert re.search(rf"in task REPORT: check_last[\w.]* \(firmware.c:({line - 1}|{line})\) < ", text)
 
 
+def test_the_place_of_an_assertion_begins_its_trace_once() -> None:
+    line, reports = line_of("assert_that(how != ASSERTION)"), reports_of(FirmwareOnChip())
+    place, caller = f"go_wrong (firmware.c:{line})", "report (firmware.c:1)"
+    for trace in ((), (caller,), (place, caller), ("go_wrong (firmware.c:1)", caller)):
+        expected = (place, *trace[-1:])
+        assert reports._with_place(f"firmware.c:{line}", trace) == expected
+        assert reports._with_place("other.c:1", trace) == trace
+
+
 @COMPILERS
 def test_a_call_through_a_null_pointer_is_a_change_to_arm_code(compiler: str) -> None:
     text = crashed(FirmwareOnChip(compiler, planted=NULL_CALL))
