@@ -5,18 +5,24 @@ import json
 import re
 import shutil
 import subprocess
+from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import capstone
 import pytest
+from capstone import arm
 
 pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
 from hil.api import fly
 from hil.board import image_firmware
+from hil.emulator.stm32f405 import coverage
 from hil.emulator.stm32f405.chip import StopReason
 from hil.emulator.stm32f405.coverage import FileCoverage, ImageLines
+from hil.emulator.stm32f405.image import Image
 from hil.errors import LabError
 from hil.laboratory.experiments import find_experiment
 from hil.laboratory.files.coverage import read_executed
@@ -53,6 +59,33 @@ def entered(file: FileCoverage) -> dict[str, int]:
 def line_of(text: str) -> int:
     lines = (SOURCES / "firmware.c").read_text(encoding="utf-8").splitlines()
     return next(number for number, line in enumerate(lines, 1) if text in line)
+
+
+def conditional_jumps(image: Image) -> Iterator[tuple[int, int]]:
+    """Yield what capstone says of an image's functions: address and size of each jump or call on a condition."""
+    reader = capstone.Cs(capstone.CS_ARCH_ARM, capstone.CS_MODE_THUMB | capstone.CS_MODE_MCLASS)
+    reader.detail = True
+    jumps = {arm.ARM_GRP_JUMP, arm.ARM_GRP_CALL, arm.ARM_GRP_BRANCH_RELATIVE}
+    ends = sorted({one.address for one in image.functions if one.address >= image.base})
+    for begin, end in pairwise([*ends, image.base + len(image.code)]):
+        data = {2 * at + image.base for at in image.constants} & set(range(begin, end))
+        for first, last in pairwise([begin, *sorted(data), end]):
+            first += 2 * (first in data)
+            for one in reader.disasm(image.code[first - image.base : last - image.base], first):
+                on_condition = one.cc not in (arm.ARM_CC_AL, arm.ARM_CC_INVALID)
+                to_pc = arm.ARM_REG_PC in one.regs_access()[1]
+                if one.id in (arm.ARM_INS_CBZ, arm.ARM_INS_CBNZ) or (
+                    on_condition and (jumps & {*one.groups} or to_pc)
+                ):
+                    yield one.address, one.size
+
+
+@pytest.mark.parametrize("compiler", ["clang", "gcc"])
+def test_conditional_jumps_are_those_that_capstone_reads(compiler: str) -> None:
+    image = Image(stm32_firmware.build(compiler))
+    found = [*coverage._branches(image)]
+    assert len(found) > 50
+    assert found == [*conditional_jumps(image)]
 
 
 def counted_by_gcov(folder: Path) -> dict[str, Any]:
