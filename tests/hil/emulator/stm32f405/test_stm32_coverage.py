@@ -28,6 +28,7 @@ from hil.laboratory.experiments import find_experiment
 from hil.laboratory.files.coverage import read_executed
 from hil.laboratory.request import Request
 from support import stm32_firmware
+from support.stm32_bench import Bench
 from support.stm32_firmware import SOURCES
 from support.stm32_machine import FirmwareOnChip
 
@@ -217,3 +218,12 @@ def test_coverage_adds_over_flights_keeps_the_hash_and_is_of_one_image(
     (tmp_path / "cov.counts").unlink()
     with pytest.raises(LabError, match=r"cov\.info exists without its cov\.counts: choose another name$"):
         flown(5, out)
+
+
+def test_the_instruction_in_which_the_chip_sleeps_has_run_and_the_next_one_has_not() -> None:
+    bench = Bench(bytes.fromhex("00bf00bf"))
+    bench.chip.record()
+    for _ in range(2):
+        bench.wait(10)
+        runs = coverage.runs_of(bench.chip.passages)[4:10]
+        assert runs.tolist() == [1, 1, 1, 0, 0, 0]  # two NOPs, WFI, the jump back to it
