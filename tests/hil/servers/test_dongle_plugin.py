@@ -3,6 +3,7 @@
 import atexit
 import errno
 import socket
+import struct
 from array import array
 from collections.abc import Iterator
 from threading import Thread
@@ -107,6 +108,18 @@ def test_pyusb_finds_a_crazyradio() -> None:
     assert [one.bEndpointAddress for one in device[0][(0, 0)]] == [0x81, 0x01]
     process.listener.close()
     data = all_descriptors()
+    interface = device[0][(0, 0)]
+    for part, at, layout, names in (
+        (device, 0, "<BBHBBBBHHHBBBB", "bLength bDescriptorType bcdUSB bDeviceClass bDeviceSubClass bDeviceProtocol "
+         "bMaxPacketSize0 idVendor idProduct bcdDevice iManufacturer iProduct iSerialNumber bNumConfigurations"),
+        (device[0], 18, "<BBHBBBBB", "bLength bDescriptorType wTotalLength bNumInterfaces bConfigurationValue "
+         "iConfiguration bmAttributes bMaxPower"),
+        (interface, 27, "<9B", "bLength bDescriptorType bInterfaceNumber bAlternateSetting bNumEndpoints "
+         "bInterfaceClass bInterfaceSubClass bInterfaceProtocol iInterface"),
+        *((interface[index], 36 + 7 * index, "<BBBBHB", "bLength bDescriptorType bEndpointAddress bmAttributes "
+           "wMaxPacketSize bInterval") for index in range(2)),
+    ):  # fmt: skip
+        assert [getattr(part, name) for name in names.split()] == [*struct.unpack_from(layout, data, at)]
     assert (data[:2], len(data), int.from_bytes(data[20:22], "little")) == (b"\x12\x01", 18 + 32, 32)
     assert data[8:14] == bytes.fromhex("1519 7777 0405")
     assert data[27:29] == b"\x09\x04"

@@ -216,6 +216,16 @@ def test_the_built_in_station_sends_what_was_asked_for(
     assert flown == calls
 
 
+def test_each_robot_has_a_seed_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds, of_seed = list[int](), Streams.of_seed
+    monkeypatch.setattr(Streams, "of_seed", lambda seed: seeds.append(seed) or of_seed(seed))
+    config = load_config()
+    for number in (1, 2, 3):
+        Server(Service(config, number, seed=5), print, room=SharedRoom(config, 3)).close()
+    assert [seeds[0], *seeds[-2:]] == [5, 6, 7]
+    assert set(seeds) == {5, 6, 7}
+
+
 def test_a_radio_port_that_is_taken_is_named() -> None:
     with (
         socket.create_server(("127.0.0.1", 0)) as taken,
