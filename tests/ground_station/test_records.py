@@ -156,3 +156,12 @@ def test_a_program_without_a_standard_output_flies(monkeypatch: pytest.MonkeyPat
     records = Records()
     records.print_text("connected")
     assert not records.incomplete
+
+
+def test_frames_of_one_instant_stay_in_their_order(tmp_path: Path) -> None:
+    frames = FrameLog(tmp_path / "frames")
+    for t_us, frame in ((5, b"b"), (5, b"a"), (3, b"d"), (5, b"c")):
+        frames.note(t_us, frame)
+    frames.close()
+    content = (tmp_path / "frames").read_bytes()
+    assert [content[at : at + 9][8:] for at in range(0, len(content), 9)] == [b"d", b"b", b"a", b"c"]

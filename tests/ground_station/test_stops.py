@@ -25,6 +25,7 @@ def test_a_lost_session_is_like_ctrl_c_but_only_once(number: int) -> None:
             signal.raise_signal(number)
         for each in STOPS[1:]:  # the result is being written
             signal.raise_signal(each)
+        assert signal.getsignal(signal.SIGINT) == before[0]  # Ctrl-C still ends it
     assert [signal.getsignal(each) for each in STOPS] == before
 
 

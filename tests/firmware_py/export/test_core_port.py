@@ -475,6 +475,28 @@ def test_requests_are_repeated_ever_more_seldom_until_three_seconds_are_silent()
     assert silence.requests == 2 * (1 + 8)
 
 
+class Slow(AppPackets):
+    """A board whose every answer is waited for seven times, 2.3 s together."""
+
+    def __init__(self) -> None:
+        self.heard, self.waits = dict[bytes, None](), 0
+
+    def send(self, data: bytes) -> None:
+        self.heard[data[:4]] = None
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        self.waits += 1
+        if self.waits % 8:
+            return None
+        head = [*self.heard][self.waits // 8 - 1]
+        return bytes((Message.CALL,)) + head[1:] + bytes(CALLED.struct.size)
+
+
+def test_silence_counts_from_the_last_answer_on() -> None:
+    answers = CoreClient(Slow(), "app").execute([call(Call.RESET)] * 3)
+    assert [answer.kind for answer in answers] == [Message.CALL] * 3
+
+
 @pytest.mark.parametrize("kind", [Message.HELLO, Message.CALL, Message.HEALTH, Message.REFUSED])
 def test_an_answer_that_lacks_its_last_byte_is_one_line_and_not_silence(kind: Message) -> None:
     size = {Message.HELLO: ABOUT, Message.CALL: CALLED, Message.HEALTH: HEALTH, Message.REFUSED: WHY}[
