@@ -94,6 +94,20 @@ def test_frames_are_taken_from_the_first_port_until_it_is_silent_for_a_second_an
     source.close()
 
 
+def test_frames_of_another_computer_are_not_the_server_s(server: Server) -> None:
+    source = source_of(server.port)
+    source.open()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.2", server.port))
+        server.sockets.append(other)
+        server.frame(3, 9.0)
+    server.frame(0, 1.0)
+    assert [heard(source), heard(source)] == [1.0, None]
+    (line,) = [line for line in source.notices() if "ignored" in line]
+    assert f"packets of 127.0.0.2:{server.port} are" in line
+    source.close()
+
+
 def test_answers_count_only_from_the_port_of_commands(server: Server) -> None:
     source = source_of(server.port)
     source.open()
