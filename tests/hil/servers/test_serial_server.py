@@ -1,7 +1,6 @@
 """The ends of a served serial line: bytes pass both ways, nobody who comes, leaves or sleeps holds the server up."""
 
 import os
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -59,20 +58,6 @@ def test_one_client_s_message_is_not_split_by_another() -> None:
     bench.close()
 
 
-def test_a_client_of_a_pty_reads_nothing_from_before_it_came() -> None:
-    bench = OpenEnd(Address("pty").open)
-    bench.end.send(bytes(100_000))  # more than the line holds
-    with suppress(BlockingIOError):
-        while True:
-            os.write(bench.end._master, bytes(4096))
-    bench.end.send(b"lost")
-    client = os.open(bench.end.master, os.O_RDWR | os.O_NOCTTY)
-    bench.end.send(b"now")
-    assert os.read(client, 4096) == b"now"
-    os.close(client)
-    bench.close()
-
-
 def test_the_link_to_a_pty_is_made_and_removed(tmp_path: Path) -> None:
     path = tmp_path / "floaty"
     bench = OpenEnd(Address("pty", path=path).open)
@@ -82,16 +67,6 @@ def test_the_link_to_a_pty_is_made_and_removed(tmp_path: Path) -> None:
         bench.serve_until(lambda: bench.received == b"through the link")
     bench.close()
     assert not os.path.lexists(path)
-
-
-def test_a_client_that_slept_reads_what_is_sent_after_its_line_was_full(tmp_path: Path) -> None:
-    bench = OpenEnd(Address("pty", path=tmp_path / "floaty").open)
-    with serial.Serial(bench.end.master, 921_600, timeout=10.0) as client:
-        bench.end.send(bytes(1_000_000))  # more than a line holds
-        bench.end.send(b"fresh")
-        assert client.read(5) == b"fresh"
-        assert client.in_waiting == 0
-    bench.close()
 
 
 def test_the_link_of_a_killed_server_is_replaced_but_nothing_else(tmp_path: Path) -> None:

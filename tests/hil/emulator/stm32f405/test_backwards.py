@@ -6,7 +6,6 @@ import signal
 import socket
 import sys
 import threading
-from contextlib import suppress
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +13,14 @@ from pathlib import Path
 import pytest
 
 from hil.emulator.stm32f405.backwards import NEAR, PERIOD, TRAIL, Goal, Position, Search
-from hil.emulator.stm32f405.checkpoints import LIMIT, SIZE_BYTES, Checkpoint, Checkpoints, why_none
+from hil.emulator.stm32f405.checkpoints import (
+    LIMIT,
+    SIZE_BYTES,
+    Checkpoint,
+    Checkpoints,
+    _written_files,
+    why_none,
+)
 from hil.emulator.stm32f405.chip import CYCLES_PER_US, SOFTWARE, StopReason
 from hil.emulator.stm32f405.debugged_chip import DebuggedChip
 from hil.emulator.stm32f405.freertos import FreeRtos
@@ -151,10 +157,8 @@ class Flight:
         if not self.pid:
             code = 1
             try:
-                for number in map(int, os.listdir("/proc/self/fd")):  # the tests' own files never go back
-                    if number > 2 and number not in (held, server._listener.fileno()):
-                        with suppress(OSError):
-                            os.close(number)
+                for number, *_ in _written_files():  # the tests' own, which never go back
+                    os.close(number)
                 self._fly(server, planted)
                 code = 7
             except KeyboardInterrupt:
