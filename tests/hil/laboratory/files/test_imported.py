@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
+from mcap.writer import Writer
 from mcap_ros2.writer import Writer as Ros2Writer
 from scipy.spatial.transform import Rotation
 
@@ -298,7 +299,17 @@ def test_a_map_chooses_scales_turns_and_releases(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("step", "unit"), [(0.5, "s"), (0.0005, "s"), (0.6, "ms"), (500.0, "ms"), (501.0, "us"), (5e5, "us")]
+    ("step", "unit"),
+    [
+        (0.5, "s"),
+        (0.0005, "s"),
+        (0.6, "ms"),
+        (500.0, "ms"),
+        (501.0, "us"),
+        (5e5, "us"),
+        (1e-5, "s"),
+        (1e10, "s"),
+    ],
 )
 def test_times_without_a_unit_have_that_of_a_usual_step(step: float, unit: str) -> None:
     t = step * np.array([0, 0, 0, 0, 1, np.inf, 1, 2, np.nan, 3])  # repeated, and some that are no times
@@ -483,6 +494,27 @@ def test_an_mcap_file_of_ros_2_gives_pose_and_goal(cli: Cli, tmp_path: Path) -> 
     assert column(log, "cameras.yaw")[0] == pytest.approx(2 * np.arcsin(0.6))
     assert "left out: /said" in cli.err
     assert not [name for name in log.column_names if "stamp" in name]
+
+
+def test_the_topic_with_the_most_positions_comes_first_without_its_long_lists(tmp_path: Path) -> None:
+    place = {"position": {"x": 1.0}}
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for topic, rows, message in (
+            ("/a", 2, place), ("/b", 3, {**place, "few": [0] * 16, "many": [0] * 17}), ("/c", 9, {"gyro": 1.0}),
+        ):  # fmt: skip
+            channel = writer.register_channel(topic, "json", 0)
+            for ns in range(rows):
+                writer.add_message(channel, ns, json.dumps(message).encode(), ns)
+        writer.finish()
+    tables = read_tables(tmp_path / "a.mcap")
+    assert [len(table.columns["timestamp [ns]"]) for table in tables] == [3, 2, 9]
+    assert [*tables[0].columns] == [
+        "timestamp [ns]",
+        "b.position.x",
+        *(f"b.few.{number}" for number in range(16)),
+    ]
 
 
 def test_our_own_mcap_file_has_the_log_s_path_again(run: Run, tmp_path: Path) -> None:

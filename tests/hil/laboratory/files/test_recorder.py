@@ -114,6 +114,16 @@ def test_rows_that_are_a_second_apart_are_on_disk(tmp_path: Path) -> None:
     assert load_log(killed(tmp_path, rows=21, period_us=100_000)).num_rows == 11
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_time_of_an_event_is_below_the_numbers_that_a_float_rounds(tmp_path: Path, sign: int) -> None:
+    line = '{{"t_us": {}, "source": "lab", "text": "a"}}\n'
+    (tmp_path / "events.jsonl").write_text(line.format(sign * (2**53 - 1)))
+    assert [event["t_us"] for event in load_events(tmp_path)] == [sign * (2**53 - 1)]
+    (tmp_path / "events.jsonl").write_text(line.format(0) + line.format(sign * 2**53))
+    with pytest.raises(LabError, match=r"events\.jsonl:2: not an event"):
+        load_events(tmp_path)
+
+
 def test_a_flight_that_was_not_released_counts_from_its_planned_release() -> None:
     planned = {b"config": b'{"flight": {"release_us": 5}}'}
     assert [release_of(known) for known in ({}, planned, planned | {RELEASE_US: b"-7"})] == [0, 5, -7]
