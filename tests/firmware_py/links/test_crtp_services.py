@@ -139,6 +139,17 @@ def test_attitudes_are_shown_in_degrees_with_the_nose_up_positive_as_the_stock_f
         assert angles == pytest.approx([roll, -pitch, yaw], rel=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("mv", "level"), [(2999, 0), (3000, 0), (3001, 10), (3780, 10), (3781, 20), (4100, 90), (4101, 90)]
+)
+def test_a_battery_is_shown_by_the_stock_firmwares_curve_and_is_low_below_its_limit(
+    client: CrtpClient, logs, mv: int, level: int
+) -> None:
+    client.battery_mv = mv
+    client.firmware._core.parameters.fields.low_battery_mv = 3000
+    assert client.log(logs, "pm.batteryLevel", "pm.state", "pm.vbatMV") == [level, 3 * (mv < 3000), mv]
+
+
 def test_telemetry_tells_the_excitation_sample_by_sample(client: CrtpClient, params) -> None:
     client.poses(605_000, 3_000_000)
     client.write(params, "excite.u1", 0.05)

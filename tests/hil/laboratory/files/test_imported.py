@@ -319,6 +319,13 @@ def test_times_without_a_unit_have_that_of_a_usual_step(step: float, unit: str) 
     assert joined.notes == ["6 rows are left out: t does not advance there"]
 
 
+def test_the_first_table_must_have_the_clock_that_a_map_names() -> None:
+    named, other = (Table({name: np.arange(3.0)}, ()) for name in ("stamp", "t"))
+    assert join("log", [named, other], "stamp [ms]").clock == "stamp [ms]"
+    with pytest.raises(LabError, match=r"log: no column of times like 'stamp \[ms\]' among t"):
+        join("log", [other, named], "stamp [ms]")
+
+
 # Names of programs that write such logs, what they give, with which sign; unit of values as large as the limit, and beyond.
 KNOWN = [
     *((f"{source}.{axis}", f"cameras.{axis}", "", 20.0, "m", "mm")
