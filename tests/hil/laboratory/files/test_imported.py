@@ -20,6 +20,7 @@ from hil.laboratory.files.alignment import released_like
 from hil.laboratory.files.imported import import_log
 from hil.laboratory.files.joined import Joined, join
 from hil.laboratory.files.log_map import Map, guess
+from hil.laboratory.files.recorder import load_events
 from hil.laboratory.files.tables import Table, read_tables
 from hil.pictures.viewer.recording import recording_of
 from support.command import Cli, floaty
@@ -376,8 +377,10 @@ def test_of_many_columns_only_those_that_change_are_kept(others: int, kept: int)
 
 def test_a_clock_from_the_release_releases_at_its_zero(tmp_path: Path) -> None:
     path = csv(tmp_path / "log.csv", {"time from the release [s]": T - 0.2, **place("x", "y", "z")})
-    log = import_log([path], tmp_path).log
-    assert log.column("flight.free").to_numpy().tolist() == [0] * 10 + [1] * (ROWS - 10)
+    imported = import_log([path], tmp_path)
+    assert imported.log.column("flight.free").to_numpy().tolist() == [0] * 10 + [1] * (ROWS - 10)
+    texts = [f"imported from {path}", *imported.notes]
+    assert load_events(tmp_path) == [{"t_us": 200_000, "source": "lab", "text": text} for text in texts]
 
 
 @pytest.mark.parametrize("size", [0.89, 1.11])

@@ -99,9 +99,9 @@ def test_the_counts_of_flights_add_up_beyond_32_bits(tmp_path: Path) -> None:
     counts[[0, 7, -1]] = (1, 2, 3), (2**32 - 1, 0, 5), (0, 0, 9)
     for flights in (1, 2, 3):
         check_coverage(out, "image")
-        add_executed(out, Executed("image", 1, counts, "board", None))
+        add_executed(out, Executed("image", 2, counts, "board", None))
         found = read_executed(out)
-        assert (found.flights, (found.counts == flights * counts).all()) == (flights, True)
+        assert (found.flights, (found.counts == flights * counts).all()) == (2 * flights, True)
     assert [base_of(tmp_path / name).name for name in ("a", "a.info", "a.v1", "a.v1.info")] == [
         "a",
         "a",
