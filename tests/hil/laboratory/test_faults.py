@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from hil.config import load_config
 from hil.errors import LabError
 from hil.laboratory.experiments import EXPERIMENTS, Experiment
-from hil.laboratory.fault_kinds import KINDS, MARKERS_ON, Kind
+from hil.laboratory.fault_kinds import KINDS, MARKERS_ON
 from hil.laboratory.faults import SWITCHED_ON, Fault, check, parse, spans_of, switched_on, why_not
 from hil.laboratory.files.recorder import load_events, load_log
 from hil.laboratory.files.result import Result, read_result
@@ -340,28 +341,63 @@ def test_faults_on_one_knob_add_up_and_leave_it_as_it_was() -> None:
     assert flight.robot.body.tunnel.side_wind == (0.1, 0.2, 0.3)
 
 
+DEG5 = math.radians(5.0)
+ACTS: dict[str, dict[str, object]] = {  # what each fault changes, and the value from rest
+    "mocap.dropout": {"mocap.dropout": 1.0}, "mocap.outlier": {"mocap.wrong_by": 0.3},
+    "mocap.swap": {"mocap.swapped_by": 0.1}, "mocap.freeze": {"mocap.frozen": 1.0}, "mocap.latency": {"mocap.more_latency_us": 40_000.0},
+    "marker.hidden": {"mocap.markers.hidden": 4.0}, "marker.swap": {"mocap.markers.swapped": 1.0},
+    "marker.noise": {"mocap.markers.noise_scale": 2.0}, "marker.ghosts": {"mocap.markers.ghosts": 5.0},
+    "radio.loss": {"air.uplink_loss": 0.5, "air.downlink_loss": 0.5}, "radio.uplink_loss": {"air.uplink_loss": 0.5},
+    "radio.downlink_loss": {"air.downlink_loss": 0.5}, "radio.cut": {"air.uplink_loss": 1.0, "air.downlink_loss": 1.0},
+    "radio.bit_errors": {"air.uplink_bit_error_rate": 1e-3, "air.downlink_bit_error_rate": 1e-3},
+    "radio.jitter": {"air.uplink_jitter_us": 15_000.0}, "serial.cut": {"uart.connected": 0.0},
+    "serial.bit_errors": {"uart.uplink_bit_error_rate": 1e-4, "uart.downlink_bit_error_rate": 1e-4},
+    **{f"imu.bias.{name}": {"imu.rate_bias": DEG5 * np.eye(3)[axis]} for axis, name in enumerate("pqr")},
+    "imu.noise": {"imu.noise_scale": 10.0}, "imu.saturation": {"imu.rate_range": 4.0 * DEG5},
+    "imu.freeze": {"imu.frozen": True}, "imu.silent": {"imu.silent": True},
+    **{f"servo.stuck.{n}": {f"servo.pace.{n}": 0.0} for n in (1, 2, 3, 4)},
+    **{f"servo.slow.{n}": {f"servo.pace.{n}": 0.5} for n in (1, 2, 3, 4)},
+    **{f"servo.trim.{n}": {f"servo.trim.{n}": DEG5} for n in (1, 2, 3, 4)},
+    "wind.side_x": {"body.tunnel.side_wind": (0.25, 0.0, 0.0)}, "wind.side_y": {"body.tunnel.side_wind": (0.0, 2.0, 0.0)},
+    "wind.fan": {"body.tunnel.fan_factor": 0.95}, "wind.occlusion": {"body.tunnel.shadow": 0.2},
+    "wind.gusts": {"body.tunnel.gust_scale": 2.0},
+    **{
+        f"push.{name}": {"pushes": size * np.eye(6)[part]}
+        for part, (name, size) in enumerate(
+            (("x", 1.0), ("y", 2.0), ("z", 2.0), ("roll", 0.02), ("pitch", 0.02), ("yaw", 0.02))
+        )
+    },
+    "cpu.load": {"thief.share": 0.3}, "battery.sag": {"battery.sag_V": 1.0},
+}  # fmt: skip
+
+
 @pytest.mark.parametrize("link", [RADIO, MAVLINK])
-def test_a_fault_turns_its_own_knobs_and_no_other(link: str) -> None:
-    """Every knob stands away from where it rests, so that one that is put back shows."""
-    flight = lockstep_flight(Request.of(HOVER, overrides=[MARKERS_ON], duration_s=1.0, link=link))
-    kinds = [kind for kind in OF_FLOATY.values() if kind.link in ("", link)]
-    knobs = list(dict.fromkeys(knob for kind in kinds for knob in kind.knobs))
+def test_a_fault_turns_what_it_names_and_nothing_else_and_puts_it_back(link: str) -> None:
+    assert set(ACTS) == set(OF_FLOATY)
+    settings = [MARKERS_ON, "radio.uplink_loss=0", "radio.downlink_loss=0"]
+    flight = lockstep_flight(Request.of(HOVER, overrides=settings, duration_s=1.0, link=link))
+    robot, own = flight.robot, flight.robot.body.settings
+    kinds = {name: kind for name, kind in OF_FLOATY.items() if kind.link in ("", link)}
+    places = {place for name in kinds for place in ACTS[name]}
 
-    def turn(kind: Kind, share: float) -> None:
-        for knob in kind.knobs:
-            knob.turn(flight.robot, knob.blend(knob.read(flight.robot), kind.scale * kind.size * share))
+    def readings() -> dict[str, object]:
+        return {place: own[place].read() if place in own else attrgetter(place)(robot) for place in places}
 
-    def readings() -> list[float]:
-        return [knob.read(flight.robot) for knob in knobs]
+    rest = readings()
+    for name, kind in kinds.items():
+        fault = Fault(name, 0.0, 1.0, kind.size)
+        flight.switchboard.begin(fault, 0)
+        turned = {place: value for place, value in readings().items() if value != rest[place]}
+        assert turned.keys() == ACTS[name].keys(), name
+        for place, value in ACTS[name].items():
+            assert turned[place] == pytest.approx(value), name
+        flight.switchboard.end(fault, 0)
+        assert readings() == rest, name
 
-    for kind in kinds:
-        if kind.size != 0.0:  # a servo that is stuck has no pace to be changed
-            turn(kind, 0.5)
-    for kind in kinds:
-        before = readings()
-        turn(kind, 0.9)
-        turned = {knob for knob, was, now in zip(knobs, before, readings(), strict=True) if was != now}
-        assert turned <= set(kind.knobs), kind.meaning
+
+def test_a_fault_that_would_begin_at_the_end_is_refused() -> None:
+    with pytest.raises(LabError, match=r"the flight ends 1 s after the release, before it begins"):
+        Request.of(HOVER, duration_s=1.0, faults=["push.y@1"])
 
 
 def test_a_change_between_two_faults_persists_beside_a_third() -> None:
