@@ -10,7 +10,8 @@ from firmware_py.core.sampling import WINDOW
 from firmware_py.core.structs import Input, Sampling
 from firmware_py.core_runner import CoreBlocks, default_runner
 from firmware_py.errors import FirmwareError
-from firmware_py.firmware import Firmware
+from firmware_py.firmware import WATCHDOG_US, Firmware
+from firmware_py.rtos import WatchdogError
 from firmware_py.supervisor import wrapped
 from firmware_py.tasks import MEASUREMENT_QUEUE
 from firmware_py.wire.parameters import ABSOLUTE
@@ -156,3 +157,19 @@ def test_an_error_in_a_task_names_task_and_time(bench: FirmwareBench) -> None:
     bench.write_compare = None  # type: ignore[method-assign,assignment]  # a driver that is not there
     with pytest.raises(FirmwareError, match=r"task STABILIZER at 6?[05]\d?\.\d+ ms: TypeError"):
         bench.run(60_000)
+
+
+def test_the_watchdog_bites_after_its_longest_time_and_not_before(bench: FirmwareBench) -> None:
+    bench.run(1_000_000)
+    path, now_us = bench.firmware.flight_tasks._path.fields, bench.firmware.kernel.now_us
+    path.fed_us = now_us - WATCHDOG_US
+    bench.firmware.check_watchdog()
+    path.fed_us -= 1
+    with pytest.raises(WatchdogError, match="STABILIZER has not run for 353 ms"):
+        bench.firmware.check_watchdog()
+
+
+def test_the_smallest_and_the_largest_angle_of_the_flaps_are_logged(bench: FirmwareBench) -> None:
+    bench.firmware._core.control.fields.flap[:] = (0.25, -0.5, 0.125, 0.75)
+    read = {variable.name: variable.read for variable in bench.firmware.variables}
+    assert [read[f"motors_ctrp.{name}_angle"]() for name in ("min", "max")] == [-0.5, 0.75]

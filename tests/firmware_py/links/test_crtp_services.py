@@ -545,6 +545,18 @@ def test_cflib_reads_and_writes_the_configuration_block(client: CrtpClient) -> N
     again.update(done.append)
     assert again.valid
     assert again.elements["radio_address"] == 0xE7E7E7E701
+    poses = [
+        struct.pack("<B3hI", address, 0, 0, 0, pack_quaternion((1.0, 0.0, 0.0, 0.0))) for address in (0xE7, 1)
+    ]
+    for data, taken in (
+        (poses[:1], False),
+        (poses[1:], True),
+        (poses, True),
+    ):  # by the last byte of its address
+        before = client.firmware.pilot.seen_us
+        client.send(LOC, 1, b"\x09" + b"".join(data))
+        client.run(client.now_us + 5000)
+        assert (client.firmware.pilot.seen_us > before) == taken
 
 
 def test_memory_tester_gives_the_address_and_counts_wrong_bytes(client: CrtpClient, logs, params) -> None:

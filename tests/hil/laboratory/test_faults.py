@@ -344,7 +344,8 @@ def test_faults_on_one_knob_add_up_and_leave_it_as_it_was() -> None:
 DEG5 = math.radians(5.0)
 ACTS: dict[str, dict[str, object]] = {  # what each fault changes, and the value from rest
     "mocap.dropout": {"mocap.dropout": 1.0}, "mocap.outlier": {"mocap.wrong_by": 0.3},
-    "mocap.swap": {"mocap.swapped_by": 0.1}, "mocap.freeze": {"mocap.frozen": 1.0}, "mocap.latency": {"mocap.more_latency_us": 40_000.0},
+    "mocap.swap": {"mocap.swapped_by": 0.1}, "mocap.freeze": {"mocap.frozen": 1.0},
+    "mocap.latency": {"mocap.more_latency_us": 40_000.0},
     "marker.hidden": {"mocap.markers.hidden": 4.0}, "marker.swap": {"mocap.markers.swapped": 1.0},
     "marker.noise": {"mocap.markers.noise_scale": 2.0}, "marker.ghosts": {"mocap.markers.ghosts": 5.0},
     "radio.loss": {"air.uplink_loss": 0.5, "air.downlink_loss": 0.5}, "radio.uplink_loss": {"air.uplink_loss": 0.5},

@@ -75,6 +75,15 @@ def test_a_jump_just_before_the_end_is_not_judged(early_s: float, rise_s: float)
         assert found["hold_rms"] < 1e-9
 
 
+def test_a_step_is_risen_at_nine_tenths_and_judged_from_half_a_second_on() -> None:
+    times, goal = np.array([0.0, 0.5, 0.75, 1.0]), np.array([0.0, 1.0, 1.0, 1.0])
+    assert steps(times, np.array([0.0, 0.0, 0.9, 1.0]), goal)[0][0] == 0.25
+    for first_us, judged in ((500_000, True), (500_001, False)):
+        t_us = [0, first_us, 750_000, 1_000_000]
+        table = pyarrow.table({"t": t_us, "truth.y": [0.0, 0.0, 1.0, 1.0], "goal.y": goal})
+        assert bool(y_steps(table)) == judged
+
+
 def test_gain_and_lag_are_those_of_a_first_order_lag() -> None:
     frequency, late = 0.15, 0.2
     times = np.arange(0.0, 41.0, 0.01)
