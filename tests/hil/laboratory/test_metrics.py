@@ -61,7 +61,7 @@ def test_metrics_count_from_the_release_to_the_end() -> None:
         "serial.up_busy": [9 * 10**5 * second for second in range(4)]
         + [3_600_000 + 10**5 * n for n in range(11)],
         "serial.down_busy": [10**6 * second // 2 for second in range(15)],
-        "serial.overrun": [0, *14 * [7]],
+        "serial.overrun": [*range(8), *7 * [7]],
         "estimator.refused": [*10 * [0], *5 * [2]],
         "estimator.too_old": [1] * 15,
         "estimator.invalid": range(15),
@@ -123,6 +123,14 @@ def test_a_flight_from_floor_to_floor_is_judged_by_its_phases() -> None:
     assert values["held"] == pytest.approx(0.5)
     assert values["reached_box"] == pytest.approx(0.9)
     assert values["touch_down_speed"] == pytest.approx(1.5), "of the last ten rows"
+    for row in (30, 40):  # the first of them, and the one in which the feet touch
+        descent = np.zeros(51)
+        descent[[29, row, 41]] = -2.0, -1.5, -2.0
+        other = pa.table(
+            {name: descent if name == "truth.vz" else table[name] for name in table.column_names}
+        )
+        touched = measure(other.replace_schema_metadata({PHASES: json.dumps(phases)}), lost=False)
+        assert touched["touch_down_speed"] == pytest.approx(1.5)
     assert values["max_x"] == pytest.approx(0.01)
     assert values["off_path"] == pytest.approx(0.3)
     assert values["landed_off_axis"] == pytest.approx(0.04)

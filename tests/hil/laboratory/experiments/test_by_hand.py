@@ -18,6 +18,7 @@ from hil.emulator.events import EventQueue
 from hil.laboratory.experiments import EXPERIMENTS, measures
 from hil.laboratory.experiments.airspeed import holding
 from hil.laboratory.experiments.disturbances import fan
+from hil.laboratory.experiments.overload import loads_that_hurt
 from hil.laboratory.experiments.power import VEHICLES
 from hil.laboratory.experiments.take_off import measure as take_off
 
@@ -131,6 +132,8 @@ def test_a_take_off_and_its_landing_are_measured_between_their_switches() -> Non
             "hover_in_box": 82 / 92,
         }
     )
+    climb[220] = -0.9
+    assert take_off(log(TIMES, truth_z=height, truth_vz=climb))["touch_down_speed"] == pytest.approx(0.9)
     assert all(map(isnan, take_off(log(TIMES, truth_z=0.069)).values())), (
         "2 cm above the net are not in the air"
     )
@@ -144,11 +147,21 @@ def test_a_take_off_and_its_landing_are_measured_between_their_switches() -> Non
 @pytest.mark.parametrize("axis", [0, 1])
 def test_the_offset_in_a_wind_is_that_of_its_last_five_seconds(axis: int) -> None:
     times = np.round(np.arange(0.0, 14.0, 0.01), 2)
-    blown = np.select([times < 7.0, times < 12.0], [0.9, -0.1], 0.7)
+    blown = np.select([times < 7.0, times < 8.0, times < 12.0], [0.9, -0.6, 0.025], 0.7)  # -0.1 in the mean
     flight = log(times, **{f"truth_{'xy'[axis]}": blown, f"truth_{'yx'[axis]}": 0.5})
     assert measures.leaning(axis, 12.0, flight) == {"wind_offset": pytest.approx(0.1)}
     assert measures.leaning(axis, 12.0, flight.slice(0, 1200)) == {"wind_offset": pytest.approx(0.1)}
     assert measures.leaning(axis, 12.0, flight.slice(0, 1199)) == {}, "lost before the wind ended"
+
+
+def test_a_load_hurts_from_its_first_late_row_on_and_is_held_up_to_the_step_before_the_box_is_left() -> None:
+    share = np.array([0.0, 0.0, 0.05, 0.05, 0.1, 0.1, 0.15, 0.15, 0.2])
+    times = 0.01 * np.arange(len(share))
+    own = {"cpu_THIEF": np.cumsum(share * 1e4), "late_KALMAN": np.cumsum(share >= 0.1), "late_STABILIZER": 0}
+    for away, held in ((share >= 0.15, 0.1), (share > 9.0, 0.2), (share >= 0.0, np.nan)):
+        assert loads_that_hurt(log(times, truth_y=0.11 * away, **own)) == pytest.approx(
+            {"estimator_late_from": 0.1, "controller_late_from": np.inf, "held_up_to": held}, nan_ok=True
+        )
 
 
 def test_a_height_sine_is_measured_in_z() -> None:
