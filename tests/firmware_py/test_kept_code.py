@@ -89,6 +89,19 @@ def test_where_neither_folder_can_be_used_one_serves_that_ends_with_the_process(
     assert second.endswith(": in a folder that all may write: compiled code is kept elsewhere")
 
 
+def test_a_folder_that_cannot_be_written_is_not_used(
+    cache_home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = os.access  # root may write everywhere
+    monkeypatch.setattr(
+        os, "access", lambda path, mode: not str(path).startswith(str(cache_home)) and real(path, mode)
+    )
+    assert not kept_folder("c", "key").is_relative_to(cache_home)
+    assert capsys.readouterr().err == (
+        f"floaty: {cache_home / 'floaty'}: cannot be written: compiled code is kept elsewhere\n"
+    )
+
+
 def test_a_relative_folder_is_never_used(monkeypatch: pytest.MonkeyPatch, empty_folder: Path) -> None:
     monkeypatch.setenv("FLOATY_CACHE_DIR", ".")
     assert not kept_folder("c", "key").is_relative_to(empty_folder / "floaty")

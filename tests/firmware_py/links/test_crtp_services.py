@@ -696,10 +696,11 @@ def test_queues_have_the_originals_names_and_lengths(client: CrtpClient) -> None
     }  # fmt: skip
 
 
-def test_packets_to_the_board_are_counted_beyond_a_byte(client: CrtpClient, logs) -> None:
-    (before,) = client.log(logs, "radio.numRxUc")
-    for _ in range(300):
-        client.send(15, 3, b"")
+def test_packets_to_the_board_and_to_all_are_counted_beyond_a_byte(client: CrtpClient, logs) -> None:
+    names = "radio.numRxUc", "radio.numRxBc"
+    before = client.log(logs, *names)
+    for number in range(600):
+        client.firmware.radio_received(b"\xf3", broadcast=number % 2 == 1)
         client.run(client.now_us + 1_000)
-    (after,) = client.log(logs, "radio.numRxUc")
-    assert 300 <= after - before < 310
+    unicasts, broadcasts = np.subtract(client.log(logs, *names), before)
+    assert (300 <= unicasts < 310, broadcasts) == (True, 300)  # with those that ask for the log

@@ -64,6 +64,13 @@ def test_thrust_is_bitcrazes_measurement_and_torque_its_share(volts: float) -> N
     )  # crazyflow's fit beside Bitcraze's
 
 
+@pytest.mark.parametrize("motors", ["brushed", "brushless"])
+def test_a_duty_is_a_share_of_all_counts_and_no_count_is_beyond_them(motors: str) -> None:
+    body, steps = make(motors=motors), STEPS[motors]
+    body.set_counts(0, [-1, steps // 4, steps, steps + 1])
+    assert body.rotors.fields.duty.tolist() == [0.0, steps // 4 / steps, 1.0, 1.0]
+
+
 def test_hovers_at_the_voltage_at_which_four_thrusts_are_its_weight() -> None:
     body = spun_up((0.625,) * 4, hover_volts() / 0.625)
     assert body.acceleration_W == pytest.approx([0.0, 0.0, 0.0], abs=0.003)
