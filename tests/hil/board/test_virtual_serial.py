@@ -185,6 +185,7 @@ def test_wrong_bits_follow_the_binomial_law_and_are_counted(direction, rate):
 
 def test_wrong_bits_begin_and_end_in_flight():
     bench = LineWithEnds(baud=1_000_000, host_latency_us=0)
+    bench.line.downlink_bit_error_rate = 1e-12  # the next wrong bit is far away
     bench.write(0, bytes(30))
     bench.run(5_000)
     bench.line.downlink_bit_error_rate = 1.0
