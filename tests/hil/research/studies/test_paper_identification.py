@@ -57,7 +57,9 @@ def test_the_papers_method_misses_what_the_others_find(tmp_path: Path) -> None:
 
 def test_the_report_has_the_rows_of_the_identification(tmp_path: Path) -> None:
     rows = [PaperConstant("a", "230 ± 66", "230", "230", "43 ± 131", "211 ± 12", "226 ± 10")]
-    text = write_paper(tmp_path, Paper((), (), False), (), None, rows).read_text(encoding="utf-8")
+    report = write_paper(tmp_path, Paper((), (), False), (), None, rows)
+    assert report == tmp_path / "report.html"
+    text = report.read_text(encoding="utf-8")
     page = Page(text)
     assert WHY.split(":")[0].replace("'", "&#39;") in text
     assert list(page.tables["identification"][-1]) == list(astuple(rows[0]))
