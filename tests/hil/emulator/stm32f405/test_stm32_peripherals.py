@@ -1,5 +1,7 @@
 """The chip's peripherals by their registers, as ST's reference manual RM0090 has them; code only sleeps."""
 
+from struct import pack
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ pytest.importorskip("unicorn")
 
 from hil.emulator.stm32f405.chip import CYCLES_PER_US, FLASH, RAM, StopReason
 from hil.errors import LabError
-from support.stm32_bench import Bench
+from support.stm32_bench import SLEEP, Bench
 
 TIM3, I2C1, IWDG = 0x4000_0400, 0x4000_5400, 0x4000_3000
 USART6, EXTI = 0x4001_1400, 0x4001_3C00
@@ -129,6 +131,26 @@ def test_only_a_jump_that_is_taken_refills_the_pipeline() -> None:
         return int(bench.chip.state.now - bench.chip.state.sleeping)
 
     assert cycles("00d0") - cycles("00d1") == 100 * (3 - 1)  # beq is taken and skips the nop, bne is not
+
+
+@pytest.mark.parametrize(("lines", "misses"), [(3, 3), (64, 64), (65, 3 * 65)])
+def test_a_line_of_flash_waits_unless_it_is_among_the_64_used_last(lines: int, misses: int) -> None:
+    def cycles(cached: bool) -> int:
+        size = 16 * lines - 8 - len(SLEEP)  # from FLASH + 8 to the end of the last line
+        back = -size // 2 & 0x7FF  # nops; subs r1, #1; bne.w to the first
+        loop = (
+            bytes.fromhex("00bf") * (size // 2 - 3)
+            + bytes.fromhex("0139")
+            + pack("<HH", 0xF47F, 0xA800 | back)
+        )
+        bench = Bench(loop)
+        bench.chip.set_register("r1", 3)
+        if cached:
+            bench.chip.empty_flash_cache()
+        bench.wait(100)
+        return int(bench.chip.state.now - bench.chip.state.sleeping)
+
+    assert cycles(cached=True) - cycles(cached=False) == 5 * misses
 
 
 def test_an_unknown_peripheral_reads_as_0_and_is_named_once(bench: Bench) -> None:
