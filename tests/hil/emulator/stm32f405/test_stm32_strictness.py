@@ -16,7 +16,8 @@ VTOR, CCR, SHPR2, SHCSR, CPACR, MPU_CTRL = (
 GPIOA, TIM3_ARR, APB1ENR = 0x4002_0000, 0x4000_042C, 0x4002_3840
 CCM, NO_MEMORY = 0x1000_0000, 0x3000_0000
 HARD_FAULT, MEM_MANAGE, BUS_FAULT, USAGE_FAULT = 3, 4, 5, 6
-IACCVIOL, IBUSERR, PRECISERR, STKERR, BFARVALID = 1, 1 << 8, 1 << 9, 1 << 12, 1 << 15  # in CFSR
+IACCVIOL, IBUSERR, PRECISERR, BFARVALID = 1, 1 << 8, 1 << 9, 1 << 15  # in CFSR
+UNSTKERR, STKERR = 1 << 11, 1 << 12
 UNDEFINED, INVSTATE, INVPC, NOCP, UNALIGNED, DIVBYZERO = (1 << bit for bit in (16, 17, 18, 19, 24, 25))
 UNALIGN_TRP, DIV_0_TRP, STKALIGN = 1 << 3, 1 << 4, 1 << 9  # in CCR
 VECTTBL, FORCED, DEBUGEVT = 1 << 1, 1 << 30, 1 << 31  # in HFSR
@@ -425,13 +426,14 @@ INVALID_RETURNS = {  # handlers
         INVPC,
     ),  # ldr r0, [sp, #28]; adds r0, #3; str r0, [sp, #28]
     "with a frame of no Thumb code": ("0020 0790 7047", INVSTATE),  # movs r0, #0; str r0, [sp, #28]
+    "with a frame in no memory": ("80f3 0988 6ff0 020e 7047", UNSTKERR),  # msr psp, r0; mvn lr, #2
 }
 
 
 @pytest.mark.parametrize(("handler", "status"), INVALID_RETURNS.values(), ids=INVALID_RETURNS.keys())
-def test_an_invalid_return_from_an_exception_is_a_usage_fault(handler: str, status: int) -> None:
-    bench = with_handler("", handler)
-    assert bench.run() == USAGE_FAULT
+def test_an_invalid_return_from_an_exception_is_a_fault(handler: str, status: int) -> None:
+    bench = with_handler("", handler, r0=NO_MEMORY)
+    assert bench.run() == (BUS_FAULT if status == UNSTKERR else USAGE_FAULT)
     assert bench.cfsr == status
 
 
