@@ -215,6 +215,15 @@ def test_a_trial_shows_the_true_value_beside_its_target_and_the_mean_opening_eac
         assert [one[7] for one in curve.read(rows)] == pytest.approx(shown)
 
 
+def test_an_opening_is_the_mean_of_the_tenth_of_a_second_around_its_row() -> None:
+    values = np.arange(30.0) ** 2
+    smooth = trials._tenth(values)
+    assert [smooth[row] for row in (5, 12, 25)] == pytest.approx(
+        [values[row - 5 : row + 5].mean() for row in (5, 12, 25)]
+    )
+    assert (len(smooth), smooth[0]) == (30, pytest.approx(np.arange(5.0) @ np.arange(5.0) / 10))
+
+
 def trial(number: int, seconds: float) -> pa.Table:
     """A flight in which everything is `number` times as large as in the first; its first 0.1 s it is held."""
     count = round(100 * seconds)

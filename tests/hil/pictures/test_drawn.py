@@ -184,6 +184,10 @@ def test_a_swarm_has_the_path_end_and_home_of_each_robot_and_the_distance_to_its
         assert times == pytest.approx([-0.01, 0.0, 0.01])
         assert values == pytest.approx(expected[name], rel=1e-6, nan_ok=True), name
     assert [one["colour"] for one in panel["series"]] == [BLUE, ORANGE, GREEN]
+    (mirrored,) = swarm._distances(result, logs[::-1], places[::-1]).plot["panels"]
+    for number, name in enumerate(expected):
+        values = lines_of(mirrored)[f"robot {3 - number}"][1]
+        assert values == pytest.approx(expected[name], rel=1e-6, nan_ok=True), "whichever log is the shorter"
 
 
 def test_an_overload_has_the_misses_per_second_and_the_largest_error_at_each_share() -> None:

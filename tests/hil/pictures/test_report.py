@@ -30,7 +30,8 @@ from hil.laboratory.schedule import load_schedule
 from hil.pictures import curves
 from hil.pictures.figures import PICTURES, goal_moves, latency_budget
 from hil.pictures.links import link_to
-from hil.pictures.pages import library, thinned
+from hil.pictures.pages import PageFigure, embedded, library, thinned, zoomable
+from hil.pictures.panels import Interval, Marks, Panel, Plot, Series
 from hil.pictures.report import metric_rows, write_report
 from hil.pictures.timeline import story_of
 from support.html_page import Page, lines_of
@@ -310,3 +311,23 @@ def test_a_metric_without_a_value_is_a_dash_and_fails(folder: Path) -> None:
     rows = {row.name: row for row in metric_rows(read_result(folder))}
     assert (rows["rms_x"].value, rows["rms_x"].mark) == ("–", "FAILS")
     assert "rms_y" not in rows  # neither a value nor a limit
+
+
+def test_only_a_figure_with_a_time_axis_of_its_own_has_a_window_and_equal_marks_are_embedded_once() -> None:
+    marks, times = Marks((Interval("fault", 1.0, 2.0, "x"),)), np.array([0.0, 1.0])
+    both = (
+        Series("a", "red", times, times),
+        Series("b", "blue", times, -times),
+        Series("c", "red", times + 1.0, times),
+    )
+    plot = embedded(Plot((Panel("x [m]", both, least=0.5),), (0.25, 0.75)))
+    figures = [PageFigure("one", "One", "", plot=plot, marks=marks), PageFigure("two", "", "", plot=plot, alone=True),
+        PageFigure("still", "", "", source="data:"), PageFigure("three", "", "", plot=plot, marks=marks)]  # fmt: skip
+    content = zoomable(figures)["content"]
+    assert [(one["place"], one["alone"], one["window"], one["marks"]) for one in content["figures"]] == [
+        ("one", False, None, 0), ("two", True, (0.25, 0.75), 1), ("three", False, None, 0)]  # fmt: skip
+    assert content["marks"] == [dataclasses.asdict(one) for one in (marks, Marks())]
+    (panel,) = content["figures"][0]["panels"]
+    assert [len(table) for table in panel["tables"]] == [3, 2], "curves of the same instants share them"
+    assert {name: shown[0].tolist() for name, shown in lines_of(panel).items()} == {
+        "a": [0.0, 1.0], "b": [0.0, 1.0], "c": [1.0, 2.0]}  # fmt: skip

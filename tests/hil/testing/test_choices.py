@@ -199,6 +199,8 @@ def test_what_left_a_baseline_is_told_whole_and_the_first_row_that_differs(
     assert told(lost, 0.2)[:2] == ["hover", "outcome: completed | lost"]
     assert told(lost, 0.2)[-1] == "the rows are equal; the last is at 0.00 s | 0.00 s"
     assert told(replace(lost, path=kept.path), 0.2)[-1] == "1 metrics are equal."
+    kept = replace(kept, path=())
+    assert told(lost, 0.2)[-1] == "1 metrics are equal.", "a baseline over a link has no path"
 
 
 @pytest.mark.parametrize(("rows", "apart"), [(5, 10), (1000, 10), (1001, 20), (2500, 30)])
@@ -210,6 +212,12 @@ def test_a_pinned_path_has_at_most_a_hundred_rows_in_seconds_from_its_first(rows
     assert [row[0] for row in path] == pytest.approx([0.01 * n for n in range(0, rows, apart)])
     assert path[0][1:] == tuple(range(7))
     assert baselines._path_of(SimpleNamespace(free=table.slice(0, 0))) == ()  # type: ignore[arg-type]
+    for in_lockstep in (True, False):
+        request = SimpleNamespace(title="hover", bench=SimpleNamespace(in_lockstep=in_lockstep))
+        run: Any = SimpleNamespace(
+            free=table, request=request, outcome="completed", hash="h", metrics={"a": nan, "b": 1}
+        )
+        assert Pinned.of(run) == Pinned("hover", "completed", "h", {"b": 1.0}, path if in_lockstep else ())
 
 
 @pytest.mark.parametrize(("changes", "name"), [({}, []), ({"link": "mavlink"}, ["mavlink"]),

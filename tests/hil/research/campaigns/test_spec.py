@@ -6,6 +6,7 @@ import pytest
 
 from hil.research.campaigns.config import find_spec, read_spec
 from hil.research.campaigns.sampling import check_spec, draw
+from support.campaigns import spec_of
 from support.command import Cli
 
 HOVER = 'experiments = ["hover"]\nflights = 64\n'
@@ -40,6 +41,7 @@ PUSH = HOVER + '[[faults]]\nkind = "push.y"\n'
         (HOVER + "seed = -1", "seed = -1"),
         (TAU + "{ unifrom = [1, 2] }", "did you mean uniform?"),
         (TAU + "{ uniform = [2, 1] }", "expected low < high"),
+        (TAU + "{ uniform = [1, 1] }", "expected low < high"),
         (TAU + "{}", "expected one of uniform, log_uniform, normal, choice"),
         (TAU + "{ log_uniform = [0, 1] }", "expected bounds above 0"),
         (TAU + "{ normal = [0.05, 0] }", "expected a deviation above 0"),
@@ -99,3 +101,10 @@ def test_files_that_a_spec_names_begin_at_its_folder(tmp_path: Path) -> None:
     assert spec.experiments == (f"{tmp_path}/mine.py:PUSHED", "hover")
     assert spec.profiles == (f"{tmp_path}/lab.toml",)
     assert spec.board == f"{tmp_path}/cf2.elf"
+
+
+@pytest.mark.parametrize(("flights", "points"), [(11, 2), (12, 2), (13, 3)])
+def test_the_last_point_of_a_campaign_may_have_fewer_flights(flights: int, points: int) -> None:
+    """Of two experiments on three profiles."""
+    spec = spec_of(flights=flights, experiments=("hover", "y-square"), profiles=("floaty", "as-flown", "lqr"))
+    assert (spec.cells, spec.points) == (6, points)
