@@ -4,6 +4,7 @@ Nothing is written, nothing flies. `TABLE` has the words of `floaty` and what th
 """
 
 import os
+import re
 import shlex
 import socket
 import struct
@@ -296,6 +297,53 @@ def test_every_option_with_a_number_or_a_choice_names_itself_and_what_it_is_not(
     told = cli.refusal(*names, option.opts[-1], *["nonsense"] * option.nargs)
     assert option.opts[-1] in told
     assert "nonsense" in told
+
+
+SEED = "--seed 1 0..4611686018427387904, --profile floaty"
+DEFAULTS_AND_BOUNDS = f"""
+fly: {SEED}, --seeds 1 1..10000, --link radio, --board c, --gdb 0..65535, --workers 1..1024
+view: --view window
+runs: folder runs
+serve: {SEED}, --udp 0..65535, --radio-port 19840 0..65535, --gdb 0..65535, --boards 1 1..10
+station: named hover, --start 1.0 0..3600, --duration 0.., --profile floaty
+deploy check: {SEED}
+debug: --at crash, --before 1.0 0.0..3600.0, --port 3333 0..65535
+paper: --seeds 5 1..1000, --workers 1..1024
+study: --seeds 5 1..1000, --workers 1..1024
+campaign: --workers 1..1024, --shrink 0..
+tune: {SEED}, --seeds 1 1..100, --repeat 1..10, --robots 100 0..1000, --metric distance, --experiment hover, --board c
+tune: --duration 0.5..600.0, --flights 120 10..100000, --workers 1..1024
+design optimise: {SEED}, --figure least-authority, --generations 25 1..500, --updrafts (8.0, 11.0) 1..60
+design: --profile floaty, --speed 1..40, --angle 0..70, --length 1.0 0.1..10, --mass 1.0 0.01..100
+drag-model: {SEED}
+"""
+
+
+def test_options_have_their_defaults_and_bounds() -> None:
+    """Those of a profile or a folder alone, as of `param` and `replay`, are not listed."""
+
+    def words(command: click.Command, *names: str) -> Iterator[tuple[str, str]]:
+        context = click.Context(command)
+        for name in command.list_commands(context) if isinstance(command, click.Group) else ():
+            inner = command.get_command(context, name)
+            assert inner is not None
+            yield from words(inner, *names, name)
+        for option in command.params:
+            low, high = (getattr(option.type, end, None) for end in ("min", "max"))
+            bounds = "" if low is None else f" {low}..{'' if high is None else high}"
+            known = not getattr(option, "is_flag", False) and isinstance(
+                option.default, int | float | str | tuple
+            )
+            if (default := f" {option.default}" * (known and option.default != "")) or bounds:
+                yield " ".join(names), f"{option.opts[0]}{default}{bounds}"
+
+    listed = {
+        (name, word)
+        for line in DEFAULTS_AND_BOUNDS.strip().splitlines()
+        for name, rest in [line.split(": ", 1)]
+        for word in re.split(r", (?=--)", rest)
+    }
+    assert {one for one in words(app) if one[1] != "--profile floaty" or one[0] in dict(listed)} == listed
 
 
 def test_a_name_that_is_no_text_is_one_line(cli: Cli) -> None:
