@@ -7,6 +7,7 @@ import subprocess
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import matplotlib
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 import hil
 from hil import Along, Experiment, Kind, LabError, Metric, Request, Run, fly, knob, load_run
-from hil.api import command_of, request_of
+from hil.api import Swarm, command_of, request_of
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.files.recorder import load_log
@@ -242,3 +243,21 @@ def test_a_former_module_names_its_place() -> None:
         assert name in former
         import_module(now)
         assert hil.__file__ != import_module(now).__file__
+
+
+@pytest.mark.parametrize(("robots", "limit", "words"), [
+    ((True, True), True, "all limits hold"), ((True, False, False), True, "robot 2; robot 3"),
+    ((False, True), False, "robot 1; too near"),
+])  # fmt: skip
+def test_a_swarm_names_the_robots_that_failed_by_their_folders_numbers(
+    robots: tuple[bool, ...], limit: bool, words: str
+) -> None:
+    class Limit(SimpleNamespace):
+        def __str__(self) -> str:
+            return "too near"
+
+    result: Any = SimpleNamespace(
+        robots=tuple(SimpleNamespace(passed=one) for one in robots), verdicts=(Limit(holds=limit),), folder="f",
+        request=SimpleNamespace(title="t"),
+    )  # fmt: skip
+    assert repr(Swarm(result)) == f"<t: {words}; f>"

@@ -20,6 +20,7 @@ from ground_station.errors import LinkError
 from hil.commands import fly, identify, paper, param
 from hil.config import load_config
 from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.metric_pairs import MetricPair
 from hil.laboratory.replay import Misses
 from hil.research.campaigns.run import Runner
 from hil.research.design import analysis
@@ -437,6 +438,35 @@ def test_a_flight_is_written_drawn_traced_printed_and_its_viewer_stays_until_it_
     assert told.out.splitlines() == ["this machine was too slow: time stood still for 12 ms", "processor time:", "  cpu.txt",
         "  cpu.folded", "coverage: 9 of 10", "  cov.info", "  cov.html"]  # fmt: skip
     assert told.err == "the flight can be viewed until Ctrl-C\n" * len(stays)
+
+
+@pytest.mark.parametrize(
+    ("flown", "outcome", "value", "code", "told"),
+    [
+        (0, "completed", 1.05, 0, "within 10 % of before"),
+        (1, "completed", 0.95, 1, "within 10 % of before"),
+        (1, "lost", 1.0, 1, "left before by more than 10 %: outcome completed | lost"),
+        (0, "completed", 1.2, 1, "left before by more than 10 %: rms"),
+        (130, "interrupted", 2.0, 130, ""),
+    ],
+)
+def test_a_flight_with_a_baseline_fails_by_its_limits_its_outcome_and_its_metrics(
+    cli: Cli, asked: Asked, flown: int, outcome: str, value: float, code: int, told: str
+) -> None:
+    asked.answer({
+        "commands.fly._fly_one": flown, "laboratory.files.folder.reserved": lambda *what: nullcontext(),
+        "commands.fly._flown": Made(result=Made(folder="before", outcome="completed")),
+        "laboratory.experiments.finder_of": "finder", "pictures.compare.load_flown": Made(result=Made(outcome=outcome)),
+        "pictures.compare.compare": Made(
+            metrics=[MetricPair("same", "cm", (2.0, 2.0)), MetricPair("rms", "cm", (1.0, value))]
+        ),
+        "commands.compare.print_comparison": None,
+    })  # fmt: skip
+    assert cli("fly", "hover", "--baseline", "b", "--out", "now") == code
+    assert cli.out.splitlines()[-1:] == [told][: bool(told)]
+    names = [one[0] for one in asked]
+    assert names.index("_flown") < names.index("_fly_one")
+    assert ("print_comparison" in names) == told.startswith("left")
 
 
 def test_a_replay_prints_what_each_estimate_missed_in_the_units_of_its_rows(cli: Cli, asked: Asked) -> None:

@@ -39,6 +39,8 @@ fly hover --resume | --workers, --cluster and --resume are for several --seeds
 fly hover --gdb 3333 | --gdb 3333: needs one flight with an image as --board
 fly hover --bogus | No such option
 fly hover --robots 2 --view | --robots 2: --view: not for robots that fly together
+fly hover --robots 2 --seeds 2 --baseline b | --baseline b: is for one seed
+fly hover --robots 2 --resume --baseline b | --robots 2: --seeds, --workers, --cluster, --resume, --baseline: not for robots
 fly hover --robots 2 --link udp://127.0.0.1:1 | --link udp://127.0.0.1:1: --robots is for flights in lockstep
 fly hover --link RADIO --seeds 2 | --seeds is for flights in lockstep
 fly hover --link udp://127.0.0.1:1 --board python | only c flies over a link

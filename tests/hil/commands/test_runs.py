@@ -17,7 +17,9 @@ def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("hil.commands.listing.console._width", 80)
 
 
-def test_runs_are_listed_with_date_request_verdict_and_hash(cli: Cli) -> None:
+def test_runs_are_listed_with_date_request_verdict_and_hash(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = fly("hover", duration_s=0.1, profile="as-flown", faults=["push.y@0=1"])
     shutil.copytree(run.folder, "runs/deep/[broken]")
     Path("runs/deep/[broken]/result.json").write_text("{}")
@@ -33,6 +35,11 @@ def test_runs_are_listed_with_date_request_verdict_and_hash(cli: Cli) -> None:
     assert "foreign" not in text
     assert "deep/[broken]" in text.replace(" ", "")
     assert "missing" in text
+    monkeypatch.setattr("hil.commands.listing.console._width", 400)
+    assert cli("runs") == 0
+    heading, sound, broken = cli.out.splitlines()
+    assert sound[heading.index("verdict") :].split() == ["ok", run.hash[:12]]
+    assert broken[heading.index("verdict") :].startswith("experiment is missing")
 
 
 @pytest.mark.parametrize("command", ["report", "view"])
@@ -51,3 +58,23 @@ def test_a_file_that_cannot_be_written_is_one_line(cli: Cli, command: tuple[str,
     said = cli.refusal(*command, run.folder)
     assert said.startswith(f"floaty: RUN {run.folder}: cannot be written (")
     assert "s a directory" in said
+
+
+def test_pages_with_all_words_are_listed_by_their_best_line_then_by_their_lines(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    pages = {
+        "tutorials/often": "# Often\nred\nblue\nred\nblue\nred\n", "tutorials/half": "# Half\nred\n",
+        "howto/once": "# Once\nRed-Blue\n", "reference/best": "# Best\nred\n  blue\nred blue\nred\nblue\n",
+    }  # fmt: skip
+    for name, text in pages.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / f"{name}.md").write_text(text, encoding="utf-8")
+    monkeypatch.setattr("hil.commands.listing.FOLDERS", (tmp_path / "none", tmp_path))
+    assert cli("docs", "red", "blue") == 0
+    assert cli.out.splitlines() == [
+        "best  Best", "    red", "    blue", "    red blue", "once  Once", "    Red-Blue",
+        "often  Often", "    red", "    blue", "    red",
+    ]  # fmt: skip
+    assert cli("docs") == 0
+    assert cli.out.split()[:8:2] == ["half", "often", "once", "best"]

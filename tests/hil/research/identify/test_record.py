@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ground_station.telemetry_log import POSE_COLUMNS, TIME_COLUMN
 from hil.config import LabConfig, load_config
 from hil.errors import LabError
-from hil.research.design.axes import DELAY, PITCH, ROLL, Axis, dynamics, robot_of
+from hil.research.design.axes import DELAY, PITCH, ROLL, YAW, Axis, dynamics, robot_of
 from hil.research.design.loop import FREQUENCIES
 from hil.research.identify import spectra
 from hil.research.identify.flow import flow_of
@@ -31,7 +31,15 @@ from hil.research.identify.identify import (
     interval_text,
     operating_point,
 )
-from hil.research.identify.joint import LATE_S, Estimate, Excited, identities, pose_lateness, whitened
+from hil.research.identify.joint import (
+    LATE_S,
+    Estimate,
+    Excited,
+    JointFit,
+    identities,
+    pose_lateness,
+    whitened,
+)
 from hil.research.identify.pages import _identity, _one_step, _period, _responses, write_pages
 from hil.research.identify.plates import plant_of, straightened, turns_of
 from hil.research.identify.record import (
@@ -43,7 +51,7 @@ from hil.research.identify.record import (
     Record,
     load_record,
 )
-from hil.research.identify.response import TICK_DELAYS_S, flap_response, one_step, response
+from hil.research.identify.response import LAG, TICK_DELAYS_S, flap_response, one_step, outputs, response
 from hil.research.identify.two_controllers import closed_loop
 from hil.world.floaty.correction import OperatingPoint
 
@@ -75,6 +83,7 @@ def test_a_hundred_rows_of_flight_are_enough_and_one_less_is_not(tmp_path: Path)
     assert len(record.t) == 100
     assert record.lost_rows == pytest.approx(0.0, abs=1e-12)
     assert record.period_s == pytest.approx(0.02)
+    assert record.u_t - record.mean_t == pytest.approx(np.full(100, 0.005))
     with pytest.raises(LabError, match="99 rows of flight under control; identification needs 100"):
         loaded(tmp_path, columns(99))
 
@@ -262,6 +271,29 @@ def test_a_record_of_exactly_as_many_realisations_as_needed_is_used(period_s: fl
         spectra.windows(excited(enough - period_s, period_s, begin_s))
 
 
+def test_the_slopes_of_the_joint_fit_are_those_of_its_errors() -> None:
+    """Of roll in two records and of yaw in the second; every parameter counts, also in what is known."""
+    rng, w = np.random.default_rng(3), 2 * np.pi * np.array([0.5, 2.0])
+    excited_axes = []
+    for axis, record in ((ROLL, 1), (YAW, 4), (ROLL, 4)):
+        count = 1 + len(outputs(axis))
+        Z = rng.normal(size=(2, count)) + 1j * rng.normal(size=(2, count))
+        C = np.tile(np.eye(count, dtype=complex), (2, 1, 1))
+        excited_axes.append(
+            Excited(axis, record, spectra.Spectra(w, Z, C, Z[None], Z[:, 0], np.ones((2, count))))
+        )
+    names = [*ROLL.constants, *YAW.constants, LAG, DELAY]
+    values = CONFIG.model.model_dump()
+    x = 1.0 + 0.1 * rng.random(len(names) + 2)
+    scale = np.array([*(values.get(name, 1.0) for name in names[:-2]), 0.05, 0.013, 0.003, 0.003])
+    fit = JointFit(excited_axes, names, [1, 4], scale, 0.05, lambda values: [values[names[0]] * values[LAG]])
+    steps = 1e-5 * np.eye(len(x))
+    expected = np.stack([(fit.errors(x + step) - fit.errors(x - step)) / 2e-5 for step in steps], axis=1)
+    assert np.abs(expected).max(axis=0).min() > 0.001
+    assert fit.slopes(x) == pytest.approx(expected, rel=1e-3, abs=1e-3)
+    assert [len(one) for one in (fit.errors(x), fit.prior(x))] == [expected.shape[0], 2 + 2 + 1]
+
+
 def test_the_covariance_of_the_mean_is_that_of_numpy_over_the_lines_around() -> None:
     rng, count, lines = np.random.default_rng(1), 5, 12
     P = rng.normal(size=(count, lines, 17)) + 1j * rng.normal(size=(count, lines, 17))
@@ -354,6 +386,24 @@ def test_a_constant_is_as_certain_as_its_interval_is_narrow(sign: float, share: 
     value = 0.0 if share == np.inf else 64.0 * sign
     found = constant((value, 64.0 * min(share, 1.0)))
     assert _verdict(found, Evidence(1.0, 0.0, 1.0), 64.0)[0] == verdict
+
+
+@pytest.mark.parametrize(
+    ("share", "usual", "verdict"),
+    [
+        (0.1, -6.3, WEAK),
+        (0.5, 6.3, WEAK),
+        (0.8, 6.3, UNKNOWN),
+        (0.1, 6.4, IDENTIFIED),
+        (0.1, np.nan, IDENTIFIED),
+    ],
+)
+def test_a_value_far_from_the_profile_s_is_not_believed_however_narrow(
+    share: float, usual: float, verdict: str
+) -> None:
+    assert _verdict(constant((64.0, 64.0 * share)), Evidence(1.0, 0.0, 1.0), usual)[0] == verdict
+    why = _verdict(constant((64.0, 64.0 * share)), Evidence(1.0, 0.0, 1.0), usual)[1]
+    assert ("more than 10 times the profile's" in why) == (verdict == WEAK)
 
 
 def constant(
