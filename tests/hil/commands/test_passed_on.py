@@ -141,8 +141,12 @@ def test_parameters_are_asked_for_in_turn_and_the_first_refusal_ends_it(
     monkeypatch.setattr(param, "_ask", lambda wanted, **board: asked.append(wanted[0]) or [[("a", 1.0)]])
     assert (cli("param", "save", "--link", "udp://1.1.1.1:1"), cli.out) == (0, "saved\n")
     assert asked[-1].action is ControlAction.SAVE
-    told = cli.refusal("param", "list", "b", "--link", "udp://1.1.1.1:1")
-    assert "b: no parameter of the board begins with that" in told
+    monkeypatch.setattr(
+        param, "_ask", lambda wanted, **board: [[("ab.c", 1.0), ("Abc", -0.25), ("b.ab", 3.0)]]
+    )
+    assert (cli("param", "list", "aB", "--link", "udp://1.1.1.1:1"), cli.out) == (0, "ab.c 1\nAbc -0.25\n")
+    told = cli.refusal("param", "list", "c", "--link", "udp://1.1.1.1:1")
+    assert "c: no parameter of the board begins with that" in told
 
 
 SPEC = """

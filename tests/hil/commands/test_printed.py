@@ -8,10 +8,11 @@ from types import SimpleNamespace as Made
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from scipy.stats import binomtest
 
-from hil.commands import compare, deploy, identify, listing, paper, serve, station, tables
+from hil.commands import compare, deploy, identify, listing, paper, pictures, serve, station, tables
 from hil.commands import options as common
 from hil.config import load_config
 from hil.errors import LabError
@@ -168,6 +169,24 @@ def test_two_boards_are_a_row_per_seed_and_the_largest_of_all(printed: Any) -> N
         "0.071 s motor.m1", "radio"], ["2", "1.100 2.000 3.000", "1.100 2.000 3.000", "3.50", "52 | 53",
         "equal", ""], "2 seeds: rms errors within 25.0 % of the first's, bodies within 3.50 mm"]  # fmt: skip
     assert compare._print_seeds(Path("a"), Path("b"), seeds[1:]) == 0
+
+
+def test_columns_of_a_foreign_log_are_a_row_each_but_those_that_keep_their_names(printed: Any) -> None:
+    def field(unit: str) -> Any:
+        return pa.field(unit, pa.float64(), metadata={"unit": unit})
+
+    names = {"t": "s", "x": "m", "none": "rad", "same": "V"}
+    values = [[2e6, 3e6, 4.5e6], [2.0, nan, -0.25], [nan] * 3, [7.0] * 3]
+    schema = pa.schema([field(unit).with_name(name) for name, unit in names.items()])
+    log = pa.table(values, schema=schema)
+    columns = {"t": "time", "x": "px", "none": "n", "same": "same [mV]", "left": "away [m]"}
+    pictures._print_map(Made(log=log, map=Made(columns=columns, profile="p")))
+    *rows, last = printed()
+    assert [row for row in rows if row] == [
+        ["column", "from", "least", "largest", "unit"], ["t", "time", "2e+06", "4.5e+06", "s"],
+        ["x", "px", "-0.25", "2", "m"], ["none", "n", "", "", "rad"], ["left", "away [m]", "", "", ""],
+    ]  # fmt: skip
+    assert last == "3 rows, 2.500 s, profile p; to correct it: --map, a copy of map.toml"
 
 
 def test_faults_are_listed_with_their_sizes_bounds_and_times(printed: Any) -> None:

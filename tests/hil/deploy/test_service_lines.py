@@ -183,8 +183,8 @@ def test_a_pose_is_sent_as_the_client_of_its_kind_sends_it() -> None:
 
 def test_goals_of_two_boards_are_compared_with_those_of_the_instants_around() -> None:
     path = [(0.1 * n, 0.0, 1.0, 0.0) for n in range(5)]
-    late = [path[0], *path[:-1]]
-    assert list(differences(Answers([], path), Answers([], late))) == []
+    for other in ([path[0], *path[:-1]], [*path[1:], path[-1]]):
+        assert list(differences(Answers([], path), Answers([], other))) == []
     assert list(differences(Answers([], path), Answers([], [path[0], path[0], path[0], path[3],
         path[4]]))) == [f"goal {path[0]} after 0.4 s, expected {path[2]}"]  # fmt: skip
     assert list(differences(Answers(["arm: 01"]), Answers(["arm: 02"]))) == ["arm: 02, expected 01"]

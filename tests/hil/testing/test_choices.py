@@ -44,6 +44,8 @@ def test_a_name_tells_only_what_differs_between_the_choices() -> None:
     assert [name_of(one, two) for one in two] == ["seed1", "seed2"]
     boards = [choice(1, "c"), choice(1, "python")]
     assert [name_of(one, boards) for one in boards] == ["c", "python"]
+    three = [choice(1), choice(2), choice(1, "python")]
+    assert [name_of(one, three) for one in three] == ["c-seed1", "c-seed2", "python-seed1"]
     assert name_of(choice(), [choice()]) == ""
     faulty: list[Options] = [{**choice(), "faults": ("push.y@1=1", "push.x@2=1")}, {**choice(), "faults": ()}]
     assert [name_of(one, faulty) for one in faulty] == ["push.y@1=1+push.x@2=1", "no-fault"]
