@@ -520,18 +520,22 @@ def test_flights_of_a_failed_test_are_drawn_once_and_named_where_kept(
         def test_it(floaty, late):
             flight = floaty.fly(Experiment("mine", "", 0.05, {}))
             assert flight is None
+
+        def test_end(floaty, late):
+            floaty.fly(Experiment("mine", "", 0.05, {}))
         """
     )
     (pytester.path / "below").mkdir()
     monkeypatch.chdir(pytester.path / "below")
     options = ("--floaty-board=c", "--floaty-profile=as-flown, ", "--floaty-seeds=1", f"--floaty-keep={keep}")
     result = pytester.runpytest_inprocess("..", "--rootdir=..", *options)
-    result.assert_outcomes(failed=1, errors=1)
+    result.assert_outcomes(failed=1, passed=1, errors=2)
     shown = result.stdout.str()
-    assert len(drawn) == (keep != "none"), "the second report of a test draws nothing"
-    assert shown.count("folder   runs/pytest/") == (2 if keep == "failed" else 0)
+    assert len(drawn) == 2 * (keep != "none"), "the second report of a test draws nothing"
+    assert shown.count("folder   runs/pytest/") == (3 if keep == "failed" else 0)
+    assert len(kept(pytester)) == 2 * (keep == "failed"), "also of a test that only ends badly"
     again = "pytest --floaty-board=c '--floaty-profile=as-flown, ' --floaty-seeds=1 '"
-    assert shown.count(again) == shown.count(f"(paths are relative to {pytester.path})") == 2
+    assert shown.count(again) == shown.count(f"(paths are relative to {pytester.path})") == 3
     assert (re.search(r"<mine, seed 1: .*; .*>", shown) is not None) == (keep == "failed")
 
 
