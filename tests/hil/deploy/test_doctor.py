@@ -218,7 +218,8 @@ def test_a_link_that_repeats_more_than_a_tenth_of_the_packets_gets_advice(
     monkeypatch: pytest.MonkeyPatch, repeated: int, advice: str
 ) -> None:
     client: Any = SimpleNamespace(repeated=5)
-    times = iter([*(us for n in range(100) for us in (0, 1000 * (1 + n))), 0, 2_000_000])
+    trips_ms = [300, *(1 + 37 * n % 100 for n in range(1, 100))]  # neither in order nor symmetric
+    times = iter([*(us for ms in trips_ms for us in (0, 1000 * ms)), 0, 2_000_000])
     monkeypatch.setattr(doctor, "clock_us", lambda: next(times))
 
     def execute(asked: list[Any]) -> None:
@@ -226,7 +227,7 @@ def test_a_link_that_repeats_more_than_a_tenth_of_the_packets_gets_advice(
 
     client.execute = execute
     expected = (
-        f"round trip 50.5 ms, the longest 100.0; 300 packets/s each way, {repeated} of 600 repeated{advice}"
+        f"round trip 51.5 ms, the longest 300.0; 300 packets/s each way, {repeated} of 600 repeated{advice}"
     )
     assert doctor._link(client, 50.0) == doctor.Finding("link", expected)
 
