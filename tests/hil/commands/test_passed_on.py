@@ -18,6 +18,7 @@ from firmware_py.policy.measuring import LawFigures
 from ground_station.controls import ControlAction, ControlsError
 from ground_station.errors import LinkError
 from hil.commands import fly, identify, paper, param
+from hil.commands.options import say
 from hil.config import load_config
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.metric_pairs import MetricPair
@@ -471,6 +472,55 @@ def test_a_flight_with_a_baseline_fails_by_its_limits_its_outcome_and_its_metric
     names = [one[0] for one in asked]
     assert names.index("_flown") < names.index("_fly_one")
     assert ("print_comparison" in names) == told.startswith("left")
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ((), ("show", "recording of x")), (("--at", "0"), ("show_at", Path("x"), 0.0)),
+        (("--view", "web"), ("browse", Path("x"), 0.0, say)),
+        (("--view", "web", "--at", "-1.5"), ("browse", Path("x"), -1.5, say)),
+    ],
+)  # fmt: skip
+def test_a_recording_is_shown_where_and_at_the_time_that_was_asked_for(
+    cli: Cli, asked: Asked, words: tuple[str, ...], expected: tuple[Any, ...]
+) -> None:
+    asked.answer({
+        "live.recording.browse": None, "live.recording.show_at": None, "commands.pictures.show": None,
+        "pictures.viewer.recording.recording_of": lambda run: f"recording of {run}",
+    })  # fmt: skip
+    assert cli("view", "x", *words) == 0
+    assert asked[-1] == expected
+
+
+@pytest.mark.parametrize("identical", [True, False])
+def test_logs_are_identical_only_with_the_same_columns(cli: Cli, asked: Asked, identical: bool) -> None:
+    comparison = Made(identical=identical, first=None, unmeasured=("own.py:turn",))
+    asked.answer({
+        "pictures.compare.load_flown": lambda folder, find: f"flown {folder}", "pictures.compare.compare": comparison,
+        "research.studies.two_boards.comparable": False, "pictures.compare.write_comparison": "page",
+        "commands.compare.print_comparison": None,
+    })  # fmt: skip
+    assert cli("compare", "a", "b") == (0 if identical else 1)
+    assert ("write_comparison", Path("b"), "flown a", "flown b", comparison, ()) in asked
+    assert (cli.out, cli.err.count("'--experiment own.py:turn' executes it")) == ("  page\n", 1)
+
+
+def test_a_robot_of_another_size_is_analysed_and_written_as_a_profile_of_its_length(
+    cli: Cli, asked: Asked
+) -> None:
+    asked.answer({
+        "commands.design.point_of": "point", "commands.design.write_profile": None, "commands.design.show": None,
+        "research.design.analysis.analyse": "found", "research.design.analysis.write": "page",
+    })  # fmt: skip
+    words = ("--length", "2", "--mass", "3", "--write", "own.toml", "--out", "o", "--set", "a.b=1")
+    assert cli("design", "--angle", "40", *words) == 0
+    about = "The robot of floaty, lengths times 2, masses times 3."
+    assert asked == [
+        ("point_of", "floaty", ("a.b=1",), None, 40.0, 2.0, 3.0), ("write_profile", "point", Path("own.toml"), about, 2.0),
+        ("analyse", "point"), ("write", "found", Path("o")), ("show", "found"),
+    ]  # fmt: skip
+    assert cli.out == "report  page\n"
 
 
 def test_a_replay_prints_what_each_estimate_missed_in_the_units_of_its_rows(cli: Cli, asked: Asked) -> None:
