@@ -267,6 +267,23 @@ def test_an_age_of_the_pose_delays_the_observation_of_the_cameras_alone() -> Non
     np.testing.assert_array_equal(old[:, 9:], fresh[:, 9:])
 
 
+def test_the_fast_model_shows_distance_and_velocity_along_its_heading_wherever_the_goal_looks() -> None:
+    quiet: Any = {"overrides": STILL, "errors": EstimateErrors(0.0, 0.0, 0.0, 0.0)}
+    env = make_env("Track", **quiet)
+    assert isinstance(env, FastEnv)
+    env.reset(seed=11)
+    amplitude, hertz = env._fleet._memory[-1]["path"][0]
+    home = np.array([*load_config().flight.home, 0.0])
+    for action in actions(60, 0.3):
+        seen, body = env.step(action)[0], env.truth.body.fields
+        goal = home + amplitude * np.sin(2e-6 * np.pi * hertz * body.time_us)
+        yaw = Rotation.from_quat(body.q_WB, scalar_first=True).as_euler("ZYX")[0]
+        expected = Rotation.from_euler("Z", yaw).apply([goal[:3] - body.p_WB, body.v_WB], inverse=True)
+        assert seen[8] == pytest.approx(goal[3] - yaw, abs=2e-6)
+        assert seen[:6].reshape(2, 3) == pytest.approx(expected, abs=2e-6)
+    assert abs(goal[3]) > 0.1
+
+
 def test_errors_of_the_estimate_have_their_sizes_from_the_start_on_and_last_their_time() -> None:
     """As the difference from a flight without errors: of 300 robots after each of 40 steps."""
     errors = hil.research.learn.EstimateErrors(0.002, 0.03, 0.005, 0.07, tau_s=0.08)
