@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from firmware_py.errors import FirmwareError
 from firmware_py.policy.measuring import LawFigures
 from ground_station.controls import ControlAction, ControlsError
 from ground_station.errors import LinkError
@@ -46,7 +47,7 @@ class Asked(list[Any]):
     def answer(self, answers: Mapping[str, Any]) -> None:
         """Note the calls of functions of `hil`, and return an answer each."""
         places = {
-            one if one.startswith("ground_station") else f"hil.{one}": answer
+            one if one.startswith(("ground_station", "firmware_py")) else f"hil.{one}": answer
             for one, answer in answers.items()
         }
         for (
@@ -76,7 +77,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[Asked]:
     kept = {
         f"{module}.{name}"
         for module, content in [*sys.modules.items()]
-        if module.startswith(("hil.", "ground_station."))
+        if module.startswith(("hil.", "ground_station.", "firmware_py."))
         for name, value in vars(content).items()
         if any(value is one for one in asked.patched.values())
     }
@@ -491,6 +492,24 @@ def test_a_recording_is_shown_where_and_at_the_time_that_was_asked_for(
     })  # fmt: skip
     assert cli("view", "x", *words) == 0
     assert asked[-1] == expected
+
+
+def test_each_file_of_own_logic_that_can_fly_is_a_line_and_one_refusal_is_enough(
+    cli: Cli, asked: Asked
+) -> None:
+    def checked(file: Path) -> Any:
+        if file.name == "bad.py":
+            raise FirmwareError("bad.py:3: one\nbad.py:4: two")
+        point = Made(name="controller")
+        return Made(plugs=[Made(point=point, hooks=("begin", "act"), parameters=range(int(file.stem)))])
+
+    asked.answer({"firmware_py.logic.loading.check_file": checked})
+    for name in ("0.py", "bad.py", "1.py", "2.py"):
+        Path(name).touch()
+    words = [f"{n}.py: ok (controller: begin, act; {n} parameter{s})" for n, s in enumerate(("s", "", "s"))]
+    assert (cli("check", "0.py", "1.py"), cli.out.splitlines()) == (0, words[:2])
+    assert (cli("check", "0.py", "bad.py", "1.py", "2.py"), cli.out.splitlines()) == (2, words)
+    assert cli.err.splitlines() == ["bad.py:3: one", "bad.py:4: two"]
 
 
 @pytest.mark.parametrize("identical", [True, False])
