@@ -183,6 +183,7 @@ def test_a_viewer_is_opened_once_when_it_is_asked_for_and_gets_the_rows_from_the
     panel.wants_viewer = True
     panel.show_rows(rows, iter([event]))
     assert not panel.wants_viewer
+    panel.wants_viewer = True  # asked for again by another page
     panel.show_rows(rows, [])
     assert shown == ["web", (rows, [event]), (rows, [])]
     assert told == [{"texts": ["lab: x"]}, {"texts": ["lab: x"], "viewer": "http://viewer"}, {"texts": []}]

@@ -5,8 +5,10 @@ import signal
 import socket
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
+from typing import IO
 
 import pytest
 
@@ -50,6 +52,20 @@ def test_a_missing_display_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path
             match=r"^the viewer needs a display, and this computer has none; in a browser: floaty view RUN --view web",
         ):
             opens()
+
+
+@pytest.mark.parametrize("code", [0, 1, -signal.SIGTERM])
+def test_a_window_that_is_closed_or_killed_is_no_error(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+    def run(words: list[str], *, env: object, stderr: IO[bytes], check: bool) -> SimpleNamespace:
+        assert words == [*window.COMMAND, "--port", "7", "x.rrd"]
+        stderr.write(b"first\nno GPU\n")
+        return SimpleNamespace(returncode=code)
+
+    monkeypatch.setattr(window, "_require_display", lambda: None)
+    monkeypatch.setattr(window.subprocess, "run", run)
+    refused = pytest.raises(LabError, match=r"^x\.rrd: the viewer ended with code 1 \(no GPU\)$")
+    with refused if code > 0 else nullcontext():
+        show("x.rrd", "--port", "7")
 
 
 def test_a_port_that_is_taken_gives_way_to_one_that_is_free() -> None:
