@@ -166,6 +166,7 @@ def test_conditions_are_positive_where_the_robot_is_stable_and_steers(name: str)
         ((5, 6, 7, 8), (5, 8)),
         ((0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12), (0, 12)),
         ((0, 1, 4, 6, 7, 9), (6, 7)),
+        ((4, 6, 7, 8, 9, 10, 11, 12), (6, 12)),
         ((0, 1, 2, 3, 4, 5, 7, 8, 9), (math.nan, math.nan)),
     ],
 )
