@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
@@ -53,7 +54,7 @@ class Requests:
 
 
 NO_REQUESTS = Requests()
-NO_SENSORS: Mapping[str, F32s] = {}
+NO_SENSORS: Mapping[str, F32s] = MappingProxyType({})
 
 
 class VirtualBoard:

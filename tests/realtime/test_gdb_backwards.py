@@ -1,8 +1,10 @@
-"""Time that runs backwards under GDB: the commands of docs/howto/debug.md."""
+"""Time that runs backwards under GDB: the commands of docs/howto/debug.md, and what remains of a flight's processes."""
 
 import json
+import os
 import re
 import shutil
+import signal
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -85,6 +87,50 @@ def test_the_page_s_commands_find_what_was_planted(
         json.loads((path / "result.json").read_text()) for path in (flown, tmp_path / "flown-debug")
     )
     assert first["hash"] == second["hash"]
+
+
+def processes_of(folder: Path) -> list[int]:
+    """Return the processes whose command line names a folder."""
+    found = []
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            if (
+                os.fsencode(folder) in (place / "cmdline").read_bytes()
+                and b"Z" not in (place / "stat").read_bytes()
+            ):
+                found.append(int(place.name))
+        except OSError:
+            continue
+    return found
+
+
+@pytest.mark.parametrize("how", ["kill", "ctrl-c", "detach", "gdb is killed"])
+def test_no_process_outlives_the_flight(tmp_path: Path, how: str) -> None:
+    elf, out = stm32_firmware.build("gcc"), tmp_path / "flown"
+    command = ("fly", "hover", "--duration", "0.5", "--board", str(elf), "--gdb", "0", "--out", str(out))
+    back = ("break send_line", "continue 30", "reverse-continue")
+    end = (
+        ("detach",)
+        if how == "detach"
+        else ("delete", "watch nobody", "shell touch " + str(tmp_path / "there"), "continue")
+    )
+    with waiting(*command) as (flight, address):
+        debugger = gdb(address, elf, *back, *end)
+        if how == "detach":
+            debugger.communicate(timeout=60)
+        else:
+            while not (tmp_path / "there").exists():
+                assert debugger.poll() is None
+            assert len(processes_of(out)) >= 3  # the first, the flying one, a checkpoint
+            if how == "gdb is killed":
+                debugger.kill()
+            else:
+                flight.send_signal(signal.SIGKILL if how == "kill" else signal.SIGINT)
+        flight.communicate(timeout=60)  # its end, and that of all who have its standard output
+        debugger.kill()
+        debugger.communicate()
+    assert flight.returncode == {"kill": -signal.SIGKILL, "ctrl-c": 130}.get(how, 1)
+    assert processes_of(out) == []
 
 
 def test_what_is_counted_goes_back_with_time(tmp_path: Path) -> None:

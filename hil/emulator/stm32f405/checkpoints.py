@@ -172,20 +172,20 @@ def _wait(pid: int, told: int, kept: set[int]) -> NoReturn:
                 flying = int(words[-1])
         return flying
 
-    def pass_on(number: int, _: object) -> None:
-        with suppress(ProcessLookupError):
-            os.kill(newest(), number)
-
     os.set_blocking(told, False)
-    signal.signal(signal.SIGINT, pass_on)
+    signals = {signal.SIGINT, signal.SIGCHLD}
+    signal.pthread_sigmask(signal.SIG_BLOCK, signals)  # none is missed just before the wait for it
     for number in map(int, os.listdir("/proc/self/fd")):
         if number > 2 and number not in kept:
             with suppress(OSError):
                 os.close(number)
     while True:
-        ended, status = os.waitpid(-1, 0)
-        if ended == newest():
+        ended, status = os.waitpid(-1, os.WNOHANG)
+        if ended and ended == newest():
             os._exit(KILLED + os.WTERMSIG(status) if os.WIFSIGNALED(status) else os.WEXITSTATUS(status))
+        if not ended and signal.sigwait(signals) == signal.SIGINT:
+            with suppress(ProcessLookupError):
+                os.kill(newest(), signal.SIGINT)
 
 
 def _awaited(line: socket.socket, life: int) -> Message:

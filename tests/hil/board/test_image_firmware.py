@@ -157,7 +157,7 @@ def test_what_the_robot_s_own_sensors_measure_is_in_the_app_s_memory_with_each_s
     layout = logic.loaded.structs[field.block].dtype
     firmware = booted(image_with(**{f"floaty_{field.block}": layout.itemsize}), logic)
     for measured in ((1.0, 2.0), (3.0, 4.0)):
-        firmware._board.sensors[field.name] = np.array(measured, np.float32)
+        firmware._board.sensors = {field.name: np.array(measured, np.float32)}
         firmware.imu_ready()
         there = firmware.chip.read(PLACE, layout.itemsize)
         assert np.frombuffer(there, layout)[field.name][0].tolist() == list(measured)

@@ -156,6 +156,7 @@ class Flight:
         self.pid = os.fork()
         if not self.pid:
             code = 1
+            signal.signal(signal.SIGINT, signal.default_int_handler)  # also where it is ignored, as by nohup
             try:
                 for number, *_ in _written_files():  # the tests' own, which never go back
                     os.close(number)
