@@ -173,3 +173,21 @@ def test_the_smallest_and_the_largest_angle_of_the_flaps_are_logged(bench: Firmw
     bench.firmware._core.control.fields.flap[:] = (0.25, -0.5, 0.125, 0.75)
     read = {variable.name: variable.read for variable in bench.firmware.variables}
     assert [read[f"motors_ctrp.{name}_angle"]() for name in ("min", "max")] == [-0.5, 0.75]
+
+
+def test_a_report_has_the_priority_of_its_task_also_while_that_waits(bench: FirmwareBench) -> None:
+    """Those of Bitcraze's config.h, but for the app."""
+    bench.run(50_000)
+    told = {report.name: report.priority for report in bench.firmware.reports()}
+    named = {
+        "STABILIZER": 5,
+        "SENSORS": 4,
+        "SYSLINK": 3,
+        "CRTP-TX": 2,
+        "CRTP-RX": 2,
+        "KALMAN": 2,
+        "LOG": 1,
+        "PARAM": 1,
+        "MEM": 1,
+    }
+    assert told == dict.fromkeys(told, 0) | named

@@ -102,6 +102,14 @@ def cycles_of(name: str, operands: str) -> int:
     return next(CYCLES[stem] for suffix in CONDITIONS if (stem := name.removesuffix(suffix)) in CYCLES)
 
 
+@pytest.mark.parametrize(
+    ("code", "cycles"), [("91ed000a", 2), ("91ed000b", 3), ("81ed000b", 3), ("2ded048b", 5)],
+    ids=["vldr s0", "vldr d0", "vstr d0", "vpush d8-d9"],
+)  # fmt: skip
+def test_a_double_is_two_words_of_memory(code: str, cycles: int) -> None:
+    assert count(bytes.fromhex(code)).cycles[-1] == cycles
+
+
 def runner_of(image: CoreImage) -> Callable[[CoreBlocks], CoreRunner]:
     return lambda blocks: CortexM4Runner(blocks, image, build_machine())
 
