@@ -181,7 +181,7 @@ def _wait(pid: int, told: int, kept: set[int]) -> NoReturn:
                 os.close(number)
     while True:
         ended, status = os.waitpid(-1, os.WNOHANG)
-        if ended and ended == newest():
+        if ended == newest():
             os._exit(KILLED + os.WTERMSIG(status) if os.WIFSIGNALED(status) else os.WEXITSTATUS(status))
         if not ended and signal.sigwait(signals) == signal.SIGINT:
             with suppress(ProcessLookupError):

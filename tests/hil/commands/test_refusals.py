@@ -274,21 +274,23 @@ def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, words: str, told: str
     assert told in cli.refusal(*arguments)
 
 
-def options(command: click.Command, *names: str) -> Iterator[tuple[tuple[str, ...], click.Option]]:
-    """Return every option of a command and of its commands that takes a number or one of some words."""
+def parameters(command: click.Command, *names: str) -> Iterator[tuple[tuple[str, ...], click.Parameter]]:
+    """Return every option and argument of a command and of its commands."""
     context = click.Context(command)
     for name in command.list_commands(context) if isinstance(command, click.Group) else ():
         inner = command.get_command(context, name)
         assert inner is not None
-        yield from options(inner, *names, name)
-    for option in command.params:
-        if isinstance(option, click.Option) and isinstance(
-            option.type, click.Choice | type(click.INT) | type(click.FLOAT)
-        ):
-            yield names, option
+        yield from parameters(inner, *names, name)
+    yield from ((names, one) for one in command.params)
 
 
-TYPED = list(options(app))
+PARAMETERS = list(parameters(app))
+TYPED = [  # options that take a number or one of some words
+    (names, one)
+    for names, one in PARAMETERS
+    if isinstance(one, click.Option)
+    and isinstance(one.type, click.Choice | type(click.INT) | type(click.FLOAT))
+]
 
 
 @pytest.mark.parametrize(("names", "option"), TYPED, ids=[" ".join((*n, o.opts[-1])) for n, o in TYPED])
@@ -324,13 +326,8 @@ drag-model: {SEED}
 def test_options_have_their_defaults_and_bounds() -> None:
     """Those of a profile or a folder alone, as of `param` and `replay`, are not listed."""
 
-    def words(command: click.Command, *names: str) -> Iterator[tuple[str, str]]:
-        context = click.Context(command)
-        for name in command.list_commands(context) if isinstance(command, click.Group) else ():
-            inner = command.get_command(context, name)
-            assert inner is not None
-            yield from words(inner, *names, name)
-        for option in command.params:
+    def words() -> Iterator[tuple[str, str]]:
+        for names, option in PARAMETERS:
             low, high = (getattr(option.type, end, None) for end in ("min", "max"))
             bounds = "" if low is None else f" {low}..{'' if high is None else high}"
             known = not getattr(option, "is_flag", False) and isinstance(
@@ -345,7 +342,7 @@ def test_options_have_their_defaults_and_bounds() -> None:
         for name, rest in [line.split(": ", 1)]
         for word in re.split(r", (?=--)", rest)
     }
-    assert {one for one in words(app) if one[1] != "--profile floaty" or one[0] in dict(listed)} == listed
+    assert {one for one in words() if one[1] != "--profile floaty" or one[0] in dict(listed)} == listed
 
 
 def test_a_name_that_is_no_text_is_one_line(cli: Cli) -> None:

@@ -32,7 +32,7 @@ def image() -> Image:
 
 
 class Board:
-    """A Crazyflie in a room of its own; `said` are the lines of its console."""
+    """A Crazyflie with nothing around it; `said` are the lines of its console."""
 
     def __init__(self, planted: int = NOTHING) -> None:
         self.eeprom, self.said = bytearray(b"\xff" * 8192), list[str]()

@@ -141,7 +141,7 @@ def test_checkpoints_are_an_eighth_of_the_way_apart_at_least_a_period_and_one_is
 
 
 class Flight:
-    """A flight in a process of its own that can go back in time, whose debugger the test is.
+    """A flight in a separate process that can go back in time; the test is its debugger.
 
     It reports each millisecond in a file, reaches 130 ms and exits with 7. `outlived` ends when all of its processes have.
     """
