@@ -11,8 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from firmware_py.export.elf import Symbol
+from hil.emulator.stm32f405.image import Image
 from support.paths import ROOT, TESTS
 
+PLACE = 0x2001_0000  # in RAM, which the tests' firmware does not use
 SOURCES = TESTS / "firmware_stm32"
 BUILD = ROOT / "runs" / "build"
 FILES = ("firmware.c", "exceptions.c", "measured.c")
@@ -83,3 +86,12 @@ def flash_binary(elf: Path) -> bytes:
     for load, data in pieces:
         binary[load - base : load - base + len(data)] = data
     return bytes(binary)
+
+
+def image_with(**sizes: int) -> Image:
+    """Return the tests' image with variables of these sizes, one after the other."""
+    image, place = Image(build()), PLACE
+    for name, size in sizes.items():
+        image._variables[name] = [Symbol(name, place, size, False, True)]
+        place += (size + 7) // 8 * 8
+    return image

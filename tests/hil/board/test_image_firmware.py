@@ -12,7 +12,6 @@ pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
 from firmware_py.config import LogicConfig, parameters_of
-from firmware_py.export.elf import Symbol
 from firmware_py.logic.loading import load_logic, sensed_by
 from firmware_py.signals import CONTROL, COUNTERS, ESTIMATOR, INPUT
 from firmware_py.wire.supervisor import Cause, State
@@ -22,24 +21,14 @@ from hil.config import load_config
 from hil.emulator.stm32f405.chip import SOFTWARE, WATCHDOG, build_machine
 from hil.emulator.stm32f405.image import Image
 from hil.errors import LabError
-from support.stm32_firmware import build
+from support.stm32_firmware import PLACE, build, image_with
 
-PLACE = 0x2001_0000  # which the tests' firmware does not use
 APP = {"floaty_estimator": ESTIMATOR, "floaty_control": CONTROL, "floaty_input": INPUT}
 
 
 @cache
 def plain() -> Image:
     return Image(build())
-
-
-def image_with(**sizes: int) -> Image:
-    """Return the tests' image with variables of these sizes, one after the other."""
-    image, place = Image(build()), PLACE
-    for name, size in sizes.items():
-        image._variables[name] = [Symbol(name, place, size, False, True)]
-        place += (size + 7) // 8 * 8
-    return image
 
 
 def booted(image: Image, logic: Any = None) -> ImageFirmware:

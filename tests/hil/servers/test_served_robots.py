@@ -11,7 +11,6 @@ from struct import pack
 import pytest
 
 from firmware_py.config import parameters_of
-from firmware_py.export.elf import Symbol
 from hil.board import image_firmware
 from hil.board.clock import Paced, Readers
 from hil.board.image_firmware import ChipImage
@@ -19,7 +18,6 @@ from hil.config import load_config
 from hil.emulator.crazyflie.bootloader import CHUNK, LOAD_BUFFER, PAGE_SIZE, WRITE_FLASH
 from hil.emulator.events import EventQueue
 from hil.emulator.stm32f405.chip import build_machine
-from hil.emulator.stm32f405.image import Image
 from hil.errors import LabError
 from hil.laboratory.files.recorder import stored_in
 from hil.laboratory.lockstep import image_at
@@ -31,7 +29,7 @@ from hil.servers.served_robot import UDP_RETRY_US, ServedRobot
 from hil.servers.server import Endpoints, Server, Service, open_motive
 from hil.servers.shared_room import SharedRoom
 from hil.world.scene import VisualModel
-from support.stm32_firmware import build, flash_binary
+from support.stm32_firmware import build, flash_binary, image_with
 from support.watching import Watcher
 
 
@@ -89,10 +87,8 @@ def test_constants_that_stay_the_images_are_said_and_it_is_polled_while_a_client
 ) -> None:
     monkeypatch.setattr(served_robot, "APP_PARAMETER", "test.gain")
     config, said, polled = load_config(), list[str](), list[int]()
-    layout, image = parameters_of(config).memory.dtype, Image(build())
-    image._variables["floaty_parameters"] = [
-        Symbol("floaty_parameters", 0x2001_0000, layout.itemsize, False, True)
-    ]
+    layout = parameters_of(config).memory.dtype
+    image = image_with(floaty_parameters=layout.itemsize)
     monkeypatch.setattr(Robot, "polled", lambda robot, now_us: polled.append(now_us))
     server = Server(Service(config, executor=ChipImage.flashed(image, build_machine())), said.append)
     (line,) = [line for line in said if "has its own" in line]
