@@ -1,0 +1,201 @@
+"""What users get is what they got: texts, files, pages, pictures and recordings of a fixed set of commands.
+
+A change of a label, unit, order, colour or number shows here first. If one is meant, write the outputs anew and read
+what `git diff` shows:
+
+    PYTHONPATH=tests python tests/approved/test_outputs.py [NAME ...]
+
+The first file of a kind stands there whole, later ones as a hash of their lines; files of programs as that of their bytes.
+"""
+
+import difflib
+import hashlib
+import io
+import math
+import re
+import shlex
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import chdir, redirect_stderr, redirect_stdout
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import pytest
+from matplotlib.figure import Figure
+
+from hil.commands.options import COMPILING
+from support import described
+from support.command import floaty
+
+APPROVED = Path(__file__).parent
+SCRIPTS = {
+    "flights": """
+        fly hover --duration 1.5 --perfetto --set markers.enabled=true
+        fly yaw-step --duration 1.5 --seed 3 --fault push.x@0.2 --fault servo.stuck.1@0.6:0.2 --out runs/pushed
+        fly hover --duration 1 --fault serial.cut@0.1:0.1 --link mavlink --out runs/cut
+        fly hover --duration 1 --baseline runs/hover-1 --out runs/again
+        runs
+        compare runs/hover-1 runs/pushed
+        replay runs/hover-1 --profile original
+        report runs/pushed
+        export runs/hover-1 --csv --mcap --tlog
+        import runs/hover-1/flight.csv --out runs/imported
+        fly hover --robots 2 --duration 0.6 --out runs/swarm
+        fly hover --seeds 3 --duration 0.6 --workers 1 --out runs/seeds
+        fly take-off-landing --duration 2 --out runs/take-off
+    """,
+    "lists": """
+        list
+        list --faults
+        docs
+    """,
+    "projects": """
+        new law
+        new robot --robot
+        new tilt --tilt-rotor
+        check law/controller.py
+        fly hover --profile tilt/profile.toml --duration 0.5
+        deploy write app
+        deploy write own --profile law/profile.toml
+    """,
+    "campaigns": """
+        campaign small.toml --workers 1 --out campaign
+        tune --vary controller.gain_yaw=0.5..1.5 --metric rms_x --duration 0.5 --flights 10 --workers 1 --runs tuned
+    """,
+    "identification": """
+        fly identify-u3 --duration 100 --seeds 2 --workers 1 --out excited
+        identify excited/identify-u3-1 --validate excited/identify-u3-2 --profile-out found.toml --out identified
+    """,
+    "paper": """
+        paper --only hover --seeds 1 --no-studies --workers 1
+    """,
+    "tuning": """
+        tune --robots 10 --out gains.toml
+    """,
+    "design": """
+        design
+        design --json --speed 9.5
+        drag-model
+    """,
+}
+HASHED = (".py", ".c", ".h", ".md", ".css", ".js", ".ld", ".in", ".tlog", ".perfetto-trace")
+DATA = (
+    ".parquet",
+    ".rrd",
+    ".csv",
+    ".jsonl",
+    "result.json",
+    "campaign.json",
+    "report.html",
+)  # simulated: exact
+FLOWN = (
+    "events.jsonl",
+    "flight.rrd",
+    "log.parquet",
+    "schedule.parquet",
+    "telemetry.csv",
+)  # whole in "flights"
+VOLATILE = (
+    (re.compile(r"\b\d+(\.\d+)? times real time(; \d+(\.\d+)? s from start to end)?"), "N times real time"),
+    (re.compile(r"^\d\d-\d\d \d\d:\d\d"), "MM-DD hh:mm"),
+    (re.compile(r"commit( \| | )[0-9a-f]{7,}(-dirty)?"), "commit C"),
+    (re.compile(r"RecordingInfo:start_time: 1 \S+"), "RecordingInfo:start_time: T"),
+    (re.compile(r"(versions:|versions \|) .*"), "versions V"),
+    (re.compile(r"(real_time_factor|speed) [\d.e+-]+"), "speed S"),
+)
+
+
+def plain(text: str, place: str) -> str:
+    """Return a line without what is another one's on another machine, day or commit."""
+    text = text.rstrip().replace(place, "PLACE")
+    for pattern, shown in VOLATILE:
+        text = pattern.sub(shown, text)
+    return text
+
+
+def outputs(name: str) -> Iterator[str]:
+    """Yield what a script prints, draws and writes."""
+    figures: list[str] = []
+    saved, seen = Figure.savefig, set[str]() if name == "flights" else set(FLOWN)
+
+    def show(figure: Figure, *arguments: Any, **options: Any) -> None:
+        figures.extend(described.figure(figure))
+        saved(figure, *arguments, **options)
+
+    with tempfile.TemporaryDirectory() as folder, chdir(folder), pytest.MonkeyPatch.context() as patch:
+        place = str(Path(folder).resolve())
+        for source in APPROVED.glob("*.toml"):
+            shutil.copy(source, folder)
+        patch.setattr(Figure, "savefig", show)
+        patch.setenv("COLUMNS", "140")
+        for command in filter(None, map(str.strip, SCRIPTS[name].splitlines())):
+            before = {path: path.stat().st_mtime_ns for path in Path().rglob("*")}
+            printed = io.StringIO()
+            with redirect_stdout(printed), redirect_stderr(printed):
+                code = floaty(*shlex.split(command))
+            yield f"$ floaty {command}"
+            lines = printed.getvalue().replace(f"{COMPILING}\n", "").splitlines()
+            yield from (plain(line, place) for line in (*lines, f"exit code {code}", *figures))
+            figures.clear()
+            for path in sorted(Path().rglob("*")):
+                if path.is_file() and before.get(path) != path.stat().st_mtime_ns:
+                    yield from written(path, place, seen)
+
+
+def written(path: Path, place: str, seen: set[str]) -> Iterator[str]:
+    """Yield a file's name and lines; of a kind that was seen their hash."""
+    if path.suffix in HASHED:
+        yield f"--- {path} {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}"
+        return
+    lines = [plain(line, place) for line in described.lines_of(path)]
+    digest = hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+    if path.name in seen and (path.suffix in DATA or path.name in DATA):
+        yield f"--- {path} {digest}"
+    else:
+        seen.add(path.name)
+        yield f"--- {path}"
+        yield from lines
+
+
+NUMBER = re.compile(r"(?<![\w.])-?\d+\.?\d*(?:e[-+]?\d+)?(?![\w])")
+
+
+def close(line: str, known: str) -> bool:
+    """Whether two lines differ at most in digits that another processor's linear algebra changes."""
+    if NUMBER.sub("#", line) != NUMBER.sub("#", known):
+        return False
+    pairs = zip(NUMBER.findall(line), NUMBER.findall(known), strict=True)
+    return all(
+        a == b or ("." in a + b and math.isclose(float(a), float(b), rel_tol=1e-4, abs_tol=1e-9))
+        for a, b in pairs
+    )
+
+
+LONG = ("tuning",)
+
+
+def versions() -> str:
+    """Return the libraries whose pictures and recordings stand in the outputs."""
+    return " ".join(f"{name} {version(name)}" for name in ("matplotlib", "rerun-sdk", "scipy", "rich"))
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.long) if name in LONG else name for name in SCRIPTS]
+)
+def test_users_get_what_they_got(name: str) -> None:
+    (made_with, *known), found = (APPROVED / f"{name}.txt").read_text().splitlines(), [*outputs(name)]
+    if len(found) == len(known):
+        found = [old if close(line, old) else line for line, old in zip(found, known, strict=True)]
+    difference = list(difflib.unified_diff(known, found, "approved", "now", lineterm="", n=1))
+    if difference and made_with != versions():
+        pytest.skip(f"differs, but was approved with {made_with}; here are {versions()}")
+    assert not difference, "\n".join(difference[:60])
+
+
+if __name__ == "__main__":
+    for one in sys.argv[1:] or SCRIPTS:
+        sys.stdout.write(f"{one}\n")
+        (APPROVED / f"{one}.txt").write_text("\n".join([versions(), *outputs(one)]) + "\n")
