@@ -26,7 +26,7 @@ from typing import Any
 import pytest
 from matplotlib.figure import Figure
 
-from hil.commands.options import COMPILING
+from hil.commands import options
 from support import described
 from support.command import floaty
 
@@ -121,23 +121,24 @@ def outputs(name: str) -> Iterator[str]:
     figures: list[str] = []
     saved, seen = Figure.savefig, set[str]() if name == "flights" else set(FLOWN)
 
-    def show(figure: Figure, *arguments: Any, **options: Any) -> None:
+    def show(figure: Figure, *arguments: Any, **named: Any) -> None:
         figures.extend(described.figure(figure))
-        saved(figure, *arguments, **options)
+        saved(figure, *arguments, **named)
 
     with tempfile.TemporaryDirectory() as folder, chdir(folder), pytest.MonkeyPatch.context() as patch:
         place = str(Path(folder).resolve())
         for source in APPROVED.glob("*.toml"):
             shutil.copy(source, folder)
         patch.setattr(Figure, "savefig", show)
-        patch.setenv("COLUMNS", "140")
+        for console in (options.console, options.notices):
+            patch.setattr(console, "width", 140)
         for command in filter(None, map(str.strip, SCRIPTS[name].splitlines())):
             before = {path: path.stat().st_mtime_ns for path in Path().rglob("*")}
             printed = io.StringIO()
             with redirect_stdout(printed), redirect_stderr(printed):
                 code = floaty(*shlex.split(command))
             yield f"$ floaty {command}"
-            lines = printed.getvalue().replace(f"{COMPILING}\n", "").splitlines()
+            lines = printed.getvalue().replace(f"{options.COMPILING}\n", "").splitlines()
             yield from (plain(line, place) for line in (*lines, f"exit code {code}", *figures))
             figures.clear()
             for path in sorted(Path().rglob("*")):
