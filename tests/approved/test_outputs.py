@@ -102,7 +102,7 @@ VOLATILE = (
     (re.compile(r"\b\d+(\.\d+)? times real time(; \d+(\.\d+)? s from start to end)?"), "N times real time"),
     (re.compile(r"^\d\d-\d\d \d\d:\d\d"), "MM-DD hh:mm"),
     (re.compile(r'("commit": ")[^"]*'), r"\1C"),
-    (re.compile(r"\bcommit( \| | )(?:none|[0-9a-f]{7,}\+?|(?=,|$))"), r"commit\1C"),
+    (re.compile(r"\bcommit( \| | )(?:none|unknown|[0-9a-f]{7,}\+?|(?=,|$))"), r"commit\1C"),
     (re.compile(r"\"versions\": \{.*?\}"), "versions V"),
     (re.compile(r"RecordingInfo:start_time: 1 \S+"), "RecordingInfo:start_time: T"),
     (re.compile(r"(versions:|versions \|) .*"), "versions V"),
