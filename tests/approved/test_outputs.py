@@ -106,16 +106,17 @@ VOLATILE = (
     (re.compile(r"\"versions\": \{.*?\}"), "versions V"),
     (re.compile(r"RecordingInfo:start_time: 1 \S+"), "RecordingInfo:start_time: T"),
     (re.compile(r"(versions:|versions \|) .*"), "versions V"),
+    (re.compile(r"python \d\S*, floaty-hil .*"), "versions V"),
     (re.compile(r"(real_time_factor|speed) [\d.e+-]+"), "speed S"),
 )
 
 
 def plain(text: str, place: str) -> str:
     """Return a line without what is another one's on another machine, day or commit."""
-    text = text.rstrip().replace(place, "PLACE")
+    text = text.replace(place, "PLACE")
     for pattern, shown in VOLATILE:
         text = pattern.sub(shown, text)
-    return text
+    return text.rstrip()
 
 
 def outputs(name: str) -> Iterator[str]:
