@@ -13,6 +13,7 @@ import hashlib
 import io
 import math
 import re
+import runpy
 import shlex
 import shutil
 import sys
@@ -23,12 +24,16 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import click
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 from hil.commands import options
+from hil.commands.app import app
 from support import described
 from support.command import floaty
+from support.paths import ROOT
 
 APPROVED = Path(__file__).parent
 SCRIPTS = {
@@ -51,12 +56,15 @@ SCRIPTS = {
         list
         list --faults
         docs
+        HELP
     """,
     "projects": """
         new law
         new robot --robot
         new tilt --tilt-rotor
         check law/controller.py
+        fly hover --profile law/profile.toml --duration 0.5 --out runs/law
+        fly hover --profile robot/profile.toml --duration 0.5 --out runs/robot
         fly hover --profile tilt/profile.toml --duration 0.5
         deploy write app
         deploy write own --profile law/profile.toml
@@ -71,6 +79,9 @@ SCRIPTS = {
     """,
     "paper": """
         paper --only hover --seeds 1 --no-studies --workers 1
+    """,
+    "study": """
+        study design-updrafts --seeds 1 --workers 1
     """,
     "tuning": """
         tune --robots 10 --out gains.toml
@@ -111,6 +122,47 @@ VOLATILE = (
 )
 
 
+def helps(group: click.Group = app, *before: str) -> Iterator[str]:
+    """Yield the call of every command's help."""
+    yield " ".join((*before, "--help"))
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        if isinstance(command, click.Group):
+            yield from helps(command, *before, name)
+        else:
+            yield " ".join((*before, name, "--help"))
+
+
+def reference() -> Iterator[str]:
+    """Yield the generated pages about the profile's keys, variables, columns and faults."""
+    for name, text in runpy.run_path(str(ROOT / "tools" / "reference_pages.py"))["pages"]().items():
+        yield f"--- {name}"
+        yield from text.splitlines()
+
+
+def learned() -> Iterator[str]:
+    """Yield what each environment of `hil.research.learn` answers to the same random actions."""
+    from hil.research.learn.envs import make_env
+    from hil.research.learn.tasks import TASKS
+
+    for task in TASKS:
+        for fidelity in ("fast", "firmware"):
+            rng = np.random.default_rng(3)
+            env = make_env(task, fidelity, duration_s=0.6)
+            seen, info = env.reset(seed=5)
+            for _ in range(2):
+                rows, ended = [seen], False
+                while not ended:
+                    seen, reward, lost, over, info = env.step(rng.uniform(-0.3, 0.3, 4).astype(np.float32))
+                    rows, ended = [*rows, np.append(seen, reward)], lost or over
+                yield f"{task} {fidelity}: {lost} {over} {described.numbers(np.concatenate(rows))}; {info}"
+                seen, info = env.reset()
+
+
+PYTHON = {"reference": reference, "learned": learned}
+
+
 def plain(text: str, place: str) -> str:
     """Return a line without what is another one's on another machine, day or commit."""
     text = text.replace(place, "PLACE")
@@ -121,6 +173,9 @@ def plain(text: str, place: str) -> str:
 
 def outputs(name: str) -> Iterator[str]:
     """Yield what a script prints, draws and writes."""
+    if name in PYTHON:
+        yield from PYTHON[name]()
+        return
     figures: list[str] = []
     saved, seen = Figure.savefig, set[str]() if name == "flights" else set(FLOWN)
 
@@ -135,7 +190,8 @@ def outputs(name: str) -> Iterator[str]:
         patch.setattr(Figure, "savefig", show)
         for console in (options.console, options.notices):
             patch.setattr(console, "width", 140)
-        for command in filter(None, map(str.strip, SCRIPTS[name].splitlines())):
+        script = SCRIPTS[name].replace("HELP", "\n".join(helps()))
+        for command in filter(None, map(str.strip, script.splitlines())):
             before = {path: path.stat().st_mtime_ns for path in Path().rglob("*")}
             printed = io.StringIO()
             with redirect_stdout(printed), redirect_stderr(printed):
@@ -187,7 +243,8 @@ def versions() -> str:
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.long) if name in LONG else name for name in SCRIPTS]
+    "name",
+    [pytest.param(name, marks=pytest.mark.long) if name in LONG else name for name in (*SCRIPTS, *PYTHON)],
 )
 def test_users_get_what_they_got(name: str) -> None:
     (made_with, *known), found = (APPROVED / f"{name}.txt").read_text().splitlines(), [*outputs(name)]
@@ -200,6 +257,6 @@ def test_users_get_what_they_got(name: str) -> None:
 
 
 if __name__ == "__main__":
-    for one in sys.argv[1:] or SCRIPTS:
+    for one in sys.argv[1:] or (*SCRIPTS, *PYTHON):
         sys.stdout.write(f"{one}\n")
         (APPROVED / f"{one}.txt").write_text("\n".join([versions(), *outputs(one)]) + "\n")

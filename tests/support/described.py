@@ -1,6 +1,7 @@
 """What stands in files and figures, as text: names and texts whole, long runs of numbers by count, ends and two sums."""
 
 import base64
+import hashlib
 import json
 import math
 import re
@@ -16,6 +17,7 @@ import pyarrow.parquet as pq
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from mcap.reader import make_reader
 from rerun.chunk import RrdReader
 
 from hil.pictures.viewer.track import FROM_RELEASE
@@ -110,6 +112,17 @@ def csv(path: Path) -> Iterator[str]:
             yield f"{name}: {numbers(float(cell or 'nan') for cell in column)}"
         except ValueError:
             yield f"{name}: {texts(column)}"
+
+
+def mcap(path: Path) -> Iterator[str]:
+    """Yield each topic with its schema, and the hash of its messages' bytes and instants."""
+    found: dict[str, list[bytes]] = {}
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            told = f"{channel.topic} {schema.name if schema else ''} {channel.message_encoding}"
+            found.setdefault(told, []).append(message.log_time.to_bytes(8, "big") + message.data)
+    for told, messages in sorted(found.items()):
+        yield f"{told}: {len(messages)} {hashlib.sha256(b''.join(messages)).hexdigest()[:16]}"
 
 
 class _Html(HTMLParser):
@@ -217,7 +230,9 @@ def lines_of(path: Path) -> Iterator[str]:
         yield from _Html(path.read_text(encoding="utf-8")).lines
     elif kind == ".json":
         yield from described(json.loads(path.read_text(encoding="utf-8")))
-    elif kind not in (".png", ".mcap", ".tlog", ".perfetto-trace", ".elf"):
+    elif kind == ".mcap":
+        yield from mcap(path)
+    elif kind not in (".png", ".tlog", ".perfetto-trace", ".elf"):
         yield from map(short, path.read_text(encoding="utf-8").splitlines())
 
 
