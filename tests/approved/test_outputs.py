@@ -55,7 +55,6 @@ SCRIPTS = {
     "lists": """
         list
         list --faults
-        docs
         HELP
     """,
     "projects": """
