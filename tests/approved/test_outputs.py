@@ -135,7 +135,9 @@ def helps(group: click.Group = app, *before: str) -> Iterator[str]:
 
 def reference() -> Iterator[str]:
     """Yield the generated pages about the profile's keys, variables, columns and faults."""
-    for name, text in runpy.run_path(str(ROOT / "tools" / "reference_pages.py"))["pages"]().items():
+    for name, text in runpy.run_path(str(ROOT / "tools" / "reference_pages.py"), run_name="pages")[
+        "pages"
+    ]().items():
         yield f"--- {name}"
         yield from text.splitlines()
 
