@@ -55,6 +55,7 @@ SCRIPTS = {
     "lists": """
         list
         list --faults
+        docs
         HELP
     """,
     "projects": """
