@@ -110,6 +110,7 @@ FLOWN = (
     "telemetry.csv",
 )  # whole in "flights"
 VOLATILE = (
+    (re.compile(r"^Usage: .*?floaty"), "Usage: floaty"),
     (re.compile(r"\b\d+(\.\d+)? times real time(; \d+(\.\d+)? s from start to end)?"), "N times real time"),
     (re.compile(r"^\d\d-\d\d \d\d:\d\d"), "MM-DD hh:mm"),
     (re.compile(r'("commit": ")[^"]*'), r"\1C"),
@@ -190,6 +191,7 @@ def outputs(name: str) -> Iterator[str]:
         for source in APPROVED.glob("*.toml"):
             shutil.copy(source, folder)
         patch.setattr(Figure, "savefig", show)
+        patch.setenv("COLUMNS", "140")
         for console in (options.console, options.notices):
             patch.setattr(console, "width", 140)
         script = SCRIPTS[name].replace("HELP", "\n".join(helps()))
