@@ -32,9 +32,9 @@ def test_a_profile_s_name_has_its_sign_and_a_board_s_name_too(cli: Cli, asked: l
     assert (name, factor) == ("extCtrl.y_P", -1.0)
     assert cli("param", "get", "controller.gain_y", "extCtrl.y_P", "supervisor.pose_timeout_us", *LINK) == 0
     assert cli.out == "controller.gain_y -1.5\nextCtrl.y_P 1.5\nsupervisor.pose_timeout_us 1500\n"
-    assert cli("param", "set", "controller.gain_y=-2.5", "extCtrl.y_P=2.25", *LINK) == 0
-    assert cli.out == "controller.gain_y -2.5\nextCtrl.y_P 2.25\n"
-    assert [(one.name, one.value) for one in asked[3:]] == [("extCtrl.y_P", 2.5), ("extCtrl.y_P", 2.25)]
+    assert cli("param", "set", "controller.gain_y=-2.5", "extCtrl.y_P=2.123456", *LINK) == 0
+    assert cli.out == "controller.gain_y -2.5\nextCtrl.y_P 2.123456\n"  # all digits of a float32
+    assert [(one.name, one.value) for one in asked[3:]] == [("extCtrl.y_P", 2.5), ("extCtrl.y_P", 2.123456)]
 
 
 @pytest.mark.parametrize("group", ["extctrl", "extCtrl.", "EXTCTRL"])

@@ -37,6 +37,7 @@ fly hover --seeds 2 --view | --seeds 2
 fly hover --seeds 2 --perfetto | --seeds 2
 fly hover --resume | --workers, --cluster and --resume are for several --seeds
 fly hover --gdb 3333 | --gdb 3333: needs one flight with an image as --board
+fly hover --gdb 0 | --gdb 0: needs one flight with an image as --board
 fly hover --bogus | No such option
 fly hover --robots 2 --view | --robots 2: --view: not for robots that fly together
 fly hover --robots 2 --seeds 2 --baseline b | --baseline b: is for one seed
@@ -148,6 +149,7 @@ param set extCtrl.y_P= --link udp://127.0.0.1:1 | extCtrl.y_P=: expected NAME=VA
 param set extCtrl.y_P=two --link udp://127.0.0.1:1 | extCtrl.y_P=two: expected NAME=VALUE with a number
 
 serve --gdb 3333 | --gdb 3333: needs one board and an image as --board
+serve --gdb 0 | --gdb 0: needs one board and an image as --board
 serve --baud 9600 | --baud: now --set serial.baud=N
 serve --natnet | --natnet: now --set capture.natnet=3.1
 serve --natnet-port | --natnet-port: now --set capture.port=PORT
