@@ -28,6 +28,7 @@ from hil.research.identify.identify import (
     Identification,
     IdentifiedConstant,
     _verdict,
+    identify,
     interval_text,
     operating_point,
 )
@@ -92,6 +93,15 @@ def test_the_share_of_lost_rows_is_that_of_the_rows_that_are_missing(tmp_path: P
     kept = np.arange(200) % 4 != 1
     record = loaded(tmp_path, {name: values[kept] for name, values in columns(200).items()})
     assert record.lost_rows == pytest.approx(0.25, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("share", "reason"),
+    [(0.3, "no excitation"), (0.3001, "30% of the telemetry's rows are missing; at most 30%")],
+)
+def test_a_flight_may_lack_three_tenths_of_its_rows(share: float, reason: str) -> None:
+    with pytest.raises(LabError, match=reason):
+        identify([replace(swinging(robot_of(CONFIG), seconds=10.0), lost_rows=share)])
 
 
 def test_a_board_whose_time_stamps_wrap_flies_on(tmp_path: Path) -> None:

@@ -103,6 +103,11 @@ def test_a_copy_flies_on_from_the_same_state_apart_from_its_original() -> None:
     twin = copy.deepcopy(env)
     flown = [[one.step(np.tile(action, (2, 1)))[0] for action in actions(20, 0.2)] for one in (env, twin)]
     np.testing.assert_array_equal(*flown)
+    own, other = (
+        [*one._memory, one._draws, one._sensing.memory]
+        for one in (env.unwrapped._fleet, twin.unwrapped._fleet)
+    )  # type: ignore[attr-defined]
+    assert not any(map(np.shares_memory, own, other))
 
 
 def test_a_row_of_many_robots_flies_as_the_seed_of_its_own() -> None:
