@@ -374,6 +374,14 @@ def test_a_failure_map_needs_five_failures_and_five_flights_that_hold(failures: 
     assert (found.failure_map is not None) == mapped
 
 
+@pytest.mark.parametrize(("flights", "known"), [(19, False), (20, True)])
+def test_an_influence_needs_two_flights_in_every_slice_of_an_axis(flights: int, known: bool) -> None:
+    spec = spec_of(flights=flights)
+    rows = [planted(draw(spec, index)).columns() for index in range(flights)]
+    found = find(spec, table_of(rows, schema_of(plan_of(spec)))).influences
+    assert any(one.method == "PAWN" for one in found) == known
+
+
 def test_a_flight_that_was_not_flown_has_no_metric_and_no_verdict() -> None:
     spec = spec_of(flights=1)
     (row,) = table_of([failed(draw(spec, 0), "no board").columns()], schema_of(plan_of(spec))).to_pylist()

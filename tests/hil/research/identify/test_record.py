@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from ground_station.telemetry_log import POSE_COLUMNS, TIME_COLUMN
 from hil.config import LabConfig, load_config
@@ -33,11 +34,15 @@ from hil.research.identify.identify import (
     operating_point,
 )
 from hil.research.identify.joint import (
+    DELAY_S,
     LATE_S,
     Estimate,
     Excited,
     JointFit,
+    _equations,
+    _regress,
     identities,
+    instrumental,
     pose_lateness,
     whitened,
 )
@@ -530,6 +535,29 @@ def test_poses_are_late_by_the_cameras_angle_behind_the_gyro_s(late_s: float) ->
     shown = spectra.Spectra(w, Z, C, Z[None], Z[:, 0], np.ones((3, 4)))
     assert pose_lateness([Excited(ROLL, 2, shown)], 2) == pytest.approx(late_s)
     assert pose_lateness([Excited(ROLL, 2, shown)], 1) == LATE_S, "another record"
+
+
+def test_the_instruments_intervals_are_student_s_with_two_numbers_for_each_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("hil.research.identify.joint.LAG_SPREAD", 0.0)
+    monkeypatch.setattr("hil.research.identify.joint.DELAY_SPREAD_S", 0.0)
+    rng, w, values = (
+        np.random.default_rng(2),
+        2 * np.pi * np.array([0.5, 1.0, 3.0]),
+        CONFIG.model.model_dump(),
+    )
+    G = response(YAW, {**values, LAG: 0.05, "delay": DELAY_S}, w)
+    Z = np.concatenate([np.ones((3, 1)), G * (1 + 0.01 * rng.normal(size=G.shape))], axis=1)
+    C = np.tile(1e-4 * np.eye(Z.shape[1], dtype=complex), (3, 1, 1))
+    one = Excited(YAW, 0, spectra.Spectra(w, Z, C, Z[None], Z[:, 0], np.ones(Z.shape)))
+    ((names, rows),) = _equations(YAW)
+    theta, covariance, misfit = _regress([(one.spectra, LATE_S)], rows, 0.05, DELAY_S)
+    found = instrumental([one], 0.05)
+    assert found.values == pytest.approx(dict(zip(names, theta, strict=True)))
+    half = student.ppf(0.975, 2 * 3 - len(theta)) * np.sqrt(np.diag(covariance))
+    assert found.errors == pytest.approx(dict(zip(names, half, strict=True)))
+    assert found.misfit == misfit
 
 
 def test_a_flap_follows_the_held_input_of_which_the_mean_of_two_ticks_is_reported() -> None:

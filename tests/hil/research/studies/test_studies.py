@@ -135,7 +135,10 @@ def test_a_model_error_scales_the_constants_of_its_part_and_no_other() -> None:
 
 
 def test_the_settings_of_a_size_count_more_than_those_of_its_variant() -> None:
-    variant = Variant("a", lambda size: Options(overrides={"radio.uplink_loss": size}), Expected(), settings=("radio.uplink_loss=0.9",))  # fmt: skip
+    def lost(size: float) -> Options:
+        return Options(overrides={"radio.uplink_loss": size})
+
+    variant = Variant("a", lost, Expected(), settings=("radio.uplink_loss=0.9",))
     jobs = flights_of(Study("s", "?", "loss", "", (0.1, 0.2), (variant,)), 2)
     found = [(job.request().config.radio.uplink_loss, job.request().seed) for job in jobs]
     assert found == [(0.1, 1), (0.1, 2), (0.2, 1), (0.2, 2)]
