@@ -142,6 +142,7 @@ def test_a_round_designs_each_axis_from_the_hover_s_flow_and_flies_its_gains_and
     ("old", "new", "better", "another"),
     [
         (hovered(0.02), hovered(0.018), True, True),
+        (hovered(0.02), hovered(0.95 * 0.02), True, True),
         (hovered(0.02), hovered(0.0195), True, False),
         (hovered(0.02), hovered(0.02), True, False),
         (hovered(0.02), hovered(0.021), False, False),
@@ -185,7 +186,7 @@ def test_the_worst_robots_that_a_plant_can_be_are_flown_the_worst_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A robot is its peak; those with a constant of another sign or over four times the plant's are no plant's."""
-    config = load_config()
+    config = load_config(overrides=["plant.constant_factors={roll_u1=0.9}"])
     truth = asdict(tuning.plant_of(config).linearise())
     given = config.plant.constant_factors
     robots = [{name: value * share for name, value in truth.items()} | {"peak": peak, "flap_rate": 20.0 + peak}
