@@ -21,6 +21,7 @@ from hil.research.learn.batch import EstimateErrors, Fleet
 from hil.research.learn.envs import REACH, FastEnv, FirmwareEnv, Setup, make_env
 from hil.research.learn.tasks import PUSHES, TASKS, EpisodeTask, draw_episode
 from hil.world.floaty.plant import Plant
+from hil.world.servos import next_period_us
 from hil.world.tunnel import GUST_RMS
 
 STILL = ["tunnel.turbulence=none"]
@@ -252,6 +253,24 @@ def test_a_push_of_the_fast_model_acts_from_its_instant_on_for_a_tenth_of_a_seco
                 if 0 <= begin_us - round(1e6 * at_s) < 100_000:
                     expected[int(kind)] = size
             np.testing.assert_array_equal(env.truth.body.fields.push, expected)
+
+
+def test_flaps_follow_a_command_from_the_first_period_that_begins_a_millisecond_after_the_step() -> None:
+    env = make_env("Hover", overrides=STILL)
+    assert isinstance(env, FastEnv)
+    env.reset(seed=1)
+    for action in actions(12, 0.2):
+        now_us, before = round(env.truth.body.fields.time_us), env.truth.flaps.fields
+        env.step(action)
+        after, angle = env.truth.flaps.fields, before.angle.copy()
+        waits_s = 1e-6 * (next_period_us(now_us + 1000) - now_us)
+        for command, lasts_s in ((before.command, waits_s), (after.command, 0.01 - waits_s)):
+            error = command + after.trim - angle
+            left = np.maximum(np.abs(error) * np.exp(-lasts_s / after.lag), after.dead_band)
+            angle = np.where(
+                np.abs(error) > after.dead_band, command + after.trim - np.copysign(left, error), angle
+            )
+        assert after.angle == pytest.approx(angle, abs=1e-9)
 
 
 def test_every_draw_of_an_episode_is_a_number_of_its_own() -> None:
