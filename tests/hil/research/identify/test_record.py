@@ -368,6 +368,15 @@ def test_a_robot_that_follows_its_model_has_no_disturbance() -> None:
         assert own[1] < 0.1 * power(robot | {name: 1.5 * robot[name]})[1], name
 
 
+@pytest.mark.parametrize("hertz", [1.0, 4.0])
+def test_a_robot_that_follows_its_model_is_predicted_one_step_ahead(hertz: float) -> None:
+    robot = robot_of(CONFIG)
+    values = {**CONFIG.model.model_dump(), LAG: 1 / robot["flap_rate"], "delay": robot[DELAY] + TICK_DELAYS_S}
+    t, measured, predicted = one_step(swinging(robot, hertz), 0, values, LATE_S)
+    settled = slice(len(t) // 10, None)
+    assert np.std((measured - predicted)[settled]) < 0.01 * np.std(measured[settled])
+
+
 def test_fifteen_seconds_of_flight_after_the_first_two_show_the_flow_and_less_do_not() -> None:
     robot = robot_of(CONFIG)
     assert flow_of(swinging(robot, seconds=17.04), ROLL, robot).input == pytest.approx(0.0, abs=0.01)
