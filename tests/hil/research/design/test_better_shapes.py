@@ -369,6 +369,10 @@ def test_every_number_of_a_shape_at_a_bound_of_the_search_is_named(number: int) 
         (line,) = at_bounds(shape)
         assert line.startswith(f"{SEARCHED[number].name} = ")
         assert f"at the {end} bound of the search (" in line
+    one = SEARCHED[number]
+    for share, end in ((0.0009, "lower"), (0.0011, ""), (0.9989, ""), (0.9991, "upper")):
+        found = one.reached(one.low + share * (one.high - one.low))
+        assert (f"at the {end} bound" in found) if end else not found
 
 
 def test_lighter_or_wider_robots_hold_slower_air_in_the_same_proportion(
