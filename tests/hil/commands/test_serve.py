@@ -38,12 +38,13 @@ def test_a_server_with_a_program_on_its_bus_ends_with_it(
     cli: Cli, monkeypatch: pytest.MonkeyPatch, code: int
 ) -> None:
     programs = started(monkeypatch, code)
+    monkeypatch.setattr(server.Paced, "stood_still_us", property(lambda clock: 12_400))
     assert cli("serve", *ALONE, "--usb", "--", "radio", "E7") == code
     lines = cli.out.splitlines()
     assert [line.split()[0] for line in lines] == ["radio", "use", "serving;", "stopped;"]
     port = int(lines[1].partition("FLOATY_DONGLE=127.0.0.1:")[2].split()[0])
     assert programs == [(port, ["radio", "E7"])]
-    assert lines[-1] == "stopped; time stood still for 0 ms"
+    assert lines[-1] == "stopped; time stood still for 12 ms"
 
 
 @pytest.mark.usefixtures("_ctrl_c")
