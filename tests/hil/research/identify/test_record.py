@@ -379,7 +379,7 @@ def test_a_robot_that_follows_its_model_is_predicted_one_step_ahead(hertz: float
 
 def test_fifteen_seconds_of_flight_after_the_first_two_show_the_flow_and_less_do_not() -> None:
     robot = robot_of(CONFIG)
-    assert flow_of(swinging(robot, seconds=17.04), ROLL, robot).input == pytest.approx(0.0, abs=0.01)
+    assert flow_of(swinging(robot, seconds=17.02), ROLL, robot).input == pytest.approx(0.0, abs=0.01)
     with pytest.raises(LabError, match="15 s after the first 2 s are needed"):
         flow_of(swinging(robot, seconds=16.9), ROLL, robot)
 
