@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from scipy.stats import t as student
 from ground_station.telemetry_log import POSE_COLUMNS, TIME_COLUMN
 from hil.config import LabConfig, load_config
 from hil.errors import LabError
-from hil.research.design.axes import DELAY, PITCH, ROLL, YAW, Axis, dynamics, robot_of
+from hil.research.design.axes import DELAY, HEIGHT, PITCH, ROLL, YAW, Axis, dynamics, robot_of
 from hil.research.design.loop import FREQUENCIES
 from hil.research.identify import spectra
 from hil.research.identify.flow import flow_of
@@ -28,10 +29,12 @@ from hil.research.identify.identify import (
     Evidence,
     Identification,
     IdentifiedConstant,
+    _truths,
     _verdict,
     identify,
     interval_text,
     operating_point,
+    truth_of,
 )
 from hil.research.identify.joint import (
     DELAY_S,
@@ -390,6 +393,27 @@ def test_fifteen_seconds_of_flight_after_the_first_two_show_the_flow_and_less_do
     assert np.isfinite(flow_of(seconds(17.0), ROLL, robot).spectrum).all()
     with pytest.raises(LabError, match="15 s after the first 2 s are needed"):
         flow_of(seconds(16.75), ROLL, robot)
+
+
+def test_a_constant_s_truth_is_that_of_the_first_flight_that_excited_its_axis_and_of_the_first_for_others() -> (
+    None
+):
+    plain = replace(swinging(robot_of(CONFIG), seconds=2.0), simulated=True)
+    flights = [replace(plain, u=plain.u + 0.02 * n) for n in range(4)]
+    excited_axes: list[Any] = [
+        SimpleNamespace(axis=axis, record=n) for axis, n in ((YAW, 0), (ROLL, 1), (ROLL, 2))
+    ]
+    found, own = _truths(flights[0], flights[1:], excited_axes), [truth_of(one) for one in flights]
+    for axis, flown in ((YAW, 1), (ROLL, 2), (PITCH, 0), (HEIGHT, 0)):
+        for name in {*axis.constants} - {"y_rate", "x_rate"}:
+            assert found[name] == own[flown][name], name
+    assert own[0]["yaw_u3"] != own[1]["yaw_u3"]
+    assert (found[LAG], np.isnan(found["delay"]), np.isnan(found["y_rate"])) == (
+        CONFIG.actuators.tau,
+        True,
+        True,
+    )
+    assert truth_of(replace(plain, simulated=False)) == {}
 
 
 def test_the_operating_point_is_the_mean_of_the_flight_in_the_tunnel_s_flow() -> None:
