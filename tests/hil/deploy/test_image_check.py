@@ -411,6 +411,8 @@ def test_each_bound_is_that_of_its_size_in_every_one_of_its_columns(bound: Bound
             if bound.unit == "ms":
                 assert str(one).endswith("ms apart (estimator.pose_age_us), at most 1 ms")
         assert not found(name, []).held
+        unknown = found(name, [0.0, np.nan, np.nan])
+        assert (unknown.held, unknown.column) == (False, name), "what is no number is the largest"
 
 
 def test_the_first_state_that_one_board_does_not_reach_is_found(tmp_path: Path) -> None:
