@@ -261,6 +261,10 @@ def test_values_that_are_tried_are_inside_but_not_the_default_and_just_outside(n
     beside = [np.nextafter(low, -np.float32(np.inf)), np.nextafter(high, np.float32(np.inf))]
     edges = [float(edge) for edge in beside] if one.scalar.is_float else [low - 1.0, high + 1.0]
     assert outside == [edge for edge in edges if one.scalar.cast(edge) == edge]
+    for initial in image_check._values(replace(one, initial=one.low), one.scalar)[
+        :1
+    ]:  # the default is that value
+        assert image_check._values(replace(one, initial=initial), one.scalar)[0] not in (initial, *outside)
     assert image_check._behind(replace(one, scale=0.1), 3.0) == one.place.scalar.cast(
         float(np.float32(0.1) * np.float32(3.0))
     )
