@@ -113,15 +113,22 @@ def test_texts_and_changes_of_state_are_recorded_once(folder: Path) -> None:
         assert 1000 * event["t_us"] in moments(path, f"/text/{event['source']}")
 
 
-def test_markers_change_colour_where_they_come_into_sight_or_go(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def marked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder with markers, of which three are hidden for a while."""
+    folder = tmp_path_factory.mktemp("markers") / "run"
     request = Request.of(
         EXPERIMENTS["hover"],
         overrides=[MARKERS_ON],
         duration_s=0.5,
         faults=[parse("marker.hidden@0.2:0.1=3")],
     )
-    fly(request, tmp_path / "run")
-    log, path = load_log(tmp_path / "run"), write_run_rrd(tmp_path / "run")
+    fly(request, folder)
+    return folder
+
+
+def test_markers_change_colour_where_they_come_into_sight_or_go(marked: Path) -> None:
+    path = write_run_rrd(marked)
     colours = values(path, "/world/robot/markers", "Points3D:colors")
     expected = [[HIDDEN] * n + [SEEN] * (8 - n) for n in (8, 0, 3, 0)]  # no exposure yet; all
     assert colours.tolist() == expected
@@ -138,14 +145,34 @@ def test_markers_change_colour_where_they_come_into_sight_or_go(tmp_path: Path) 
         marker_places(GeometryConfig(), NetConfig()),
         atol=1e-7,
     )
-    split = tmp_path / "split.rrd"
+
+
+def content(path: Path) -> dict[tuple[str, str], list[tuple[int, str]]]:
+    """All values of a recording that move with time, by entity and component, with their instants."""
+    found: dict[tuple[str, str], list[tuple[int, str]]] = {}
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        if FROM_RELEASE in batch.schema.names:
+            times = [moment.value for moment in batch.column(FROM_RELEASE)]
+            for name in (name for name in batch.schema.names if ":" in name):
+                rows = zip(times, map(str, batch.column(name).to_pylist()), strict=True)
+                found.setdefault((chunk.entity_path, name), []).extend(rows)
+    return {key: sorted(rows) for key, rows in found.items()}
+
+
+@pytest.mark.parametrize("size", [40, 7])
+def test_a_flight_in_pieces_as_it_comes_live_has_the_recording_of_the_whole(
+    marked: Path, tmp_path: Path, size: int
+) -> None:
+    log = load_log(marked)
     recording = rerun.RecordingStream("test")
-    recording.save(split)
+    recording.save(tmp_path / "split.rrd")
     stage = RerunFlight(recording, log.schema)
-    for start in range(0, log.num_rows, 40):  # as live: nothing twice, nothing missing
-        stage.add_rows(log.slice(start, 40))
+    for start in range(0, log.num_rows, size):
+        stage.add_rows(log.slice(start, size))
     recording.disconnect()
-    assert moments(split, "/world/robot/markers") == moments(path, "/world/robot/markers")
+    assert content(tmp_path / "split.rrd") == content(staged(tmp_path / "whole.rrd", log))
+    assert stage._past.num_rows == 100, "a second is enough"
 
 
 def rows_by_entity(path: Path) -> Counter[str]:
