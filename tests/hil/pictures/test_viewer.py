@@ -37,8 +37,8 @@ from hil.laboratory.schedule import SCHEMA
 from hil.live import window
 from hil.live.feed import open_view
 from hil.pictures import curves, scene
-from hil.pictures.viewer.layout import blueprint, views_of
-from hil.pictures.viewer.plots import PLOTS, rates
+from hil.pictures.viewer.layout import EYE, blueprint, tunnel_view, views_of
+from hil.pictures.viewer.plots import PLOTS, rates, refused
 from hil.pictures.viewer.recording import RerunFlight, write_rrd, write_run_rrd
 from hil.pictures.viewer.scene import HIDDEN, METRES_PER_NEWTON, PUSH_SHOWN_US, SEEN
 from hil.pictures.viewer.swarm import write_swarm_rrd
@@ -387,6 +387,12 @@ def test_the_goal_has_a_path_where_it_moves(tmp_path: Path) -> None:
     assert rows_by_entity(staged(tmp_path / "still.rrd", real_log()))["/world/wanted"] == 1
 
 
+def test_a_mark_is_at_the_row_whose_counter_is_larger_than_before() -> None:
+    rows = pa.table({"a": [1, 1, 2, 2, 2, 5], "b": [0, 0, 0, 0, 1, 0]})
+    assert refused(rows, ("a", "b", "none")).tolist() == [2, 4, 5]
+    assert refused(rows, ("none",)).tolist() == []
+
+
 def test_rates_are_those_of_the_second_before() -> None:
     rows = pa.table({"t": 10_000 * np.arange(300), "n": np.arange(300) // 2, "m": 3 * np.arange(300)})
     counters = curves.Curves(("n", "m"), ("", ""), "1/s", curves.plain("n", "m"))
@@ -456,9 +462,28 @@ def test_every_view_of_a_flight_has_one_place_in_the_layout(folder: Path) -> Non
     assert len(set(plots)) == len(plots) > 5
 
 
-def test_robots_that_flew_together_are_in_one_recording_each_at_its_place_with_its_texts(
-    folder: Path, tmp_path: Path
+@pytest.mark.parametrize(
+    ("origin", "name", "worlds"), [("world", "Wind tunnel", ["world"]), ("room", "Room", ["a", "b"])]
+)
+def test_a_scene_shows_four_seconds_of_path_and_the_goal_s_fifteen_to_either_side(
+    origin: str, name: str, worlds: list[str]
 ) -> None:
+    view = tunnel_view("from_release", origin, worlds, EYE)
+    assert (view.name, view.origin) == (name, origin)
+    shown = {
+        path: one.ranges.as_arrow_array().to_pylist() for path, (one,) in view.visualizer_overrides.items()
+    }
+    spans = {"trail": (-4.0, 0.0), "wanted": (-15.0, 15.0)}
+    assert shown == {
+        f"{world}/{path}": [{"timeline": "from_release", "range": {"start": begin * 1e9, "end": end * 1e9}}]
+        for world in worlds for path, (begin, end) in spans.items()
+    }  # fmt: skip
+
+
+def test_robots_that_flew_together_are_in_one_recording_each_at_its_place_with_its_texts(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hil.pictures.viewer.swarm.ROWS_AT_ONCE", 40)
     origins = ((1.0, 2.0, 3.0), (-4.0, 5.0, 6.0))
     request = SimpleNamespace(title="two robots")
     result: Any = SimpleNamespace(
@@ -479,7 +504,8 @@ def test_robots_that_flew_together_are_in_one_recording_each_at_its_place_with_i
         assert place.column("Transform3D:translation").to_pylist() == [[list(origin)]]
         (label,) = [batch for entity, batch in found if entity == f"/room/{number}/world/robot/number"]
         assert label.column("Points3D:labels").to_pylist() == [[str(number)]]
-        assert counted[f"/room/{number}/world/robot"] == alone["/world/robot"]
+        for name in ("robot", "trail", "drag"):
+            assert counted[f"/room/{number}/world/{name}"] == alone[f"/world/{name}"]
         told = [
             text for entity, batch in found if entity.startswith(f"/room/{number}/text/")
             for (text,) in batch.column("TextLog:text").to_pylist()
