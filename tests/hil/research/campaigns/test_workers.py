@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -302,11 +303,15 @@ def test_a_signal_completes_the_flight_and_no_other_plan_is_flown(
     assert [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)] == before
 
 
-def test_a_logged_flight_that_ends_with_an_error_is_one_line(
+def test_a_logged_flight_that_ends_with_an_error_is_one_line_and_a_lost_one_a_row(
     flown: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(run, "Workers", lambda *_: SimpleNamespace(
-        fly=lambda jobs, stopped: (failed(one, "no such body") for one in jobs), close=lambda: None))  # fmt: skip
+    outcome = "lost"
+    monkeypatch.setattr(run, "Workers", lambda *_: SimpleNamespace(fly=lambda jobs, stopped: (
+        replace(failed(one, "no such body"), outcome=outcome) for one in jobs), close=lambda: None))  # fmt: skip
+    (row,) = Runner(Console(quiet=True)).log("one", {"a": ("hover", Options())}, tmp_path)
+    assert (row.outcome, row.folder) == ("lost", tmp_path / "a")
+    outcome = "error"
     with pytest.raises(LabError, match=f"^{tmp_path}/a: no such body$"):
         Runner(Console(quiet=True)).log("one", {"a": ("hover", Options())}, tmp_path)
 
