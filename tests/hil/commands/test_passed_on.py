@@ -699,6 +699,22 @@ def test_a_study_flies_alone_into_a_folder_of_its_name(cli: Cli, monkeypatch: py
         ([], [STUDIES["loss"]], 5, Path("x"), crew | {"resume": False})]  # fmt: skip
 
 
+def test_the_drag_model_is_measured_with_its_seed_and_drawn_at_the_hover_angle_in_degrees(
+    cli: Cli, asked: Asked
+) -> None:
+    place = "research.studies.drag_model."
+    asked.answer({f"{place}measure": ["a", "b"], f"{place}write": "page"})
+    words = ("--seed", "3", "--set", "plant.hover_angle=0.5", "--out", "x/y")
+    assert cli("drag-model", *words) == 0
+    config = load_config("floaty", ["plant.hover_angle=0.5"])
+    assert asked == [
+        ("measure", config, 3),
+        ("write", ["a", "b"], pytest.approx(28.6479, abs=1e-4), Path("x/y")),
+    ]
+    assert Path("x/y").is_dir()
+    assert cli.out == "report  page\n"
+
+
 def test_the_exit_code_is_that_of_the_paper_s_rows_or_of_studies_alone(
     cli: Cli, asked: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -366,6 +366,17 @@ def test_numbers_of_two_boards_may_be_apart_by_their_tolerance() -> None:
         assert bool(list(differences(Answers([], [place]), Answers([], [found])))) == apart
 
 
+def test_answers_come_in_the_order_of_the_programs_of_which_as_many_run_as_there_are_processors(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("hil.deploy.services.os.sched_getaffinity", lambda process: {0, 1})
+    bench: Any = SimpleNamespace(play=lambda program: Answers([f"{program}: 1"], [(0.0, 1.0, 2.0, 3.0)]))
+    played = [*play_in_copies(bench, "abcde")]
+    assert [(one.lines, one.path) for one in played] == [
+        ([f"{name}: 1"], [(0.0, 1.0, 2.0, 3.0)]) for name in "abcde"
+    ]
+
+
 def test_a_program_that_breaks_off_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(LabError, match="the board broke off a program of requests"):
         list(play_in_copies(ServiceBench(PythonBoard()), ["no-such-word"]))

@@ -29,7 +29,7 @@ from hil.errors import LabError
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import MARKERS_ON
 from hil.laboratory.faults import parse
-from hil.laboratory.files.recorder import load_events, load_log
+from hil.laboratory.files.recorder import load_events, load_log, stored_in
 from hil.laboratory.metrics import body, column
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
@@ -375,6 +375,50 @@ def test_a_real_flight_has_the_same_scene_without_unknown_parts(tmp_path: Path) 
     assert not {"/world/drag", "/world/tether"} & {entity for entity, rows in counted.items() if rows > 1}
     assert counted["/plot/position/marks/pose_refused_on_board"] == 1 + 1
     assert counted["/plot/position/marks/pose_too_late_for_the_link"] == 1 + 1
+
+
+def test_the_goal_the_robot_and_the_tunnel_stand_where_they_are(folder: Path) -> None:
+    still: dict[str, Any] = {}
+    for chunk in RrdReader(write_run_rrd(folder)).stream():
+        if chunk.is_static:
+            batch = chunk.to_record_batch()
+            still |= {
+                (chunk.entity_path, name): batch.column(name).to_pylist()[0]
+                for name in batch.schema.names
+                if ":" in name
+            }
+
+    def lines(name: str) -> list[NDArray[np.float64]]:
+        return [np.array(line) for line in still[f"/world/{name}", "LineStrips3D:strips"]]
+
+    model = VisualModel.read(stored_in(load_log(folder).schema.metadata, "look"))
+    expected: dict[str, list[Any]] = {
+        "goal/estimate/ghost": [*model.outline],
+        "goal/ghost": [*model.outline, [(0, 0, 0), (0.16, 0, 0)]],
+        "goal/cross": [np.outer((-0.02, 0.02), axis) for axis in np.eye(3)],
+        "goal/box": scene.box_lines(0.1), "robot/frame": [*model.frame], "tunnel/net": scene.net_lines(0.6, 0.0),
+    }  # fmt: skip
+    for name, wanted in expected.items():
+        for line, one in zip(lines(name), wanted, strict=True):
+            np.testing.assert_allclose(line, one, atol=1e-7, err_msg=name)
+    low, high, *posts = lines("tunnel/nozzle")
+    for ring, height in ((low, 0.0), (high, 1.8)):
+        np.testing.assert_allclose(np.linalg.norm(ring[:, :2], axis=1), 0.6, rtol=1e-6)
+        np.testing.assert_allclose(ring[:, 2], height)
+    np.testing.assert_allclose([post[:, 2] for post in posts], [(0.0, 1.8)] * 4)
+    flow = {
+        name: still["/world/tunnel/flow", f"Cylinders3D:{name}"] for name in ("lengths", "radii", "centers")
+    }
+    assert flow == {
+        "lengths": [pytest.approx(1.8)],
+        "radii": [pytest.approx(0.2)],
+        "centers": [[0.0, 0.0, pytest.approx(0.9)]],
+    }
+    for part in model.parts:
+        (place,) = [still[f"/world/robot/parts/{part.name}", "Mesh3D:vertex_positions"]]
+        np.testing.assert_allclose(place, part.triangles.reshape(-1, 3), atol=1e-7)
+        if part.label:
+            assert still[f"/world/robot/parts/{part.name}/number", "Points3D:labels"] == [part.label]
 
 
 def test_the_goal_has_a_path_where_it_moves(tmp_path: Path) -> None:

@@ -229,6 +229,49 @@ def test_the_real_reason_is_given_for_an_unreadable_file(
         loaded(tmp_path, columns(150), change)
 
 
+def test_a_file_without_what_is_needed_is_refused_by_the_name_of_that(tmp_path: Path) -> None:
+    with pytest.raises(
+        LabError, match=r"^x\.csv: no telemetry\.csv there; identify takes run folders and telemetry\.csv$"
+    ):
+        load_record(Path("x.csv"), "floaty")
+    table = columns(150)
+    for title in (BOARD_COLUMN, TIME_COLUMN, *POSE_COLUMNS, *INPUTS, *RATES, "supervisor.state []"):
+        with pytest.raises(LabError) as refused:
+            loaded(tmp_path, {name: values for name, values in table.items() if name != title})
+        assert str(refused.value) == f"{tmp_path / 'telemetry.csv'}: no column {title!r}"
+    silent = {name: np.full(150, np.nan) for name in POSE_COLUMNS}
+    with pytest.raises(
+        LabError, match=re.escape(f": no pose in {POSE_COLUMNS[0]!r} to {POSE_COLUMNS[-1]!r}")
+    ):
+        loaded(tmp_path, table | silent)
+    for title in EXCITATIONS:
+        del table[title]
+    assert not loaded(tmp_path, table).excitation.any(), "none was reported"
+
+
+def test_spectra_are_refused_in_one_line_with_their_numbers() -> None:
+    t, w = np.arange(0.0, 20.0, 0.5), 2 * np.pi * 0.05 * np.arange(1, 14)
+    with pytest.raises(
+        LabError, match=r"^r: 40 samples in a period of 20 s for 13 lines: at least 42 are needed$"
+    ):
+        spectra._fit(t, np.zeros((40, 1)), w, "r")
+    assert spectra._fit(t, np.cos(w[2] * t)[:, None], w[:12], "r")[2, 0] == pytest.approx(1.0)
+    fast = excited(100.0)
+    fast.excitation[:, 0] = np.cos(2 * np.pi * 20.05 * fast.t + 0.3)
+    with pytest.raises(LabError, match=r"^r: rows of 20 ms are too far apart for the excitation's lines$"):
+        spectra.period_spectra(fast)
+    with pytest.raises(
+        LabError, match=r": 0 realisations of 22 s, 5 more with holes of over 0\.3 s; at least 4"
+    ):
+        spectra.windows(excited(110.0, 1.0))
+    own = [np.array([5]), *[np.empty(0, int)] * 3]
+    with pytest.raises(LabError, match=r"^r: u3 is not excited in it$"):
+        spectra.spectra_of(excited(90.0), (own, w, np.ones((4, 13, 17), complex)), 2, (8,))
+    first, second = (replace(excited(90.0), name=name) for name in ("a", "b"))
+    with pytest.raises(LabError, match=r"^b: the same flight as a: each flight counts once$"):
+        identify([first, second])
+
+
 def holed(begin: float, end: float, afresh: float | None) -> Record:
     """A record without rows from `begin` to `end`; the excitation may begin again, at `afresh`."""
     rng, t = np.random.default_rng(4), 0.02 * np.arange(6751)
@@ -599,6 +642,22 @@ def test_the_instruments_intervals_are_student_s_with_two_numbers_for_each_line(
     half = student.ppf(0.975, 2 * 3 - len(theta)) * np.sqrt(np.diag(covariance))
     assert found.errors == pytest.approx(dict(zip(names, half, strict=True)))
     assert found.misfit == misfit
+
+
+def test_the_misfit_of_the_instruments_is_one_where_the_scatter_is_as_stated() -> None:
+    """On average of many draws: of three lines and two constants four numbers are free."""
+    rng, w, model = np.random.default_rng(2), 2 * np.pi * np.array([0.5, 1.0, 3.0]), CONFIG.model
+    rate = model.yaw_u3 * flap_response(w, 0.05, DELAY_S) / (1j * w - model.yaw_rate)
+    true = np.stack([1.0 + 0j * w, rate, rate / (1j * w)], axis=1)
+    size = 1e-4 * np.abs(true).mean(axis=0)
+    C = np.tile(np.diag(size.astype(complex) ** 2), (3, 1, 1))
+    ((_, rows),) = _equations(YAW)
+    misfits = []
+    for _ in range(400):
+        noise = (rng.normal(size=true.shape) + 1j * rng.normal(size=true.shape)) * size / np.sqrt(2)
+        one = spectra.Spectra(w, true + noise, C, true[None], true[:, 0], np.ones(true.shape))
+        misfits.append(_regress([(one, LATE_S)], rows, 0.05, DELAY_S)[2])
+    assert np.mean(misfits) == pytest.approx(1.0, abs=0.12)
 
 
 def test_a_flap_follows_the_held_input_of_which_the_mean_of_two_ticks_is_reported() -> None:

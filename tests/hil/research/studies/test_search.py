@@ -99,6 +99,17 @@ def test_whole_numbers_stay_whole(tmp_path: Path) -> None:
     assert isinstance(after.value(7.6), int)
 
 
+@pytest.mark.parametrize(("text", "reason"), [
+    *((f"controller.gain_y={bounds}", "expected KEY=LOW..HIGH") for bounds in ("1..1", "2..1", "-inf..1", "0..inf", "nan..1",
+      "a..1", "1", "1..")), ("gain_y=1..2", "expected KEY=LOW..HIGH"),
+    ("robot.body=1..2", "robot.body is no number of profile floaty"), ("tracker.enabled=0..1", "is no number of profile"),
+    ("predictor.horizon=0..5", "predictor.horizon = 0"), ("predictor.horizon=3..13", "predictor.horizon = 13"),
+])  # fmt: skip
+def test_bounds_that_cannot_be_flown_are_refused_before_a_flight(text: str, reason: str) -> None:
+    with pytest.raises(LabError, match=reason):
+        intervals(("controller.gain_z=1..2", text), "floaty")
+
+
 def test_a_metric_that_the_experiment_lacks_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(LabError, match=r"^--metric settle: hover does not measure it in this time$"):
         found(Runner(), aim("settle"), tmp_path)

@@ -182,6 +182,14 @@ def test_surprises_are_reported(expected: Expected, cells: tuple[str, ...], surp
     assert judged(expected, *cells) == surprises
 
 
+def test_an_expectation_is_a_sentence_of_the_bounds_that_it_has() -> None:
+    told = "holds the limits up to 1 m, is not lost up to 2 m, is stopped by the supervisor from 3 m, is lost from 4 m"
+    assert Expected(1, 2, 3, 4).text("m") == told
+    for number, part in enumerate(told.split(", ")):
+        assert Expected(*(float(n + 1) if n == number else None for n in range(4))).text("m") == part
+    assert Expected(lost_from=2).text("") == "is lost from 2"
+
+
 def test_the_typical_outcome_is_the_median_and_the_worse_of_two() -> None:
     assert VariantOutcome(1.0, ("lost", "holds", "holds"), ()).typical == "holds"
     assert VariantOutcome(1.0, ("lost", "holds"), ()).typical == "lost"
