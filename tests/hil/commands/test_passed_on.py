@@ -430,8 +430,9 @@ def test_a_flight_is_written_drawn_traced_printed_and_its_viewer_stays_until_it_
     })  # fmt: skip
     monkeypatch.setattr(fly, "print_result", lambda result: asked.append("printed"))
     monkeypatch.setattr(type(fly.common.notices), "is_terminal", True)
-    monkeypatch.setattr(fly.common, "progress_bar", lambda *columns, wanted: nullcontext(
+    monkeypatch.setattr(fly.common, "progress_bar", lambda *columns, wanted: bars.append(wanted) or nullcontext(
         Made(add_task=lambda *what, **more: 0, update=lambda *what, **more: None)))  # fmt: skip
+    bars: list[bool] = []
     assert fly._fly_one(request, Path("x"), "web") == 0
     fly._cover(request)
     order = [one if isinstance(one, str) else one[0] for one in asked]
@@ -445,6 +446,9 @@ def test_a_flight_is_written_drawn_traced_printed_and_its_viewer_stays_until_it_
     assert told.out.splitlines() == ["this machine was too slow: time stood still for 12 ms", "processor time:", "  cpu.txt",
         "  cpu.folded", "coverage: 9 of 10", "  cov.info", "  cov.html"]  # fmt: skip
     assert told.err == "the flight can be viewed until Ctrl-C\n" * len(stays)
+    bench.gdb = 3333  # the flight may go back in time
+    fly._fly_one(request, Path("x"), "web")
+    assert bars == [True, False]
 
 
 @pytest.mark.parametrize(

@@ -247,6 +247,7 @@ def test_vehicles_have_their_power_per_mass_and_floaty_the_mean_of_its_flights()
     }
     assert found == pytest.approx(ends)
     assert bars.yaxis_inverted()
+    assert bars.get_xlim() == pytest.approx((0.0, 1.12 * max(values))), "all bars and their numbers"
     points = [
         (line.get_xydata()[0].tolist(), line.get_marker()) for line in scatter.lines if len(line.get_xdata())
     ]

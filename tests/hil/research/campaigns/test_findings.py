@@ -131,7 +131,6 @@ def rows_of(*changes: dict[str, object]) -> list[Row]:
 
 
 def test_the_worst_flights_are_those_lost_first_then_those_far_beyond_a_limit() -> None:
-    spec = spec_of(flights=5)
     limits = {"in_box": False}
     rows = rows_of(
         {"metrics": {"in_box": 0.5}, "holds": limits},
@@ -139,12 +138,16 @@ def test_the_worst_flights_are_those_lost_first_then_those_far_beyond_a_limit() 
         {"metrics": {"in_box": 0.1}, "holds": limits},
         {"outcome": "lost", "error": "early", "metrics": {"flown": 2.0}},
         {"metrics": {"rms_x": 0.5}, "holds": {"in_box": True}},
+        {
+            "metrics": {"in_box": 0.89, "unseen": 9.0},
+            "holds": {"in_box": False, "unseen": False},
+        },  # by the farthest
     )
-    spec = spec_of(flights=5, settings=["limits.hover.in_box=0.9"])
+    spec = spec_of(flights=6, settings=["limits.hover.in_box=0.9"])
     table = table_of([row.columns() for row in rows], schema_of(plan_of(spec)))
     found = find(spec, table)
-    assert [one.index for one in found.worst] == [3, 1, 2, 0, 4]
-    assert (found.rate.failed, found.rate.flown) == (5, 5)
+    assert [one.index for one in found.worst] == [3, 1, 5, 2, 0, 4]
+    assert (found.rate.failed, found.rate.flown, found.worst[2].why) == (6, 6, "in_box, unseen")
 
 
 @pytest.mark.parametrize("allowed", [False, True])

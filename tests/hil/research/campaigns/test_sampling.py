@@ -192,6 +192,7 @@ def test_points_as_flown_say_which_faults_happened_and_nothing_of_those_that_did
     )
     drawn = points_of(spec)
     flown = as_flown(spec, drawn)
+    assert np.array_equal(drawn, points_of(spec)), "the points stay"
     names = [axis.name for axis in axes(spec)]
     happens, size = names.index("fault 1 push.y happens"), names.index("fault 1 push.y size")
     always = names.index("fault 2 push.y size")

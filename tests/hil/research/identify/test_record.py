@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 from scipy.stats import t as student
 
 from ground_station.telemetry_log import POSE_COLUMNS, TIME_COLUMN
@@ -20,7 +21,7 @@ from hil.config import LabConfig, load_config
 from hil.errors import LabError
 from hil.research.design.axes import DELAY, HEIGHT, PITCH, ROLL, YAW, Axis, dynamics, robot_of
 from hil.research.design.loop import FREQUENCIES
-from hil.research.identify import spectra
+from hil.research.identify import plates, spectra
 from hil.research.identify.flow import flow_of
 from hil.research.identify.identify import (
     IDENTIFIED,
@@ -34,6 +35,7 @@ from hil.research.identify.identify import (
     identify,
     interval_text,
     operating_point,
+    rows_of,
     truth_of,
 )
 from hil.research.identify.joint import (
@@ -578,6 +580,21 @@ def test_u3_is_straightened_by_the_law_of_flat_plates_sin_phi_cos_phi_squared() 
     assert straight.bent == pytest.approx(0.0, abs=1e-9)
 
 
+def test_the_bent_accelerations_are_those_of_a_robot_whose_weight_the_plates_carry(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng, t, pose = np.random.default_rng(4), 0.02 * np.arange(500), np.zeros((500, 6))
+    pose[:, 3], pose[:, 1] = 0.1 * np.sin(3.0 * t), 0.2 * np.cos(2.0 * t)
+    u = lfilter([0.1], [1.0, -0.9], rng.normal(size=(len(t), 4)), axis=0) * 0.2
+    record = Record("r", t, t, u, 0 * u, u[:, :3], t, pose, 0.0, 0.0, CONFIG, False)
+    once = straightened(record)
+    light = plates._plates
+    monkeypatch.setattr(plates, "_plates", lambda config: lambda *at, **of: 3.0 * light(config)(*at, **of))
+    again = straightened(record)
+    assert (again.bent, again.u) == (pytest.approx(once.bent), pytest.approx(once.u))
+    assert np.abs(once.bent).max(axis=0).min() > 0.01
+
+
 def test_turning_alone_pushes_a_robot_of_plates() -> None:
     t, zero = 0.02 * np.arange(100), np.zeros((100, 6))
     record = Record("r", t, t, zero[:, :4], zero[:, :4], zero[:, :3], t, zero, 0.0, 0.0, CONFIG, False)
@@ -703,6 +720,14 @@ def test_roll_lifts_a_robot_that_leans_and_no_other() -> None:
 )
 def test_a_value_ends_at_the_second_digit_of_its_interval(value: float, half: float, text: str) -> None:
     assert interval_text(value, half) == text
+
+
+def test_a_column_is_shown_that_is_filled_in_any_row() -> None:
+    one, other = constant((64.0, 1.0)), replace(constant((64.0, 1.0)), truth=60.0)
+    rows = rows_of([one, other])
+    assert list(rows[0]) == ["constant", "truth", "instruments", "joint fit", "unit", "verdict"]
+    assert [row["truth"] for row in rows] == ["", "60"]
+    assert rows_of([]) == []
 
 
 def test_the_page_shows_identified_constants_first_and_no_empty_column(tmp_path: Path) -> None:

@@ -48,6 +48,8 @@ def test_robots_are_drawn_from_the_covariance_beside_the_profile(tmp_path: Path)
     assert lags.std() == pytest.approx(0.002, rel=0.1)
     assert robots.nominal[DELAY] == pytest.approx(0.0045)
     assert {one["roll_u1"] for one in robots.drawn} == {230.0}, "of which nothing is said"
+    early = [one[DELAY] for one in robots_of(written(tmp_path, delay=0.0105), CONFIG, 64).drawn]
+    assert min(early) == 0.0 < max(early), "no robot answers before it is told"
 
 
 def test_without_a_file_every_constant_is_known_to_a_fifth() -> None:
@@ -165,6 +167,11 @@ def test_a_closed_loop_s_constants_are_those_of_two_lines_of_which_y_has_one(
     assert found.acceleration.reshape(10, 19)[:, 3] == pytest.approx(
         c * found.angle.reshape(10, 19)[:, 3], rel=0.02
     )
+    window = cut(record, 404)
+    back = SimpleNamespace(name="r", pose_t=window.pose_t, pose=window.pose[[*range(402, -1, -1), 403]])
+    monkeypatch.undo()
+    ahead, behind = (two_controllers.closed_loop(one, ROLL).starred for one in (window, back))
+    assert behind == pytest.approx(ahead * [-1.0, 1.0, -1.0], rel=1e-6), "time's direction is that of damping"
     with pytest.raises(LabError, match=r"^r: 4\.0 s of flight; the paper's method takes windows of 4 s$"):
         two_controllers.closed_loop(cut(record, 402), ROLL)
     assert len(two_controllers.closed_loop(cut(record, 405), ROLL).w) == 19
