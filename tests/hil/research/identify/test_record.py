@@ -132,6 +132,9 @@ def test_a_robot_that_looks_elsewhere_is_refused(tmp_path: Path, facing: float) 
     yaw = np.angle(np.exp(1j * (facing + 0.1 * np.sin(np.arange(150.0)))))
     with pytest.raises(LabError, match=r"it looks along -?\d+ deg; expected within 30 deg of 0"):
         loaded(tmp_path, columns(150, **{POSE_COLUMNS[6]: yaw}))
+    for turned, refused in ((29.0, False), (31.0, True)):
+        with pytest.raises(LabError, match=f"it looks along {turned:.0f} deg") if refused else nullcontext():
+            loaded(tmp_path, columns(150, **{POSE_COLUMNS[6]: np.full(150, np.radians(turned))}))
 
 
 def test_inputs_within_the_flaps_limits_are_what_was_commanded(tmp_path: Path) -> None:

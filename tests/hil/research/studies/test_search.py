@@ -55,6 +55,25 @@ def test_a_flight_that_was_not_completed_costs_more_than_any(outcome: str) -> No
     assert asked.cost(jobs[1:]) == 0.5
     assert asked.cost(jobs) == (LOST + 0.5) / 2
     assert (asked.cost_text(asked.cost(jobs)), asked.cost_text(0.5)) == ("lost", "50 cm")
+    far = Row(Job(0, "hover", Options(), {}), "completed", "", True, "", {"rms_z": 1e300}, {})
+    assert asked.cost([far]) == LOST, "nor does a completed flight cost more than a lost one"
+
+
+@pytest.mark.parametrize("metrics", [{}, {"rms_z": 0.5}])
+def test_a_flight_whose_error_is_not_of_its_numbers_ends_the_search(
+    tmp_path: Path, metrics: dict[str, float]
+) -> None:
+    """One with metrics has flown: it counts as lost."""
+
+    class Failing(Runner):
+        def _row(self, job: Job) -> Row:
+            return Row(job, "error", "too little memory", False, "", metrics, {})
+
+    if metrics:
+        assert found(Failing(), aim("rms_z", flights=8), tmp_path).before == LOST
+    else:
+        with pytest.raises(LabError, match=r"^too little memory$"):
+            found(Failing(), aim("rms_z", flights=8), tmp_path)
 
 
 @pytest.mark.parametrize("metric", ["rms_z", "in_box"])  # smallest is best, largest is best
