@@ -19,7 +19,7 @@ from scipy.stats import t as student
 from ground_station.telemetry_log import POSE_COLUMNS, TIME_COLUMN
 from hil.config import LabConfig, load_config
 from hil.errors import LabError
-from hil.research.design.axes import DELAY, HEIGHT, PITCH, ROLL, YAW, Axis, dynamics, robot_of
+from hil.research.design.axes import AXES, DELAY, HEIGHT, PITCH, RATE, ROLL, YAW, Axis, dynamics, robot_of
 from hil.research.design.loop import FREQUENCIES
 from hil.research.identify import plates, spectra
 from hil.research.identify.flow import flow_of
@@ -48,6 +48,7 @@ from hil.research.identify.joint import (
     _regress,
     identities,
     instrumental,
+    joint,
     pose_lateness,
     whitened,
 )
@@ -631,6 +632,26 @@ def test_flat_plates_fulfil_the_identities_of_the_fit() -> None:
         assert sum(abs(one) > 0.01 for one in changed) == 1, name
 
 
+@pytest.mark.parametrize("best", [0, 1, 2, 3])
+def test_the_best_of_all_starts_is_the_fit(monkeypatch: pytest.MonkeyPatch, best: int) -> None:
+    starts: list[Array] = []
+
+    def solved(fit: JointFit, x: Array) -> Any:
+        starts.append(x * fit.scale)
+        cost = 1.0 if len(starts) == 1 + best else 2.0
+        return SimpleNamespace(x=x, cost=cost, fun=np.ones(12), jac=np.eye(len(x)))
+
+    monkeypatch.setattr(JointFit, "solved", solved)
+    w = 2 * np.pi * np.array([0.5, 1.0, 3.0])
+    one = spectra.Spectra(w, np.ones((3, 3), complex), np.tile(np.eye(3, dtype=complex), (3, 1, 1)), np.ones((1, 3, 3)),
+        np.ones(3), np.ones((3, 3)))  # fmt: skip
+    values = CONFIG.model.model_dump()
+    found = joint([Excited(YAW, 2, one)], 0.05, [values, values | {"yaw_u3": 7.0}], lambda values: [])
+    assert [start[2] for start in starts] == pytest.approx([0.05, 0.05, 0.06, 0.04]), "two lags more"
+    assert [*found.values.values(), *found.late] == pytest.approx([*starts[best]])
+    assert found.values["yaw_u3"] == pytest.approx(7.0 if best == 1 else values["yaw_u3"])
+
+
 @pytest.mark.parametrize("late_s", [0.02, -0.008])
 def test_poses_are_late_by_the_cameras_angle_behind_the_gyro_s(late_s: float) -> None:
     w = 2 * np.pi * np.array([0.5, 1.0, 3.0])
@@ -639,6 +660,18 @@ def test_poses_are_late_by_the_cameras_angle_behind_the_gyro_s(late_s: float) ->
     shown = spectra.Spectra(w, Z, C, Z[None], Z[:, 0], np.ones((3, 4)))
     assert pose_lateness([Excited(ROLL, 2, shown)], 2) == pytest.approx(late_s)
     assert pose_lateness([Excited(ROLL, 2, shown)], 1) == LATE_S, "another record"
+
+
+@pytest.mark.parametrize("axis", AXES, ids=lambda axis: axis.name)
+def test_the_instruments_find_every_constant_of_a_robot_that_follows_its_model(axis: Axis) -> None:
+    """Also one that turning alone pushes, by poses that are late."""
+    w, late = 2 * np.pi * np.array([0.3, 0.7, 1.1, 1.7, 2.3, 3.1]), 0.021 if RATE in axis.states else LATE_S
+    values = {**dict.fromkeys(axis.constants, 0.3), **CONFIG.model.model_dump(), LAG: 0.05, "delay": DELAY_S}
+    Z = np.concatenate([np.ones((len(w), 1)), response(axis, values, w, late)], axis=1)
+    C = np.tile(np.eye(Z.shape[1], dtype=complex), (len(w), 1, 1)) * 1e-12
+    one = Excited(axis, 0, spectra.Spectra(w, Z, C, Z[None], Z[:, 0], np.ones(Z.shape)))
+    found = instrumental([one], 0.05).values
+    assert found == pytest.approx({name: values[name] for name in axis.constants}, rel=0.02, abs=0.02)
 
 
 def test_the_instruments_intervals_are_student_s_with_two_numbers_for_each_line(

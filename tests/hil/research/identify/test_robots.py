@@ -1,6 +1,7 @@
 """What `floaty tune` takes from identification: robots that a model's intervals allow, and what the flow does."""
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,12 +12,15 @@ from scipy.signal import cont2discrete, dlsim
 
 from hil.config import load_config
 from hil.errors import LabError
-from hil.research.design.axes import DELAY, PITCH, ROLL, Axis, dynamics, robot_of
+from hil.research.design.axes import AXES, DELAY, PITCH, ROLL, Axis, dynamics, robot_of
 from hil.research.design.loop import FREQUENCIES
 from hil.research.identify import pages, two_controllers
 from hil.research.identify.flow import flow_of
+from hil.research.identify.identify import UNKNOWN, WEAK, Identification, IdentifiedConstant
+from hil.research.identify.joint import Estimate
 from hil.research.identify.record import Record
-from hil.research.identify.robots import UNKNOWN_SHARE, KnownModel, beside, robots_of
+from hil.research.identify.response import LAG
+from hil.research.identify.robots import UNKNOWN_SHARE, KnownModel, beside, robots_of, write_profile
 from hil.research.identify.two_controllers import ClosedLoop
 
 CONFIG = load_config()
@@ -52,11 +56,39 @@ def test_robots_are_drawn_from_the_covariance_beside_the_profile(tmp_path: Path)
     assert min(early) == 0.0 < max(early), "no robot answers before it is told"
 
 
-def test_without_a_file_every_constant_is_known_to_a_fifth() -> None:
+def test_without_a_file_every_constant_is_known_to_a_fifth(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     robots = robots_of("floaty", CONFIG, 256)
     spread = np.std([one["pitch_u2"] for one in robots.drawn]) / 1066
     assert 1.96 * spread == pytest.approx(UNKNOWN_SHARE, rel=0.1)
     assert robots_of("floaty", CONFIG, 0).drawn == ()
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "floaty.json").write_text("another program's")
+    assert robots_of("floaty", CONFIG, 256) == robots
+
+
+def test_a_profile_has_all_constants_of_an_axis_of_which_one_is_known(tmp_path: Path) -> None:
+    every = dict.fromkeys((name for axis in AXES for name in axis.constants), 0.0)
+    values = {**every, **CONFIG.model.model_dump(), LAG: 0.04, DELAY: 0.0145} | {
+        "roll_u1": 231.0,
+        "roll_rate": -3.5,
+        "yaw_u3": 9.0,
+    }
+    constants = tuple(
+        IdentifiedConstant(name, "", (0.0, 0.0), 0.0, (0.0, 0.0), (0.0, 0.0), (value, 0.25),
+            WEAK if name in ("roll_u1", LAG) else UNKNOWN, "")
+        for name, value in values.items()
+    )  # fmt: skip
+    flown: Any = SimpleNamespace(name="flight", u=np.zeros((9, 4)), config=CONFIG)
+    estimate = Estimate(values, dict.fromkeys(values, 0.25), 1.0, (), np.eye(len(values)))
+    path = tmp_path / "new.toml"
+    assert write_profile(path, "floaty", Identification(constants, (), estimate, (flown,), ())) == ""
+    written, text = load_config(str(path)).model, path.read_text(encoding="utf-8")
+    assert (written.roll_u1, written.roll_rate, written.flap_rate) == (231.0, -3.5, 25.0)
+    assert written.yaw_u3 == CONFIG.model.yaw_u3, "of yaw nothing is known"
+    found = dict(re.findall(r"(roll_u1|roll_rate) = \S+ +# (.*)", text))
+    assert found == {"roll_u1": "± 0.25, weak", "roll_rate": "± 0.25, not identifiable"}
 
 
 @pytest.mark.parametrize(
