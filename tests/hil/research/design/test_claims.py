@@ -12,7 +12,7 @@ from hil.pictures.curves import AXIS_COLOURS, BLUE, GREY, ORANGE, RED, SERIES_CO
 from hil.research.design import figures
 from hil.research.design.authority import LEVEL_SHARE, Attainable
 from hil.research.design.axes import AXES, PITCH, ROLL
-from hil.research.design.claims import _near, claims, robot_lines, text_of
+from hil.research.design.claims import _near, _stable, claims, robot_lines, text_of
 from hil.research.design.linear import Point, point_of
 from hil.research.design.sweeps import (
     FACTORS,
@@ -110,6 +110,18 @@ def test_each_claim_has_the_robot_s_value_and_its_verdict(point: Point, stable: 
     assert not any(one.why for one in table if one.verdict == "agrees")
     assert not stable or all(one.why for one in table if one.verdict == "differs")
     assert [one.paper for one in found if one.title == "z per vz"] == ["-2 ± 0.1"]
+
+
+@pytest.mark.parametrize(
+    ("roll", "pitch", "verdict"), [(-1, -1, "agrees"), (-1, 1, "differs"), (1, -1, "differs")]
+)
+def test_rates_are_damped_where_both_are(
+    point: Point, monkeypatch: pytest.MonkeyPatch, roll: float, pitch: float, verdict: str
+) -> None:
+    changed = replace(point.linear.constants, roll_rate=roll, pitch_rate=pitch)
+    monkeypatch.setattr(type(point.linear), "constants", property(lambda linear: changed))
+    found = _stable(point, Stability(*np.zeros((3, 1)), 0.5))
+    assert [one.verdict for one in found if one.title.startswith("rates are damped")] == [verdict]
 
 
 @pytest.mark.parametrize(("growth", "verdict"), [(-0.01, "agrees"), (0.0, "differs"), (0.01, "differs")])

@@ -61,6 +61,8 @@ from hil.research.identify.record import (
     RATES,
     WRAP_MS,
     Record,
+    _in_order,
+    _ticks,
     load_record,
 )
 from hil.research.identify.response import LAG, TICK_DELAYS_S, flap_response, one_step, outputs, response
@@ -560,6 +562,21 @@ def test_rates_sampled_before_the_inputs_belong_to_the_next_tick(tmp_path: Path)
     late = loaded(tmp_path, columns(120, begin_ms=1008))
     assert early.u_t[0] == late.u_t[0] == pytest.approx(1.0)
     assert (early.t[0], late.t[0]) == (pytest.approx(1.01), pytest.approx(1.0))
+    ms = np.arange(20_000)
+    inputs, rates = _ticks(1e-3 * ms)
+    assert np.array_equal(np.round(1e3 * inputs), ms // 10 * 10)
+    assert np.array_equal(np.round(1e3 * rates), (ms + 1) // 10 * 10)
+
+
+@pytest.mark.parametrize(("factor", "refused"), [(0.009, True), (0.011, False), (99.0, False), (101.0, True)])
+def test_clocks_of_which_one_counts_a_hundredth_of_the_other_are_refused(
+    tmp_path: Path, factor: float, refused: bool
+) -> None:
+    table = columns(150)
+    table[TIME_COLUMN] = AHEAD_S + (table[TIME_COLUMN] - AHEAD_S) / factor
+    expected = r"in another unit, such as microseconds\?$"
+    with pytest.raises(LabError, match=expected) if refused else nullcontext():
+        _in_order(table, tmp_path)
 
 
 def test_a_file_that_is_not_csv_is_refused_in_one_line(tmp_path: Path) -> None:

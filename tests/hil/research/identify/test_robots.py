@@ -204,6 +204,11 @@ def test_a_closed_loop_s_constants_are_those_of_two_lines_of_which_y_has_one(
     monkeypatch.undo()
     ahead, behind = (two_controllers.closed_loop(one, ROLL).starred for one in (window, back))
     assert behind == pytest.approx(ahead * [-1.0, 1.0, -1.0], rel=1e-6), "time's direction is that of damping"
+    every = 200 * rng.normal(size=(400, 6))[np.arange(len(t)) % 400]  # the same in every window
+    same = SimpleNamespace(pose_t=t + 3.0, pose=every)
+    once, twice = (two_controllers.closed_loop(cut(same, rows), ROLL) for rows in (405, 805))
+    free = (2 * 38 - 3) / (38 - 3)  # numbers of 19 complex bins, without the three constants
+    assert (once.errors / twice.errors) ** 2 == pytest.approx(np.full(3, free))
     with pytest.raises(LabError, match=r"^r: 4\.0 s of flight; the paper's method takes windows of 4 s$"):
         two_controllers.closed_loop(cut(record, 402), ROLL)
     assert len(two_controllers.closed_loop(cut(record, 405), ROLL).w) == 19
