@@ -239,7 +239,7 @@ def test_a_page_shows_each_axis_by_a_flight_that_was_not_fitted_where_there_is_o
     def one(axis: Axis, record: int) -> Any:
         return SimpleNamespace(axis=axis, record=record)
 
-    fitted = [one(ROLL, 1), one(PITCH, 0), one(PITCH, 2)]
+    fitted = [one(ROLL, 1), one(PITCH, 2), one(PITCH, 0)]
     records = tuple(SimpleNamespace(name=f"r{n}") for n in range(3))
     estimate = SimpleNamespace(values="values", late=(0.1, 0.2, 0.3))
     constants = [SimpleNamespace(name=name, verdict=verdict) for name, verdict in
@@ -268,4 +268,4 @@ def test_a_page_shows_each_axis_by_a_flight_that_was_not_fitted_where_there_is_o
     asked.clear()
     _, content = pages.write_pages(tmp_path, found, None)
     content["figures"][1][2]()
-    assert asked[2][1:] == (records[0], fitted[1], "values", 0.1)
+    assert asked[2][1:] == (records[2], fitted[1], "values", 0.3)
