@@ -450,6 +450,8 @@ def test_the_stages_of_the_age_lie_on_one_another(folder: Path) -> None:
     table = pa.table({f"age.{name}": [age_us] for name, age_us in ages.items()})
     np.testing.assert_allclose(curves.AGE_STAGES.read(table), [[20.0, 38.0, 39.0, 39.1, 41.1]])
     counted = rows_by_entity(write_run_rrd(folder))
+    tasks = {name.rpartition("/")[2] for name in counted if name.startswith("/state/task/")}
+    assert "IDLE" not in tasks >= {"KALMAN", "STABILIZER"}, "what runs when nothing else does has no lane"
     assert counted["/plot/age/stages"] > 60  # by the station's own record, and their names
 
 

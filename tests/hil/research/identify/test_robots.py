@@ -52,6 +52,12 @@ def test_robots_are_drawn_from_the_covariance_beside_the_profile(tmp_path: Path)
     assert lags.std() == pytest.approx(0.002, rel=0.1)
     assert robots.nominal[DELAY] == pytest.approx(0.0045)
     assert {one["roll_u1"] for one in robots.drawn} == {230.0}, "of which nothing is said"
+    uncertain = robots_of(
+        written(tmp_path, covariance=np.diag([30.0, 0.16, 4e-3, 1e-6]).tolist()), CONFIG, 64
+    )
+    assert max(one["flap_rate"] for one in uncertain.drawn) == pytest.approx(200.0), (
+        "no flap lags less than 5 ms"
+    )
     early = [one[DELAY] for one in robots_of(written(tmp_path, delay=0.0105), CONFIG, 64).drawn]
     assert min(early) == 0.0 < max(early), "no robot answers before it is told"
 
