@@ -84,7 +84,7 @@ class PanelCommands:
             (milliseconds,) = _numbers(rest or "10", (1,), "step MS")
             if not 10 <= milliseconds <= STEP_MS_MOST:
                 raise LabError(f"step {rest}: expected 10..{STEP_MS_MOST} ms")
-            self._until_us = now_us + max(RECORD_PERIOD_US, round(1000 * milliseconds))
+            self._until_us = now_us + round(1000 * milliseconds)
             self._paused = False
         elif word == "goal":
             x, y, z, *yaw = _numbers(rest, (3, 4), "goal X Y Z [YAW], metres in W and degrees")

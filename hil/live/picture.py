@@ -95,6 +95,9 @@ def main() -> int:
         missing = why_missing(error) if isinstance(error, ImportError) else ""
         say(FAILED, f"--view {sys.argv[1]}: {missing}" if missing else f"{type(error).__name__}: {error}")
         return 1
+    finally:
+        with suppress(OSError):
+            answers.close()
     return 0
 
 

@@ -64,7 +64,7 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     result, events = read_result(folder, find_shipped), load_events(folder)
     log = with_marks(load_log(folder), events)
     experiment, release_us = experiment or result.request.experiment, release_of(log.schema.metadata)
-    marks = marks_of_flight(log, result.cause or "lost" if result.outcome == "lost" else None)
+    marks = marks_of_flight(log, result.cause if result.outcome == "lost" else None)
     answers = _answers(folder, log, experiment, marks)
     failures = failures_of(log, result)
     close = close_ups(log, marks, failures[0].at_s if failures else None)

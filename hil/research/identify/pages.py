@@ -65,7 +65,7 @@ def _axis(
     answer.set_title(
         "a flight that was not fitted" if held_out else "the fitted flight; --validate RUN: another"
     )
-    _one_step(step, records[seen.record], seen, found.estimate.values, late[0 if held_out else seen.record])
+    _one_step(step, records[seen.record], seen, found.estimate.values, late[seen.record])
     return figure
 
 

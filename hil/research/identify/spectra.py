@@ -98,6 +98,8 @@ def _begun(t: Array, r: Array) -> list[float]:
     """Return when an excitation r (N, 4) began: first, and anew after holes. It always begins with the same phases."""
     begun, step = [float(t[0])], float(np.median(np.diff(t)))
     first = t < t[0] + ALIKE_S
+    if np.count_nonzero(first) <= ALIKE_ROWS:
+        return begun
     at_first = interp1d(t[first] - t[0], r[first], "cubic", axis=0, bounds_error=False, fill_value=np.nan)
     for place in np.flatnonzero(np.diff(t) > BREAK_ROWS * step):
         after = slice(place + 1, place + 1 + int(np.count_nonzero(first)))

@@ -79,7 +79,8 @@ def command(body: Rigid, flaps: Flaps, agent: Agent, control: Control) -> None:
 @compiled
 def disturb(body: Rigid, agent: Agent) -> None:
     """Apply the pushes of this step."""
-    t, pushes = body.time_us * 1e-6, agent.pushes
+    t = (body.time_us + 1.0) * 1e-6  # 1 us later: rounding moves no push to the next step
+    pushes = agent.pushes
     for i in range(6):
         body.push[i] = 0.0
     for i in range(PUSHES):

@@ -182,7 +182,7 @@ class _Flown:
 
     def costs(self, name: str, points: Sequence[Numbers]) -> list[float]:
         jobs = [self._job(point, seed) for point in points for seed in self._seeds]
-        if name in ("round-1", "judgement"):
+        if name == "round-1":
             jobs[0].request()
         rows = self._runner.fly(name, jobs, self._folder)
         if self._runner.interrupted or len(rows) < len(jobs):

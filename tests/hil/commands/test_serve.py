@@ -1,6 +1,7 @@
 """`floaty serve` in this process: what it opens and says, whose exit code it has, and when it ends."""
 
 import signal
+from pathlib import Path
 from types import SimpleNamespace as Made
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 
 from ground_station import records, stops
 from hil.commands import options
+from hil.errors import LabError
 from hil.servers import server, usb_dongle
 from support.command import Cli
 
@@ -38,12 +40,13 @@ def test_a_server_with_a_program_on_its_bus_ends_with_it(
     cli: Cli, monkeypatch: pytest.MonkeyPatch, code: int
 ) -> None:
     programs = started(monkeypatch, code)
+    monkeypatch.setattr(server.Paced, "stood_still_us", property(lambda clock: 12_400))
     assert cli("serve", *ALONE, "--usb", "--", "radio", "E7") == code
     lines = cli.out.splitlines()
-    assert [line.split()[0] for line in lines] == ["radio", "use", "serving;", "stopped;"]
+    assert [line.split()[0] for line in lines if "12 ms" not in line] == ["radio", "use", "serving;"]
     port = int(lines[1].partition("FLOATY_DONGLE=127.0.0.1:")[2].split()[0])
     assert programs == [(port, ["radio", "E7"])]
-    assert lines[-1] == "stopped; time stood still for 0 ms"
+    assert lines[-1] == "stopped; time stood still for 12 ms"
 
 
 @pytest.mark.usefixtures("_ctrl_c")
@@ -61,6 +64,41 @@ def test_a_server_says_how_a_program_gets_the_bus_and_where_its_cameras_are(
     assert programs == []
     monkeypatch.setattr(usb_dongle, "why_not", lambda: "no bus")
     assert cli.refusal("serve", "--usb") == "floaty: --usb: no bus\n"
+
+
+@pytest.mark.parametrize(("words", "absolute", "plan", "endpoints"), [
+    ("", True, (1, False, [], None), (19850, None, [], None, True)),
+    ("--station --seed 7", False, (7, False, [], None), (19850, None, [], "corrections", True)),
+    ("--station poses --no-motive --radio", True, (1, False, [], None), (None, 19840, [], "poses", False)),
+    ("--radio --radio-port 5 --udp 6 --state x", True, (1, False, [], Path("x")), (6, 5, [], None, True)),
+    ("--mavlink udp:7 --fault serial.cut@1", True, (1, True, ["serial.cut@1"], None), (None, None, 1, None, True)),
+])  # fmt: skip
+def test_a_server_is_planned_as_it_is_asked_for(
+    cli: Cli,
+    monkeypatch: pytest.MonkeyPatch,
+    words: str,
+    absolute: bool,
+    plan: tuple[Any, ...],
+    endpoints: tuple[Any, ...],
+) -> None:
+    """Clients send absolute poses, as does the station with poses; markers are for a Motive."""
+    asked: list[Any] = []
+
+    def swarm(*what: Any) -> Any:
+        asked.extend(what)
+        raise LabError("enough")
+
+    monkeypatch.setattr("hil.servers.swarm.Swarm", swarm)
+    assert cli.refusal("serve", *words.split()) == "floaty: enough\n"
+    service, boards, ends, _ = asked
+    assert (boards, service.config.predictor.absolute, service.config.markers.enabled) == (
+        1,
+        absolute,
+        endpoints[-1],
+    )
+    assert (service.seed, service.mavlink, [str(one) for one in service.faults], service.state) == plan
+    mavlink = len(ends.mavlink) or []
+    assert (ends.udp, ends.radio, mavlink, ends.station, ends.motive) == endpoints
 
 
 @pytest.mark.usefixtures("_ctrl_c")

@@ -261,6 +261,10 @@ def test_values_that_are_tried_are_inside_but_not_the_default_and_just_outside(n
     beside = [np.nextafter(low, -np.float32(np.inf)), np.nextafter(high, np.float32(np.inf))]
     edges = [float(edge) for edge in beside] if one.scalar.is_float else [low - 1.0, high + 1.0]
     assert outside == [edge for edge in edges if one.scalar.cast(edge) == edge]
+    for initial in image_check._values(replace(one, initial=one.low), one.scalar)[
+        :1
+    ]:  # the default is that value
+        assert image_check._values(replace(one, initial=initial), one.scalar)[0] not in (initial, *outside)
     assert image_check._behind(replace(one, scale=0.1), 3.0) == one.place.scalar.cast(
         float(np.float32(0.1) * np.float32(3.0))
     )
@@ -362,6 +366,17 @@ def test_numbers_of_two_boards_may_be_apart_by_their_tolerance() -> None:
         assert bool(list(differences(Answers([], [place]), Answers([], [found])))) == apart
 
 
+def test_answers_come_in_the_order_of_the_programs_of_which_as_many_run_as_there_are_processors(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("hil.deploy.services.os.sched_getaffinity", lambda process: {0, 1})
+    bench: Any = SimpleNamespace(play=lambda program: Answers([f"{program}: 1"], [(0.0, 1.0, 2.0, 3.0)]))
+    played = [*play_in_copies(bench, "abcde")]
+    assert [(one.lines, one.path) for one in played] == [
+        ([f"{name}: 1"], [(0.0, 1.0, 2.0, 3.0)]) for name in "abcde"
+    ]
+
+
 def test_a_program_that_breaks_off_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(LabError, match="the board broke off a program of requests"):
         list(play_in_copies(ServiceBench(PythonBoard()), ["no-such-word"]))
@@ -411,6 +426,8 @@ def test_each_bound_is_that_of_its_size_in_every_one_of_its_columns(bound: Bound
             if bound.unit == "ms":
                 assert str(one).endswith("ms apart (estimator.pose_age_us), at most 1 ms")
         assert not found(name, []).held
+        unknown = found(name, [0.0, np.nan, np.nan])
+        assert (unknown.held, unknown.column) == (False, name), "what is no number is the largest"
 
 
 def test_the_first_state_that_one_board_does_not_reach_is_found(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from hil.laboratory.metrics import column, free_flight
 from hil.pictures import video
 from hil.pictures.report import write_report
 from hil.pictures.scene import turn_of
-from hil.research.identify.record import profile_of
+from hil.research.identify.record import _flown_with, profile_of
 from hil.world.scene import VisualModel
 from support.command import Cli
 from support.flights import hover
@@ -71,6 +71,10 @@ def test_its_log_has_its_motion_and_no_flaps(flown: Result) -> None:
 def test_what_is_identified_from_its_flights_changes_its_profile(flown: Result, tmp_path: Path) -> None:
     assert profile_of(flown.folder) == flown.request.profile != "floaty"
     assert profile_of(tmp_path / "telemetry.csv") == "floaty"
+    assert _flown_with(flown.folder)[1:] == (
+        True,
+        pytest.approx(1e-6 * flown.request.config.flight.release_us),
+    )
 
 
 def test_a_body_in_free_fall_falls_as_galileo_found(tmp_path: Path) -> None:

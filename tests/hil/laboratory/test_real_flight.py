@@ -48,6 +48,7 @@ from hil.pictures.figures import PICTURES
 from hil.pictures.gallery import GALLERY
 from hil.pictures.panels import marks_of_flight
 from hil.pictures.report import write_report
+from hil.research.identify.record import _flown_with
 from support.full_disk import small_files
 from support.html_page import Page
 from support.watching import Watcher
@@ -251,6 +252,7 @@ def test_the_judged_part_lasts_from_trajectory_to_experiment_end(tmp_path: Path)
     assert result.metrics["max_x"] == pytest.approx(0.0, abs=1e-9)
     log = load_log(tmp_path / "run")
     assert release_of(log.schema.metadata) == 1_003_000
+    assert _flown_with(tmp_path / "run")[1:] == (False, 0.0), "the board's own clock is another"
     assert log.num_rows == pytest.approx(805, abs=2)
     (held,) = marks_of_flight(log).intervals
     assert (held.kind, held.begin_s, held.end_s) == (

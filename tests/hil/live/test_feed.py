@@ -106,7 +106,9 @@ def test_a_picture_that_cannot_come_up_is_an_error_before_the_flight(program: st
 def test_a_picture_reports_its_address_and_typed_lines() -> None:
     said: list[str] = []
     view = LiveView(picture(TAKES_ALL), said.append)
-    view.note(5, "lab", "the first text")
+    for number in range(feed.LINES + 1):
+        view.note(5, "lab", f"text {number}")
+    assert (len(view._texts), view._texts[0]["text"]) == (feed.LINES, "text 1"), "the oldest gives way"
     view.rows(rows(0, 20))
     view.note(25, "lab", "the last text")
     assert view.close() == 0

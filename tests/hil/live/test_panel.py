@@ -6,7 +6,9 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pytest
 from tornado.httpclient import HTTPClientError, HTTPRequest
@@ -18,6 +20,7 @@ from ground_station import operator
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.files.recorder import load_log
+from hil.laboratory.metrics import body
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.live.panel import (
@@ -164,6 +167,41 @@ def test_a_page_shows_only_the_newest_row(panel: PanelScreen, loop: IOLoop, tmp_
         panel.show_rows(log.slice(first % 150, 1), [])
     assert [len(panel._past), panel._past[-1]["t"][0]] == [BATCHES_KEPT, log["t"][(139 + BATCHES_KEPT) % 150]]
     socket.close()
+
+
+def test_the_scene_has_the_goals_of_the_whole_flight_and_the_path_of_the_last_seconds(
+    panel: PanelScreen, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    fly(Request.of(EXPERIMENTS["hover"], duration_s=0.5), tmp_path / "run")
+    log, drawn = load_log(tmp_path / "run"), []
+    y = log["truth.y"].to_numpy().copy()
+    y[3] = np.nan  # one place of which a part is unknown
+    log = log.set_column(log.column_names.index("truth.y"), "truth.y", pa.array(y))
+    log = log.set_column(log.column_names.index("goal.x"), "goal.x", pa.array(np.arange(150.0)))
+
+    class Scene:
+        def __init__(self, look: Any, goals: Any, places: Any) -> None:
+            drawn.append([goals, places])
+
+        def at(self, row: pa.Table, trail: Any, course: Any) -> Any:
+            drawn[-1] += [row["t"][0].as_py(), trail, course]
+            return SimpleNamespace(save=lambda file, **how: file.write(b"x"))
+
+    monkeypatch.setattr("hil.live.panel.VideoScene", Scene)
+    panel.pages.add(lambda message: None)  # type: ignore[arg-type]
+    monkeypatch.setattr(panel, "_tell", lambda message: None)
+    for first in (0, 20):
+        panel.show_rows(log.slice(first, 20), [])
+    (_, places, at_us, trail, course) = drawn[-1]
+    assert [goals[:, 0].tolist() for goals, *_ in drawn] == [[19.0], [19.0, 39.0]]
+    assert at_us == log["t"][39].as_py()
+    assert (
+        places.tolist()
+        == trail.tolist()
+        == body(log.slice(0, 40), "x", "y", "z")[[0, *range(6, 40, 3)]].tolist()
+    )
+    assert course[:, 0].tolist() == [*range(0, 40, 3)]
+    panel.pages.clear()
 
 
 def test_a_viewer_is_opened_once_when_it_is_asked_for_and_gets_the_rows_from_then_on(

@@ -55,9 +55,6 @@ def test_a_picture_shows_what_comes_and_counts_all_that_it_took(monkeypatch: pyt
     ]  # fmt: skip
 
 
-@pytest.mark.filterwarnings(
-    "ignore::pytest.PytestUnraisableExceptionWarning"
-)  # its answers end with the process
 @pytest.mark.parametrize(
     ("error", "told", "code"),
     [
@@ -83,6 +80,9 @@ def test_the_process_answers_in_lines_and_what_libraries_print_is_not_among_them
         if error is not None:
             raise error
         say(TAKEN, "7")
+        assert capfd.readouterr() == ("taken 7\n", "a library's words\n"), "at once"
+        say(TAKEN, "7")
+        os.write(1, b"a library's words\n")
 
     monkeypatch.setattr(picture, "run", run)
     monkeypatch.setattr(picture.os, "nice", asked.append)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rerun.blueprint import Blueprint
 
 from hil.errors import LabError
 from hil.laboratory.experiments import EXPERIMENTS
@@ -84,8 +85,13 @@ def test_a_port_that_is_taken_is_one_line(links: Links, run: Path) -> None:
         Links(run, str, links.server_port)
 
 
-def test_a_recording_is_served_with_the_time_at_an_instant(run: Path) -> None:
+def test_a_recording_is_served_with_the_time_at_an_instant(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved, save = [], Blueprint.save
+    monkeypatch.setattr(Blueprint, "save", lambda layout, *to: saved.append(to[0]) or save(layout, *to))
     recording = ServedRecording(run)
+    assert set(saved) == {"floaty"}, "the layout is that of the recording's application"
     assert (run / "flight.rrd").is_file()
     at = recording.at(0.25)
     assert at.startswith("rerun+http://127.0.0.1:")

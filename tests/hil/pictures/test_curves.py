@@ -48,6 +48,23 @@ def flight(yaw: Sequence[float], period_us: int = 10_000, **columns: Sequence[fl
     ).replace_schema_metadata(RELEASE)
 
 
+def test_own_columns_are_those_of_the_group_by_unit() -> None:
+    fields = [
+        ("t", ""),
+        ("robot.b", "V"),
+        ("robots.x", "V"),
+        ("robot.a", "m"),
+        ("logic.c", "V"),
+        ("robot.d", "V"),
+    ]
+    schema = pa.schema([pa.field(name, pa.float64(), metadata={"unit": unit}) for name, unit in fields])
+    rows = pa.table([pa.array([1.0 + place]) for place in range(len(fields))], schema=schema)
+    found = curves.own_columns(rows, "robot")
+    assert [(one.unit, one.names, one.read(rows).tolist()) for one in found] == [
+        ("V", ("b", "d"), [[2.0, 6.0]]), ("m", ("a",), [[4.0]])]  # fmt: skip
+    assert len({*found[0].colours}) == 2
+
+
 def test_angles_have_their_own_names() -> None:
     rows = flight(
         [180.0],

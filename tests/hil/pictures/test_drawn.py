@@ -17,7 +17,7 @@ from hil.pictures import charts, swarm
 from hil.pictures.curves import BLUE, GREEN, GREY, ORANGE, PINK, RED, SKY, YELLOW, task_colour
 from hil.pictures.drawing import figure_of, name_marks
 from hil.pictures.panels import Bar, Instant, Interval, Marks, Panel, Plot, Series
-from hil.pictures.path import FlownPath, path_of
+from hil.pictures.path import FlownPath, _grid, _Wall, path_of
 from hil.world.floaty.geometry import weigh
 from support.html_page import lines_of
 
@@ -91,6 +91,11 @@ TO_SPACE = Rotation.from_euler("zy", [60, 30], degrees=True).as_matrix()[
 ]  # right and up for an eye at -60, 30 degrees
 VIEWS = {"150": 0.62 * TO_SPACE, "455": np.eye(3)[:2], "745": np.eye(3)[[0, 2]]}
 FLOWN = np.array([(0.0, 0.0, 0.0), (8.0, 4.0, -2.0), (5.0, 5.0, 6.0), (-9.0, 3.0, 1.0)])
+
+
+@pytest.mark.parametrize(("reach", "lines"), [(25.0, 5), (25.1, 3)])
+def test_a_grid_has_at_most_two_lines_and_a_half_beside_its_middle(reach: float, lines: int) -> None:
+    assert len([*_grid(np.eye(3)[:2], _Wall(0, 1, 0.0, 0.0), reach)]) == lines
 
 
 @pytest.mark.parametrize("moves", [False, True])
@@ -242,6 +247,7 @@ def test_vehicles_have_their_power_per_mass_and_floaty_the_mean_of_its_flights()
     }
     assert found == pytest.approx(ends)
     assert bars.yaxis_inverted()
+    assert bars.get_xlim() == pytest.approx((0.0, 1.12 * max(values))), "all bars and their numbers"
     points = [
         (line.get_xydata()[0].tolist(), line.get_marker()) for line in scatter.lines if len(line.get_xdata())
     ]

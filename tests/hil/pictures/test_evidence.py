@@ -12,9 +12,10 @@ from hil.laboratory import metrics
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import spans_of
 from hil.laboratory.metrics import METRICS, judge
+from hil.pictures import curves
 from hil.pictures.panels import Instant, Interval, Marks, saturated
 from hil.pictures.report import FaultRow, fault_rows, metric_rows, not_executed
-from hil.pictures.timeline import _before, _rotors, _windows, evidence, failures_of, story_of
+from hil.pictures.timeline import _before, _plot, _rotors, _windows, evidence, failures_of, story_of
 
 
 @pytest.mark.parametrize(
@@ -118,6 +119,30 @@ def test_close_ups_are_around_faults_that_begin_together_and_around_a_loss_or_li
     assert _windows(Marks(faults), 2.25) == at_faults
     assert _windows(Marks((), lost), 8.51) == [loss], "shown already"
     assert _windows(Marks(), None) == []
+
+
+def test_a_close_up_has_the_estimate_and_commands_dashed_in_the_colours_of_the_truth() -> None:
+    log = flown_log()
+    shown = {panel.label: panel.series for panel in _plot(log, (0.0, 2.0)).panels}
+    assert [*shown] == [
+        "position error [cm]",
+        "attitude error [deg]",
+        "flaps [deg]",
+        "without a pose [ms]",
+        "states",
+    ]
+    pairs = (("position error [cm]", curves.POSITION, curves.POSITION_ESTIMATE, "estimate"),
+        ("attitude error [deg]", curves.ATTITUDE, curves.ATTITUDE_ESTIMATE, "estimate"),
+        ("flaps [deg]", curves.FLAPS, curves.FLAPS_COMMAND, "command"))  # fmt: skip
+    for label, curve, other, name in pairs:
+        lines = shown[label]
+        assert [line.name for line in lines] == [*curve.names, name, *[""] * (len(curve.names) - 1)]
+        assert [line.colour for line in lines] == [*curve.colours] * 2
+        assert [line.dashed for line in lines] == [False] * len(curve.names) + [True] * len(curve.names)
+        for line, values in zip(lines, [*curve.read(log).T, *other.read(log).T], strict=True):
+            np.testing.assert_array_equal(line.values, values)
+    bare = _plot(log.drop_columns(["estimate.x", "estimate.roll"]), (0.0, 2.0)).panels
+    assert [len(panel.series) for panel in bare[:2]] == [3, 3], "of an imported log"
 
 
 def judged(values: dict[str, float], limits: dict[str, float], outcome: str = "completed") -> Any:

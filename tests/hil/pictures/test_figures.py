@@ -16,7 +16,7 @@ from ground_station.latency import STAGES
 from hil.laboratory.experiments.overload import loads_that_hurt
 from hil.laboratory.schedule import runs
 from hil.pictures import curves, figures, pages
-from hil.pictures.panels import Interval, Marks, Picture, Still
+from hil.pictures.panels import Bar, Interval, Marks, Picture, Still, lanes
 
 RELEASE_US = 1_000_000
 # Machado, Oliveira, Fernandes 2009: what is seen without the red, without the green receptors; of linear RGB.
@@ -145,6 +145,18 @@ def overloaded(shares: list[float], error: list[float], late: list[int]) -> pa.T
             "late.KALMAN": spread(late), "late.STABILIZER": zeros,
         }
     )  # fmt: skip
+
+
+def test_a_lane_s_states_have_their_colours_and_last_until_the_next_one() -> None:
+    asked = [
+        ("one", np.array([0.5, 2.0]), ["on", "off"], {"on": "red"}),
+        ("other", np.array([1.0]), ["on"], {"on": "blue"}),
+    ]
+    assert lanes(asked, 5.0) == (
+        Bar("one", "on", "red", 0.5, 2.0),
+        Bar("one", "off", curves.GREY, 2.0, 5.0),
+        Bar("other", "on", "blue", 1.0, 5.0),
+    )
 
 
 def test_an_overload_is_held_up_to_the_last_step_inside_the_box_and_never_late_is_not_late_at_100() -> None:

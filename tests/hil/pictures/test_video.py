@@ -17,6 +17,7 @@ from hil.laboratory.metrics import body, column, free_flight, known
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.pictures import curves, video
+from hil.pictures.curves import since_release
 from hil.world.floaty.drawing import look_of
 from hil.world.scene import Part, VisualModel
 from support.command import Cli
@@ -68,6 +69,11 @@ def test_each_frame_shows_the_robot_of_its_instant_and_the_curves_up_to_it(folde
     assert all((np.abs(a - b).max(axis=2) > 40).any() for a, b in pairwise(scenes))
     ink = [(picture[:, video.SIDE :].min(axis=2) < 100).sum() for picture in pictures]
     assert ink[0] < ink[5] < ink[-1]
+    flight = free_flight(log)
+    graph = video._Graph(log, flight)
+    assert graph._axes[-1].get_xlim() == pytest.approx(tuple(since_release(flight)[[0, -1]]))
+    whole, pale = (np.asarray(one).astype(float) for one in (graph._whole, graph._pale))
+    assert pale == pytest.approx(whole + 0.8 * (255.0 - whole), abs=1.0)
 
 
 def test_the_scene_shows_every_goal_and_every_place_of_the_robot() -> None:

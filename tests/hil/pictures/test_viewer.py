@@ -29,7 +29,7 @@ from hil.errors import LabError
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import MARKERS_ON
 from hil.laboratory.faults import parse
-from hil.laboratory.files.recorder import load_events, load_log
+from hil.laboratory.files.recorder import load_events, load_log, stored_in
 from hil.laboratory.metrics import body, column
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
@@ -37,8 +37,8 @@ from hil.laboratory.schedule import SCHEMA
 from hil.live import window
 from hil.live.feed import open_view
 from hil.pictures import curves, scene
-from hil.pictures.viewer.layout import blueprint, views_of
-from hil.pictures.viewer.plots import PLOTS, rates
+from hil.pictures.viewer.layout import EYE, blueprint, tunnel_view, views_of
+from hil.pictures.viewer.plots import PLOTS, rates, refused
 from hil.pictures.viewer.recording import RerunFlight, write_rrd, write_run_rrd
 from hil.pictures.viewer.scene import HIDDEN, METRES_PER_NEWTON, PUSH_SHOWN_US, SEEN
 from hil.pictures.viewer.swarm import write_swarm_rrd
@@ -113,15 +113,22 @@ def test_texts_and_changes_of_state_are_recorded_once(folder: Path) -> None:
         assert 1000 * event["t_us"] in moments(path, f"/text/{event['source']}")
 
 
-def test_markers_change_colour_where_they_come_into_sight_or_go(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def marked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder with markers, of which three are hidden for a while."""
+    folder = tmp_path_factory.mktemp("markers") / "run"
     request = Request.of(
         EXPERIMENTS["hover"],
         overrides=[MARKERS_ON],
         duration_s=0.5,
         faults=[parse("marker.hidden@0.2:0.1=3")],
     )
-    fly(request, tmp_path / "run")
-    log, path = load_log(tmp_path / "run"), write_run_rrd(tmp_path / "run")
+    fly(request, folder)
+    return folder
+
+
+def test_markers_change_colour_where_they_come_into_sight_or_go(marked: Path) -> None:
+    path = write_run_rrd(marked)
     colours = values(path, "/world/robot/markers", "Points3D:colors")
     expected = [[HIDDEN] * n + [SEEN] * (8 - n) for n in (8, 0, 3, 0)]  # no exposure yet; all
     assert colours.tolist() == expected
@@ -138,14 +145,34 @@ def test_markers_change_colour_where_they_come_into_sight_or_go(tmp_path: Path) 
         marker_places(GeometryConfig(), NetConfig()),
         atol=1e-7,
     )
-    split = tmp_path / "split.rrd"
+
+
+def content(path: Path) -> dict[tuple[str, str], list[tuple[int, str]]]:
+    """All values of a recording that move with time, by entity and component, with their instants."""
+    found: dict[tuple[str, str], list[tuple[int, str]]] = {}
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        if FROM_RELEASE in batch.schema.names:
+            times = [moment.value for moment in batch.column(FROM_RELEASE)]
+            for name in (name for name in batch.schema.names if ":" in name):
+                rows = zip(times, map(str, batch.column(name).to_pylist()), strict=True)
+                found.setdefault((chunk.entity_path, name), []).extend(rows)
+    return {key: sorted(rows) for key, rows in found.items()}
+
+
+@pytest.mark.parametrize("size", [40, 7])
+def test_a_flight_in_pieces_as_it_comes_live_has_the_recording_of_the_whole(
+    marked: Path, tmp_path: Path, size: int
+) -> None:
+    log = load_log(marked)
     recording = rerun.RecordingStream("test")
-    recording.save(split)
+    recording.save(tmp_path / "split.rrd")
     stage = RerunFlight(recording, log.schema)
-    for start in range(0, log.num_rows, 40):  # as live: nothing twice, nothing missing
-        stage.add_rows(log.slice(start, 40))
+    for start in range(0, log.num_rows, size):
+        stage.add_rows(log.slice(start, size))
     recording.disconnect()
-    assert moments(split, "/world/robot/markers") == moments(path, "/world/robot/markers")
+    assert content(tmp_path / "split.rrd") == content(staged(tmp_path / "whole.rrd", log))
+    assert stage._past.num_rows == 100, "a second is enough"
 
 
 def rows_by_entity(path: Path) -> Counter[str]:
@@ -350,6 +377,50 @@ def test_a_real_flight_has_the_same_scene_without_unknown_parts(tmp_path: Path) 
     assert counted["/plot/position/marks/pose_too_late_for_the_link"] == 1 + 1
 
 
+def test_the_goal_the_robot_and_the_tunnel_stand_where_they_are(folder: Path) -> None:
+    still: dict[str, Any] = {}
+    for chunk in RrdReader(write_run_rrd(folder)).stream():
+        if chunk.is_static:
+            batch = chunk.to_record_batch()
+            still |= {
+                (chunk.entity_path, name): batch.column(name).to_pylist()[0]
+                for name in batch.schema.names
+                if ":" in name
+            }
+
+    def lines(name: str) -> list[NDArray[np.float64]]:
+        return [np.array(line) for line in still[f"/world/{name}", "LineStrips3D:strips"]]
+
+    model = VisualModel.read(stored_in(load_log(folder).schema.metadata, "look"))
+    expected: dict[str, list[Any]] = {
+        "goal/estimate/ghost": [*model.outline],
+        "goal/ghost": [*model.outline, [(0, 0, 0), (0.16, 0, 0)]],
+        "goal/cross": [np.outer((-0.02, 0.02), axis) for axis in np.eye(3)],
+        "goal/box": scene.box_lines(0.1), "robot/frame": [*model.frame], "tunnel/net": scene.net_lines(0.6, 0.0),
+    }  # fmt: skip
+    for name, wanted in expected.items():
+        for line, one in zip(lines(name), wanted, strict=True):
+            np.testing.assert_allclose(line, one, atol=1e-7, err_msg=name)
+    low, high, *posts = lines("tunnel/nozzle")
+    for ring, height in ((low, 0.0), (high, 1.8)):
+        np.testing.assert_allclose(np.linalg.norm(ring[:, :2], axis=1), 0.6, rtol=1e-6)
+        np.testing.assert_allclose(ring[:, 2], height)
+    np.testing.assert_allclose([post[:, 2] for post in posts], [(0.0, 1.8)] * 4)
+    flow = {
+        name: still["/world/tunnel/flow", f"Cylinders3D:{name}"] for name in ("lengths", "radii", "centers")
+    }
+    assert flow == {
+        "lengths": [pytest.approx(1.8)],
+        "radii": [pytest.approx(0.2)],
+        "centers": [[0.0, 0.0, pytest.approx(0.9)]],
+    }
+    for part in model.parts:
+        (place,) = [still[f"/world/robot/parts/{part.name}", "Mesh3D:vertex_positions"]]
+        np.testing.assert_allclose(place, part.triangles.reshape(-1, 3), atol=1e-7)
+        if part.label:
+            assert still[f"/world/robot/parts/{part.name}/number", "Points3D:labels"] == [part.label]
+
+
 def test_the_goal_has_a_path_where_it_moves(tmp_path: Path) -> None:
     moving = np.where(np.arange(30) < 20, 0.0, 0.01 * np.arange(30))
     log = real_log()
@@ -358,6 +429,12 @@ def test_the_goal_has_a_path_where_it_moves(tmp_path: Path) -> None:
     assert counted["/world/wanted"] == 9 + 1  # and its colour
     assert counted["/world/goal/ghost"] == 1
     assert rows_by_entity(staged(tmp_path / "still.rrd", real_log()))["/world/wanted"] == 1
+
+
+def test_a_mark_is_at_the_row_whose_counter_is_larger_than_before() -> None:
+    rows = pa.table({"a": [1, 1, 2, 2, 2, 5], "b": [0, 0, 0, 0, 1, 0]})
+    assert refused(rows, ("a", "b", "none")).tolist() == [2, 4, 5]
+    assert refused(rows, ("none",)).tolist() == []
 
 
 def test_rates_are_those_of_the_second_before() -> None:
@@ -373,6 +450,8 @@ def test_the_stages_of_the_age_lie_on_one_another(folder: Path) -> None:
     table = pa.table({f"age.{name}": [age_us] for name, age_us in ages.items()})
     np.testing.assert_allclose(curves.AGE_STAGES.read(table), [[20.0, 38.0, 39.0, 39.1, 41.1]])
     counted = rows_by_entity(write_run_rrd(folder))
+    tasks = {name.rpartition("/")[2] for name in counted if name.startswith("/state/task/")}
+    assert "IDLE" not in tasks >= {"KALMAN", "STABILIZER"}, "what runs when nothing else does has no lane"
     assert counted["/plot/age/stages"] > 60  # by the station's own record, and their names
 
 
@@ -429,9 +508,28 @@ def test_every_view_of_a_flight_has_one_place_in_the_layout(folder: Path) -> Non
     assert len(set(plots)) == len(plots) > 5
 
 
-def test_robots_that_flew_together_are_in_one_recording_each_at_its_place_with_its_texts(
-    folder: Path, tmp_path: Path
+@pytest.mark.parametrize(
+    ("origin", "name", "worlds"), [("world", "Wind tunnel", ["world"]), ("room", "Room", ["a", "b"])]
+)
+def test_a_scene_shows_four_seconds_of_path_and_the_goal_s_fifteen_to_either_side(
+    origin: str, name: str, worlds: list[str]
 ) -> None:
+    view = tunnel_view("from_release", origin, worlds, EYE)
+    assert (view.name, view.origin) == (name, origin)
+    shown = {
+        path: one.ranges.as_arrow_array().to_pylist() for path, (one,) in view.visualizer_overrides.items()
+    }
+    spans = {"trail": (-4.0, 0.0), "wanted": (-15.0, 15.0)}
+    assert shown == {
+        f"{world}/{path}": [{"timeline": "from_release", "range": {"start": begin * 1e9, "end": end * 1e9}}]
+        for world in worlds for path, (begin, end) in spans.items()
+    }  # fmt: skip
+
+
+def test_robots_that_flew_together_are_in_one_recording_each_at_its_place_with_its_texts(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hil.pictures.viewer.swarm.ROWS_AT_ONCE", 40)
     origins = ((1.0, 2.0, 3.0), (-4.0, 5.0, 6.0))
     request = SimpleNamespace(title="two robots")
     result: Any = SimpleNamespace(
@@ -452,7 +550,8 @@ def test_robots_that_flew_together_are_in_one_recording_each_at_its_place_with_i
         assert place.column("Transform3D:translation").to_pylist() == [[list(origin)]]
         (label,) = [batch for entity, batch in found if entity == f"/room/{number}/world/robot/number"]
         assert label.column("Points3D:labels").to_pylist() == [[str(number)]]
-        assert counted[f"/room/{number}/world/robot"] == alone["/world/robot"]
+        for name in ("robot", "trail", "drag"):
+            assert counted[f"/room/{number}/world/{name}"] == alone[f"/world/{name}"]
         told = [
             text for entity, batch in found if entity.startswith(f"/room/{number}/text/")
             for (text,) in batch.column("TextLog:text").to_pylist()

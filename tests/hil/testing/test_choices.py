@@ -307,10 +307,11 @@ def test_flights_of_a_test_have_numbers_folders_and_options_of_the_mark_before_t
     assert item.flown == []
     flights.begin("t.py::test[a]", tmp_path / "t.py", choice())
     assert not place.exists(), "of an earlier session"
-    flights.fly()
+    for _ in range(SHOWN + 1):
+        flights.fly()
     assert flights._item.flown[0].number == 1
     trim(flights._item, True)
-    assert (place / "1").exists()
+    assert sorted(path.name for path in place.iterdir()) == ["1", "2", "3", "4"], "all are kept"
 
 
 def test_a_baseline_is_of_as_many_flights_and_of_metrics_that_there_are(

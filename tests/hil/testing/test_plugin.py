@@ -289,6 +289,17 @@ def test_flights_take_what_the_mark_says_and_options_go_before_it(pytester: pyte
         ({"links": ["radio", "mavlink"]}, Wanted(), [choice(), choice(link="mavlink")]),
         ({"links": ["mavlink"]}, Wanted(link="radio"), [choice()]),
         (
+            {"links": ["radio", "mavlink"], "profiles": ["a", "b"], "boards": ["c", "python"], "seeds": 2},
+            Wanted(),
+            [
+                choice(seed, board, profile, link)
+                for link in ("radio", "mavlink")
+                for profile in ("a", "b")
+                for board in ("c", "python")
+                for seed in (1, 2)
+            ],
+        ),
+        (
             {"faults": ["push.y@1", ["push.x@1=2", "mocap.dropout@2"], []]},
             Wanted(),
             [

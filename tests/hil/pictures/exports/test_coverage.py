@@ -5,7 +5,15 @@ from pathlib import Path
 import pytest
 
 from hil.emulator.stm32f405.coverage import BranchCoverage, FileCoverage, FunctionCoverage
-from hil.pictures.exports.coverage import Share, Shares, _covered, _shared_folder, source_of, tracefile
+from hil.pictures.exports.coverage import (
+    Share,
+    Shares,
+    _covered,
+    _ranges,
+    _shared_folder,
+    source_of,
+    tracefile,
+)
 
 LINES = {1: 0, 3: 2, 8: 0, 9: 0, 12: 0}
 FILE = FileCoverage(
@@ -37,6 +45,7 @@ def test_the_page_has_the_lines_around_those_that_never_ran() -> None:
     assert all(text == f"line {number}" for piece in one.pieces for number, text, _ in piece)
     assert [count for _, _, count in one.pieces[0]] == [0, None, 2]
     assert one.never == "1, 8-9, 12"
+    assert _ranges([3, 5, 7, 8, 9, 12]) == "3, 5, 7-9, 12"
     assert [share for _, share in one.functions] == [Share(1, 2), Share(0, 3)]
     assert one.shares == Shares(Share(1, 5), Share(1, 2), Share(3, 6))
     assert _covered(FILE, None, "").pieces == []

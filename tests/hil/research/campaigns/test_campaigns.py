@@ -33,7 +33,7 @@ from hil.research.campaigns.dataset import ARRIVING, FLIGHTS, Dataset
 from hil.research.campaigns.findings import Findings, find
 from hil.research.campaigns.jobs import Job, Row, fly_job
 from hil.research.campaigns.report import write_report
-from hil.research.campaigns.run import Flyer, InterimResult, Runner, conduct, interval
+from hil.research.campaigns.run import Flyer, InterimResult, Rate, Runner, conduct, interval
 from hil.research.campaigns.sampling import draw, plan_of
 from support.browser import BROWSER, browser
 from support.campaigns import BAD_PUSH, planted, spec_of
@@ -270,12 +270,13 @@ def test_the_planted_effect_is_found(tmp_path: Path) -> None:
 def reported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Findings]:
     """The report of a campaign, and what it found."""
     folder, spec = tmp_path_factory.mktemp("campaign"), spec_of(flights=128, sampling="sobol")
-    flown_into(folder, spec, workers(2))
-    dataset = Dataset(folder, plan_of(spec), resume=True)
+    dataset = Dataset(folder, plan_of(spec), resume=False)
+    for number in range(128):
+        dataset.add(planted(draw(spec, number)))
+    dataset.close(128)
     return write_report("my spec.toml", spec, dataset, complete=True)
 
 
-@pytest.mark.long
 def test_the_report_has_rates_influences_commands_and_pictures(reported: tuple[Path, Findings]) -> None:
     path, found = reported
     text = path.read_text(encoding="utf-8")
@@ -285,10 +286,36 @@ def test_the_report_has_rates_influences_commands_and_pictures(reported: tuple[P
     assert "floaty campaign &#39;my spec.toml&#39; --shrink FLIGHT" in text
     assert [picture[:4] for picture in page.pictures] == [b"\x89PNG"] * 2
     told = json.loads((path.parent / "result.json").read_text())
-    assert (told["failed"], told["flown"]) == (found.rate.failed, 128)
+    flown = [draw(spec_of(flights=128, sampling="sobol"), n) for n in range(128)]
+    pushes = {
+        n: float(str(one.options["faults"][0]).partition("=")[2])
+        for n, one in enumerate(flown)
+        if one.options["faults"]
+    }
+    failed = [n for n, push in pushes.items() if push >= BAD_PUSH]
+    counts = {"failed": len(failed), "flown": 128, "interval_95": [*found.rate.interval]}
+    assert {name: told[name] for name in ("complete", "errors", *counts)} == {
+        "complete": True,
+        "errors": [],
+        **counts,
+    }
+    none = {"failed": 0, "flown": 128, "interval_95": [*Rate(0, 128).interval]}
+    where = {"experiment": "hover", "profile": "floaty"}
+    assert told["cells"] == [{**where, "loss_allowed": False, **counts, "lost": none}]
+    for one, row, shown in zip(found.limits, told["limits"], page.tables["limits"][1:], strict=True):
+        wrong = counts if one.name == "in_box" else {"failed": 0, "flown": 0, "interval_95": [0.0, 1.0]}
+        assert row == {**where, "metric": one.name, "bound": one.bound, **wrong}
+        upper = one.metric.bound == "max"
+        levels = [one.metric.show(np.quantile(one.values, q if upper else 1.0 - q)) for q in (0.5, 0.95, 1.0)]
+        limit = f"{one.name} {'≤' if upper else '≥'} {one.metric.show(one.bound)}"
+        assert shown == ["hover, floaty", limit, str(one.rate), *levels]
+    assert page.tables["cells"][1:] == [["hover", "floaty", str(found.rate), str(Rate(0, 128))]]
+    assert [row["index"] for row in told["worst"]] == sorted(failed, key=lambda n: -pushes[n])[:10]
+    for one, row in zip(found.influences, told["influences"], strict=True):
+        assert row == {"figure": one.figure, "method": one.method, "chance": one.chance, "by_axis": dict(one.by_axis),
+            "half_interval_95": {}}  # fmt: skip
 
 
-@pytest.mark.long
 def test_a_cell_of_the_failure_map_leads_to_its_flights(reported: tuple[Path, Findings]) -> None:
     path, found = reported
     text = path.read_text(encoding="utf-8")

@@ -131,7 +131,6 @@ def rows_of(*changes: dict[str, object]) -> list[Row]:
 
 
 def test_the_worst_flights_are_those_lost_first_then_those_far_beyond_a_limit() -> None:
-    spec = spec_of(flights=5)
     limits = {"in_box": False}
     rows = rows_of(
         {"metrics": {"in_box": 0.5}, "holds": limits},
@@ -139,12 +138,16 @@ def test_the_worst_flights_are_those_lost_first_then_those_far_beyond_a_limit() 
         {"metrics": {"in_box": 0.1}, "holds": limits},
         {"outcome": "lost", "error": "early", "metrics": {"flown": 2.0}},
         {"metrics": {"rms_x": 0.5}, "holds": {"in_box": True}},
+        {
+            "metrics": {"in_box": 0.89, "unseen": 9.0},
+            "holds": {"in_box": False, "unseen": False},
+        },  # by the farthest
     )
-    spec = spec_of(flights=5, settings=["limits.hover.in_box=0.9"])
+    spec = spec_of(flights=6, settings=["limits.hover.in_box=0.9"])
     table = table_of([row.columns() for row in rows], schema_of(plan_of(spec)))
     found = find(spec, table)
-    assert [one.index for one in found.worst] == [3, 1, 2, 0, 4]
-    assert (found.rate.failed, found.rate.flown) == (5, 5)
+    assert [one.index for one in found.worst] == [3, 1, 5, 2, 0, 4]
+    assert (found.rate.failed, found.rate.flown, found.worst[2].why) == (6, 6, "in_box, unseen")
 
 
 @pytest.mark.parametrize("allowed", [False, True])
@@ -253,14 +256,18 @@ def test_a_histogram_tells_what_fails_from_the_limit_itself_and_counts_few_fligh
     assert (heights, shown.get_yscale()) == ([count - failing, failing], scale)
 
 
-def test_each_profile_s_rate_is_of_its_own_clusters() -> None:
-    """Saltelli: the points of a base row share their wind, each flown by both profiles."""
-    spec = spec_of(sampling="saltelli", flights=8 * 5 * 2, profiles=["floaty", "as-flown"])
+@pytest.mark.parametrize(
+    "several", [{"profiles": ["floaty", "as-flown"]}, {"experiments": ["hover", "yaw-sine-0.02"]}]
+)
+def test_each_profile_s_and_experiment_s_rate_is_of_its_own_clusters(several: dict[str, list[str]]) -> None:
+    """Saltelli: the points of a base row share their wind, each flown by both."""
+    spec = spec_of(sampling="saltelli", flights=8 * 5 * 2, **several)
     table = table_of([planted(draw(spec, index)).columns() for index in range(80)], schema_of(plan_of(spec)))
     found = find(spec, table)
     passed = np.array([planted(draw(spec, index)).passed for index in range(80)]).reshape(8, 5, 2)
     for number, cell in enumerate(found.cells):
-        assert cell.profile == spec.profiles[number]
+        assert (cell.profile, cell.experiment) == (spec.profiles[number % len(spec.profiles)],
+            spec.experiments[number % len(spec.experiments)])  # fmt: skip
         assert cell.rate == tallied(~passed[:, :, number])
     assert found.rate == tallied(~passed.reshape(8, 10))
 
@@ -372,6 +379,25 @@ def test_a_failure_map_needs_five_failures_and_five_flights_that_hold(failures: 
     rows = [replace(planted(draw(spec, index)), passed=index >= failures) for index in range(12)]
     found = find(spec, table_of([row.columns() for row in rows], schema_of(plan_of(spec))))
     assert (found.failure_map is not None) == mapped
+
+
+def test_the_logistic_map_is_pulled_to_no_influence_as_by_one_flight_more() -> None:
+    """At the optimum the residuals balance the prior, whose precision is an axis' variance; the offset has none."""
+    spec = spec_of(flights=40)
+    rows = [planted(draw(spec, index)).columns() for index in range(40)]
+    found = find(spec, table_of(rows, schema_of(plan_of(spec)))).failure_map
+    assert found is not None
+    left = found.failed - found.chance(found.points)
+    assert left.sum() == pytest.approx(0.0, abs=1e-3)
+    assert left @ (found.points - 0.5) == pytest.approx(found.weights / 12.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(("flights", "known"), [(19, False), (20, True)])
+def test_an_influence_needs_two_flights_in_every_slice_of_an_axis(flights: int, known: bool) -> None:
+    spec = spec_of(flights=flights)
+    rows = [planted(draw(spec, index)).columns() for index in range(flights)]
+    found = find(spec, table_of(rows, schema_of(plan_of(spec)))).influences
+    assert any(one.method == "PAWN" for one in found) == known
 
 
 def test_a_flight_that_was_not_flown_has_no_metric_and_no_verdict() -> None:

@@ -16,6 +16,7 @@ from hil.research.campaigns.sampling import (
     check_design,
     cluster_of,
     draw,
+    plan_of,
     points_of,
     value_at,
 )
@@ -89,6 +90,16 @@ def test_values_have_no_more_digits_than_every_processor_agrees_on() -> None:
 def test_the_ends_of_a_design_s_axes_are_values() -> None:
     assert math.isfinite(float(value_at(Distribution(normal=(0.0, 1.0)), 0.0)))
     assert value_at(Distribution(choice=(True, False)), 1.0) is False
+
+
+@pytest.mark.parametrize(
+    ("varies", "kind"),
+    [({"choice": [True, False]}, bool), ({"choice": [True, 2.0]}, str),
+     ({"choice": ["a", 2]}, str), ({"choice": ["a"]}, str),
+     ({"choice": [1, 2.5]}, float), ({"uniform": [1, 2]}, float)],
+)  # fmt: skip
+def test_a_column_of_values_that_a_number_cannot_hold_is_of_texts(varies: dict[str, Any], kind: type) -> None:
+    assert plan_of(spec_of(parameters={"actuators.tau": varies})).values == {"actuators.tau": kind}
 
 
 def test_every_choice_is_as_likely_as_the_others() -> None:
@@ -181,6 +192,7 @@ def test_points_as_flown_say_which_faults_happened_and_nothing_of_those_that_did
     )
     drawn = points_of(spec)
     flown = as_flown(spec, drawn)
+    assert np.array_equal(drawn, points_of(spec)), "the points stay"
     names = [axis.name for axis in axes(spec)]
     happens, size = names.index("fault 1 push.y happens"), names.index("fault 1 push.y size")
     always = names.index("fault 2 push.y size")

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -173,7 +174,7 @@ def test_the_first_request_to_end_starts_no_flight_and_the_second_waits_for_none
     assert list(Crew(monkeypatch).workers.fly(map(job, range(9)), lambda: 2)) == []
 
 
-@pytest.mark.parametrize("lost", ["status", "workers", "back"])
+@pytest.mark.parametrize("lost", ["status", "workers", "back", "rows"])
 def test_a_cluster_that_is_lost_or_stays_without_workers_ends_it_in_one_line(
     monkeypatch: pytest.MonkeyPatch, lost: str
 ) -> None:
@@ -187,11 +188,13 @@ def test_a_cluster_that_is_lost_or_stays_without_workers_ends_it_in_one_line(
         looks += 1
         cluster.workers = {"a": 1} if lost == "back" and looks % 4 == 0 else {}
         cluster.status = "closed" if lost == "status" and looks == 2 else "running"
-        if looks == 30:
-            Pool.end(cluster)
+        if looks == 30 or (lost == "rows" and looks % 3 == 0):  # the first of its flights
+            flying, cluster.open = (cluster.open, []) if looks == 30 else (cluster.open[:1], cluster.open[1:])
+            for future, one in flying:
+                future.set_result(planted(one))
 
     monkeypatch.setattr(cluster, "end", idle)
-    if lost == "back":
+    if lost in ("back", "rows"):
         assert len(crew.fly(3)) == 3
         return
     with pytest.raises(
@@ -300,11 +303,15 @@ def test_a_signal_completes_the_flight_and_no_other_plan_is_flown(
     assert [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)] == before
 
 
-def test_a_logged_flight_that_ends_with_an_error_is_one_line(
+def test_a_logged_flight_that_ends_with_an_error_is_one_line_and_a_lost_one_a_row(
     flown: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(run, "Workers", lambda *_: SimpleNamespace(
-        fly=lambda jobs, stopped: (failed(one, "no such body") for one in jobs), close=lambda: None))  # fmt: skip
+    outcome = "lost"
+    monkeypatch.setattr(run, "Workers", lambda *_: SimpleNamespace(fly=lambda jobs, stopped: (
+        replace(failed(one, "no such body"), outcome=outcome) for one in jobs), close=lambda: None))  # fmt: skip
+    (row,) = Runner(Console(quiet=True)).log("one", {"a": ("hover", Options())}, tmp_path)
+    assert (row.outcome, row.folder) == ("lost", tmp_path / "a")
+    outcome = "error"
     with pytest.raises(LabError, match=f"^{tmp_path}/a: no such body$"):
         Runner(Console(quiet=True)).log("one", {"a": ("hover", Options())}, tmp_path)
 

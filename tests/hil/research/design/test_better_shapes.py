@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_discrete_lyapunov
 
 from hil.config import load_config
 from hil.errors import LabError
@@ -20,10 +20,11 @@ from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.research.design import optimise as search
 from hil.research.design.authority import authorities
-from hil.research.design.axes import AXES, PITCH, ROLL, Axis
+from hil.research.design.axes import AXES, HEIGHT, PITCH, ROLL, YAW, Axis, dynamics
 from hil.research.design.bounds import HIGH, LOW, SEARCHED, at_bounds, shape_of
-from hil.research.design.gains import gains_of, profile_text
+from hil.research.design.gains import _least_cost, gains_of, profile_text
 from hil.research.design.linear import Linear, Point
+from hil.research.design.loop import held
 from hil.research.design.sweeps import flat_high
 from hil.research.design.trim import balanced, coefficient_of, scaled
 from hil.world.config import PlantConfig, PlantServoConfig, TunnelConfig
@@ -67,6 +68,29 @@ def test_gains_hold_every_axis_of_a_stable_and_of_an_unstable_robot(robot: Point
     gains = gains_of(model)
     for axis in AXES:
         assert closed_loop(model, gains, axis).real.max() < -0.1, axis.name
+
+
+@pytest.mark.parametrize("axis", [YAW, HEIGHT], ids=["yaw", "height"])
+def test_gains_cost_least_in_the_gusts_by_bryson_s_rule(axis: Axis) -> None:
+    """Variances over the squares of what is allowed, of a flap command that is one period late; 2 % aside they are more."""
+    robot = PAPER.linear.robot | {"flap_rate": 20.0}
+    Phi, Gamma = held(*dynamics(axis, robot), 0.01)
+    turn = math.radians(10.0 if axis is YAW else 8.0)
+    allowed = {"position": 0.06, "velocity": 0.3, "angle": turn, "rate": 1.0}
+    gust = {"velocity": 0.01, "rate": 0.15}
+    n = len(axis.states)
+
+    def cost(gains: NDArray[np.float64]) -> float:
+        row = np.array([*gains, 0.0, 0.0])  # nothing of the flap, nothing of the command under way
+        closed = np.vstack([np.hstack([Phi, Gamma[:, :1]]), -row])
+        noise = np.diag([*(gust.get(state, 0.0) ** 2 for state in axis.states), 0.0, 0.0])
+        P = solve_discrete_lyapunov(closed, noise)
+        moved = sum(P[i, i] / allowed[state] ** 2 for i, state in enumerate(axis.states))
+        return float(moved + row @ P @ row / math.radians(8.0) ** 2)
+
+    gains = _least_cost(axis, robot)
+    for step in 0.02 * np.concatenate([np.eye(n), -np.eye(n)]):
+        assert cost(gains * (1.0 + step)) > cost(gains)
 
 
 def test_an_axis_that_no_input_reaches_is_refused_in_one_line() -> None:
@@ -369,6 +393,10 @@ def test_every_number_of_a_shape_at_a_bound_of_the_search_is_named(number: int) 
         (line,) = at_bounds(shape)
         assert line.startswith(f"{SEARCHED[number].name} = ")
         assert f"at the {end} bound of the search (" in line
+    one = SEARCHED[number]
+    for share, end in ((0.0009, "lower"), (0.0011, ""), (0.9989, ""), (0.9991, "upper")):
+        found = one.reached(one.low + share * (one.high - one.low))
+        assert (f"at the {end} bound" in found) if end else not found
 
 
 def test_lighter_or_wider_robots_hold_slower_air_in_the_same_proportion(

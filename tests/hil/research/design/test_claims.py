@@ -10,9 +10,9 @@ from matplotlib.colors import to_hex
 from hil.config import load_config
 from hil.pictures.curves import AXIS_COLOURS, BLUE, GREY, ORANGE, RED, SERIES_COLOURS
 from hil.research.design import figures
-from hil.research.design.authority import Attainable
+from hil.research.design.authority import LEVEL_SHARE, Attainable
 from hil.research.design.axes import AXES, PITCH, ROLL
-from hil.research.design.claims import claims, robot_lines, text_of
+from hil.research.design.claims import _near, _stable, claims, robot_lines, text_of
 from hil.research.design.linear import Point, point_of
 from hil.research.design.sweeps import (
     FACTORS,
@@ -27,6 +27,7 @@ from hil.research.design.sweeps import (
 )
 from hil.world.floaty.correction import PAPER_TABLE
 from hil.world.floaty.geometry import weigh
+from support.figures import words_of
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +112,18 @@ def test_each_claim_has_the_robot_s_value_and_its_verdict(point: Point, stable: 
     assert [one.paper for one in found if one.title == "z per vz"] == ["-2 ± 0.1"]
 
 
+@pytest.mark.parametrize(
+    ("roll", "pitch", "verdict"), [(-1, -1, "agrees"), (-1, 1, "differs"), (1, -1, "differs")]
+)
+def test_rates_are_damped_where_both_are(
+    point: Point, monkeypatch: pytest.MonkeyPatch, roll: float, pitch: float, verdict: str
+) -> None:
+    changed = replace(point.linear.constants, roll_rate=roll, pitch_rate=pitch)
+    monkeypatch.setattr(type(point.linear), "constants", property(lambda linear: changed))
+    found = _stable(point, Stability(*np.zeros((3, 1)), 0.5))
+    assert [one.verdict for one in found if one.title.startswith("rates are damped")] == [verdict]
+
+
 @pytest.mark.parametrize(("growth", "verdict"), [(-0.01, "agrees"), (0.0, "differs"), (0.01, "differs")])
 def test_an_axis_is_stable_where_nothing_grows(
     point: Point, monkeypatch: pytest.MonkeyPatch, growth: float, verdict: str
@@ -123,6 +136,21 @@ def test_an_axis_is_stable_where_nothing_grows(
     assert {
         told[title] for title in ("flat flaps: pitch is stable by its V", "pitch stays stable by its V")
     } == {verdict}
+
+
+@pytest.mark.parametrize(("off", "verdict"), [(0.149, "agrees"), (0.151, "differs"), (-0.151, "differs")])
+def test_what_is_about_a_value_is_within_15_percent_of_it(
+    point: Point, monkeypatch: pytest.MonkeyPatch, off: float, verdict: str
+) -> None:
+    assert _near(-16.0 * (1.0 + off), -16.0) == verdict
+    monkeypatch.setattr(
+        type(point.linear), "poles", lambda linear, axis: [complex(-0.5, 4.0 + 4.0 * off), complex(-1.0)]
+    )
+    sweep = Stability(
+        np.zeros((len(HEIGHTS), len(KINKS))), np.zeros(len(KINKS)), np.zeros((len(KINKS), 3)), 0.5
+    )
+    told = {one.title: one.verdict for one in claims(point, sweep, angles(), LAWS, 0.0)}
+    assert told["the same: roll poles"] == verdict
 
 
 def test_a_robot_is_described_in_the_units_of_its_words(point: Point) -> None:
@@ -142,7 +170,7 @@ def test_pictures_of_a_design_show_their_sweeps_by_name(point: Point) -> None:
     rng = np.random.default_rng(1)
     sweep = Stability(rng.normal(size=(len(HEIGHTS), len(KINKS))), rng.normal(size=len(KINKS)),
         rng.normal(size=(len(KINKS), 3)) + 1j, 0.5)  # fmt: skip
-    left, middle, right, _ = figures.stability(point, sweep).axes
+    left, middle, right, _ = (stable := figures.stability(point, sweep)).axes
     kinks, own, height = (np.degrees(KINKS), degrees(point.geometry.kink_angle),
         100 * weigh(point.geometry).axis_height)  # fmt: skip
     assert [tuple(line.get_xydata()[0]) for line in left.lines] == [pytest.approx((own, height)), (0.0, 0.0)]
@@ -153,15 +181,19 @@ def test_pictures_of_a_design_show_their_sweeps_by_name(point: Point) -> None:
     poles = [part[:, index] for index in range(3) for part in (sweep.poles.real, sweep.poles.imag)]
     assert [line.get_ydata() for line in right.lines[:6]] == [pytest.approx(one) for one in poles]
     assert [to_hex(line.get_color()) for line in right.lines[:6]] == [BLUE, ORANGE] * 3
-    assert [text.get_text() for text in right.get_legend().get_texts()] == ["real", "imaginary"]
-    swept, (left, right) = angles(), figures.hover(point, angles()).axes
+    assert left.collections[0].get_cmap().name == "RdBu_r", "red falls over"
+    swept, (left, right) = angles(), (hover := figures.hover(point, angles())).axes
+    band = [
+        tuple(axes.patches[0].get_extents().transformed(axes.transData.inverted()).intervalx)
+        for axes in (left, right)
+    ]
+    assert band == [pytest.approx((20.0, 25.0))] * 2
     for (name, values), colour in zip(
         swept.constants.items(), (AXIS_COLOURS[2], *AXIS_COLOURS[:2], ORANGE), strict=True
     ):
         shown = {one.get_label(): one for one in left.lines}[name]
         assert shown.get_xydata() == pytest.approx(np.c_[np.degrees(OPENINGS), values / max(abs(values))])
         assert to_hex(shown.get_color()) == colour
-    assert [line.get_label() for line in right.lines[::2][:2]] == ["a: 20.0°", "b: 26.0°"]
     assert [line.get_xydata().tolist() for line in right.lines[1:4:2]] == [[[pytest.approx(20.0), 1.0]],
         [[pytest.approx(26.0), 1.0]]]  # fmt: skip
     assert right.lines[2].get_ydata() == pytest.approx(swept.criteria["b"])
@@ -171,17 +203,26 @@ def test_pictures_of_a_design_show_their_sweeps_by_name(point: Point) -> None:
         spans = [tuple(np.ptp(one.get_xy(), axis=0)) for one in axes.patches]
         assert spans == [(2 * a, 2 * b), (a, b)][: 1 + (b != 4)]
         assert [to_hex(one.get_facecolor()) for one in axes.patches] == [BLUE, ORANGE][: len(spans)]
-        names = {1: "roll [rad/s²]", 2: "pitch [rad/s²]", 3: "yaw [rad/s²]", 4: "lift [weights]"}
-        assert (axes.get_xlabel(), axes.get_ylabel()) == (names[a], names[b])
         assert axes.lines[0].get_xydata().tolist() == [[0.0, float(b == 4)]]
     assert reached.get_suptitle().startswith("hover at 25°, flaps ")
-    scaled = {axes.get_xlabel(): axes for axes in figures.scale(LAWS).axes}
+    scale = figures.scale(LAWS)
+    scaled = {axes.get_xlabel(): axes for axes in scale.axes}
+    assert [words_of(figure) for figure in (stable, hover, reached, scale)] == [
+        [("", "kink [deg]", "centre of mass below the flaps [cm]"), ("", "kink [deg]", "f_αα [1/s²]"),
+         ("", "kink [deg]", "roll poles [1/s]", "real", "imaginary"), ("", "", "f_αα [1/s²]: red: falls over")],
+        [("", "hover angle [deg]", "input constant / its largest", "roll", "pitch", "yaw", "lift"),
+         ("", "hover angle [deg]", "share of the best", "a: 20.0°", "b: 26.0°")],
+        [("", "roll [rad/s²]", "pitch [rad/s²]", "any lift", f"lift = weight ± {100 * LEVEL_SHARE:g} %"),
+         *(("", across, up) for across, up in (("roll [rad/s²]", "yaw [rad/s²]"), ("pitch [rad/s²]", "yaw [rad/s²]"),
+           ("roll [rad/s²]", "lift [weights]"), ("pitch [rad/s²]", "lift [weights]"), ("yaw [rad/s²]", "lift [weights]")))],
+        [("", "l, relative", "relative", "lift: +0.100 (paper +0)", "roll: -1.000 (paper -1)"),
+         ("", "m, relative", "", "Re: +0.500 (paper +0.5)"), ("", "m / l², relative", "", "speed: +0.500 (paper +0.5)")],
+    ]  # fmt: skip
     for cause, wanted in (
-        ("l", [(LAWS[1], "lift: +0.100 (paper +0)"), (LAWS[2], "roll: -1.000 (paper -1)")]),
-        ("m", [(LAWS[3], "Re: +0.500 (paper +0.5)")]),
+        ("l", [LAWS[1], LAWS[2]]),
+        ("m", [LAWS[3]]),
     ):
-        for line, (law, text) in zip(scaled[f"{cause}, relative"].lines, wanted, strict=True):
-            assert line.get_label() == text
+        for line, law in zip(scaled[f"{cause}, relative"].lines, wanted, strict=True):
             assert line.get_xydata() == pytest.approx(np.c_[FACTORS, FACTORS**law.exponent])
     assert [line.get_ydata()[2] for line in scaled["m / l², relative"].lines] == [1.0]
     tried, front = np.array([(1.0, 5.0), (2.0, 4.0), (3.0, 1.0)]), np.array([(1.0, 5.0), (3.0, 1.0)])

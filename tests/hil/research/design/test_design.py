@@ -14,7 +14,7 @@ from hil.config import load_config
 from hil.errors import LabError
 from hil.research.design import analysis, sweeps
 from hil.research.design.authority import attainable, pressure_at, single, wrenches
-from hil.research.design.axes import ROLL
+from hil.research.design.axes import PITCH, ROLL
 from hil.research.design.claims import claims
 from hil.research.design.linear import Linear, Point, linear, stiffness
 from hil.research.design.margins import Margins, margins_of, worst
@@ -86,6 +86,10 @@ def test_g0_has_the_constants_and_poles_that_the_specification_prints() -> None:
     assert roll[0] == pytest.approx(complex(-0.42, 3.91), abs=0.005)
     assert roll[1] == pytest.approx(roll[0].conjugate())
     assert roll[2] == pytest.approx(-1.01, abs=0.005)
+    pitch = model.poles(PITCH)
+    assert pitch == sorted(pitch, key=lambda pole: (-abs(pole.imag), -pole.real, -pole.imag))
+    lone = Linear(np.diag([-3.0, 0, 0, 0, -1.0, 0, 0, -2.0, 0]), model.B).poles(PITCH)
+    assert lone == [-1.0, -2.0, -3.0], "the slowest first"
 
 
 def test_the_first_robot_falls_over_as_the_specification_prints() -> None:

@@ -26,7 +26,7 @@ from hil.research.design.axes import (
     gains_in,
     robot_of,
 )
-from hil.research.design.loop import FREQUENCIES, Timing, build, held
+from hil.research.design.loop import FREQUENCIES, Timing, build, filter_gain, held
 from hil.research.design.margins import margins, margins_of, pose_delay_margin
 from hil.research.design.tune import Flow, GainTask, by_regulator, cost, delay_margin, design, motion
 
@@ -141,6 +141,8 @@ def test_without_the_predictor_the_authors_x_loop_bears_less() -> None:
     blind = load_config("as-flown", ["predictor.enabled=false"])
     assert Timing.of(blind, 0.04) == Timing(0.04, 0)
     assert Timing.of(load_config("as-flown", ["predictor.age=fixed"]), 0.06) == Timing(0.06, 4)
+    timings = [Timing.of(CONFIG, age_s) for age_s in (0.004, 0.014, 0.016)]
+    assert [(one.age_s, one.horizon) for one in timings] == [(0.01, 1), (0.01, 1), (0.02, 2)]
     axis, gains = PITCH, gains_in(blind, PITCH)
     helped = margins(build(axis, robot_of(blind), load_config("as-flown"), NOW), gains)
     left_alone = margins(build(axis, robot_of(blind), blind, Timing.of(blind, 0.04)), gains)
@@ -157,6 +159,30 @@ def test_predicted_motion_is_that_of_the_lyapunov_equation(axis: Axis) -> None:
     assert states == pytest.approx(np.diag(loop.C @ P @ loop.C.T), rel=0.05)
     assert u == pytest.approx(float(gains @ loop.N @ P @ loop.N.T @ gains), rel=0.05)
     assert FREQUENCIES[-1] < 0.5 / STEP_S
+
+
+@pytest.mark.parametrize("axis", AXES, ids=NAMES)
+def test_the_filter_s_gain_is_that_of_its_recursion_with_the_profile_s_noises(axis: Axis) -> None:
+    """An input is the mean of four flaps, a pose comes in every second tick."""
+    noise, Phi = CONFIG.estimator, held(*dynamics(axis, robot_of(CONFIG)), STEP_S)[0]
+    process = {"position": noise.process_position, "velocity": noise.process_velocity, "angle": noise.process_attitude,
+        "rate": noise.process_rate}  # fmt: skip
+    Q = np.diag([*(process[state] for state in axis.states), noise.process_flap / 4])
+    measured = {
+        "rate": noise.measured_rate,
+        "position": 2 * noise.measured_position,
+        "angle": 2 * noise.measured_attitude,
+    }
+    seen = [state for state in measured if state in axis.states]
+    C = np.array([[float(state == one) for state in (*axis.states, "flap")] for one in seen])
+    P = np.eye(len(Q))
+    for _ in range(3000):
+        P = Phi @ P @ Phi.T + Q
+        K = P @ C.T @ np.linalg.inv(C @ P @ C.T + np.diag([measured[state] for state in seen]))
+        P = P - K @ C @ P
+    found, rows = filter_gain(axis, CONFIG, Phi)
+    assert found == pytest.approx(K, rel=1e-4, abs=1e-7)
+    assert rows.tolist() == C.tolist()
 
 
 def test_a_robot_that_answers_later_has_less_delay_left() -> None:

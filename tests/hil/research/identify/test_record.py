@@ -7,18 +7,21 @@ from dataclasses import asdict, replace
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.signal import lfilter
+from scipy.stats import t as student
 
 from ground_station.telemetry_log import POSE_COLUMNS, TIME_COLUMN
 from hil.config import LabConfig, load_config
 from hil.errors import LabError
-from hil.research.design.axes import DELAY, PITCH, ROLL, YAW, Axis, dynamics, robot_of
+from hil.research.design.axes import AXES, DELAY, HEIGHT, PITCH, RATE, ROLL, YAW, Axis, dynamics, robot_of
 from hil.research.design.loop import FREQUENCIES
-from hil.research.identify import spectra
+from hil.research.identify import plates, spectra
 from hil.research.identify.flow import flow_of
 from hil.research.identify.identify import (
     IDENTIFIED,
@@ -27,16 +30,25 @@ from hil.research.identify.identify import (
     Evidence,
     Identification,
     IdentifiedConstant,
+    _truths,
     _verdict,
+    identify,
     interval_text,
     operating_point,
+    rows_of,
+    truth_of,
 )
 from hil.research.identify.joint import (
+    DELAY_S,
     LATE_S,
     Estimate,
     Excited,
     JointFit,
+    _equations,
+    _regress,
     identities,
+    instrumental,
+    joint,
     pose_lateness,
     whitened,
 )
@@ -49,6 +61,8 @@ from hil.research.identify.record import (
     RATES,
     WRAP_MS,
     Record,
+    _in_order,
+    _ticks,
     load_record,
 )
 from hil.research.identify.response import LAG, TICK_DELAYS_S, flap_response, one_step, outputs, response
@@ -94,6 +108,15 @@ def test_the_share_of_lost_rows_is_that_of_the_rows_that_are_missing(tmp_path: P
     assert record.lost_rows == pytest.approx(0.25, abs=0.005)
 
 
+@pytest.mark.parametrize(
+    ("share", "reason"),
+    [(0.3, "no excitation"), (0.3001, "30% of the telemetry's rows are missing; at most 30%")],
+)
+def test_a_flight_may_lack_three_tenths_of_its_rows(share: float, reason: str) -> None:
+    with pytest.raises(LabError, match=reason):
+        identify([replace(swinging(robot_of(CONFIG), seconds=10.0), lost_rows=share)])
+
+
 def test_a_board_whose_time_stamps_wrap_flies_on(tmp_path: Path) -> None:
     record = loaded(tmp_path, columns(120, begin_ms=WRAP_MS - 1000))
     assert np.diff(record.t) == pytest.approx(np.full(119, 0.02))
@@ -112,6 +135,9 @@ def test_a_robot_that_looks_elsewhere_is_refused(tmp_path: Path, facing: float) 
     yaw = np.angle(np.exp(1j * (facing + 0.1 * np.sin(np.arange(150.0)))))
     with pytest.raises(LabError, match=r"it looks along -?\d+ deg; expected within 30 deg of 0"):
         loaded(tmp_path, columns(150, **{POSE_COLUMNS[6]: yaw}))
+    for turned, refused in ((29.0, False), (31.0, True)):
+        with pytest.raises(LabError, match=f"it looks along {turned:.0f} deg") if refused else nullcontext():
+            loaded(tmp_path, columns(150, **{POSE_COLUMNS[6]: np.full(150, np.radians(turned))}))
 
 
 def test_inputs_within_the_flaps_limits_are_what_was_commanded(tmp_path: Path) -> None:
@@ -209,6 +235,50 @@ def test_the_real_reason_is_given_for_an_unreadable_file(
 ) -> None:
     with pytest.raises(LabError, match=reason):
         loaded(tmp_path, columns(150), change)
+
+
+def test_a_file_without_what_is_needed_is_refused_by_the_name_of_that(tmp_path: Path) -> None:
+    with pytest.raises(
+        LabError, match=r"^x\.csv: no telemetry\.csv there; identify takes run folders and telemetry\.csv$"
+    ):
+        load_record(Path("x.csv"), "floaty")
+    table = columns(150)
+    for title in (BOARD_COLUMN, TIME_COLUMN, *POSE_COLUMNS, *INPUTS, *RATES, "supervisor.state []"):
+        with pytest.raises(LabError) as refused:
+            loaded(tmp_path, {name: values for name, values in table.items() if name != title})
+        assert str(refused.value) == f"{tmp_path / 'telemetry.csv'}: no column {title!r}"
+    silent = {name: np.full(150, np.nan) for name in POSE_COLUMNS}
+    with pytest.raises(
+        LabError, match=re.escape(f": no pose in {POSE_COLUMNS[0]!r} to {POSE_COLUMNS[-1]!r}")
+    ):
+        loaded(tmp_path, table | silent)
+    for title in EXCITATIONS:
+        del table[title]
+    assert not loaded(tmp_path, table).excitation.any(), "none was reported"
+
+
+def test_spectra_are_refused_in_one_line_with_their_numbers() -> None:
+    t, w = np.arange(0.0, 20.0, 0.5), 2 * np.pi * 0.05 * np.arange(1, 14)
+    with pytest.raises(
+        LabError, match=r"^r: 40 samples in a period of 20 s for 13 lines: at least 42 are needed$"
+    ):
+        spectra._fit(t, np.zeros((40, 1)), w, "r")
+    assert spectra._fit(t, np.cos(w[2] * t)[:, None], w[:12], "r")[2, 0] == pytest.approx(1.0)
+    fast = excited(100.0)
+    fast.excitation[:, 0] = np.cos(2 * np.pi * 20.05 * fast.t + 0.3)
+    with pytest.raises(LabError, match=r"^r: rows of 20 ms are too far apart for the excitation's lines$"):
+        spectra.period_spectra(fast)
+    with pytest.raises(
+        LabError,
+        match=r": 107\.2 s of settled excitation: 0 realisations of 22 s, 5 more with holes of over 0\.3 s; at",
+    ):
+        spectra.windows(excited(110.0, 1.0))
+    own = [np.array([5]), *[np.empty(0, int)] * 3]
+    with pytest.raises(LabError, match=r"^r: u3 is not excited in it$"):
+        spectra.spectra_of(excited(90.0), (own, w, np.ones((4, 13, 17), complex)), 2, (8,))
+    first, second = (replace(excited(90.0), name=name) for name in ("a", "b"))
+    with pytest.raises(LabError, match=r"^b: the same flight as a: each flight counts once$"):
+        identify([first, second])
 
 
 def holed(begin: float, end: float, afresh: float | None) -> Record:
@@ -353,11 +423,49 @@ def test_a_robot_that_follows_its_model_has_no_disturbance() -> None:
         assert own[1] < 0.1 * power(robot | {name: 1.5 * robot[name]})[1], name
 
 
+@pytest.mark.parametrize("hertz", [1.0, 4.0])
+def test_a_robot_that_follows_its_model_is_predicted_one_step_ahead(hertz: float) -> None:
+    robot = robot_of(CONFIG)
+    values = {**CONFIG.model.model_dump(), LAG: 1 / robot["flap_rate"], "delay": robot[DELAY] + TICK_DELAYS_S}
+    t, measured, predicted = one_step(swinging(robot, hertz), 0, values, LATE_S)
+    settled = slice(len(t) // 10, None)
+    assert np.std((measured - predicted)[settled]) < 0.01 * np.std(measured[settled])
+
+
 def test_fifteen_seconds_of_flight_after_the_first_two_show_the_flow_and_less_do_not() -> None:
     robot = robot_of(CONFIG)
-    assert flow_of(swinging(robot, seconds=17.04), ROLL, robot).input == pytest.approx(0.0, abs=0.01)
+    record = swinging(robot, seconds=2.0)
+
+    def seconds(duration: float) -> Record:
+        """Rows every quarter of a second, whose times are exact."""
+        t = np.arange(0.0, duration + 0.1, 0.25)
+        rows = {name: getattr(record, name)[: len(t)] for name in ("u", "excitation", "rates", "pose")}
+        return replace(record, t=t, u_t=t, pose_t=t, **rows)
+
+    assert np.isfinite(flow_of(seconds(17.0), ROLL, robot).spectrum).all()
     with pytest.raises(LabError, match="15 s after the first 2 s are needed"):
-        flow_of(swinging(robot, seconds=16.9), ROLL, robot)
+        flow_of(seconds(16.75), ROLL, robot)
+
+
+def test_a_constant_s_truth_is_that_of_the_first_flight_that_excited_its_axis_and_of_the_first_for_others() -> (
+    None
+):
+    plain = replace(swinging(robot_of(CONFIG), seconds=2.0), simulated=True)
+    flights = [replace(plain, u=plain.u + 0.02 * n) for n in range(4)]
+    excited_axes: list[Any] = [
+        SimpleNamespace(axis=axis, record=n) for axis, n in ((YAW, 0), (ROLL, 1), (ROLL, 2))
+    ]
+    found, own = _truths(flights[0], flights[1:], excited_axes), [truth_of(one) for one in flights]
+    for axis, flown in ((YAW, 1), (ROLL, 2), (PITCH, 0), (HEIGHT, 0)):
+        for name in {*axis.constants} - {"y_rate", "x_rate"}:
+            assert found[name] == own[flown][name], name
+    assert own[0]["yaw_u3"] != own[1]["yaw_u3"]
+    assert (found[LAG], np.isnan(found["delay"]), np.isnan(found["y_rate"])) == (
+        CONFIG.actuators.tau,
+        True,
+        True,
+    )
+    assert truth_of(replace(plain, simulated=False)) == {}
 
 
 def test_the_operating_point_is_the_mean_of_the_flight_in_the_tunnel_s_flow() -> None:
@@ -455,6 +563,21 @@ def test_rates_sampled_before_the_inputs_belong_to_the_next_tick(tmp_path: Path)
     late = loaded(tmp_path, columns(120, begin_ms=1008))
     assert early.u_t[0] == late.u_t[0] == pytest.approx(1.0)
     assert (early.t[0], late.t[0]) == (pytest.approx(1.01), pytest.approx(1.0))
+    ms = np.arange(20_000)
+    inputs, rates = _ticks(1e-3 * ms)
+    assert np.array_equal(np.round(1e3 * inputs), ms // 10 * 10)
+    assert np.array_equal(np.round(1e3 * rates), (ms + 1) // 10 * 10)
+
+
+@pytest.mark.parametrize(("factor", "refused"), [(0.009, True), (0.011, False), (99.0, False), (101.0, True)])
+def test_clocks_of_which_one_counts_a_hundredth_of_the_other_are_refused(
+    tmp_path: Path, factor: float, refused: bool
+) -> None:
+    table = columns(150)
+    table[TIME_COLUMN] = AHEAD_S + (table[TIME_COLUMN] - AHEAD_S) / factor
+    expected = r"in another unit, such as microseconds\?$"
+    with pytest.raises(LabError, match=expected) if refused else nullcontext():
+        _in_order(table, tmp_path)
 
 
 def test_a_file_that_is_not_csv_is_refused_in_one_line(tmp_path: Path) -> None:
@@ -477,6 +600,21 @@ def test_u3_is_straightened_by_the_law_of_flat_plates_sin_phi_cos_phi_squared() 
     assert expected < 0.97 * 0.2
     assert straight.u[:, [1, 3]] == pytest.approx(u[:, [1, 3]])
     assert straight.bent == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_bent_accelerations_are_those_of_a_robot_whose_weight_the_plates_carry(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng, t, pose = np.random.default_rng(4), 0.02 * np.arange(500), np.zeros((500, 6))
+    pose[:, 3], pose[:, 1] = 0.1 * np.sin(3.0 * t), 0.2 * np.cos(2.0 * t)
+    u = lfilter([0.1], [1.0, -0.9], rng.normal(size=(len(t), 4)), axis=0) * 0.2
+    record = Record("r", t, t, u, 0 * u, u[:, :3], t, pose, 0.0, 0.0, CONFIG, False)
+    once = straightened(record)
+    light = plates._plates
+    monkeypatch.setattr(plates, "_plates", lambda config: lambda *at, **of: 3.0 * light(config)(*at, **of))
+    again = straightened(record)
+    assert (again.bent, again.u) == (pytest.approx(once.bent), pytest.approx(once.u))
+    assert np.abs(once.bent).max(axis=0).min() > 0.01
 
 
 def test_turning_alone_pushes_a_robot_of_plates() -> None:
@@ -512,6 +650,26 @@ def test_flat_plates_fulfil_the_identities_of_the_fit() -> None:
         assert sum(abs(one) > 0.01 for one in changed) == 1, name
 
 
+@pytest.mark.parametrize("best", [0, 1, 2, 3])
+def test_the_best_of_all_starts_is_the_fit(monkeypatch: pytest.MonkeyPatch, best: int) -> None:
+    starts: list[Array] = []
+
+    def solved(fit: JointFit, x: Array) -> Any:
+        starts.append(x * fit.scale)
+        cost = 1.0 if len(starts) == 1 + best else 2.0
+        return SimpleNamespace(x=x, cost=cost, fun=np.ones(12), jac=np.eye(len(x)))
+
+    monkeypatch.setattr(JointFit, "solved", solved)
+    w = 2 * np.pi * np.array([0.5, 1.0, 3.0])
+    one = spectra.Spectra(w, np.ones((3, 3), complex), np.tile(np.eye(3, dtype=complex), (3, 1, 1)), np.ones((1, 3, 3)),
+        np.ones(3), np.ones((3, 3)))  # fmt: skip
+    values = CONFIG.model.model_dump()
+    found = joint([Excited(YAW, 2, one)], 0.05, [values, values | {"yaw_u3": 7.0}], lambda values: [])
+    assert [start[2] for start in starts] == pytest.approx([0.05, 0.05, 0.06, 0.04]), "two lags more"
+    assert [*found.values.values(), *found.late] == pytest.approx([*starts[best]])
+    assert found.values["yaw_u3"] == pytest.approx(7.0 if best == 1 else values["yaw_u3"])
+
+
 @pytest.mark.parametrize("late_s", [0.02, -0.008])
 def test_poses_are_late_by_the_cameras_angle_behind_the_gyro_s(late_s: float) -> None:
     w = 2 * np.pi * np.array([0.5, 1.0, 3.0])
@@ -520,6 +678,57 @@ def test_poses_are_late_by_the_cameras_angle_behind_the_gyro_s(late_s: float) ->
     shown = spectra.Spectra(w, Z, C, Z[None], Z[:, 0], np.ones((3, 4)))
     assert pose_lateness([Excited(ROLL, 2, shown)], 2) == pytest.approx(late_s)
     assert pose_lateness([Excited(ROLL, 2, shown)], 1) == LATE_S, "another record"
+
+
+@pytest.mark.parametrize("axis", AXES, ids=lambda axis: axis.name)
+def test_the_instruments_find_every_constant_of_a_robot_that_follows_its_model(axis: Axis) -> None:
+    """Also one that turning alone pushes, by poses that are late."""
+    w, late = 2 * np.pi * np.array([0.3, 0.7, 1.1, 1.7, 2.3, 3.1]), 0.021 if RATE in axis.states else LATE_S
+    values = {**dict.fromkeys(axis.constants, 0.3), **CONFIG.model.model_dump(), LAG: 0.05, "delay": DELAY_S}
+    Z = np.concatenate([np.ones((len(w), 1)), response(axis, values, w, late)], axis=1)
+    C = np.tile(np.eye(Z.shape[1], dtype=complex), (len(w), 1, 1)) * 1e-12
+    one = Excited(axis, 0, spectra.Spectra(w, Z, C, Z[None], Z[:, 0], np.ones(Z.shape)))
+    found = instrumental([one], 0.05).values
+    assert found == pytest.approx({name: values[name] for name in axis.constants}, rel=0.02, abs=0.02)
+
+
+def test_the_instruments_intervals_are_student_s_with_two_numbers_for_each_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("hil.research.identify.joint.LAG_SPREAD", 0.0)
+    monkeypatch.setattr("hil.research.identify.joint.DELAY_SPREAD_S", 0.0)
+    rng, w, values = (
+        np.random.default_rng(2),
+        2 * np.pi * np.array([0.5, 1.0, 3.0]),
+        CONFIG.model.model_dump(),
+    )
+    G = response(YAW, {**values, LAG: 0.05, "delay": DELAY_S}, w)
+    Z = np.concatenate([np.ones((3, 1)), G * (1 + 0.01 * rng.normal(size=G.shape))], axis=1)
+    C = np.tile(1e-4 * np.eye(Z.shape[1], dtype=complex), (3, 1, 1))
+    one = Excited(YAW, 0, spectra.Spectra(w, Z, C, Z[None], Z[:, 0], np.ones(Z.shape)))
+    ((names, rows),) = _equations(YAW)
+    theta, covariance, misfit = _regress([(one.spectra, LATE_S)], rows, 0.05, DELAY_S)
+    found = instrumental([one], 0.05)
+    assert found.values == pytest.approx(dict(zip(names, theta, strict=True)))
+    half = student.ppf(0.975, 2 * 3 - len(theta)) * np.sqrt(np.diag(covariance))
+    assert found.errors == pytest.approx(dict(zip(names, half, strict=True)))
+    assert found.misfit == misfit
+
+
+def test_the_misfit_of_the_instruments_is_one_where_the_scatter_is_as_stated() -> None:
+    """On average of many draws: of three lines and two constants four numbers are free."""
+    rng, w, model = np.random.default_rng(2), 2 * np.pi * np.array([0.5, 1.0, 3.0]), CONFIG.model
+    rate = model.yaw_u3 * flap_response(w, 0.05, DELAY_S) / (1j * w - model.yaw_rate)
+    true = np.stack([1.0 + 0j * w, rate, rate / (1j * w)], axis=1)
+    size = 1e-4 * np.abs(true).mean(axis=0)
+    C = np.tile(np.diag(size.astype(complex) ** 2), (3, 1, 1))
+    ((_, rows),) = _equations(YAW)
+    misfits = []
+    for _ in range(400):
+        noise = (rng.normal(size=true.shape) + 1j * rng.normal(size=true.shape)) * size / np.sqrt(2)
+        one = spectra.Spectra(w, true + noise, C, true[None], true[:, 0], np.ones(true.shape))
+        misfits.append(_regress([(one, LATE_S)], rows, 0.05, DELAY_S)[2])
+    assert np.mean(misfits) == pytest.approx(1.0, abs=0.12)
 
 
 def test_a_flap_follows_the_held_input_of_which_the_mean_of_two_ticks_is_reported() -> None:
@@ -565,6 +774,14 @@ def test_roll_lifts_a_robot_that_leans_and_no_other() -> None:
 )
 def test_a_value_ends_at_the_second_digit_of_its_interval(value: float, half: float, text: str) -> None:
     assert interval_text(value, half) == text
+
+
+def test_a_column_is_shown_that_is_filled_in_any_row() -> None:
+    one, other = constant((64.0, 1.0)), replace(constant((64.0, 1.0)), truth=60.0)
+    rows = rows_of([one, other])
+    assert list(rows[0]) == ["constant", "truth", "instruments", "joint fit", "unit", "verdict"]
+    assert [row["truth"] for row in rows] == ["", "60"]
+    assert rows_of([]) == []
 
 
 def test_the_page_shows_identified_constants_first_and_no_empty_column(tmp_path: Path) -> None:

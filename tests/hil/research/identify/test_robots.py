@@ -1,6 +1,7 @@
 """What `floaty tune` takes from identification: robots that a model's intervals allow, and what the flow does."""
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,12 +12,15 @@ from scipy.signal import cont2discrete, dlsim
 
 from hil.config import load_config
 from hil.errors import LabError
-from hil.research.design.axes import DELAY, PITCH, ROLL, Axis, dynamics, robot_of
+from hil.research.design.axes import AXES, DELAY, PITCH, ROLL, Axis, dynamics, robot_of
 from hil.research.design.loop import FREQUENCIES
 from hil.research.identify import pages, two_controllers
 from hil.research.identify.flow import flow_of
+from hil.research.identify.identify import UNKNOWN, WEAK, Identification, IdentifiedConstant
+from hil.research.identify.joint import Estimate
 from hil.research.identify.record import Record
-from hil.research.identify.robots import UNKNOWN_SHARE, KnownModel, beside, robots_of
+from hil.research.identify.response import LAG
+from hil.research.identify.robots import UNKNOWN_SHARE, KnownModel, beside, robots_of, write_profile
 from hil.research.identify.two_controllers import ClosedLoop
 
 CONFIG = load_config()
@@ -48,13 +52,49 @@ def test_robots_are_drawn_from_the_covariance_beside_the_profile(tmp_path: Path)
     assert lags.std() == pytest.approx(0.002, rel=0.1)
     assert robots.nominal[DELAY] == pytest.approx(0.0045)
     assert {one["roll_u1"] for one in robots.drawn} == {230.0}, "of which nothing is said"
+    uncertain = robots_of(
+        written(tmp_path, covariance=np.diag([30.0, 0.16, 4e-3, 1e-6]).tolist()), CONFIG, 64
+    )
+    assert max(one["flap_rate"] for one in uncertain.drawn) == pytest.approx(200.0), (
+        "no flap lags less than 5 ms"
+    )
+    early = [one[DELAY] for one in robots_of(written(tmp_path, delay=0.0105), CONFIG, 64).drawn]
+    assert min(early) == 0.0 < max(early), "no robot answers before it is told"
 
 
-def test_without_a_file_every_constant_is_known_to_a_fifth() -> None:
+def test_without_a_file_every_constant_is_known_to_a_fifth(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     robots = robots_of("floaty", CONFIG, 256)
     spread = np.std([one["pitch_u2"] for one in robots.drawn]) / 1066
     assert 1.96 * spread == pytest.approx(UNKNOWN_SHARE, rel=0.1)
     assert robots_of("floaty", CONFIG, 0).drawn == ()
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "floaty.json").write_text("another program's")
+    assert robots_of("floaty", CONFIG, 256) == robots
+
+
+def test_a_profile_has_all_constants_of_an_axis_of_which_one_is_known(tmp_path: Path) -> None:
+    every = dict.fromkeys((name for axis in AXES for name in axis.constants), 0.0)
+    values = {**every, **CONFIG.model.model_dump(), LAG: 0.04, DELAY: 0.0145} | {
+        "roll_u1": 231.0,
+        "roll_rate": -3.5,
+        "yaw_u3": 9.0,
+    }
+    constants = tuple(
+        IdentifiedConstant(name, "", (0.0, 0.0), 0.0, (0.0, 0.0), (0.0, 0.0), (value, 0.25),
+            WEAK if name in ("roll_u1", LAG) else UNKNOWN, "")
+        for name, value in values.items()
+    )  # fmt: skip
+    flown: Any = SimpleNamespace(name="flight", u=np.zeros((9, 4)), config=CONFIG)
+    estimate = Estimate(values, dict.fromkeys(values, 0.25), 1.0, (), np.eye(len(values)))
+    path = tmp_path / "new.toml"
+    assert write_profile(path, "floaty", Identification(constants, (), estimate, (flown,), ())) == ""
+    written, text = load_config(str(path)).model, path.read_text(encoding="utf-8")
+    assert (written.roll_u1, written.roll_rate, written.flap_rate) == (231.0, -3.5, 25.0)
+    assert written.yaw_u3 == CONFIG.model.yaw_u3, "of yaw nothing is known"
+    found = dict(re.findall(r"(roll_u1|roll_rate) = \S+ +# (.*)", text))
+    assert found == {"roll_u1": "± 0.25, weak", "roll_rate": "± 0.25, not identifiable"}
 
 
 @pytest.mark.parametrize(
@@ -165,6 +205,16 @@ def test_a_closed_loop_s_constants_are_those_of_two_lines_of_which_y_has_one(
     assert found.acceleration.reshape(10, 19)[:, 3] == pytest.approx(
         c * found.angle.reshape(10, 19)[:, 3], rel=0.02
     )
+    window = cut(record, 404)
+    back = SimpleNamespace(name="r", pose_t=window.pose_t, pose=window.pose[[*range(402, -1, -1), 403]])
+    monkeypatch.undo()
+    ahead, behind = (two_controllers.closed_loop(one, ROLL).starred for one in (window, back))
+    assert behind == pytest.approx(ahead * [-1.0, 1.0, -1.0], rel=1e-6), "time's direction is that of damping"
+    every = 200 * rng.normal(size=(400, 6))[np.arange(len(t)) % 400]  # the same in every window
+    same = SimpleNamespace(pose_t=t + 3.0, pose=every)
+    once, twice = (two_controllers.closed_loop(cut(same, rows), ROLL) for rows in (405, 805))
+    free = (2 * 38 - 3) / (38 - 3)  # numbers of 19 complex bins, without the three constants
+    assert (once.errors / twice.errors) ** 2 == pytest.approx(np.full(3, free))
     with pytest.raises(LabError, match=r"^r: 4\.0 s of flight; the paper's method takes windows of 4 s$"):
         two_controllers.closed_loop(cut(record, 402), ROLL)
     assert len(two_controllers.closed_loop(cut(record, 405), ROLL).w) == 19
@@ -195,7 +245,7 @@ def test_a_page_shows_each_axis_by_a_flight_that_was_not_fitted_where_there_is_o
     def one(axis: Axis, record: int) -> Any:
         return SimpleNamespace(axis=axis, record=record)
 
-    fitted = [one(ROLL, 1), one(PITCH, 0), one(PITCH, 2)]
+    fitted = [one(ROLL, 1), one(PITCH, 2), one(PITCH, 0)]
     records = tuple(SimpleNamespace(name=f"r{n}") for n in range(3))
     estimate = SimpleNamespace(values="values", late=(0.1, 0.2, 0.3))
     constants = [SimpleNamespace(name=name, verdict=verdict) for name, verdict in
@@ -224,4 +274,4 @@ def test_a_page_shows_each_axis_by_a_flight_that_was_not_fitted_where_there_is_o
     asked.clear()
     _, content = pages.write_pages(tmp_path, found, None)
     content["figures"][1][2]()
-    assert asked[2][1:] == (records[0], fitted[1], "values", 0.1)
+    assert asked[2][1:] == (records[2], fitted[1], "values", 0.3)

@@ -14,12 +14,14 @@ from gymnasium.utils.env_checker import check_env
 from scipy.spatial.transform import Rotation
 
 import hil.research.learn
+from ground_station.trajectory import Goal
 from hil.config import load_config
 from hil.errors import LabError
 from hil.research.learn.batch import EstimateErrors, Fleet
 from hil.research.learn.envs import REACH, FastEnv, FirmwareEnv, Setup, make_env
 from hil.research.learn.tasks import PUSHES, TASKS, EpisodeTask, draw_episode
 from hil.world.floaty.plant import Plant
+from hil.world.servos import next_period_us
 from hil.world.tunnel import GUST_RMS
 
 STILL = ["tunnel.turbulence=none"]
@@ -103,6 +105,11 @@ def test_a_copy_flies_on_from_the_same_state_apart_from_its_original() -> None:
     twin = copy.deepcopy(env)
     flown = [[one.step(np.tile(action, (2, 1)))[0] for action in actions(20, 0.2)] for one in (env, twin)]
     np.testing.assert_array_equal(*flown)
+    own, other = (
+        [*one._memory, one._draws, one._sensing.memory]
+        for one in (env.unwrapped._fleet, twin.unwrapped._fleet)
+    )  # type: ignore[attr-defined]
+    assert not any(map(np.shares_memory, own, other))
 
 
 def test_a_row_of_many_robots_flies_as_the_seed_of_its_own() -> None:
@@ -190,18 +197,23 @@ def test_observations_stay_within_their_space_however_wrong_the_estimate(many: b
     assert np.abs(found).max() == REACH.max(), "a bound was reached"
 
 
-def test_the_laboratory_rewards_the_truth_at_the_end_of_each_step() -> None:
+@pytest.mark.parametrize("fidelity", ["fast", "firmware"])
+def test_a_step_is_rewarded_for_the_truth_at_its_end(fidelity: str) -> None:
     """Distance, tilt and yaw of the goal at that instant, and the change of the limited action, by scipy's rotations."""
-    env = make_env("Hover", "firmware", duration_s=0.5)
-    assert isinstance(env, FirmwareEnv)
+    env = make_env("Hover", fidelity, duration_s=0.5)  # type: ignore[arg-type]
     env.reset(seed=3)
-    before = np.zeros(4)
+    before, goal = np.zeros(4), Goal(tuple(load_config().flight.home), 0.0)
     for action in actions(12, 0.5):
-        _, reward, *_ = env.step(action)
-        assert env.flight is not None
-        body, now_us = env.flight.robot.body, env.flight.now_us
-        env.flight.robot.advance_truth(now_us)  # changes nothing: it is there
-        goal, R = env.flight.line.trajectory.at(now_us), Rotation.from_quat(np.roll(body.q_WB, -1))
+        seen, reward, *_ = env.step(action)
+        if isinstance(env, FastEnv):
+            body: Any = env.truth.body.fields
+        else:
+            assert env.flight is not None
+            body, now_us = env.flight.robot.body, env.flight.now_us
+            env.flight.robot.advance_truth(now_us)  # changes nothing: it is there
+            goal = env.flight.line.trajectory.at(now_us)
+        np.testing.assert_array_equal(seen[16:], action)
+        R = Rotation.from_quat(np.roll(body.q_WB, -1))
         far, tilt = math.dist(body.p_WB, goal.p_WG), math.acos(R.as_matrix()[2, 2])
         yaw = float(R.as_euler("ZYX")[0]) - goal.yaw
         parts = [
@@ -213,9 +225,9 @@ def test_the_laboratory_rewards_the_truth_at_the_end_of_each_step() -> None:
     env.close()
 
 
-def test_the_laboratory_limits_actions_and_forgets_them_at_a_reset() -> None:
-    limited, wild = (make_env("Hover", "firmware", duration_s=0.5) for _ in range(2))
-    assert isinstance(wild, FirmwareEnv)
+@pytest.mark.parametrize("fidelity", ["fast", "firmware"])
+def test_actions_are_limited_and_forgotten_at_a_reset(fidelity: str) -> None:
+    limited, wild = (make_env("Hover", fidelity, duration_s=0.5) for _ in range(2))  # type: ignore[arg-type]
     for env in (limited, wild):
         env.reset(seed=1)
     for _ in range(3):
@@ -225,6 +237,40 @@ def test_the_laboratory_limits_actions_and_forgets_them_at_a_reset() -> None:
     assert not wild.reset(seed=1)[0][16:].any()
     for env in (limited, wild):
         env.close()
+
+
+def test_a_push_of_the_fast_model_acts_from_its_instant_on_for_a_tenth_of_a_second() -> None:
+    env = make_env("Push", overrides=STILL)
+    assert isinstance(env, FastEnv)
+    for seed in (1, 2, 3):
+        env.reset(seed=seed)
+        drawn = env._fleet._memory[-1]["pushes"][0].T
+        for action in np.zeros((700, 4), np.float32):
+            begin_us = round(env.truth.body.fields.time_us)
+            env.step(action)
+            expected = np.zeros(6)
+            for at_s, kind, size in drawn:
+                if 0 <= begin_us - round(1e6 * at_s) < 100_000:
+                    expected[int(kind)] = size
+            np.testing.assert_array_equal(env.truth.body.fields.push, expected)
+
+
+def test_flaps_follow_a_command_from_the_first_period_that_begins_a_millisecond_after_the_step() -> None:
+    env = make_env("Hover", overrides=STILL)
+    assert isinstance(env, FastEnv)
+    env.reset(seed=1)
+    for action in actions(12, 0.2):
+        now_us, before = round(env.truth.body.fields.time_us), env.truth.flaps.fields
+        env.step(action)
+        after, angle = env.truth.flaps.fields, before.angle.copy()
+        waits_s = 1e-6 * (next_period_us(now_us + 1000) - now_us)
+        for command, lasts_s in ((before.command, waits_s), (after.command, 0.01 - waits_s)):
+            error = command + after.trim - angle
+            left = np.maximum(np.abs(error) * np.exp(-lasts_s / after.lag), after.dead_band)
+            angle = np.where(
+                np.abs(error) > after.dead_band, command + after.trim - np.copysign(left, error), angle
+            )
+        assert after.angle == pytest.approx(angle, abs=1e-9)
 
 
 def test_every_draw_of_an_episode_is_a_number_of_its_own() -> None:
@@ -241,12 +287,16 @@ def test_every_draw_of_an_episode_is_a_number_of_its_own() -> None:
     ]  # fmt: skip
     assert np.concatenate(unit) == pytest.approx(share[0][:11])
     assert (one.push_size + 1.0) / 2.0 == pytest.approx(share[0][-1 - PUSHES : -1])
+    assert (one.push_at / 3.0 - np.arange(3) - 0.2) / 0.5 == pytest.approx(share[0][11:14], abs=0.01), (
+        "of three thirds"
+    )
+    assert one.push_kind.tolist() == (6 * share[0][14:17]).astype(int).tolist()
     assert one.robot == share[0][-1]
 
 
 def test_an_age_of_the_pose_delays_the_observation_of_the_cameras_alone() -> None:
     quiet: Any = {"overrides": STILL, "errors": hil.research.learn.EstimateErrors(0.0, 0.0, 0.0, 0.0)}
-    now, late = make_env("Hover", **quiet), make_env("Hover", pose_delay_us=50_000, **quiet)
+    now, late = make_env("Hover", **quiet), make_env("Hover", pose_delay_us=46_000, **quiet)  # five steps
     assert isinstance(now, FastEnv)
     home = load_config().flight.home
     seen = {env: [env.reset(seed=2)[0]] for env in (now, late)}

@@ -79,6 +79,22 @@ def test_drag_coefficient_of_the_kinked_robot_is_that_of_the_specification() -> 
     assert WEIGHT / by_the_paper(hover, math.radians(42.5), 1.0)[2] == pytest.approx(1.353, rel=1e-3)
 
 
+def test_samples_follow_each_other_every_millisecond_after_the_start() -> None:
+    class Clamped:
+        p_WB, q_WB = np.zeros(3), np.zeros(4)
+
+        def place(self, *pose: object, flaps: list[float]) -> None:
+            self.flaps = flaps
+
+        def advance(self, now_us: int) -> None:
+            self.wrench_B = np.full(6, float(now_us))
+
+    plant = Clamped()
+    samples = drag_model._measure(plant, np.array([1.0, 2.0]), 7_000)  # type: ignore[arg-type]
+    assert plant.flaps == [1.0, 2.0]
+    assert samples.tolist() == [[7_000.0 + 1000.0 * (1 + n)] * 6 for n in range(len(samples))]
+
+
 def test_measurements_scatter_with_the_gusts_around_the_model() -> None:
     for row in islice(measure(load_config(), 1), 3):
         assert row.robot == "flat"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from firmware_py.config import ControllerConfig, ModelConfig
 from hil.config import load_config
+from hil.research.studies.paper_rows import ROWS as PAPER_ROWS
 from hil.world.floaty.correction import PAPER_TABLE
 
 ROWS = PAPER_TABLE  # value, uncertainty
@@ -21,6 +22,15 @@ FLAP_LAG = 0.05  # [s] the author's firmware, flapTimeConst = 20 1/s
 MODEL: ModelConfig = load_config("floaty").model
 AUTHOR: ControllerConfig = load_config("as-flown").controller
 Matrix = NDArray[np.float64]
+
+
+def test_the_paper_s_claims_are_judged_by_the_numbers_in_their_words() -> None:
+    claims = {(one.text, one.bound) for row in PAPER_ROWS.values() for one in row.claims.values()}
+    assert claims == {
+        ("", None), ("3.4 W", None), ("33 min", 33.0), ("10 W/kg", 10.05), ("< 0.5 s", 0.5), ("> 1", 1.0), ("0", 0.0),
+        ("< 20 deg", math.radians(20.0)), ("> 80 deg/s", math.radians(80.0)), ("about 1", 0.95), ("mostly", 0.5),
+        ("always", 1.0), ("all 9", 9.0), ("yes", 1.0), ("hovers", 0.1),
+    }  # fmt: skip
 
 
 def closed_loop(

@@ -90,7 +90,8 @@ def test_the_report_has_the_papers_value_and_the_spread_of_each_profile_s_flight
 def test_the_result_tells_of_each_flight_how_it_ended(result: Row) -> None:
     told = _trials(ROWS["hover"], trials(result, True, False))
     assert (told["holds"], list(told["missed"])) == (False, ["y_over_x"])
-    assert [(one["passed"], one["failed"]) for one in told["flights"]] == [(True, []), (False, ["max_x"])]
+    assert [(one["passed"], one["failed"], one["cause"]) for one in told["flights"]] == [
+        (True, [], None), (False, ["max_x"], None)]  # fmt: skip
     lost = Trials("floaty", (dataclasses.replace(result, outcome="lost", error="it fell"),))
     for trials_of, marked in ((lost, {"it fell"}), (trials(result, True), set())):
         ((_, figures),) = _figures(ROWS["hover"], (trials_of,))

@@ -55,6 +55,25 @@ def test_a_flight_that_was_not_completed_costs_more_than_any(outcome: str) -> No
     assert asked.cost(jobs[1:]) == 0.5
     assert asked.cost(jobs) == (LOST + 0.5) / 2
     assert (asked.cost_text(asked.cost(jobs)), asked.cost_text(0.5)) == ("lost", "50 cm")
+    far = Row(Job(0, "hover", Options(), {}), "completed", "", True, "", {"rms_z": 1e300}, {})
+    assert asked.cost([far]) == LOST, "nor does a completed flight cost more than a lost one"
+
+
+@pytest.mark.parametrize("metrics", [{}, {"rms_z": 0.5}])
+def test_a_flight_whose_error_is_not_of_its_numbers_ends_the_search(
+    tmp_path: Path, metrics: dict[str, float]
+) -> None:
+    """One with metrics has flown: it counts as lost."""
+
+    class Failing(Runner):
+        def _row(self, job: Job) -> Row:
+            return Row(job, "error", "too little memory", False, "", metrics, {})
+
+    if metrics:
+        assert found(Failing(), aim("rms_z", flights=8), tmp_path).before == LOST
+    else:
+        with pytest.raises(LabError, match=r"^too little memory$"):
+            found(Failing(), aim("rms_z", flights=8), tmp_path)
 
 
 @pytest.mark.parametrize("metric", ["rms_z", "in_box"])  # smallest is best, largest is best
@@ -97,6 +116,17 @@ def test_whole_numbers_stay_whole(tmp_path: Path) -> None:
     assert (after.value(7.6), after.given) == (8, 1_000_000)
     assert (gain.value(0.123456789), gain.given) == (0.12346, pytest.approx(-0.4))
     assert isinstance(after.value(7.6), int)
+
+
+@pytest.mark.parametrize(("text", "reason"), [
+    *((f"controller.gain_y={bounds}", "expected KEY=LOW..HIGH") for bounds in ("1..1", "2..1", "-inf..1", "0..inf", "nan..1",
+      "a..1", "1", "1..")), ("gain_y=1..2", "expected KEY=LOW..HIGH"),
+    ("robot.body=1..2", "robot.body is no number of profile floaty"), ("tracker.enabled=0..1", "is no number of profile"),
+    ("predictor.horizon=0..5", "predictor.horizon = 0"), ("predictor.horizon=3..13", "predictor.horizon = 13"),
+])  # fmt: skip
+def test_bounds_that_cannot_be_flown_are_refused_before_a_flight(text: str, reason: str) -> None:
+    with pytest.raises(LabError, match=reason):
+        intervals(("controller.gain_z=1..2", text), "floaty")
 
 
 def test_a_metric_that_the_experiment_lacks_is_one_line(tmp_path: Path) -> None:

@@ -134,6 +134,16 @@ def test_a_model_error_scales_the_constants_of_its_part_and_no_other() -> None:
     assert request.config.plant == load_config().plant, "the world stays right"
 
 
+def test_the_settings_of_a_size_count_more_than_those_of_its_variant() -> None:
+    def lost(size: float) -> Options:
+        return Options(overrides={"radio.uplink_loss": size})
+
+    variant = Variant("a", lost, Expected(), settings=("radio.uplink_loss=0.9",))
+    jobs = flights_of(Study("s", "?", "loss", "", (0.1, 0.2), (variant,)), 2)
+    found = [(job.request().config.radio.uplink_loss, job.request().seed) for job in jobs]
+    assert found == [(0.1, 1), (0.1, 2), (0.2, 1), (0.2, 2)]
+
+
 def unchanged(size: float) -> Options:
     return Options()
 
@@ -170,6 +180,14 @@ def judged(expected: Expected, *cells: str) -> list[str]:
 )
 def test_surprises_are_reported(expected: Expected, cells: tuple[str, ...], surprises: list[str]) -> None:
     assert judged(expected, *cells) == surprises
+
+
+def test_an_expectation_is_a_sentence_of_the_bounds_that_it_has() -> None:
+    told = "holds the limits up to 1 m, is not lost up to 2 m, is stopped by the supervisor from 3 m, is lost from 4 m"
+    assert Expected(1, 2, 3, 4).text("m") == told
+    for number, part in enumerate(told.split(", ")):
+        assert Expected(*(float(n + 1) if n == number else None for n in range(4))).text("m") == part
+    assert Expected(lost_from=2).text("") == "is lost from 2"
 
 
 def test_the_typical_outcome_is_the_median_and_the_worse_of_two() -> None:

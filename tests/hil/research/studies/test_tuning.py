@@ -36,7 +36,9 @@ def test_the_profile_cad_has_the_plate_model_on_board() -> None:
     assert cad.controller == load_config("as-flown").controller
 
 
-def test_an_axis_is_judged_by_old_and_new_gains_for_its_robot_and_by_the_worst_of_all() -> None:
+def test_an_axis_is_judged_by_old_and_new_gains_for_its_robot_and_by_the_worst_of_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     config = load_config()
     timing, old = Timing.of(config, 0.04), gains_in(config, ROLL)
     robots, new = [robot_of(config), robot_of(config) | {DELAY: 0.014}], 0.9 * old
@@ -47,6 +49,9 @@ def test_an_axis_is_judged_by_old_and_new_gains_for_its_robot_and_by_the_worst_o
     late = [pose_delay_margin(ROLL, robot, config, timing, new) for robot in robots]
     assert late[1] < late[0]
     assert (one.late, one.least_late) == tuple(late)
+    monkeypatch.setattr("hil.research.design.tune.WORSE", 1)
+    three = [robots[0], *robots], [loops[0], *loops]
+    assert judged(task, *three, old, new).least_late == late[1], "of those with the highest peaks"
     assert (one.old_margins, one.margins, one.least) == (margins(loops[0], old), each[0], worst(each))
     assert (one.old_motion, one.motion) == tuple(motion(loops[0], task, gains) for gains in (old, new))
     assert (one.old.tolist(), one.new.tolist()) == (old.tolist(), new.tolist())
@@ -137,6 +142,7 @@ def test_a_round_designs_each_axis_from_the_hover_s_flow_and_flies_its_gains_and
     ("old", "new", "better", "another"),
     [
         (hovered(0.02), hovered(0.018), True, True),
+        (hovered(0.02), hovered(0.95 * 0.02), True, True),
         (hovered(0.02), hovered(0.0195), True, False),
         (hovered(0.02), hovered(0.02), True, False),
         (hovered(0.02), hovered(0.021), False, False),
@@ -180,7 +186,7 @@ def test_the_worst_robots_that_a_plant_can_be_are_flown_the_worst_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A robot is its peak; those with a constant of another sign or over four times the plant's are no plant's."""
-    config = load_config()
+    config = load_config(overrides=["plant.constant_factors={roll_u1=0.9}"])
     truth = asdict(tuning.plant_of(config).linearise())
     given = config.plant.constant_factors
     robots = [{name: value * share for name, value in truth.items()} | {"peak": peak, "flap_rate": 20.0 + peak}

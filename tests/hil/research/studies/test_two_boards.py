@@ -157,11 +157,14 @@ def test_packets_of_the_uplink_wait_beside_those_that_come_down(down: Any, up: A
 
 
 def test_two_folders_of_runs_are_a_row_per_seed(flown: Path, tmp_path: Path) -> None:
-    """The second body is 12.3 mm beside the first, and its board fuses three poses more."""
+    """The second body is 12.3 mm beside the first, once 20 mm, and its board fuses three poses more."""
+
+    shift = np.full(RELEASE + FLOWN, 0.0123)
+    shift[RELEASE + 7] = 0.02
 
     def beside(columns: Columns) -> None:
         bumped(columns)
-        columns["truth.x"] += 0.0123
+        columns["truth.x"] += shift[: len(columns["t"])]
         columns["estimator.fused"] += 3
 
     first, second = tmp_path / "first", tmp_path / "second"
@@ -175,12 +178,14 @@ def test_two_folders_of_runs_are_a_row_per_seed(flown: Path, tmp_path: Path) -> 
     assert [one.seed for one in found] == [2, 10]
     free = load_flown(flown).log.slice(RELEASE)
     errors = [column(free, f"truth.{axis}") - column(free, f"goal.{axis}") for axis in "xyz"]
-    rms = [float(np.sqrt((error**2).mean())) for error in (*errors, errors[0] + 0.0123)]
+    rms = [
+        float(np.sqrt((error**2).mean())) for error in (*errors, errors[0] + shift[RELEASE:][: free.num_rows])
+    ]
     fused = int(column(free, "estimator.fused")[-1])
     for one in found:
         assert one.first is not None
         assert str(one.first).startswith(f"first servo count: row {RELEASE + 1}, 0.01")
         assert [*one.rms_m[0], *one.rms_m[1]] == pytest.approx([*rms[:3], rms[3], *rms[1:3]], rel=1e-6)
-        assert (one.apart_m, one.fused) == (pytest.approx(0.0123, rel=1e-6), (fused, fused + 3))
+        assert (one.apart_m, one.fused) == (pytest.approx(0.02, rel=1e-6), (fused, fused + 3))
     with pytest.raises(LabError, match="neither two runs nor folders with runs of the same names"):
         seeds_of(first, flown.parent)
