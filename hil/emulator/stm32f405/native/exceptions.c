@@ -172,7 +172,7 @@ void enter(struct machine *m, unsigned exception, uint32_t return_address)
     if (process && m->canary && *word(m, m->stack_begin) != UNUSED) /* it overflowed, and may have returned since */
         note_overflow(m);
     if (!place || !end) {
-        if (handler == HARD_FAULT || exception == HARD_FAULT) {
+        if (exception == HARD_FAULT) {
             lock_up(m, return_address);
             return;
         }
@@ -289,8 +289,7 @@ void leave(struct machine *m, uint32_t exc_return)
     if (m->profile)
         profile_leave(m, m->now + RETURN_CYCLES);
     m->active[exception >> 6] &= ~(1ull << (exception & 63));
-    if (exception != NMI)
-        m->faultmask = 0;
+    m->faultmask = 0;
     if (m->line[exception >> 6] >> (exception & 63) & 1)
         set_pending(m, exception);
     if (!valid) {
@@ -517,7 +516,10 @@ void system_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t given,
         if (value & 1)
             note_unknown(m, 0xE000ED94);
         break;
-    case 0xEF00: set_pending(m, IRQ + (value & 0x7F)); break; /* STIR */
+    case 0xEF00: /* STIR */
+        if ((value & 0x1FF) < EXCEPTIONS - IRQ)
+            set_pending(m, IRQ + (value & 0x1FF));
+        break;
     case 0xEF34: m->fpccr = value; break;
     default: break;
     }
