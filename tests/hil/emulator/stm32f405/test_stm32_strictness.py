@@ -10,8 +10,8 @@ from hil.errors import LabError
 from support.stm32_bench import FLASH, RAM, Bench
 
 START, VECTORS, DATA = FLASH + 8, RAM + 0x4000, RAM + 0x2000
-VTOR, CCR, SHPR2, SHCSR, CPACR, MPU_CTRL = (
-    0xE000_E000 + offset for offset in (0xD08, 0xD14, 0xD1C, 0xD24, 0xD88, 0xD94)
+VTOR, CCR, SHPR2, SHCSR, CFSR, HFSR, CPACR, MPU_CTRL = (
+    0xE000_E000 + offset for offset in (0xD08, 0xD14, 0xD1C, 0xD24, 0xD28, 0xD2C, 0xD88, 0xD94)
 )
 GPIOA, TIM3_ARR, APB1ENR = 0x4002_0000, 0x4000_042C, 0x4002_3840
 CCM, NO_MEMORY = 0x1000_0000, 0x3000_0000
@@ -208,6 +208,21 @@ def test_an_unaligned_load_in_an_it_block_keeps_the_condition_of_the_next() -> N
     assert (bench.chip.register("r0"), bench.chip.register("r7")) == (word(5), 5)
 
 
+def test_behind_an_it_block_that_ends_with_an_unaligned_load_nothing_is_conditional() -> None:
+    bench = Strict(
+        "002e 08bf 2068 0537 0137", {"r4": DATA + 5}
+    )  # cmp r6, #0; it eq; ldreq r0, [r4]; adds r7, #5; #1
+    assert bench.run() == 0
+    assert (bench.chip.register("r0"), bench.chip.register("r7")) == (word(5), 6)
+
+
+@pytest.mark.parametrize(("code", "place"), [("dff8 0500", 17), ("5ff8 0500", 7)])
+def test_an_unaligned_load_by_the_pc_counts_from_a_word(code: str, place: int) -> None:
+    bench = Strict(f"00bf {code} 0137")  # nop; ldr.w r0, [pc, #5 or #-5]
+    assert bench.run() == 0
+    assert bench.chip.register("r0") == int.from_bytes(bench.chip.read(FLASH + place, 4), "little")
+
+
 def test_a_step_over_an_unaligned_load_ends_after_it() -> None:
     bench = Strict("2068 2068 0137", {"r4": DATA + 5})
     bench.chip.step()
@@ -227,21 +242,60 @@ def test_a_step_does_not_wake_a_processor_that_sleeps() -> None:
     assert (chip.register("pc"), chip.state.now) == (START + 2, slept_at + 500)
 
 
-@pytest.mark.parametrize(("code", "kind"), [("2068", 3), ("2060", 2)], ids=["read", "written"])
-def test_a_watchpoint_sees_an_unaligned_access(code: str, kind: int) -> None:
-    bench = Strict(code, {"r4": DATA + 5})
-    bench.chip.watch(kind, DATA + 8, 1, True)
-    assert bench.chip.run(1680) & StopReason.WATCHPOINT
-    assert bench.chip.state.watch_address == DATA + 8
+@pytest.mark.parametrize(
+    ("code", "kind", "first", "last"),
+    [
+        ("2068", 3, 5, 8),
+        ("2060", 2, 5, 8),
+        ("2068", 3, 4, 7),
+        ("2060", 2, 4, 7),
+        ("84ed 000b", 2, 0, 7),
+        ("94ed 000b", 3, 0, 7),
+    ],
+    ids=["unaligned read", "unaligned write", "read", "write", "double written", "double read"],
+)
+def test_a_watchpoint_sees_an_access_by_each_of_its_bytes_and_no_other(
+    code: str, kind: int, first: int, last: int
+) -> None:
+    for place in (first - 1, first, last, last + 1):
+        for watched in (2, 3, 4):
+            bench = Strict(code, {"r4": DATA + first})
+            bench.chip.watch(watched, DATA + place, 1, True)
+            seen = first <= place <= last and watched in (kind, 4)
+            assert bool(bench.chip.run(1680) & StopReason.WATCHPOINT) == seen
+            assert bench.chip.state.watch_address == (DATA + place if seen else 0)
+            other = 2 + (watched - 1) % 3
+            with pytest.raises(LabError):
+                bench.chip.watch(other, DATA + place, 1, False)
+            bench.chip.watch(watched, DATA + place, 1, False)
+
+
+STACKING = {
+    "push {r0}": "01b4", "push {r0, lr}": "01b5", "push.w {r0, r8}": "2de9 0101", "sub sp, #8": "82b0",
+    "sub.w sp, #8": "adf1 080d",
+    "mov sp, r4": "a546", "add sp, r5": "ad44", "str r0, [sp, #-4]!": "4df8 040d", "strd r0, r1, [sp, #-8]!": "6de9 0201",
+    "vpush {d8}": "2ded 028b", "vpush {s16}": "2ded 018a", "subw sp, sp, #8": "adf2 080d", "sub.w sp, sp, r6": "adeb 060d",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("code", **ids(STACKING))
+def test_each_instruction_that_lowers_the_stack_pointer_may_overflow_a_stack(code: str) -> None:
+    for room, overflows in ((0, True), (64, False)):
+        bench = Strict(f"{code} ffe7", {"r4": RAM + 0xFF0, "r5": -8 & 0xFFFF_FFFF, "r6": 8})
+        bench.chip.state.stack_begin, bench.chip.state.task[0].block = RAM + 0x1000 - room, 7
+        assert bool(bench.chip.run(1680) & StopReason.OVERFLOW) == overflows
+        assert bench.chip.state.overflow == 7 * overflows
 
 
 def test_masks_are_read_as_they_were_written() -> None:
     # movs r0, #0x5f; msr basepri_max, r0; mrs r1, basepri; movs r0, #0x70; msr basepri_max, r0; mrs r2, basepri_max
     # msr basepri, r0; mrs r5, basepri; cpsid f; mrs r3, faultmask; cpsie f; mrs r4, faultmask
     raised = "5f20 80f3 1288 eff3 1181 7020 80f3 1288 eff3 1282"  # the maximum raises 0 and lowers nothing
-    bench = Strict(f"{raised} 80f3 1188 eff3 1185 71b6 eff3 1383 61b6 eff3 1384")
+    # movs r0, #1; msr faultmask, r0; mrs r9, faultmask; movs r0, #2; msr faultmask, r0; mrs r10, faultmask
+    by_msr = "0120 80f3 1388 eff3 1389 0220 80f3 1388 eff3 138a"
+    bench = Strict(f"{raised} 80f3 1188 eff3 1185 71b6 eff3 1383 61b6 eff3 1384 {by_msr}")
     assert bench.run() == 0
-    assert [bench.chip.register(f"r{n}") for n in (1, 2, 5, 3, 4)] == [0x50, 0x50, 0x70, 1, 0]
+    assert [bench.chip.register(f"r{n}") for n in (1, 2, 5, 3, 4, 9, 10)] == [0x50, 0x50, 0x70, 1, 0, 1, 0]
 
 
 ARMV8_M = {
@@ -437,13 +491,19 @@ def test_an_invalid_return_from_an_exception_is_a_fault(handler: str, status: in
     assert bench.cfsr == status
 
 
-@pytest.mark.parametrize(("ccr", "padding"), [(STKALIGN, 4), (0, 0)])
-def test_a_frame_is_aligned_to_eight_bytes_unless_that_is_switched_off(ccr: int, padding: int) -> None:
-    bench = Strict("01b4 00df", ccr=ccr)  # push {r0}; svc
+@pytest.mark.parametrize(("code", "ccr", "padding"), [
+    ("01b4 00df", STKALIGN, 4), ("01b4 00df", 0, 0), ("00ee 100a 01b4 00df", STKALIGN, 4), ("00ee 100a 01b4 00df", 0, 4),
+])  # fmt: skip
+def test_a_frame_is_aligned_to_eight_bytes_unless_that_is_switched_off(
+    code: str, ccr: int, padding: int
+) -> None:
+    """With floats it is always so. B1.5.7."""
+    bench = Strict(code, ccr=ccr)  # vmov s0, r0; push {r0}; svc
+    floats = 0x48 * code.startswith("00ee")
     before = bench.chip.register("msp") - 4
     assert bench.run() == 11
     frame = bench.chip.register("msp")
-    assert before - frame == 0x20 + padding
+    assert before - frame == 0x20 + padding + floats
     assert bench[frame + 28] >> 9 & 1 == (padding == 4)
 
 
@@ -459,6 +519,29 @@ def test_a_supervisor_call_where_it_may_not_interrupt_is_a_hard_fault(
     bench[SHPR2] = priority << 24
     assert bench.run() == exception
     assert bench.chip.state.hfsr == (FORCED if exception == HARD_FAULT else 0)
+
+
+@pytest.mark.parametrize(
+    ("priority", "exception"), [(0x30, USAGE_FAULT), (0x40, HARD_FAULT), (0x50, HARD_FAULT)]
+)
+def test_a_fault_in_a_handler_is_a_hard_fault_unless_it_is_more_urgent(priority: int, exception: int) -> None:
+    bench = with_handler("", "00de")  # udf
+    bench[SHPR2], bench[SHPR2 - 4] = 0x40 << 24, priority << 16
+    assert bench.run() == exception
+    assert bench.chip.state.hfsr == (FORCED if exception == HARD_FAULT else 0)
+    bench[HFSR] = bench[CFSR] = 0
+    assert (bench.cfsr, bench.chip.state.hfsr) == (UNDEFINED, FORCED if exception == HARD_FAULT else 0)
+    bench[HFSR], bench[CFSR] = FORCED, UNDEFINED
+    assert (bench[CFSR], bench[HFSR]) == (0, 0)
+
+
+def test_flags_reach_the_handler() -> None:
+    bench = Strict(
+        "80fa 40f0 00df", {"r0": 0xFFFF_FFFF}
+    )  # uadd8 r0, r0, r0; svc: the greater-or-equal of bytes
+    bench.chip.set_register("xpsr", 0xF800_0000 | 1 << 24)
+    assert bench.run() == 11
+    assert bench.chip.register("xpsr") == 0xF80F_0000 | 1 << 24 | 11
 
 
 def test_a_fault_while_interrupts_are_masked_is_a_hard_fault() -> None:
