@@ -244,6 +244,20 @@ def test_the_last_byte_by_dma_is_not_acknowledged_and_no_other_follows(bench: Be
         assert bench[I2C1 + 0x14] & (1 << 6 | 4) == 0, "neither RXNE nor BTF"
 
 
+def test_without_last_the_byte_behind_dma_is_acknowledged_and_read(bench: Bench) -> None:
+    bench.chip.add_device(1, 0x50, np.arange(256, dtype=np.uint8))
+    stream = stream_of(0, 0)
+    bench[I2C1 + 0x1C], bench[I2C1 + 4] = 35, 1 << 11
+    bench[stream + NDTR], bench[stream + PAR], bench[stream + M0AR] = 3, I2C1 + 0x10, BUFFER
+    bench[stream + CR] = ENABLED | INCREMENT
+    address(bench, 0x50 << 1 | 1)
+    bench.until(I2C1 + 0x14, 2)
+    bench[I2C1 + 0x18]
+    bench.wait(200)
+    assert bench.chip.read(BUFFER, 4) == b"\0\1\2\0"
+    assert (bench[I2C1 + 0x14], bench[I2C1 + 0x10]) == (1 << 6 | 4, 3)
+
+
 def test_a_missing_acknowledgement_is_cleared_by_writing_0_and_nothing_else_is(bench: Bench) -> None:
     bench[I2C1 + 0x1C], bench[I2C1] = 35, 1
     address(bench, 0x41 << 1)

@@ -24,7 +24,8 @@ class Memory:
         self.bytes = {base: bytearray(size) for _, base, size in MEMORIES}
         for number in range(priorities):
             self.empty_list(READY + 20 * number)
-        for place in (DELAYED, WAITING):
+        self.delayed = READY + 20 * priorities
+        for place in (self.delayed, WAITING):
             self.empty_list(place)
         self.tasks: list[int] = []
 
@@ -85,12 +86,21 @@ def test_the_pointer_to_the_running_task_is_the_first_literal_that_the_handler_l
     assert found is None or found._current == literal
 
 
-@pytest.mark.parametrize(("highest", "own"), [(0, 0), (5, 2), (5, 5), (31, 31), (32, 31), (32, 32), (40, 33)])
+@pytest.mark.parametrize(("missing", "known"), [(0, True), (1, False), (8, False)])
+def test_a_handler_at_the_end_of_an_image_is_read_whole_or_not_at_all(missing: int, known: bool) -> None:
+    image = image_of([0x4B05])  # ldr r3, [pc, #20]
+    code = bytearray(image.code[: 0x80 + 32 - missing])
+    code[0x80 + 24 : 0x80 + 28] = pack("<I", CURRENT)
+    image = Made(code=bytes(code[: 0x80 + 32 - missing]), base=FLASH)
+    assert (UnnamedFreeRtos.of(image, lambda *place: b"") is not None) == known  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("highest", "own"), [(1, 0), (5, 2), (5, 5), (31, 31), (32, 31), (32, 32), (40, 33)])
 def test_tasks_are_found_at_each_priority(highest: int, own: int) -> None:
     memory = Memory(highest + 1)
     low = memory.task(b"LOW", own, READY + 20 * own, 64)
     other = memory.task(b"another", highest, READY + 20 * highest, 65)
-    sleeper = memory.task(b"SLEEP-16-letters", 1, DELAYED, 130)
+    sleeper = memory.task(b"SLEEP-16-letters", 1, memory.delayed, 130)
     waiting = memory.task(b"WAIT", 0, WAITING, 0)
     kernel = UnnamedFreeRtos(memory.read, CURRENT)
     assert (kernel.places[0], kernel.running, kernel.heap_bytes) == (0, False, (None, None))
@@ -98,7 +108,7 @@ def test_tasks_are_found_at_each_priority(highest: int, own: int) -> None:
     if own >= 32:
         assert kernel.places == (0, 48, 20, 0, 0)
         return
-    assert kernel.places == (CURRENT, 48, 20, READY, READY + 20 * (max(highest, 1) + 1))
+    assert kernel.places == (CURRENT, 48, 20, READY, READY + 20 * (highest + 1))
     assert kernel.running
     views = [(one.name, one.state, one.priority, one.stack_free_bytes, one.block) for one in kernel.tasks()]
     expected = [
@@ -137,8 +147,8 @@ LISTS = {  # words of a list around a task
 def test_a_list_that_does_not_fit_together_leads_to_no_task(at: int, word: int) -> None:
     memory = Memory(3)
     memory.write(CURRENT, memory.task(b"TASK", 0, READY, 64))
-    memory.task(b"HIDDEN", 2, DELAYED, 64)
-    memory.write(DELAYED + at, word)
+    memory.task(b"HIDDEN", 2, memory.delayed, 64)
+    memory.write(memory.delayed + at, word)
     kernel = UnnamedFreeRtos(memory.read, CURRENT)
     assert kernel.places[-1] == READY + 20
     assert [one.name for one in kernel.tasks()] == ["TASK"]
