@@ -299,3 +299,64 @@ def test_a_reset_ends_what_was_masked(register: str, kind: int) -> None:
     bench.chip.reset(SOFTWARE)
     bench.wait(10)
     assert bench.chip.profiled().masked[kind].cycles == 0
+
+
+@pytest.mark.parametrize(("register", "kind"), [("10", 0), ("11", 1), ("13", 0)])
+def test_the_longest_time_with_interrupts_masked_is_kept_with_its_places(register: str, kind: int) -> None:
+    """Twenty instructions, then thirty, then ten."""
+    mask, unmask = f"80f3 {register}88", f"81f3 {register}88"  # msr, r0 or r1
+    bench = profiled("".join(mask + "00bf" * length + unmask for length in (20, 30, 10)))
+    bench.chip.set_register("r0", 0xF1)
+    begin = bench.chip.state.now
+    bench.wait(10)
+    longest = bench.chip.profiled().masked[kind]
+    assert longest.cycles == pytest.approx(32, abs=2)
+    assert longest.when - begin == pytest.approx(4 + 20 + 4 + 4, abs=6)
+    assert (longest.begin, longest.end) == (8 + 48 + 4, 8 + 48 + 68)
+    assert longest.root == 32  # what runs before all tasks
+    assert bench.chip.profiled().masked[1 - kind].cycles == 0
+
+
+def test_processor_time_belongs_to_the_task_that_the_last_switch_has_chosen() -> None:
+    """Forty tasks, of which the last nine share a place; the outside chooses the next one, and whether it is ready."""
+    bench, rng = Logging(), np.random.default_rng(3)
+    bench.start(IABR, {})
+    current, blocks, ready = RAM + 0x100, [RAM + 0x8000 + 0x40 * one for one in range(40)], RAM + 0x200
+    state = bench.chip.state
+    state.kernel.current_place, state.kernel.stack_offset, state.kernel.container_offset = current, 0x30, 0x14
+    state.kernel.ready_begin, state.kernel.ready_end, state.tracing = ready, ready + 40, 1
+    for block in blocks:
+        bench[block + 0x14] = ready
+    expected: dict[int, dict[str, int]] = {}
+    order: list[int] = []
+    running = -1
+    for one in (*range(40), *rng.integers(0, 40, 120).tolist()):
+        container = int(rng.choice((ready, ready + 20, ready + 40, ready - 20)))
+        if running >= 0:
+            bench[blocks[min(running, 31)] + 0x14] = container
+        bench[current] = blocks[one]
+        bench[ICSR] = 1 << 28
+        before = state.now
+        bench.wait(int(rng.integers(1, 30)))
+        if one == min(running, 31):
+            assert state.switch_count == len(order)
+            continue
+        place, now = min(one, 31), state.task_switch[len(order)].now
+        order.append(blocks[one])
+        assert before < now < before + 168
+        if running >= 0:
+            last = expected[min(running, 31)]
+            last["cycles"] += now - last["since"]
+            last["ran"] = now
+            if container not in (ready, ready + 20):
+                last["busy"] = 0
+        mine = expected.setdefault(place, {"cycles": 0, "times": 0, "busy": 0, "ran": 0})
+        mine["since"], mine["times"] = now, mine["times"] + 1
+        mine["busy"] = mine["busy"] or now
+        running = one
+    assert [state.task_switch[at].block for at in range(state.switch_count)] == order
+    assert (state.task_count, state.running) == (32, min(running, 31))
+    for place, mine in expected.items():
+        task = state.task[place]
+        found = {"cycles": task.cycles, "times": task.times, "busy": task.busy_since, "ran": task.ran}
+        assert found == {name: mine[name] for name in found}, place

@@ -66,6 +66,26 @@ def test_only_a_jump_that_is_taken_refills_the_pipeline() -> None:
     assert cycles("00d0") - cycles("00d1") == 100 * (3 - 1)  # beq is taken and skips the nop, bne is not
 
 
+@pytest.mark.parametrize("place", [RAM + 0x3001, RAM + 0x3005])
+def test_code_in_ram_takes_a_cycle_per_half_word_and_a_refill_per_jump(place: int) -> None:
+    bench = Bench(bytes.fromhex("2047"))  # bx r4
+    bench.chip.write(RAM + 0x3000, bytes.fromhex("00bf 00bf 00bf 00bf 2847"))  # nop, four times; bx r5
+    before = bench.chip.state.now
+    bench.chip.set_register("r4", place)
+    bench.chip.set_register("r5", (FLASH + 10) | 1)
+    bench.wait(10)
+    taken = bench.chip.state.now - before - bench.chip.state.sleeping
+    halves = 5 - (place - RAM - 0x3001) // 2
+    assert taken - 2 * 3 - halves in (5, 6, 7), "bx, wfi and the jump behind it"
+
+
+def test_there_is_room_for_sixteen_devices(bench: Bench) -> None:
+    for number in range(16):
+        assert bench.chip.add_device(1 + number % 3, number, np.zeros(1, np.uint8)) == number
+    with pytest.raises(LabError, match="more devices"):
+        bench.chip.add_device(1, 16, np.zeros(1, np.uint8))
+
+
 @pytest.mark.parametrize(("lines", "misses"), [(3, 3), (64, 64), (65, 3 * 65)])
 def test_a_line_of_flash_waits_unless_it_is_among_the_64_used_last(lines: int, misses: int) -> None:
     def cycles(cached: bool) -> int:
@@ -91,8 +111,10 @@ def test_where_nothing_is_nothing_can_be_read(bench: Bench) -> None:
         bench.chip.read(0x6000_0000, 4)
 
 
+# IWDG, SPI2, SPI3, I2C2, I2C3, TIM8, TIM9.
 # TIM2 to TIM5, USART2, I2C1, TIM1, USART6, SPI1, SYSCFG, EXTI, GPIOA to GPIOD, RCC, DMA1, DMA2; SysTick, NVIC, SCB.
 PERIPHERALS = (
+    0x4000_3000, 0x4000_3800, 0x4000_3C00, 0x4000_5800, 0x4000_5C00, 0x4001_0400, 0x4001_4000,
     0x4000_0000, 0x4000_0400, 0x4000_0800, 0x4000_0C00, 0x4000_4400, 0x4000_5400, 0x4001_0000, 0x4001_1400, 0x4001_3000,
     0x4001_3800, 0x4001_3C00, 0x4002_0000, 0x4002_0400, 0x4002_0800, 0x4002_0C00, 0x4002_3800, 0x4002_6000, 0x4002_6400,
 )  # fmt: skip
@@ -109,7 +131,7 @@ def test_a_reset_chip_is_like_a_fresh_one(bench: Bench, seed: int) -> None:
         places = [
             base + 4 * word for base in PERIPHERALS + SYSTEM for word in range(24 if base < SYSTEM[0] else 4)
         ]
-        return registers | {place: one[place] for place in places}
+        return registers | {place: one[place] for place in (*places, 0x5006_0808)}  # also a random number
 
     rng = np.random.default_rng(seed)
     fresh = Bench()
@@ -126,9 +148,18 @@ def test_a_reset_chip_is_like_a_fresh_one(bench: Bench, seed: int) -> None:
     fresh.chip.run(bench.chip.state.now)
     for one in (bench, fresh):
         one.chip.reset(0x0C00_0000)
-    # The manuals' values: VTOR, CCR, status of USART2 and SPI1, reload of TIM2 and TIM3, cause.
-    places = (0xE000_ED08, 0xE000_ED14, 0x4000_4400, 0x4001_3008, 0x4000_002C, 0x4000_042C, 0x4002_3874)
-    values = (FLASH, 0x200, 0xC0, 2, 0xFFFF_FFFF, 0xFFFF, 0x0C00_0000)
+    # The manuals' values: VTOR, CCR, status of USART2 and SPI1, reload of TIM2 and TIM3, cause, RCC.
+    places = (
+        0xE000_ED08,
+        0xE000_ED14,
+        0x4000_4400,
+        0x4001_3008,
+        0x4000_002C,
+        0x4000_042C,
+        0x4002_3874,
+        0x4002_3800,
+    )
+    values = (FLASH, 0x200, 0xC0, 2, 0xFFFF_FFFF, 0xFFFF, 0x0C00_0000, 0x83)
     assert [bench[place] for place in places] == list(values)
     assert [bench.chip.register(name) for name in CORE] == [*13 * [0], RAM + 0x1000, FLASH + 8, 0, 0, 0, 0]
     for _ in range(3):

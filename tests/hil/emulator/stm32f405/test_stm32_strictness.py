@@ -285,6 +285,8 @@ def test_each_instruction_that_lowers_the_stack_pointer_may_overflow_a_stack(cod
         bench.chip.state.stack_begin, bench.chip.state.task[0].block = RAM + 0x1000 - room, 7
         assert bool(bench.chip.run(1680) & StopReason.OVERFLOW) == overflows
         assert bench.chip.state.overflow == 7 * overflows
+        bench.chip.reset(1 << 28)
+        assert (bench.chip.state.overflow, bench.chip.state.stack_begin) == (0, 0)
 
 
 def test_masks_are_read_as_they_were_written() -> None:
@@ -356,7 +358,7 @@ def test_floats_are_enabled_and_disabled_by_the_code_itself() -> None:
     assert (bench.cfsr, bench.stacked_pc) == (NOCP, START + 24)
 
 
-@pytest.mark.parametrize("code", ["91fb f2f0", "b1fb f2f0"], ids=["sdiv", "udiv"])
+@pytest.mark.parametrize("code", ["91fb f2f0", "b1fb f2f0", "91fb fcf0"], ids=["sdiv", "udiv", "by r12"])
 def test_a_division_by_zero_is_a_usage_fault_if_the_firmware_wants_it_so(code: str) -> None:
     bench = Strict(code, {"r1": 7}, ccr=STKALIGN | DIV_0_TRP)
     assert bench.run() == HARD_FAULT
@@ -378,6 +380,20 @@ def test_a_breakpoint_holds_each_arrival_once() -> None:
     chip.step()  # onto it
     assert chip.run(chip.state.now + 1000) & StopReason.BREAK
     assert (chip.register("pc"), chip.register("r7")) == (START, 3)
+
+
+def test_there_is_room_for_64_breakpoints_and_one_that_went_makes_room() -> None:
+    chip = Strict("").chip
+    chip.breakpoints = {FLASH + 2 * number for number in range(64)}
+    chip.run(1)
+    chip.breakpoints |= {FLASH + 128}
+    with pytest.raises(LabError, match="more breakpoints"):
+        chip.run(1)
+    other = Strict("").chip
+    other.breakpoints = {FLASH + 2 * number for number in range(64)}
+    other.run(1)
+    other.breakpoints = {FLASH + 128 + 2 * number for number in range(63)}
+    other.run(1)
 
 
 def test_a_breakpoint_instruction_without_a_debugger_is_a_hard_fault() -> None:
@@ -421,6 +437,12 @@ def test_an_access_to_where_nothing_is_is_a_bus_fault_with_its_address(code: str
     bench[SHCSR] = HANDLED
     assert bench.run() == BUS_FAULT
     assert (bench.cfsr, bench.chip.state.bfar, bench.stacked_pc) == (PRECISERR | BFARVALID, address, START)
+
+
+def test_the_first_sixteen_writers_near_address_0_are_reported_once() -> None:
+    bench = Strict("2160" * 18 + "dae7", {"r4": 0x40})  # str r1, [r4]; b to the second
+    reasons = [bench.chip.run(bench.chip.state.now + 500) for _ in range(20)]
+    assert reasons == [StopReason.LOW_WRITE] * 16 + [StopReason.TIME] * 4
 
 
 def test_a_store_to_locked_flash_has_no_effect() -> None:
