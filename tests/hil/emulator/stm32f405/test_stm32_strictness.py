@@ -451,21 +451,20 @@ def test_a_store_to_locked_flash_has_no_effect() -> None:
     assert bench.chip.read(FLASH + 0x8000, 4) == b"\xff" * 4
 
 
-def test_a_bit_of_memory_is_a_word_of_its_own() -> None:
-    # str r1, [r4]; ldr r0, [r5]: bit 6 of WORDS[2] = 0x83 is set, bit 7 of WORDS[1] = 0x82 is read
-    alias = 0x2200_0000 + (DATA - RAM) * 32
-    bench = Strict("2160 2868", {"r1": 1, "r4": alias + 2 * 32 + 6 * 4, "r5": alias + 32 + 7 * 4})
-    assert bench.run() == 0
-    assert bench.chip.read(DATA, 4) == bytes((0x81, 0x82, 0xC3, 0x84))
-    assert bench.chip.register("r0") == 1
-
-
-def test_a_bit_of_a_peripheral_is_a_word_of_its_own() -> None:
-    bench = Strict(
-        "2160 2868", {"r1": 1, "r4": 0x4200_0000 + (APB1ENR - 0x4000_0000) * 32 + 4, "r5": APB1ENR}
-    )
-    assert bench.run() == 0
-    assert bench.chip.register("r0") == 2
+@pytest.mark.parametrize("bit", [0, 6, 15, 31])
+@pytest.mark.parametrize("before", [0, 0xFFFF_FFFF, 0x5A5A_A5A5])
+@pytest.mark.parametrize("place", [DATA + 4, APB1ENR])
+def test_a_bit_of_memory_or_of_a_peripheral_is_a_word_of_its_own(bit: int, before: int, place: int) -> None:
+    region = place & 0xF000_0000
+    alias = region + 0x0200_0000 + (place - region) * 32 + 4 * bit
+    for value in (0, 1, 2, 3):  # only the lowest bit of it counts
+        bench = Strict(
+            "2868 2160 2a68", {"r1": value, "r4": alias, "r5": alias}
+        )  # ldr r0, [r5]; str; ldr r2, [r5]
+        bench[place] = before
+        assert bench.run() == 0
+        assert (bench.chip.register("r0"), bench.chip.register("r2")) == (before >> bit & 1, value & 1)
+        assert bench[place] == before & ~(1 << bit) | (value & 1) << bit
 
 
 def test_a_peripheral_without_a_clock_reads_as_zero_and_keeps_nothing() -> None:
