@@ -20,15 +20,16 @@ VECTORS, REQUESTS, LOG = RAM + 0x4000, RAM + 0x5000, RAM + 0x6000
 # mrs r0, ipsr; ldr r1, [r4]; stm r7!, {r0, r1}; ldr r1, [r6, r0, lsl #2]; str r1, [r5]; b on; mrs r0, ipsr; stm r7!, {r0};
 # bx lr
 HANDLER = bytes.fromhex("eff30580 2168 03c7 56f82010 2960 ffe7 eff30580 01c7 7047")
+SUPERVISOR_CALL = bytes.fromhex("00df")
 
 
 class Logging(Bench):
     """A chip whose handlers log their numbers and what is at r4, request another interrupt, and log their number again."""
 
     def __init__(self) -> None:
-        super().__init__(HANDLER)
+        super().__init__(HANDLER + SUPERVISOR_CALL)
 
-    def start(self, seen: int, requests: dict[int, int]) -> None:
+    def start(self, seen: int, requests: dict[int, int], calls: bool = False) -> None:
         self.chip.reset(SOFTWARE)
         self.chip.write(VECTORS, pack(f"<{EXCEPTIONS}I", *[(FLASH + 8) | 1] * EXCEPTIONS))
         self.chip.write(
@@ -37,7 +38,7 @@ class Logging(Bench):
         self[VTOR] = VECTORS
         for name, value in (("r4", seen), ("r5", STIR), ("r6", REQUESTS), ("r7", LOG)):
             self.chip.set_register(name, value)
-        self.chip.set_register("pc", FLASH + 8 + len(HANDLER))
+        self.chip.set_register("pc", FLASH + 8 + len(HANDLER) + (0 if calls else len(SUPERVISOR_CALL)))
 
     def log(self) -> list[int]:
         self.wait(1000)
@@ -318,9 +319,12 @@ def test_the_longest_time_with_interrupts_masked_is_kept_with_its_places(registe
 
 
 def test_processor_time_belongs_to_the_task_that_the_last_switch_has_chosen() -> None:
-    """Forty tasks, of which the last nine share a place; the outside chooses the next one, and whether it is ready."""
+    """Forty tasks, of which the last nine share a place; the outside chooses the next one, and whether it is ready.
+
+    The first one begins by a supervisor call.
+    """
     bench, rng = Logging(), np.random.default_rng(3)
-    bench.start(IABR, {})
+    bench.start(IABR, {}, calls=True)
     current, blocks, ready = RAM + 0x100, [RAM + 0x8000 + 0x40 * one for one in range(40)], RAM + 0x200
     state = bench.chip.state
     state.kernel.current_place, state.kernel.stack_offset, state.kernel.container_offset = current, 0x30, 0x14
@@ -335,7 +339,7 @@ def test_processor_time_belongs_to_the_task_that_the_last_switch_has_chosen() ->
         if running >= 0:
             bench[blocks[min(running, 31)] + 0x14] = container
         bench[current] = blocks[one]
-        bench[ICSR] = 1 << 28
+        bench[ICSR] = (running >= 0) << 28
         before = state.now
         bench.wait(int(rng.integers(1, 30)))
         if one == min(running, 31):
