@@ -153,6 +153,20 @@ def test_a_board_that_leaves_the_loop_waits_for_a_pose_of_its_own(host: Host) ->
     assert (host.app.supervisor.state, host.app.supervisor.cause) == (State.WAITING, Cause.NONE)
 
 
+def test_a_host_sends_corrections_whatever_the_board_s_poses_are(library: Path, tmp_path: Path) -> None:
+    flown = []
+    for absolute in (False, True):
+        app = App(library, tmp_path / f"{absolute}.so")
+        app.boot(absolute=absolute)
+        for size in ("radius", "below", "above"):
+            app.set(f"box.{size}", 5.0)
+        host = Host(app)
+        host.run(1200, poses=True)
+        assert app.supervisor.state == State.FLYING
+        flown.append((host.looped, app.estimator()))
+    assert flown[0] == flown[1]
+
+
 @pytest.mark.long
 def test_a_mode_that_begins_while_a_sample_is_filed_begins_without_it(tmp_path: Path) -> None:
     """The stabilizer task preempts the receiving task between its reading `received` and its writing it."""

@@ -70,13 +70,14 @@ def test_only_a_jump_that_is_taken_refills_the_pipeline() -> None:
 def test_code_in_ram_takes_a_cycle_per_half_word_and_a_refill_per_jump(place: int) -> None:
     bench = Bench(bytes.fromhex("2047"))  # bx r4
     bench.chip.write(RAM + 0x3000, bytes.fromhex("00bf 00bf 00bf 00bf 2847"))  # nop, four times; bx r5
-    before = bench.chip.state.now
+    before, executed = bench.chip.state.now, bench.chip.state.instructions
     bench.chip.set_register("r4", place)
     bench.chip.set_register("r5", (FLASH + 10) | 1)
     bench.wait(10)
     taken = bench.chip.state.now - before - bench.chip.state.sleeping
     halves = 5 - (place - RAM - 0x3001) // 2
     assert taken - 2 * 3 - halves in (5, 6, 7), "bx, wfi and the jump behind it"
+    assert bench.chip.state.instructions - executed == 2 + halves
 
 
 def test_there_is_room_for_sixteen_devices(bench: Bench) -> None:

@@ -566,6 +566,7 @@ def test_an_invalid_return_from_an_exception_is_a_fault(handler: str, status: in
     bench = with_handler("", handler, r0=NO_MEMORY)
     assert bench.run() == (BUS_FAULT if status == UNSTKERR else USAGE_FAULT)
     assert bench.cfsr == status
+    assert bench.stacked_pc & 1 == 0
 
 
 @pytest.mark.parametrize(("code", "ccr", "padding"), [

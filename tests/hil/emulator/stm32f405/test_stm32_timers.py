@@ -121,3 +121,11 @@ def test_systick_counts_down_and_flags_its_periods(bench: Bench, control: int, p
         assert bench[0xE000_E010] == control | (left >= 100) << 16
         assert bench[0xE000_E010] == control
         left %= 100
+    for place, flag in (
+        (0xE000_E010, 1),
+        (0xE000_E018, 0),
+    ):  # a write to the count clears it, one to its control does not
+        bench.wait(101)
+        bench[place] = control
+        assert bench[0xE000_E010] == control | flag << 16
+        assert bench[0xE000_E018] == load, "it counts from the reload value"
