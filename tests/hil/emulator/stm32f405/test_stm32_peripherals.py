@@ -11,12 +11,7 @@ from hil.emulator.stm32f405.chip import CYCLES_PER_US, FLASH, RAM, StopReason
 from hil.errors import LabError
 from support.stm32_bench import SLEEP, Bench
 
-TIM3, I2C1, IWDG = 0x4000_0400, 0x4000_5400, 0x4000_3000
-USART6, EXTI = 0x4001_1400, 0x4001_3C00
-GPIOA, SYSCFG, CAN1 = 0x4002_0000, 0x4001_3800, 0x4000_6400
-START, STOP, ENABLED = 1 << 8, 1 << 9, 1
-SB, ADDR, BTF, RXNE, TXE = 1, 2, 4, 1 << 6, 1 << 7
-BYTE_US = 10  # of a USART at 1 Mbaud
+TIM3 = 0x4000_0400
 
 
 @pytest.fixture
@@ -31,18 +26,6 @@ def test_a_compare_register_is_seen_from_outside_when_it_changes() -> None:
     bench.chip.set_register("r4", TIM3 + 0x34)
     assert [bench.chip.run(1680) for _ in range(2)] == [StopReason.COMPARE, StopReason.TIME]
     assert bench.chip.state.compare[2][0] == 25522
-
-
-def test_a_byte_that_is_not_fetched_in_time_is_overrun(bench: Bench) -> None:
-    bench[USART6 + 0x08], bench[USART6 + 0x0C] = 84, 1 << 13 | 4
-    bench.chip.feed(6, b"ab")
-    bench.wait(BYTE_US + 1)
-    assert bench[USART6] & (RXNE >> 1 | 8) == RXNE >> 1
-    bench.wait(BYTE_US)
-    assert bench[USART6] & 8
-    assert bench.chip.state.usart[5].overruns == 1
-    assert bench[USART6 + 4] == ord("a")
-    assert bench[USART6] & 8 == 0
 
 
 def test_a_store_into_flash_changes_nothing_and_the_next_instruction_follows() -> None:
