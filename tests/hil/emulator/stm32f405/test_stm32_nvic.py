@@ -364,3 +364,6 @@ def test_processor_time_belongs_to_the_task_that_the_last_switch_has_chosen() ->
         task = state.task[place]
         found = {"cycles": task.cycles, "times": task.times, "busy": task.busy_since, "ran": task.ran}
         assert found == {name: mine[name] for name in found}, place
+    bench.chip.reset(SOFTWARE)
+    assert not any(state.task[place].busy_since for place in range(32))
+    assert [state.task[place].cycles for place in expected] == [mine["cycles"] for mine in expected.values()]

@@ -286,6 +286,33 @@ def test_a_watchpoint_sees_an_access_by_each_of_its_bytes_and_no_other(
             bench.chip.watch(watched, DATA + place, 1, False)
 
 
+def test_an_access_inside_a_watched_range_is_reported_by_its_own_address() -> None:
+    bench = Strict("2068", {"r4": DATA + 4})
+    bench.chip.watch(3, DATA, 16, True)
+    assert bench.chip.run(1680) & StopReason.WATCHPOINT
+    assert bench.chip.state.watch_address == DATA + 4
+
+
+def test_an_interrupt_that_is_masked_ends_a_sleep_that_went_on_over_a_run() -> None:
+    bench = Strict("72b6 30bf 0137 fee7")  # cpsid i; wfi; adds r7, #1; b to itself
+    bench.wait(5)
+    assert bench.chip.register("r7") == 0
+    bench[0xE000_E100] = bench[0xE000_E200] = 1  # interrupt 0 is enabled and pending
+    bench.wait(5)
+    assert (bench.chip.register("r7"), bench.chip.register("xpsr") & 0x1FF) == (1, 0)
+
+
+def test_a_reset_in_front_of_the_end_of_a_block_forgets_that_end() -> None:
+    bench = Strict("00bf 00bf 71b6")  # nop; nop; cpsid f
+    bench.chip.breakpoints = {START + 2}
+    assert bench.chip.run(1680) & StopReason.BREAK
+    bench.chip.reset(1 << 28)
+    bench.chip.breakpoints = set()
+    bench.chip.set_register("pc", START + 6)
+    bench.wait(10)
+    assert bench.chip.register("faultmask") == 0
+
+
 STACKING = {
     "push {r0}": "01b4", "push {r0, lr}": "01b5", "push.w {r0, r8}": "2de9 0101", "sub sp, #8": "82b0",
     "sub.w sp, #8": "adf1 080d",
