@@ -367,3 +367,44 @@ def test_processor_time_belongs_to_the_task_that_the_last_switch_has_chosen() ->
     bench.chip.reset(SOFTWARE)
     assert not any(state.task[place].busy_since for place in range(32))
     assert [state.task[place].cycles for place in expected] == [mine["cycles"] for mine in expected.values()]
+
+
+def test_time_that_an_outside_load_takes_is_charged_to_nobody() -> None:
+    bench = profiled("")
+    for us in (5, 7, 3):
+        bench.chip.state.owed += us * 168
+        bench.wait(20)
+    profile, state = bench.chip.profiled(), bench.chip.state
+    assert (state.owed, state.taken) == (0, 15 * 168)
+    assert sum(profile.total) == state.now - state.taken == 45 * 168
+
+
+def test_no_activation_of_a_task_goes_on_over_a_reset() -> None:
+    bench, (current, first, second, ready) = Logging(), (RAM + 0x100, RAM + 0x8000, RAM + 0x8040, RAM + 0x200)
+    state = bench.chip.state
+
+    def switch(block: int) -> None:
+        bench[current], bench[ICSR] = block, 1 << 28
+        bench.wait(5)
+
+    for _ in range(2):
+        bench.start(IABR, {})
+        begin = state.now
+        bench[first + 0x14] = bench[second + 0x14] = ready
+        state.kernel.current_place, state.kernel.stack_offset, state.kernel.container_offset = (
+            current,
+            0x30,
+            0x14,
+        )
+        state.kernel.ready_begin, state.kernel.ready_end = ready, ready + 20
+        if not state.profile:
+            bench.chip.profile([(FLASH + 8, FLASH + 64)])
+        for block in (first, second, first, second):
+            switch(block)
+    bench[second + 0x14] = 0  # both wait now
+    switch(first)
+    bench[first + 0x14] = 0
+    switch(second)
+    log = bench.chip.profiled().log
+    ended = [(log[at].task, log[at].begin >= begin) for at in range(bench.chip.profiled().logged)]
+    assert ended == [(1, True), (0, True)]
