@@ -166,6 +166,11 @@ def test_a_word_moves_once_a_period_and_only_while_its_request_is_enabled(wire: 
     wire._move(bytes(64), 16, TO_TIMER | WORDS)
     wire.wait(7 * PERIOD // 84)
     assert wire[STREAM + 4] in (9, 10)
+    for selected in (0x0101, 0x0202, 0x0303):  # an input, of whichever pin, asks for no word
+        wire[wire.timer + CCMR1], left = selected, wire[STREAM + 4]
+        wire.wait(5 * PERIOD // 84)
+        assert wire[STREAM + 4] == left
+    wire[wire.timer + CCMR1] = 0x6868
     wire[wire.timer + DIER], left = 0, wire[STREAM + 4]
     wire.wait(100)
     assert wire[STREAM + 4] == left

@@ -228,6 +228,15 @@ def test_a_reset_watchdog_has_its_longest_reload(bench: Bench) -> None:
     assert bench.wait(1000) == StopReason.TIME
 
 
+def test_a_chip_that_only_sleeps_has_nothing_to_do(bench: Bench) -> None:
+    for _ in range(2):
+        bench[0x4001_0034] = 5
+        bench.wait(400_000)
+        assert set(bench.chip.state.due) == {(1 << 64) - 1}, "nothing is planned"
+        assert bench.chip.state.compare[0][0] == 5
+        bench.chip.reset(1 << 26)
+
+
 def test_sixteen_missing_peripherals_are_named(bench: Bench) -> None:
     missing = [0x4000_6000 + 0x400 * one for one in range(4)] + [
         0x4004_0000 + 0x400 * one for one in range(13)
