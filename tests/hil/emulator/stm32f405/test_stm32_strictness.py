@@ -338,8 +338,10 @@ def test_masks_are_read_as_they_were_written() -> None:
     raised = "5f20 80f3 1288 eff3 1181 7020 80f3 1288 eff3 1282"  # the maximum raises 0 and lowers nothing
     # movs r0, #1; msr faultmask, r0; mrs r9, faultmask; movs r0, #2; msr faultmask, r0; mrs r10, faultmask
     by_msr = "0120 80f3 1388 eff3 1389 0220 80f3 1388 eff3 138a"
-    bench = Strict(f"{raised} 80f3 1188 eff3 1185 71b6 eff3 1383 61b6 eff3 1384 {by_msr}")
+    both = "73b6 eff3 138b 63b6 eff3 138c"  # cpsid if; mrs r11, faultmask; cpsie if; mrs r12, faultmask
+    bench = Strict(f"{raised} 80f3 1188 eff3 1185 71b6 eff3 1383 61b6 eff3 1384 {by_msr} {both}")
     assert bench.run() == 0
+    assert [bench.chip.register(f"r{n}") for n in (11, 12)] == [1, 0]
     assert [bench.chip.register(f"r{n}") for n in (1, 2, 5, 3, 4, 9, 10)] == [0x50, 0x50, 0x70, 1, 0, 1, 0]
 
 
