@@ -100,7 +100,7 @@ def test_the_app_takes_back_what_the_python_board_refuses_and_nothing_else(app: 
     waiting: list[bytes] = []
     drawn_ones = [drawn(command, rng) for command in 100 * list(LAYOUTS)]
     for data in (*drawn_ones, *spoilt()):
-        if len(waiting) == 3 or rng.random() < 0.5:  # the firmware's commander gets its turn
+        if len(waiting) == 4 or rng.random() < 0.5:  # the firmware's commander gets its turn
             waiting, waits.value = [], 0
         app.radio(data, PORT, 0)
         waiting.append(data)

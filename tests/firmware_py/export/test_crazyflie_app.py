@@ -677,6 +677,7 @@ def test_the_firmwares_commander_gets_the_state_in_the_world(app: App) -> None:
     told = np.array([state[f"stateEstimate.q{name}"] for name in "wxyz"])
     assert abs(told @ np.array(q_WB)) == pytest.approx(1.0, abs=1e-3)
     assert state["stateEstimate.yaw"] == pytest.approx(math.degrees(3.2 - 2 * math.pi), abs=2.0)
+    assert [struct.unpack_from("<I", app._state, at)[0] for at in (0, 32, 48)] == [step] * 3
 
 
 def test_until_something_is_commanded_floaty_holds_where_it_is(app: App) -> None:

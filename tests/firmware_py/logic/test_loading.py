@@ -14,7 +14,7 @@ from firmware_py.logic.loading import load_logic
 from hil.config import load_config
 from hil.errors import LabError
 from support.command import Cli
-from support.own_logic import AS_BUILT_IN, ESTIMATOR, LAW, make_project, own_config
+from support.own_logic import AS_BUILT_IN, ESTIMATOR, HEAD, LAW, make_project, own_config
 
 
 def line_of(text: str, part: str) -> int:
@@ -368,3 +368,46 @@ def test_text_outside_the_subset_is_an_export_error(tmp_path: Path) -> None:
         ExportError, match=r"call of print, which is no kernel: write a field of the memory struct"
     ):
         load_logic(LogicConfig(controller=str(tmp_path / "law.py")))
+
+
+PATHS = (
+    HEAD
+    + """
+class Memory(Struct):
+    n: i32
+
+
+@kernel
+def reset_law(memory: Memory) -> None:
+    memory.n = i32(0)
+
+
+@kernel
+def control_law(parameters: Parameters, estimator: Estimator, control: Control, memory: Memory) -> None:
+    feedback(parameters, estimator, control)
+    k = memory.n
+    if memory.n > 5:
+        k = i32(1)
+    OTHERWISE
+    control.u[0] = control.u[k]
+    allocate(parameters, control)
+"""
+)
+
+
+@pytest.mark.parametrize(
+    ("otherwise", "known"),
+    [
+        ("else:\n        k = i32(2)", True), ("", False), ("else:\n        k = i32(k + 1)", False),
+        ("elif memory.n < 2:\n        k = i32(2)\n    else:\n        k = i32(3)", True),
+        ("elif memory.n < 2:\n        k = i32(2)", False),
+        ("else:\n        allocate(parameters, control)\n        return", True),
+    ],
+)  # fmt: skip
+def test_an_index_is_bounded_where_each_path_bounds_it(tmp_path: Path, otherwise: str, known: bool) -> None:
+    law = PATHS.replace("OTHERWISE", otherwise)
+    if known:
+        own_config(tmp_path, law)
+    else:
+        with pytest.raises(LabError, match=r"index k: it may be outside 0\.\.3 in flight"):
+            own_config(tmp_path, law)

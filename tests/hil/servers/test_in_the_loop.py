@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from firmware_py.core.structs import Estimator
 from firmware_py.wire.core_port import (
     CHANNEL_LOOP,
     HIL_HOLD,
@@ -137,14 +138,33 @@ def test_the_zero_of_the_boards_own_gyro_does_not_act_in_the_loop(app: App) -> N
 
 
 def test_a_board_that_leaves_the_loop_waits_for_a_pose_of_its_own(host: Host) -> None:
+    estimate = Estimator.dtype.fields["pose"][1]  # so many bytes; measurements and counters follow
+    fresh = host.app.estimator()[:estimate]
     host.run(1004, poses=True)  # near a tick: a pose would count
     assert host.app.supervisor.state == State.FLYING
+    assert host.app.estimator()[:estimate] != fresh
     host.client.execute([loop(Hil.OFF)])
     host.app.radio(
         encode_ext_pose((0.01, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)[1:]
     )  # the host's last, which waits
-    host.run(600, sending=False)
+    host.run(1, sending=False)
+    assert host.app.estimator()[:estimate] == fresh, "nothing of that flight is left"
+    host.run(599, sending=False)
     assert (host.app.supervisor.state, host.app.supervisor.cause) == (State.WAITING, Cause.NONE)
+
+
+def test_a_host_sends_corrections_whatever_the_board_s_poses_are(library: Path, tmp_path: Path) -> None:
+    flown = []
+    for absolute in (False, True):
+        app = App(library, tmp_path / f"{absolute}.so")
+        app.boot(absolute=absolute)
+        for size in ("radius", "below", "above"):
+            app.set(f"box.{size}", 5.0)
+        host = Host(app)
+        host.run(1200, poses=True)
+        assert app.supervisor.state == State.FLYING
+        flown.append((host.looped, app.estimator()))
+    assert flown[0] == flown[1]
 
 
 @pytest.mark.long

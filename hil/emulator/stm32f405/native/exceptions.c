@@ -8,6 +8,7 @@ enum { SPSEL = 2, FPCA = 4, ENTRY_CYCLES = 12, RETURN_CYCLES = 10, ALIGNED = 1 <
 enum { NONBASETHRDENA = 1, STKALIGN = 1 << 9 }; /* bits of CCR, B3.2.8 */
 enum { USE_PSP = 4, NO_FLOATS = 16, TO_THREAD = 8 }; /* bits of EXC_RETURN */
 enum { VECTTBL = 1 << 1, FORCED = 1 << 30 };
+enum { COUNTFLAG = 1 << 16 }; /* of SysTick */
 #define UNUSED 0xA5A5A5A5u /* what FreeRTOS fills a stack with */
 
 uint32_t get_register(struct machine *m, int number)
@@ -172,7 +173,7 @@ void enter(struct machine *m, unsigned exception, uint32_t return_address)
     if (process && m->canary && *word(m, m->stack_begin) != UNUSED) /* it overflowed, and may have returned since */
         note_overflow(m);
     if (!place || !end) {
-        if (handler == HARD_FAULT || exception == HARD_FAULT) {
+        if (exception == HARD_FAULT) {
             lock_up(m, return_address);
             return;
         }
@@ -289,8 +290,7 @@ void leave(struct machine *m, uint32_t exc_return)
     if (m->profile)
         profile_leave(m, m->now + RETURN_CYCLES);
     m->active[exception >> 6] &= ~(1ull << (exception & 63));
-    if (exception != NMI)
-        m->faultmask = 0;
+    m->faultmask = 0;
     if (m->line[exception >> 6] >> (exception & 63) & 1)
         set_pending(m, exception);
     if (!valid) {
@@ -417,7 +417,7 @@ static uint32_t system_word(struct machine *m, uint32_t offset)
     case 0x1004: return (uint32_t)m->now; /* CYCCNT */
     case 0xE010: {
         uint32_t control = m->tick_ctrl;
-        m->tick_ctrl &= ~(1u << 16); /* reading clears COUNTFLAG, B3.3.3 */
+        m->tick_ctrl &= ~(uint32_t)COUNTFLAG; /* by reading, B3.3.3 */
         return control;
     }
     case 0xE014: return m->tick_load;
@@ -493,11 +493,14 @@ void system_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t given,
     }
     switch (at) {
     case 0xE010:
-        m->tick_ctrl = value & 7;
+        m->tick_ctrl = (m->tick_ctrl & COUNTFLAG) | (value & 7);
         start_tick(m);
         break;
     case 0xE014: m->tick_load = value & 0xFFFFFF; break;
-    case 0xE018: start_tick(m); break;
+    case 0xE018: /* whatever is written, B3.3.5 */
+        m->tick_ctrl &= ~(uint32_t)COUNTFLAG;
+        start_tick(m);
+        break;
     case 0xED04: write_icsr(m, value); break;
     case 0xED08: m->vtor = value & ~0x7Fu; break;
     case 0xED0C:
@@ -517,7 +520,10 @@ void system_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t given,
         if (value & 1)
             note_unknown(m, 0xE000ED94);
         break;
-    case 0xEF00: set_pending(m, IRQ + (value & 0x7F)); break; /* STIR */
+    case 0xEF00: /* STIR */
+        if ((value & 0x1FF) < EXCEPTIONS - IRQ)
+            set_pending(m, IRQ + (value & 0x1FF));
+        break;
     case 0xEF34: m->fpccr = value; break;
     default: break;
     }
@@ -528,7 +534,7 @@ void tick_due(struct machine *m)
     uint64_t factor = m->tick_ctrl & 4 ? 1 : 8;
     m->tick_since = m->due[DUE_SYSTICK];
     plan(m, DUE_SYSTICK, m->tick_since + (m->tick_load + 1ull) * factor);
-    m->tick_ctrl |= 1 << 16;
+    m->tick_ctrl |= COUNTFLAG;
     if (m->tick_ctrl & 2)
         set_pending(m, SYSTICK);
 }

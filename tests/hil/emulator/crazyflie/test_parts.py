@@ -51,8 +51,9 @@ def test_the_radio_chip_is_busy_while_its_queue_is_full() -> None:
         radio_command=lambda *_: None,
     )
     radio = RadioLine(bench.chip, bench.processor, bench.decks, outside, polls=False)  # type: ignore[arg-type]
-    send(bench, syslink.encode(syslink.RAW, b"\x30hello"))
-    radio.sent()
+    for data in (b"", b"\x30hello"):  # an empty frame is no packet
+        send(bench, syslink.encode(syslink.RAW, data))
+        radio.sent()
     assert (bench[GPIOA_IDR] >> 4 & 1, sent) == (1, [])
     room.append(True)
     radio.received(syslink.EMPTY)

@@ -1,5 +1,6 @@
 """Debugging information and names: line programs as pyelftools reads them, and what an image's symbols stand for."""
 
+import re
 from copy import deepcopy
 from io import BytesIO
 from pathlib import Path
@@ -15,7 +16,7 @@ pytest.importorskip("unicorn")
 pytest.importorskip("ziglang")
 
 from firmware_py.export.elf import Symbol
-from hil.emulator.stm32f405.debug_info import _line_states
+from hil.emulator.stm32f405.debug_info import DebugInfo, _line_states
 from hil.emulator.stm32f405.image import Image, has_symbols
 from hil.errors import LabError
 from support.stm32_firmware import build, flash_binary
@@ -93,6 +94,10 @@ def test_a_name_stands_for_exactly_one_thing_and_a_pointer_names_what_it_points_
     assert image.name_of(0x2001_0024, read) == "pointer"
     assert image.name_of(0x2001_0028, read) == image.name_of(0x2001_002C, read) == "object"
     assert image.name_of(0x2001_0040, read) == "0x20010040"
+    place = image.place(image.symbol("go_wrong").address)
+    assert re.fullmatch(r"go_wrong \(firmware\.c:\d+\)", place)
+    image.debug = DebugInfo(None, image.path)
+    assert image.place(image.symbol("go_wrong").address) == "go_wrong", "without lines"
     (tmp_path / "plain.bin").write_bytes(flash_binary(build()))
     assert (has_symbols(build()), has_symbols(tmp_path / "plain.bin")) == (True, False)
     with pytest.raises(LabError, match=r"gone\.elf: No such file"):

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("unicorn")
 
+from hil.emulator.stm32f405.checkpoints import Checkpoints
 from hil.emulator.stm32f405.chip import CYCLES_PER_US, Chip, StopReason
 from hil.emulator.stm32f405.debugged_chip import DebuggedChip
 from hil.emulator.stm32f405.freertos import FreeRtos
@@ -237,6 +238,40 @@ def test_after_a_hang_up_the_machine_runs_and_accepts_another(
         assert server.wants_to_stop()
         other.sendall(framed(b"k"))
         assert server.hold() is ResumeRequest.KILL
+
+
+class NotedCheckpoints(Checkpoints):
+    """Notes what is done with them, and copies no process."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.done: list[str] = []
+
+    def begin(self) -> None:
+        self.done.append("begin")
+
+    def clear(self) -> None:
+        self.done.append("clear")
+
+    def finish(self) -> None:
+        self.done.append("finish")
+
+
+@pytest.mark.parametrize("packet", [b"D", b"k", b""])
+def test_checkpoints_begin_with_a_debugger_and_are_of_no_use_without_it(machine: Chip, packet: bytes) -> None:
+    noted = NotedCheckpoints()
+    server = GdbServer(0, checkpoints=noted)
+    server.attach(machine)
+    for _ in range(2):
+        with socket.create_connection(("127.0.0.1", server.port)) as line:
+            line.sendall(framed(packet) if packet else b"+")
+            line.shutdown(socket.SHUT_WR)
+            server.hold()
+        assert not server.is_connected
+        assert noted.done == ["begin", "clear"]
+        noted.done.clear()
+    server.close()
+    assert noted.done == ["finish"]
 
 
 def test_what_is_not_a_debugger_is_closed_and_writes_nothing(machine: Chip) -> None:

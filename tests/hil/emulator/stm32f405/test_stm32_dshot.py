@@ -62,11 +62,11 @@ class Wire(Bench):
         self[self.timer + CR1] = 1
         return self.wait(WAIT_US)
 
-    def capture(self, edges: int = 11) -> list[int]:
-        """Return the counts at the edges of the next 100 us, 11: both kinds, 1: rising, 3: falling."""
+    def capture(self, edges: int = 11, selected: int = 0x0101) -> list[int]:
+        """Return the counts at the edges of the next 100 us, by default both kinds (1: rising, 3: falling)."""
         self[self.timer + CR1] = self[self.timer + CNT] = 0
         self[self.timer + ARR] = 10_000
-        self[self.timer + CCMR1 + self.channel // 2 * 4] = 0x0101
+        self[self.timer + CCMR1 + self.channel // 2 * 4] = selected
         self[self.timer + CCER] = edges << 4 * self.channel
         self._move(bytes(100), 25, TO_MEMORY | WORDS)
         self[self.timer + CR1] = 1
@@ -166,6 +166,11 @@ def test_a_word_moves_once_a_period_and_only_while_its_request_is_enabled(wire: 
     wire._move(bytes(64), 16, TO_TIMER | WORDS)
     wire.wait(7 * PERIOD // 84)
     assert wire[STREAM + 4] in (9, 10)
+    for selected in (0x0101, 0x0202, 0x0303):  # an input, of whichever pin, asks for no word
+        wire[wire.timer + CCMR1], left = selected, wire[STREAM + 4]
+        wire.wait(5 * PERIOD // 84)
+        assert wire[STREAM + 4] == left
+    wire[wire.timer + CCMR1] = 0x6868
     wire[wire.timer + DIER], left = 0, wire[STREAM + 4]
     wire.wait(100)
     assert wire[STREAM + 4] == left
@@ -180,14 +185,16 @@ def test_without_an_esc_the_words_are_compare_counts() -> None:
     assert (wire.throttle, wire[wire.timer + CCR1 + 12]) == (99, 99)
 
 
-@pytest.mark.parametrize("rpm", [200, 1000, 2300, 15_000, 40_000])
-def test_an_inverted_frame_is_answered_with_the_motors_period(wire: Wire, rpm: int) -> None:
-    wire.rpm[0] = rpm
-    wire.send(frame_of(0, True), True)
-    edges = wire.capture()
-    assert 20 < edges[0] / 84 + 7 < 40, "30 us behind the frame"
-    us = 60e6 / (rpm * 6)  # 6 pairs of poles
-    assert 0.99 * us - 1 < period_us(edges, BIT) <= us
+def test_an_inverted_frame_is_answered_with_the_motors_period(wire: Wire) -> None:
+    """Nine bits of it, as fine as they can be, also where an exponent ends."""
+    ends = [512.0 * 2**exponent - part for exponent in range(7) for part in (0.25, 0.0)]
+    for us in (*ends, *np.random.default_rng(2).uniform(100, 60_000, 40)):
+        wire.rpm[0] = 60e6 / (us * 6)  # 6 pairs of poles
+        wire.send(frame_of(0, True), True)
+        edges = wire.capture()
+        assert 20 < edges[0] / 84 + 7 < 40, "30 us behind the frame"
+        coarse = 2 ** max(int(us + 1e-6).bit_length() - 9, 0)
+        assert period_us(edges, BIT) == int(us + 1e-6) // coarse * coarse
 
 
 @pytest.mark.parametrize("rpm", [0.0, 100.0])
@@ -205,6 +212,8 @@ def test_edges_are_captured_by_their_kind(wire: Wire) -> None:
         found[kind] = wire.capture(kind)
     assert found[11][0::2] == pytest.approx(found[3], abs=5), "the first one falls"
     assert found[11][1::2] == pytest.approx(found[1], abs=5)
+    wire.send(frame_of(0, True), True)
+    assert wire.capture(selected=0x0202) == [], "the pin of another channel"
 
 
 def test_a_plain_or_refused_frame_is_not_answered(wire: Wire) -> None:

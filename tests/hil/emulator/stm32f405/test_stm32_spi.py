@@ -131,6 +131,10 @@ def test_bytes_written_before_the_start_leave_at_the_start(bench: Selected) -> N
     bench.wait(BYTE_US)
     assert bench[SPI1 + DR] == 0
     assert bench.exchange(b"\0") == b"\x11"
+    bench[SPI1 + DR] = bench[SPI1 + DR] = 0  # switched off meanwhile: the second stays
+    bench[SPI1 + CR1] = MASTER | BY_64
+    bench.wait(3 * BYTE_US)
+    assert bench[SPI1 + SR] == RXNE
 
 
 def test_a_device_on_i2c_gets_writes_only_and_can_move() -> None:

@@ -2,6 +2,7 @@
 
 from struct import pack, unpack
 
+import numpy as np
 import pytest
 
 from hil.emulator.stm32f405 import chip as chip_module
@@ -10,8 +11,8 @@ from hil.errors import LabError
 from support.stm32_bench import FLASH, RAM, Bench
 
 START, VECTORS, DATA = FLASH + 8, RAM + 0x4000, RAM + 0x2000
-VTOR, CCR, SHPR2, SHCSR, CPACR, MPU_CTRL = (
-    0xE000_E000 + offset for offset in (0xD08, 0xD14, 0xD1C, 0xD24, 0xD88, 0xD94)
+VTOR, CCR, SHPR2, SHCSR, CFSR, HFSR, CPACR, MPU_CTRL = (
+    0xE000_E000 + offset for offset in (0xD08, 0xD14, 0xD1C, 0xD24, 0xD28, 0xD2C, 0xD88, 0xD94)
 )
 GPIOA, TIM3_ARR, APB1ENR = 0x4002_0000, 0x4000_042C, 0x4002_3840
 CCM, NO_MEMORY = 0x1000_0000, 0x3000_0000
@@ -119,55 +120,70 @@ def word(offset: int) -> int:
     return int.from_bytes(WORDS[offset : offset + 4], "little")
 
 
-def half(offset: int) -> int:
-    return int.from_bytes(WORDS[offset : offset + 2], "little")
+SINGLE = {
+    "ldr r0, [r4]": "2068", "ldr r0, [r4, #8]": "a068", "ldr.w r0, [r4, #1]": "d4f8 0100", "ldr r0, [r4], #5": "54f8 050b",
+    "ldr r0, [r4, #-2]!": "54f8 020d", "ldr r0, [r4, r5]": "6059", "ldr r0, [r4, r5, lsl #1]": "54f8 1500",
+    "ldrt r0, [r4]": "54f8 000e", "ldrh r0, [r4, #2]": "6088", "ldrsh r0, [r4, r5]": "605f",
+    "ldrsh.w r0, [r4, #2]": "b4f9 0200",
+    "str r0, [r4, #4]": "6060", "str r0, [r4, r5]": "6051", "str.w r0, [r4, #1]": "c4f8 0100", "strh r0, [r4, #2]": "6080",
+}  # fmt: skip
 
 
-LOADS = {  # with r4 = DATA + 5 and r5 = 2: code, r0, r4
-    "ldr r0, [r4]": ("2068", word(5), 5),
-    "ldr r0, [r4, #8]": ("a068", word(13), 5),
-    "ldr.w r0, [r4, #1]": ("d4f8 0100", word(6), 5),
-    "ldr r0, [r4], #5": ("54f8 050b", word(5), 10),
-    "ldr r0, [r4, #-2]!": ("54f8 020d", word(3), 3),
-    "ldr r0, [r4, r5]": ("6059", word(7), 5),
-    "ldr r0, [r4, r5, lsl #1]": ("54f8 1500", word(9), 5),
-    "ldrt r0, [r4]": ("54f8 000e", word(5), 5),
-    "ldr r4, [r4]": ("2468", None, word(5) - DATA),
-    "ldrh r0, [r4, #2]": ("6088", half(7), 5),
-    "ldrsh r0, [r4, r5]": ("605f", half(7) | 0xFFFF_0000, 5),
-    "ldrsh.w r0, [r4, #2]": ("b4f9 0200", half(7) | 0xFFFF_0000, 5),
-    "ldrh r0, [r4], #2": ("34f8 020b", half(5), 7),
-}
-STORES = {  # with r0 = 0x44332211: code, offset, bytes, r4
-    "str r0, [r4, #4]": ("6060", 9, 4, 5),
-    "str r0, [r4, r5]": ("6051", 7, 4, 5),
-    "str.w r0, [r4, #1]": ("c4f8 0100", 6, 4, 5),
-    "str r0, [r4], #5": ("44f8 050b", 5, 4, 10),
-    "strh r0, [r4, #2]": ("6080", 7, 2, 5),
-    "strh r0, [r4, #-2]": ("24f8 020c", 3, 2, 5),
-}
+def random_access(rng: np.random.Generator) -> tuple[bytes, int, int]:
+    """A load or store of one register, its base and its index, in every encoding (A5.2.4, A5.3.7 to A5.3.10)."""
+    low = [int(register) for register in rng.permutation(8)]
+    high = [int(register) for register in rng.permutation(13)]
+    loads, half = int(rng.integers(2)), int(rng.integers(2))
+    if rng.random() < 0.4:
+        target, base, index = low[:3]
+        operation = int(rng.choice((0, 1, 4, 5, 7)))
+        by_index = 0x5000 | operation << 9 | index << 6
+        by_number = (0x8000 if half else 0x6000) | loads << 11 | int(rng.integers(32)) << 6
+        return pack("<H", int(rng.choice((by_index, by_number))) | base << 3 | target), base, index
+    target, base, index = high[:3]
+    target = base if rng.random() < 0.1 else target
+    signed = int(loads and half and rng.random() < 0.5)
+    first = 0xF800 | signed << 8 | (1 if half else 2) << 5 | loads << 4 | base
+    before, adds, writes_back = (int(bit) for bit in rng.integers(0, 2, 3))
+    form, number = rng.integers(3), int(rng.integers(100))
+    if form == 0:
+        return pack("<2H", first | 0x80, target << 12 | number), base, index
+    if form == 1:
+        return pack("<2H", first, target << 12 | int(rng.integers(4)) << 4 | index), base, index
+    # Without an offset before it an access moves the base, which then is not what it loads.
+    writes_back = target != base and (writes_back or not before)
+    flags = (before or not writes_back) << 10 | adds << 9 | writes_back << 8
+    return pack("<2H", first, target << 12 | 0x800 | flags | number), base, index
 
 
-@pytest.mark.parametrize(("code", "loaded", "moved"), LOADS.values(), ids=LOADS.keys())
-def test_an_unaligned_load_of_one_register_is_carried_out(code: str, loaded: int | None, moved: int) -> None:
-    bench = Strict(code, {"r4": DATA + 5, "r5": 2})
-    assert bench.run() == 0
-    assert loaded in (None, bench.chip.register("r0"))
-    assert bench.chip.register("r4") == DATA + moved
+def test_each_load_and_store_of_one_register_is_that_of_a_core_that_aligns_nothing() -> None:
+    from unicorn import UC_ARCH_ARM, UC_MODE_THUMB, Uc, arm_const
 
-
-@pytest.mark.parametrize(("code", "offset", "size", "moved"), STORES.values(), ids=STORES.keys())
-def test_an_unaligned_store_of_one_register_is_carried_out(
-    code: str, offset: int, size: int, moved: int
-) -> None:
-    bench = Strict(code, {"r0": 0x4433_2211, "r4": DATA + 5, "r5": 2})
-    assert bench.run() == 0
-    expected = WORDS[:offset] + pack("<I", 0x4433_2211)[:size] + WORDS[offset + size :]
-    assert bench.chip.read(DATA, len(WORDS)) == expected
-    assert bench.chip.register("r4") == DATA + moved
-
-
-SINGLE = {name: row[0] for name, row in (LOADS | STORES).items()}
+    bench, rng, reference = Strict("00bf 00bf"), np.random.default_rng(9), Uc(UC_ARCH_ARM, UC_MODE_THUMB)
+    reference.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
+    reference.mem_map(FLASH, 0x1000)
+    reference.mem_map(RAM, 0x2_0000)
+    names = [f"r{number}" for number in range(13)]
+    numbers = [getattr(arm_const, f"UC_ARM_REG_R{number}") for number in range(13)]
+    for _ in range(500):
+        code, base, index = random_access(rng)
+        memory = rng.bytes(512)
+        registers = rng.integers(0, 1 << 32, 13).tolist()
+        registers[index], registers[base] = int(rng.integers(16)), DATA + 200 + int(rng.integers(8))
+        bench.chip.write(START, code)
+        bench.chip.write(DATA, memory)
+        reference.mem_write(START, code)
+        reference.mem_write(DATA, memory)
+        for name, number, value in zip(names, numbers, registers, strict=True):
+            bench.chip.set_register(name, value)
+            reference.reg_write(number, value)
+        bench.chip.set_register("pc", START)
+        bench.chip.step()
+        reference.emu_start(START | 1, START + len(code), count=1)
+        found = [bench.chip.register(name) for name in names]
+        assert found == [reference.reg_read(number) for number in numbers], code.hex()
+        assert bench.chip.read(DATA, 512) == bytes(reference.mem_read(DATA, 512)), code.hex()
+        assert bench.chip.register("pc") == START + len(code)
 
 
 @pytest.mark.parametrize("code", **ids(SINGLE))
@@ -208,6 +224,21 @@ def test_an_unaligned_load_in_an_it_block_keeps_the_condition_of_the_next() -> N
     assert (bench.chip.register("r0"), bench.chip.register("r7")) == (word(5), 5)
 
 
+def test_behind_an_it_block_that_ends_with_an_unaligned_load_nothing_is_conditional() -> None:
+    bench = Strict(
+        "002e 08bf 2068 0537 0137", {"r4": DATA + 5}
+    )  # cmp r6, #0; it eq; ldreq r0, [r4]; adds r7, #5; #1
+    assert bench.run() == 0
+    assert (bench.chip.register("r0"), bench.chip.register("r7")) == (word(5), 6)
+
+
+@pytest.mark.parametrize(("code", "place"), [("dff8 0500", 17), ("5ff8 0500", 7)])
+def test_an_unaligned_load_by_the_pc_counts_from_a_word(code: str, place: int) -> None:
+    bench = Strict(f"00bf {code} 0137")  # nop; ldr.w r0, [pc, #5 or #-5]
+    assert bench.run() == 0
+    assert bench.chip.register("r0") == int.from_bytes(bench.chip.read(FLASH + place, 4), "little")
+
+
 def test_a_step_over_an_unaligned_load_ends_after_it() -> None:
     bench = Strict("2068 2068 0137", {"r4": DATA + 5})
     bench.chip.step()
@@ -227,21 +258,91 @@ def test_a_step_does_not_wake_a_processor_that_sleeps() -> None:
     assert (chip.register("pc"), chip.state.now) == (START + 2, slept_at + 500)
 
 
-@pytest.mark.parametrize(("code", "kind"), [("2068", 3), ("2060", 2)], ids=["read", "written"])
-def test_a_watchpoint_sees_an_unaligned_access(code: str, kind: int) -> None:
-    bench = Strict(code, {"r4": DATA + 5})
-    bench.chip.watch(kind, DATA + 8, 1, True)
+@pytest.mark.parametrize(
+    ("code", "kind", "first", "last"),
+    [
+        ("2068", 3, 5, 8),
+        ("2060", 2, 5, 8),
+        ("2068", 3, 4, 7),
+        ("2060", 2, 4, 7),
+        ("84ed 000b", 2, 0, 7),
+        ("94ed 000b", 3, 0, 7),
+    ],
+    ids=["unaligned read", "unaligned write", "read", "write", "double written", "double read"],
+)
+def test_a_watchpoint_sees_an_access_by_each_of_its_bytes_and_no_other(
+    code: str, kind: int, first: int, last: int
+) -> None:
+    for place in (first - 1, first, last, last + 1):
+        for watched in (2, 3, 4):
+            bench = Strict(code, {"r4": DATA + first})
+            bench.chip.watch(watched, DATA + place, 1, True)
+            seen = first <= place <= last and watched in (kind, 4)
+            assert bool(bench.chip.run(1680) & StopReason.WATCHPOINT) == seen
+            assert bench.chip.state.watch_address == (DATA + place if seen else 0)
+            other = 2 + (watched - 1) % 3
+            with pytest.raises(LabError):
+                bench.chip.watch(other, DATA + place, 1, False)
+            bench.chip.watch(watched, DATA + place, 1, False)
+
+
+def test_an_access_inside_a_watched_range_is_reported_by_its_own_address() -> None:
+    bench = Strict("2068", {"r4": DATA + 4})
+    bench.chip.watch(3, DATA, 16, True)
     assert bench.chip.run(1680) & StopReason.WATCHPOINT
-    assert bench.chip.state.watch_address == DATA + 8
+    assert bench.chip.state.watch_address == DATA + 4
+
+
+def test_an_interrupt_that_is_masked_ends_a_sleep_that_went_on_over_a_run() -> None:
+    bench = Strict("72b6 30bf 0137 fee7")  # cpsid i; wfi; adds r7, #1; b to itself
+    bench.wait(5)
+    assert bench.chip.register("r7") == 0
+    bench[0xE000_E100] = bench[0xE000_E200] = 1  # interrupt 0 is enabled and pending
+    bench.wait(5)
+    assert (bench.chip.register("r7"), bench.chip.register("xpsr") & 0x1FF) == (1, 0)
+
+
+def test_a_reset_in_front_of_the_end_of_a_block_forgets_that_end() -> None:
+    bench = Strict("00bf 00bf 71b6")  # nop; nop; cpsid f
+    bench.chip.breakpoints = {START + 2}
+    assert bench.chip.run(1680) & StopReason.BREAK
+    bench.chip.reset(1 << 28)
+    bench.chip.breakpoints = set()
+    bench.chip.set_register("pc", START + 6)
+    bench.wait(10)
+    assert bench.chip.register("faultmask") == 0
+
+
+STACKING = {
+    "push {r0}": "01b4", "push {r0, lr}": "01b5", "push.w {r0, r8}": "2de9 0101", "sub sp, #8": "82b0",
+    "sub.w sp, #8": "adf1 080d",
+    "mov sp, r4": "a546", "add sp, r5": "ad44", "str r0, [sp, #-4]!": "4df8 040d", "strd r0, r1, [sp, #-8]!": "6de9 0201",
+    "vpush {d8}": "2ded 028b", "vpush {s16}": "2ded 018a", "subw sp, sp, #8": "adf2 080d", "sub.w sp, sp, r6": "adeb 060d",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("code", **ids(STACKING))
+def test_each_instruction_that_lowers_the_stack_pointer_may_overflow_a_stack(code: str) -> None:
+    for room, overflows in ((0, True), (64, False)):
+        bench = Strict(f"{code} ffe7", {"r4": RAM + 0xFF0, "r5": -8 & 0xFFFF_FFFF, "r6": 8})
+        bench.chip.state.stack_begin, bench.chip.state.task[0].block = RAM + 0x1000 - room, 7
+        assert bool(bench.chip.run(1680) & StopReason.OVERFLOW) == overflows
+        assert bench.chip.state.overflow == 7 * overflows
+        bench.chip.reset(1 << 28)
+        assert (bench.chip.state.overflow, bench.chip.state.stack_begin) == (0, 0)
 
 
 def test_masks_are_read_as_they_were_written() -> None:
     # movs r0, #0x5f; msr basepri_max, r0; mrs r1, basepri; movs r0, #0x70; msr basepri_max, r0; mrs r2, basepri_max
     # msr basepri, r0; mrs r5, basepri; cpsid f; mrs r3, faultmask; cpsie f; mrs r4, faultmask
     raised = "5f20 80f3 1288 eff3 1181 7020 80f3 1288 eff3 1282"  # the maximum raises 0 and lowers nothing
-    bench = Strict(f"{raised} 80f3 1188 eff3 1185 71b6 eff3 1383 61b6 eff3 1384")
+    # movs r0, #1; msr faultmask, r0; mrs r9, faultmask; movs r0, #2; msr faultmask, r0; mrs r10, faultmask
+    by_msr = "0120 80f3 1388 eff3 1389 0220 80f3 1388 eff3 138a"
+    both = "73b6 eff3 138b 63b6 eff3 138c"  # cpsid if; mrs r11, faultmask; cpsie if; mrs r12, faultmask
+    bench = Strict(f"{raised} 80f3 1188 eff3 1185 71b6 eff3 1383 61b6 eff3 1384 {by_msr} {both}")
     assert bench.run() == 0
-    assert [bench.chip.register(f"r{n}") for n in (1, 2, 5, 3, 4)] == [0x50, 0x50, 0x70, 1, 0]
+    assert [bench.chip.register(f"r{n}") for n in (11, 12)] == [1, 0]
+    assert [bench.chip.register(f"r{n}") for n in (1, 2, 5, 3, 4, 9, 10)] == [0x50, 0x50, 0x70, 1, 0, 1, 0]
 
 
 ARMV8_M = {
@@ -302,9 +403,9 @@ def test_floats_are_enabled_and_disabled_by_the_code_itself() -> None:
     assert (bench.cfsr, bench.stacked_pc) == (NOCP, START + 24)
 
 
-@pytest.mark.parametrize("code", ["91fb f2f0", "b1fb f2f0"], ids=["sdiv", "udiv"])
+@pytest.mark.parametrize("code", ["91fb f2f0", "b1fb f2f0", "91fb fcf0"], ids=["sdiv", "udiv", "by r12"])
 def test_a_division_by_zero_is_a_usage_fault_if_the_firmware_wants_it_so(code: str) -> None:
-    bench = Strict(code, {"r1": 7}, ccr=STKALIGN | DIV_0_TRP)
+    bench = Strict(code, {"r1": 7, "r4": 1}, ccr=STKALIGN | DIV_0_TRP)
     assert bench.run() == HARD_FAULT
     assert (bench.cfsr, bench.stacked_pc) == (DIVBYZERO, START)
     bench = Strict(code, {"r0": 1, "r1": 7})
@@ -324,6 +425,20 @@ def test_a_breakpoint_holds_each_arrival_once() -> None:
     chip.step()  # onto it
     assert chip.run(chip.state.now + 1000) & StopReason.BREAK
     assert (chip.register("pc"), chip.register("r7")) == (START, 3)
+
+
+def test_there_is_room_for_64_breakpoints_and_one_that_went_makes_room() -> None:
+    chip = Strict("").chip
+    chip.breakpoints = {FLASH + 2 * number for number in range(64)}
+    chip.run(1)
+    chip.breakpoints |= {FLASH + 128}
+    with pytest.raises(LabError, match="more breakpoints"):
+        chip.run(1)
+    other = Strict("").chip
+    other.breakpoints = {FLASH + 2 * number for number in range(64)}
+    other.run(1)
+    other.breakpoints = {FLASH + 128 + 2 * number for number in range(63)}
+    other.run(1)
 
 
 def test_a_breakpoint_instruction_without_a_debugger_is_a_hard_fault() -> None:
@@ -369,27 +484,32 @@ def test_an_access_to_where_nothing_is_is_a_bus_fault_with_its_address(code: str
     assert (bench.cfsr, bench.chip.state.bfar, bench.stacked_pc) == (PRECISERR | BFARVALID, address, START)
 
 
+def test_the_first_sixteen_writers_near_address_0_are_reported_once() -> None:
+    bench = Strict("2160" * 18 + "dae7", {"r4": 0x40})  # str r1, [r4]; b to the second
+    reasons = [bench.chip.run(bench.chip.state.now + 500) for _ in range(20)]
+    assert reasons == [StopReason.LOW_WRITE] * 16 + [StopReason.TIME] * 4
+
+
 def test_a_store_to_locked_flash_has_no_effect() -> None:
     bench = Strict("2060", {"r4": FLASH + 0x8000})
     assert bench.run() == 0
     assert bench.chip.read(FLASH + 0x8000, 4) == b"\xff" * 4
 
 
-def test_a_bit_of_memory_is_a_word_of_its_own() -> None:
-    # str r1, [r4]; ldr r0, [r5]: bit 6 of WORDS[2] = 0x83 is set, bit 7 of WORDS[1] = 0x82 is read
-    alias = 0x2200_0000 + (DATA - RAM) * 32
-    bench = Strict("2160 2868", {"r1": 1, "r4": alias + 2 * 32 + 6 * 4, "r5": alias + 32 + 7 * 4})
-    assert bench.run() == 0
-    assert bench.chip.read(DATA, 4) == bytes((0x81, 0x82, 0xC3, 0x84))
-    assert bench.chip.register("r0") == 1
-
-
-def test_a_bit_of_a_peripheral_is_a_word_of_its_own() -> None:
-    bench = Strict(
-        "2160 2868", {"r1": 1, "r4": 0x4200_0000 + (APB1ENR - 0x4000_0000) * 32 + 4, "r5": APB1ENR}
-    )
-    assert bench.run() == 0
-    assert bench.chip.register("r0") == 2
+@pytest.mark.parametrize("bit", [0, 6, 15, 31])
+@pytest.mark.parametrize("before", [0, 0xFFFF_FFFF, 0x5A5A_A5A5])
+@pytest.mark.parametrize("place", [DATA + 4, APB1ENR])
+def test_a_bit_of_memory_or_of_a_peripheral_is_a_word_of_its_own(bit: int, before: int, place: int) -> None:
+    region = place & 0xF000_0000
+    alias = region + 0x0200_0000 + (place - region) * 32 + 4 * bit
+    for value in (0, 1, 2, 3):  # only the lowest bit of it counts
+        bench = Strict(
+            "2868 2160 2a68", {"r1": value, "r4": alias, "r5": alias}
+        )  # ldr r0, [r5]; str; ldr r2, [r5]
+        bench[place] = before
+        assert bench.run() == 0
+        assert (bench.chip.register("r0"), bench.chip.register("r2")) == (before >> bit & 1, value & 1)
+        assert bench[place] == before & ~(1 << bit) | (value & 1) << bit
 
 
 def test_a_peripheral_without_a_clock_reads_as_zero_and_keeps_nothing() -> None:
@@ -435,15 +555,22 @@ def test_an_invalid_return_from_an_exception_is_a_fault(handler: str, status: in
     bench = with_handler("", handler, r0=NO_MEMORY)
     assert bench.run() == (BUS_FAULT if status == UNSTKERR else USAGE_FAULT)
     assert bench.cfsr == status
+    assert bench.stacked_pc & 1 == 0
 
 
-@pytest.mark.parametrize(("ccr", "padding"), [(STKALIGN, 4), (0, 0)])
-def test_a_frame_is_aligned_to_eight_bytes_unless_that_is_switched_off(ccr: int, padding: int) -> None:
-    bench = Strict("01b4 00df", ccr=ccr)  # push {r0}; svc
+@pytest.mark.parametrize(("code", "ccr", "padding"), [
+    ("01b4 00df", STKALIGN, 4), ("01b4 00df", 0, 0), ("00ee 100a 01b4 00df", STKALIGN, 4), ("00ee 100a 01b4 00df", 0, 4),
+])  # fmt: skip
+def test_a_frame_is_aligned_to_eight_bytes_unless_that_is_switched_off(
+    code: str, ccr: int, padding: int
+) -> None:
+    """With floats it is always so. B1.5.7."""
+    bench = Strict(code, ccr=ccr)  # vmov s0, r0; push {r0}; svc
+    floats = 0x48 * code.startswith("00ee")
     before = bench.chip.register("msp") - 4
     assert bench.run() == 11
     frame = bench.chip.register("msp")
-    assert before - frame == 0x20 + padding
+    assert before - frame == 0x20 + padding + floats
     assert bench[frame + 28] >> 9 & 1 == (padding == 4)
 
 
@@ -459,6 +586,29 @@ def test_a_supervisor_call_where_it_may_not_interrupt_is_a_hard_fault(
     bench[SHPR2] = priority << 24
     assert bench.run() == exception
     assert bench.chip.state.hfsr == (FORCED if exception == HARD_FAULT else 0)
+
+
+@pytest.mark.parametrize(
+    ("priority", "exception"), [(0x30, USAGE_FAULT), (0x40, HARD_FAULT), (0x50, HARD_FAULT)]
+)
+def test_a_fault_in_a_handler_is_a_hard_fault_unless_it_is_more_urgent(priority: int, exception: int) -> None:
+    bench = with_handler("", "00de")  # udf
+    bench[SHPR2], bench[SHPR2 - 4] = 0x40 << 24, priority << 16
+    assert bench.run() == exception
+    assert bench.chip.state.hfsr == (FORCED if exception == HARD_FAULT else 0)
+    bench[HFSR] = bench[CFSR] = 0
+    assert (bench.cfsr, bench.chip.state.hfsr) == (UNDEFINED, FORCED if exception == HARD_FAULT else 0)
+    bench[HFSR], bench[CFSR] = FORCED, UNDEFINED
+    assert (bench[CFSR], bench[HFSR]) == (0, 0)
+
+
+def test_flags_reach_the_handler() -> None:
+    bench = Strict(
+        "80fa 40f0 00df", {"r0": 0xFFFF_FFFF}
+    )  # uadd8 r0, r0, r0; svc: the greater-or-equal of bytes
+    bench.chip.set_register("xpsr", 0xF800_0000 | 1 << 24)
+    assert bench.run() == 11
+    assert bench.chip.register("xpsr") == 0xF80F_0000 | 1 << 24 | 11
 
 
 def test_a_fault_while_interrupts_are_masked_is_a_hard_fault() -> None:

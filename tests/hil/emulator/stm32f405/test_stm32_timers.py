@@ -1,5 +1,6 @@
 """The timers and SysTick by their registers, as RM0090 has them (chapters 17 to 20 and the vector table of chapter 12)."""
 
+import numpy as np
 import pytest
 
 pytest.importorskip("unicorn")
@@ -16,7 +17,7 @@ TIMERS = {
     9: (0x4001_4000, 1, 24), 10: (0x4001_4400, 1, 25), 11: (0x4001_4800, 1, 26), 12: (0x4000_1800, 2, 43),
     13: (0x4000_1C00, 2, 44), 14: (0x4000_2000, 2, 45),
 }  # fmt: skip
-TIM7 = TIMERS[7][0]
+TIM7, CLEARED = TIMERS[7][0], 0xE000_E280
 
 
 @pytest.fixture
@@ -50,48 +51,42 @@ def test_each_timer_has_its_clock_its_width_and_its_interrupt(bench: Bench, numb
     assert bench.is_pending(irq)
 
 
-def test_a_flag_is_cleared_by_writing_0_and_kept_by_writing_1(bench: Bench) -> None:
-    start(bench, TIM7)
-    bench.wait(150)
-    bench[TIM7 + SR] = 1
-    assert bench[TIM7 + SR] & 1 == 1
-    bench[TIM7 + SR] = 0
-    assert bench[TIM7 + SR] & 1 == 0
-
-
-@pytest.mark.parametrize(("control", "flag"), [(UPDATE_DISABLED, 0), (UPDATE_BY_OVERFLOW_ALONE, 1)])
-def test_an_overflow_is_an_update_unless_updates_are_disabled(bench: Bench, control: int, flag: int) -> None:
-    start(bench, TIM7, control=ENABLED | control)
-    bench.wait(150)
-    assert bench[TIM7 + SR] & 1 == flag
-
-
-@pytest.mark.parametrize(("control", "flag"), [(0, 1), (UPDATE_DISABLED, 0), (UPDATE_BY_OVERFLOW_ALONE, 0)])
-def test_an_update_by_software_sets_the_flag_unless_it_may_not(bench: Bench, control: int, flag: int) -> None:
-    bench[TIM7 + CR1] = control
-    bench[TIM7 + EGR] = 1
-    assert bench[TIM7 + SR] & 1 == flag
-
-
-def test_a_counter_that_is_set_overflows_after_the_rest_of_its_period(bench: Bench) -> None:
-    start(bench, TIM7)
-    bench[TIM7 + DIER], bench[TIM7 + CNT] = 1, 90
-    bench.wait(9)
-    assert not bench.is_pending(55)
-    bench.wait(2)
-    assert bench.is_pending(55)
-
-
-def test_a_period_below_the_count_begins_a_new_one(bench: Bench) -> None:
-    start(bench, TIM7)
-    bench.wait(80)
-    bench[TIM7 + ARR] = 49
-    assert bench[TIM7 + CNT] == 0
-    bench.wait(30)
-    assert bench[TIM7 + CNT] == 30
-    assert bench[TIM7 + SR] & 1 == 0
-    bench.wait(25)
-    assert bench[TIM7 + SR] & 1 == 1
+@pytest.mark.parametrize("number", TIMERS)
+def test_a_timer_counts_and_requests_as_a_model(number: int) -> None:
+    """Whatever is written in between; the model counts tick by tick."""
+    base, cycles, irq = TIMERS[number]
+    bench, rng = Bench(), np.random.default_rng(number)
+    count, period, divider, control, enabled, flag = 0, 99, 84, 0, 0, 0
+    start(bench, base, divider - 1, period, control)
+    for _ in range(120):
+        kind = rng.integers(9)
+        if kind == 0:
+            control = bench[base + CR1] = int(rng.integers(8))
+        elif kind == 1:
+            flag &= int(rng.integers(2))
+            bench[base + SR] = flag
+        elif kind == 2:
+            divider = int(rng.choice((7, 21, 42, 84)))
+            bench[base + PSC] = divider - 1
+            bench[base + EGR] = 1
+            count, flag = 0, flag | (control & (UPDATE_DISABLED | UPDATE_BY_OVERFLOW_ALONE) == 0)
+        elif kind == 3:
+            enabled = bench[base + DIER] = int(rng.integers(2))
+        elif kind == 4:
+            count = bench[base + CNT] = int(rng.integers(period + 1))
+        elif kind == 5:  # below the count a new period begins
+            period = bench[base + ARR] = max(1, int(rng.choice((count, rng.integers(1, 300)))))
+            count = 0 if count > period else count
+        else:
+            us = int(rng.integers(1, 60))
+            bench.wait(us)
+            for _ in range(us * CYCLES_PER_US // (cycles * divider) * (control & ENABLED)):
+                flag |= count == period and not control & UPDATE_DISABLED
+                count = 0 if count == period else count + 1
+        found = [bench[base + place] for place in (CNT, SR, CR1, DIER, PSC, ARR)]
+        assert found == [count, flag, control, enabled, divider - 1, period]
+        bench[CLEARED] = bench[CLEARED + 4] = 0xFFFF_FFFF
+        assert bench.is_pending(irq) == bool(flag and enabled)
 
 
 def test_a_prescaler_acts_from_the_next_update_on(bench: Bench) -> None:
@@ -114,11 +109,23 @@ def test_systick_keeps_its_period_while_code_runs_in_long_blocks() -> None:
     assert 16_799 - bench[0xE000_E018] == pytest.approx(late, abs=20)
 
 
-def test_countflag_of_systick_is_set_by_a_period_and_cleared_by_reading(bench: Bench) -> None:
-    bench[0xE000_E014], bench[0xE000_E018], bench[0xE000_E010] = 16_799, 0, 5
-    assert bench[0xE000_E010] == 5
-    bench.wait(101)
-    assert bench[0xE000_E010] == 5 | 1 << 16
-    assert bench[0xE000_E010] == 5
-    bench.wait(100)
-    assert bench[0xE000_E010] == 5 | 1 << 16, "it goes on counting"
+@pytest.mark.parametrize(("control", "per_us"), [(5, 168), (1, 21)])
+def test_systick_counts_down_and_flags_its_periods(bench: Bench, control: int, per_us: int) -> None:
+    """With the core's clock or an eighth of it; COUNTFLAG is cleared by reading."""
+    load, left = 100 * per_us - 1, 0
+    bench[0xE000_E014], bench[0xE000_E018], bench[0xE000_E010] = load, 0, control
+    for us in (0, 40, 59, 1, 100, 99, 250, 3):
+        bench.wait(us)
+        left += us
+        assert bench[0xE000_E018] == load - left * per_us % (load + 1)
+        assert bench[0xE000_E010] == control | (left >= 100) << 16
+        assert bench[0xE000_E010] == control
+        left %= 100
+    for place, flag in (
+        (0xE000_E010, 1),
+        (0xE000_E018, 0),
+    ):  # a write to the count clears it, one to its control does not
+        bench.wait(101)
+        bench[place] = control
+        assert bench[0xE000_E010] == control | flag << 16
+        assert bench[0xE000_E018] == load, "it counts from the reload value"

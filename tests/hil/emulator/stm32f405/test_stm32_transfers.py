@@ -82,6 +82,21 @@ def test_without_increment_all_bytes_go_to_one_place(bench: Bench) -> None:
     assert bench.chip.read(BUFFER, 3) == b"c\0\0"
 
 
+def test_items_are_set_until_the_first_has_moved(bench: Bench) -> None:
+    stream = stream_of(1, 1)
+    receive_by_dma(bench, 3, INCREMENT)
+    bench[stream + NDTR] = 0x1_0005
+    assert bench[stream + NDTR] == 5
+    bench.chip.feed(6, b"a")
+    bench.wait(BYTE_US + 1)
+    bench[stream + NDTR] = 9
+    assert bench[stream + NDTR] == 4
+    bench[stream + CR] = 0
+    bench[stream + NDTR] = 0
+    bench[stream + CR] = ENABLED
+    assert bench[stream + CR] == 0, "nothing to move"
+
+
 @pytest.mark.parametrize("dma", [0, 1])
 @pytest.mark.parametrize("number", range(8))
 def test_each_stream_has_its_flag_and_its_interrupt(bench: Bench, dma: int, number: int) -> None:
@@ -156,10 +171,41 @@ def test_writing_the_status_clears_only_what_software_may_clear(bench: Bench) ->
     bench.chip.feed(6, b"ab")
     bench.wait(2 * BYTE_US + 1)
     assert bench[USART6 + SR] == TXE | TC | RXNE | ORE
+    assert bench.chip.state.usart[5].overruns == 1
     bench[USART6 + SR] = ~TC & 0xFFFF_FFFF
     assert bench[USART6 + SR] == TXE | RXNE | ORE
     bench[USART6 + SR] = 0
     assert bench[USART6 + SR] == TXE | ORE
+    assert (bench[USART6 + DR], bench[USART6 + SR]) == (ord("a"), TXE), "the second byte is lost"
+
+
+@pytest.mark.parametrize("control", [0, 4, 1 << 13])
+def test_a_receiver_that_is_off_takes_nothing(bench: Bench, control: int) -> None:
+    bench[USART6 + BRR], bench[USART6 + CR1] = 84, control
+    bench.chip.feed(6, b"ab")
+    bench.wait(3 * BYTE_US)
+    assert bench[USART6 + SR] == TXE | TC
+
+
+def test_a_line_holds_4096_bytes_in_each_direction(bench: Bench) -> None:
+    sent = np.random.default_rng(1).bytes(4100)
+    bench[USART6 + BRR], bench[USART6 + CR1] = 8, RECEIVING | SENDING
+    for byte in sent:
+        bench[USART6 + DR] = byte
+        bench.wait(1)
+    assert bench.chip.sent(6) == sent[:4096]
+    assert bench.chip.sent(6) == b""
+    bench[USART6 + BRR] = 9
+    assert bench.chip.feed(6, sent) == 4096
+    arrived = []
+    for _ in range(4500):
+        bench.wait(1)
+        if bench[USART6 + SR] & RXNE:
+            arrived.append(bench[USART6 + DR])
+        if len(arrived) == 10:
+            assert bench.chip.feed(6, sent[4096:] + sent) == 10
+            arrived.append(-1)
+    assert bytes(one for one in arrived if one >= 0) == sent[:4096] + (sent[4096:] + sent)[:10]
 
 
 # I2C
@@ -184,32 +230,18 @@ def test_a_bit_lasts_as_the_clock_register_sets(bench: Bench, clock: int, bit_us
     assert bench[I2C1 + 0x14] & 2
 
 
-def test_the_last_byte_by_dma_is_not_acknowledged_and_no_other_follows(bench: Bench) -> None:
+def test_without_last_the_byte_behind_dma_is_acknowledged_and_read(bench: Bench) -> None:
     bench.chip.add_device(1, 0x50, np.arange(256, dtype=np.uint8))
     stream = stream_of(0, 0)
-    bench[I2C1 + 0x1C], bench[I2C1 + 4] = 35, 1 << 12 | 1 << 11  # LAST, DMAEN
-    for begin in (0, 3):  # the next read goes on behind it
-        bench[DMAS[0] + 8] = 1 << 5
-        bench[stream + NDTR], bench[stream + PAR], bench[stream + M0AR] = 3, I2C1 + 0x10, BUFFER
-        bench[stream + CR] = ENABLED | INCREMENT
-        address(bench, 0x50 << 1 | 1)
-        bench.until(I2C1 + 0x14, 2)
-        bench[I2C1 + 0x18]  # clears ADDR
-        bench.wait(200)
-        assert bench.chip.read(BUFFER, 4) == bytes([begin, begin + 1, begin + 2, 0])
-        assert bench[I2C1 + 0x14] & (1 << 6 | 4) == 0, "neither RXNE nor BTF"
-
-
-@pytest.mark.parametrize(("control", "pending"), [(1 << 9, False), (1 << 10 | 1 << 9, True)])
-def test_empty_registers_interrupt_only_if_buffered(bench: Bench, control: int, pending: bool) -> None:
-    bench.chip.add_device(1, 0x50, np.zeros(256, np.uint8))
-    bench[I2C1 + 0x1C], bench[I2C1] = 35, 1
-    address(bench, 0x50 << 1)
+    bench[I2C1 + 0x1C], bench[I2C1 + 4] = 35, 1 << 11
+    bench[stream + NDTR], bench[stream + PAR], bench[stream + M0AR] = 3, I2C1 + 0x10, BUFFER
+    bench[stream + CR] = ENABLED | INCREMENT
+    address(bench, 0x50 << 1 | 1)
     bench.until(I2C1 + 0x14, 2)
-    bench[I2C1 + 0x18]  # clears ADDR: TXE
-    bench[I2C1 + 4] = control
-    assert bench[I2C1 + 0x14] & 1 << 7
-    assert bench.is_pending(31) is pending
+    bench[I2C1 + 0x18]
+    bench.wait(200)
+    assert bench.chip.read(BUFFER, 4) == b"\0\1\2\0"
+    assert (bench[I2C1 + 0x14], bench[I2C1 + 0x10]) == (1 << 6 | 4, 3)
 
 
 def test_a_missing_acknowledgement_is_cleared_by_writing_0_and_nothing_else_is(bench: Bench) -> None:
@@ -270,3 +302,107 @@ def test_dma_cannot_reach_the_core_coupled_memory(bench: Bench) -> None:
     assert not bench[stream + CR] & ENABLED
     assert bench[DMAS[1]] == 1 << 9  # TEIF1
     assert bench.chip.read(CCM, 1) == b"\0"
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_transfers_on_i2c_move_the_bytes_of_a_model(number: int) -> None:
+    """Writes and reads by registers or DMA, behind a stop or a repeated start; a pointer goes on behind what was used."""
+    base, bench, rng = 0x4000_5400 + 0x400 * (number - 1), Bench(), np.random.default_rng(number)
+    sr1, data = base + 0x14, base + 0x10
+    # Address: bytes of an address in it, whether each byte has its own, its memory.
+    kinds = {0x50: (1, False, 256), 0x51: (2, False, 700), 0x29: (1, True, 64)}
+    memories = {at: rng.integers(0, 256, size, np.uint8) for at, (_, _, size) in kinds.items()}
+    models, pointers = {at: memory.tolist() for at, memory in memories.items()}, dict.fromkeys(kinds, 0)
+    for at, (length, pairs, _) in kinds.items():
+        bench.chip.add_device(number, at, memories[at], length, pairs)
+    bench[base + 0x1C], bench[base] = 0x8000 | 4, 1
+    stopped = True
+    for _ in range(120):
+        at, reads = int(rng.choice((*kinds, 0x10))), bool(rng.random() < 0.5)
+        bench[base] = 1 << 10 | 1 << 8 | 1  # ACK, START
+        bench.until(sr1, 1)
+        assert bench[sr1] == 1
+        assert bench[base + 0x18] == 3
+        bench[data] = at << 1 | reads
+        bench.wait(10)
+        if at not in kinds:
+            assert bench[sr1] == 1 << 10
+            bench[sr1] = 0
+        elif reads:
+            (length, _, size), by_dma = kinds[at], bool(rng.random() < 0.5)
+            count = int(rng.choice((1, 2, 3, 300 if by_dma and at == 0x51 else 7)))
+            expected = [models[at][(pointers[at] + one) % size] for one in range(count)]
+            pointers[at] += count
+            if by_dma:
+                stream = stream_of(0, 3)
+                bench[DMAS[0] + 8] = 1 << 27
+                bench[stream + NDTR], bench[stream + PAR], bench[stream + M0AR] = count, data, BUFFER
+                bench[base + 4], bench[stream + CR] = 1 << 12 | 1 << 11, ENABLED | INCREMENT
+                bench[base + 0x18]
+                bench.wait(3 * count + 20)
+                bench[base + 4] = 0
+                assert list(bench.chip.read(BUFFER, count)) == expected
+            else:
+                found = []
+                bench[base] = (count > 1) << 10 | 1
+                bench[base + 0x18]
+                while len(found) < count:
+                    bench.until(sr1, 1 << 6)
+                    found.append(bench[data])
+                    bench[base] = (len(found) < count - 1) << 10 | 1
+                assert found == expected
+        else:
+            length, pairs, size = kinds[at]
+            place, written = int(rng.integers(0, size)), rng.integers(0, 256, rng.integers(0, 5)).tolist()
+            sent = list(place.to_bytes(length, "big"))
+            for one, byte in enumerate(written):
+                sent += [(place + 5 * one) % size] * (pairs and one > 0) + [byte]
+                models[at][(place + (5 if pairs else 1) * one) % size] = byte
+            pointers[at] = (
+                (place + 5 * max(len(written) - 1, 0)) % size + bool(written)
+                if pairs
+                else place + len(written)
+            )
+            bench[base + 0x18]
+            for byte in sent:
+                bench.until(sr1, 1 << 7)
+                bench[data] = byte
+            bench.until(sr1, 4)
+        stopped = bool(rng.random() < 0.6)
+        if stopped:
+            bench[base] = 1 << 9 | 1
+            bench.wait(2)
+            assert (bench[base], bench[sr1], bench[base + 0x18]) == (1, 0, 0)
+        assert {one: memory.tolist() for one, memory in memories.items()} == models
+
+
+def test_a_start_waits_for_the_stop_in_progress(bench: Bench) -> None:
+    bench.chip.add_device(1, 0x50, np.zeros(256, np.uint8))
+    bench[I2C1 + 0x1C], bench[I2C1] = 210, 1
+    address(bench, 0x50 << 1)
+    bench.until(I2C1 + 0x14, 2)
+    bench[I2C1] = 1 << 9 | 1
+    bench[I2C1] = 1 << 8 | 1
+    assert bench[I2C1] == 1 << 9 | 1 << 8 | 1
+    bench.wait(15)
+    assert (bench[I2C1], bench[I2C1 + 0x14]) == (1 << 8 | 1, 0)
+    bench.wait(20)
+    assert (bench[I2C1], bench[I2C1 + 0x14]) == (1, 1)
+
+
+@pytest.mark.parametrize("reset", [False, True])
+def test_a_controller_that_is_switched_off_or_reset_forgets_its_transfer(bench: Bench, reset: bool) -> None:
+    bench.chip.add_device(1, 0x50, np.zeros(256, np.uint8))
+    bench[I2C1 + 0x1C], bench[I2C1 + 0x08], bench[I2C1] = 35, 0x5A, 1
+    address(bench, 0x41 << 1)
+    bench.wait(100)
+    address(bench, 0x50 << 1 | 1)
+    bench.until(I2C1 + 0x14, 2)
+    bench[I2C1 + 0x18]
+    bench.wait(100)
+    assert bench[I2C1 + 0x14] == 1 << 10 | 1 << 6 | 4  # AF, RXNE, BTF
+    bench[I2C1] = 1 << 15 if reset else 0
+    expected = [1 << 15, 0, 0, 0, 0, 0, 0, 0, 0] if reset else [0, 0, 0x5A, 0, 0, 0, 35, 0, 0]
+    for _ in range(2):
+        assert [bench[I2C1 + 4 * one] for one in range(10) if one != 4] == expected  # all but the data
+        bench.wait(100)
