@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 unexport PYTHONDONTWRITEBYTECODE  # the tests start many programs: each would compile all sources anew
 
-.PHONY: fly test test-all check bench mutants docs pictures dist clients clean
+.PHONY: fly test test-all approve check bench mutants docs pictures dist clients clean
 
 fly: .venv/fly.stamp
 	$(BIN)/floaty fly hover
@@ -16,6 +16,11 @@ test: .venv/test.stamp
 test-all: .venv/test.stamp
 	$(BIN)/python -m pytest -n auto --dist loadgroup -m 'not realtime' --durations 20
 	$(BIN)/python -m pytest -n 3 --dist loadfile -m realtime --reruns 2 -rsREf --durations 20
+
+# The outputs of tests/approved as they are now: read what git shows of them, and commit what was meant.
+approve: .venv/test.stamp
+	for test in outputs kernels services; do PYTHONPATH=tests $(BIN)/python tests/approved/test_$$test.py; done
+	git diff --stat tests/approved
 
 check: .venv/test.stamp
 	$(BIN)/floaty deploy check

@@ -3,7 +3,7 @@
 The order of a sum, a sign, an edge or a reset that changes shows here by the kernel's name. If one is meant, give the
 reason in CHANGELOG where a flight's hash changes too, and write the results anew:
 
-    PYTHONPATH=tests python tests/approved/test_kernels.py
+    make approve
 """
 
 import hashlib

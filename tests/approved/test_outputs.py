@@ -3,7 +3,7 @@
 A change of a label, unit, order, colour or number shows here first. If one is meant, write the outputs anew and read
 what `git diff` shows:
 
-    PYTHONPATH=tests python tests/approved/test_outputs.py [NAME ...]
+    make approve                      # one alone: PYTHONPATH=tests python tests/approved/test_outputs.py NAME
 
 The first file of a kind stands there whole, later ones as a hash of their lines; files of programs as that of their bytes.
 """

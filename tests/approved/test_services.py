@@ -3,7 +3,7 @@
 An operator flies, steers, arms, disarms, stops, asks, logs, stores, loses the link, drains the battery and sends
 nonsense, in any order. If a change is meant, compare what it does with the original firmware, and write the answers anew:
 
-    PYTHONPATH=tests python tests/approved/test_services.py
+    make approve
 """
 
 import hashlib
