@@ -38,6 +38,16 @@ def test_python_s_memories_lie_where_the_machine_has_them() -> None:
     assert numbers["CLOCK_HZ"] == chip.CYCLES_PER_US * 1_000_000
 
 
+@pytest.mark.parametrize("base", [chip.FLASH, chip.FLASH + 0x4000])
+def test_flash_is_erased_around_the_code_and_memories_are_empty(base: int) -> None:
+    code = bytes(range(1, 65))
+    made = Chip(code, base, build_machine())
+    before, after = base - chip.FLASH, chip.FLASH_SIZE - (base - chip.FLASH) - len(code)
+    assert made.read(chip.FLASH, chip.FLASH_SIZE) == b"\xff" * before + code + b"\xff" * after
+    assert not made.ram.any()
+    assert not made.ccm.any()
+
+
 @pytest.mark.parametrize(
     ("was", "is_now"),
     [
