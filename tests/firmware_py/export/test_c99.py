@@ -147,6 +147,7 @@ REFUSED_KERNELS = [
     ("HALF = 0.5\n", 0, "constant HALF is none of f32(number), a 32-bit integer and constant(numbers)"),
     ("HALF = f32(1e39)\n", 0, "constant HALF is none of f32(number), a 32-bit integer and constant(numbers)"),
     ("class Thing:\n    pass\n", 0, "class Thing is not a Struct"),
+    ("class Thing(Struct, Other):\n    pass\n", 0, "class Thing is not a Struct"),
     ("class Thing(Struct):\n    x: float\n", 1, "field type float"),
     ("class Thing(Struct):\n    x: f64\n", 1, "field type f64"),
     ("class Thing(Struct):\n    x: Annotated[F64s, 3]\n", 1, "field type Annotated[F64s, 3]"),

@@ -73,3 +73,28 @@ def test_a_frame_that_a_reset_cut_off_costs_no_later_one() -> None:
         bench.chip.reset(0x1400_0000)
         radio.reset(bench.chip.now_us)
     assert lines == ["hello"]
+
+
+def test_battery_and_signal_are_reported_once_the_processor_has_asked() -> None:
+    fed: list[bytes] = []
+    every, frames = {}, [[(syslink.BATTERY_REPORTS, b"")]]
+    chip = SimpleNamespace(
+        now_us=7, feed=lambda usart, data: fed.append(data), pin=lambda *_: None, sent=lambda usart: b"".join(
+            syslink.encode(*frame) for frame in (frames.pop() if frames else ())
+        ),
+    )  # fmt: skip
+    outside = SimpleNamespace(read_battery_mv=lambda: 3900, radio_command=lambda *_: None)
+    line = RadioLine(chip, SimpleNamespace(every=every.setdefault), None, outside, polls=False)  # type: ignore[arg-type]
+    (report,) = every.values()
+
+    def reported() -> list[tuple[int, bytes]]:
+        fed.clear()
+        report(0)
+        return list(syslink.Decoder().decode_frames(b"".join(fed)))
+
+    assert reported() == []
+    line.sent()
+    volts = (syslink.BATTERY, struct.pack("<Bfff", 0, 3.9, 0.0, 25.0))
+    assert reported() == [volts, (syslink.SIGNAL, b"\0")], "nothing was heard yet"
+    line.received(syslink.EMPTY)
+    assert reported() == [volts, (syslink.SIGNAL, b"\x28")]
