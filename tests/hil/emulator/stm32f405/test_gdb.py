@@ -92,6 +92,14 @@ def test_a_wrong_checksum_is_asked_for_again_and_an_answer_repeated(protocol: Re
     assert protocol.receive(b"+") == b""
 
 
+def test_ctrl_c_interrupts_only_a_machine_that_runs(protocol: RemoteProtocol) -> None:
+    assert protocol.receive(b"\x03") == b""
+    assert not protocol.interrupted
+    protocol.receive(framed(b"c"))
+    protocol.receive(b"\x03")
+    assert protocol.interrupted
+
+
 def test_without_acknowledgements_only_answers_are_sent(protocol: RemoteProtocol) -> None:
     assert ask(protocol, b"QStartNoAckMode") == b"OK"
     assert protocol.receive(framed(b"?")) == framed(b"T05thread:1;")
@@ -140,6 +148,8 @@ def test_the_target_description_numbers_the_registers_as_they_are_sent(protocol:
     while piece[:1] == b"m":
         piece = ask(protocol, b"qXfer:features:read:target.xml:%x,64" % len(text))
         text += piece[1:]
+    for size, more in ((len(text) - 1, b"m"), (len(text), b"l"), (len(text) + 1, b"l")):
+        assert ask(protocol, b"qXfer:features:read:target.xml:0,%x" % size) == more + text[:size]
     root = ElementTree.fromstring(text)
     registers = [(r.get("name"), int(r.get("bitsize") or 0) // 8) for r in root.iter("reg")]
     assert registers == list(REGISTERS)
