@@ -31,11 +31,14 @@ from matplotlib.figure import Figure
 
 from hil.commands import options
 from hil.commands.app import app
+from hil.laboratory.fault_kinds import KINDS
+from hil.laboratory.metrics import METRICS
 from support import described
 from support.command import floaty
 from support.paths import ROOT
 
 APPROVED = Path(__file__).parent
+KNOWN = {id(kinds): set(kinds) for kinds in (KINDS, METRICS)}  # before any test has added its own
 SCRIPTS = {
     "flights": """
         fly hover --duration 1.5 --perfetto --set markers.enabled=true
@@ -176,9 +179,15 @@ def plain(text: str, place: str) -> str:
 
 def outputs(name: str) -> Iterator[str]:
     """Yield what a script prints, draws and writes."""
-    if name in PYTHON:
-        yield from PYTHON[name]()
-        return
+    with pytest.MonkeyPatch.context() as patch:
+        for kinds in (KINDS, METRICS):
+            for own in set(kinds) - KNOWN[id(kinds)]:
+                patch.delitem(kinds, own)
+        yield from PYTHON[name]() if name in PYTHON else printed(name)
+
+
+def printed(name: str) -> Iterator[str]:
+    """Yield what a script's commands print, draw and write."""
     figures: list[str] = []
     saved, seen = Figure.savefig, set[str]() if name == "flights" else set(FLOWN)
 
@@ -197,11 +206,11 @@ def outputs(name: str) -> Iterator[str]:
         script = SCRIPTS[name].replace("HELP", "\n".join(helps()))
         for command in filter(None, map(str.strip, script.splitlines())):
             before = {path: path.stat().st_mtime_ns for path in Path().rglob("*")}
-            printed = io.StringIO()
-            with redirect_stdout(printed), redirect_stderr(printed):
+            said = io.StringIO()
+            with redirect_stdout(said), redirect_stderr(said):
                 code = floaty(*shlex.split(command))
             yield f"$ floaty {command}"
-            lines = printed.getvalue().replace(f"{options.COMPILING}\n", "").splitlines()
+            lines = said.getvalue().replace(f"{options.COMPILING}\n", "").splitlines()
             yield from (plain(line, place) for line in (*lines, f"exit code {code}", *figures))
             figures.clear()
             for path in sorted(Path().rglob("*")):

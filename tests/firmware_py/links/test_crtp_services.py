@@ -608,6 +608,8 @@ def test_24_bytes_are_read_at_once_up_to_the_last_one(client: CrtpClient) -> Non
     client.eeprom[8167:8191] = bytes(range(24))
     head = struct.pack("<BI", 0, 8191 - 24)
     assert client.one(MEM, 1, head + b"\x18") == head + b"\0" + bytes(range(24))
+    assert client.one(MEM, 2, head) == head + b"\0"  # nothing is written, and that is well
+    assert client.ask(MEM, 1, head) == []  # a read of no length
 
 
 # Localisation

@@ -69,6 +69,26 @@ def test_the_link_to_a_pty_is_made_and_removed(tmp_path: Path) -> None:
     assert not os.path.lexists(path)
 
 
+@pytest.mark.parametrize(("taken", "forgets"), [(None, True), (0, True), (4, True), (5, False)])
+def test_what_a_pty_cannot_take_whole_empties_it(
+    taken: int | None, forgets: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = OpenEnd(Address("pty").open)
+    forgotten: list[bool] = []
+    monkeypatch.setattr(bench.end, "_forget_unread", lambda: forgotten.append(True))
+
+    def write(file: int, data: bytes) -> int:
+        if taken is None:
+            raise BlockingIOError
+        return taken
+
+    monkeypatch.setattr(os, "write", write)
+    bench.end.send(b"12345")
+    monkeypatch.undo()
+    assert forgotten == [True] * forgets
+    bench.close()
+
+
 def test_the_link_of_a_killed_server_is_replaced_but_nothing_else(tmp_path: Path) -> None:
     stale, file, other = tmp_path / "stale", tmp_path / "file", tmp_path / "other"
     stale.symlink_to("/dev/pts/99999")
