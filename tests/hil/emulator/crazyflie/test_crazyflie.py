@@ -1,9 +1,6 @@
 """A whole board with the tests' own firmware, which goes wrong: what is reported once, after each reset, and not at all."""
 
 import re
-from collections.abc import Sequence
-from functools import cache
-from struct import pack
 
 import pytest
 
@@ -11,11 +8,9 @@ pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
 from hil.emulator.crazyflie import crazyflie
-from hil.emulator.crazyflie.crazyflie import Crazyflie
-from hil.emulator.stm32f405.chip import SOFTWARE, WATCHDOG, build_machine
-from hil.emulator.stm32f405.image import Image
+from hil.emulator.stm32f405.chip import SOFTWARE, WATCHDOG
 from hil.emulator.stm32f405.stopped_tasks import SETTLED_US
-from support.stm32_firmware import build
+from support.crazyflie_board import Board
 
 (
     NOTHING, BUS_FAULT, UNDEFINED, ASSERTION, HUNGRY_WATCHDOG, NULL_CALL, NULL_READ, NULL_WRITE, DIVISION, HANG, OVERFLOW,
@@ -24,42 +19,6 @@ IN_REPORT = r", in task REPORT: go_wrong \(firmware.c:\d+\) < report \(firmware.
 BUSY = (
     r"hang: busy for 10 ms without waiting for anything, in task SPIN-0: .*"  # that it is, from its start on
 )
-
-
-@cache
-def image() -> Image:
-    return Image(build())
-
-
-class Board:
-    """A Crazyflie with nothing around it; `said` are the lines of its console."""
-
-    def __init__(self, planted: int = NOTHING) -> None:
-        self.eeprom, self.said = bytearray(b"\xff" * 8192), list[str]()
-        self.counts: list[tuple[int, ...]] = []
-        self.crazyflie = Crazyflie(image(), build_machine(), self, False, outputs=((2, 0), (2, 1)))
-        self.crazyflie.chip.write(image().symbol("planted").address, pack("<I", planted))
-
-    def run(self, begin_ms: int, end_ms: int) -> list[str]:
-        """Return what it says until then."""
-        before = len(self.said)
-        for ms in range(begin_ms, end_ms):
-            self.crazyflie.processor.run(1000 * (ms + 1))
-        return self.said[before:]
-
-    def read_battery_mv(self) -> int:
-        return 3700
-
-    def radio_send(self, data: bytes) -> bool:
-        return True
-
-    def radio_command(self, kind: int, data: bytes) -> None: ...
-
-    def debug_write(self, text: str) -> None:
-        self.said.append(text)
-
-    def write_compare(self, counts: Sequence[int]) -> None:
-        self.counts.append(tuple(counts))
 
 
 @pytest.mark.parametrize(("planted", "line"), [
