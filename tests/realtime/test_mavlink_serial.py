@@ -221,7 +221,7 @@ class Cable:
 
     def _loop(self) -> None:
         while not self._stopping:
-            select.select((self._board,) + ((self._master,) if self._master else ()), (), (), 0.002)
+            select.select((self._board,), (), (), 0.002)  # not the master, which `pull` may close meanwhile
             with self._lock, suppress(BlockingIOError):
                 if self._master is None:
                     os.read(self._board, 65536)
