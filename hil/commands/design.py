@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from click.core import ParameterSource
 from rich.table import Table
 
 from hil.commands import options as common
@@ -78,9 +79,20 @@ class Search:
 def design(context: click.Context, robot: DesignOptions) -> None:
     """Compute trim, constants, poles, authority and sweeps of a profile's robot, and compare the paper's claims."""
     require("floaty design", "design", "scipy", "control")
+    given = [
+        one.opts[0]
+        for one in context.command.params
+        if context.get_parameter_source(one.name or "") is ParameterSource.COMMANDLINE
+    ]
     if context.invoked_subcommand is not None:
+        if given:
+            raise LabError(f"{', '.join(given)}: before {context.invoked_subcommand}, which does not read it")
         return
     if robot.as_json:
+        if others := [name for name in given if name not in ("--json", "--profile", "--set")]:
+            raise LabError(
+                f"{', '.join(others)}: does not change what --json prints, the model of the profile"
+            )
         for line in _model_on_board(robot).splitlines():
             say(line)
         return

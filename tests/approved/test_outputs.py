@@ -91,7 +91,8 @@ SCRIPTS = {
     """,
     "design": """
         design
-        design --json --speed 9.5
+        design --json
+        design --length 2 --mass 8 --write big.toml
         drag-model
     """,
 }

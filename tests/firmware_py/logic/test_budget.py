@@ -115,6 +115,20 @@ def test_a_call_of_exactly_the_budget_is_admitted_and_one_more_cycle_is_not(tmp_
         own_config(tmp_path, law(one + body))
 
 
+def test_a_call_costs_four_cycles_more_than_what_it_calls(tmp_path: Path) -> None:
+    add = "memory.hidden = memory.hidden + DT"
+    helper = f"@kernel\ndef step(memory: Memory) -> None:\n    {add}\n\n\n"
+    cycles = []
+    for one in (add, "step(memory)"):
+        text = law(f"{one}\n{SUM.format(CALL_CYCLES // 5)}").replace("@kernel\n", f"{helper}@kernel\n", 1)
+        with pytest.raises(LabError, match=r": control_law takes at least \d+ cycles") as beyond:
+            own_config(tmp_path, text)
+        found = re.search(r"at least (\d+)", str(beyond.value))
+        assert found
+        cycles.append(int(found[1]))
+    assert cycles[1] - cycles[0] == 4
+
+
 def test_loops_that_fit_alone_but_not_together_are_refused_where_the_function_begins(tmp_path: Path) -> None:
     text = law("\n".join([SUM.format("100000"), SUM.format("100000").replace(" i ", " k ")]))
     with pytest.raises(LabError, match=rf"py:{line_of(text, 'def control_law')}: control_law takes at least"):

@@ -1,6 +1,7 @@
 """A whole board with the tests' own firmware, which goes wrong: what is reported once, after each reset, and not at all."""
 
 import re
+from types import SimpleNamespace as Made
 
 import pytest
 
@@ -9,7 +10,7 @@ pytest.importorskip("cffi")
 
 from hil.emulator.crazyflie import crazyflie
 from hil.emulator.stm32f405.chip import SOFTWARE, WATCHDOG
-from hil.emulator.stm32f405.stopped_tasks import SETTLED_US
+from hil.emulator.stm32f405.stopped_tasks import SETTLED_US, StoppedTask
 from support.crazyflie_board import Board
 
 (
@@ -112,3 +113,31 @@ def test_outputs_are_told_when_one_has_changed_and_a_missing_peripheral_once() -
         "the image uses a peripheral that is not modelled, at 0x40012000: it reads as 0",
         "the image uses a peripheral whose clock is off (RCC), at 0x40005400: it reads as 0 and keeps nothing",
     ]
+
+
+def test_a_task_that_hangs_or_stopped_is_reported_once_and_nothing_after_a_crash(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    board = Board()
+    own, reported = board.crazyflie, list[object]()
+    stopped = StoppedTask(0x2000_0100, 70_000, 1_000, "waits")
+    looked: list[int] = []
+
+    def busy(least_us: int) -> tuple[int, int]:
+        looked.append(least_us)
+        return 0x2000_0200 if len(looked) < 3 else 0x2000_0300, 211_000
+
+    monkeypatch.setattr(own.processor, "longest_busy", busy)
+    monkeypatch.setattr(own, "_watch", Made(newly_stopped=lambda: [stopped] if len(looked) == 1 else []))
+    monkeypatch.setattr(
+        own, "_crashes", Made(hang=lambda *of: ("hang", *of), stopped=lambda *of: ("stopped", *of))
+    )
+    monkeypatch.setattr(own, "_report", reported.append)
+    for _ in range(3):
+        own._look_at_tasks(10_000)
+    own._crashed = True
+    own._look_at_tasks(10_000)
+    assert looked == [10_000] * 3
+    assert reported == [
+        ("hang", 0x2000_0200, 211_000), ("stopped", 0x2000_0100, 70_000, 1_000, "waits"), ("hang", 0x2000_0300, 211_000),
+    ]  # fmt: skip
