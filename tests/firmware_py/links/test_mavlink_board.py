@@ -854,6 +854,12 @@ def test_exactly_the_persistent_parameters_are_stored(client: MavlinkClient) -> 
     assert len(expected) < sum(one.write is not None for one in own_parameters(client))
 
 
+def test_a_board_speaks_as_the_system_and_component_of_its_profile() -> None:
+    client = MavlinkClient("mavlink.system=9", "mavlink.component=7")
+    client.run(1_500_000)
+    assert {(one.get_srcSystem(), one.get_srcComponent()) for _, one in client.messages} == {(9, 7)}
+
+
 def test_the_heartbeat_is_armed_only_while_the_flaps_are_controlled() -> None:
     client = MavlinkClient("mavlink.rates.heartbeat=20")
 
