@@ -227,6 +227,9 @@ def test_a_bin_without_an_elf_has_the_places_and_constants_of_its_elf(compiler: 
     assert np.mean(same) > 0.9
 
 
+ROOM = (1 << 20) - 0x4000  # behind the bootloader
+
+
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
@@ -234,6 +237,11 @@ def test_a_bin_without_an_elf_has_the_places_and_constants_of_its_elf(compiler: 
         (b"\xff" * 4096, "no vector table at 0x08004000: the stack pointer there, 0xfffffffc"),
         (b"\x00\x00\x02\x20\x01\x50\x00\x08", "the reset vector there, 0x08005001, is not Thumb code"),
         (b"\x00\x00\x02\x20\x09\x40\x00\x08" + bytes(1 << 20), "do not fit into the 1048576 bytes of flash"),
+        (
+            b"\xff" * (ROOM + 4),
+            f"{ROOM + 4} bytes from 0x08004000 on do not fit into the 1048576 bytes of flash",
+        ),
+        (b"\xff" * ROOM, "no vector table at 0x08004000: the stack pointer there"),  # fits
         (
             b"\x00\x00\x02\x20\x09\x40\x00\x08" + 30 * b"\x01\x50\x00\x08",
             "truncated: 128 bytes from 0x08004000 on",
