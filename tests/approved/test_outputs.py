@@ -130,7 +130,7 @@ VOLATILE = (
 def helps(group: click.Group = app, *before: str) -> Iterator[str]:
     """Yield the call of every command's help."""
     yield " ".join((*before, "--help"))
-    context = click.Context(group)
+    context = click.Context(group, **group.context_settings)  # what it makes for the help is kept
     for name in group.list_commands(context):
         command = group.get_command(context, name)
         if isinstance(command, click.Group):
