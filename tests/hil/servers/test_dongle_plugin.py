@@ -14,6 +14,7 @@ import pytest
 import usb.core
 import usb.util
 
+from hil.board.clock import Paced
 from hil.servers import dongle_plugin
 from hil.servers.dongle_plugin import (
     CONTROL,
@@ -30,6 +31,7 @@ from hil.servers.dongle_plugin import (
     install,
     standard_request,
 )  # fmt: skip
+from hil.servers.dongle_server import DongleServer
 
 ACKED, LOST = b"\x01", b"\x00"
 
@@ -160,6 +162,16 @@ def test_a_packet_goes_to_every_process_until_a_board_has_answered_with_these_se
     dongle.control(b"\x01\x51\x00")
     dongle.write(b"d")
     assert [one.frames(2)[1] for one in (first, second)] == 2 * [(WRITE, b"d")]
+
+
+def test_a_client_is_told_the_ports_of_the_other_processes() -> None:
+    clock = Paced()
+    server = DongleServer(0, clock.readers, Made, lambda text: None, (0x1234, 9))  # type: ignore[arg-type]
+    with socket.create_connection(("127.0.0.1", server.port), 20.0) as client:
+        clock.wait_until(clock.now_us() + 20_000_000)
+        clock.serve(0)
+        assert client.recv(64) == frame(PORTS, 0, bytes.fromhex("1234 0009"))
+    server.close()
 
 
 def test_without_acknowledgements_none_is_awaited(
