@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Callable, Iterator
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ from hil.emulator.stm32f405.gdb_protocol import (
     ResumeRequest,
     framed,
 )
+from support.approved import skip_unless, versions
 from support.crazyflie_board import Board
 from support.stm32_machine import FirmwareOnChip
 
@@ -110,23 +110,15 @@ FOUND: dict[str, Callable[[], list[str]]] = {
 }
 
 
-def compiler() -> str:
-    """Return what builds the tests' firmware."""
-    try:
-        return f"ziglang {version('ziglang')}"
-    except PackageNotFoundError:
-        return ""
-
-
 @pytest.mark.parametrize("name", FOUND)
 def test_the_emulator_tells_what_it_told(name: str) -> None:
     known = json.loads(REPORTS.read_text())
     found = FOUND[name]()
-    if found != known[name] and known["compiler"] != compiler():
-        pytest.skip(f"differs, but was approved with {known['compiler']}; here is {compiler() or 'none'}")
+    if found != known[name]:
+        skip_unless(known["versions"], versions("ziglang"))
     assert found == known[name]
 
 
 if __name__ == "__main__":
-    content = {"compiler": compiler()} | {name: find() for name, find in FOUND.items()}
+    content = {"versions": versions("ziglang")} | {name: find() for name, find in FOUND.items()}
     REPORTS.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
