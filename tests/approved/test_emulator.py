@@ -1,11 +1,10 @@
-"""The emulated chip reports, counts and tells a debugger of the tests' firmware what it did.
+"""What the emulator said of the tests' firmware, it still says: its reports, its counts and its answers to a debugger.
 
 Crashes of every kind, where the cycles went, and a debugger's random questions. If a change is meant: make approve.
 """
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
 from hil.emulator.stm32f405.chip import RAM, StopReason
-from hil.emulator.stm32f405.cpu_profile import Reader, functions_of
 from hil.emulator.stm32f405.gdb_protocol import (
     REGISTERS,
     SIGINT,
@@ -26,9 +24,9 @@ from hil.emulator.stm32f405.gdb_protocol import (
     ResumeRequest,
     framed,
 )
-from support.approved import skip_unless, versions
+from support.approved import approve, judge
 from support.crazyflie_board import Board
-from support.stm32_machine import FirmwareOnChip
+from support.stm32_machine import FirmwareOnChip, Profiled
 
 REPORTS = Path(__file__).with_name("emulator.json")
 MISTAKES = range(21)  # `enum planted` of the tests' firmware
@@ -49,16 +47,7 @@ def crash(planted: int) -> list[str]:
 
 def profile() -> list[str]:
     """Return where the cycles of 200 ms went."""
-    firmware = FirmwareOnChip()
-    line = firmware.processor()
-    firmware.chip.record()
-    firmware.chip.profile([(one.address, one.address + one.size) for one in functions_of(firmware.image)])
-    for now_us in range(1_000, 200_001, 1_000):
-        while firmware.chip.now_us < now_us:
-            firmware.run(now_us)
-        firmware.chip.pin("C", 14, True)
-        firmware.chip.pin("C", 14, False)
-    return list(told(Reader(firmware.image, firmware.chip, line.task_names, 0).read(), "profile"))
+    return list(told(Profiled("clang").run_with_samples(200_000), "profile"))
 
 
 def told(value: Any, name: str) -> Iterator[str]:
@@ -112,13 +101,8 @@ FOUND: dict[str, Callable[[], list[str]]] = {
 
 @pytest.mark.parametrize("name", FOUND)
 def test_the_emulator_tells_what_it_told(name: str) -> None:
-    known = json.loads(REPORTS.read_text())
-    found = FOUND[name]()
-    if found != known[name]:
-        skip_unless(known["versions"], versions("ziglang"))
-    assert found == known[name]
+    judge(REPORTS, name, FOUND[name](), "ziglang")
 
 
 if __name__ == "__main__":
-    content = {"versions": versions("ziglang")} | {name: find() for name, find in FOUND.items()}
-    REPORTS.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+    approve(REPORTS, FOUND, "ziglang")

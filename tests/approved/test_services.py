@@ -7,7 +7,6 @@ nonsense, in any order. If a change is meant, compare what it does with the orig
 """
 
 import hashlib
-import json
 import struct
 from collections import defaultdict
 from collections.abc import Callable
@@ -21,7 +20,7 @@ import pytest
 from firmware_py.wire import crtp, setpoints
 from firmware_py.wire.high_level import PathCommand, encode
 from firmware_py.wire.parameters import encode_pose_kind
-from support.approved import skip_unless, versions
+from support.approved import approve, judge
 from support.crtp_client import LINK, LOC, LOG, MEM, PARAM, PLATFORM, SUPERVISOR, CrtpClient
 from support.firmware_bench import LEVEL, FirmwareBench
 from support.mavlink_client import MavlinkClient
@@ -285,12 +284,8 @@ FLIGHTS: dict[str, Callable[[], dict[str, str]]] = {
 
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_a_board_answers_a_random_operator_as_it_did(name: str) -> None:
-    known, found = json.loads(ANSWERS.read_text()), FLIGHTS[name]()
-    if found != known[name]:
-        skip_unless(known["versions"], versions("pymavlink"))
-    assert found == known[name]
+    judge(ANSWERS, name, FLIGHTS[name](), "pymavlink")
 
 
 if __name__ == "__main__":
-    content = {"versions": versions("pymavlink")} | {name: fly() for name, fly in FLIGHTS.items()}
-    ANSWERS.write_text(json.dumps(content, indent=2) + "\n")
+    approve(ANSWERS, FLIGHTS, "pymavlink")

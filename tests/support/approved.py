@@ -1,6 +1,10 @@
 """Judges what came out now by what was approved, where the libraries that shape it are those of then."""
 
+import json
+from collections.abc import Callable, Mapping
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,3 +24,17 @@ def skip_unless(made_with: str, here: str) -> None:
     """Skip the test, whose outputs differ, if they were approved with other versions."""
     if made_with != here:
         pytest.skip(f"differs, but was approved with {made_with}; here are {here}")
+
+
+def judge(path: Path, name: str, found: Any, *packages: str) -> None:
+    """Fail where something differs from what a file has under its name."""
+    known = json.loads(path.read_text(encoding="utf-8"))
+    if found != known[name]:
+        skip_unless(known["versions"], versions(*packages))
+    assert found == known[name]
+
+
+def approve(path: Path, finders: Mapping[str, Callable[[], Any]], *packages: str) -> None:
+    """Write what all finders find, under their names."""
+    content = {"versions": versions(*packages)} | {name: find() for name, find in finders.items()}
+    path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

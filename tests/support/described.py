@@ -1,4 +1,4 @@
-"""What stands in files and figures, as text: names and texts whole, long runs of numbers by count, ends and two sums."""
+"""Describes files and figures as text: names in full, and many numbers by their count, first, last and two sums."""
 
 import base64
 import hashlib
@@ -21,6 +21,7 @@ from mcap.reader import make_reader
 from rerun.chunk import RrdReader
 
 from hil.pictures.viewer.track import FROM_RELEASE
+from support.figures import named
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
 RUN = re.compile(rf"(?<![\w.#])(?:{NUMBER}[\s,;MLZ\[\]]+){{8,}}{NUMBER}(?![\w.])")
@@ -46,7 +47,7 @@ def texts(values: Iterable[Any]) -> str:
 
 
 def short(text: str) -> str:
-    """Return a text in which long runs of numbers are told by their sums."""
+    """Return a text with a summary in place of each long list of numbers."""
     return RUN.sub(lambda run: f"<{numbers(map(float, ONE.findall(run.group())))}>", text)
 
 
@@ -255,9 +256,8 @@ def _axes(axes: Axes) -> Iterator[str]:
         f"axes {axes.get_title()!r} {axes.get_xlabel()!r} {axes.get_ylabel()!r} {axes.get_xscale()} {axes.get_yscale()} "
         f"x {numbers(axes.get_xlim())} y {numbers(axes.get_ylim())} {axes.axison}"
     )
-    legend = axes.get_legend()
-    if legend is not None:
-        yield f"  legend {[text.get_text() for text in legend.get_texts()]}"
+    if names := named(axes):
+        yield f"  legend {names}"
     for line in axes.lines:
         x, y = (np.asarray(one, float) for one in line.get_data(orig=False))
         yield (

@@ -9,7 +9,8 @@ import pytest
 pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
-from hil.emulator.stm32f405.chip import CYCLES_PER_US, Chip, StopReason, build_machine
+from hil.emulator.stm32f405.chip import CYCLES_PER_US, SOFTWARE, Chip, StopReason, build_machine
+from hil.emulator.stm32f405.cpu_profile import CpuProfile, Reader, functions_of
 from hil.emulator.stm32f405.debugged_chip import DebuggedChip
 from hil.emulator.stm32f405.freertos import FreeRtos
 from hil.emulator.stm32f405.gdb import GdbServer
@@ -54,3 +55,22 @@ class FirmwareOnChip:
 
     def poke(self, name: str, value: int) -> None:
         self.chip.write(self.image.symbol(name).address, pack("<I", value))
+
+
+class Profiled(FirmwareOnChip):
+    """The tests' firmware, its cycles charged from power-on."""
+
+    def __init__(self, compiler: str, **variables: int) -> None:
+        super().__init__(compiler, **variables)
+        self.on_time_line = self.processor()
+        self.chip.record()
+        self.chip.profile([(one.address, one.address + one.size) for one in functions_of(self.image)])
+
+    def run_with_samples(self, us: int) -> CpuProfile:
+        for now_us in range(1_000, us + 1, 1_000):
+            while self.chip.now_us < now_us:
+                if self.run(now_us) & StopReason.RESET:
+                    self.chip.reset(SOFTWARE)
+            self.chip.pin("C", 14, True)
+            self.chip.pin("C", 14, False)
+        return Reader(self.image, self.chip, self.on_time_line.task_names, 0).read()

@@ -10,30 +10,10 @@ pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
 from firmware_py.export.elf import FLASH
-from hil.emulator.stm32f405.chip import SOFTWARE, StopReason
-from hil.emulator.stm32f405.cpu_profile import ROOT, Calls, CpuProfile, Part, Reader, functions_of
-from support.stm32_machine import FirmwareOnChip
+from hil.emulator.stm32f405.cpu_profile import ROOT, Calls, Part, Reader
+from support.stm32_machine import Profiled
 
 ASSERTION, MASKING, NESTED, SLEEP = 3, 2, 3, 5  # a mistake and three scenarios
-
-
-class Profiled(FirmwareOnChip):
-    """The tests' firmware, its cycles charged from power-on."""
-
-    def __init__(self, compiler: str, **variables: int) -> None:
-        super().__init__(compiler, **variables)
-        self.on_time_line = self.processor()
-        self.chip.record()
-        self.chip.profile([(one.address, one.address + one.size) for one in functions_of(self.image)])
-
-    def run_with_samples(self, us: int) -> CpuProfile:
-        for now_us in range(1_000, us + 1, 1_000):
-            while self.chip.now_us < now_us:
-                if self.run(now_us) & StopReason.RESET:
-                    self.chip.reset(SOFTWARE)
-            self.chip.pin("C", 14, True)
-            self.chip.pin("C", 14, False)
-        return Reader(self.image, self.chip, self.on_time_line.task_names, 0).read()
 
 
 def calls_of(calls: Calls, name: str) -> int:
