@@ -76,6 +76,8 @@ class CrazyradioLink(LiveLink):
         self._connected = connected = threading.Event()
         self._lost, self._logs = "", LogBlocks(self._queue, self._log_table)
         crazyflie = self._crazyflie = Crazyflie(rw_cache=self._cache)
+        # The thread of cflib's own pings waits for itself when it is the first to meet a lost link.
+        crazyflie.link_statistics.latency.start = lambda: None
         crazyflie.packet_received.add_callback(self._on_any_packet)
         crazyflie.connected.add_callback(lambda uri: connected.set())
         for event in ("connection_failed", "connection_lost", "disconnected_link_error"):
