@@ -28,11 +28,18 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from firmware_py import compiling
+from firmware_py.export.kernels import translate
+from hil import fly, fly_swarm
 from hil.commands import options
 from hil.commands.app import app
+from hil.config import load_config, profile_names
+from hil.laboratory.bodies import make_body
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.metrics import METRICS
-from support import described
+from hil.research.learn.envs import make_env
+from hil.research.learn.tasks import TASKS
+from support import described, foreign_logs
 from support.approved import skip_unless, versions
 from support.command import floaty
 from support.paths import ROOT
@@ -74,6 +81,7 @@ SCRIPTS = {
     """,
     "campaigns": """
         campaign small.toml --workers 1 --out campaign
+        campaign small.toml --out campaign --shrink 1
         tune --vary controller.gain_yaw=0.5..1.5 --metric rms_x --duration 0.5 --flights 10 --workers 1 --runs tuned
     """,
     "identification": """
@@ -89,6 +97,26 @@ SCRIPTS = {
     "tuning": """
         tune --robots 10 --out gains.toml
     """,
+    "imports": """
+        import cfclient.csv --out cfclient
+        import "units in brackets.csv" --out brackets
+        import "neither, by size.csv" --out sizes
+        import "measured beside estimated.csv" "a quaternion.csv" --out joined
+        import log00 --out card
+        import bag.mcap --out bag
+        report bag
+        fly hover --duration 0.6 --link mavlink --set markers.enabled=true --out flown
+        export flown --mcap --tlog --csv
+        import flown/flight.mcap --out mcap
+        import flown/flight.tlog --out tlog
+        import cfclient.csv --map mine.toml --out mapped
+        import flown/flight.csv --map tlog/map.toml --out wrong
+        import flown/log.parquet --like flown --out liked
+        compare liked flown
+    """,
+    "optimise": """
+        design optimise --generations 1 --updrafts 9.5 10 --write best.toml
+    """,
     "design": """
         design
         design --json
@@ -98,6 +126,7 @@ SCRIPTS = {
 }
 HASHED = (".py", ".c", ".h", ".md", ".css", ".js", ".ld", ".in", ".tlog", ".perfetto-trace")
 DATA = (
+    ".mcap",
     ".parquet",
     ".rrd",
     ".csv",
@@ -108,6 +137,8 @@ DATA = (
 )  # simulated: exact
 FLOWN = (
     "events.jsonl",
+    "flight.csv",
+    "flight.mcap",
     "flight.rrd",
     "log.parquet",
     "schedule.parquet",
@@ -153,9 +184,6 @@ def reference() -> Iterator[str]:
 
 def learned() -> Iterator[str]:
     """Yield what each environment of `hil.research.learn` answers to the same random actions."""
-    from hil.research.learn.envs import make_env
-    from hil.research.learn.tasks import TASKS
-
     for task in TASKS:
         for fidelity in ("fast", "firmware"):
             rng = np.random.default_rng(3)
@@ -170,7 +198,31 @@ def learned() -> Iterator[str]:
                 seen, info = env.reset()
 
 
-PYTHON = {"reference": reference, "learned": learned}
+def translated() -> Iterator[str]:
+    """Yield, of each C function that flies here, the hash of its text."""
+    texts: dict[str, str] = {}
+    library = compiling._library
+
+    def kept(functions: compiling.Functions, arrays: tuple[Any, ...]) -> Path:
+        if (name := " ".join(one.__name__ for one in functions)) not in texts:
+            texts[name] = translate(functions, arrays)
+        return library(functions, arrays)
+
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiling, "_library", kept)
+        for profile in profile_names():
+            config = load_config(profile)
+            make_body(config, np.random.default_rng(0), config.flight.home)
+        fly("hover", Path(folder) / "alone", duration_s=0.02)
+        fly_swarm("hover", 2, Path(folder) / "swarm", duration_s=0.02)
+        make_env("Hover", "fast", duration_s=0.1).reset(seed=1)
+    for name, text in texts.items():
+        yield f"--- {name}"
+        for part in re.split(r"\n\n(?=\S)", text):
+            yield f"{part.splitlines()[0]} {hashlib.sha256(part.encode()).hexdigest()[:12]}"
+
+
+PYTHON = {"reference": reference, "learned": learned, "translated": translated}
 
 
 def plain(text: str, place: str) -> str:
@@ -203,6 +255,8 @@ def printed(name: str) -> Iterator[str]:
         place = str(Path(folder).resolve())
         for source in APPROVED.glob("*.toml"):
             shutil.copy(source, folder)
+        if name == "imports":
+            foreign_logs.write_all(Path())
         patch.setattr(Figure, "savefig", show)
         patch.setenv("COLUMNS", "140")
         for console in (options.console, options.notices):
@@ -251,7 +305,7 @@ def close(line: str, known: str) -> bool:
     )
 
 
-LONG = ("tuning",)
+LONG = ("optimise", "tuning")
 PACKAGES = ("click", "foxglove-sdk", "matplotlib", "rerun-sdk", "rich", "scipy")  # shape the outputs
 
 
