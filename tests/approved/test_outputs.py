@@ -144,6 +144,7 @@ FLOWN = (
     "schedule.parquet",
     "telemetry.csv",
 )  # whole in "flights"
+COMPILING = ("floaty: compiling ", options.COMPILING)  # only where it was not yet
 VOLATILE = (
     (re.compile(r"^Usage: .*?floaty"), "Usage: floaty"),
     (re.compile(r"\b\d+(\.\d+)? times real time(; \d+(\.\d+)? s from start to end)?"), "N times real time"),
@@ -268,7 +269,7 @@ def printed(name: str) -> Iterator[str]:
             with redirect_stdout(said), redirect_stderr(said):
                 code = floaty(*shlex.split(command))
             yield f"$ floaty {command}"
-            lines = said.getvalue().replace(f"{options.COMPILING}\n", "").splitlines()
+            lines = [line for line in said.getvalue().splitlines() if not line.startswith(COMPILING)]
             yield from (plain(line, place) for line in (*lines, f"exit code {code}", *figures))
             figures.clear()
             for path in sorted(Path().rglob("*")):
