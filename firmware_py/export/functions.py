@@ -288,7 +288,7 @@ class FunctionPrinter:
             self._print.scalar(limits[0], integer, "the start of a range").text if len(limits) > 1 else "0"
         )
         step = ranges.step(limits)
-        if len(limits) == 3 and not (step and ranges.loop(limits)):
+        if len(limits) == 3 and not (step and ranges.loop(limits) and all(map(self._fixed, limits))):
             first, last, by = map(ast.unparse, limits)
             many, sign = (f"{first} - {last}", "-") if step == -1 else ("n", f"+ {by} *")
             hint = f"write for k in range({many.removesuffix(' - 0')}): and {name} = {first} {sign} k inside"

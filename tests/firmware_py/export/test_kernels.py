@@ -20,7 +20,8 @@ from firmware_py.export.errors import ExportError
 from firmware_py.export.kernels import build, library, translate
 from firmware_py.export.live_reading import Arrays
 from firmware_py.export.methods import METHOD
-from support.random_programs import Language, Programs
+from support.random_frames import KERNEL, KERNEL_HEAD, LIVE
+from support.random_programs import Programs
 
 COMPILERS = [one for one in compilers() if one.name != "cc"]
 IDS = [one.name for one in COMPILERS]
@@ -105,34 +106,10 @@ def test_c_computes_the_bits_of_python(compiler: Compiler) -> None:
     holds()
 
 
-LIVE = Language(
-    reals=("numbers[0]", "numbers[n % 5]", "COEFFICIENTS[m % 3]"),
-    wholes=("counts[0]", "counts[m % 3]"),
-    places=(("numbers[m % 5]", False), ("counts[n % 3]", True)),
-    real="{}", of_whole="f64({})", whole_of="i32({})", root="math.sqrt", truth="{}", live=True,
-)  # fmt: skip
-RANDOM = """\
-import math
-from firmware_py.compiling import compiler
-from firmware_py.core.subset import F64s, I32s, f64, i32
-
-COEFFICIENTS = (0.5, -0.25, 3.0)
-kernel = compiler()
-"""
-KERNEL = """
-
-@kernel
-def random_{name}(numbers: F64s, counts: I32s) -> None:
-    \"\"\"Do.\"\"\"
-{body}
-    numbers[4] = numbers[4] * 0.125 + (x - y if is_far else n - m - counts[0])
-"""
-
-
 def test_random_kernels_compute_the_bits_of_python(tmp_path: Path) -> None:
     path = tmp_path / "random_kernels.py"
     kernels = (KERNEL.format(name=n, body=indent(Programs(LIVE, n).body(), "    ")) for n in range(30))
-    path.write_text(RANDOM + "".join(kernels), encoding="utf-8")
+    path.write_text(KERNEL_HEAD + "".join(kernels), encoding="utf-8")
     spec = spec_from_file_location("random_kernels", path)
     assert spec is not None
     assert spec.loader is not None

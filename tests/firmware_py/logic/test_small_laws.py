@@ -1,7 +1,6 @@
 """Small laws as users write them: accepted, with the same bits in Python and C, or refused with what to write instead."""
 
 from pathlib import Path
-from textwrap import indent
 
 import numpy as np
 import pytest
@@ -16,48 +15,9 @@ from hil.board.cores.boards import BOARDS, runner_of
 from hil.config import LabConfig
 from support.command import Cli
 from support.own_logic import own_config
-from support.random_programs import Language, Programs
+from support.random_frames import OWN, law_of
+from support.random_programs import Programs
 
-HEAD = '''"""Small laws."""
-
-from typing import Annotated
-
-from firmware_py.core.maths import ZERO, clamp
-from firmware_py.core.structs import Control, Estimator, Input
-from firmware_py.core.subset import F32s, I32s, Logged, Struct, Tunable, constant, f32, i32, kernel, sqrt
-
-TABLE = constant(0.5, -1.25, 3.0, 0.1)
-DT = f32(0.01)
-MANY = 80
-
-
-class Gains(Struct):
-    gain_z: Annotated[f32, Tunable(3.0, "rad/m", low=0.0, high=10.0)]
-
-
-class Memory(Struct):
-    ticks: i32
-    mode: i32
-    integral: Annotated[f32, Logged("m s")]
-    errors: Annotated[F32s, 4]
-    counts: Annotated[I32s, 3]
-    answers: Annotated[F32s, MANY]
-
-
-'''
-LAW = """@kernel
-def law_{name}(estimator: Estimator, own: Gains, memory: Memory) -> f32:
-{body}
-
-"""
-HOOKS = """@kernel
-def reset_law(data: Input, memory: Memory) -> None:
-    memory.ticks = i32(0)
-
-
-@kernel
-def control_law(data: Input, estimator: Estimator, control: Control, own: Gains, memory: Memory) -> None:
-{calls}"""
 SUM = "total = ZERO\n    for k in range(4):\n        total = total + memory.errors[k] * f32(i + 1)\n"
 CLAMPED = "if i < 0:\n    i = i32(0)\nif i > 3:\n    i = i32(3)\nreturn TABLE[i]"
 ACCEPTED = [
@@ -91,12 +51,6 @@ ACCEPTED = [
     "i = 0\nfor k in range(4):\n    if memory.errors[k] > memory.errors[min(max(i, 0), 3)]:\n        i = k\n"
     "return f32(i) * sqrt(abs(clamp(memory.errors[0], -own.gain_z, own.gain_z)))",
 ]  # fmt: skip
-OWN = Language(
-    reals=("own.gain_z", "memory.errors[0]", "memory.errors[n % 4]", "TABLE[min(max(m, 0), 3)]", "estimator.now[2]", "DT"),
-    wholes=("memory.ticks", "memory.counts[1]", "memory.counts[m % 3]"),
-    places=(("memory.integral", False), ("memory.errors[m % 4]", False), ("memory.counts[n % 3]", True)),
-    real="f32({})", of_whole="f32({})", whole_of="i32({})", root="sqrt", truth="{}", live=False,
-)  # fmt: skip
 RANDOM = [
     Programs(OWN, seed).body() + "\nif is_far:\n    return x\nreturn y + f32(n) + f32(m)"
     for seed in range(16)
@@ -116,6 +70,8 @@ REFUSED = [
      "write memory.mode == 1 or memory.ticks == 2"),
     ("for i in range(memory.ticks, 0, -1):\n    memory.errors[0] = DT\nreturn ZERO",
      "write for k in range(memory.ticks): and i = memory.ticks - k inside"),
+    ("last = 4\nfor i in range(0, last, 2):\n    memory.errors[i] = DT\nreturn ZERO",
+     "the numbers of a range with a step are constants"),
     ("if memory.ticks > 2:\n    a = DT\nreturn a", "a is read before it has a value: write a = f32(0.0) before line"),
     ("for i in range(memory.ticks):\n    n = n + 1\nreturn f32(n)", "n is read before it has a value: write n ="),
     ("for i in range(4):\n    if memory.mode == i:\n        break\n    a = DT\nreturn a", "write a = f32(0.0) before line"),
@@ -210,12 +166,6 @@ AT_THE_TOP = [
     ("@kernel\ndef f1(x: f32):\n    return x", ["write -> f32"]), ("@kernel\ndef f2(x: f32):\n    pass", ["write -> None"]),
     ("@kernel\ndef f3(x) -> f32:\n    return x", ["argument x of f3 has no type of the subset: write x: f32"]),
 ]  # fmt: skip
-
-
-def law_of(bodies: list[str], top: str = "") -> str:
-    laws = "".join(LAW.format(name=n, body=indent(body, "    ")) for n, body in enumerate(bodies))
-    calls = [f"    memory.answers[{n}] = law_{n}(estimator, own, memory)\n" for n in range(len(bodies))]
-    return f"{HEAD}{top}\n\n{laws}\n{HOOKS.format(calls=''.join(calls) or '    return')}"
 
 
 @pytest.fixture(scope="module")
