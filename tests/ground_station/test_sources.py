@@ -194,6 +194,8 @@ def test_a_newer_server_is_asked_for_the_newest_version_that_can_be_read(answer:
     frame = stream.on_packet(packets.frame(1, V, (1, 1, 1)), 0)
     assert frame is not None
     assert (frame.valid, frame.p_WB) == (True, packets.POSE[0])
+    stream.on_packet(packets.packet(3, b"no\0"), 0)  # nothing was asked
+    assert not stream.notices
 
 
 @pytest.mark.parametrize("answer", [b"\xff\xff\xff\xff", b"", b"no\0", b"Bitstream,4.2\0"])

@@ -571,6 +571,7 @@ def test_memory_tester_gives_the_address_and_counts_wrong_bytes(client: CrtpClie
     assert client.log(logs, "memTst.errCntW") == [3]
     assert [len(client.one(MEM, 0, bytes((2, number)))) for number in (4, 5)] == [15, 2]  # the last, and none
     client.write(params, "memTst.resetW", 1)
+    assert client.read(params, "memTst.resetW") == 0
     assert client.log(logs, "memTst.errCntW") == [0]
 
 

@@ -1,18 +1,22 @@
 """Flights through another core, open loop: `floaty replay`."""
 
 import json
+from math import nan
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from firmware_py.config import parameters_of
 from firmware_py.core.structs import MODE_FLY
-from firmware_py.core.subset import i32
+from firmware_py.core.subset import f32, i32
 from firmware_py.core_runner import CoreBlocks
 from hil import LabError, Run, fly, load_run
 from hil.config import load_config
-from hil.laboratory.replay import Shadowed, misses, replay
+from hil.laboratory.replay import WRAP_US, Shadowed, _with_replay, misses, replay
 from support.command import Cli
 
 STATES = [*"xyz", "vx", "vy", "vz", "roll", "pitch", "yaw", *"pqr", *(f"flap_{n}" for n in (1, 2, 3, 4))]
@@ -70,6 +74,22 @@ def test_the_second_core_keeps_its_own_commands_and_estimates_with_those_that_fl
         made.run.call(name)
     assert shadow.control.bytes() == own != made.control.bytes()
     assert shadow.estimator.bytes() == made.estimator.bytes()
+
+
+def test_a_row_shows_what_the_second_core_knew_then_through_the_clock_s_wrap_and_boots() -> None:
+    def core(*ticks: tuple[int, int]) -> Shadowed:
+        rows = [
+            (us % WRAP_US, np.full(16, n, f32), np.full(4, -n, f32), (n,) * len(COUNTS)) for us, n in ticks
+        ]
+        return cast(Shadowed, SimpleNamespace(rows=rows))
+
+    made = [core(*((WRAP_US + 10_000 * n, n + 3) for n in (-2, -1, 0, 1))), core((WRAP_US + 20_000, 7))]
+    seen = {-25_000: nan, -20_000: 1, -10_001: 1, -10_000: 2, 0: 3, 15_000: 4, 20_000: 7, 99_000: 7}
+    log = _with_replay(made, pa.table({"t": [WRAP_US + at_us for at_us in seen]}))
+    for name, sign in (("x", 1), ("u4", -1), ("resets", 1)):
+        assert log.column(f"replay.{name}").to_pylist() == pytest.approx(
+            [sign * n for n in seen.values()], nan_ok=True
+        )
 
 
 def test_the_command_shows_both_and_the_report_draws_them(flown: Run, cli: Cli, tmp_path: Path) -> None:

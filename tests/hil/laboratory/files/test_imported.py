@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
+import pymavlink.dialects.v20.development as dialect
 import pytest
 from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
@@ -18,7 +19,7 @@ from hil.laboratory.files.imported import import_log
 from hil.laboratory.files.joined import Joined, join
 from hil.laboratory.files.log_map import Map, guess
 from hil.laboratory.files.recorder import load_events
-from hil.laboratory.files.tables import Table, read_tables
+from hil.laboratory.files.tables import Table, _tlog, read_tables
 from hil.pictures.viewer.recording import recording_of
 from support.command import Cli, floaty
 from support.foreign_logs import (
@@ -133,6 +134,22 @@ def test_a_telemetry_log_of_mavlink_is_in_the_world_s_frame(run: Run, tmp_path: 
     assert angles == pytest.approx(
         np.stack([sent.column(name).to_numpy() for name in names], axis=1)[-20:], abs=1e-6
     )
+
+
+def test_the_rows_of_a_tlog_are_those_of_its_best_pose_behind_bytes_that_are_no_frame() -> None:
+    codec = dialect.MAVLink(None, 1, 1)
+    messages = [
+        dialect.MAVLink_attitude_message(0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0),
+        dialect.MAVLink_vision_position_estimate_message(0, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0),
+        dialect.MAVLink_local_position_ned_message(0, 4.0, 5.0, 6.0, 0.0, 0.0, 0.0),
+    ]
+    content = b""
+    for number, message in enumerate(messages, 1):
+        content += number.to_bytes(8, "big") + message.pack(codec) + b"abc" * (number == 2)
+    tables = _tlog(Path("log.tlog"), content)
+    kinds = ["LOCAL_POSITION_NED", "VISION_POSITION_ESTIMATE", "ATTITUDE"]
+    assert [next(name.split(".")[0] for name in table.columns if "." in name) for table in tables] == kinds
+    assert [table.columns["timestamp [us]"].tolist() for table in tables] == [[3], [2], [1]]
 
 
 def test_other_delimiters_decimal_commas_marks_and_words_are_read(tmp_path: Path) -> None:
