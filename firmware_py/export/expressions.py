@@ -328,6 +328,9 @@ class Expressions:
         """Return the call of a kernel."""
         kernel = self.module.names.get(name)
         if not isinstance(kernel, Signature):
+            if name in self.module.builtins and name in (*CASTS, *FLOAT_FUNCTIONS, "elapsed"):
+                form = "elapsed(later, earlier)" if name == "elapsed" else f"{name}(x)"
+                raise self.refuse(node, f"{name} of {len(node.args)} arguments: write {form}")
             raise self.refuse(node, f"call of {name}, which is no kernel{self._function(node, name)}")
         if kernel.writes and not alone:
             hint = f"write x = {name}(..) on a line of its own, or {name}(..) alone"

@@ -71,6 +71,7 @@ REFUSED = [
     ("for i in range(memory.ticks, 0, -1):\n    memory.errors[0] = DT\nreturn ZERO",
      "write for k in range(memory.ticks): and i = memory.ticks - k inside"),
     ("i = memory.ticks\nfor k in range(memory.mode):\n    i = i32(3)\nreturn TABLE[i]", "it may be outside 0..3 in flight"),
+    ("return f32(own.gain_z, DT)", "f32 of 2 arguments: write f32(x)"),
     ("last = 4\nfor i in range(0, last, 2):\n    memory.errors[i] = DT\nreturn ZERO",
      "the numbers of a range with a step are constants"),
     ("if memory.ticks > 2:\n    a = DT\nreturn a", "a is read before it has a value: write a = f32(0.0) before line"),
