@@ -66,6 +66,9 @@ def join(what: str, tables: Sequence[Table], clock: str | float | None) -> Joine
             one = Source.of(title)
             if one.name == source.name:
                 continue
+            if infinite := int(np.isinf(values).sum()):
+                joined.notes.append(f"left out: {one.name}: infinite in {infinite} of {len(values)} rows")
+                values = np.where(np.isinf(values), np.nan, values)
             key = one.name if one.name not in joined.columns else f"{one.name}.{number + 1}"
             joined.columns[key] = np.where(rows >= 0, values[advances][np.maximum(rows, 0)], np.nan)
             joined.units[key] = one.unit

@@ -170,8 +170,9 @@ def test_other_delimiters_decimal_commas_marks_and_words_are_read(tmp_path: Path
         (lambda text: f"# by me\n# {text}".encode(), ""),
         (lambda text: f"{text}9.9,1.0".encode(), "left out: a row, expected 4 columns, got 2: 9.9,1.0"),
         (lambda text: f"{text}9.9,1.0,1.0,oops\n".encode(), "left out: z: no number: 'oops'"),
+        (lambda text: f"{text}9.9,1.0,1.0,1e999\n".encode(), "left out: z: infinite in 1 of 41 rows"),
     ],
-    ids=["UTF-16", "Windows", "remarks", "names in the last remark", "cut off", "torn cell"],
+    ids=["UTF-16", "Windows", "remarks", "names in the last remark", "cut off", "torn cell", "infinite"],
 )  # fmt: skip
 def test_usual_faults_of_a_file_are_read_over_and_said(
     change: Callable[[str], bytes], note: str, tmp_path: Path
@@ -451,6 +452,8 @@ def test_parquet_with_time_stamps_is_read(tmp_path: Path) -> None:
 
 GOOD = {"t": T, **place("x", "y", "z")}
 FORMATS = "expected CSV, Parquet, MCAP, a tlog, or a Crazyflie's micro-SD log"
+
+
 PLACES = "cameras.x, cameras.y, cameras.z"
 BAD: Mapping[str, tuple[Mapping[str, Any] | bytes, str, str]] = {
     "no clock": ({name: GOOD[name] for name in "xyz"}, "", 'no column of times among x, y, z; name it in a map: t = "NAME'),
