@@ -76,6 +76,14 @@ def test_an_image_is_what_a_programmer_writes_into_flash(compiler: str) -> None:
     assert image.function_at(image.reset) == "Reset_Handler"
 
 
+def test_flash_between_segments_is_erased(elf: Path, changed) -> None:
+    at = 52 + 32 + 12  # where the second segment is loaded to
+    behind = int.from_bytes(elf.read_bytes()[at : at + 4], "little")
+    whole, code = Elf(elf).code, Elf(changed(at, "<I", behind + 64)).code
+    gap = behind - Elf(elf).base
+    assert code == whole[:gap] + b"\xff" * 64 + whole[gap:]
+
+
 @COMPILERS
 @pytest.mark.parametrize("function", ["Reset_Handler", "assertFail", "vTaskSwitchContext"])
 def test_an_address_is_reported_as_function_and_line(compiler: str, function: str) -> None:
