@@ -462,6 +462,7 @@ BAD: Mapping[str, tuple[Mapping[str, Any] | bytes, str, str]] = {
     "no unit of a clock": ({"t [min]": T, **place("x", "y", "z")}, "", "t = 't': unit 'min'; expected s, ms, us, µs, ns"),
     "no such unit": (GOOD, '"cameras.x" = "x [deg]"', "cameras.x = 'x': unit 'deg'; expected m, cm, mm"),
     "no unit": (GOOD, '"cameras.x" = "x"', "cameras.x = 'x': unit ''; expected m, cm, mm"),
+    "a unit of none": (GOOD, '"cameras.qw" = "x [deg]"', "cameras.qw = 'x': unit 'deg'; expected none"),
     "no quaternion": ({**GOOD, "qw": T, "qx": T, "qy": T, "qz": T + 2}, "", "cameras.qw to qz: a quaternion of length"),
     "text": (b"t\nhello\n", "", f"no rows with numbers; {FORMATS}"),
     "binary": (b"\1\0\2", "", FORMATS),
