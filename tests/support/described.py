@@ -5,6 +5,7 @@ import hashlib
 import json
 import math
 import re
+import uuid
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from html.parser import HTMLParser
@@ -13,11 +14,13 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from mcap.reader import make_reader
+from PIL import Image
 from rerun.chunk import RrdReader
 
 from hil.pictures.viewer.track import FROM_RELEASE
@@ -26,6 +29,7 @@ from support.figures import named
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
 RUN = re.compile(rf"(?<![\w.#])(?:{NUMBER}[\s,;MLZ\[\]]+){{8,}}{NUMBER}(?![\w.])")
 ONE = re.compile(NUMBER)
+UUID = re.compile(r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 SKIPPED = ("rerun.controls.RowId", "log_time", "log_tick")
 
 
@@ -65,7 +69,7 @@ def array(values: pa.Array | pa.ChunkedArray) -> str:
         return numbers(math.nan if value is None else value for value in values.to_pylist())
     if pa.types.is_struct(kind):
         return (
-            "; ".join(f"{field.name} {array(values.combine_chunks().field(field.name))}" for field in kind)
+            "; ".join(f"{field.name} {array(pc.struct_field(values, [n]))}" for n, field in enumerate(kind))
             if len(values)
             else ""
         )
@@ -87,6 +91,7 @@ def recording(path: Path) -> Iterator[str]:
     batches: dict[str, list[pa.RecordBatch]] = {}
     for chunk in RrdReader(path).stream():
         batches.setdefault(str(chunk.entity_path), []).append(chunk.to_record_batch())
+    yield from layout(path)
     for entity, members in sorted(batches.items()):
         columns: dict[str, list[pa.Array]] = {}
         for batch in sorted(members, key=_begin):
@@ -94,7 +99,38 @@ def recording(path: Path) -> Iterator[str]:
                 columns.setdefault(name, []).append(column)
         for name, pieces in sorted(columns.items()):
             if name not in SKIPPED:
-                yield f"{entity} {name}: {len(pieces)} {array(pa.chunked_array(pieces))}"
+                yield f"{entity} {name}: {len(pieces)} {component(name, pa.chunked_array(pieces))}"
+
+
+def component(name: str, values: pa.ChunkedArray) -> str:
+    """Return a component's values; colours as rrggbbaa, the root of the layout as its name."""
+    flat = values.combine_chunks().flatten() if pa.types.is_list(values.type) else values
+    if "color" in name and pa.types.is_uint32(flat.type):
+        return texts(f"{value:08x}" for value in flat.to_pylist())
+    if name.endswith("root_container"):
+        return str(uuid.UUID(bytes=bytes(flat.flatten().to_pylist())))
+    return array(values)
+
+
+def layout(path: Path) -> Iterator[str]:
+    """Yield the components of a recording's views and containers, from the outermost to the innermost."""
+    reader, lines, order = RrdReader(path), dict[str, list[str]](), list[str]()
+    for entry in reader.blueprints():
+        for chunk in reader.stream(store=entry):
+            batch, entity = chunk.to_record_batch(), str(chunk.entity_path)
+            lines.setdefault(entity, []).extend(
+                f"{entity} {name}: {component(name, pa.chunked_array([column]))}"
+                for name, column in zip(batch.schema.names, batch.columns, strict=True)
+                if name not in (*SKIPPED, "blueprint")
+            )
+    waiting = [entity for entity in sorted(lines) if not UUID.search(entity)]
+    while waiting:
+        for line in sorted(lines.pop(waiting.pop(0))):
+            order += [one for one in UUID.findall(line) if one not in order]
+            for number, view in enumerate(order):
+                line = line.replace(view, f"#{number}")
+            yield line
+        waiting += [one for view in order for one in sorted(lines) if view in one and one not in waiting]
 
 
 def _begin(batch: pa.RecordBatch) -> tuple[list[str], int]:
@@ -124,6 +160,16 @@ def mcap(path: Path) -> Iterator[str]:
             found.setdefault(told, []).append(message.log_time.to_bytes(8, "big") + message.data)
     for told, messages in sorted(found.items()):
         yield f"{told}: {len(messages)} {hashlib.sha256(b''.join(messages)).hexdigest()[:16]}"
+
+
+def gif(path: Path) -> Iterator[str]:
+    """Yield the size, and of each tenth picture its time and the mean colours of the squares of a grid."""
+    with Image.open(path) as pictures:
+        yield f"{pictures.size} {getattr(pictures, 'n_frames', 1)} {pictures.info}"
+        for number in range(0, getattr(pictures, "n_frames", 1), 10):
+            pictures.seek(number)
+            grid = pictures.convert("RGB").resize((8, 8), Image.Resampling.BOX)
+            yield f"{number} {pictures.info['duration']}: {numbers(np.asarray(grid, float).ravel())}"
 
 
 class _Html(HTMLParser):
@@ -233,6 +279,8 @@ def lines_of(path: Path) -> Iterator[str]:
         yield from described(json.loads(path.read_text(encoding="utf-8")))
     elif kind == ".mcap":
         yield from mcap(path)
+    elif kind == ".gif":
+        yield from gif(path)
     elif kind not in (".png", ".tlog", ".perfetto-trace", ".elf"):
         yield from map(short, path.read_text(encoding="utf-8").splitlines())
 
