@@ -261,7 +261,17 @@ def plot(_: str, run: str) -> int:
 
 
 OTHERWISE = {"DISTURB": disturb, "PLOT": plot}  # in place of a command
-PYTHON = {"reference": reference, "learned": learned}
+
+
+def live() -> Iterator[str]:
+    """Yield what live pictures show."""
+    from support.watched_flight import watched
+
+    with tempfile.TemporaryDirectory() as folder:
+        yield from (plain(line, folder) for line in watched(Path(folder)))
+
+
+PYTHON = {"reference": reference, "learned": learned, "live": live}
 PYTHON |= {"translated": translated}
 
 
