@@ -277,7 +277,7 @@ PYTHON |= {"translated": translated}
 
 def plain(text: str, place: str) -> str:
     """Return a line without what is another one's on another machine, day or commit."""
-    text = text.replace(place, "PLACE")
+    text = text.replace(place, "PLACE").replace(str(ROOT), "ROOT")
     for pattern, shown in VOLATILE:
         text = pattern.sub(shown, text)
     return text.rstrip()
