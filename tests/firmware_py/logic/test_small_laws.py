@@ -118,6 +118,7 @@ REFUSED = [
     ("return f32(max(memory.ticks > 1, memory.mode > 1))", "of bool and bool: write an if"),
     ("return f32((memory.ticks > 1) + memory.mode)", "+ of bool and i32: write and, or, not between comparisons"),
     ("return memory.errors + own.gain_z", "+ of f32 array and f32: write a loop over range(..) for the elements"),
+    ("return memory.errors[0, 1]", "2 indices on f32 array: write memory.errors[column]"),
     ("return own + DT", "+ of Gains and f32: write a field of it"),
     ("for i in reversed(range(4)):\n    memory.errors[i] = DT\nreturn ZERO", "write for i in range(4 - 1, -1, -1)"),
     ("for i, e in enumerate(memory.errors):\n    memory.integral = DT\nreturn ZERO",

@@ -1,14 +1,16 @@
 """`floaty serve` in this process: what it opens and says, whose exit code it has, and when it ends."""
 
 import signal
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace as Made
 from typing import Any
 
+import click
 import pytest
 
 from ground_station import records, stops
-from hil.commands import options
+from hil.commands import options, serve
 from hil.errors import LabError
 from hil.servers import server, usb_dongle
 from support.command import Cli
@@ -47,6 +49,22 @@ def test_a_server_with_a_program_on_its_bus_ends_with_it(
     port = int(lines[1].partition("FLOATY_DONGLE=127.0.0.1:")[2].split()[0])
     assert programs == [(port, ["radio", "E7"])]
     assert lines[-1] == "stopped; time stood still for 12 ms"
+
+
+@pytest.mark.parametrize(("names", "expected"), [(None, "a.bin"), (Path("a.elf"), "a.elf")])
+def test_a_debugger_gets_the_file_with_the_names(
+    monkeypatch: pytest.MonkeyPatch, names: Path | None, expected: str
+) -> None:
+    @dataclass
+    class Image:
+        place: object
+        debugger: object = None
+
+    monkeypatch.setattr("hil.laboratory.lockstep.debugger", lambda gdb, elf, stack, why: (gdb, str(elf)))
+    monkeypatch.setattr("hil.laboratory.lockstep.image_at", lambda board, elf: Image((board, elf)))
+    asked: Any = Made(board="a.bin", elf=names, gdb=3333)
+    with click.Context(serve.serve):
+        assert serve._executor(asked) == Image(("a.bin", names), (3333, expected))
 
 
 @pytest.mark.usefixtures("_ctrl_c")

@@ -103,12 +103,14 @@ def test_both_flights_of_an_image_and_their_ends_are_compared(
     monkeypatch.setattr(beside, "fly", fly_one)
     monkeypatch.setattr(beside, "load_flown", lambda folder: f"{folder.parent.name}/{folder.name}")
     monkeypatch.setattr(beside, "compare_flights", lambda *flights: flights)
-    monkeypatch.setattr(beside, "compare_states", lambda *folders: [one.name for one in folders])
+    monkeypatch.setattr(
+        beside, "compare_states", lambda *folders: [f"{one.parent.name}/{one.name}" for one in folders]
+    )
     shown: list[Any] = []
     compared, ends, states = beside.fly_beside_python(
         Path("a.elf"), "floaty", (), lambda *what: shown.append(what)
     )
-    assert (compared, states) == (["hover/python", "hover/image"], ["python", "image"])
+    assert (compared, states) == (["hover/python", "hover/image"], ["supervisor/python", "supervisor/image"])
     assert ends == (2 if resets[0] else 1) * expected, "resets in each of both flights"
     hover, drilled = (
         ("hover", "c", 4.0, beside.FAULTS),

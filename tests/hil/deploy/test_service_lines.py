@@ -164,6 +164,9 @@ def test_means_of_log_variables_have_their_tolerances() -> None:
         row in [(services.BLOCK, rows[0]), (1, (9, 9)), (services.BLOCK, rows[1])]
     )  # fmt: skip
     assert LINES["values"](bench, ["0.1", "a.b~0.25", "c.d~3"]) == "2~0.25 6~3"  # type: ignore[arg-type]
+    assert [data[:2] for port, channel, data in bench.sent if (port, channel) == (5, 1)] == [
+        bytes((command, services.BLOCK)) for command in (6, 8, 2)
+    ], "created, started every 10 ms and deleted"
     assert LINES["values"](Bench(*[b"\0"] * 9), ["0.1", "a.b~0.25"]) == "nothing"  # type: ignore[arg-type]
 
 

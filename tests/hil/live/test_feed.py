@@ -166,6 +166,24 @@ def test_a_full_feed_drops_the_oldest_and_never_waits() -> None:
     assert seen == [0, 6, 7, 8]
 
 
+def test_waiting_pieces_are_written_a_hundred_at_a_time() -> None:
+    busy, go_on, together = threading.Event(), threading.Event(), list[int]()
+
+    def sink(pieces: list[feed.Piece]) -> None:
+        together.append(len(pieces))
+        busy.set()
+        go_on.wait()
+
+    queue = Feed(sink)
+    queue.offer((rows(0, 1), []))
+    busy.wait()
+    for item in range(250):
+        queue.offer((rows(item, 1), []))
+    go_on.set()
+    assert queue.close(timeout_s=10)
+    assert together == [1, 100, 100, 50]
+
+
 @pytest.mark.parametrize("kept", [True, False])
 def test_a_viewer_gets_every_row_once_five_times_a_second(kept: bool, tmp_path: Path) -> None:
     seen, value = Watcher(), [0.0]

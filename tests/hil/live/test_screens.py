@@ -6,6 +6,7 @@ import socket
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
+from http.client import HTTPConnection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import IO
@@ -13,7 +14,7 @@ from typing import IO
 import pytest
 
 from hil.errors import LabError
-from hil.live import recording, rerun_screen, window
+from hil.live import local_server, recording, rerun_screen, window
 from hil.live.feed import open_view
 from hil.live.local_server import LocalServer
 from hil.live.picture import open_screen
@@ -79,8 +80,15 @@ def test_a_server_takes_another_port_when_its_own_is_in_use_and_leaves_no_socket
     with socket.create_server(("127.0.0.1", 0)) as other:
         server = LocalServer(other.getsockname()[1], None, {})
     host, port = server.host.split(":")
-    socket.create_connection((host, int(port)), timeout=10.0).close()
+    for size, code in ((local_server.BODY_MAX, 404), (local_server.BODY_MAX + 1, 400)):  # there is no page
+        asker = HTTPConnection(host, int(port), timeout=10.0)
+        asker.request(
+            "POST", "/", headers={"Content-Length": str(size)}, body=bytes(size) if code == 404 else None
+        )
+        assert asker.getresponse().status == code
+        asker.close()
     server.close()
+    assert not server._thread.is_alive()
     gc.collect()  # a socket that nobody closed warns, and a warning fails the test
 
 

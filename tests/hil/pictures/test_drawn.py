@@ -98,6 +98,15 @@ def test_a_grid_has_at_most_two_lines_and_a_half_beside_its_middle(reach: float,
     assert len([*_grid(np.eye(3)[:2], _Wall(0, 1, 0.0, 0.0), reach)]) == lines
 
 
+def test_of_a_long_path_every_so_many_places_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    t = np.arange(10.0)
+    course = FlownPath(np.c_[t, -t, 2 * t], np.c_[t, t, t], np.zeros(10, np.bool_), 10.0)
+    for most, places in ((10, 5), (9, 5), (4, 4), (3, 3), (11, 10)):
+        monkeypatch.setattr("hil.pictures.path.POINTS", most)
+        lines = re.findall(rb'points="([^"]*)"[^>]*stroke="(?:#0072B2|black)"', path_of(course).content, re.I)
+        assert {len(line.split()) for line in lines} == {places}, most
+
+
 @pytest.mark.parametrize("moves", [False, True])
 def test_a_path_is_drawn_to_scale_from_three_sides_on_numbered_grids_behind_it(moves: bool) -> None:
     goal = np.array([(0.0, 0.0, 0.0), (0.0, 12.0, 3.0), (1.0, 2.0, 3.0), (1.0, 2.0, -3.0)]) * moves

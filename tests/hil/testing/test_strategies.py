@@ -1,5 +1,6 @@
 """Faults and trajectories for Hypothesis: what they draw is allowed, and the smallest is what an engineer calls small."""
 
+import math
 import pickle
 
 import pytest
@@ -10,7 +11,7 @@ from ground_station.trajectory import Along, Goal
 from hil.errors import LabError
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Fault, parse
-from hil.testing import Waypoints, faults, trajectories
+from hil.testing import Waypoints, faults, strategies, trajectories
 
 QUICK = settings(database=None, derandomize=True)
 HOME = Goal((0.0, 0.0, 1.15), 0.0)
@@ -23,6 +24,19 @@ def test_every_fault_is_possible_and_reads_back_from_its_text(fault: Fault) -> N
     assert 0.0 <= fault.start_s <= 2.0
     assert 0.1 <= fault.duration_s <= 1.0
     assert parse(str(fault)) == fault
+
+
+def test_every_size_of_a_kind_s_grid_can_be_asked_for_alone() -> None:
+    for kind in (one for one in KINDS.values() if one.sized):
+        none, step = (
+            strategies._no_fault(kind),
+            strategies._round_step((kind.high - kind.low) / strategies.GRID),
+        )
+        indices = range(
+            math.ceil((kind.low - none) / step - 1e-6), math.floor((kind.high - none) / step + 1e-6) + 1
+        )
+        for size in (round(none + index * step, 9) for index in indices):
+            strategies._sizes(kind, (size, size))  # it raises for one that is not on the grid
 
 
 @given(fault=faults("push.y", size=(-1.0, 0.5)))

@@ -663,7 +663,7 @@ def test_the_best_of_all_starts_is_the_fit(monkeypatch: pytest.MonkeyPatch, best
     w = 2 * np.pi * np.array([0.5, 1.0, 3.0])
     one = spectra.Spectra(w, np.ones((3, 3), complex), np.tile(np.eye(3, dtype=complex), (3, 1, 1)), np.ones((1, 3, 3)),
         np.ones(3), np.ones((3, 3)))  # fmt: skip
-    values = CONFIG.model.model_dump()
+    values = {**CONFIG.model.model_dump(), "yaw_rate": 0.0}  # a constant that is zero has a scale, too
     found = joint([Excited(YAW, 2, one)], 0.05, [values, values | {"yaw_u3": 7.0}], lambda values: [])
     assert [start[2] for start in starts] == pytest.approx([0.05, 0.05, 0.06, 0.04]), "two lags more"
     assert [*found.values.values(), *found.late] == pytest.approx([*starts[best]])
