@@ -92,6 +92,8 @@ SCRIPTS = {
         fly hover --profile tilt/profile.toml --duration 0.5
         deploy write app
         deploy write own --profile law/profile.toml
+        deploy check --duration 0.1 --targets c-O0
+        deploy check take-off-landing --duration 0.1 --targets plain --fault push.y@0.05 --seed 2
     """,
     "campaigns": """
         campaign small.toml --workers 1 --out campaign
