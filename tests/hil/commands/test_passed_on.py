@@ -378,8 +378,14 @@ def test_a_station_flies_with_its_files_and_ends_with_the_result_of_its_record(
         asked.answer({"commands.options.write_pictures": failing(OSError(28, ""))})
         assert cli(*STATION, *files) == 3
         assert cli.out == "run: No space left on device; no more is written to it\n"
-    else:
-        assert asked == []
+        return
+    assert asked == []
+    view = Made(know=None, lines=None)
+    asked.answer({"commands.options.open_live": view, "commands.options.close_live": None})
+    flight.close = lambda failure, interrupted: None
+    assert cli(*STATION, *files, "--view", "window") == 0
+    recorded, flown = (next(one for one in asked if one[0] == name) for name in ("RealFlight", "fly_with"))
+    assert (recorded[1], recorded[-1], flown[3].log) == (None, view, Path("log.csv")), "only seen, not kept"
 
 
 def session_experiment(session: Any) -> Any:
