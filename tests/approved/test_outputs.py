@@ -74,7 +74,11 @@ SCRIPTS = {
         fly hover --duration 0.8 --link mavlink --profile original --out b
         DISTURB b 2
         report b
-        compare a b --out ab
+        export b --csv
+        import b/flight.csv --out c
+        DISTURB c 3
+        report c
+        compare a c --out ac
     """,
     "lists": """
         list
