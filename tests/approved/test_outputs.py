@@ -277,7 +277,19 @@ def live() -> Iterator[str]:
         yield from (plain(line, folder) for line in watched(Path(folder)))
 
 
-PYTHON = {"reference": reference, "learned": learned, "live": live}
+def programs() -> Iterator[str]:
+    """Yield what the Python board answers to each program of requests, without the tolerances of other boards."""
+    from hil.board.board_firmware import PythonBoard
+    from hil.deploy.service_programs import PROGRAMS
+    from hil.deploy.services import ServiceBench, play_in_copies
+
+    played = play_in_copies(ServiceBench(PythonBoard()), PROGRAMS.values())
+    for name, answers in zip(PROGRAMS, played, strict=True):
+        path = described.numbers(np.ravel(answers.path))
+        yield f"{name}: {'; '.join(line.partition(': ')[2] for line in answers.lines)}; path {path}"
+
+
+PYTHON = {"reference": reference, "learned": learned, "live": live, "programs": programs}
 PYTHON |= {"translated": translated}
 
 
