@@ -1,8 +1,12 @@
 """The tracefile and the page of a coverage, of files whose lines, functions and branches are written by hand."""
 
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from hil.emulator.stm32f405.coverage import BranchCoverage, FileCoverage, FunctionCoverage
 from hil.pictures.exports.coverage import (
@@ -51,6 +55,17 @@ def test_the_page_has_the_lines_around_those_that_never_ran() -> None:
     assert _covered(FILE, None, "").pieces == []
     assert (str(Share(0, 0)), Share(0, 0).percent, str(Share(1, 3))) == ("-", 100.0, "33.3 %")
     assert Shares.of([FILE, FILE]).functions == Share(2, 4)
+
+
+@given(lines=st.dictionaries(st.integers(1, 40), st.integers(0, 1)))
+def test_pieces_are_the_runs_of_lines_beside_one_that_never_ran(lines: dict[int, int]) -> None:
+    covered = _covered(replace(FILE, lines=lines), (Path("a.c"), 30 * ["text"]), "")
+    pieces = [[number for number, _, _ in piece] for piece in covered.pieces]
+    never = [line for line, count in lines.items() if not count]
+    near = [number for number in range(1, 31) if any(abs(number - line) <= 2 for line in never)]
+    assert [number for piece in pieces for number in piece] == near
+    assert all(piece == [*range(piece[0], piece[-1] + 1)] for piece in pieces)
+    assert all(later[0] - piece[-1] > 1 for piece, later in pairwise(pieces))
 
 
 @pytest.mark.parametrize(("paths", "shared"), [
