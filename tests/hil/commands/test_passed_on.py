@@ -218,7 +218,9 @@ def test_seeds_that_were_interrupted_are_counted_and_folders_that_moved_are_name
 ) -> None:
     monkeypatch.setattr(Runner, "interrupted", True)
     monkeypatch.setattr(Runner, "fly", lambda runner, name, jobs, out: [Made(passed=True)])
+    covered: list[int] = []
     monkeypatch.setattr(fly, "print_seeds", lambda rows: None)
+    monkeypatch.setattr(fly, "_cover", lambda request: covered.append(request.seed))
     monkeypatch.setattr(
         "hil.laboratory.files.folder.moved",
         lambda request, folder: f"why {request.seed}" * (request.seed > 5),
@@ -229,6 +231,7 @@ def test_seeds_that_were_interrupted_are_counted_and_folders_that_moved_are_name
     )
     assert (cli("fly", "hover", "--seed", "4", "--seeds", "3"), cli.err.count("why 6")) == (130, 1)
     assert "and so on" not in cli.err
+    assert covered == [5, 4], "once for all seeds"
 
 
 def test_a_better_shape_is_printed_drawn_and_written_with_its_figure(

@@ -1,6 +1,7 @@
 """`floaty serve` in this process: what it opens and says, whose exit code it has, and when it ends."""
 
 import signal
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace as Made
@@ -49,6 +50,19 @@ def test_a_server_with_a_program_on_its_bus_ends_with_it(
     port = int(lines[1].partition("FLOATY_DONGLE=127.0.0.1:")[2].split()[0])
     assert programs == [(port, ["radio", "E7"])]
     assert lines[-1] == "stopped; time stood still for 12 ms"
+
+
+@pytest.mark.parametrize("station", [None, "poses", "corrections"])
+@pytest.mark.parametrize("board", [None, "cf2.elf"])
+@pytest.mark.parametrize("pilot", [False, True])
+def test_the_built_in_station_sends_poses_to_a_crazyflie_s_own_firmware(
+    station: str | None, board: str | None, pilot: bool
+) -> None:
+    asked: Any = Made(station=station, board=board, profile="crazyflie")
+    config: Any = Made(pilot=Made(enabled=pilot))
+    wrong = "--board FILE" if board is None else "takes poses" if station == "corrections" else ""
+    with pytest.raises(LabError, match=wrong) if pilot and wrong else nullcontext():
+        assert serve._station_of(asked, config) == ("poses" if pilot else station)
 
 
 @pytest.mark.parametrize(("names", "expected"), [(None, "a.bin"), (Path("a.elf"), "a.elf")])

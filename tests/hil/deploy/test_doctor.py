@@ -69,8 +69,13 @@ def findings(cli: Cli) -> dict[str, str]:
     return {line[2:12].strip(): line[:2].strip() + line[12:] for line in lines}
 
 
-def test_a_board_that_is_well_is_described_and_gets_its_own_gyro_back(cli: Cli, board: Board) -> None:
-    assert cli("board", "doctor", URI) == 0
+def test_a_board_that_is_well_is_described_and_gets_its_own_gyro_back(
+    cli: Cli, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judge, rates = doctor._link, list[float]()
+    monkeypatch.setattr(doctor, "_link", lambda client, hz: rates.append(hz) or judge(client, hz))
+    assert cli("board", "doctor", URI, "--set", "mocap.period_us=10_000") == 0
+    assert rates == [100.0], "poses per second of the profile"
     found = findings(cli)
     subjects = "firmware core profile state link memory battery RAM gyro servos computes loop"
     assert " ".join(found) == subjects
