@@ -277,6 +277,10 @@ def test_a_better_shape_is_printed_drawn_and_written_with_its_figure(
     found.reference_flies = False
     assert cli("design", "optimise", "--figure", "speed-range", "--out", "x") == 0
     assert "speed-range: 1.250; floaty: not stable and steering around its hover; 7 robots flew" in cli.out
+    assert [one[1][1] for one in asked if one[0] == "pareto"] == [
+        "least-authority / that of the profile's robot",
+        "speed-range",
+    ]
 
 
 @pytest.mark.parametrize("interrupted", [False, True])
