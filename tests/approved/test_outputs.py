@@ -99,6 +99,12 @@ SCRIPTS = {
         deploy check --duration 0.1 --targets c-O0
         deploy check take-off-landing --duration 0.1 --targets plain --fault push.y@0.05 --seed 2
     """,
+    "tested": """
+        PYTEST flown.py -k "not baseline"
+        PYTEST flown.py -k seeds --floaty-keep=all --floaty-profile=floaty,lqr --floaty-seeds=3
+        PYTEST flown.py -k a_baseline --floaty-update
+        PYTEST flown.py -k baseline --floaty-keep=none --floaty-board=c
+    """,
     "campaigns": """
         campaign small.toml --workers 1 --out campaign
         campaign small.toml --out campaign --shrink 1
@@ -169,6 +175,8 @@ VOLATILE = (
     (re.compile(r"^Usage: .*?floaty"), "Usage: floaty"),
     (re.compile(r"\b\d+(\.\d+)? times real time(; \d+(\.\d+)? s from start to end)?"), "N times real time"),
     (re.compile(r"^\d\d-\d\d \d\d:\d\d"), "MM-DD hh:mm"),
+    (re.compile(r"\d+\.\d+s$"), "S s"),
+    (re.compile(r"\b0x[0-9a-f]{10,}"), "0x…"),
     (re.compile(r'("commit": ")[^"]*'), r"\1C"),
     (re.compile(r"\bcommit( \| | )(?:none|unknown|[0-9a-f]{7,}\+?|(?=,|$))"), r"commit\1C"),
     (re.compile(r"\"versions\": \{.*?\}"), "versions V"),
@@ -266,7 +274,21 @@ def plot(_: str, run: str) -> int:
     return 0
 
 
-OTHERWISE = {"DISTURB": disturb, "PLOT": plot}  # in place of a command
+def run_pytest(_: str, *words: str) -> int:
+    """Run pytest with the plugin."""
+    sys.modules.pop("flown", None)
+    without = (f"no:{name}" for name in ("cacheprovider", "faulthandler", "warnings", "xdist"))
+    options = (
+        *(f"-p{name}" for name in without),
+        "--import-mode=importlib",
+        "--no-header",
+        "-q",
+        "--tb=short",
+    )
+    return int(pytest.main([*options, *words]))
+
+
+OTHERWISE = {"DISTURB": disturb, "PLOT": plot, "PYTEST": run_pytest}  # in place of a command
 
 
 def live() -> Iterator[str]:
@@ -323,7 +345,7 @@ def printed(name: str) -> Iterator[str]:
 
     with tempfile.TemporaryDirectory() as folder, chdir(folder), pytest.MonkeyPatch.context() as patch:
         place = str(Path(folder).resolve())
-        for source in ("small.toml", "gallery.py"):
+        for source in ("small.toml", "gallery.py", "flown.py"):
             shutil.copy(APPROVED / source, folder)
         if name == "imports":
             foreign_logs.write_all(Path())
@@ -376,7 +398,15 @@ def close(line: str, known: str) -> bool:
 
 
 LONG = ("optimise", "tuning")
-PACKAGES = ("click", "foxglove-sdk", "matplotlib", "rerun-sdk", "rich", "scipy")  # shape the outputs
+PACKAGES = (
+    "click",
+    "foxglove-sdk",
+    "matplotlib",
+    "pytest",
+    "rerun-sdk",
+    "rich",
+    "scipy",
+)  # shape the outputs
 
 
 @pytest.mark.parametrize(
