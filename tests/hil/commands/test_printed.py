@@ -95,6 +95,24 @@ def test_flights_of_many_seeds_are_a_row_each_and_the_means_of_the_completed(pri
     assert printed() == []
 
 
+@pytest.mark.parametrize(("factor", "speed"), [(nan, ""), (12.4, "12 times real time; ")])
+@pytest.mark.parametrize(("age_s", "taken"), [(nan, ""), (7.25, "7.2 s from start to end; ")])
+def test_a_flight_says_how_fast_it_was_and_how_long_it_took_where_that_is_known(
+    factor: float,
+    speed: str,
+    age_s: float,
+    taken: str,
+    printed: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.setattr(tables, "process_age_s", lambda: age_s)
+    result: Any = Made(request=Made(title="hover, seed 1", profile="floaty"), rows=(), cause="fell", outcome="lost",
+        real_time_factor=factor, hash="a" * 64, folder=tmp_path, ages=(), usage=None)  # fmt: skip
+    tables.print_result(result)
+    assert printed()[-1] == f"lost: fell; {speed}{taken}hash {'a' * 16}"
+
+
 def test_robots_that_fly_together_are_a_row_each_and_their_common_limits(
     printed: Any, tmp_path: Path
 ) -> None:
@@ -298,7 +316,7 @@ def test_a_design_prints_its_robot_inputs_claims_and_page(
 @pytest.mark.usefixtures("empty_folder")
 @pytest.mark.parametrize(("flown", "text"), [("a" * 64, "the same flight"),
     ("a" * 63 + "b", "not the same flight: it was interrupted or changed")])  # fmt: skip
-@pytest.mark.parametrize(("from_us", "begin"), [(1_234_000, "1.23"), (-5, "0.00")])
+@pytest.mark.parametrize(("from_us", "begin"), [(1_234_000, "1.23"), (-500_000, "0.00")])
 def test_a_debugged_flight_is_or_is_not_the_one_that_flew(
     flown: str, text: str, from_us: int, begin: str, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:

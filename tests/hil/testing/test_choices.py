@@ -200,6 +200,8 @@ def test_what_left_a_baseline_is_told_whole_and_the_first_row_that_differs(
     lost = replace(now, outcome="lost", path=kept.path[:1])
     assert told(lost, 0.2)[:2] == ["hover", "outcome: completed | lost"]
     assert told(lost, 0.2)[-1] == "the rows are equal; the last is at 0.00 s | 0.00 s"
+    later = replace(lost, path=(*kept.path, (3.5, *row[1:])))
+    assert told(later, 0.2)[-1] == "the rows are equal; the last is at 0.00 s | 3.50 s"
     assert told(replace(lost, path=kept.path), 0.2)[-1] == "1 metrics are equal."
     kept = replace(kept, path=())
     assert told(lost, 0.2)[-1] == "1 metrics are equal.", "a baseline over a link has no path"
