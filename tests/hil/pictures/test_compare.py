@@ -76,6 +76,9 @@ def test_only_differing_settings_are_reported(runs: dict[str, Path]) -> None:
     }
     assert other["outcome"] == ["completed", "lost"]
     assert (other["commit"][1], other["versions.numpy"][1]) == ("x", "1")
+    empty = replace(a, log=a.log.replace_schema_metadata({}))
+    for runs_of, values in (((a, empty), (str(gain), "–")), ((empty, a), ("–", str(gain)))):
+        assert ("controller.gain_z", *values) in compare(*runs_of).settings, "one has no such setting"
     assert {name for name, _, _ in comparison.settings} <= {"controller.gain_z", "overrides", "commit"}
 
 

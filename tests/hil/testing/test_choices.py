@@ -316,6 +316,16 @@ def test_flights_of_a_test_have_numbers_folders_and_options_of_the_mark_before_t
     assert sorted(path.name for path in place.iterdir()) == ["1", "2", "3", "4"], "all are kept"
 
 
+@pytest.mark.parametrize("coverage", [None, Path("seen")])
+@pytest.mark.parametrize("board", ["a.elf", "python"])
+def test_images_add_their_coverage_where_that_was_asked_for(
+    flights: Any, tmp_path: Path, coverage: Path | None, board: str
+) -> None:
+    own = Flights(tmp_path, tmp_path, coverage=coverage)
+    own._item = flights._item
+    assert own._chosen({"board": board}).get("coverage") == (coverage if board == "a.elf" else None)
+
+
 def test_a_baseline_is_of_as_many_flights_and_of_metrics_that_there_are(
     flights: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -334,9 +344,9 @@ def test_a_baseline_is_of_as_many_flights_and_of_metrics_that_there_are(
     again = "`pytest --floaty-update 't.py::test[a]'`"
     shown = "baselines/a-push.y-1-2-push.x-2-1-mine-seed7.json"
     with pytest.raises(LabError, match="there is none") as missing:
-        flights.baseline("a", metrics=["rms_x"])
+        flights.baseline("a", metrics=["rms_x", "max_z"])
     assert str(missing.value) == f"baseline {shown}: there is none; {again} writes it, then commit it"
-    assert unknown == ["rms_x"], "of the last flight"
+    assert unknown == ["rms_x", "max_z"], "of the last flight"
     flights._update = True
     flights.baseline("a")
     assert (flights._item.written, [run.folder.name for run in kept]) == ([shown], ["1", "2"])
