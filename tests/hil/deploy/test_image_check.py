@@ -401,6 +401,17 @@ MEMBERS = {
 SIZE_OF = {"rms": 14**0.5 / 2, "mean": 1.0, "final": 2.0}  # of the differences 0, -1, 3, 2
 
 
+def test_flights_of_other_lengths_are_compared_from_the_release_on() -> None:
+    rows = np.array([0.0, 5.0, 2.0, 7.0, 1.0])
+    names = {"t", "flight.free", *(name for one in BOUNDS for name in one.columns)}
+    runs = [
+        SimpleNamespace(log=pa.table(dict.fromkeys(names, rows[:count]) | {"flight.free": np.ones(count)}))
+        for count in (5, 3)
+    ]
+    for pair in (runs, runs[::-1]):
+        assert {one.found for one in compare_flights(*pair)} == {0.0}  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("bound", BOUNDS, ids=lambda bound: f"{bound.name} {bound.size}")
 def test_each_bound_is_that_of_its_size_in_every_one_of_its_columns(bound: Bound, sign: int) -> None:
