@@ -21,6 +21,16 @@ def test_two_profiles(floaty: Flights) -> None:
     assert floaty.fly("yaw-step", seed=3, **SHORT).metrics["rms_y"] < 1e-9
 
 
+@pytest.mark.floaty(seeds=[6])
+class TestMarked:
+    def test_of_the_class(self, floaty: Flights) -> None:
+        assert floaty.seed == 6
+
+    @pytest.mark.floaty(seeds=[7, 8])
+    def test_of_its_own(self, floaty: Flights) -> None:
+        assert floaty.seed == 7
+
+
 @pytest.mark.floaty(seeds=[4, 9], boards=["c", "python"])
 def test_four_choices(floaty: Flights) -> None:
     assert (floaty.target, floaty.seed) != ("python", 9)

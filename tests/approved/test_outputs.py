@@ -61,6 +61,7 @@ SCRIPTS = {
         export runs/hover-1 --csv --mcap --tlog
         import runs/hover-1/flight.csv --out runs/imported
         import runs/hover-1/flight.mcap --out runs/of-topics
+        import runs/hover-1/flight.csv runs/cut/link.tlog
         fly hover --robots 2 --duration 0.6 --out runs/swarm
         fly hover --seeds 3 --duration 0.6 --workers 1 --out runs/seeds
         fly take-off-landing --duration 2 --out runs/take-off
@@ -102,7 +103,7 @@ SCRIPTS = {
     "tested": """
         PYTEST flown.py -k "not baseline"
         PYTEST flown.py -k seeds --floaty-keep=all --floaty-profile=floaty,lqr --floaty-seeds=3
-        PYTEST flown.py -k a_baseline --floaty-update
+        PYTEST flown.py -k "seeds or a_baseline" --floaty-update
         PYTEST flown.py -k baseline --floaty-keep=none --floaty-board=c
     """,
     "campaigns": """

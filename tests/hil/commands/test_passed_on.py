@@ -234,6 +234,18 @@ def test_seeds_that_were_interrupted_are_counted_and_folders_that_moved_are_name
     assert covered == [5, 4], "once for all seeds"
 
 
+@pytest.mark.parametrize("out", [(), ("--out", "x")])
+def test_a_flight_whose_usual_folder_is_another_s_says_why(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, out: tuple[str, ...]
+) -> None:
+    flown: list[Path] = []
+    monkeypatch.setattr("hil.laboratory.files.folder.moved", lambda request, folder: f"not {folder}")
+    monkeypatch.setattr(fly, "_fly_one", lambda request, folder, target: flown.append(folder) or 0)
+    assert cli("fly", "hover", "--seed", "8", *out) == 0
+    assert flown == [Path("x") if out else Path("runs/hover-8")]
+    assert ("not runs/hover-8\n" in cli.err) == (not out)
+
+
 def test_a_better_shape_is_printed_drawn_and_written_with_its_figure(
     cli: Cli, asked: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -99,9 +99,17 @@ def test_a_silent_picture_does_not_delay_the_flight() -> None:
 
 
 @pytest.mark.parametrize(("program", "why"), [(FAILS, "no such screen"), (DIES, "ended without a message")])
-def test_a_picture_that_cannot_come_up_is_an_error_before_the_flight(program: str, why: str) -> None:
+def test_a_picture_that_cannot_come_up_is_an_error_before_the_flight_and_is_ended(
+    program: str, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+    start = subprocess.Popen
+    monkeypatch.setattr(
+        feed.subprocess, "Popen", lambda *what, **how: started.append(start(*what, **how)) or started[-1]
+    )
     with pytest.raises(LabError, match=why):
-        LiveView(picture(program), [].append)
+        LiveView(picture(program), [].append, 5.0)
+    assert [one.returncode is None for one in started] == [False]
 
 
 def test_a_picture_reports_its_address_and_typed_lines() -> None:
