@@ -60,8 +60,6 @@ SCRIPTS = {
         report runs/pushed
         export runs/hover-1 --csv --mcap --tlog
         import runs/hover-1/flight.csv --out runs/imported
-        import runs/hover-1/flight.mcap --out runs/of-topics
-        import runs/hover-1/flight.csv runs/cut/link.tlog
         fly hover --robots 2 --duration 0.6 --out runs/swarm
         fly hover --seeds 3 --duration 0.6 --workers 1 --out runs/seeds
         fly take-off-landing --duration 2 --out runs/take-off
@@ -128,7 +126,7 @@ SCRIPTS = {
         import cfclient.csv --out cfclient
         import "units in brackets.csv" --out brackets
         import "neither, by size.csv" --out sizes
-        import "measured beside estimated.csv" "a quaternion.csv" --out joined
+        import "measured beside estimated.csv" "a quaternion.csv"
         import log00 --out card
         import bag.mcap --out bag
         report bag
@@ -312,8 +310,13 @@ def programs() -> Iterator[str]:
         yield f"{name}: {'; '.join(line.partition(': ')[2] for line in answers.lines)}; path {path}"
 
 
-PYTHON = {"reference": reference, "learned": learned, "live": live, "programs": programs}
-PYTHON |= {"translated": translated}
+PYTHON = {
+    "reference": reference,
+    "learned": learned,
+    "live": live,
+    "programs": programs,
+    "translated": translated,
+}
 
 
 def plain(text: str, place: str) -> str:
