@@ -179,7 +179,7 @@ VOLATILE = (
     (re.compile(r'("commit": ")[^"]*'), r"\1C"),
     (re.compile(r"\bcommit( \| | )(?:none|unknown|[0-9a-f]{7,}\+?|(?=,|$))"), r"commit\1C"),
     (re.compile(r"\"versions\": \{.*?\}"), "versions V"),
-    (re.compile(r"RecordingInfo:start_time: 1 \S+"), "RecordingInfo:start_time: T"),
+    (re.compile(r"RecordingInfo:start_time: (1 )?\S+"), "RecordingInfo:start_time: T"),
     (re.compile(r"(versions:|versions \|) .*"), "versions V"),
     (re.compile(r"python \d\S*, floaty-hil .*"), "versions V"),
     (re.compile(r"(real_time_factor|speed) [\d.e+-]+"), "speed S"),
