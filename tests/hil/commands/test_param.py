@@ -44,9 +44,10 @@ def test_a_board_is_asked_over_its_link_with_the_profile_s_settings_and_refuses_
 ) -> None:
     opened: list[Any] = []
     link = SimpleNamespace(open=opened.append, close=lambda: opened.append("closed"))
-    monkeypatch.setattr("ground_station.links.schemes.find_link", lambda *what: opened.append(what) or link)
     answers = iter([SimpleNamespace(error="", values=[("a", 1.0)]), SimpleNamespace(error="no b")])
+    # first: the program, which is loaded here, keeps the function that finds links
     monkeypatch.setattr("ground_station.program.ask", lambda link, request: next(answers))
+    monkeypatch.setattr("ground_station.links.schemes.find_link", lambda *what: opened.append(what) or link)
     change = "serial.baud=57600"
     assert cli.refusal("param", "get", "a", "b", *LINK, "--set", change) == "floaty: no b\n"
     (uri, settings), stopped, closed = opened
