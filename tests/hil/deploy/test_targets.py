@@ -2,6 +2,7 @@
 
 from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -73,3 +74,15 @@ def test_c_is_built_with_the_optimisation_that_its_target_names(monkeypatch: pyt
     assert {name: one.keywords["library"].name for name, one in factories.items() if name != "plain"} == {  # type: ignore[attr-defined]
         "c-O0": "-O0", "c-O2": "-O2"}  # fmt: skip
     assert (factories["plain"], box.machine_code) == (PlainRunner, None)
+
+
+@pytest.mark.parametrize(("elf", "flash"), [(None, 5), (Path("cf2.elf"), None)])
+def test_a_core_that_is_part_of_a_firmware_has_no_flash_of_its_own(
+    monkeypatch: pytest.MonkeyPatch, elf: Path | None, flash: int | None
+) -> None:
+    monkeypatch.setattr(targets, "build_machine", lambda: Path("machine"))
+    monkeypatch.setattr(targets, "read_image", lambda elf, whole: SimpleNamespace(code=b"123"))
+    monkeypatch.setattr(targets, "build_image", lambda source, header: SimpleNamespace(code=b"12345"))
+    code = Toolbox((CORTEX_M4,), LogicConfig(), elf=elf).machine_code
+    assert code is not None
+    assert code.flash_bytes == flash

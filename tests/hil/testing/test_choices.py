@@ -88,6 +88,22 @@ def test_what_the_imu_is_fed_is_turned_by_45_degrees_and_ends_at_its_range() -> 
     assert board._board.imu[5] == -32768
 
 
+def test_samples_differ_by_a_count_to_either_side_until_the_imu_stops(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    board, seen = BareBoard(load_config()), list[Any]()
+    monkeypatch.setattr(board._board, "measure", seen.append)
+    board.run(ms=3)
+    board.imu_running = False
+    board.run(ms=3)
+    assert [np.subtract(one, board._fed)[2] for one in seen] in ([1, -1, 1], [-1, 1, -1])
+    assert all(np.delete(np.subtract(one, board._fed), 2).tolist() == [0] * 5 for one in seen)
+    with pytest.raises(
+        LabError, match=r"^log variable 'Estimate\.z': there is none; cfclient lists them all$"
+    ):
+        board.read("Estimate.z")
+
+
 def test_a_packet_that_is_hushed_is_not_repeated_beside_the_next_one() -> None:
     board = BareBoard(load_config())
     arrived: list[bytes] = []
