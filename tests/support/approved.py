@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
+from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -38,3 +39,23 @@ def approve(path: Path, finders: Mapping[str, Callable[[], Any]], *packages: str
     """Write what all finders find, under their names."""
     content = {"versions": versions(*packages)} | {name: find() for name, find in finders.items()}
     path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+class Log:
+    """What happened, by kind; `told` has of each kind the count, a hash of all and the last one."""
+
+    def __init__(self) -> None:
+        self._rows: dict[str, list[str]] = {}
+
+    def note(self, kind: str, *what: object) -> None:
+        """Note what happened."""
+        self._rows.setdefault(kind, []).append(" ".join(map(str, what)))
+
+    def told(self) -> dict[str, str]:
+        """Return a line for each kind."""
+        hashes = {
+            kind: sha256("\n".join(rows).encode()).hexdigest()[:12] for kind, rows in self._rows.items()
+        }
+        return {
+            kind: f"{len(rows)} {hashes[kind]} {rows[-1][:100]}" for kind, rows in sorted(self._rows.items())
+        }

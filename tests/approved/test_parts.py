@@ -1,0 +1,291 @@
+"""The parts of a Crazyflie around its microcontroller answer random use as they did, at the same instants.
+
+The radio chip with its boot loader, its end of the serial line, the decks' sensors and memories, the barometer. If a
+change is meant: make approve.
+"""
+
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("unicorn")
+pytest.importorskip("cffi")
+
+from hil.emulator.crazyflie import syslink
+from hil.emulator.crazyflie.barometer import CONFIG, Barometer
+from hil.emulator.crazyflie.config import RadioConfig
+from hil.emulator.crazyflie.nrf51 import BROADCAST, RATES, AirSettings, Band, Nrf51, Power, peer_packet
+from hil.emulator.crazyflie.radio_line import RadioLine
+from hil.emulator.crazyflie.shockburst import Air
+from hil.emulator.events import EventQueue
+from support.approved import Log, approve, judge
+from support.deck_bench import DeckBench
+
+USES = Path(__file__).with_name("parts.json")
+SEEDS = range(1, 4)
+HOME = bytes.fromhex("E7E7E7E7E7")
+SYSLINK = (
+    *(getattr(syslink, name) for name in dir(syslink) if isinstance(getattr(syslink, name), int)),
+    0x41,
+)
+
+
+class Random:
+    """Random use of one part, and what was seen of it."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng, self.log = np.random.default_rng(seed), Log()
+
+    def pick(self, *of: Any) -> Any:
+        return of[int(self.rng.integers(len(of)))]
+
+    def below(self, bound: int) -> int:
+        return int(self.rng.integers(bound))
+
+    def data(self, *sizes: int) -> bytes:
+        return self.rng.bytes(self.pick(*sizes))
+
+
+class RadioChip(Random):
+    """The radio chip on the air, at power-on and off, and in its boot loader; it is its own processor."""
+
+    battery_V = 3.75
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self.events = EventQueue()
+        air = Air.of(RadioConfig(uplink_loss=0.3, uplink_bit_error_rate=1e-3))
+        self.air = Band(
+            self.events, lambda: float(self.rng.random()), lambda *to: self.log.note("peers", *to)
+        )
+        settings = AirSettings(80, 2_000_000, HOME)
+        self.chip = Nrf51(settings, bytes.fromhex("0110A7F10AC0"), 3, self.air, self, air)
+
+    def __getattr__(self, name: str) -> Any:
+        """Note what reaches the processor."""
+        if name not in ("start", "stop", "greet", "received", "polled", "retuned"):
+            raise AttributeError(name)
+        return lambda *of: self.log.note(f"processor {name}", *of)
+
+    def packet(self) -> bytes:
+        """Return a packet that the chip, its boot loader, the processor or nobody understands."""
+        null = 0xF3 | self.below(4) << 2
+        place = struct.pack("<HH", self.pick(0, 0, 9, 20, 1023), self.pick(0, 25, 1000, 1023))
+        return self.pick(
+            bytes((null,)), bytes((self.below(256),)), bytes((null, 5, self.below(2))), bytes((null, 5)),
+            bytes((self.below(16) << 4 | self.below(16),)) + self.data(0, 1, 5, 30),
+            bytes((null, 0xFE, self.pick(1, 2, 3, 4, 0xF0, 0xFF, 0xFF, 9))) + self.pick(b"", b"\0", b"\1", b"\2ab"),
+            bytes((0xFF, 0xFE, self.pick(2, 3, 3, 0xFF)),), bytes((0xFF, 0xFE, 0xF0, self.below(2))),
+            bytes((0xFF, 0xFE, 0xF0)) + self.pick(b"", b"\0"), bytes((null, 0xFE)),
+            bytes((null, 3, self.pick(1, 1, 2, 2, 3), self.pick(0, 1, 2, 3, 80, 125, 126))), bytes((null, 3, 1)),
+            bytes((null, 0x80 | self.below(16))) + self.data(0, 1, 9), bytes((null, self.below(256), 7, 7)),
+            bytes((0xFF, self.pick(0xFE, 0xFF), self.pick(0x10, 0x12))),
+            bytes((0xFF, self.pick(0xFE, 0xFF), self.pick(0x14, 0x1C))) + place + self.data(0, 25),
+            bytes((0xFF, self.pick(0xFE, 0xFF), 0x18))
+            + struct.pack("<HHH", self.pick(0, 0, 1, 9), self.pick(15, 16, 87, 88, 90, 231, 1023), self.pick(1, 1, 2, 10)),
+            bytes((0xFF, self.pick(0xFE, 0xFF), self.pick(0x14, 0x18, 0x1C, 0x20))) + self.data(0, 2),
+        )  # fmt: skip
+
+    def settings(self) -> AirSettings:
+        own = self.chip.settings
+        wrong = AirSettings(own.channel, self.pick(*RATES), self.pick(own.address, BROADCAST))
+        return self.pick(AirSettings(own.channel, own.bits_per_second, BROADCAST), wrong)
+
+    def use(self) -> None:
+        """Do one thing."""
+        chip, now_us, log = self.chip, self.events.now_us, self.log
+        what = self.pick(
+            "hear", "hear", "hear", "hear", "send", "overhear", "peer", "command", "power", "written"
+        )
+        if what == "hear":
+            packet = self.packet()
+            log.note(what, packet.hex(), chip.hear(now_us, packet).hex())
+        elif what == "send":
+            log.note(what, chip.send(now_us, self.data(1, 5, 31)))
+        elif what == "overhear":
+            chip.overhear(now_us, self.packet())
+        elif what == "peer":
+            chip.hear_peer(now_us, self.settings(), self.pick(peer_packet(self.data(1, 20)), self.packet()))
+        elif what == "command":
+            data = self.pick(b"", bytes((self.pick(0, 1, 2, 3, 90),)), self.data(5), self.data(1, 2, 20))
+            chip.command(now_us, self.pick(1, 1, 2, 2, 5, 5, 0x0A, 0x0A, 7, 0x11, 0x1A), data)
+        elif what == "power":
+            act: Callable[..., object] = self.pick(chip.press_button, chip.press_button, chip.power_cycle)
+            act(now_us)
+            if self.pick(True, False):
+                chip.tune(AirSettings(80, 2_000_000, HOME))
+        else:
+            loader = chip.bootloader
+            log.note(what, hash_of(loader.take_written()), loader.malformed, hash_of(loader.nrf51.flash))
+
+    def told(self) -> dict[str, str]:
+        chip, booting = self.chip, AirSettings(0, 2_000_000, bytes.fromhex("B1F1A71001"))
+        for _ in range(900):
+            self.use()
+            if chip.power is Power.OFF and self.pick(True, False, False):
+                chip.press_button(self.events.now_us)
+            self.events.run(self.events.now_us + self.pick(0, 10, 300, 1_500, 20_000, 101_000))
+            hears = [chip.hears(booting), chip.hears(chip.settings), chip.hears_all(self.settings())]
+            self.log.note("state", self.events.now_us, chip.power, chip.settings, hears, chip.heard_us)
+        return self.log.told()
+
+
+def hash_of(data: bytes | bytearray) -> int:
+    """Return a number that differs with the contents."""
+    return int(np.frombuffer(bytes(data), np.uint8).astype(np.int64) @ (np.arange(len(data)) % 9973 + 1))
+
+
+class Line(Random):
+    """The radio chip's end of the line, with the decks' memories; it is its own chip, processor and surroundings."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self.events, self.full, self.bytes = EventQueue(), False, b""
+        decks, processor = DeckBench("flow2", "multiranger").decks, SimpleNamespace(every=self.every)
+        self.line = RadioLine(self, processor, decks, self, polls=True)  # type: ignore[arg-type]
+
+    def every(self, period_us: int, do: Callable[[int], object]) -> None:
+        self.events.every(period_us, period_us, do)
+
+    @property
+    def now_us(self) -> int:
+        return self.events.now_us
+
+    def feed(self, usart: int, data: bytes) -> None:
+        self.log.note(f"fed {data[2]:02x}", self.now_us, usart, data.hex())
+
+    def sent(self, usart: int) -> bytes:
+        data, self.bytes = self.bytes, b""
+        return data
+
+    def pin(self, port: str, number: int, high: bool) -> None:
+        self.log.note("pin", self.now_us, port, number, high)
+
+    def read_battery_mv(self) -> int:
+        return 3_000 + self.below(1_200)
+
+    def radio_send(self, data: bytes) -> bool:
+        self.log.note("radio", self.now_us, not self.full, data.hex())
+        return not self.full
+
+    def radio_command(self, kind: int, data: bytes) -> None:
+        self.log.note("command", self.now_us, kind, data.hex())
+
+    def debug_write(self, text: str) -> None:
+        self.log.note("console", self.now_us, repr(text))
+
+    def frame(self) -> bytes:
+        """Return what the processor may say."""
+        kind = self.pick(*SYSLINK, *(8 * (syslink.RAW,)))
+        if syslink.SCAN_MEMORIES <= kind <= syslink.WRITE_MEMORY:
+            at = self.pick(0, 8, 100, 109, 111, 200)
+            data = struct.pack("<BH", self.below(3), at)
+            size = self.pick(1, 3, 11)
+            written = struct.pack("<H", size) + self.data(size)
+            data += written if kind == syslink.WRITE_MEMORY else bytes(self.pick(0, 9, 29))
+        else:
+            text = self.pick(b"a\n", b"lines\nof\xff\n", b"half", b"")
+            data = self.pick(b"\0" + text, b"\x0c" + text, b"\x10abc", b"", self.data(1, 5))
+        return syslink.encode(kind, data)
+
+    def told(self) -> dict[str, str]:
+        for _ in range(500):
+            for _ in range(self.below(3)):
+                frame = self.frame()
+                wrong = frame[: self.below(len(frame))] + self.data(1)
+                self.bytes += self.pick(frame, frame, frame, frame, wrong, b"\xbc")
+            cut = self.below(len(self.bytes) + 1)
+            self.bytes, rest = self.bytes[:cut], self.bytes[cut:]
+            self.line.sent()
+            self.bytes += rest
+            self.full = self.pick(True, False, False)
+            if self.below(3) == 0:
+                peer = peer_packet(self.data(1, 20))
+                self.line.received(self.pick(self.data(1, 20), peer, syslink.EMPTY), self.pick(True, False))
+            if self.below(100) == 0:
+                self.line.reset(self.now_us)
+            self.events.run(self.now_us + self.pick(0, 500, 1_999, 2_000, 12_000, 30_000))
+        return self.log.told()
+
+
+class DeckUser(Random):
+    """Registers of both decks' sensors, of a body that moves."""
+
+    RANGER_WRITES: Sequence[tuple[int, Callable[["DeckUser"], bytes]]] = (
+        (0x5E, lambda own: bytes((own.below(2), 0x20 + own.below(96), own.pick(7, 11, 15, 3)))),
+        (0x61, lambda own: bytes((own.below(2), 0x20 + own.below(96), own.pick(7, 11, 15)))),
+        (0x6C, lambda own: own.pick(0, 600 * 30, 600 * 60).to_bytes(4)),
+        (0x30, lambda own: bytes((own.pick(0x00, 0x10), own.below(2)))),
+        (0x86, lambda own: bytes((own.below(2), own.pick(0x40, 0x40, 0x10, 0x20, 0x80, 0x00, 0xC0)))),
+        (0x87, lambda own: bytes((own.pick(0x40, 0x10),))),
+    )
+
+    def told(self) -> dict[str, str]:
+        bench = DeckBench("flow2", "multiranger")
+        bench.write(0x20, b"\3\0")
+        for number in range(500):
+            address = self.pick(0x29, 0x29, 0x35, 0x36)
+            what = self.pick(
+                "move", "expander", "address", "write", "write", "write", "read", "read", "read", "flow"
+            )
+            if what == "move":
+                angles, place = self.rng.normal(0, 0.3, 4), self.rng.uniform(-1, 1, 3)
+                quaternion = np.array((1.0, *angles[:3])) / np.sqrt(1.0 + angles[:3] @ angles[:3])
+                bench.place((*place[:2], 1.2 * abs(place[2]) - 0.05), tuple(quaternion.tolist()))
+            elif what == "expander":
+                bench.write(0x20, bytes((self.pick(1, 1, 3), self.pick(0x01, 0x10, 0x57, 0x00, 0xA8))))
+                self.log.note(what, bench.read(0x20, b"\1", 1).hex(), bench.read(0x20, b"\3", 1).hex())
+            elif what == "flow":
+                register = self.pick(0x00, 0x02, 0x16, 0x16, 0x5F)
+                received = bench.transfer(
+                    self.pick(bytes((register, *(12 * (0,)))), b"\xba\x5a", b"\xba\0", b"\xc0\7")
+                )
+                self.log.note(what, register, bench.us, received.hex())
+            elif bench.answers(address):
+                bench.stop()
+                if what == "address":
+                    bench.write(address, bytes((0, 1, self.pick(0x29, 0x35, 0x36))))
+                elif what == "write":
+                    register, contents = self.pick(*self.RANGER_WRITES)
+                    bench.write(address, register.to_bytes(2) + contents(self))
+                else:
+                    register, size = self.pick((0x88, 20), (0x31, 1), (0xDE, 8), (0x10F, 3), (0x01, 6))
+                    received = bench.read(address, register.to_bytes(2), size)
+                    self.log.note(f"ranger {address:02x}", number, register, received.hex())
+            bench.wait(self.pick(0, 1_000, 8_264, 40_000))
+        return self.log.told()
+
+
+class Weather(Random):
+    """A barometer that rises and falls, with each of its filters."""
+
+    def told(self) -> dict[str, str]:
+        registers = np.zeros(256, np.uint8)
+        barometer = Barometer(registers)
+        for _ in range(300):
+            if self.below(5) == 0:
+                registers[CONFIG] = self.below(256)
+            barometer.measure(self.below(2_000) * 1e-3, self.below(2_000) * 1e-3 - 1.0)
+            self.log.note("registers", registers[:10].tobytes().hex())
+        return self.log.told()
+
+
+FOUND: dict[str, Callable[[], dict[str, str]]] = {
+    f"{kind.__name__} {seed}": lambda kind=kind, seed=seed: kind(seed).told()  # type: ignore[misc]
+    for kind in (RadioChip, Line, DeckUser, Weather)
+    for seed in SEEDS
+}
+
+
+@pytest.mark.parametrize("name", FOUND)
+def test_a_part_answers_random_use_as_it_did(name: str) -> None:
+    judge(USES, name, FOUND[name]())
+
+
+if __name__ == "__main__":
+    approve(USES, FOUND)
