@@ -1,12 +1,16 @@
 """What the emulator said of the tests' firmware, it still says: its reports, its counts and its answers to a debugger.
 
-Crashes of every kind, where the cycles went, and a debugger's random questions. If a change is meant: make approve.
+Crashes of every kind, where the cycles went, a debugger's random questions, what the debugging information knows, and
+what the time line and the kernel's structures hold after random use. If a change is meant: make approve.
 """
 
 import dataclasses
 import hashlib
+import struct
 from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
+from types import SimpleNamespace as Made
 from typing import Any
 
 import numpy as np
@@ -15,7 +19,10 @@ import pytest
 pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
-from hil.emulator.stm32f405.chip import RAM, StopReason
+from hil.emulator.stm32f405 import crash as crashes
+from hil.emulator.stm32f405.chip import CYCLES_PER_US, RAM, SOFTWARE, WATCHDOG, Chip, StopReason
+from hil.emulator.stm32f405.coverage import ImageLines
+from hil.emulator.stm32f405.freertos import FreeRtos, Wait
 from hil.emulator.stm32f405.gdb_protocol import (
     REGISTERS,
     SIGINT,
@@ -24,14 +31,23 @@ from hil.emulator.stm32f405.gdb_protocol import (
     ResumeRequest,
     framed,
 )
-from support.approved import approve, judge
+from hil.emulator.stm32f405.image import Image
+from hil.emulator.stm32f405.literals import literals
+from hil.emulator.stm32f405.processor import ChipProcessor
+from hil.emulator.stm32f405.stopped_tasks import LOOKS, PERIODS, SETTLED_US, TaskWatch
+from hil.emulator.stm32f405.unnamed_freertos import UnnamedFreeRtos
+from hil.errors import LabError
+from support.approved import Log, approve, judge
 from support.crazyflie_board import Board
+from support.stm32_firmware import build
 from support.stm32_machine import FirmwareOnChip, Profiled
 
 REPORTS = Path(__file__).with_name("emulator.json")
 MISTAKES = range(21)  # `enum planted` of the tests' firmware
 HANG = 9  # ends by the watchdog
 PACKETS, SEEDS = 150, range(1, 4)
+USUAL = ("-g", "-DUSUAL_PLACES", "-fno-strict-aliasing")  # what is found without symbols
+MADE_WITH = ("ziglang", "pyelftools")
 
 
 def crash(planted: int) -> list[str]:
@@ -50,6 +66,16 @@ def profile() -> list[str]:
     return list(told(Profiled("clang").run_with_samples(200_000), "profile"))
 
 
+def profiles() -> dict[str, str]:
+    """Return hashes of where the cycles went of code without inlining: in peace, with resets, in a scenario."""
+    log = Log()
+    for planted, scenario, end_us in ((0, 0, 60_000), (3, 0, 30_000), (0, 2, 5_000), (0, 3, 5_000)):
+        firmware = Profiled("clang", flags=("-g", "-fno-inline"), planted=planted, scenario=scenario)
+        for line in told(firmware.run_with_samples(end_us), "profile"):
+            log.note(f"{planted} {scenario} {line.split('.')[1].split('[')[0].split(':')[0]}", line)
+    return log.told()
+
+
 def told(value: Any, name: str) -> Iterator[str]:
     """Yield the members of nested records, a line for each number or text; arrays by count, first, last and sum."""
     if dataclasses.is_dataclass(value):
@@ -64,20 +90,31 @@ def told(value: Any, name: str) -> Iterator[str]:
         yield f"{name}: {value:.6g}" if isinstance(value, float) else f"{name}: {value}"
 
 
+def picking(seed: int) -> tuple[np.random.Generator, Callable[..., Any]]:
+    """Return random numbers, and what picks one of its arguments."""
+    rng = np.random.default_rng(seed)
+    return rng, lambda *of: of[int(rng.integers(len(of)))]
+
+
 def debugger(seed: int) -> list[str]:
-    """Return what random packets of a debugger are answered, between short runs."""
-    rng, firmware = np.random.default_rng(seed), FirmwareOnChip()
-    protocol = RemoteProtocol(firmware.chip)
-    pick: Callable[..., Any] = lambda *of: of[int(rng.integers(len(of)))]  # noqa: E731
+    """Return what random packets of a debugger are answered, between short runs; the last one knows the tasks."""
+    (rng, pick), firmware = picking(seed), FirmwareOnChip()
+    knows = seed == SEEDS[-1]
+    kernel = FreeRtos(firmware.image, firmware.chip.read) if knows else None
+    protocol, threads = RemoteProtocol(firmware.chip, kernel, knows), (1, 2, 3)
     found = []
-    for _ in range(PACKETS):
+    for number in range(PACKETS):
+        if knows and number == 10:
+            firmware.run(3_000)
+            threads = tuple(one.block for one in kernel.tasks())  # type: ignore[union-attr]
         at, register = RAM + 4 * int(rng.integers(0, 64)), int(rng.integers(len(REGISTERS) + 1))
         length = pick(0, 1, 2, 4, 16)
         packet = pick(
             "?", "g", f"p{register:x}", f"m{at:x},{length:x}", f"m{at:x},{length:x}", f"M{at:x},4:{rng.bytes(4).hex()}",
             f"Z{pick(0, 1, 2, 3, 4)},{at:x},{pick(1, 2, 4)}", f"z{pick(0, 1, 2, 3, 4)},{at:x},{pick(1, 2, 4)}",
-            "qfThreadInfo", f"qThreadExtraInfo,{pick(1, 2, 3):x}",
-            f"H{pick('g', 'c')}{pick(-1, 0, 1, 2)}", f"T{pick(1, 2, 9)}",
+            "qfThreadInfo", f"qThreadExtraInfo,{pick(*threads):x}", f"Hg{pick(*threads):x}", f"Hg{pick(*threads):x}",
+            f"H{pick('g', 'c')}{pick(-1, 0, 1, 2)}", f"T{pick(9, *threads):x}", pick("bc", "vCont;s", "C05", "S05"),
+            f"qXfer:features:read:target.xml:{pick(0, 100, 9000):x},{pick(10, 9000):x}",
             "qC", "qSupported", "vCont?", "qAttached", f"P{pick(0, 1, 5):x}={rng.bytes(4).hex()}", "D", "bs", "c", "s",
             "qRcmd,666f6f",
         )  # fmt: skip
@@ -89,20 +126,286 @@ def debugger(seed: int) -> list[str]:
         text = answer.decode("latin-1")
         found.append(f"{packet} -> {text if len(text) < 90 else hashlib.sha256(answer).hexdigest()[:12]}")
     found.append(f"{sorted(firmware.chip.breakpoints)} {protocol.take_changes()} {protocol.take_changes()}")
+    return [*found, str(protocol.stored())]
+
+
+def known(flags: tuple[str, ...]) -> dict[str, str]:
+    """Return what an image's names and debugging information say of every address, name and line."""
+    image, log = Image(build(flags=flags)), Log()
+    for address in range(image.base, image.base + len(image.code), 2):
+        log.note("lines", image.place(address), image.variable_at(address))
+        log.note("frames", image.debug.frames._rules_at(address))
+    for line, name in product(range(1, 700, 3), ("firmware.c", "exceptions.c", "measured.c", "other.c")):
+        log.note("addresses", image.debug.address_of(f"{name}:{line}"))
+    for row in image.debug.rows:
+        log.note("rows", Path(row.path).name, row.begin, row.end, row.line, row.is_statement)
+    functions = [one.address for one in image.functions]
+    for at, name in product(
+        functions[::9], ("tskTaskControlBlock", "xLIST", "QueueDefinition", "SNAPSHOT_DATA", "none")
+    ):
+        try:
+            log.note("structures", image.debug.structure(name, at))
+        except LabError as error:
+            log.note("structures", str(error).partition(": ")[2])
+    for name in ("tasks", "bus_guard", "box", "stacks", "queue", "line"):
+        try:
+            log.note("variables", image.debug.variable(name, functions[0]))
+        except LabError as error:
+            log.note("variables", str(error).partition(": ")[2])
+    log.note(
+        "image", image.base, image.memory, sorted(image.constants), image.initial_stack_pointer, image.reset
+    )
+    log.note("literals", sorted(literals(image.code)))
+    return log.told()
+
+
+def covered() -> dict[str, str]:
+    """Return which lines, functions and branches ran, across a reset, and counted on after a second request."""
+    firmware, log = FirmwareOnChip(planted=3), Log()
+    lines = ImageLines(firmware.image)
+    for end_us in (20_000, 30_000, 40_000):
+        firmware.chip.record()
+        while firmware.chip.now_us < end_us:
+            if firmware.run(end_us) & StopReason.RESET:
+                firmware.chip.reset(SOFTWARE)
+        for file in lines.coverage(firmware.chip.passages):
+            log.note(
+                Path(file.path).name,
+                end_us,
+                file.lines_run,
+                sorted(file.lines.items()),
+                file.functions,
+                file.branches,
+            )
+    return log.told()
+
+
+def kernel(seed: int) -> dict[str, str]:
+    """Return what the kernel's structures say while they are moved at random, with names and without."""
+    (rng, pick), log = picking(seed), Log()
+    firmware = FirmwareOnChip(flags=USUAL)
+    image, chip = firmware.image, firmware.chip
+    named, unnamed = FreeRtos(image, chip.read), UnnamedFreeRtos.of(image, chip.read)
+    assert unnamed is not None
+    log.note("before", named.running, named.current_block, unnamed.running, unnamed.places, unnamed.tasks())
+    place = {name: image.symbol(name).address for name in ("tasks", "bus_guard", "xSuspendedTaskList")}
+    while chip.now_us < 30_000 + 500 * seed:
+        firmware.run(30_000 + 500 * seed)
+    queue, task = named._queue, named._task
+    assert queue is not None
+    lists = [place["bus_guard"] + queue[f"xTasksWaitingTo{what}"].offset for what in ("Receive", "Send")]
+    for _ in range(60):
+        for kernel in (named, unnamed):
+            try:
+                views = kernel.tasks()
+            except LabError as error:
+                views = [str(error)]
+            log.note(type(kernel).__name__, kernel.running, kernel.places, kernel.heap_bytes, *views)
+        for number in range(6):
+            block = place["tasks"] + task.size * number
+            log.note("waits", number, waits(named, block))
+            if block != named.current_block:
+                log.note("registers", number, saved(named, block))
+        block = place["tasks"] + task.size * int(rng.integers(6))
+        lie = image.symbol(pick("xSuspendedTaskList", "xSuspendedTaskList", "pxReadyTasksLists", "xDelayedTaskList1",
+                                "xTasksWaitingTermination")).address  # fmt: skip
+        words = pick(
+            [(block + task["xStateListItem.pxContainer"].offset, pick(lie, lie, lie, 0))],
+            [(block + task["xEventListItem.pxContainer"].offset, pick(0, *lists, *lists, lie))],
+            [(block + task["uxBasePriority"].offset, pick(0, 1, 3))],
+            [(place["bus_guard"] + queue[name].offset, pick(0, 0, 1, 1, 1, block, 70_000)) for name in (
+                "uxItemSize", "uxLength", "uxMessagesWaiting", "pcHead", "u.xSemaphore.xMutexHolder")],
+            [(block + task["xStateListItem.xItemValue"].offset, pick(0, 7, 3_600_000, 0x7FFF_FFFF))],
+            [(block + task["ucNotifyState"].offset, pick(0, 1, 2))],
+        )  # fmt: skip
+        for at, word in words:
+            chip.write(at, struct.pack("<I", word))
+    return log.told()
+
+
+def waits(kernel: FreeRtos, block: int) -> Wait | str | None:
+    try:
+        return kernel.endless_wait(block)
+    except LabError as error:
+        return str(error)
+
+
+def saved(kernel: FreeRtos, block: int) -> object:
+    """Return the registers of a task: as they are, and as if its frame had a padding or floats."""
+    found = []
+    try:
+        place = kernel._word(block + kernel._task["pxTopOfStack"].offset)
+        found.append(sorted(kernel.saved_registers(block).items()))
+    except LabError as error:
+        return str(error)
+    for exc_return, status in product((0xFFFF_FFED, 0xFFFF_FFFD), (0, 1 << 9)):
+        frame = struct.pack("<9I", *range(8), exc_return).ljust(
+            36 + (0 if exc_return & 16 else 64) + 28, b"\7"
+        )
+        memory = frame + struct.pack("<I", status)
+        own = Made(_word=lambda at: place, _task=kernel._task)
+        own._read = lambda at, size, memory=memory: memory[at - place :][:size]
+        found.append(sorted(FreeRtos.saved_registers(own, block).items()))  # type: ignore[arg-type]
     return found
 
 
-FOUND: dict[str, Callable[[], list[str]]] = {
+def time_line(seed: int) -> dict[str, str]:
+    """Return where a chip's time went that runs in random portions, with resets, an outside load and a trace."""
+    (_, pick), firmware, log = picking(seed), FirmwareOnChip(flags=USUAL), Log()
+    chip, read = firmware.chip, firmware.chip.read
+    own = (FreeRtos if seed % 2 else UnnamedFreeRtos).of(firmware.image, read)
+
+    def act(why: int) -> None:
+        log.note("acts", StopReason(why) if why in list(StopReason) else why, chip.now_us, processor.now_us)
+        if pick(True, False, False):
+            processor.stop_before(processor.now_us + pick(0, 1, 100))
+
+    processor = ChipProcessor(chip, own, act, chip.run)
+    processor.every(pick(700, 1_300), lambda now_us: log.note("every", now_us, processor.now_us))
+    now_us = 0
+    for number in range(80):
+        what = pick(
+            "run", "run", "run", "run", "until", "later", "stop", "trace", "reset", "sample", "sample"
+        )
+        now_us += pick(0, 1, 333, 1_000, 2_500)
+        if what == "until":
+            processor.run(now_us - 100, now_us)
+        elif what == "later":
+            processor.later(pick(0, 10, 3_000), lambda us: log.note("later", us, processor.now_us))
+        elif what == "stop":
+            processor.later(pick(1, 50), lambda us: processor.stop_before(us - processor.ahead_us + 30))
+        elif what == "trace":
+            processor.set_trace(pick(None, lambda *of: log.note("trace", *of)))
+        elif what == "reset":
+            chip.reset(pick(SOFTWARE, WATCHDOG))
+        elif what == "sample":
+            chip.pin("C", 14, True)
+            chip.pin("C", 14, False)
+        if number == 20:
+            processor.begin(now_us)
+            now_us = 0
+        if number == 40:
+            processor.occupy("load", lambda: pick(0, 100, 400))
+        processor.run(now_us)
+        processor.find_kernel()
+        busy = processor.longest_busy(pick(0, 500, 5_000))
+        log.note("times", processor.now_us, processor.run_times_us(), processor.activations(), busy)
+        log.note("tasks", processor.current, processor.task_names, processor.tasks)
+    return log.told()
+
+
+def watch(seed: int) -> dict[str, str]:
+    """Return which of some tasks are reported as stopped, that run regularly, rarely, or no longer."""
+    (_, pick), log = picking(seed), Log()
+    tasks = [Made(block=0x100 * number, times=0, ran=0) for number in range(1, 5)]
+    chip = Made(now_us=0, state=Made(task=tasks, task_count=3, running=0))
+    reasons: dict[int, Wait | None] = {}
+    stopped = TaskWatch(chip, Made(endless_wait=reasons.get))  # type: ignore[arg-type]
+    chip.now_us, period_us, alive = SETTLED_US - 500_000, 100_000, {1, 2, 3, 4}
+    for _ in range(600):
+        chip.now_us += period_us
+        for number, task in enumerate(tasks, 1):
+            if number in alive and pick(True, number < 4):
+                task.times += pick(1, 1, number)
+                task.ran = (chip.now_us - pick(0, 0, 50_000)) * CYCLES_PER_US
+        if pick(*(8 * [False]), True):
+            alive ^= {pick(1, 2, 3, 4)}
+        if pick(*(20 * [False]), True):
+            reasons[0x100 * pick(1, 2, 3, 4)] = pick(None, Wait("a"), Wait("b"), Wait("c", for_messages=True))
+        chip.state.task_count, chip.state.running = pick(3, 4, 4, 4), pick(0, 0, 1)
+        log.note("stopped", chip.now_us, *stopped.newly_stopped())
+        if pick(*(150 * [False]), True):
+            stopped.restart()
+    assert LOOKS == PERIODS == 10
+    return log.told()
+
+
+def reasons() -> dict[str, str]:
+    """Return the words for each bit of the fault status registers, alone and with the next."""
+    log = Log()
+    for status, hard in product(
+        [0, *(1 << n | 1 << m for n in range(26) for m in (n, n + 1))], (0, 2, 1 << 30, 3 << 30)
+    ):
+        words = {crashes.CFSR: status, crashes.HFSR: hard, crashes.MMFAR: 0x1234, crashes.BFAR: 0x5678}
+        chip: Any = Made(read=lambda at, size, words=words: struct.pack("<I", words[at]))
+        log.note("reasons", crashes.fault_reasons(chip))
+    for trace in ((), ("a",), ("a", "a", "b"), ("a", "b", "b", "b", "a")):
+        log.note("crash", crashes.Crash("what", "who", trace))
+    return log.told()
+
+
+def memory(seed: int) -> dict[str, str]:
+    """Return what a chip holds after random writes, runs and returns to what was saved."""
+    (rng, pick), firmware, log = picking(seed), FirmwareOnChip(), Log()
+    chip: Chip = firmware.chip
+    chip.add_device(2, 0x51, np.zeros(16, np.uint8))
+    chip.record()
+    if seed == 2:
+        chip.empty_flash_cache()
+    kept = [chip.save()]
+    places = (0, 0x0800_4000, 0x0810_0000 - 8, 0x1000_0000, 0x1001_0000 - 4, RAM + 0x1F000, RAM + 0x2_0000 - 8,
+              0x1FFF_7800, 0x1FFF_7A10, 0x4000_0000, 0x4002_3800, 0x4007_FFFC, 0xE000_ED00, 0x3000_0000)  # fmt: skip
+    for _ in range(120):
+        at, size = pick(*places) + pick(0, 0, 1, 2, 4), pick(1, 2, 4, 4, 7, 16)
+        what = pick("read", "read", "write", "run", "step", "save", "restore", "register", "pin", "reset")
+        try:
+            if what == "read":
+                log.note(what, hex(at), chip.read(at, size).hex())
+            elif what == "write" and at >= 0x1000_0000:
+                chip.write(at & ~3, rng.bytes(4 * (size + 3 >> 2)))
+            elif what == "run":
+                log.note(what, int(firmware.run(int(chip.now_us) + pick(1, 300, 2_000))), chip.now_us)
+            elif what == "step":
+                log.note(what, chip.step(), chip.step(int(chip.state.now) + pick(0, 100)), chip.state.now)
+            elif what == "save":
+                kept = [*kept[-3:], chip.save()]
+            elif what == "restore":
+                chip.restore(pick(*kept))
+            elif what == "register":
+                name = pick(
+                    "r0", "sp", "lr", "pc", "xpsr", "msp", "psp", "s3", "d4", "basepri", "control", "fpscr"
+                )
+                log.note(what, name, chip.register(name))
+            elif what == "pin":
+                chip.pin("C", 14, pick(True, False))
+                log.note(what, chip.feed(6, rng.bytes(size)), chip.sent(6).hex(), chip.sent(1).hex())
+            elif what == "reset":
+                chip.reset(pick(SOFTWARE, WATCHDOG))
+        except LabError as error:
+            log.note("refused", what, error)
+        log.note(
+            "state",
+            chip.resets,
+            chip.state.now,
+            chip.register("pc"),
+            int(chip.passages.sum()),
+            chip.ram[::97].sum(),
+        )
+    log.note("cycles", chip.cycles_of_code().sum(), np.flatnonzero(chip.cycles_of_code())[:40])
+    return log.told()
+
+
+FOUND: dict[str, Callable[[], list[str] | dict[str, str]]] = {
     **{f"mistake {planted}": lambda planted=planted: crash(planted) for planted in MISTAKES},  # type: ignore[misc]
     **{f"debugger {seed}": lambda seed=seed: debugger(seed) for seed in SEEDS},  # type: ignore[misc]
     "profile": profile,
+    "known DWARF 5": lambda: known(("-g",)),
+    "known DWARF 4": lambda: known(("-gdwarf-4", "-fno-inline", "-ffunction-sections")),
+    "covered": covered,
+    "profiles": profiles,
+    "reasons": reasons,
+    **{
+        f"{use.__name__} {seed}": lambda use=use, seed=seed: use(seed)  # type: ignore[misc]
+        for use in (kernel, time_line, watch, memory)
+        for seed in SEEDS
+    },
 }
 
 
 @pytest.mark.parametrize("name", FOUND)
 def test_the_emulator_tells_what_it_told(name: str) -> None:
-    judge(REPORTS, name, FOUND[name](), "ziglang")
+    judge(REPORTS, name, FOUND[name](), *MADE_WITH)
 
 
 if __name__ == "__main__":
-    approve(REPORTS, FOUND, "ziglang")
+    approve(REPORTS, FOUND, *MADE_WITH)

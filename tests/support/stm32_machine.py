@@ -60,8 +60,8 @@ class FirmwareOnChip:
 class Profiled(FirmwareOnChip):
     """The tests' firmware, its cycles charged from power-on."""
 
-    def __init__(self, compiler: str, **variables: int) -> None:
-        super().__init__(compiler, **variables)
+    def __init__(self, compiler: str, flags: Sequence[str] = ("-g",), **variables: int) -> None:
+        super().__init__(compiler, flags, **variables)
         self.on_time_line = self.processor()
         self.chip.record()
         self.chip.profile([(one.address, one.address + one.size) for one in functions_of(self.image)])

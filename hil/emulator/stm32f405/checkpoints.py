@@ -91,7 +91,6 @@ class Checkpoints:
             self._thin_out(cycles)
             return None
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        self._ended.clear()
         while True:
             message = _awaited(theirs, self.life)
             pid = os.fork()

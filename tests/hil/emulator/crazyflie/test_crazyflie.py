@@ -11,7 +11,7 @@ pytest.importorskip("cffi")
 from hil.emulator.crazyflie import crazyflie
 from hil.emulator.stm32f405.chip import SOFTWARE, WATCHDOG
 from hil.emulator.stm32f405.stopped_tasks import SETTLED_US, StoppedTask
-from support.crazyflie_board import Board
+from support.crazyflie_board import Board, image
 
 (
     NOTHING, BUS_FAULT, UNDEFINED, ASSERTION, HUNGRY_WATCHDOG, NULL_CALL, NULL_READ, NULL_WRITE, DIVISION, HANG, OVERFLOW,
@@ -31,6 +31,8 @@ def test_a_fault_is_a_failure_once_and_what_kept_other_tasks_from_running_comes_
     planted: int, line: str
 ) -> None:
     board = Board(planted)
+    handler = image().symbol("Stuck_Handler").address
+    board.crazyflie.chip.write(handler, b"\xfe\xe7")  # b . : a loop of one instruction
     said = board.run(0, 60)
     assert [bool(re.fullmatch(pattern, text)) for pattern, text in zip((BUSY, line), said, strict=True)] == [
         True

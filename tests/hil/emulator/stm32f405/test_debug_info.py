@@ -4,10 +4,12 @@ import re
 from copy import deepcopy
 from io import BytesIO
 from pathlib import Path
+from types import SimpleNamespace as Made
 from typing import Any
 
 import pytest
 from elftools.dwarf.lineprogram import LineProgram
+from elftools.dwarf.ranges import BaseAddressEntry, RangeEntry
 from elftools.elf.elffile import ELFFile
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,7 +18,7 @@ pytest.importorskip("unicorn")
 pytest.importorskip("ziglang")
 
 from firmware_py.export.elf import Symbol
-from hil.emulator.stm32f405.debug_info import DebugInfo, _line_states
+from hil.emulator.stm32f405.debug_info import DebugInfo, _line_states, _ranges, _size
 from hil.emulator.stm32f405.image import Image, has_symbols
 from hil.errors import LabError
 from support.stm32_firmware import build, flash_binary
@@ -74,6 +76,74 @@ def test_a_line_program_has_the_rows_that_pyelftools_reads(
         for row in _line_states(made)
     ]
     assert rows == expected
+
+
+def set_address(address: int) -> bytes:
+    return b"\0\5\2" + address.to_bytes(4, "little")
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+@pytest.mark.parametrize("version", [4, 5])
+def test_an_address_has_the_line_of_the_piece_that_begins_there_and_none_behind_it(
+    program: Any, order: tuple[int, int], version: int
+) -> None:
+    """Two pieces of code, in any order, one behind the other; what the linker dropped is at 0."""
+    pieces = [
+        set_address(at) + b"\3" + sleb(line) + b"\1" + b"\3\1\1" + set_address(at + 16) + b"\0\1\1"
+        for at, line in ((0x0800_4000, 9), (0x0800_4010, 19))
+    ]
+    code = set_address(0) + b"\1\0\1\1" + b"".join(pieces[number] for number in order)
+    header = deepcopy(program.header)
+    header["version"] = version
+    made = LineProgram(header, BytesIO(code), program.structs, 0, len(code))
+    debug = DebugInfo(Made(line_program_for_CU=lambda unit: made, get_aranges=lambda: None), Path("x"))
+    unit = Made(cu_offset=0)
+    debug.__dict__["_units"] = [(0x0800_4000, 0x0800_4100, unit)]
+    files = [Path(entry.name.decode()).name for entry in header["file_entry"]]
+    name = files[1 if version >= 5 else 0]
+    places = [debug.line_at(at) for at in (0x0800_4000, 0x0800_400F, 0x0800_4010, 0x0800_401F, 0x0800_4020)]
+    assert places == [f"{name}:11", f"{name}:11", f"{name}:21", f"{name}:21", ""]
+
+
+def attributes(**values: Any) -> dict[str, Any]:
+    """Return attributes of an entry; a pair is a value and its form."""
+    pairs = {name: one if isinstance(one, tuple) else (one, "DW_FORM_data4") for name, one in values.items()}
+    return {f"DW_AT_{name}": Made(value=value, form=form) for name, (value, form) in pairs.items()}
+
+
+def test_the_code_of_a_unit_is_in_one_piece_or_in_many_relative_to_a_base_or_not() -> None:
+    def ranges(entries: list[Any] = [], **values: Any) -> list[tuple[int, int]]:  # noqa: B006
+        unit = Made(get_top_DIE=lambda: Made(attributes=attributes(**values)))
+        return _ranges(
+            unit, Made(get_range_list_at_offset=lambda offset, unit: entries if offset == 7 else [])
+        )
+
+    assert ranges() == ranges(low_pc=0x100) == []
+    assert (
+        ranges(low_pc=0x100, high_pc=0x20)
+        == ranges(low_pc=0x100, high_pc=(0x120, "DW_FORM_addr"))
+        == [(0x100, 0x120)]
+    )
+    pieces = [RangeEntry(0, 8, 1, 2, False), RangeEntry(8, 8, 0x11, 0x12, True), BaseAddressEntry(16, 0x200),
+              RangeEntry(24, 8, 1, 2, False), RangeEntry(32, 8, 0x21, 0x22, True)]  # fmt: skip
+    found = [(0x101, 0x102), (0x11, 0x12), (0x201, 0x202), (0x21, 0x22)]
+    assert ranges(pieces, low_pc=0x100, ranges=7) == found
+    assert ranges(pieces[:2], ranges=7) == [(1, 2), (0x11, 0x12)]
+
+
+def test_an_array_has_the_size_of_all_its_dimensions_however_they_are_counted() -> None:
+    def kind(tag: str, of: Any = None, dimensions: list[dict[str, int]] = [], **values: int) -> Any:  # noqa: B006
+        children = [Made(attributes=attributes(**one)) for one in dimensions]
+        own = attributes(**values) | (attributes(type=0) if of else {})
+        return Made(tag=f"DW_TAG_{tag}", attributes=own, iter_children=lambda: children,
+                    get_DIE_from_attribute=lambda name: of)  # fmt: skip
+
+    word = kind("typedef", kind("volatile_type", kind("const_type", kind("base_type", byte_size=4))))
+    array = kind("array_type", word, [{"upper_bound": 1}, {"count": 3}, {"upper_bound": 4}, {"count": 7}, {}])
+    pointer = kind("pointer_type", word)
+    assert (_size(word), _size(array), _size(pointer)) == (4, 4 * 2 * 3 * 5 * 7, 4)
+    assert _size(kind("array_type", pointer, [{"count": 2}, {"count": 5}])) == 40
+    assert _size(kind("typedef")) == _size(kind("subroutine_type")) == 0
 
 
 def test_a_name_stands_for_exactly_one_thing_and_a_pointer_names_what_it_points_to(tmp_path: Path) -> None:

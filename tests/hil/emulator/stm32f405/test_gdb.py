@@ -536,3 +536,29 @@ def test_what_changes_the_machine_is_noted_once(
     assert not protocol.take_changes()
     assert protocol.stopped(SIGINT, at_begin=True) == framed(b"T02replaylog:begin;thread:1;")
     assert protocol.stopped(SIGTRAP, 0x2000_0010) == framed(b"T05watch:20000010;thread:1;")
+
+
+@pytest.mark.parametrize(("from_us", "booted_us", "held_us"), [
+    (0, 0, 0), (-1, 0, 0), (0, 1_000, 0), (2_000, 0, None), (2_000, 1_000, 3_000), (2_001, 1_000, 4_000), (1, 1, 1_000),
+])  # fmt: skip
+def test_a_debugger_s_part_begins_at_power_on_or_at_a_time_of_the_laboratory(
+    from_us: int, booted_us: int, held_us: int | None
+) -> None:
+    """The chip is asked each millisecond; before the laboratory begins there is no later time."""
+    machine, held = FirmwareOnChip(), list[int]()
+
+    def wait(port: int) -> None:
+        held.append(machine.chip.now_us)
+        raise KeyboardInterrupt
+
+    server = GdbServer(0, wait, from_us=from_us)
+    booted = (lambda: booted_us,) if booted_us else ()
+    chip = DebuggedChip(machine.chip, server, None, *booted)
+    for end_us in range(1_000, 7_000, 1_000):
+        while not held and machine.chip.now_us < end_us:
+            try:
+                chip.run(end_us * CYCLES_PER_US)
+            except KeyboardInterrupt:
+                break
+    assert [us // 1_000 * 1_000 for us in held] == ([] if held_us is None else [held_us])
+    server.close()

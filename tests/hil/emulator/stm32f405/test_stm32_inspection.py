@@ -18,7 +18,7 @@ from hil.emulator.stm32f405.image import Image
 from hil.emulator.stm32f405.processor import ChipProcessor
 from hil.emulator.stm32f405.stopped_tasks import StoppedTask, TaskWatch
 from hil.emulator.stm32f405.unnamed_freertos import UnnamedFreeRtos
-from support.stm32_firmware import SOURCES, build
+from support.stm32_firmware import SOURCES, build, image_with
 from support.stm32_machine import FirmwareOnChip
 
 MS = 1000
@@ -86,6 +86,13 @@ def test_the_high_water_mark_is_what_was_never_written(compiler: str) -> None:
 def test_an_image_without_heap_4_has_no_free_bytes_of_it() -> None:
     machine = FirmwareOnChip()
     assert FreeRtos(machine.image, machine.chip.read).heap_bytes == (None, None)
+    names = "xFreeBytesRemaining", "xMinimumEverFreeBytesRemaining"
+    image = image_with(**dict.fromkeys(names, 4))
+    for number, name in enumerate(names, 7):
+        machine.chip.write(image.symbol(name).address, pack("<I", number))
+    assert FreeRtos(image, machine.chip.read).heap_bytes == (7, 8)
+    del image._variables[names[1]]
+    assert FreeRtos(image, machine.chip.read).heap_bytes == (None, None)
 
 
 def crashed(machine: FirmwareOnChip) -> str:

@@ -1,6 +1,7 @@
 """Thumb instructions as the image's readers see them, against capstone: jumps, IT blocks, and constants among the code."""
 
 import re
+from itertools import product
 from struct import pack
 from types import SimpleNamespace
 
@@ -84,8 +85,8 @@ def test_the_table_behind_a_table_branch_is_as_long_as_its_last_index(wide: int,
     """TBB has bytes, TBH half words; CMP with the last index stands at most five half words before."""
     table = 0xE8DF, 0xF000 | wide << 4
     size = entries if wide else (entries + 1) // 2
-    for between in range(6):
-        words = [NOP, 0x2800 | entries - 1, *between * [NOP], *table, *8 * [NOP]]
-        begin = 4 + between
+    for between, before in product(range(6), range(2)):
+        words = [*before * [NOP], 0x2800 | entries - 1, *between * [NOP], *table, *8 * [NOP]]
+        begin = 3 + before + between
         expected = range(begin, begin + size) if between < 5 else range(0)
         assert literals(np.array(words, "<u2").tobytes()) == set(expected), between
