@@ -96,10 +96,10 @@ class UdpServer:
         assert self._socket is not None
         try:
             data, client = self._socket.recvfrom(2048)
-        except ConnectionRefusedError:  # reports an earlier packet: its client is gone
-            self.end_session()
-            return
-        except OSError:
+        except OSError as error:
+            if isinstance(error, ConnectionRefusedError):  # reports an earlier packet: its client is gone
+                self.end_session()
+            self._forget_errors()
             return
         if not 1 <= len(data) <= MAX_PACKET:
             return
@@ -110,6 +110,12 @@ class UdpServer:
         if not self._admit(now_us, client):
             return
         self._received(now_us, data)
+
+    def _forget_errors(self) -> None:
+        """Empty the queue of reports, with which the port stays readable."""
+        with suppress(OSError):
+            while self._socket is not None and sys.platform == "linux":
+                self._socket.recvmsg(0, 0, socket.MSG_ERRQUEUE)
 
     def _probe(self, now_us: int) -> None:
         """Drop a session whose port is closed: its program has ended, and cflib sends its first packet only once."""

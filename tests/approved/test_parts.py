@@ -23,8 +23,9 @@ from hil.emulator.crazyflie.nrf51 import BROADCAST, RATES, AirSettings, Band, Nr
 from hil.emulator.crazyflie.radio_line import RadioLine
 from hil.emulator.crazyflie.shockburst import Air
 from hil.emulator.events import EventQueue
-from support.approved import Log, approve, judge
+from support.approved import approve, judge
 from support.deck_bench import DeckBench
+from support.random_use import Random
 
 USES = Path(__file__).with_name("parts.json")
 SEEDS = range(1, 4)
@@ -33,22 +34,6 @@ SYSLINK = (
     *(getattr(syslink, name) for name in dir(syslink) if isinstance(getattr(syslink, name), int)),
     0x41,
 )
-
-
-class Random:
-    """Random use of one part, and what was seen of it."""
-
-    def __init__(self, seed: int) -> None:
-        self.rng, self.log = np.random.default_rng(seed), Log()
-
-    def pick(self, *of: Any) -> Any:
-        return of[int(self.rng.integers(len(of)))]
-
-    def below(self, bound: int) -> int:
-        return int(self.rng.integers(bound))
-
-    def data(self, *sizes: int) -> bytes:
-        return self.rng.bytes(self.pick(*sizes))
 
 
 class RadioChip(Random):

@@ -115,6 +115,11 @@ def test_a_client_that_is_gone_makes_room_at_once(board: Board, clients: list[so
     board.read(1)
     assert board.received == [b"\xf0a", b"\xf0b"]
     assert board.said == []
+    second.close()
+    board.server.send(b"answer")
+    board.read(2)
+    assert not board.server.has_session(2)
+    assert not select.select([*board.readers], [], [], 0)[0], "its report is read only once"
 
 
 @pytest.mark.parametrize("null", [b"\xff", b"\xf3"])
