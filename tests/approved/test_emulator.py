@@ -10,6 +10,7 @@ import struct
 from collections.abc import Callable, Iterator
 from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace as Made
 from typing import Any
 
@@ -22,6 +23,7 @@ pytest.importorskip("cffi")
 from hil.emulator.stm32f405 import crash as crashes
 from hil.emulator.stm32f405.chip import CYCLES_PER_US, RAM, SOFTWARE, WATCHDOG, Chip, StopReason
 from hil.emulator.stm32f405.coverage import ImageLines
+from hil.emulator.stm32f405.debugged_chip import DebuggedChip
 from hil.emulator.stm32f405.freertos import FreeRtos, Wait
 from hil.emulator.stm32f405.gdb_protocol import (
     REGISTERS,
@@ -39,6 +41,7 @@ from hil.emulator.stm32f405.unnamed_freertos import UnnamedFreeRtos
 from hil.errors import LabError
 from support.approved import Log, approve, judge
 from support.crazyflie_board import Board
+from support.flight_backwards import Flight
 from support.stm32_firmware import build
 from support.stm32_machine import FirmwareOnChip, Profiled
 
@@ -127,6 +130,79 @@ def debugger(seed: int) -> list[str]:
         found.append(f"{packet} -> {text if len(text) < 90 else hashlib.sha256(answer).hexdigest()[:12]}")
     found.append(f"{sorted(firmware.chip.breakpoints)} {protocol.take_changes()} {protocol.take_changes()}")
     return [*found, str(protocol.stored())]
+
+
+class Session:
+    """A debugger that sets breakpoints and watchpoints anywhere, steps, interrupts and leaves, without a socket."""
+
+    checkpoints, from_us, is_connected = None, 0, True
+
+    def __init__(self, seed: int) -> None:
+        (self.rng, self.pick), self.log = picking(seed), Log()
+        self.firmware = FirmwareOnChip()
+        image, chip = self.firmware.image, self.firmware.chip
+        self.places = [
+            one.address + 2 * int(self.rng.integers(one.size // 2)) for one in image.functions if one.size
+        ]
+        self.words = [
+            image.symbol(name).address for name in ("xTickCount", "tasks", "queue", "samples_taken", "eeprom")
+        ]
+        chip.crash_points |= {image.symbol(name).address for name in ("assertFail", "Stuck_Handler")}
+
+    def attach(self, chip: Chip, kernel: FreeRtos) -> None:
+        self.protocol = RemoteProtocol(chip, kernel)
+
+    def wants_to_stop(self) -> bool:
+        return bool(self.rng.random() < 0.1)
+
+    def hold(self, signal: int, watched: int | None = None, at_begin: bool = False) -> ResumeRequest:
+        """Send some packets, of which the last one resumes."""
+        chip, pick, protocol = self.firmware.chip, self.pick, self.protocol
+        self.log.note(
+            "held", signal, watched, at_begin, chip.now_us, chip.register("pc"), chip.state.instructions
+        )
+        if protocol.request is not ResumeRequest.STOP:
+            self.log.note("reported", protocol.stopped(signal, watched, at_begin))
+        for _ in range(pick(0, 1, 3)):
+            set_or_clear, place, word = pick("Z", "Z", "z"), pick(*self.places), pick(*self.words)
+            packet = pick(f"{set_or_clear}0,{place:x},2", f"{set_or_clear}0,{place:x},2", f"{set_or_clear}2,{word:x},4",
+                          f"{set_or_clear}{pick(3, 4)},{word:x},{pick(1, 4)}", "g", "?")  # fmt: skip
+            protocol.receive(framed(packet.encode()))
+        if len(chip.breakpoints) > 4:
+            for place in sorted(chip.breakpoints):
+                protocol.receive(framed(b"z0,%x,2" % place))
+        protocol.receive(framed(pick(b"c", b"c", b"s", b"s", b"vCont;s:1;c")))
+        return protocol.request
+
+    def told(self) -> dict[str, str]:
+        chip, kernel = self.firmware.chip, FreeRtos(self.firmware.image, self.firmware.chip.read)
+        debugged, end = DebuggedChip(chip, self, kernel), 0  # type: ignore[arg-type]
+        for _ in range(150):
+            end += self.pick(10, 300, 1_000) * CYCLES_PER_US
+            why = debugged.run(end)
+            self.log.note("ran", why, chip.state.now, chip.register("pc"))
+            if why & StopReason.RESET:
+                chip.reset(SOFTWARE)
+        return self.log.told()
+
+
+def backwards(seed: int) -> dict[str, str]:
+    """Return where a flight stops that a debugger lets run and step, forward and back, in its first 100 ms."""
+    (_, pick), log = picking(seed), Log()
+    with TemporaryDirectory() as folder:
+        flight = Flight(Path(folder) / "log")
+        line, ticks = (flight.place(name) for name in ("send_line", "xTickCount"))
+        flight.ask(b"Z0,%x,2" % line)
+        for number in range(16):
+            if number % 4 == 0:
+                packet = b"%s2,%x,4" % (pick(b"Z", b"z"), ticks)
+                log.note("set", packet, flight.ask(packet))
+            late = int.from_bytes(bytes.fromhex(flight.ask(b"m%x,4" % ticks).decode()), "little") > 100
+            back = pick(b"bc", b"bs", b"bs")
+            packet = back if late else pick(b"c", b"c", b"c", b"s", back) if number else b"c"
+            log.note("stopped", packet, *flight.stop(packet))
+        log.note("ended", flight.end(), flight.path.read_text().split())
+    return log.told()
 
 
 def known(flags: tuple[str, ...]) -> dict[str, str]:
@@ -392,11 +468,12 @@ FOUND: dict[str, Callable[[], list[str] | dict[str, str]]] = {
     "known DWARF 5": lambda: known(("-g",)),
     "known DWARF 4": lambda: known(("-gdwarf-4", "-fno-inline", "-ffunction-sections")),
     "covered": covered,
+    **{f"session {seed}": lambda seed=seed: Session(seed).told() for seed in SEEDS},  # type: ignore[misc]
     "profiles": profiles,
     "reasons": reasons,
     **{
         f"{use.__name__} {seed}": lambda use=use, seed=seed: use(seed)  # type: ignore[misc]
-        for use in (kernel, time_line, watch, memory)
+        for use in (kernel, time_line, watch, memory, backwards)
         for seed in SEEDS
     },
 }

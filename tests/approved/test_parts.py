@@ -18,6 +18,7 @@ pytest.importorskip("cffi")
 
 from hil.emulator.crazyflie import syslink
 from hil.emulator.crazyflie.barometer import CONFIG, Barometer
+from hil.emulator.crazyflie.bootloader import Bootloader
 from hil.emulator.crazyflie.config import RadioConfig
 from hil.emulator.crazyflie.nrf51 import BROADCAST, RATES, AirSettings, Band, Nrf51, Power, peer_packet
 from hil.emulator.crazyflie.radio_line import RadioLine
@@ -66,7 +67,8 @@ class RadioChip(Random):
             bytes((self.below(16) << 4 | self.below(16),)) + self.data(0, 1, 5, 30),
             bytes((null, 0xFE, self.pick(1, 2, 3, 4, 0xF0, 0xFF, 0xFF, 9))) + self.pick(b"", b"\0", b"\1", b"\2ab"),
             bytes((0xFF, 0xFE, self.pick(2, 3, 3, 0xFF)),), bytes((0xFF, 0xFE, 0xF0, self.below(2))),
-            bytes((0xFF, 0xFE, 0xF0)) + self.pick(b"", b"\0"), bytes((null, 0xFE)),
+            bytes((0xFF, 0xFE, 0xF0)) + self.pick(b"", b"\0", b"\0\0", b"\1\1"), bytes((null, 0xFE)),
+            bytes((0xFF, 0xFE, 0xF0)) + self.pick(b"\0\0", b"\1\1"),
             bytes((null, 3, self.pick(1, 1, 2, 2, 3), self.pick(0, 1, 2, 3, 80, 125, 126))), bytes((null, 3, 1)),
             bytes((null, 0x80 | self.below(16))) + self.data(0, 1, 9), bytes((null, self.below(256), 7, 7)),
             bytes((0xFF, self.pick(0xFE, 0xFF), self.pick(0x10, 0x12))),
@@ -117,6 +119,32 @@ class RadioChip(Random):
             self.events.run(self.events.now_us + self.pick(0, 10, 300, 1_500, 20_000, 101_000))
             hears = [chip.hears(booting), chip.hears(chip.settings), chip.hears_all(self.settings())]
             self.log.note("state", self.events.now_us, chip.power, chip.settings, hears, chip.heard_us)
+        return self.log.told()
+
+
+class Loader(Random):
+    """Both boot loaders' packets, whole and cut."""
+
+    def told(self) -> dict[str, str]:
+        loader = Bootloader()
+        loader.load(self.data(20_000))
+        for _ in range(500):
+            target, command = (
+                self.pick(0xFF, 0xFE),
+                self.pick(0x10, 0x12, 0x14, 0x14, 0x14, 0x1C, 0x18, 0x18, 0x20),
+            )
+            place = struct.pack("<HH", self.pick(0, 0, 9, 16, 88), self.pick(0, 25, 1000, 1023, 1024))
+            write = struct.pack(
+                "<HHH", self.pick(0, 1, 9), self.pick(15, 16, 88, 231, 1023), self.pick(0, 1, 2, 10)
+            )
+            rest = write if command == 0x18 else place + self.data(0, 25)
+            packet = bytes((self.pick(0xFF, 0xFF, 0xFF, 0xF3), target, command)) + rest
+            if self.below(9) == 0:
+                packet = packet[: self.below(len(packet))]
+            self.log.note("answer", packet.hex(), loader.answer(packet), loader.malformed)
+            self.log.note(
+                "written", hash_of(loader.take_written()[:30_000]), hash_of(loader.nrf51.flash[90_000:91_500])
+            )
         return self.log.told()
 
 
@@ -262,7 +290,7 @@ class Weather(Random):
 
 FOUND: dict[str, Callable[[], dict[str, str]]] = {
     f"{kind.__name__} {seed}": lambda kind=kind, seed=seed: kind(seed).told()  # type: ignore[misc]
-    for kind in (RadioChip, Line, DeckUser, Weather)
+    for kind in (RadioChip, Loader, Line, DeckUser, Weather)
     for seed in SEEDS
 }
 

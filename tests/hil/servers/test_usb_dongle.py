@@ -350,7 +350,7 @@ def test_a_program_that_still_runs_is_ended_without_an_error(
 
 
 def test_what_a_program_needs_is_said_in_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def refused(*arguments: str) -> str:
         assert usb_dongle.main(arguments) == 2
@@ -361,6 +361,13 @@ def test_what_a_program_needs_is_said_in_one_line(
     assert refused("127.0.0.1:1") == refused("here", "true") == usage
     monkeypatch.setattr(usb_dongle, "PRELOAD", "libnothere.so")
     assert refused("127.0.0.1:1", "true") == f"{usb_dongle.MISSING}\n"
+    for folder in ("usr/lib", "usr/lib64/x86", "usr/local/lib", "usr/lib/arm/deep"):
+        root = tmp_path / folder.replace("/", "-")
+        monkeypatch.setattr(usb_dongle, "Path", lambda place, root=root: root / place.removeprefix("/"))
+        assert usb_dongle.why_not() == usb_dongle.MISSING
+        (root / folder).mkdir(parents=True)
+        (root / folder / usb_dongle.PRELOAD).touch()
+        assert usb_dongle.why_not() == (usb_dongle.MISSING if folder.endswith("deep") else "")
     monkeypatch.setattr(sys, "byteorder", "big")
     assert usb_dongle.why_not() == "needs a 64-bit little-endian machine"
     monkeypatch.setattr(usb_dongle, "why_not", lambda: "")

@@ -5,6 +5,8 @@ import socket
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
 from struct import pack, unpack_from
+from types import SimpleNamespace as Made
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -12,6 +14,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("unicorn")
 
+from hil.emulator.stm32f405.backwards import Goal, Position, Search
 from hil.emulator.stm32f405.checkpoints import Checkpoints
 from hil.emulator.stm32f405.chip import CYCLES_PER_US, Chip, StopReason
 from hil.emulator.stm32f405.debugged_chip import DebuggedChip
@@ -562,3 +565,23 @@ def test_a_debugger_s_part_begins_at_power_on_or_at_a_time_of_the_laboratory(
                 break
     assert [us // 1_000 * 1_000 for us in held] == ([] if held_us is None else [held_us])
     server.close()
+
+
+def test_a_debugger_that_interrupts_a_way_back_ends_it() -> None:
+    """It would stop once more where the way ends."""
+    machine, held = FirmwareOnChip(), list[int]()
+
+    def hold(signal: int, watched: int | None = None, at_begin: bool = False) -> ResumeRequest:
+        held.append(signal)
+        return ResumeRequest.RUN
+
+    server: Any = Made(attach=lambda *of: None, hold=hold, checkpoints=None, from_us=0, is_connected=True)
+    server.wants_to_stop = lambda: len(held) == 1 and chip._search is not None
+    chip = DebuggedChip(machine.chip, server)
+    for end_us in (1_000, 2_000, 3_000):
+        while machine.chip.now_us < end_us:
+            chip.run(end_us * CYCLES_PER_US)
+        if end_us == 1_000:
+            assert held == [SIGINT]
+            chip._search = Search(Goal.THERE, Position(9, 0, 0, 0, 1 << 60, 1 << 60))
+    assert (held, chip._search) == ([SIGINT, SIGINT], None)
