@@ -327,7 +327,8 @@ def saved(kernel: FreeRtos, block: int) -> object:
 
 def time_line(seed: int) -> dict[str, str]:
     """Return where a chip's time went that runs in random portions, with resets, an outside load and a trace."""
-    (_, pick), firmware, log = picking(seed), FirmwareOnChip(flags=USUAL), Log()
+    (_, pick), log = picking(seed), Log()
+    firmware = FirmwareOnChip(flags=(*USUAL, "-DCALM") if seed == 2 else USUAL)
     chip, read = firmware.chip, firmware.chip.read
     own = (FreeRtos if seed % 2 else UnnamedFreeRtos).of(firmware.image, read)
 
@@ -364,7 +365,7 @@ def time_line(seed: int) -> dict[str, str]:
             processor.occupy("load", lambda: pick(0, 100, 400))
         processor.run(now_us)
         processor.find_kernel()
-        busy = processor.longest_busy(pick(0, 500, 5_000))
+        busy = processor.longest_busy(pick(0, 100, 500, 5_000))
         log.note("times", processor.now_us, processor.run_times_us(), processor.activations(), busy)
         log.note("tasks", processor.current, processor.task_names, processor.tasks)
     return log.told()

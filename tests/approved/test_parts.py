@@ -4,8 +4,13 @@ The radio chip with its boot loader, its end of the serial line, the decks' sens
 change is meant: make approve.
 """
 
+import json
 import struct
+import warnings
+import zipfile
 from collections.abc import Callable, Sequence
+from functools import partial
+from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,13 +25,21 @@ from hil.emulator.crazyflie import syslink
 from hil.emulator.crazyflie.barometer import CONFIG, Barometer
 from hil.emulator.crazyflie.bootloader import Bootloader
 from hil.emulator.crazyflie.config import RadioConfig
+from hil.emulator.crazyflie.crazyflie import _check_board
+from hil.emulator.crazyflie.log_table import log_numbers, log_table, parameter_table
 from hil.emulator.crazyflie.nrf51 import BROADCAST, RATES, AirSettings, Band, Nrf51, Power, peer_packet
+from hil.emulator.crazyflie.parts import Parts
 from hil.emulator.crazyflie.radio_line import RadioLine
+from hil.emulator.crazyflie.release_file import released_firmware
 from hil.emulator.crazyflie.shockburst import Air
-from hil.emulator.events import EventQueue
+from hil.emulator.events import EVENTS_AT_ONE_INSTANT, EndlessInstantError, EventQueue
+from hil.emulator.stm32f405.chip import OTP
+from hil.errors import LabError
+from hil.world.body import Carrier
 from support.approved import approve, judge
 from support.deck_bench import DeckBench
 from support.random_use import Random
+from support.stm32_bench import Bench
 
 USES = Path(__file__).with_name("parts.json")
 SEEDS = range(1, 4)
@@ -240,6 +253,7 @@ class DeckUser(Random):
 
     def told(self) -> dict[str, str]:
         bench = DeckBench("flow2", "multiranger")
+        self.log.note("flow", bench.transfer(bytes(4)).hex(), bench.transfer(b"\x16" + bytes(12)).hex())
         bench.write(0x20, b"\3\0")
         for number in range(500):
             address = self.pick(0x29, 0x29, 0x35, 0x36)
@@ -274,6 +288,176 @@ class DeckUser(Random):
         return self.log.told()
 
 
+class Sensors(Random):
+    """The IMU's and the barometer's registers of a body that moves anywhere, with ESCs or without."""
+
+    def told(self) -> dict[str, str]:
+        chip, eeprom = Bench().chip, np.zeros(8192, np.uint8)
+        motion = SimpleNamespace(p_WB=np.zeros(3))
+        carrier = Carrier(motion, self.rng, escs=self.pick(None, np.zeros(4)))  # type: ignore[arg-type]
+        parts = Parts(chip, eeprom, self.pick(carrier, carrier, carrier, None))
+        self.log.note(
+            "board", parts.device_type, chip.read(OTP, 16), parts.gyro.tobytes(), parts.accel.tobytes()
+        )
+        for _ in range(100):
+            motion.p_WB = np.array((5.0, -7.0, 0.01 * self.below(300) - 1.0))
+            parts._barometer._registers[CONFIG] = self.pick(0, 2, 4)
+            parts.measure_pressure()
+            parts.sample(self.rng.integers(-32_768, 32_768, 6).tolist())
+            registers = parts.gyro, parts.accel, parts._barometer._registers
+            self.log.note("registers", *(one[:32].tobytes().hex() for one in registers))
+        return self.log.told()
+
+
+class Releases(Random):
+    """Release files with manifests of all kinds, of which few have one firmware for the board."""
+
+    def told(self) -> dict[str, str]:
+        path = Path("release.zip")
+        for _ in range(300):
+            files = {}
+            for name in ("stm.bin", "nrf.bin", "radio.bin")[: 1 + self.below(3)]:
+                part: dict[str, Any] = {
+                    "target": self.pick(
+                        *(9 * [name[:-4] + "32"]), "nrf51", ["stm32", "nrf51"], ["nrf51"], [], 3
+                    ),
+                    "type": self.pick(*(12 * ["fw"]), "bootloader", None),
+                }
+                if self.below(9):
+                    part["platform"] = self.pick(*(9 * ["cf2"]), "tag", "cf3")
+                if self.below(3) == 0:
+                    part["release"] = self.pick("2024.1", "x\n", 7)
+                files[self.pick(*(20 * [name]), "a/b", ".hidden", 101 * "n")] = part
+            version, listed = self.pick(*(5 * [1, 2]), 3), self.pick(*(15 * [files]), [], {})
+            manifest: dict[str, Any] = {"version": version, "files": listed}
+            if self.below(2):
+                manifest["fw_platform"] = self.pick("cf2", "cf2", "cf21bl", "bolt", "flapper", "new")
+            if self.below(3) == 0:
+                manifest["release"] = "2025.2"
+            text = json.dumps(manifest)
+            text = self.pick(*(20 * [text]), text.replace("{", '{"version": 1, ', 1), text[1:], "[]")
+            packed = BytesIO()
+            with zipfile.ZipFile(packed, "w") as file, warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                for name in files if self.below(9) else ():
+                    for _ in range(self.pick(*(9 * [1]), 2)):
+                        file.writestr(name, self.data(8))
+                if self.below(20):
+                    file.writestr("manifest.json", text)
+            try:
+                self.log.note("taken", released_firmware(path, packed.getvalue()))
+            except LabError as error:
+                self.log.note("refused", error)
+        return self.log.told()
+
+
+class Boards(Random):
+    """Images built for any boards, with names and without, on a robot of each type."""
+
+    def told(self) -> dict[str, str]:
+        types = "CF21", "C21B", "CB11", "CB10", "RR10", "CF20"
+        for _ in range(300):
+            found = [one.encode() + self.pick(b"\0", b"\0", b"x") for one in types if self.below(3) == 0]
+            code = b"".join([*found, self.pick(b"", b"", b"", b"Flapper (")])
+            has = self.pick(True, False)
+            image: Any = SimpleNamespace(
+                code=code, named=self.pick(True, False), path="image", has=lambda name, has=has: has
+            )
+            try:
+                self.log.note("board", _check_board(image, self.pick("CF21", "C21B")))
+            except LabError as error:
+                self.log.note("board", error)
+        return self.log.told()
+
+
+class Tables(Random):
+    """Tables of log variables and parameters in code with and without names, between entries that belong to none."""
+
+    def told(self) -> dict[str, str]:
+        base = 0x0800_4000
+        for _ in range(60):
+            names, code = [b"alpha", b"b", b"gamma_9", b"\xffno", b"-x", 40 * b"n"], bytearray(64)
+            at = {
+                name: base + len(code) + sum(len(one) + 1 for one in names[:number])
+                for number, name in enumerate(names)
+            }
+            code += b"".join(name + b"\0" for name in names) + bytes(-sum(len(one) + 1 for one in names) % 4)
+            table, size = self.pick(("log", 12), ("param", 20))
+            begin = len(code)
+            for _ in range(self.pick(0, 1, 3, 4)):
+                self.group(code, at, size)
+            end, middle = len(code), bytes(4 * self.pick(0, 1, 3))
+            code += middle
+            for _ in range(self.pick(0, 1, 2)):
+                self.group(code, at, self.pick(12, 20))
+            code += bytes(4 * self.below(4))
+            ends = {f"_{table}_start": base + begin, f"_{table}_stop": base + end}
+            image: Any = SimpleNamespace(
+                code=bytes(code), base=base, named=self.pick(True, False, False),
+                has=self.pick(ends.__contains__, ends.__contains__, lambda _: False),
+                symbol=lambda name, ends=ends: SimpleNamespace(address=ends[name]),
+            )  # fmt: skip
+            chip: Any = SimpleNamespace(
+                read=lambda where, size, code=code: bytes(code[where - base :][:size]).ljust(size, b"\5")
+            )
+            self.log.note("numbers", log_numbers(image, chip))
+            for one in log_table(image, chip):
+                self.log.note("log", one.name, one.scalar, one.read(), one.unit)
+            for name, found in parameter_table(image, chip).items():
+                self.log.note("parameters", name, found.number, found.scalar, found.writable, found.read())
+        return self.log.told()
+
+    def group(self, code: bytearray, at: dict[bytes, int], size: int) -> None:
+        """Append a group of entries, of which some are not well made."""
+        flags = self.pick(0, 0, 0x20)
+        entries = [(0x81 | flags, self.pick(*at.values()))]
+        for _ in range(self.below(4)):
+            kind = self.pick(*range(1, 11), 0x41, 0x48, 0x28, 0x07)
+            entries.append((kind, self.pick(*at.values(), 0, *[at[b"alpha"]] * 8)))
+        for kind, name in [*entries, (self.pick(0x80, 0x80, 0x80, 0xA0, 0x81), self.pick(*at.values()))]:
+            code += struct.pack("<BxxxII", kind, name, self.pick(0x2000_0000, 0x0800_4000, 0)) + bytes(
+                size - 12
+            )
+
+
+class Events(Random):
+    """Events planned for once and for ever, the beat, and callbacks that plan others or fail, in runs of any length."""
+
+    def told(self) -> dict[str, str]:
+        events = EventQueue()
+
+        def happen(number: int, us: int) -> None:
+            self.log.note("ran", number, us, events.now_us, events.next_us, events.other_us)
+            what = self.pick(*10 * [None], "at", "at", "past", "fail")
+            if what == "at":
+                events.at(us + self.pick(0, 1, 5), partial(happen, number + 1000))
+            elif what == "past":
+                events.at(us - 1, print)
+            elif what == "fail":
+                raise KeyError("failed")
+
+        for number in range(300):
+            what = self.pick("at", "every", "beat", "run", "run", "run", "leave", "many")
+            start_us, act = events.now_us + self.pick(-1, 0, 1, 7, 20), partial(happen, number)
+            try:
+                if what == "at":
+                    events.at(start_us, act)
+                elif what == "every" and number < 100:
+                    events.every(self.pick(-1, 0, 5, 10, 40), start_us, act)
+                elif what == "beat" and number < 100:
+                    events.set_beat(self.pick(3, 10), max(start_us, events.now_us), act)
+                elif what == "many" and number > 295:
+                    for _ in range(EVENTS_AT_ONE_INSTANT - self.pick(1, 10, 100)):
+                        events.at(events.now_us + 1, int)
+                    events.run(events.now_us + 1)
+                else:
+                    events.run(events.now_us + self.pick(0, 1, 10, 30), leave_beat=what == "leave")
+            except (KeyError, ValueError, EndlessInstantError) as error:
+                self.log.note("failed", number, repr(error)[:60])
+            self.log.note("state", number, events.now_us, events.next_us, events.other_us)
+        return self.log.told()
+
+
 class Weather(Random):
     """A barometer that rises and falls, with each of its filters."""
 
@@ -290,7 +474,7 @@ class Weather(Random):
 
 FOUND: dict[str, Callable[[], dict[str, str]]] = {
     f"{kind.__name__} {seed}": lambda kind=kind, seed=seed: kind(seed).told()  # type: ignore[misc]
-    for kind in (RadioChip, Loader, Line, DeckUser, Weather)
+    for kind in (RadioChip, Loader, Line, DeckUser, Sensors, Releases, Boards, Tables, Events, Weather)
     for seed in SEEDS
 }
 
