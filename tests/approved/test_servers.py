@@ -46,6 +46,7 @@ from hil.servers.tcp_port import TcpPort
 from hil.servers.udp_server import UdpServer
 from support.approved import approve, judge
 from support.random_use import Random
+from support.watching import Watcher
 
 ANSWERS = Path(__file__).with_name("servers.json")
 SEEDS = range(1, 4)
@@ -591,6 +592,57 @@ class Processes(Random):
         return self.log.told()
 
 
+class Apart(Random):
+    """The process of robot 2 or 3: what it obeys, and what it passes to robot 1's."""
+
+    def told(self, seed: int) -> dict[str, str]:
+        settings = AirSettings(80, 2_000_000, bytes.fromhex("FFE7E7E7E7"))
+        messages = deque[Any]()
+        for _ in range(30):
+            messages.append(self.pick(
+                None, None, ("hear", (settings, peer_packet(self.data(3)))),
+                *(("type", (line,)) for line in ("status", "2 status", "3 status", "clear", "2 push.y:0.1", "3 push.y:0.1")),
+            ))  # fmt: skip
+        messages += [("type", ("status",)), *([("end", ())] if seed % 2 else [])]
+
+        taken: list[Any] = [("type", ("",))]
+
+        class Served(Clock):
+            """It reads a message every 50 ms, in the end that robot 1's process is gone."""
+
+            def serve(self, now_us: int) -> None:
+                if now_us % 50_000 == 0 and self.readers:
+                    taken.append(messages.popleft() if messages else "gone")
+                    for read in [*self.readers.values()] if taken[-1] is not None else ():
+                        read(now_us)
+
+        def recv() -> Any:
+            message = taken.pop()
+            if message == "gone":
+                raise EOFError
+            return message
+
+        def send(message: tuple[str, tuple[Any, ...]]) -> None:
+            name, arguments = message
+            self.log.note(
+                name,
+                *(
+                    one.t_us if isinstance(one, MocapFrame) else one
+                    for one in arguments
+                    if not isinstance(one, Sighting)
+                ),
+            )
+
+        pipe: Any = Made(recv=recv, send=send, fileno=lambda: 99)
+        plan = Service(load_config(), number=self.pick(2, 3), faults=(parse("imu.silent:0.1", live=True),))
+        room = swarm.SharedRoom(plan.config, 3)
+        with replaced((server, "Paced", Served)):
+            endpoints = Endpoints(station=self.pick(None, "corrections"), motive=self.pick(True, False))
+            swarm._serve_apart(plan, endpoints, pipe, room)
+        self.log.note("room", *(room.rows != swarm.SharedRoom(plan.config, 3).rows).any(axis=1))
+        return self.log.told()
+
+
 class Robot(Random):
     """A served robot that flies in its room, is switched off, moved to other channels, fails and is repaired."""
 
@@ -606,7 +658,8 @@ class Robot(Random):
         faults = (parse("push.y=0.2", live=True),)
         with TemporaryDirectory() as folder, replaced((server, "Paced", Clock)):
             plan = Service(config, number=self.pick(1, 2), faults=faults, state=Path(folder))
-            own = Server(plan, say, None, to_peers)
+            watcher = Watcher() if seed == 3 else None
+            own = Server(plan, say, watcher, to_peers)
             lab.append(own)
             own.open(Endpoints(station=self.pick("corrections", "poses")))
             live, chip = LiveFaults(own, say, {3: partial(self.log.note, "robot 3")}), own.served.nrf51
@@ -670,6 +723,10 @@ class Robot(Random):
                     *map(str, own.switchboard.active),
                 )
             own.close()
+            for batch in watcher.batches if watcher is not None else ():
+                self.log.note("rows", batch.num_rows, batch.schema.names, sorted(batch.schema.metadata or {}))
+            for note in watcher.notes if watcher is not None else ():
+                self.log.note("notes", *note)
         return self.log.told()
 
 
@@ -728,7 +785,7 @@ def addresses(seed: int) -> dict[str, str]:
 FOUND: dict[str, Callable[[], dict[str, str]]] = {
     **{
         f"{kind.__name__} {seed}": lambda kind=kind, seed=seed: kind(seed).told(seed)  # type: ignore[misc]
-        for kind in (Cameras, Datagrams, Connections, Cable, Bus, Lines, Processes, Robot, Hidden)
+        for kind in (Cameras, Datagrams, Connections, Cable, Bus, Lines, Processes, Apart, Robot, Hidden)
         for seed in SEEDS
     },
     "addresses": lambda: addresses(0),
