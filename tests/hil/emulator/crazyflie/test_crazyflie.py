@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
-from hil.emulator.crazyflie import crazyflie
+from hil.emulator.crazyflie import crazyflie, radio_line
 from hil.emulator.stm32f405.chip import SOFTWARE, WATCHDOG
 from hil.emulator.stm32f405.stopped_tasks import SETTLED_US, StoppedTask
 from support.crazyflie_board import Board, image
@@ -143,3 +143,17 @@ def test_a_task_that_hangs_or_stopped_is_reported_once_and_nothing_after_a_crash
     assert reported == [
         ("hang", 0x2000_0200, 211_000), ("stopped", 0x2000_0100, 70_000, 1_000, "waits"), ("hang", 0x2000_0300, 211_000),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("planted", "polled"), [(NOTHING, [*range(16, 41, 2)]), (ASSERTION, [])])
+def test_a_host_finds_a_board_a_while_after_its_last_reset(
+    monkeypatch: pytest.MonkeyPatch, planted: int, polled: list[int]
+) -> None:
+    """A failed assertion resets every 11 ms."""
+    monkeypatch.setattr(radio_line, "GATE_US", 15_000)
+    board, fed = Board(planted, polls=True), list[int]()
+    chip = board.crazyflie.chip
+    monkeypatch.setattr(chip, "feed", lambda usart, data: fed.append(chip.now_us // 1000))
+    board.run(0, 40)
+    assert board.crazyflie.resets[SOFTWARE] == (0 if polled else 3)
+    assert fed == polled
