@@ -155,3 +155,15 @@ def test_a_processor_that_is_occupied_whole_serves_interrupts_and_no_task() -> N
     taken = dict(zip(tasks, (b - a for a, b in zip(before, after, strict=True)), strict=True))
     assert taken.pop("LOAD") > 27_500
     assert sum(taken.values()) < 500  # the interrupts
+
+
+def test_code_that_was_changed_runs_changed_also_where_it_has_run_before() -> None:
+    machine = FirmwareOnChip()
+    run(machine, 0, 20)
+    place = machine.image.symbol("tick").address
+    before, code = machine.peek("xTickCount"), machine.chip.read(place, 2)
+    for written, more in ((b"\x70\x47", 0), (code, 20)):  # bx lr
+        machine.chip.write(place, written)
+        run(machine, 20 + more, 40 + more)
+        assert machine.peek("xTickCount") == pytest.approx(before + more, abs=1)
+    assert before > 10
