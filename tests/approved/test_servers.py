@@ -8,7 +8,7 @@ import select
 import socket
 import struct
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -40,7 +40,8 @@ from hil.servers.failures import TABLE
 from hil.servers.live_faults import LiveFaults
 from hil.servers.motive import Streaming, VirtualMotive
 from hil.servers.natnet_bytes import encode_frame, encode_models, encode_server_info
-from hil.servers.serial_server import parse_addresses
+from hil.servers.serial_server import Address, parse_addresses
+from hil.servers.served_robot import ServedRobot
 from hil.servers.server import Endpoints, OpenEndpoints, Server, Service
 from hil.servers.tcp_port import TcpPort
 from hil.servers.udp_server import UdpServer
@@ -782,12 +783,60 @@ def addresses(seed: int) -> dict[str, str]:
     return own.log.told()
 
 
+def opened() -> dict[str, str]:
+    """Return what robots 1 to 3 open for each kind of endpoint, and what of it they close."""
+    own = Random(0)
+
+    def serving(name: str, result: object) -> Callable[..., object]:
+        def serve(served: ServedRobot, *arguments: Any) -> object:
+            shown = (one for one in arguments if isinstance(one, int | Sequence | Address))
+            own.log.note(name, served.number, *shown)
+            return result
+
+        return serve
+
+    changes = (("serve_radio", 7), ("serve_udp", "udp"), ("serve_mavlink", "line"))
+    patched = [(ServedRobot, name, serving(name, result)) for name, result in changes]
+    stations = [(server, "fly_built_in", lambda robot, *of: own.log.note("station", *of))]
+    for number in (1, 2, 3):
+        with TemporaryDirectory() as folder, replaced(*patched, *stations, (server, "Paced", Clock)):
+            robot = Server(
+                Service(load_config(), number=number, mavlink=number < 3, state=Path(folder)), print
+            )
+            lines = parse_addresses("tcp:5000", 3)
+            for endpoints in (
+                Endpoints(), Endpoints(udp=0), Endpoints(udp=1000), Endpoints(radio=0), Endpoints(radio=19_000),
+                Endpoints(mavlink=lines), Endpoints(station="poses"), Endpoints(station="corrections"),
+            ):  # fmt: skip
+                own.log.note("opened", number, robot.open(endpoints, [8, 9]))
+            served = robot.served
+            closed = partial(own.log.note, "closed", number)
+            served.udp, served._dongles = (
+                Made(close=partial(closed, "udp")),
+                Made(close=partial(closed, "dongles")),
+            )  # type: ignore[assignment]
+            served._line_end = Made(close=partial(closed, "line"), send=partial(own.log.note, "line"))  # type: ignore[assignment]
+            served._eeprom[100] = number
+            for _ in range(2):
+                robot.close()
+                served._from_line(0, b"data")
+            own.log.note("kept", *(hash(one.read_bytes()[100]) for one in Path(folder).iterdir()))
+            own.log.note(
+                "uris", served.uri, served.robot.config.mavlink.system, served.channels()[0].quantities
+            )
+            own.log.note(
+                "loader", served.nrf51.bootloader.stm32.flash[0x4000:0x4004].hex(), served.udp_radio._config
+            )
+    return own.log.told()
+
+
 FOUND: dict[str, Callable[[], dict[str, str]]] = {
     **{
         f"{kind.__name__} {seed}": lambda kind=kind, seed=seed: kind(seed).told(seed)  # type: ignore[misc]
         for kind in (Cameras, Datagrams, Connections, Cable, Bus, Lines, Processes, Apart, Robot, Hidden)
         for seed in SEEDS
     },
+    "opened": opened,
     "addresses": lambda: addresses(0),
 }
 
