@@ -40,13 +40,14 @@ from hil.emulator.stm32f405.stopped_tasks import LOOKS, PERIODS, SETTLED_US, Tas
 from hil.emulator.stm32f405.unnamed_freertos import UnnamedFreeRtos
 from hil.errors import LabError
 from support.approved import Log, approve, judge
-from support.crazyflie_board import Board
+from support.crazyflie_board import Board, image
 from support.flight_backwards import Flight
 from support.stm32_firmware import build
 from support.stm32_machine import FirmwareOnChip, Profiled
 
 REPORTS = Path(__file__).with_name("emulator.json")
 MISTAKES = range(21)  # `enum planted` of the tests' firmware
+NAMELESS = (1, 3, 5, 7, 9, 10, 11, 16, 19)
 HANG = 9  # ends by the watchdog
 PACKETS, SEEDS = 150, range(1, 4)
 USUAL = ("-g", "-DUSUAL_PLACES", "-fno-strict-aliasing")  # what is found without symbols
@@ -61,6 +62,24 @@ def crash(planted: int) -> list[str]:
     return [
         *board.said,
         f"failures {len(own.failures)}, known {own.known}, resets {own.resets}, {board.counts[-3:]}",
+    ]
+
+
+def nameless(planted: int) -> list[str]:
+    """Return what a board says of a mistake whose image has no names."""
+    elf = Image(build(flags=USUAL))
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "cf2.bin"
+        path.write_bytes(elf.code)
+        board = Board(planted, own=Image(path))
+    assert elf.symbol("planted").address == image().symbol("planted").address
+    board.run(0, 450 if planted == HANG else 60)
+    own = board.crazyflie
+    tasks = own.tasks.tasks() if own.tasks is not None else []
+    names = [task.name for task in own.processor.tasks]
+    return [
+        *board.said[:12],
+        f"{len(board.said)}, {own.known}, {own.resets}, {own.clock_us}, {tasks}, {names}",
     ]
 
 
@@ -465,6 +484,7 @@ def memory(seed: int) -> dict[str, str]:
 FOUND: dict[str, Callable[[], list[str] | dict[str, str]]] = {
     **{f"mistake {planted}": lambda planted=planted: crash(planted) for planted in MISTAKES},  # type: ignore[misc]
     **{f"debugger {seed}": lambda seed=seed: debugger(seed) for seed in SEEDS},  # type: ignore[misc]
+    **{f"nameless {planted}": lambda planted=planted: nameless(planted) for planted in NAMELESS},  # type: ignore[misc]
     "profile": profile,
     "known DWARF 5": lambda: known(("-g",)),
     "known DWARF 4": lambda: known(("-gdwarf-4", "-fno-inline", "-ffunction-sections")),

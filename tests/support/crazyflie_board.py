@@ -18,11 +18,12 @@ def image() -> Image:
 class Board:
     """A Crazyflie with nothing around it; `said` are the lines of its console."""
 
-    def __init__(self, planted: int = 0, polls: bool = False) -> None:
+    def __init__(self, planted: int = 0, polls: bool = False, own: Image | None = None) -> None:
+        """`own` is an image instead of the tests', or of it without names."""
         self.eeprom, self.said = bytearray(b"\xff" * 8192), list[str]()
         self.counts: list[tuple[int, ...]] = []
-        self.crazyflie = Crazyflie(image(), build_machine(), self, polls, outputs=((2, 0), (2, 1)))
-        self.crazyflie.chip.write(image().symbol("planted").address, pack("<I", planted))
+        self.crazyflie = Crazyflie(own or image(), build_machine(), self, polls, outputs=((2, 0), (2, 1)))
+        self.crazyflie.chip.write(image().symbol("planted").address, pack("<I", planted))  # in each build
 
     def run(self, begin_ms: int, end_ms: int) -> list[str]:
         """Return what it says until then."""

@@ -58,7 +58,7 @@ class UnnamedFreeRtos(FreeRtos):
 
     @property
     def running(self) -> bool:
-        return self._ready[1] != 0 and self._is_task(self.current_block)
+        return self.places[0] != 0 and self._is_task(self.current_block)
 
     @property
     def heap_bytes(self) -> tuple[None, None]:
