@@ -24,7 +24,7 @@ pytest.importorskip("cffi")
 from hil.emulator.crazyflie import syslink
 from hil.emulator.crazyflie.barometer import CONFIG, Barometer
 from hil.emulator.crazyflie.bootloader import Bootloader
-from hil.emulator.crazyflie.config import RadioConfig
+from hil.emulator.crazyflie.config import LAST_ADDRESS, RadioConfig
 from hil.emulator.crazyflie.crazyflie import _check_board
 from hil.emulator.crazyflie.log_table import log_numbers, log_table, parameter_table
 from hil.emulator.crazyflie.nrf51 import BROADCAST, RATES, AirSettings, Band, Nrf51, Power, peer_packet
@@ -36,7 +36,7 @@ from hil.emulator.events import EVENTS_AT_ONE_INSTANT, EndlessInstantError, Even
 from hil.emulator.stm32f405.chip import OTP
 from hil.errors import LabError
 from hil.world.body import Carrier
-from support.approved import approve, judge
+from support.approved import Log, approve, judge
 from support.deck_bench import DeckBench
 from support.random_use import Random
 from support.stm32_bench import Bench
@@ -472,11 +472,56 @@ class Weather(Random):
         return self.log.told()
 
 
+def accepted() -> dict[str, str]:
+    """Return which values each key of the section `radio` accepts."""
+    log = Log()
+    numbers = (
+        -1,
+        0,
+        1e-9,
+        0.5,
+        1,
+        1.5,
+        2,
+        124,
+        125,
+        126,
+        1000,
+        1001,
+        10_000,
+        10_001,
+        250_000,
+        999_999,
+        1_000_000,
+        1_000_001,
+    )
+    last = f"{LAST_ADDRESS:X}"
+    texts = (
+        "",
+        "E7E7E7E7E7",
+        "e7e7e7e7e7",
+        "E7E7E7E7E",
+        "E7E7E7E7E7E",
+        "0000000000",
+        last,
+        f"{LAST_ADDRESS + 1:X}",
+        "G7E7E7E7E7",
+    )
+    for name in RadioConfig.model_fields:
+        for value in (*numbers, *texts, True, None):
+            try:
+                log.note(name, repr(getattr(RadioConfig.model_validate({name: value}), name)))
+            except ValueError:
+                log.note(name, value, "refused")
+    log.note("all", last, RadioConfig())
+    return log.told()
+
+
 FOUND: dict[str, Callable[[], dict[str, str]]] = {
     f"{kind.__name__} {seed}": lambda kind=kind, seed=seed: kind(seed).told()  # type: ignore[misc]
     for kind in (RadioChip, Loader, Line, DeckUser, Sensors, Releases, Boards, Tables, Events, Weather)
     for seed in SEEDS
-}
+} | {"accepted": accepted}
 
 
 @pytest.mark.parametrize("name", FOUND)

@@ -139,7 +139,8 @@ class Cameras(Random):
         with replaced((motive, "clock_us", lambda: now.us), (motive, "_send", sent)):
             version, up = self.pick((3, 1), (4, 1)), self.pick("y", "z")
             settings = Streaming(0, version, seed == SEEDS[-1], up)
-            found = VirtualMotive(settings, 3, readers, np.arange(6.0).reshape(2, 3))
+            period_us = (10_000, 4_000, 16_000)[seed % 3]
+            found = VirtualMotive(settings, 3, readers, np.arange(6.0).reshape(2, 3), period_us)
             ((source, read),) = readers.items()
             for _ in range(400):
                 now.us += self.pick(0, 1_000, 7_000)
