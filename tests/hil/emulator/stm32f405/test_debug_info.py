@@ -97,12 +97,17 @@ def test_an_address_has_the_line_of_the_piece_that_begins_there_and_none_behind_
     header["version"] = version
     made = LineProgram(header, BytesIO(code), program.structs, 0, len(code))
     debug = DebugInfo(Made(line_program_for_CU=lambda unit: made, get_aranges=lambda: None), Path("x"))
-    unit = Made(cu_offset=0)
-    debug.__dict__["_units"] = [(0x0800_4000, 0x0800_4100, unit)]
     files = [Path(entry.name.decode()).name for entry in header["file_entry"]]
     name = files[1 if version >= 5 else 0]
+    top = Made(attributes={"DW_AT_name": Made(value=f"some/folder/{name}".encode())})
+    debug.__dict__["_units"] = [
+        (0x0800_4000, 0x0800_4100, Made(cu_offset=0, get_top_DIE=lambda: top)),
+        (0x0800_5000, 0x0800_5100, Made(cu_offset=9, get_top_DIE=lambda: Made(attributes={}))),
+    ]
     places = [debug.line_at(at) for at in (0x0800_4000, 0x0800_400F, 0x0800_4010, 0x0800_401F, 0x0800_4020)]
     assert places == [f"{name}:11", f"{name}:11", f"{name}:21", f"{name}:21", ""]
+    found = [debug.address_of(line) for line in (f"{name}:11", f"{name}:21", f"{name}:12", "other.c:11")]
+    assert found == [0x0800_4000, 0x0800_4010, 0, 0]
 
 
 def attributes(**values: Any) -> dict[str, Any]:
