@@ -255,23 +255,20 @@ def known(flags: tuple[str, ...]) -> dict[str, str]:
 
 
 def covered() -> dict[str, str]:
-    """Return which lines, functions and branches ran, across a reset, and counted on after a second request."""
-    firmware, log = FirmwareOnChip(planted=3), Log()
-    lines = ImageLines(firmware.image)
-    for end_us in (20_000, 30_000, 40_000):
-        firmware.chip.record()
-        while firmware.chip.now_us < end_us:
-            if firmware.run(end_us) & StopReason.RESET:
-                firmware.chip.reset(SOFTWARE)
-        for file in lines.coverage(firmware.chip.passages):
-            log.note(
-                Path(file.path).name,
-                end_us,
-                file.lines_run,
-                sorted(file.lines.items()),
-                file.functions,
-                file.branches,
-            )
+    """Return which lines, functions and branches ran, across resets and asleep, and counted on after another request."""
+    log = Log()
+    for planted, flags in ((3, ("-g",)), (0, ("-g", "-DCALM"))):
+        firmware = FirmwareOnChip(flags=flags, planted=planted)
+        lines = ImageLines(firmware.image)
+        for end_us in (20_000, 30_300, 40_700):
+            firmware.chip.record()
+            while firmware.chip.now_us < end_us:
+                if firmware.run(end_us) & StopReason.RESET:
+                    firmware.chip.reset(SOFTWARE)
+            for file in lines.coverage(firmware.chip.passages):
+                name, counts = Path(file.path).name, sorted(file.lines.items())
+                log.note(name, planted, end_us, file.lines_run, counts, file.functions, file.branches)
+            log.note("passages", end_us, *firmware.chip.passages.sum(axis=0))
     return log.told()
 
 
