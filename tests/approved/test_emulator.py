@@ -6,6 +6,7 @@ what the time line and the kernel's structures hold after random use. If a chang
 
 import dataclasses
 import hashlib
+import socket
 import struct
 from collections.abc import Callable, Iterator
 from itertools import product
@@ -25,6 +26,7 @@ from hil.emulator.stm32f405.chip import CYCLES_PER_US, RAM, SOFTWARE, WATCHDOG, 
 from hil.emulator.stm32f405.coverage import ImageLines
 from hil.emulator.stm32f405.debugged_chip import DebuggedChip
 from hil.emulator.stm32f405.freertos import FreeRtos, Wait
+from hil.emulator.stm32f405.gdb import GdbServer
 from hil.emulator.stm32f405.gdb_protocol import (
     REGISTERS,
     SIGINT,
@@ -203,6 +205,43 @@ class Session:
             if why & StopReason.RESET:
                 chip.reset(SOFTWARE)
         return self.log.told()
+
+
+def remote(seed: int) -> dict[str, str]:
+    """Return what debuggers are answered on a socket, one after the other, which ask in one piece and leave or hang up."""
+    (rng, pick), firmware, log = picking(seed), FirmwareOnChip(), Log()
+    server = GdbServer(0, lambda port: log.note("waiting", port == server.port))
+    kernel = FreeRtos(firmware.image, firmware.chip.read)
+    chip, end_us = DebuggedChip(firmware.chip, server, kernel if seed % 2 else None), 0
+    lines = [firmware.image.symbol(name).address for name in ("send_line", "tick", "vTaskSwitchContext")]
+    for number in range(8):
+        end_us = 1_000 + firmware.chip.now_us
+        if pick(True, False, False):
+            with socket.create_connection(("127.0.0.1", server.port)) as browser:
+                browser.sendall(b"GET / HTTP/1.1")
+                while number and server.wants_to_stop():
+                    log.note("refused", number)
+        with socket.create_connection(("127.0.0.1", server.port)) as line:
+            packets = [
+                pick(b"c", b"s", b"g", b"?", b"qC", b"QStartNoAckMode", b"Z0,%x,2" % pick(*lines), b"bs", b"vCont;s",
+                     b"z0,%x,2" % pick(*lines), b"P4=%s" % rng.bytes(4).hex().encode())
+                for _ in range(pick(2, 6, 20))
+            ]  # fmt: skip
+            last = pick(b"", b"\x03", framed(b"D"), framed(b"k"), b"$bad#00")
+            line.sendall(b"+" + b"".join(map(framed, packets)) + last)
+            line.shutdown(socket.SHUT_WR)
+            begun = False
+            while not begun or server.is_connected:
+                try:
+                    log.note(
+                        "ran", chip.run(end_us * CYCLES_PER_US), firmware.chip.now_us, server.is_connected
+                    )
+                except KeyboardInterrupt:
+                    log.note("killed", number, firmware.chip.now_us)
+                begun, end_us = True, max(end_us, firmware.chip.now_us) + 100
+            log.note("answers", b"".join(iter(lambda: line.recv(1 << 16), b"")))
+    server.close()
+    return log.told()
 
 
 def backwards(seed: int) -> dict[str, str]:
@@ -491,7 +530,7 @@ FOUND: dict[str, Callable[[], list[str] | dict[str, str]]] = {
     "reasons": reasons,
     **{
         f"{use.__name__} {seed}": lambda use=use, seed=seed: use(seed)  # type: ignore[misc]
-        for use in (kernel, time_line, watch, memory, backwards)
+        for use in (kernel, time_line, watch, memory, remote, backwards)
         for seed in SEEDS
     },
 }

@@ -81,13 +81,11 @@ class GdbServer:
 
     def wants_to_stop(self) -> bool:
         """Return whether the debugger sent Ctrl-C, or a new one connected, while the machine ran."""
-        waiting = self._listener if self._client is None else self._client
-        if not self._arrives(waiting, 0):
-            return False
         if self._client is None:
-            return self._admit()
-        self._receive()
-        return self.protocol.interrupted
+            return self._arrives(self._listener, 0) and self._admit()
+        if self._arrives(self._client, 0):
+            self._receive()
+        return self._client is not None and self.protocol.interrupted
 
     def _arrives(self, line: socket.socket, timeout_ms: int | None = None) -> bool:
         """Wait for input; end the process when the first one has ended, whose flight this is."""

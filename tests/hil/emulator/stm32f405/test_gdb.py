@@ -585,3 +585,19 @@ def test_a_debugger_that_interrupts_a_way_back_ends_it() -> None:
             assert held == [SIGINT]
             chip._search = Search(Goal.THERE, Position(9, 0, 0, 0, 1 << 60, 1 << 60))
     assert (held, chip._search) == ([SIGINT, SIGINT], None)
+
+
+@pytest.mark.parametrize("leaves", [False, True])
+def test_ctrl_c_that_arrives_with_the_request_to_run_stops_unless_the_debugger_has_left(leaves: bool) -> None:
+    machine, server = FirmwareOnChip(), GdbServer(0)
+    with socket.create_connection(("127.0.0.1", server.port)) as line:
+        line.sendall(framed(b"QStartNoAckMode") + framed(b"c") + b"\x03")
+        chip = DebuggedChip(machine.chip, server)
+        chip.run(1_000 * CYCLES_PER_US)
+        line.sendall(b"" if leaves else framed(b"D"))
+        if leaves:
+            line.shutdown(socket.SHUT_WR)
+        chip.run(2_000 * CYCLES_PER_US)
+        server.close()
+        answers = contents(b"".join(iter(lambda: line.recv(1 << 16), b"")))
+    assert answers == ([b"OK"] if leaves else [b"OK", b"T02thread:1;", b"OK"])
