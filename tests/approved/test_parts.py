@@ -100,13 +100,16 @@ class RadioChip(Random):
         """Do one thing."""
         chip, now_us, log = self.chip, self.events.now_us, self.log
         what = self.pick(
-            "hear", "hear", "hear", "hear", "send", "overhear", "peer", "command", "power", "written"
+            "hear", "hear", "hear", "hear", "send", "overhear", "peer", "command", "power", "written", "boot"
         )
         if what == "hear":
             packet = self.packet()
             log.note(what, packet.hex(), chip.hear(now_us, packet).hex())
         elif what == "send":
             log.note(what, chip.send(now_us, self.data(1, 5, 31)))
+        elif what == "boot":
+            for packet in (b"\xff\xfe\xff", bytes((0xFF, 0xFE, 0xF0, self.pick(0, 0, 1)))):
+                log.note(what, packet.hex(), chip.hear(now_us, packet).hex())
         elif what == "overhear":
             chip.overhear(now_us, self.packet())
         elif what == "peer":

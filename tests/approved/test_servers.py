@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from firmware_py.rtos import WatchdogError
 from ground_station.mocap import MocapFrame
 from ground_station.sources.natnet import MessageId, ServerInfo, decode, packet
 from ground_station.unused import Reason
@@ -67,6 +68,15 @@ def replaced(*changes: tuple[Any, str, Any]) -> Iterator[None]:
 def arrived(source: Any) -> None:
     """Wait until a socket is readable."""
     assert select.select([source], [], [], PATIENCE_S)[0]
+
+
+def failing(error: Exception) -> Callable[..., None]:
+    """Return a function that raises an error."""
+
+    def fail(*of: object) -> None:
+        raise error
+
+    return fail
 
 
 class Clock(FreeRunning):
@@ -670,10 +680,10 @@ class Robot(Random):
             for _ in range(40):
                 now_us = own.lab.now_us
                 what = self.pick(
-                    "type", "type", "hear", "hear", "hear", "fail", "fail", "button", "peer", "eeprom"
-                )
+                    "type", "type", "type", "hear", "hear", "hear", "fail", "fail", "button", "peer", "eeprom", "hang"
+                )  # fmt: skip
                 if what == "type":
-                    number = self.pick("", "", f"{plan.number} ", "3 ", "7 ")
+                    number = self.pick(*(6 * [f"{plan.number} "]), "", "3 ", "7 ")
                     line = self.pick("status", "restart", "clear", "push.y=0.3", "imu.silent:0.3", "mocap.dropout:2", "help",
                                      "kinds", "statsu", "nothing", "push.y=x", "servo.stuck.1=0.4", "status",
                                      "battery.sag")  # fmt: skip
@@ -681,7 +691,7 @@ class Robot(Random):
                 elif what == "hear":
                     null = b"\xff"
                     data = self.pick(
-                        null, null + b"\3\1" + self.data(1), null + b"\3\2" + bytes((self.below(4),)),
+                        null, null + b"\3\1" + self.pick(b"P", b"P", self.data(1)), null + b"\3\2" + bytes((self.below(4),)),
                         null + b"\xfe\2", null + b"\xfe\3",
                         null + b"\xfe\1", null + b"\xfe\xff", null + b"\xfe\xf0" + bytes((self.below(2),)),
                         null + b"\xfe\4", b"\x30\1",
@@ -700,6 +710,11 @@ class Robot(Random):
                     own.hear_peer(
                         AirSettings(80, 2_000_000, bytes.fromhex("FFE7E7E7E7")), peer_packet(self.data(4))
                     )
+                elif what == "hang":
+                    hang = failing(WatchdogError("task", now_us, "hangs"))
+                    with replaced((type(own.robot.firmware), "check_watchdog", hang)):
+                        own.lab.end_at(now_us + 10_000)
+                        own.lab.run()
                 else:
                     own.served._eeprom[self.below(64)] ^= self.below(256)
                 own.lab.end_at(
