@@ -461,6 +461,10 @@ def reasons() -> dict[str, str]:
         words = {crashes.CFSR: status, crashes.HFSR: hard, crashes.MMFAR: 0x1234, crashes.BFAR: 0x5678}
         chip: Any = Made(read=lambda at, size, words=words: struct.pack("<I", words[at]))
         log.note("reasons", crashes.fault_reasons(chip))
+    firmware = FirmwareOnChip()
+    for kernel in (None, FreeRtos(firmware.image, firmware.chip.read)):
+        reports = crashes.CrashReports(firmware.image, firmware.chip, kernel, "assertFail")
+        log.note("who", *(reports._who(number) for number in range(100)))
     for trace in ((), ("a",), ("a", "a", "b"), ("a", "b", "b", "b", "a")):
         log.note("crash", crashes.Crash("what", "who", trace))
     return log.told()

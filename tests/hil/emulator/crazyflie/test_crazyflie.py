@@ -8,10 +8,13 @@ import pytest
 pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
+from firmware_py.export.elf import Symbol
 from hil.emulator.crazyflie import crazyflie, radio_line
 from hil.emulator.stm32f405.chip import SOFTWARE, WATCHDOG
+from hil.emulator.stm32f405.image import Image
 from hil.emulator.stm32f405.stopped_tasks import SETTLED_US, StoppedTask
 from support.crazyflie_board import Board, image
+from support.stm32_firmware import PLACE
 
 (
     NOTHING, BUS_FAULT, UNDEFINED, ASSERTION, HUNGRY_WATCHDOG, NULL_CALL, NULL_READ, NULL_WRITE, DIVISION, HANG, OVERFLOW,
@@ -157,3 +160,28 @@ def test_a_host_finds_a_board_a_while_after_its_last_reset(
     board.run(0, 40)
     assert board.crazyflie.resets[SOFTWARE] == (0 if polled else 3)
     assert fed == polled
+
+
+def test_a_lock_up_is_a_failure_once_and_nothing_is_looked_for_behind_it() -> None:
+    board = Board(BUS_FAULT)
+    board.crazyflie.chip.write(image().base + 4 * 3, b"\1\0\0\x30")  # the HardFault's handler is nowhere
+    (said,) = board.run(0, 30)
+    assert re.match(
+        r"lock-up, no fault handler could run: .* at 0x30000000, in exception 3 \(Stuck_Handler\)", said
+    )
+    assert board.run(30, 180) == []
+    assert (board.crazyflie.failures, board.crazyflie.resets) == ([said], {WATCHDOG: 0, SOFTWARE: 0})
+
+
+def test_the_firmwares_own_clock_counts_its_timers_overflows() -> None:
+    board, own = Board(), image()
+    assert board.crazyflie.clock_us is None
+    known = Image(own.path)
+    known._variables["usecTimerHighCount"] = [Symbol("usecTimerHighCount", PLACE, 4, False, True)]
+    board = Board(own=known)
+    board.run(0, 20)
+    for high in (0, 3):
+        board.crazyflie.chip.write(PLACE, high.to_bytes(4, "little"))
+        count = int.from_bytes(board.crazyflie.chip.read(0x4000_1424, 4), "little")
+        assert 0 < count < 1 << 16
+        assert board.crazyflie.clock_us == (high << 16) + count
