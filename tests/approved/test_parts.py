@@ -330,7 +330,7 @@ class Releases(Random):
                     part["platform"] = self.pick(*(9 * ["cf2"]), "tag", "cf3")
                 if self.below(3) == 0:
                     part["release"] = self.pick("2024.1", "x\n", 7)
-                files[self.pick(*(20 * [name]), "a/b", ".hidden", 101 * "n")] = part
+                files[self.pick(*(20 * [name]), "a/b", ".hidden", 100 * "n", 101 * "n")] = part
             version, listed = self.pick(*(5 * [1, 2]), 3), self.pick(*(15 * [files]), [], {})
             manifest: dict[str, Any] = {"version": version, "files": listed}
             if self.below(2):

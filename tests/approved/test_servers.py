@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 from firmware_py.rtos import WatchdogError
+from firmware_py.wire.memories import CONFIG_SIZE, RadioSettings, encode_config
 from ground_station.mocap import MocapFrame
 from ground_station.sources.natnet import MessageId, ServerInfo, decode, packet
 from ground_station.unused import Reason
@@ -265,7 +266,7 @@ class Connections(Random):
             port = TcpPort(("127.0.0.1", 0), readers, PROTOCOL, join, say)
             now_us = 0
             for number in range(300):
-                now_us += self.pick(0, 1, 10_000, 999_999, 1_000_000)
+                now_us += self.pick(0, 1, 10_000, 300_000, 300_000, 999_999, 1_000_000)
                 clients = [*port.clients]
                 what = self.pick(
                     "connect",
@@ -294,9 +295,7 @@ class Connections(Random):
                         ends[one.name].shutdown(socket.SHUT_WR)
                         left.add(one.name)
                     else:
-                        ends[one.name].sendall(
-                            self.pick(b"C", b"W", b"T", b"C", b"W", b"GET") + self.data(0, 4)
-                        )
+                        ends[one.name].sendall(self.pick(b"C", b"W", b"T", b"GET", b"GET") + self.data(0, 4))
                     if one._socket in readers:
                         arrived(one._socket)
                         readers[one._socket](now_us)
@@ -541,7 +540,7 @@ class Processes(Random):
 
             def recv() -> Any:
                 if not near:
-                    raise EOFError
+                    raise EOFError if number % 2 else ConnectionResetError
                 return near.popleft()
 
             def send(message: Any) -> None:
@@ -592,7 +591,7 @@ class Processes(Random):
                         self.log.note("typed", error)
                 elif what == "peers":
                     robots.to_peers(settings, self.data(3))
-                elif self.below(12) == 0 and number - 2 in own.clock.readers:
+                elif self.below(4) == 0 and number - 2 in own.clock.readers:
                     fars[number - 2].near.clear()
                     fars[number - 2].closed.append(1)
                     own.clock.readers[number - 2](0)
@@ -837,6 +836,10 @@ def opened() -> dict[str, str]:
                 robot.close()
                 served._from_line(0, b"data")
             own.log.note("kept", *(hash(one.read_bytes()[100]) for one in Path(folder).iterdir()))
+            served._eeprom[:CONFIG_SIZE] = encode_config(RadioSettings(30 + number, 1, 0xE7E7E7E755))
+            robot.close()
+            again = Server(Service(load_config(), number=number, state=Path(folder)), print).served
+            own.log.note("moved", again.uri, again.nrf51.settings)
             own.log.note(
                 "uris", served.uri, served.robot.config.mavlink.system, served.channels()[0].quantities
             )
