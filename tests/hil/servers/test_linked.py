@@ -34,7 +34,7 @@ def line_of(stack: ExitStack, folder: Path, link: str, program: str = "", **opti
     request = Request.of(EXPERIMENTS["yaw-step"], link=link, **options)
     flight = stack.enter_context(closing(linked_flight(request, folder / "telemetry.csv", stack)))
     line: Any = flight.line
-    line.lab = flight.lab
+    line.lab, line.flight = flight.lab, flight
     line.started_by = line._command
     line._command = [sys.executable, "-c", program]
     return line
@@ -154,6 +154,7 @@ def test_a_station_may_end_in_order_and_is_killed_after_a_while(
     heard(line, WARM_UP_US)
     line.lab.end_at(10_000)
     line.lab.run()
+    line.flight.over = True  # as `Flight.end` has it: it listens no more
     line.finish(line.lab)
     assert line._station.returncode == code
     assert said == [("station", "leaving")] or code  # a killed one may not have come to say it
