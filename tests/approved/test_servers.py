@@ -572,6 +572,7 @@ class Processes(Random):
                 self.log.note("opened", robots.wait())
             except LabError as error:
                 self.log.note("opened", error)
+            robots.room.rows[:] = 1.0
             robots.listen(own, partial(self.log.note, "answered"), self.pick(cameras, None))
             terminals = robots.terminals
             for _ in range(80):
@@ -595,7 +596,7 @@ class Processes(Random):
                     fars[number - 2].near.clear()
                     fars[number - 2].closed.append(1)
                     own.clock.readers[number - 2](0)
-                self.log.note("readers", *own.clock.readers, *robots.terminals)
+                self.log.note("readers", *own.clock.readers, *robots.terminals, robots.room.rows.sum(axis=1))
             fars[0].near.append(("say", ("goodbye",)))
             robots.close()
             for far in fars:
@@ -614,7 +615,7 @@ class Apart(Random):
                 None, None, ("hear", (settings, peer_packet(self.data(3)))),
                 *(("type", (line,)) for line in ("status", "2 status", "3 status", "clear", "2 push.y:0.1", "3 push.y:0.1")),
             ))  # fmt: skip
-        messages += [("type", ("status",)), *([("end", ())] if seed % 2 else [])]
+        messages += [("type", ("status",)), *([("end", ())] if seed == 1 else [])]
 
         taken: list[Any] = [("type", ("",))]
 
@@ -629,8 +630,9 @@ class Apart(Random):
 
         def recv() -> Any:
             message = taken.pop()
+            self.log.note("read", message)
             if message == "gone":
-                raise EOFError
+                raise EOFError if seed == 2 else ConnectionResetError
             return message
 
         def send(message: tuple[str, tuple[Any, ...]]) -> None:
