@@ -41,6 +41,8 @@ from hil.emulator.stm32f405.processor import ChipProcessor
 from hil.emulator.stm32f405.stopped_tasks import LOOKS, PERIODS, SETTLED_US, TaskWatch
 from hil.emulator.stm32f405.unnamed_freertos import UnnamedFreeRtos
 from hil.errors import LabError
+from hil.world.body import Carrier
+from hil.world.room import Room
 from support.approved import Log, approve, judge
 from support.crazyflie_board import Board, image
 from support.flight_backwards import Flight
@@ -83,6 +85,31 @@ def nameless(planted: int) -> list[str]:
         *board.said[:12],
         f"{len(board.said)}, {own.known}, {own.resets}, {own.clock_us}, {tasks}, {names}",
     ]
+
+
+def carried() -> dict[str, str]:
+    """Return what the sensors of a board that a body carries show, and what the ESC of its second motor answers."""
+    log, motion = Log(), Made(p_WB=np.zeros(3), q_WB=np.array((1.0, 0.0, 0.0, 0.0)))
+    escs = np.array((4_000.0, 7_000.0, 9_000.0, 11_000.0))
+    carrier = Carrier(motion, np.random.default_rng(1), Room(0.0, 2.0, 2.5), ("flow2", "multiranger"), escs)  # type: ignore[arg-type]
+    outputs = ((2, 0), (1, 1), (3, 2), (3, 3))
+    board = Board(carrier=carrier, outputs=outputs, polls=True)
+    own = board.crazyflie
+    edges = image().symbol("edges")
+    for ms in range(0, 90, 3):
+        motion.p_WB[2] = 0.01 * ms
+        board.run(ms, ms + 3)
+        own.parts.sample((ms, 1, 2, 3, 4, 5))
+        shown = (own.parts.gyro[:10], own.parts.accel[:30], own.parts._barometer._registers[:12])
+        log.note("registers", ms, *(one.tobytes().hex() for one in shown))
+        log.note("edges", ms, own.chip.read(edges.address, edges.size).hex())
+        log.note("state", ms, own.parts.device_type, board.counts[-1:], own.radio._heard_us, own._crashed)
+        own._outside.eeprom[ms] = ms
+        log.note(
+            "decks", own.radio._decks.answer(0x20, b"").hex(), own.radio._decks.answer(0x21, b"\1").hex()
+        )
+    log.note("said", *board.said)
+    return log.told()
 
 
 def profile() -> list[str]:
@@ -529,6 +556,7 @@ FOUND: dict[str, Callable[[], list[str] | dict[str, str]]] = {
     "known DWARF 5": lambda: known(("-g",)),
     "known DWARF 4": lambda: known(("-gdwarf-4", "-fno-inline", "-ffunction-sections")),
     "covered": covered,
+    "carried": carried,
     **{f"session {seed}": lambda seed=seed: Session(seed).told() for seed in SEEDS},  # type: ignore[misc]
     "profiles": profiles,
     "reasons": reasons,

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from functools import cache
 from struct import pack
+from typing import Any
 
 from hil.emulator.crazyflie.crazyflie import Crazyflie
 from hil.emulator.stm32f405.chip import build_machine
@@ -18,11 +19,12 @@ def image() -> Image:
 class Board:
     """A Crazyflie with nothing around it; `said` are the lines of its console."""
 
-    def __init__(self, planted: int = 0, polls: bool = False, own: Image | None = None) -> None:
-        """`own` is an image instead of the tests', or of it without names."""
+    def __init__(self, planted: int = 0, own: Image | None = None, **options: Any) -> None:
+        """`own` is an image instead of the tests', or of it without names; `options` are the Crazyflie's."""
         self.eeprom, self.said = bytearray(b"\xff" * 8192), list[str]()
         self.counts: list[tuple[int, ...]] = []
-        self.crazyflie = Crazyflie(own or image(), build_machine(), self, polls, outputs=((2, 0), (2, 1)))
+        options = {"polls": False, "outputs": ((2, 0), (2, 1)), **options}
+        self.crazyflie = Crazyflie(own or image(), build_machine(), self, **options)
         self.crazyflie.chip.write(image().symbol("planted").address, pack("<I", planted))  # in each build
 
     def run(self, begin_ms: int, end_ms: int) -> list[str]:
