@@ -108,6 +108,11 @@ def carried() -> dict[str, str]:
         log.note(
             "decks", own.radio._decks.answer(0x20, b"").hex(), own.radio._decks.answer(0x21, b"\1").hex()
         )
+    state, names = own.chip.state, ("size", "address_bytes", "bus", "address", "pairs", "watched")
+    for device in state.device[0 : state.devices]:
+        log.note("devices", *(getattr(device, name) for name in names), bytes(device.memory[0:4]).hex())
+    for esc in state.esc[0 : state.escs]:
+        log.note("escs", esc.rpm[0], esc.timer, esc.channel, esc.poles)
     log.note("said", *board.said)
     return log.told()
 
