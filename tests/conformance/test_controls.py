@@ -9,6 +9,7 @@ import pytest
 
 from firmware_py import table
 from firmware_py.firmware import Firmware
+from firmware_py.rtos import TICK_US
 from firmware_py.wire import crtp
 from firmware_py.wire.supervisor import Cause, State
 from ground_station.config import LinkSettings
@@ -293,3 +294,32 @@ def test_a_parameter_that_can_only_be_read_is_not_written() -> None:
     assert dict(ask(bench, ControlAction.READ, "cpu.flash").values) == {"cpu.flash": 1024}
     bench.known["cpu.id1"] = replace(bench.known["cpu.id1"], number=9999)
     assert "does not report it" in ask(bench, ControlAction.READ, "cpu.id1").error
+
+
+@pytest.mark.parametrize("link", BENCHES)
+def test_a_full_link_is_offered_its_frame_at_each_tick_and_then_gets_it_once(link: str) -> None:
+    bench: Any = BENCHES[link]()
+    offered, leaves = list[tuple[int, bytes, bool]](), {"crtp": "radio_send", "mavlink": "uart_write"}[link]
+    leave = getattr(bench, leaves)
+
+    def offer(data: bytes) -> bool:
+        taken = leave(data)
+        offered.append((bench.now_us, bytes(data), taken))
+        return bool(taken)
+
+    setattr(bench, leaves, offer)
+    bench.run(500_000)
+    for _ in range(2):
+        bench.radio_open, bench.uart_room = False, 0
+        bench.firmware.radio_received(b"\xfcecho")
+        offered.clear()
+        while not offered:
+            bench.run(bench.now_us + 10_000)
+        bench.run(bench.now_us + 50_000)
+        waiting = [one for one in offered if one[1] == offered[-1][1]]
+        assert len(waiting) > 20
+        ticks = [at_us // TICK_US for at_us, *_ in waiting]
+        assert ticks == [*range(ticks[0], ticks[0] + len(ticks))]
+        bench.radio_open, bench.uart_room = True, 1 << 30
+        bench.run(bench.now_us + 5_000)
+        assert [one[2] for one in offered if one[1] == waiting[0][1]] == [False] * len(waiting) + [True]

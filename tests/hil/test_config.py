@@ -7,7 +7,8 @@ import pytest
 
 from firmware_py.config import parameters_of
 from firmware_py.core.structs import Parameters
-from hil.config import LabConfig, load_config, profile_names, settings_of
+from firmware_py.logic.laws import SHIPPED_LAWS
+from hil.config import LabConfig, load_config, profile_names, read_config, settings_of
 from hil.errors import LabError
 
 
@@ -68,6 +69,34 @@ def test_a_profile_builds_on_another(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text('base = "below/near.toml"\n')
     with pytest.raises(LabError, match=r"leads back to itself$"):
         load_config(str(tmp_path / "below" / "far.toml"))
+
+
+def test_own_files_lie_beside_the_profile_that_names_them_and_typed_ones_in_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folder in ("base", "mine", "here"):
+        (tmp_path / folder).mkdir()
+    own = 'controller = "law.py"\nestimator = "../far.py"\ngain = 2.0\n[robot]\nbody = "robot.py"\n'
+    (tmp_path / "base" / "base.toml").write_text(f'base = "floaty"\n[logic]\n{own}')
+    (tmp_path / "mine" / "mine.toml").write_text(
+        'base = "../base/base.toml"\n[logic]\nestimator = "own.py"\n'
+    )
+    monkeypatch.chdir(tmp_path / "here")
+    (shipped, law), *_ = SHIPPED_LAWS.items()
+
+    def found(profile: str, *overrides: str) -> tuple[str, ...]:
+        config = read_config(profile, overrides)
+        files = config.logic.controller, config.logic.estimator, config.robot.body
+        assert config.logic.values == {"gain": 2.0}
+        return tuple(one.removeprefix(f"{tmp_path}/") for one in files)
+
+    assert found("../base/base.toml") == ("base/law.py", "far.py", "base/robot.py")
+    mine = str(tmp_path / "mine" / "mine.toml")
+    assert found(mine) == ("base/law.py", "mine/own.py", "base/robot.py")
+    typed = "logic.controller=typed.py", "logic.estimator=", "robot.body=crazyflie"
+    assert found(mine, *typed) == ("here/typed.py", "", "crazyflie")
+    named = f"logic.controller={shipped}", f"logic.estimator={shipped}", "robot.body=sub/own.py"
+    assert found(mine, *named) == (law, f"here/{shipped}", "here/sub/own.py")
 
 
 def test_the_first_three_of_many_mistakes_are_named_and_values_that_no_profile_has_are_refused() -> None:
