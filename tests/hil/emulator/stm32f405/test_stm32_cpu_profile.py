@@ -10,7 +10,7 @@ pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
 from firmware_py.export.elf import FLASH
-from hil.emulator.stm32f405.cpu_profile import ROOT, Calls, Part, Reader
+from hil.emulator.stm32f405.cpu_profile import ROOT, Calls, HandlerTimes, Part, Reader
 from support.stm32_machine import Profiled
 
 ASSERTION, MASKING, NESTED, SLEEP = 3, 2, 3, 5  # a mistake and three scenarios
@@ -121,3 +121,20 @@ def test_a_function_has_the_callers_of_its_longest_call_and_the_cycles_of_all() 
     )
     assert found.others == (("C", 60), ("B", 50))
     assert (found.begin_us, found.us, found.cycles) == (6.0, 1.0, 40)
+
+
+@pytest.mark.parametrize(("worst", "last"), [(75, 75), (90, 79)])
+def test_percentiles_are_ends_of_bins_of_an_eighth_of_an_octave_but_never_above_the_worst(
+    worst: int, last: int
+) -> None:
+    """Of 100 runs, 50 take at most 11 cycles, 95 at most 51, and 99 at most 79."""
+    counts = [0] * 40
+    counts[3], counts[10], counts[20], counts[25], counts[30] = 50, 40, 5, 4, 1
+    reader = Reader.__new__(Reader)
+    reader._tasks, reader._ahead_us = (), 2
+    runs = Record(count=100, cycles=900, worst=worst, when=1680, bin=counts)
+    reader._profile = Record(service=[Record(count=0), runs])
+    reader._chip = Record(state=Record(vtor=FLASH), read=lambda at, size: (at + 1).to_bytes(4, "little"))
+    reader._image = Record(function_at=lambda address: f"at {address - FLASH}")
+    (found,) = reader._handler_times()
+    assert found == HandlerTimes("exception 1 at 4", 100, 900, worst, 8.0, (11, 51, last))
