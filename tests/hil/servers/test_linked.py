@@ -53,8 +53,9 @@ def heard(line: Any, now_us: int) -> list[tuple[str, str]]:
     "link", ["radio://0/80/2M/E7E7E7E7E7", UDP, "mavlink:pty"], ids=["radio", "udp", "mavlink"]
 )
 def test_the_station_gets_its_link_its_cameras_and_the_profile(
-    stack: ExitStack, tmp_path: Path, link: str
+    stack: ExitStack, tmp_path: Path, link: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("PYTHONPATH", "user")
     line = line_of(stack, tmp_path, link, overrides=("controller.gain_r=0.08",))
     words = line.started_by
     assert words[1:5] == ["-m", "hil.commands", "station", "yaw-step"]
@@ -70,6 +71,8 @@ def test_the_station_gets_its_link_its_cameras_and_the_profile(
         words
     )
     assert (VARIABLE in line._environment) is link.startswith("radio")
+    found = line._environment.get("PYTHONPATH", "user")  # the first `sitecustomize` on it counts
+    assert found == (f"{linked.SITE}:user" if link.startswith("radio") else "user")
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,13 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 import serial
 
 from hil.errors import LabError
-from hil.servers.serial_server import Address, parse_addresses
+from hil.servers.serial_server import UDP_PORT, Address, parse_addresses
 from support.line_clients import OpenEnd, TcpClient
 
 
@@ -127,3 +128,15 @@ def test_addresses_count_up_to_the_last_port(text: str, host: str, ends: list[st
     assert {end.host for end in addresses} == {host}
     where = [end.path or "" if end.kind == "pty" else end.port for end in addresses]
     assert [f"{end.kind}:{place}".rstrip(":") for end, place in zip(addresses, where, strict=True)] == ends
+
+
+@pytest.mark.parametrize("kind", ["pty", "udp", "tcp"])
+def test_a_closed_end_keeps_no_descriptor(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "line" if kind == "pty" else None
+    address = Address(kind, port=UDP_PORT if kind == "udp" else 0, path=path)
+    before, readers = os.listdir("/proc/self/fd"), dict[Any, Any]()
+    end = address.open(readers, max, print)
+    assert len(os.listdir("/proc/self/fd")) > len(before)
+    for _ in range(2):
+        end.close()
+        assert (os.listdir("/proc/self/fd"), readers, list(tmp_path.iterdir())) == (before, {}, [])
