@@ -598,7 +598,9 @@ class Processes(Random):
                     own.clock.readers[number - 2](0)
                 self.log.note("readers", *own.clock.readers, *robots.terminals, robots.room.rows.sum(axis=1))
             fars[0].near.append(("say", ("goodbye",)))
-            robots.close()
+            for _ in range(2):
+                robots.close()
+                self.log.note("closed", *robots.terminals, *robots._processes)
             for far in fars:
                 self.log.note("far", *far.far)
         return self.log.told()
