@@ -397,7 +397,7 @@ class Tables(Random):
             ends = {f"_{table}_start": base + begin, f"_{table}_stop": base + end}
             image: Any = SimpleNamespace(
                 code=bytes(code), base=base, named=self.pick(True, False, False),
-                has=self.pick(ends.__contains__, ends.__contains__, lambda _: False),
+                has=self.pick(*(4 * [ends.__contains__]), lambda name: name.endswith("stop"), lambda _: False),
                 symbol=lambda name, ends=ends: SimpleNamespace(address=ends[name]),
             )  # fmt: skip
             chip: Any = SimpleNamespace(
