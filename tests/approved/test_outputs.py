@@ -35,9 +35,7 @@ from hil.commands import options
 from hil.commands.app import app
 from hil.config import load_config, profile_names
 from hil.laboratory.bodies import make_body
-from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.files.recorder import load_log
-from hil.laboratory.metrics import METRICS
 from hil.pictures.drawing import DPI
 from hil.research.learn.envs import make_env
 from hil.research.learn.tasks import TASKS
@@ -47,7 +45,6 @@ from support.command import floaty
 from support.paths import ROOT
 
 APPROVED = Path(__file__).parent
-KNOWN = {id(kinds): set(kinds) for kinds in (KINDS, METRICS)}  # before any test has added its own
 SCRIPTS = {
     "flights": """
         fly hover --duration 1.5 --perfetto --set markers.enabled=true
@@ -329,11 +326,7 @@ def plain(text: str, place: str) -> str:
 
 def outputs(name: str) -> Iterator[str]:
     """Yield what a script prints, draws and writes."""
-    with pytest.MonkeyPatch.context() as patch:
-        for kinds in (KINDS, METRICS):
-            for own in set(kinds) - KNOWN[id(kinds)]:
-                patch.delitem(kinds, own)
-        yield from PYTHON[name]() if name in PYTHON else printed(name)
+    yield from PYTHON[name]() if name in PYTHON else printed(name)
 
 
 def printed(name: str) -> Iterator[str]:
@@ -368,7 +361,7 @@ def printed(name: str) -> Iterator[str]:
             yield from (plain(line, place) for line in (*lines, f"exit code {code}", *figures))
             figures.clear()
             for path in sorted(Path().rglob("*")):
-                if path.is_file() and before.get(path) != path.stat().st_mtime_ns:
+                if path.suffix != ".pyc" and path.is_file() and before.get(path) != path.stat().st_mtime_ns:
                     yield from written(path, place, seen)
 
 
