@@ -166,6 +166,7 @@ FLOWN = (
     "schedule.parquet",
     "telemetry.csv",
 )  # whole in "flights"
+STEERING = ("CI", "BUILD_NUMBER", "PYTEST_ADDOPTS")  # how much pytest prints
 COMPILING = ("floaty: compiling ", options.COMPILING)  # only where it was not yet
 VOLATILE = (
     (re.compile(r"^Usage: .*?floaty"), "Usage: floaty"),
@@ -348,6 +349,8 @@ def printed(name: str) -> Iterator[str]:
             foreign_logs.write_all(Path())
         patch.setattr(Figure, "savefig", show)
         patch.setenv("COLUMNS", "140")
+        for variable in STEERING:
+            patch.delenv(variable, raising=False)
         for console in (options.console, options.notices):
             patch.setattr(console, "width", 140)
         script = SCRIPTS[name].replace("HELP", "\n".join(helps()))

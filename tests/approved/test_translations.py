@@ -1,7 +1,7 @@
 """What the translators said to random programs with a mistake, they still say: the refusal, or a hash of the C.
 
-Half of the mistakes are statements that users write, the others wrong operators, calls and numbers. If a change is meant:
-make approve.
+Two thirds of the mistakes are statements that users write, the others wrong operators, calls and numbers. If a change is
+meant: make approve.
 """
 
 import hashlib
