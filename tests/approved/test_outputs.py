@@ -397,7 +397,7 @@ def close(line: str, known: str) -> bool:
     )
 
 
-LONG = ("optimise", "tuning")
+LONG = ("optimise", "programs", "tuning")
 PACKAGES = (
     "click",
     "foxglove-sdk",
