@@ -38,7 +38,7 @@ from hil.errors import LabError
 from hil.world.body import Carrier
 from support.approved import Log, approve, judge
 from support.deck_bench import DeckBench
-from support.random_use import Random
+from support.random_use import Random, hash_of
 from support.stm32_bench import Bench
 
 USES = Path(__file__).with_name("parts.json")
@@ -162,11 +162,6 @@ class Loader(Random):
                 "written", hash_of(loader.take_written()[:30_000]), hash_of(loader.nrf51.flash[90_000:91_500])
             )
         return self.log.told()
-
-
-def hash_of(data: bytes | bytearray) -> int:
-    """Return a number that differs with the contents."""
-    return int(np.frombuffer(bytes(data), np.uint8).astype(np.int64) @ (np.arange(len(data)) % 9973 + 1))
 
 
 class Line(Random):

@@ -48,7 +48,7 @@ from hil.servers.server import Endpoints, OpenEndpoints, Server, Service
 from hil.servers.tcp_port import TcpPort
 from hil.servers.udp_server import UdpServer
 from support.approved import approve, judge
-from support.random_use import Random
+from support.random_use import Random, hash_of
 from support.watching import Watcher
 
 ANSWERS = Path(__file__).with_name("servers.json")
@@ -317,7 +317,7 @@ class Connections(Random):
 
 
 class Cable(Random):
-    """A client's frames to a dongle, in pieces, and a board that answers; the client may be told to wait."""
+    """A client sends frames to a dongle in pieces, and a board answers; now and then the client has to wait."""
 
     def told(self, seed: int) -> dict[str, str]:
         events, board = EventQueue(), Made(battery_V=3.5)
@@ -727,11 +727,7 @@ class Robot(Random):
                 )
                 own.lab.run()
                 kept = next(Path(folder).iterdir(), None)
-                known = (
-                    0
-                    if kept is None
-                    else int(np.frombuffer(kept.read_bytes(), np.uint8)[:64].astype(int) @ np.arange(1, 65))
-                )
+                known = 0 if kept is None else hash_of(kept.read_bytes()[:64])
                 body, signals = own.robot.body, own.robot.firmware.signals
                 self.log.note(
                     "state", own.lab.now_us, chip.power, own.robot.free, own.robot.powered, body.lost, known

@@ -6,7 +6,8 @@ meant: make approve.
 
 import hashlib
 import tempfile
-from importlib.util import module_from_spec, spec_from_file_location
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from textwrap import indent
 
@@ -16,9 +17,10 @@ import pytest
 from firmware_py.core.subset import i32
 from firmware_py.export.errors import ExportError
 from firmware_py.export.kernels import translate
+from firmware_py.export.live_reading import Arrays
 from firmware_py.logic.loading import LogicError, check_file
 from support.approved import approve, judge
-from support.random_frames import KERNEL, KERNEL_HEAD, LIVE, OWN, law_of
+from support.random_frames import KERNEL, KERNEL_HEAD, LIVE, OWN, law_of, names_in
 from support.random_mistakes import mistaken
 from support.random_programs import Programs
 
@@ -27,46 +29,42 @@ LAWS, KERNELS = 100, 100
 
 
 def laws() -> list[str]:
-    """Return what is said of each law of a user."""
+    """Return the translator's answer to each control law of a user."""
     said = []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "law.py"
         for seed in range(LAWS):
             body, mistake = mistaken(Programs(OWN, seed).body() + "\nreturn x", seed)
             path.write_text(law_of([body]), encoding="utf-8")
-            try:
-                text = hashed(check_file(path).translation.source)
-            except (ExportError, LogicError) as error:
-                text = str(error).replace(folder, "")
-            said.append(f"{mistake}: {text}")
+            said.append(f"{mistake}: {answer(folder, lambda: check_file(path).translation.source)}")
     return said
 
 
 def kernels() -> list[str]:
-    """Return what is said of each kernel of the laboratory."""
-    bodies = [mistaken(Programs(LIVE, seed).body(), seed) for seed in range(KERNELS)]
+    """Return the translator's answer to each kernel of the laboratory."""
     memory, said = (np.zeros(5), np.zeros(3, i32)), []
     with tempfile.TemporaryDirectory() as folder:
-        for seed, (body, mistake) in enumerate(bodies):
-            path = Path(folder) / f"kernels_{seed}.py"
+        for seed in range(KERNELS):
+            body, mistake = mistaken(Programs(LIVE, seed).body(), seed)
+            path, name = Path(folder) / f"kernels_{seed}.py", f"random_{seed}"
             path.write_text(
                 KERNEL_HEAD + KERNEL.format(name=seed, body=indent(body, "    ")), encoding="utf-8"
             )
-            spec = spec_from_file_location(path.stem, path)
-            assert spec is not None
-            assert spec.loader is not None
-            module = module_from_spec(spec)
-            try:
-                spec.loader.exec_module(module)
-                text = hashed(translate((vars(module)[f"random_{seed}"],), memory))
-            except (ExportError, SyntaxError) as error:
-                text = str(error).replace(folder, "")
-            said.append(f"{mistake}: {text}")
+            said.append(f"{mistake}: {answer(folder, partial(kernel_in_c, path, name, memory))}")
     return said
 
 
-def hashed(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:12]
+def kernel_in_c(path: Path, name: str, memory: Arrays) -> str:
+    """Return the C of a kernel in a file."""
+    return translate((names_in(path)[name],), memory)
+
+
+def answer(folder: str, translated: Callable[[], str]) -> str:
+    """Return the hash of a translation, or why there is none."""
+    try:
+        return hashlib.sha256(translated().encode()).hexdigest()[:12]
+    except (ExportError, LogicError, SyntaxError) as error:
+        return str(error).replace(folder, "")
 
 
 FINDERS = {"laws": laws, "kernels": kernels}

@@ -42,7 +42,7 @@ def approve(path: Path, finders: Mapping[str, Callable[[], Any]], *packages: str
 
 
 class Log:
-    """What happened, by kind; `told` has of each kind the count, a hash of all and the last one."""
+    """Notes of what happened, by kind; `told` returns the count of each kind, a hash of all its notes and the last one."""
 
     def __init__(self) -> None:
         self._rows: dict[str, list[str]] = {}

@@ -1,4 +1,4 @@
-"""A flight in a process of its own, which goes back in time as its debugger wants."""
+"""A flight that runs in a process of its own, and goes back in time when its debugger asks."""
 
 import os
 import re

@@ -1,6 +1,9 @@
 """Frames around random bodies: a file of a user's small laws, and a module of the laboratory's kernels."""
 
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
 from textwrap import indent
+from typing import Any
 
 from support.random_programs import Language
 
@@ -78,3 +81,13 @@ def law_of(bodies: list[str], top: str = "") -> str:
     laws = "".join(LAW.format(name=n, body=indent(body, "    ")) for n, body in enumerate(bodies))
     calls = [f"    memory.answers[{n}] = law_{n}(estimator, own, memory)\n" for n in range(len(bodies))]
     return f"{LAW_HEAD}{top}\n\n{laws}\n{HOOKS.format(calls=''.join(calls) or '    return')}"
+
+
+def names_in(path: Path) -> dict[str, Any]:
+    """Execute a module from its file and return its names."""
+    spec = spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return vars(module)

@@ -1,7 +1,6 @@
 """The laboratory's kernels in C do what their Python does, and what has no equal in C is refused."""
 
 import math
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from textwrap import indent
 from typing import Any
@@ -20,7 +19,7 @@ from firmware_py.export.errors import ExportError
 from firmware_py.export.kernels import build, library, translate
 from firmware_py.export.live_reading import Arrays
 from firmware_py.export.methods import METHOD
-from support.random_frames import KERNEL, KERNEL_HEAD, LIVE
+from support.random_frames import KERNEL, KERNEL_HEAD, LIVE, names_in
 from support.random_programs import Programs
 
 COMPILERS = [one for one in compilers() if one.name != "cc"]
@@ -110,12 +109,8 @@ def test_random_kernels_compute_the_bits_of_python(tmp_path: Path) -> None:
     path = tmp_path / "random_kernels.py"
     kernels = (KERNEL.format(name=n, body=indent(Programs(LIVE, n).body(), "    ")) for n in range(30))
     path.write_text(KERNEL_HEAD + "".join(kernels), encoding="utf-8")
-    spec = spec_from_file_location("random_kernels", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    functions = tuple(vars(module)[f"random_{n}"] for n in range(30))
+    names = names_in(path)
+    functions = tuple(names[f"random_{n}"] for n in range(30))
     in_c, in_python = ((np.zeros(5), np.zeros(3, i32)) for _ in range(2))
     built = library(functions, in_c)
     rng = np.random.default_rng(2)
