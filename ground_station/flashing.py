@@ -4,6 +4,7 @@ The board restarts into its bootloader, takes the image in pages, is read back, 
 matches. The bootloader works by radio alone: neither USB nor UDP can flash. The only file besides the link that uses cflib.
 """
 
+import contextlib
 import re
 import struct
 from collections.abc import Callable
@@ -21,6 +22,7 @@ FLASH_END = 0x0810_0000
 MEMORIES = ((0x2000_0000, 0x2002_0000), (0x1000_0000, 0x1001_0000))  # where the stack may begin
 QUIET_S = 0.2  # without an answer no packet is in flight any more
 READ_TRIES = 3
+AGAIN = "press its button and flash again"
 
 
 def check_image(image: bytes) -> None:
@@ -38,8 +40,7 @@ def check_image(image: bytes) -> None:
 def flash(uri: str, image: bytes, progress: Progress) -> None:
     """Write an image, compare it, and start it; `LinkError` has the reason for a failure in one line.
 
-    When that happens after the first page was written, the board stays in its bootloader until it is flashed again or
-    its button is pressed.
+    After a failure the board waits in its bootloader, at an address of its own: only its button brings it back to `uri`.
     """
     if not re.fullmatch(URIS[0], uri):
         raise LinkError(f"{uri}: expected radio://0/80/2M/E7E7E7E7E7: the bootloader listens only to radio")
@@ -82,7 +83,9 @@ def _write(loader: Cloader, image: bytes, progress: Progress) -> None:
             progress("writing", at, len(image))
         if not loader.write_flash(TargetTypes.STM32, 0, target.start_page + first // size, len(places)):
             code = loader.error_code
-            raise LinkError(f"{loader.uri}: writing at byte {first} failed (bootloader's code {code})")
+            raise LinkError(
+                f"{loader.uri}: writing at byte {first} failed (bootloader's code {code}): {AGAIN}"
+            )
     progress("writing", len(image), len(image))
 
 
@@ -94,17 +97,19 @@ def _verify(loader: Cloader, image: bytes, progress: Progress) -> None:
         part, page = image[at : at + size], target.start_page + at // size
         end = at + len(part)
         if not any(_read(loader, page)[: len(part)] == part for _ in range(READ_TRIES)):
-            raise LinkError(f"{loader.uri}: the flash differs from the image in bytes {at}..{end - 1}")
+            raise LinkError(
+                f"{loader.uri}: the flash differs from the image in bytes {at}..{end - 1}: {AGAIN}"
+            )
         progress("checking", end, len(image))
 
 
 def _read(loader: Cloader, page: int) -> bytes:
-    """Return a page, empty when it cannot be read; late answers to earlier requests confuse cflib."""
+    """Return a page, empty when it cannot be read; cflib takes a late answer for that of the next request."""
     while loader.link.receive_packet(0) is not None:
         pass
-    try:
-        return bytes(loader.read_flash(TargetTypes.STM32, page) or b"")
-    except struct.error:
-        while loader.link.receive_packet(QUIET_S) is not None:
-            pass
-        return b""
+    with contextlib.suppress(struct.error):
+        if content := loader.read_flash(TargetTypes.STM32, page):
+            return bytes(content)
+    while loader.link.receive_packet(QUIET_S) is not None:
+        pass
+    return b""
