@@ -94,11 +94,12 @@ def test_a_power_cycle_is_noticed_and_stored_parameters_come_back(served: Served
         client.set("extCtrl.vz_P", 0.75)
         client.set("extCtrl.yaw_P", 0.75)
         assert client.answer(client.cf.param.persistent_store, "extCtrl.vz_P") == ("extCtrl.vz_P", True)
-        switch = PowerSwitch(served.radio_uris[0])
-        switch.stm_power_down()
-        assert client.gone.wait(PATIENCE_S)
-    switch.stm_power_up()
-    switch.close()
+        with closing(PowerSwitch(served.radio_uris[0])) as switch:
+            switch.stm_power_down()
+            try:
+                assert client.gone.wait(PATIENCE_S)
+            finally:
+                switch.stm_power_up()
     with CflibClient(served.radio_uris[0], cache) as again:
         assert again.cf.param.get_value("extCtrl.vz_P") == "0.75"
         assert float(again.cf.param.get_value("extCtrl.yaw_P")) == pytest.approx(1.2)
@@ -107,14 +108,13 @@ def test_a_power_cycle_is_noticed_and_stored_parameters_come_back(served: Served
 
 def test_a_board_off_or_in_its_bootloader_gets_its_button_pressed(served: Served, cache: Path) -> None:
     tool = Bootloader(served.radio_uris[0])
-    switch = PowerSwitch(served.radio_uris[0])
-    for leave in (lambda: tool.start_bootloader(warm_boot=True), switch.platform_power_down):
-        served.forget()
-        leave()
-        tool.close()
-        served.wait_for("board 1: power button pressed", PATIENCE_S)
-        served.wait_for("gyro zero", PATIENCE_S)
-    switch.close()
+    with closing(PowerSwitch(served.radio_uris[0])) as switch:
+        for leave in (lambda: tool.start_bootloader(warm_boot=True), switch.platform_power_down):
+            served.forget()
+            with closing(tool):
+                leave()
+            served.wait_for("board 1: power button pressed", PATIENCE_S)
+            served.wait_for("gyro zero", PATIENCE_S)
     CflibClient(served.radio_uris[0], cache).ready().close()
 
 
