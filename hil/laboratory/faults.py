@@ -53,9 +53,11 @@ class Fault:
         if not kind.low <= self.size <= kind.high:
             unit = f" {kind.unit}".rstrip()
             allowed = (
-                f"{kind.low:g}..{kind.high:g}{unit}" if kind.sized else "this kind has no size to choose"
+                f"expected {kind.low:g}..{kind.high:g}{unit}"
+                if kind.sized
+                else "this kind has no size to choose"
             )
-            raise LabError(f"fault {self.kind}: size {self.size:g}: expected {allowed}")
+            raise LabError(f"fault {self.kind}: size {self.size:g}: {allowed}")
 
     @property
     def span_us(self) -> tuple[int, float]:

@@ -186,8 +186,12 @@ class OpenDevice:
     def _submit(self, place: int) -> int:
         kind, point, _, _, data, size, *_ = URB.unpack(self._read(place, URB.size))
         if kind == URB_CONTROL:
+            if size < SETUP.size:
+                return -errno.EINVAL
             setup = self._read(data, size)
             direction, request, value, _, length = SETUP.unpack(setup[: SETUP.size])
+            if size < SETUP.size + length:
+                return -errno.EINVAL
             answer = self._controlled(direction, request, value, setup[SETUP.size :])[:length]
             self._write(data + SETUP.size, answer)
             self._complete(place, -errno.ENODEV if self._gone else len(answer) if direction & IN else length)

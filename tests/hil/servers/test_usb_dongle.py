@@ -236,6 +236,9 @@ def test_a_control_urb_has_its_setup_before_its_data(program: Program) -> None:
     assert program.reap() == A
     assert (program.urb().status, program.urb().actual) == (0, 2)
     assert program.dongle.controlled == [b"\x02\x34\x12\xe7\x02"]
+    for too_short in (0, 7, 9):  # of a setup of 8 bytes and the 2 that it announces
+        assert program.submit(URB_CONTROL, 0, too_short) == -errno.EINVAL
+    assert len(program.dongle.controlled) == 1
 
 
 def test_without_a_server_every_transfer_finds_no_device(program: Program) -> None:
