@@ -3,6 +3,7 @@
 If a change is meant: make approve.
 """
 
+import errno
 import math
 import struct
 from collections.abc import Callable
@@ -25,25 +26,37 @@ from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.supervisor import State
 from firmware_py.wire.telemetry import ALL_BLOCKS, CRAZYFLIE_BLOCKS, Sample
 from ground_station import program
-from ground_station.config import GroundConfig, LinkSettings, PilotConfig, StationConfig, TrackerConfig
+from ground_station.config import (
+    CaptureConfig,
+    GroundConfig,
+    LinkSettings,
+    PilotConfig,
+    StationConfig,
+    TrackerConfig,
+)
 from ground_station.controls import Answer, ControlAction, ControlRequest, ControlsError
 from ground_station.errors import LinkError, MocapError
 from ground_station.frame_rate import FrameRate
 from ground_station.latency import LinkLatency, budget_of, columns_of
-from ground_station.links import core_client
+from ground_station.links import core_client, live_link, mavlink_serial
 from ground_station.links.crazyflie_link import CrazyflieLink, FlightTimes, FromFloor
 from ground_station.links.crtp_controls import CrtpControls, TocEntry
+from ground_station.links.live_link import LiveLink
 from ground_station.links.log_blocks import LogBlocks
 from ground_station.links.mavlink import MavlinkLink
 from ground_station.mocap import MocapFrame
 from ground_station.operator import COMMANDS, Operator
 from ground_station.records import Records
-from ground_station.sources import replay
+from ground_station.sources import motioncapture_client, natnet, replay
+from ground_station.sources.alignment import Alignment
+from ground_station.sources.motioncapture_process import Arrival, encode_arrival
+from ground_station.sources.natnet_stream import NatnetStream
 from ground_station.station import GroundStation
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.tracker import Tracker
 from ground_station.trajectory import Course, FlightPlan, Goal, Hold, Offsets, Sine, Square, Step
 from ground_station.unused import Reason
+from support import natnet_packets
 from support.approved import approve, judge
 from support.random_use import Random, hash_of
 
@@ -650,6 +663,341 @@ class Batches(Random):
         return self.log.told()
 
 
+class Streamed(Random):
+    """A NatNet server of any version that answers, restarts, sets its clock, changes its bodies, damages packets."""
+
+    def told(self, seed: int) -> dict[str, str]:
+        now_us, number, version = 9_000_000, 10, self.pick(*natnet.VERSIONS)
+        capture = CaptureConfig(
+            body=self.pick("floaty", ""), origin=(0.1, 0.2, 0.3), yaw=0.5, body_offset=(0.01, 0.0, -0.02), body_yaw=-0.3,
+            axes=self.pick("z-up", "y-up", None),
+        )  # fmt: skip
+        stream, ahead_us = NatnetStream(capture.body, Alignment(capture)), 7_000_000
+        bodies, pose = {"floaty": 7}, ((0.1, 0.2, 0.3), (0.0, 0.0, 0.0, 1.0))
+        hz = natnet_packets.CLOCK_HZ
+        for _ in range(2500):
+            now_us += self.pick(1_000, 5_000, 5_000, 10_000)
+            if self.below(400) == 0:
+                now_us += self.pick(600_000, 3_000_000)
+                number = self.pick(number, 3)
+                ahead_us += self.pick(0, 0, 5_000_000, -4_000_000)
+                bodies = self.pick({"floaty": 7}, {"floaty": 7}, {"floaty": 8, "other": 7}, {"other": 7}, {})
+            version = stream.version if stream.server and self.below(300) else version
+            stream.call(now_us, self.pick(False, False, True))
+            for data in stream.outgoing:
+                self.log.note("asked", now_us, data.hex())
+            asked, stream.outgoing = stream.outgoing, []
+            ticks = [
+                (now_us + ahead_us - us) * hz // 1_000_000
+                for us in (self.pick(*[9_000] * 20, 2_000_000), 6_000, 4_000)
+            ]
+            if self.below(20) == 0:
+                ticks[0] = 0
+            number += self.pick(1, 1, 1, 1, 0, 2, -1)
+            if self.below(4):
+                pose = (
+                    tuple(self.rng.integers(-9, 9, 3).tolist()),
+                    self.pick((0.0, 0.6, 0.0, 0.8), (0.0, 0.0, 0.0, 1.0)),
+                )
+            came = natnet_packets.frame(
+                number, version, (ticks[0], ticks[1], ticks[2]), self.pick(7, 7, 7, 8), self.below(9) > 0, pose,
+                self.pick(0, 0, 0, 0, 0, 0, 2), self.pick(True, False),
+            )  # fmt: skip
+            if asked and self.below(4):
+                spoken = self.pick(version, version, version, (2, 9), (5, 0))
+                info, models = (
+                    natnet_packets.server_info(spoken, self.below(9) == 0),
+                    natnet_packets.model_definition(bodies, version),
+                )
+                echo = natnet_packets.echo(now_us - self.pick(800, 3_000, 2_000_000), ticks[2])
+                response = natnet_packets.packet(
+                    3, self.pick(b"\0\0\0\0", b"Bitstream,4.1\0", b"\1\0\0\0", b"no")
+                )
+                answers = {0: info, 2: response, 4: models, 10: echo, 12: echo}
+                wanted = answers[self.pick(*asked)[0]]
+                came = self.pick(
+                    *[wanted] * 12, info, models, echo, response, natnet_packets.old_server_info((2, 9))
+                )
+            came = came[: self.pick(*[None] * 60, self.below(len(came)))]
+            try:
+                self.log.note("frame", now_us, stream.on_packet(came, now_us))
+            except MocapError as error:
+                self.log.note("refused", error)
+            for line in stream.notices:
+                self.log.note("notice", now_us, line)
+            stream.notices.clear()
+            self.log.note("state", stream.counters, stream.version, stream.server, stream.missing())
+        return self.log.told()
+
+
+class Captured(Random):
+    """Lines of the process that talks to Vicon and others, in pieces, damaged, late; it ends and is started again."""
+
+    def told(self, seed: int) -> dict[str, str]:
+        now, pieces = Made(us=3_000_000), [b""]
+        system = self.pick("vicon", "vrpn", "qualisys")
+
+        def readable(files: list[Any], timeout_s: float) -> list[Any]:
+            now.us += self.pick(0, 2_000, round(timeout_s * 1e6))
+            return files if self.below(3) else []
+
+        def started(command: list[str], **more: object) -> Any:
+            self.log.note("started", now.us, *command[2:], sorted(more))
+            return Made(
+                stdout=Made(fileno=lambda: 9, close=partial(self.log.note, "closed")),
+                kill=partial(self.log.note, "killed"),
+                wait=lambda: None,
+            )
+
+        def read(number: int, most: int) -> bytes:
+            pose = [*(0.5 * self.rng.integers(-9, 9, 3)).tolist(), 1.0, 0.0, 0.0, 0.0]
+            bodies = self.pick(
+                {"floaty": pose}, {"floaty": pose}, {"other": pose}, {"floaty": pose, "other": pose}, {}
+            )
+            late_us = self.pick(300, 300, 300, -500, 1_200_000)
+            line = encode_arrival(Arrival(now.us - late_us, bodies)).encode() * self.pick(1, 1, 2)
+            wrong = self.pick(b"[1, {}\n", b"{}\n", b'[1, {"floaty": [1.0]}]\n', b"x" * 70_000)
+            pieces[0] += self.pick(*[line] * 60, wrong)
+            if self.below(300) == 0:
+                pieces[0] = b""
+                return b""
+            cut = self.pick(len(pieces[0]), self.below(len(pieces[0])) + 1)
+            data, pieces[0] = pieces[0][:cut], pieces[0][cut:]
+            return data
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(motioncapture_client, "clock_us", lambda: now.us)
+            patch.setattr(motioncapture_client, "readable", readable)
+            patch.setattr(motioncapture_client, "os", Made(read=read))
+            patch.setattr(motioncapture_client, "subprocess", Made(Popen=started, DEVNULL=-3, PIPE=-1))
+            capture = CaptureConfig(
+                system=system, body=self.pick("floaty", ""), yaw=0.4, port=self.pick(None, 99)
+            )
+            settings = motioncapture_client.settings_of(capture)
+            source = motioncapture_client.MotioncaptureSource(system, settings, capture)
+            for _ in range(3):
+                try:
+                    source.open()
+                except MocapError as error:
+                    self.log.note("refused", now.us, error)
+                for _ in range(500):
+                    now.us += self.pick(0, 1_000, 8_000)
+                    self.log.note("frame", now.us, source.receive(self.pick(0.0, 0.02, 0.7)))
+                    for line in source.notices():
+                        self.log.note("notice", now.us, line)
+                    self.log.note("summary", source.summary())
+                source.close()
+        return self.log.told()
+
+
+class Kept(LiveLink):
+    """A link that notes what its device is asked for."""
+
+    def __init__(self, own: Random) -> None:
+        super().__init__("test:0", LinkLatency("radio", 2_000, measured=False))
+        self.own = own
+
+    def _noted(self, what: str, *of: object) -> None:
+        self.own.log.note(what, live_link.clock_us(), *of)
+
+    def _open(self) -> None:
+        self._noted("open")
+        if self.own.below(6) == 0:
+            raise LinkError("test:0: no such device")
+
+    def _connect(self) -> bool:
+        self._noted("connect")
+        return self.own.below(9) == 0
+
+    def _why_no_connection(self, now_us: int, within: str) -> str:
+        return self.own.pick("", "", "", "", "", f"nothing {within}")
+
+    def _send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
+        self._noted("sent", now_us, frame.t_us, goal)
+
+    def _failure(self) -> str:
+        return self.own.pick(*[""] * 60, "unplugged")
+
+    def _close(self) -> None:
+        self._noted("close")
+
+    def start_telemetry(self, now_us: int) -> None:
+        self._noted("asks")
+
+    def receive(self, now_us: int, data: bytes) -> list[Sample]:
+        return []
+
+    def ask(self, now_us: int, request: ControlRequest) -> None:
+        self._noted("ask", request)
+
+    def answer(self, now_us: int) -> None:
+        return None
+
+    def summary(self) -> str:
+        return ""
+
+
+class Mailbox(Random):
+    """Poses for a link whose sender does its jobs later, in any number of turns."""
+
+    def told(self, seed: int) -> dict[str, str]:
+        now, jobs = Made(us=9_000_000), []
+
+        def clock_us() -> int:
+            now.us += self.pick(0, 0, 100, 300_000 if self.below(40) == 0 else 0)
+            return int(now.us)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(live_link, "clock_us", clock_us)
+            patch.setattr(
+                live_link,
+                "Sender",
+                lambda: Made(put=jobs.append, close=partial(self.log.note, "sender closed")),
+            )
+            link = Kept(self)
+            for turn in range(1500):
+                now.us += self.pick(1_000, 10_000, 20_000)
+                act = self.pick(
+                    "send", "send", "send", "send", "job", "job", "job", "read", "look", "notices", "rare"
+                )
+                if act == "send":
+                    goal = Goal((0.1 * self.below(3), 0.0, 1.0), 0.0)
+                    old_us = self.pick(*[9_000] * 6, 117_999, 118_000, 118_001, 119_000, 400_000)
+                    link.send(
+                        now.us,
+                        MocapFrame(now.us - old_us, (0.0, 0.0, turn), (1.0, 0.0, 0.0, 0.0), True),
+                        goal,
+                    )
+                elif act == "job" and jobs:
+                    jobs.pop(0)()
+                elif act == "read":
+                    link.received_us = now.us
+                    for _ in range(self.pick(1, 2, 2100 if self.below(20) == 0 else 3)):
+                        link._on_bytes(bytes((turn % 256,)))
+                elif act == "look":
+                    self.log.note("received", *link.received())
+                    try:
+                        link.check()
+                    except LinkError as error:
+                        self.log.note("lost", now.us, error)
+                elif act == "notices":
+                    self.log.note("notices", now.us, *link.notices())
+                elif act == "rare" and self.below(4) == 0:
+                    link.supervisor_state = 3
+                    try:
+                        self.pick(
+                            link.mute, link.close, *[lambda: link.open(lambda: self.below(90) == 0)] * 4
+                        )()
+                    except LinkError as error:
+                        self.log.note("refused", now.us, error)
+                self.log.note(
+                    "state", link.sent, link.late, link.supervisor_state, link.received_us, len(jobs)
+                )
+        return self.log.told()
+
+
+class Serial(Random):
+    """A serial port that is opened, fails, and brings a board's frames, another's, or only noise."""
+
+    def told(self, seed: int) -> dict[str, str]:
+        now = Made(us=4_000_000)
+        key = KEY * (seed == 2)
+        signing = Signing(key, start=500) if key else None
+        ends = ((1, 1, signing), (9, 1, None), (3, 191, signing), (4, 25, signing), (5, 25, signing))
+        boards = [FrameSender(*end) for end in ends]
+
+        def clock_us() -> int:
+            now.us += self.pick(0, 1_000, 60_000)
+            return int(now.us)
+
+        closed = partial(self.log.note, "closed")
+        failures = (
+            OSError(errno.ENOENT, "x"), ValueError("invalid URL"), OSError("could not open port: [Errno 13] denied: 'x'"),
+            OSError("Could not configure port: (25, 'Inappropriate ioctl')"), OSError("(5, 'Input error')"),
+        )  # fmt: skip
+
+        def opened(device: str, baud: int, receive: Callable[[bytes], None]) -> Any:
+            self.log.note("opened", now.us, device, baud)
+            if self.below(5) == 0:
+                raise self.pick(*failures)
+            written = partial(self.log.note, "written")
+            return Made(
+                failure="",
+                bytes=0,
+                receive=receive,
+                write=lambda data: written(now.us, data.hex()),
+                close=closed,
+            )
+
+        with pytest.MonkeyPatch.context() as patch:
+            for place in (mavlink_serial, live_link):
+                patch.setattr(place, "clock_us", clock_us)
+            patch.setattr(mavlink_serial, "signing_start", lambda: 77)
+            patch.setattr(mavlink_serial, "POLL_S", 0.0)
+            patch.setattr(mavlink_serial, "_Port", opened)
+            patch.setattr(live_link, "Sender", lambda: Made(put=lambda job: job(), close=lambda: None))
+            for uri in (
+                "mavlink:/dev/ttyUSB0",
+                "mavlink:COM3,57600",
+                "mavlink:socket://h:99",
+                "mavlink:x,99",
+                "mavlink:",
+                "udp:x",
+            ):
+                try:
+                    mavlink_serial.MavlinkSerialLink(uri, LinkSettings(50.0, 2_000, 115_200, key))
+                except LinkError as error:
+                    self.log.note("refused", error)
+            link = mavlink_serial.MavlinkSerialLink(
+                "mavlink:/dev/ttyUSB0", LinkSettings(50.0, 2_000, 115_200, key)
+            )
+            talks = 5
+
+            def heard() -> None:
+                port: Any = link._port
+                if port is None:
+                    return
+                port.failure = port.failure or self.pick(*[""] * 200, "No such device")
+                whole = self.pick(
+                    services.heartbeat(False, self.pick(*State)), services.command_ack(511, 0, 255, 190),
+                    services.command_ack(511, 3, 255, 190), mavlink.flight_array(now.us, [0.5] * 58),
+                    services.timesync_answer(now.us * 1000, services.timesync(0, link._link._time_request_ns)),
+                    *services.status_text(4, "low battery", 1),
+                )  # fmt: skip
+                data = boards[self.below(talks)].encode(now.us, whole) if talks else self.data(0, 9)
+                port.bytes += len(data)
+                port.receive(data)
+
+            for turn in range(700):
+                now.us += self.pick(1_000, 20_000)
+                if turn % 60 == 0:
+                    talks = self.pick(0, 1, 2, 5, 5)
+                    link.close()
+                    try:
+                        link.open(lambda: heard() or self.below(400) == 0)
+                    except LinkError as error:
+                        self.log.note("refused", now.us, error)
+                if self.below(3):
+                    heard()
+                for at_us, data in link.received():
+                    self.log.note("samples", at_us, len(link.receive(at_us, data)))
+                if self.below(3) == 0:
+                    link.send(
+                        now.us, MocapFrame(now.us - 9_000, (0.0, 0.1, 1.0), (1.0, 0.0, 0.0, 0.0), True), HOME
+                    )
+                try:
+                    link.check()
+                except LinkError as error:
+                    self.log.note("lost", now.us, error)
+                if self.below(30) == 0:
+                    self.pick(link.mute, lambda: link.ask(now.us, ControlRequest(ControlAction.ARM)))()
+                self.log.note(
+                    "state", link.supervisor_state, link.latency, link.received_us, link.answer(now.us)
+                )
+                self.log.note("notices", *link.notices(), link.summary())
+        return self.log.told()
+
+
 def courses(seed: int) -> dict[str, str]:
     """Return what goals users' paths give."""
     own = Random(seed)
@@ -673,7 +1021,20 @@ def courses(seed: int) -> dict[str, str]:
 FOUND: dict[str, Callable[[], dict[str, str]]] = {
     **{
         f"{kind.__name__} {seed}": lambda kind=kind, seed=seed: kind(seed).told(seed)  # type: ignore[misc]
-        for kind in (Followed, Asked, Stock, Logged, Typed, Live, Replayed, Batches)
+        for kind in (
+            Followed,
+            Asked,
+            Stock,
+            Logged,
+            Typed,
+            Live,
+            Replayed,
+            Batches,
+            Streamed,
+            Captured,
+            Mailbox,
+            Serial,
+        )
         for seed in SEEDS
     },
     "courses": lambda: courses(0),
