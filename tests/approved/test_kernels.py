@@ -1,7 +1,8 @@
-"""Every kernel computes from random memory what it computed before: plausible, far, and special numbers.
+"""Every kernel computes from random memory what it computed before, and the C of all that flies is what it was.
 
-The order of a sum, a sign, an edge or a reset that changes shows here by the kernel's name. If one is meant, give the
-reason in CHANGELOG where a flight's hash changes too, and write the results anew:
+The memory has plausible, far, and special numbers. The order of a sum, a sign, an edge or a reset that changes shows
+here by the kernel's name. If one is meant, give the reason in CHANGELOG where a flight's hash changes too, and write the
+results anew:
 
     make approve
 """
@@ -11,9 +12,11 @@ import importlib
 import inspect
 import json
 import pkgutil
+import re
 import typing
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Any
 
@@ -22,10 +25,18 @@ import pytest
 
 import firmware_py.core
 import firmware_py.logic.laws
+from firmware_py import compiling
 from firmware_py.config import parameters_of
-from firmware_py.core.structs import Parameters
+from firmware_py.core.structs import Estimator, Parameters
 from firmware_py.core.subset import Block, Struct
+from firmware_py.export.kernels import translate
+from hil import RigidBody, fly_swarm
 from hil.config import load_config
+from hil.laboratory.bodies import make_body
+from hil.pictures.exports.demonstrations import observer
+from hil.research.learn.envs import make_env
+from hil.world import fixed_order
+from support.approved import approve, judge
 
 RESULTS = Path(__file__).with_name("kernels.json")
 DRAWS = 30
@@ -152,6 +163,43 @@ def results(module: ModuleType) -> dict[str, str]:
     return found
 
 
+def texts() -> dict[str, str]:
+    """Return the hash of each part of the libraries that a flight, a quadrotor and the fast model bind."""
+    found: dict[str, str] = {}
+    make = compiling._library
+
+    def library(functions: compiling.Functions, arrays: tuple[Any, ...]) -> Path:
+        parts: dict[str, str] = {}
+        for part in translate(functions, arrays).split("\n\n"):
+            name = re.search(r"(\w+)\(.*\{$", part, re.MULTILINE)
+            key = f"{functions[0].__module__}.{functions[0].__name__} {name[1] if name else ''}"
+            parts[key] = parts.get(key, "") + part
+        found.update({key: hashlib.sha256(part.encode()).hexdigest()[:12] for key, part in parts.items()})
+        return make(functions, arrays)
+
+    class Own(RigidBody):
+        mass, inertia = 0.1, (1e-3, 1e-3, 1e-3)
+
+        def wrench(self, *of: Any) -> Any:
+            return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+
+    rng, home, numbers = np.random.default_rng(1), (0.0, 0.0, 1.0), np.zeros(20, np.float32)
+    with pytest.MonkeyPatch.context() as patch, TemporaryDirectory() as folder:
+        patch.setattr(compiling, "_library", library)
+        fly_swarm("hover", 2, f"{folder}/swarm", duration_s=0.02)
+        make_env("Hover", "fast", duration_s=0.1).reset(seed=1)
+        make_body(load_config("crazyflie"), rng, home)
+        Own(load_config(), rng, home)
+        fixed_order.eigen(np.eye(4))
+        observer(Parameters.allocate(), Estimator.allocate(), numbers[:4], numbers)
+    return found
+
+
+@pytest.mark.skipif(compiling.PLAIN, reason="FLOATY_PURE=1: nothing is bound as C")
+def test_the_c_of_every_kernel_that_flies_is_what_it_was() -> None:
+    judge(RESULTS.with_name("flown_c.json"), "functions", texts())
+
+
 @pytest.mark.parametrize("module", MODULES, ids=lambda module: module.__name__)
 def test_a_kernel_computes_from_random_memory_what_it_computed(module: ModuleType) -> None:
     known = json.loads(RESULTS.read_text())
@@ -163,3 +211,4 @@ if __name__ == "__main__":
     RESULTS.write_text(
         json.dumps({name: text for one in MODULES for name, text in results(one).items()}, indent=2) + "\n"
     )
+    approve(RESULTS.with_name("flown_c.json"), {"functions": texts})
