@@ -156,8 +156,9 @@ def test_a_turned_path_turns_about_its_origin_and_a_reversed_one_does_not_turn()
     x, y, z = there.position
     assert turned.position == pytest.approx(np.array((-y, x, z)) + here - begin.position)
     assert turned.yaw == pytest.approx(there.yaw + 0.5 * pi)
-    x, y, z = there.velocity
-    assert turned.velocity == pytest.approx((-y, x, z))
+    for flown, along in ((turned.velocity, there.velocity), (turned.acceleration, there.acceleration)):
+        assert flown == pytest.approx((-along[1], along[0], along[2]))
+    assert turned.yaw_rate == there.yaw_rate
     back = Path(path.pieces, reverse=True)
     assert back.begun_at(here, 2.0).at(0.8).position == pytest.approx(
         back.begun_at(here, None).at(0.8).position

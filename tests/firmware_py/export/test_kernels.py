@@ -216,6 +216,14 @@ def too_many(numbers: F64s) -> None:
 
 
 @kernel
+def two_rows(numbers: F64s) -> None:
+    """Do."""
+    row = numbers
+    row = numbers
+    numbers[0] = row[1]
+
+
+@kernel
 def of_nothing(numbers: F64s) -> None:
     """Do."""
     x: Any = library_sine(numbers)  # type: ignore[func-returns-value]
@@ -261,6 +269,7 @@ def recursive(numbers: F64s) -> None:
         (of_truth, "f64(numbers[1] > 0.0) of bool"),
         (too_many, "2 places for 3 values"),
         (of_nothing, "f64 = None"),
+        (two_rows, "local row of type f64 array (in two_rows)"),
         (over_a_number, "a loop runs over a range or a constant tuple"),
         (fraction, "returns a float: a method of CPython returns whole numbers"),
         (swap, "takes 1 arguments, not 2"),

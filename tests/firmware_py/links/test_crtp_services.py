@@ -258,6 +258,12 @@ def test_at_most_128_variables_are_in_blocks(client: CrtpClient, logs) -> None:
     assert client.one(LOG, 1, bytes((7, 3)) + struct.pack("<BH", 1, number)) == bytes((7, 3, errno.ENOMEM))
 
 
+def test_a_block_has_room_for_26_bytes_of_values(client: CrtpClient, logs) -> None:
+    number = logs["supervisor.state"][0]
+    assert client.create(1, *[(3, number)] * 6, (2, number)) == 0
+    assert client.one(LOG, 1, bytes((7, 1)) + struct.pack("<BH", 1, number)) == bytes((7, 1, errno.E2BIG))
+
+
 def test_a_full_request_of_cflibs_ends_in_the_middle_of_an_item(client: CrtpClient, logs) -> None:
     number, kind = logs["stateEstimate.x"]
     data = bytes((6, 1)) + struct.pack("<BH", 1, logs["supervisor.state"][0]) * 9 + bytes((kind,))

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_py.export.cycles import count
-from firmware_py.export.elf import Elf
+from firmware_py.export.elf import Elf, Symbol
 from hil.emulator.stm32f405.image import Image
 from hil.errors import LabError
 from support import stm32_firmware
@@ -166,6 +166,19 @@ def test_members_lie_where_the_c_compiler_puts_them(compiler: str) -> None:
         )
     # Members of an anonymous union belong to the structure around it.
     assert image.debug.structure("SNAPSHOT_DATA", image.reset)["file.line"].offset == 12
+
+
+def test_symbols_are_those_of_the_file_and_marks_of_code_and_data_are_no_variables(elf: Path) -> None:
+    with elf.open("rb") as file:
+        symbols = list(ELFFile(file).get_section_by_name(".symtab").iter_symbols())
+    expected = []
+    for one in symbols:
+        kind, place = one["st_info"]["type"], one["st_value"]
+        is_variable = kind == "STT_OBJECT" or (kind == "STT_NOTYPE" and one.name[:1] != "$")
+        place &= ~1 if kind == "STT_FUNC" else ~0
+        expected.append(Symbol(one.name, place, one["st_size"], kind == "STT_FUNC", is_variable))
+    assert {symbol.name for symbol in expected} >= {"$t", "$d"}
+    assert Elf(elf).symbols == expected
 
 
 def test_an_unknown_name_is_refused_with_the_nearest(elf: Path) -> None:
