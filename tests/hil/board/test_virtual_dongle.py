@@ -1,7 +1,7 @@
 """The dongle, the air and the board's radio chip on simulated time; the host's side of safelink is cflib's own code."""
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -393,6 +393,20 @@ def test_power_switch() -> None:
         assert bool(bench.exchange(b"\x10hello")[0] & 1) == (power is not Power.OFF)
         bench.wait(1000)
     assert len(bench.stm.packets) == 3
+
+
+@pytest.mark.parametrize("meanwhile", [
+    lambda bench: bench.board.command(0, syslink.SWITCH_OFF, b""),
+    lambda bench: bench.board.tune(AirSettings(37, 2_000_000, ADDRESS)),
+])  # fmt: skip
+def test_a_board_that_listens_no_more_when_the_packet_comes_does_not_answer(
+    meanwhile: Callable[[DongleAndBoard], None],
+) -> None:
+    bench, answers = DongleAndBoard(), list[bytes]()
+    bench.dongle.transmit(0, b"\x10hello", lambda _, answer: answers.append(answer))
+    meanwhile(bench)
+    bench.wait(10_000)
+    assert (answers, bench.stm.packets) == ([b"\x00"], [])
 
 
 @given(st.lists(st.sampled_from(sorted(ACTS)), max_size=8))

@@ -8,6 +8,7 @@ import pytest
 
 from firmware_py.config import LogicConfig, parameters_of
 from firmware_py.core_runner import CoreBlocks, PlainRunner
+from firmware_py.export.usage import EntryLoad
 from firmware_py.logic.loading import load_logic
 from hil.board.cores.cortex_m4 import CortexM4Runner
 from hil.config import load_config
@@ -74,6 +75,27 @@ def test_c_is_built_with_the_optimisation_that_its_target_names(monkeypatch: pyt
     assert {name: one.keywords["library"].name for name, one in factories.items() if name != "plain"} == {  # type: ignore[attr-defined]
         "c-O0": "-O0", "c-O2": "-O2"}  # fmt: skip
     assert (factories["plain"], box.machine_code) == (PlainRunner, None)
+
+
+def test_a_board_behind_a_link_is_opened_for_each_flight_and_its_cycles_add_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    opened: list[tuple[object, ...]] = []
+    monkeypatch.setattr(targets, "open_real_core", lambda *how: opened.append(how) or how[0])
+    load = {"control": EntryLoad(2, 100, 300, 70, 200)}
+    monkeypatch.setattr(
+        targets, "RealCore", lambda blocks, client: SimpleNamespace(to=(blocks, client), load=load)
+    )
+    uris = ("udp://127.0.0.1:9", "udp://127.0.0.1:10")
+    box, blocks = Toolbox((*uris, "plain"), LogicConfig()), object()
+    for flights in (1, 2):
+        with ExitStack() as flown:
+            factories = box.factories(flown)
+            assert opened[-2:] == [(uri, "--targets", flown) for uri in uris]
+            assert factories[uris[0]](blocks).to == (blocks, uris[0])  # type: ignore[arg-type, attr-defined]
+        assert {uri: {name: one.calls for name, one in loads.items()} for uri, loads in box.boards.items()} == {
+            uris[0]: {"control": 2 * flights}, uris[1]: {},
+        }  # fmt: skip
 
 
 @pytest.mark.parametrize(("elf", "flash"), [(None, 5), (Path("cf2.elf"), None)])

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from firmware_py.wire.supervisor import State
 from firmware_py.wire.telemetry import ALL_BLOCKS, ATTITUDE, Sample
 from ground_station.trajectory import Goal, Hold
 from hil.laboratory.channels import (
@@ -21,7 +22,7 @@ from hil.laboratory.channels import (
     serial_channel,
     tracker_channel,
 )
-from hil.laboratory.files.station_channels import station_channels
+from hil.laboratory.files.station_channels import UNKNOWN_STATE, station_channels
 from hil.world.body import Channel
 
 numbers = count(1)
@@ -116,6 +117,10 @@ def test_all_that_a_ground_station_knows() -> None:
     session: Any = SimpleNamespace(link=link, ground=ground)
     channels = station_channels(session, lambda: True, lambda: Goal((0.1, 0.2, 0.3), 0.4), 1000)
     assert all(map(math.isnan, (channels[3].read(), *channels[5].read()))), "no block has a sample"  # type: ignore[misc]
+    for state in (None, *State):
+        link.supervisor_state = state
+        shown = UNKNOWN_STATE if state is None else state
+        assert columns(channels[0]) == {"flight.free": True, "supervisor.state": shown}
     for block in ALL_BLOCKS:
         ground.telemetry[block.id] = Sample(block, 0, tuple(told[one.name] for one in block.variables))
     found = {name: value for channel in channels for name, value in columns(channel).items()}

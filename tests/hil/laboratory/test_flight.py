@@ -88,8 +88,11 @@ def test_an_estimate_that_is_not_finite_again_after_a_reset_is_reported_again() 
         ):
             flight.events.at(at_us + 1_000_000 * number, act)
     flight.run()
-    told = [text[:42] for _, text in flight._early if "NaN" in text]
-    assert told == [f"the estimate was NaN or infinite at {number}.21 s" for number in (1, 2)]
+    told = [text for _, text in flight._early if "NaN" in text]
+    assert [text[:42] for text in told] == [
+        f"the estimate was NaN or infinite at {number}.21 s" for number in (1, 2)
+    ]
+    assert flight.logic_failed == told[0], "the first is the cause"
 
 
 def test_flight_makes_no_garbage_that_only_the_collector_frees() -> None:

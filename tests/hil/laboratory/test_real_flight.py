@@ -419,6 +419,7 @@ def test_the_station_s_records_have_the_time_of_the_log(both: tuple[Path, Path],
     bench = StationBench(tmp_path / "run")
     shutil.copy(both[0] / "telemetry.csv", tmp_path / "run")
     bench.fly(1.0)
+    assert bench.record.log_us == bench.now_us - 7_000_000
     bench.result()
     log = load_log(tmp_path / "run")
     ages, by_the_station = ages_in_time_of(iter([log]), tmp_path / "run"), reported_ages(tmp_path / "run")

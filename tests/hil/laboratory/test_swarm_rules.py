@@ -163,7 +163,7 @@ def result_of(folder: Path, outcomes: tuple[str, ...], distance: float | None) -
     )  # type: ignore[arg-type]
     robots: Any = tuple(
         SimpleNamespace(
-            outcome=outcome, passed=True, hash=hashed, folder=folder / f"robot-{n}", cause=None,
+            outcome=outcome, passed=True, hash=hashed, folder=folder / f"robot-{n}", cause=f"why {n}",
             request=SimpleNamespace(experiment=SimpleNamespace(name=f"e{n}"), seed=n),
         )
         for n, (outcome, hashed) in enumerate(zip(outcomes, "bac", strict=True), 1)
@@ -194,9 +194,14 @@ def test_a_swarm_passes_from_its_least_distance_on_and_its_file_says_so(
     known = distance if distance is not None and np.isfinite(distance) else None
     assert (written["passed"], written["metrics"]["distance_min"]) == (passed, known)
     assert written["limits"] == {"distance_min": 0.15}
-    assert [tuple(one["origin"]) for one in written["robots"]] == [*ORIGINS]
-    assert [(one["folder"], one["hash"], one["seed"]) for one in written["robots"]] == [
-        ("robot-1", "b", 1), ("robot-2", "a", 2), ("robot-3", "c", 3),
+    nearest = None if known is None else {"distance": distance, "robots": [1, 3], "at_s": 0.5}
+    assert (written["outcome"], written["hash"], written["nearest"]) == ("completed", result.hash, nearest)
+    assert written["robots"] == [
+        {
+            "folder": f"robot-{n}", "origin": list(ORIGINS[n - 1]), "experiment": f"e{n}", "seed": n,
+            "outcome": "completed", "cause": f"why {n}", "passed": True, "hash": "bac"[n - 1],
+        }
+        for n in (1, 2, 3)
     ]  # fmt: skip
     swapped = replace(result, robots=result.robots[::-1])
     assert swapped.hash != result.hash

@@ -48,7 +48,8 @@ def answer(links: Links, path: str, **headers: str) -> tuple[int, str | None, st
 
 
 @pytest.mark.parametrize("at_s", [0.0, 12.25, -0.5])
-def test_a_link_leads_to_its_instant(links: Links, run: Path, at_s: float) -> None:
+def test_a_link_leads_to_its_instant_on_this_computer_alone(links: Links, run: Path, at_s: float) -> None:
+    assert links.server_address == (HOST, links.server_port)
     _, _, path = link_to(read_result(run), at_s).split("/", 3)[1:]
     assert answer(links, f"/{path}")[:2] == (302, f"http://viewer/{at_s:g}")
 

@@ -20,7 +20,8 @@ from hil.servers.linked import LISTEN_PERIOD_US, RELEASE_TIMEOUT_US, WARM_UP_US,
 with socket() as free:
     free.bind(("127.0.0.1", 0))
     UDP = f"udp://127.0.0.1:{free.getsockname()[1]}"
-TALK = "import sys; print('first'); print('second'); print('cut', end='', flush=True); sys.stdin.read(); "
+TYPED = b"second\n"
+TALK = "import sys; print('first'); print(sys.stdin.read(), end='cut', flush=True); "
 
 
 @pytest.fixture
@@ -37,6 +38,8 @@ def line_of(stack: ExitStack, folder: Path, link: str, program: str = "", **opti
     line.lab, line.flight = flight.lab, flight
     line.started_by = line._command
     line._command = [sys.executable, "-c", program]
+    line._typed.write(TYPED)
+    line._typed.flush()
     return line
 
 

@@ -29,6 +29,10 @@ def test_eigenvalues_and_vectors_are_numpys(size: int, rank: int, seed: int) -> 
     assert np.sort(values) == pytest.approx(np.linalg.eigvalsh(S), abs=1e-12)
     assert np.diag(values) == pytest.approx(V.T @ S @ V, abs=1e-12)
     assert np.eye(size) == pytest.approx(V.T @ V, abs=1e-13)
+    for scale in (2.0**-60, 2.0**60):
+        scaled, same = eigen(scale * S)
+        assert (scaled == scale * values).all()
+        assert (same == V).all()
 
 
 @given(st.integers(0, 6), st.integers(7, 50), seeds)

@@ -111,9 +111,16 @@ def test_at_its_trim_every_geometry_carries_its_weight_and_nothing_else(geometry
     assert torque == pytest.approx([0, 0, 0], abs=1e-12)
 
 
+BESIDE = "geometry.outline=[[0.04, 0.0], [0.115, 0.0], [0.115, 0.115], [0.04, 0.115]]"  # the base plate
 IMPOSSIBLE: Mapping[str, str] = {
     "geometry.base_side=0.3": r"base_side = 0\.3: leaves no flaps inside footprint = 0\.23",
     "geometry.strip_width=0.08": r"strip_width = 0\.08: leaves no flat part of the flap, which is 0\.075 wide",
+    "geometry.footprint=0.5; geometry.base_side=0.25; geometry.strip_width=0.125": r"which is 0\.125 wide",
+    "geometry.footprint=0.25; geometry.base_side=0.25": r"base_side = 0\.25: leaves no flaps inside footprint = 0\.25",
+    **{
+        f"{BESIDE}; geometry.strip_width=0.12; geometry.kink_side={side}": f"of the flap, which is {width} wide"
+        for side, width in (("x", r"0\.075"), ("y", r"0\.115"))
+    },
     "geometry.outline=[[-0.01, 0.05], [0.115, 0.0], [0.115, 0.115]]": r"outline\[0\] = \(-0\.01, 0\.05\): .* overlap",
     "geometry.outline=[[0.05, 0.05], [0.115, -0.01], [0.115, 0.115]]": r"outline\[1\] = \(0\.115, -0\.01\): .* overlap",
     "geometry.outline=[[0.05, 0.05], [0.125, 0.0], [0.115, 0.115]]": r"outline\[1\] = .* outside footprint / 2",
@@ -133,13 +140,12 @@ IMPOSSIBLE: Mapping[str, str] = {
 @pytest.mark.parametrize("override", IMPOSSIBLE)
 def test_an_impossible_robot_is_refused_in_one_line(override: str) -> None:
     with pytest.raises(LabError, match=IMPOSSIBLE[override]) as caught:
-        load_config(overrides=[override])
+        load_config(overrides=override.split("; "))
     assert "\n" not in str(caught.value)
 
 
 def test_a_trapezoid_beside_the_base_plate_is_accepted() -> None:
-    shape = "geometry.outline=[[0.04, 0.0], [0.115, 0.0], [0.115, 0.115], [0.04, 0.115]]"
-    geometry = load_config(overrides=[shape]).geometry
+    geometry = load_config(overrides=[BESIDE]).geometry
     flat, strip = flap_plates(geometry)
     assert flat.area + strip.area == pytest.approx(0.075 * 0.115)
     assert math.isfinite(weigh(geometry).axis_height)

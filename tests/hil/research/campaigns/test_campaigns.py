@@ -26,10 +26,11 @@ from rich.console import Console
 from scipy.stats import binomtest
 
 from hil.errors import LabError
+from hil.laboratory.metrics import METRICS
 from hil.laboratory.request import Options
 from hil.research.campaigns import jobs
 from hil.research.campaigns.config import Spec
-from hil.research.campaigns.dataset import ARRIVING, FLIGHTS, Dataset
+from hil.research.campaigns.dataset import ARRIVING, FLIGHTS, Dataset, schema_of
 from hil.research.campaigns.findings import Findings, find
 from hil.research.campaigns.jobs import Job, Row, fly_job
 from hil.research.campaigns.report import write_report
@@ -91,6 +92,17 @@ def test_a_row_describes_its_flight_and_columns_have_units(tmp_path: Path) -> No
     assert row["metric.max_y"] == expected.metrics["max_y"]
     assert row["holds.in_box"] is expected.holds["in_box"]
     assert table.schema.field("metric.max_y").metadata == {b"unit": b"m"}
+
+
+def test_every_metric_and_limit_of_every_flight_has_a_column() -> None:
+    spec = spec_of(experiments=["hover", "y-square"], profiles=["floaty", "as-flown"], faults=[])
+    plan = plan_of(spec)
+    columns = set(schema_of(plan).names)
+    requests = [plan.job(index).request() for index in range(plan.flights)]
+    assert len({(one.experiment.name, one.profile) for one in requests}) == 4
+    metrics = {f"metric.{name}" for one in requests for name in {**METRICS, **one.experiment.metrics}}
+    assert {name for name in columns if name.startswith("metric.")} == metrics
+    assert {f"holds.{name}" for one in requests for name in one.limits} <= columns
 
 
 def test_a_campaign_that_was_interrupted_flies_the_rest_and_nothing_twice(tmp_path: Path) -> None:

@@ -19,7 +19,19 @@ from scipy.stats import t as student
 from ground_station.telemetry_log import POSE_COLUMNS, TIME_COLUMN
 from hil.config import LabConfig, load_config
 from hil.errors import LabError
-from hil.research.design.axes import AXES, DELAY, HEIGHT, PITCH, RATE, ROLL, YAW, Axis, dynamics, robot_of
+from hil.research.design.axes import (
+    AXES,
+    DELAY,
+    HEIGHT,
+    PITCH,
+    RATE,
+    ROLL,
+    VELOCITY,
+    YAW,
+    Axis,
+    dynamics,
+    robot_of,
+)
 from hil.research.design.loop import FREQUENCIES
 from hil.research.identify import plates, spectra
 from hil.research.identify.flow import flow_of
@@ -421,6 +433,45 @@ def test_a_robot_that_follows_its_model_has_no_disturbance() -> None:
     own = power(robot)
     for name in ("roll_u1", "roll_roll", "roll_rate"):
         assert own[1] < 0.1 * power(robot | {name: 1.5 * robot[name]})[1], name
+
+
+@pytest.mark.parametrize("axis", AXES, ids=[axis.name for axis in AXES])
+def test_a_flow_of_known_density_is_found_on_every_axis(axis: Axis) -> None:
+    robot, count, step = robot_of(CONFIG), 60_000, 0.02
+    hertz, rng = np.fft.rfftfreq(count, step), np.random.default_rng(3)
+    pushed = [row for row, state in enumerate(axis.states) if state in (VELOCITY, RATE)]
+    densities = np.array([0.3, 0.8][: len(pushed)])  # of each acceleration, from 0.3 to 22 Hz
+    lines = np.flatnonzero((hertz > 0.3) & (hertz < 22.0))
+    n, s = len(axis.states), 2j * np.pi * hertz[lines]
+    A, flow = dynamics(axis, robot)[0][:n, :n], np.zeros((len(lines), n), complex)
+    turns = np.exp(2j * np.pi * rng.random((len(lines), len(pushed))))
+    flow[:, pushed] = turns * np.sqrt(densities * count / step / 2.0)
+    states = np.zeros((len(hertz), n), complex)
+    states[lines] = np.linalg.solve(s[:, None, None] * np.eye(n) - A, flow[:, :, None])[:, :, 0]
+    seen = np.fft.irfft(states * np.exp(2j * np.pi * hertz * LATE_S)[:, None], count, axis=0)
+    t, pose, rates = step * np.arange(count), np.zeros((count, 6)), np.zeros((count, 3))
+    for state, column in axis.pose.items():
+        pose[:, column] = seen[:, axis.states.index(state)]
+    if RATE in axis.states:
+        rates[:, axis.input] = np.fft.irfft(states[:, axis.states.index(RATE)], count)
+    still = np.zeros((count, 4))
+    record = Record("r", t, t, still, still, rates, t, pose, 0.0, 0.0, CONFIG, False)
+    among = (FREQUENCIES > 2.0) & (FREQUENCIES < 8.0)
+    found = flow_of(record, axis, robot).spectrum[among].mean(axis=0)
+    assert (np.abs(found - np.diag(densities)) < 0.1 * np.sqrt(np.outer(densities, densities))).all()
+
+
+@pytest.mark.parametrize("part", [("t", "rates"), ("pose_t", "pose")])
+def test_the_flow_is_that_of_the_time_for_which_there_are_both_rates_and_poses(part: tuple[str, str]) -> None:
+    record, kept = swinging(robot_of(CONFIG), seconds=30.0), slice(200, -150)
+    record.pose[:] += np.random.default_rng(3).normal(size=record.pose.shape)
+
+    def cut(*names: str) -> Record:
+        return replace(record, **{name: getattr(record, name)[kept] for name in names})
+
+    both = cut("t", "u_t", "u", "rates", "pose_t", "pose")
+    found, expected = (flow_of(one, ROLL, robot_of(CONFIG)).spectrum for one in (cut(*part), both))
+    assert np.abs(found - expected).max() < 1e-9 * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("hertz", [1.0, 4.0])
