@@ -151,13 +151,13 @@ class CrtpControls(Dialogue[crtp.Packet]):
 
     def _exchange_for(self, channel: int, entry: TocEntry, value: bytes = b"") -> Exchange[crtp.Packet]:
         """Return the exchange whose reply has the request's channel and number, followed by a value."""
-        size = (
-            1 if channel == parameters.CHANNEL_READ else entry.scalar.size
-        )  # a status, and a value if that is good
         packet = crtp.Packet(crtp.PORT_PARAMETERS, channel, parameters.encode_ident(entry.number) + value)
+        value_at = 3 if channel == parameters.CHANNEL_READ else 2  # behind a status, which an error ends with
 
         def fits(got: crtp.Packet) -> bool:
-            return len(got.data) >= 2 + size and parameters.decode_ident(got.data) == entry.number
+            failed = got.data[2:value_at] > bytes((parameters.OK,))
+            size = value_at + (0 if failed else entry.scalar.size)
+            return len(got.data) >= size and parameters.decode_ident(got.data) == entry.number
 
         return self._until(packet, fits)
 

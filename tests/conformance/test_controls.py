@@ -11,10 +11,11 @@ from firmware_py import table
 from firmware_py.firmware import Firmware
 from firmware_py.rtos import TICK_US
 from firmware_py.wire import crtp
+from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.supervisor import Cause, State
 from ground_station.config import LinkSettings
 from ground_station.controls import PATIENCE_US, REPEAT_US, Answer, ControlAction, ControlRequest
-from ground_station.links.crtp_controls import CrtpControls
+from ground_station.links.crtp_controls import CrtpControls, TocEntry
 from ground_station.links.mavlink import MavlinkLink
 from ground_station.links.mavlink_controls import MavlinkControls
 from hil.config import load_config
@@ -323,3 +324,25 @@ def test_a_full_link_is_offered_its_frame_at_each_tick_and_then_gets_it_once(lin
         bench.radio_open, bench.uart_room = True, 1 << 30
         bench.run(bench.now_us + 5_000)
         assert [one[2] for one in offered if one[1] == waiting[0][1]] == [False] * len(waiting) + [True]
+
+
+@pytest.mark.parametrize("action", [ControlAction.READ, ControlAction.WRITE])
+@pytest.mark.parametrize("scalar", [Scalar.U8, Scalar.F32])
+def test_a_reply_cut_anywhere_is_none_and_an_error_needs_no_value(
+    action: ControlAction, scalar: Scalar
+) -> None:
+    controls = CrtpControls(lambda data: None, lambda: {"a.b": TocEntry(258, scalar, True, False)})
+    reads = action is ControlAction.READ
+    status = bytes(1) if reads else b""
+    whole = crtp.Packet(crtp.PORT_PARAMETERS, 1 if reads else 2, b"\2\1" + status + scalar.pack(3))
+    for _ in range(2):
+        controls.ask(0, ControlRequest(action, "a.b", 3.0))
+        for size in range(len(whole.data)):
+            assert not controls.receive(0, replace(whole, data=whole.data[:size]))
+        assert controls.answer(0) is None
+        assert controls.receive(0, whole)
+        assert controls.answer(0) == Answer((("a.b", 3),))
+    if reads:
+        controls.ask(0, ControlRequest(action, "a.b"))
+        assert controls.receive(0, replace(whole, data=b"\2\1\2"))
+        assert controls.answer(0) == Answer((), "a.b: the board does not report it: error 2")
