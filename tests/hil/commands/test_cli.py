@@ -18,8 +18,9 @@ import pytest
 import hil
 from firmware_py.extras import EXTRAS, install_command, why_missing
 from hil import fly, load_run
-from hil.commands.app import COMMANDS, GROUPS
+from hil.commands.app import COMMANDS, GROUPS, MOVED, app
 from hil.commands.fly import fly as fly_command
+from hil.config import load_config
 from hil.errors import LabError
 from hil.laboratory.files.recorder import load_log
 from hil.laboratory.request import Bench, Options
@@ -327,6 +328,38 @@ def test_every_field_of_a_bench_is_an_option_of_the_api_and_of_fly() -> None:
     names = {one.name for one in fields(Bench)}
     assert names <= Options.__annotations__.keys()
     assert names <= {one.name for one in fly_command.params}
+
+
+OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
+KEY = re.compile(r"--set[ =](?!section)([a-z]+)\.([a-z0-9_]+)=")
+OTHER_PROGRAMS = {
+    "--help", "--version", "--settings",  # of `python -m ground_station`
+    "--editable", "--master",  # of uv, of MAVProxy
+    "--dirty", "--porcelain", "--branch", "--no-ahead-behind", "--untracked-files", "--no-optional-locks",  # git
+    "--bind", "--new", "--port", "--serve-web", "--web-viewer-port", "--server-memory-limit",  # rerun
+}  # fmt: skip
+
+
+def test_every_option_and_key_that_a_text_names_exists() -> None:
+    plugin = ROOT / "hil" / "testing" / "plugin.py"
+    known = OTHER_PROGRAMS | MOVED.keys() | set(OPTION.findall(plugin.read_text(encoding="utf-8")))
+    groups: list[click.Group] = [app]
+    for group in groups:
+        context = click.Context(group)
+        commands = [group.get_command(context, name) for name in group.list_commands(context)]
+        groups += [one for one in commands if isinstance(one, click.Group)]
+        parameters = [parameter for one in commands if one is not None for parameter in one.params]
+        known |= {option for one in parameters for option in (*one.opts, *one.secondary_opts)}
+    texts = {
+        path: path.read_text(encoding="utf-8")
+        for package in ("firmware_py", "ground_station", "hil")
+        for path in (ROOT / package).rglob("*.py")
+    }
+    assert {one for text in texts.values() for one in OPTION.findall(text)} - known == set()
+    config = load_config()
+    for path, text in texts.items():
+        for section, key in KEY.findall(text):
+            assert hasattr(getattr(config, section), key), (path, section, key)
 
 
 def test_a_command_imports_no_other() -> None:

@@ -106,7 +106,8 @@ def test_identify_predicts_the_flight_that_it_was_not_fitted_to_and_writes_what_
     out: str | None,
     verdicts: tuple[str, ...],
 ) -> None:
-    found = Made(excited=("u1",) * seen, free=(), constants=[Made(verdict=one) for one in verdicts])
+    excited, free = (("u1",), ()) if held is None else ((), ("u1",))
+    found = Made(excited=excited * seen, free=free * seen, constants=[Made(verdict=one) for one in verdicts])
     asked.answer({
         "research.identify.record.load_record": lambda run, profile: f"{run} {profile}",
         "research.identify.record.profile_of": "lqr", "research.identify.identify.check_held_out": None,

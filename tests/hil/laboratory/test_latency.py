@@ -169,10 +169,10 @@ def test_ages_in_a_paced_log_are_at_its_time_not_at_the_station_s(tmp_path: Path
 def test_a_log_gets_the_goals_that_the_station_recorded_at_their_time(tmp_path: Path) -> None:
     record = tmp_path / "telemetry.csv"
     titles = ("board.t [ms]", "ground.t [s]", "goal.x [m]", "goal.y [m]", "goal.z [m]", "goal.yaw [rad]")
-    rows = ("1,7.000020,1,2,3,0.1", "2,7.000040,4,5,6,0.2", "3,7.0000")
+    rows = ("1,1.000009,1,2,3,0.1", "2,7.000040,4,5,6,0.2", "3,7.0000")
     record.write_text("\n".join((",".join(titles), *rows)))
     columns = {"goal.x": 0.0, "goal.y": 0.0, "goal.z": 1.15, "goal.yaw": 0.0}
-    clock = [7_000_010, 7_000_020, 7_000_039, 7_000_040, 9_000_000]
+    clock = [1_000_008, 1_000_009, 7_000_039, 7_000_040, 9_000_000]
     log = pa.table({STATION_CLOCK: clock, **{name: [value] * 5 for name, value in columns.items()}})
     told = with_goals_sent(record, log)
     assert told.column("goal.z").to_pylist() == [1.15, 3.0, 3.0, 6.0, 6.0]

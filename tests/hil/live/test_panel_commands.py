@@ -2,12 +2,15 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
 
 from firmware_py.table import OF_PROFILE
+from ground_station.trajectory import Goal
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.faults import spans_of
 from hil.laboratory.files.recorder import load_events, load_log
@@ -142,6 +145,16 @@ def test_each_line_acts_up_to_its_bounds_and_no_further(monkeypatch: pytest.Monk
         True
     ] * len(bad)
     assert (view.known["extCtrl.y_P"], view.known[OF_PROFILE["predictor.horizon"].name]) == (-20.0, 12.0)
+    flight.close()
+
+
+def test_a_goal_without_yaw_keeps_that_of_its_instant() -> None:
+    flight = lockstep_flight(Request.of(EXPERIMENTS["hover"], duration_s=0.1))
+    turning: Any = SimpleNamespace(at=lambda t_us: Goal((0.0, 0.0, 1.15), 1e-6 * t_us))
+    flight.line.steer(turning)
+    PanelCommands(Script({5: ["goal 0 0.5 1"]}), flight)
+    flight.lab.run_to(100_000)
+    assert flight.line.trajectory.at(0) == Goal((0.0, 0.5, 1.0), pytest.approx(0.05, abs=0.011))
     flight.close()
 
 

@@ -421,6 +421,26 @@ def test_the_goal_the_robot_and_the_tunnel_stand_where_they_are(folder: Path) ->
             assert still[f"/world/robot/parts/{part.name}/number", "Points3D:labels"] == [part.label]
 
 
+@pytest.mark.parametrize("fan_factor", [0.0, 0.5])
+def test_tether_net_and_nozzle_are_those_of_the_flight_s_own_place(
+    folder: Path, tmp_path: Path, fan_factor: float
+) -> None:
+    log = load_log(folder)
+    config = stored_in(log.schema.metadata, "config")
+    config["tunnel"] |= {"hover_height": 1.4, "fan_factor": fan_factor}
+    config["plant"]["tether"]["anchor_height"], config["plant"]["ground"]["height"] = 2.0, 0.25
+    log = log.replace_schema_metadata({**log.schema.metadata, b"config": json.dumps(config).encode()})
+    path = staged(tmp_path / "elsewhere.rrd", log)
+    (strip, *_) = values(path, "/world/tether", "LineStrips3D:strips")[0]
+    np.testing.assert_allclose(strip[0], (0.0, 0.0, 3.4), atol=1e-6)
+    entities = {
+        chunk.entity_path: chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.is_static
+    }
+    (net,) = entities["/world/tunnel/net"].column("LineStrips3D:strips").to_pylist()
+    assert {round(z, 6) for line in net for _, _, z in line} == {0.25}
+    assert ("/world/tunnel/nozzle" in entities, "/world/tunnel/flow" in entities) == (fan_factor > 0.0,) * 2
+
+
 def test_the_goal_has_a_path_where_it_moves(tmp_path: Path) -> None:
     moving = np.where(np.arange(30) < 20, 0.0, 0.01 * np.arange(30))
     log = real_log()

@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
+from firmware_py.wire.supervisor import Cause, State
 from hil.laboratory.fault_kinds import KINDS
-from hil.servers.live_faults import HELP, LiveFaults
+from hil.servers.live_faults import HELP, LiveFaults, _status
 
 TOO_LONG = f"{20 * 'x'}…: expected at most 200 characters"
 
@@ -71,6 +72,21 @@ def test_the_end_of_a_stream_is_no_line_and_ends_the_reading(typed: Typed) -> No
     typed.terminal = os.dup(typed.end)
     typed.readers[typed.end](0)
     assert (typed.said, typed.readers) == ([], {})
+
+
+@pytest.mark.parametrize(("free", "state", "cause", "words"), [
+    (False, State.CALIBRATING, Cause.NONE, "held, calibrating"), (True, State.FLYING, Cause.NONE, "free, flying"),
+    (True, State.FAILSAFE, Cause.LOW_BATTERY, "free, failsafe, low battery"),
+    (False, State.FAILSAFE, Cause.CONTROLLER_NOT_FINITE, "held, failsafe, controller not finite"),
+])  # fmt: skip
+def test_a_robot_s_state_is_described_in_words(free: bool, state: State, cause: Cause, words: str) -> None:
+    supervisor = SimpleNamespace(state=state, cause=cause)
+    robot: Any = SimpleNamespace(
+        powered=True, free=free, firmware=SimpleNamespace(signals=SimpleNamespace(supervisor=supervisor))
+    )
+    assert _status(robot) == words
+    robot.powered = False
+    assert _status(robot) == "without power"
 
 
 def test_a_stream_without_lines_is_ignored(typed: Typed) -> None:

@@ -12,12 +12,14 @@ from hil.laboratory.files.recorder import (
     BATCHES_PER_PIECE,
     RELEASE_US,
     ROWS_PER_BATCH,
+    STORED,
     Observer,
     Recorder,
     forget_read_columns,
     load_events,
     load_log,
     release_of,
+    stored_in,
 )
 from hil.world.body import Channel, Quantity
 from support.watching import Watcher
@@ -33,6 +35,17 @@ def make(folder: Path, values: np.ndarray, observer: Observer | None = None) -> 
         {"seed": "7"},
         observer,
     )
+
+
+@pytest.mark.parametrize("name", STORED)
+@pytest.mark.parametrize(("text", "error"), [
+    (b"{", "not JSON: Expecting"), (b"[" * 100_000, "not JSON: maximum recursion depth"), (b"[1]", "expected a table"),
+], ids=["cut", "deep", "list"])  # fmt: skip
+def test_what_a_log_s_schema_stores_is_a_table_or_refused(name: str, text: bytes, error: str) -> None:
+    with pytest.raises(LabError, match=f"^{name} in the log's schema: {error}"):
+        stored_in({name.encode(): text}, name)
+    assert stored_in({name.encode(): b'{"a": [1]}'}, name) == {"a": [1]}
+    assert stored_in({b"other": text}, name) == stored_in(None, name) == {}
 
 
 def test_rows_survive_the_way_to_parquet_and_to_an_observer_that_keeps_them(tmp_path: Path) -> None:
