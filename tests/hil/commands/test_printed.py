@@ -12,6 +12,7 @@ import pyarrow as pa
 import pytest
 from scipy.stats import binomtest
 
+from firmware_py.export.usage import EntryLoad
 from hil.commands import compare, deploy, identify, listing, paper, pictures, serve, station, tables
 from hil.commands import options as common
 from hil.config import load_config
@@ -111,6 +112,17 @@ def test_a_flight_says_how_fast_it_was_and_how_long_it_took_where_that_is_known(
         real_time_factor=factor, hash="a" * 64, folder=tmp_path, ages=(), usage=None)  # fmt: skip
     tables.print_result(result)
     assert printed()[-1] == f"lost: fell; {speed}{taken}hash {'a' * 16}"
+
+
+def test_a_flight_says_what_the_entry_points_took_that_were_called(printed: Any, tmp_path: Path) -> None:
+    entries = {
+        name: EntryLoad(calls, 168, 336) for name, calls in (("control", 1), ("goal", 0), ("estimate", 2))
+    }
+    result: Any = Made(request=Made(title="hover", profile="floaty", bench=Made(board="c")), rows=(), cause="", outcome="ok",
+        real_time_factor=2.0, hash="a" * 64, folder=tmp_path, ages=(), usage=Made(entries=entries))  # fmt: skip
+    tables.print_result(result)
+    loads = [line.split()[:3] for line in printed() if " calls, " in line]
+    assert loads == [["c", "control", "1"], ["c", "estimate", "2"]]
 
 
 def test_robots_that_fly_together_are_a_row_each_and_their_common_limits(

@@ -5,11 +5,15 @@ import signal
 import socket
 import sys
 import threading
+from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from hil.emulator.stm32f405 import checkpoints, gdb, image
 from hil.emulator.stm32f405.backwards import NEAR, PERIOD, TRAIL, Goal, Position, Search
 from hil.emulator.stm32f405.checkpoints import (
     LIMIT,
@@ -19,6 +23,7 @@ from hil.emulator.stm32f405.checkpoints import (
     why_none,
 )
 from hil.emulator.stm32f405.chip import SOFTWARE
+from hil.laboratory.lockstep import debugger
 from support.flight_backwards import Flight
 from support.stm32_machine import FirmwareOnChip
 
@@ -254,3 +259,34 @@ def test_a_process_with_threads_cannot_be_copied_nor_any_of_another_system(
     assert why_none() == ""
     monkeypatch.setattr(sys, "platform", "darwin")
     assert why_none() == "the flight's process is copied for it, which darwin cannot"
+
+
+@pytest.mark.parametrize(
+    ("forbidden", "copies", "said"),
+    [("", "", []), ("it is real", "", ["it is real"]), ("", "threads", ["threads"])],
+)
+def test_a_debugger_has_checkpoints_unless_something_forbids_them(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    forbidden: str,
+    copies: str,
+    said: list[str],
+) -> None:
+    opened: list[Any] = []
+
+    def server(port: int, waiting: Any, kept: Any, from_us: int) -> Any:
+        opened.append((port, type(kept), from_us))
+        waiting(port + 1)
+        return SimpleNamespace(close=lambda: opened.append("closed"))
+
+    monkeypatch.setattr(gdb, "GdbServer", server)
+    monkeypatch.setattr(checkpoints, "why_none", lambda: copies)
+    monkeypatch.setattr(image, "has_symbols", lambda path: path.suffix == ".elf")
+    with ExitStack() as stack:
+        assert debugger(None, Path("cf2.bin"), stack) is None
+        debugger(3333, Path("my cf2.elf"), stack, forbidden, 70)
+    assert opened == [(3333, type(None) if said else Checkpoints, 70), "closed"]
+    assert capsys.readouterr().out.splitlines() == [
+        *(f"--gdb 3333: time runs forward only: {why}" for why in said),
+        "waiting for gdb-multiarch 'my cf2.elf' -ex 'target remote 127.0.0.1:3334'",
+    ]
