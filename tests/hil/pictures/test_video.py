@@ -61,6 +61,7 @@ def test_video_and_gif_last_as_long_as_the_flight_at_30_frames_per_second(
         assert np.abs(shown - wanted).max(axis=1).min() < 12, colour
 
 
+@pytest.mark.long
 def test_each_frame_shows_the_robot_of_its_instant_and_the_curves_up_to_it(folder: Path) -> None:
     log = load_log(folder)
     pictures = [np.asarray(picture).astype(int) for picture in video.frames(log.slice(0, log.num_rows - 67))]

@@ -362,6 +362,7 @@ def test_a_metric_that_is_no_number_is_beyond_every_limit() -> None:
     assert _beyond(below_zero, -3.0) == 0.5  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 def test_inert_axes_exceed_the_threshold_of_chance_in_one_of_twenty_campaigns() -> None:
     varied = ("actuators.tau", "plant.mass_factor", "plant.drag_factor")
     spec = spec_of(flights=60, parameters={name: {"uniform": [0.9, 1.1]} for name in varied})

@@ -46,6 +46,7 @@ def test_stable_baselines_checker_passes() -> None:
         checker.check_env(make_env("Hover", fidelity, duration_s=0.5))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("task", TASKS)
 def test_both_fidelities_fly_alike_in_open_loop_from_the_same_seed(task: str) -> None:
     """In calm air, for a second: 2 mm, 0.02 m/s and 10 mrad; rewards within 0.02."""
@@ -410,6 +411,7 @@ def test_faults_act_in_the_laboratory() -> None:
     env.close()
 
 
+@pytest.mark.long
 def test_the_errors_of_the_fast_model_are_those_of_the_laboratory_s_hover(tmp_path: Path) -> None:
     """Within a factor of two, for position, velocity, attitude and rates."""
     run = hil.fly("hover", duration_s=5.0, seed=3, folder=tmp_path / "run")
