@@ -8,15 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware_py import compiling
+from firmware_py import compiling, core_runner
 from firmware_py.compiling import bound, compiler
+from firmware_py.config import parameters_of
 from firmware_py.core.subset import F64s
+from firmware_py.core_runner import CoreBlocks, PlainRunner, default_runner
 from firmware_py.export import kernels
 from firmware_py.export.compilers import compile_texts, compilers
 from firmware_py.export.errors import CompilerError, ExportError
 from firmware_py.export.kernels import library
 from firmware_py.export.live_reading import Arrays
 from firmware_py.kept_code import UNUSED_S, keep, kept_folder, may_load
+from hil.config import load_config
 
 ABSENT_UID = 12345
 
@@ -170,6 +173,10 @@ def test_without_compiled_code_python_computes_the_same_and_one_line_says_why(
         x = np.array([4.0])
         bound(compiler()(twice), x)()
         assert x[0] == 8.0
+    monkeypatch.setattr(core_runner, "core_library", fail)
+    monkeypatch.setattr(core_runner, "PLAIN", False)
+    blocks = CoreBlocks(parameters_of(load_config()), PlainRunner)
+    assert isinstance(default_runner(blocks), PlainRunner)
     assert capsys.readouterr().err == f"floaty: flies as plain Python, far slower: {error}\n"
 
 
