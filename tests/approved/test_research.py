@@ -11,11 +11,15 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from numpy.typing import NDArray
 
+from ground_station.trajectory import Goal
+from hil import fly
 from hil.config import LabConfig, load_config
 from hil.errors import LabError
+from hil.laboratory.experiments import EXPERIMENTS
 from hil.research.design import optimise
 from hil.research.design.authority import QUANTITIES, authorities, single
 from hil.research.design.axes import AXES, DELAY, HEIGHT, NUISANCES, PITCH, ROLL, gains_in, robot_of
@@ -208,12 +212,43 @@ def drawn(folder: Path) -> dict[str, Any]:
     return found
 
 
+def flights() -> dict[str, Any]:
+    """Return the metrics of experiments, flown near the goal with errors that are now and then large, or not to the end."""
+    run = fly("hover", duration_s=5.0)
+    log, release_us, found = run.log, 1_000_000, {}
+    for number, (name, experiment) in enumerate(EXPERIMENTS.items()):
+        if name == "overload":  # its log has another task's time
+            continue
+        rng, rows = np.random.default_rng(number), log.num_rows
+        end_us = release_us + experiment.duration_s * 1e6 * (1.0 if number % 5 else 0.8)
+        t = np.linspace(0, end_us, rows).astype(np.int64)
+        course = experiment.trajectory(Goal((0.0, 0.0, 1.15), 0.0), release_us)
+        goals = np.array([(*goal.p_WG, goal.yaw) for goal in map(course.at, t.tolist())])
+        walk = np.cumsum(noise(rng, rows, 4), axis=0) / rows**0.5 * 0.05
+        flown = np.roll(goals, 3, axis=0) + walk + 0.2 * (noise(rng, rows, 4) > 0.995)
+        yaw = flown[:, 3]
+        changed = {
+            "t": t, "flight.free": t >= release_us, "battery.power": 3.4 + walk[:, 0], "truth.r": np.gradient(yaw),
+            "truth.qw": np.cos(yaw / 2), "truth.qx": 0.0 * t, "truth.qy": 0.0 * t, "truth.qz": np.sin(yaw / 2),
+            **dict(zip(("truth.x", "truth.y", "truth.z"), flown.T, strict=False)),
+            **dict(zip(("goal.x", "goal.y", "goal.z", "goal.yaw"), goals.T, strict=True)),
+        }  # fmt: skip
+        columns = [
+            pa.array(changed.get(one.name, log[one.name].to_numpy())).cast(one.type, safe=False)
+            for one in log.schema
+        ]
+        metrics = experiment.metrics_of(pa.table(columns, schema=log.schema), lost=number % 7 == 0)
+        found[name] = [value for key, value in metrics.items() if "age" not in key]
+    return found
+
+
 FOUND: dict[str, Callable[[Path], Any]] = {
     **{f"loops {axis.name}": lambda folder, number=n: loops(number) for n, axis in enumerate(AXES)},  # type: ignore[misc]
     "tuned yaw": lambda folder: tuned(2),
     "robots": lambda folder: robots(),
     "logs": lambda folder: logs(),
     "drawn": drawn,
+    "flights": lambda folder: flights(),
 }
 
 
