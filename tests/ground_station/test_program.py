@@ -13,12 +13,14 @@ from firmware_py.wire import WireError
 from firmware_py.wire.supervisor import State
 from firmware_py.wire.telemetry import CONTROL, Sample
 from ground_station import operator, program
-from ground_station.config import GroundConfig, LinkSettings
+from ground_station.config import GroundConfig, LinkSettings, TrackerConfig
 from ground_station.controls import Answer, ControlAction, ControlRequest, ControlsError
 from ground_station.errors import LinkError, MocapError
 from ground_station.latency import LinkLatency
 from ground_station.mocap import MocapFrame
 from ground_station.program import LoopHook, Session, StationSession, fly, run_until
+from ground_station.sources import replay
+from ground_station.sources.replay import ReplaySource, read_frames
 from ground_station.terminal import Terminal
 from ground_station.trajectory import Goal, Offsets, Step, Trajectory
 
@@ -31,6 +33,7 @@ class Room:
 
     uri = "room"
     latency = LinkLatency("air", 0, measured=False)
+    frame_us = FRAME_US
 
     def __init__(
         self, blind: tuple[float, float], lost: tuple[float, float], in_failsafe: bool = True
@@ -65,7 +68,7 @@ class Room:
             self.now_us = end_us
             return None
         self.now_us, exposed_us = max(self.now_us, self._next_us), self._next_us
-        self._next_us += FRAME_US
+        self._next_us += self.frame_us
         return MocapFrame(exposed_us, (0.0, 0.0, 1.15), (1.0, 0.0, 0.0, 0.0), True)
 
     # Link
@@ -233,11 +236,17 @@ def test_telemetry_and_frames_of_mavlink_are_in_their_files_whole(
     assert state.endswith(f"telemetry {sum(stamp_ms < 5000 for stamp_ms in stamps_ms)}")
 
 
+FILES = ("log", "record", "tlog")
+
+
+@pytest.mark.parametrize("names", [FILES, *((name,) for name in FILES)])
+@pytest.mark.parametrize("until_s", [1.0, 6.0])  # full when it is closed or before
 def test_full_files_end_by_themselves_and_not_the_flight(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, names: tuple[str, ...], until_s: float
 ) -> None:
     room = Room((inf, inf), (inf, inf))
-    full = {name: tmp_path / name for name in ("log", "record", "tlog")}
+    paths = {name: tmp_path / name for name in FILES}
+    full = {name: paths[name] for name in names}
     for path in full.values():
         path.symlink_to("/dev/full")
 
@@ -248,13 +257,55 @@ def test_full_files_end_by_themselves_and_not_the_flight(
         room.settings.note_frame(now_us, bytes(1000))
 
     records = program.Records()
-    flown(room, monkeypatch, 6.0, (talks,), records=records, **full)
-    ended = [text for _, text in room.says if "No space left" in text]
+    flown(room, monkeypatch, until_s, (talks,), records=records, **paths)
+    ended = [text for _, text in room.says if "No space left" in text] + records.notices()
     assert sorted(ended) == sorted(
         f"{path}: No space left on device; no more is written to it" for path in full.values()
     )
     assert records.incomplete
-    assert len(room.ages_us) == pytest.approx(300, abs=5)
+    assert len(room.ages_us) == pytest.approx(50 * until_s, abs=5)
+
+
+@pytest.mark.parametrize(("enabled", "frame_us", "effect"), [
+    (True, 500_000, "no corrections leave, see tracker.reacquire_us = 400000"),
+    (False, 500_000, "2, not 50 corrections leave per second"),
+    (True, 300_000, "3, not 50 corrections leave per second"),
+])  # fmt: skip
+def test_cameras_too_slow_for_a_track_are_named_where_there_is_a_tracker(
+    monkeypatch: pytest.MonkeyPatch, enabled: bool, frame_us: int, effect: str
+) -> None:
+    room = in_room(Room((inf, inf), (inf, inf)), monkeypatch)
+    room.frame_us = frame_us
+    settings = GroundConfig(tracker=TrackerConfig(enabled=enabled), frame_period_us=20_000)
+    fly(settings, Session("room", None, step), room.say, run_until(lambda: False, 6.0))
+    (line,) = [text for _, text in room.says if "a frame every" in text]
+    assert line.endswith(f": {effect}")
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_flight_ends_with_its_replay_even_if_that_is_recorded_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, again: bool
+) -> None:
+    room = in_room(Room((inf, inf), (inf, inf)), monkeypatch)
+    first, second = tmp_path / "first", tmp_path / "second"
+    flown(room, monkeypatch, 2.0, record=first)
+    monkeypatch.undo()
+    in_room(room, monkeypatch)
+    for name, replaced in (("clock_us", lambda: room.now_us), ("wait", room.receive)):
+        monkeypatch.setattr(replay, name, replaced)
+    monkeypatch.setattr(program, "_open_source", lambda mocap, capture: opened(ReplaySource(first)))
+    room.frame_us, room.now_us = 1_000, 0
+    fly(
+        GroundConfig(), Session("room", None, step, record=second if again else None), room.say, lambda: False
+    )
+    assert room.instants("the recording is over")
+    if again:
+        assert len(read_frames(second)) == len(read_frames(first)) > 90
+
+
+def opened(source: ReplaySource) -> ReplaySource:
+    source.open()
+    return source
 
 
 class Read(Terminal):

@@ -51,7 +51,7 @@ def test_lines_are_edited_and_completed_until_the_terminal_is_closed(
     keys: PipeInput, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ["goal", "controller.gain_y"]
-    terminal = opened(monkeypatch, lambda: words)
+    terminal = opened(monkeypatch, lambda: [*words])
     keys.send_text("markk\x7f it\rset a 1\r")
     assert [next_line(terminal) for _ in range(2)] == ["mark it", "set a 1"]
     assert terminal.lines() == []
