@@ -13,10 +13,10 @@ from firmware_py.errors import FirmwareError
 from firmware_py.firmware import WATCHDOG_US, Firmware
 from firmware_py.rtos import WatchdogError
 from firmware_py.supervisor import wrapped
-from firmware_py.tasks import MEASUREMENT_QUEUE
 from firmware_py.wire.parameters import ABSOLUTE
 from hil.config import load_config
 from support.firmware_bench import HOVER_COUNTS, FirmwareBench
+from support.mavlink_client import MavlinkClient
 
 
 @pytest.fixture
@@ -64,10 +64,16 @@ def test_controller_goes_on_when_the_imu_falls_silent(bench: FirmwareBench) -> N
     assert max(gaps) <= 20_000
 
 
-def test_measurement_queue_has_the_originals_length(bench: FirmwareBench) -> None:
+def test_every_queue_has_its_length_and_a_board_in_peace_drops_nothing() -> None:
+    """As in Crazyflie firmware, and the original's of measurements; of MAVLink and the console our own."""
+    bench = MavlinkClient()
     bench.run(1_000_000)
-    assert bench.firmware.measurements.length == MEASUREMENT_QUEUE == 20
-    assert bench.firmware.measurements.dropped == 0
+    queues = bench.firmware.kernel.queues
+    ports = {queue.name: 16 for queue in queues if queue.name.startswith("port")}
+    of_link = {"syslink": 8, "crtpPacketDelivery": 5, "crtpTx": 120, "app": 10}
+    own = {"mavTx": 32, "console": 40, "measurements": 20}
+    assert {queue.name: queue.length for queue in queues} == ports | of_link | own
+    assert {queue.dropped for queue in queues} == {0}
 
 
 class Gyro:

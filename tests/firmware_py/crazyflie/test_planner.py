@@ -1,6 +1,7 @@
 """The planner's polynomials against numpy's linear algebra and scipy's Bezier curves; its paths by their laws."""
 
 import struct
+from errno import EBUSY
 from math import pi, tau
 from types import SimpleNamespace
 
@@ -273,6 +274,17 @@ def test_only_at_rest_it_takes_off_and_only_once_it_lands(phase: Phase, command:
     if phase is not Phase.IDLE:
         commander.planner.follow(straight_up(REST, 1.0, 0.0, 2.0), 0.0, landing=phase is Phase.LANDING)
     assert commander.execute(struct.pack("<BBff?f", command, 0, 0.5, 0.0, True, 2.0), 1.0) == status
+
+
+def test_a_commander_takes_commands_from_its_first_release_until_it_is_blocked_again() -> None:
+    board = SimpleNamespace(estimate=lambda: REST, admits=lambda places: True)
+    commander = HighLevelCommander(board, lambda kind, text: None)
+    take_off = struct.pack("<BBff?f", PathCommand.TAKE_OFF, 0, 0.5, 0.0, True, 2.0)
+    for _ in range(2):
+        assert commander.execute(take_off, 1.0) == EBUSY
+        commander.block(False)
+        assert commander.execute(take_off, 1.0) == 0
+        commander.block(True)
 
 
 def test_a_path_in_flight_begins_at_the_goal_of_its_instant_between_two_set_points() -> None:

@@ -212,8 +212,14 @@ def test_targets_that_are_refused_keep_no_offboard_alive(client: MavlinkClient) 
     assert current(client) == HOLD
 
 
-def test_in_offboard_only_the_client_that_started_it_moves_the_goal(client: MavlinkClient) -> None:
-    offboard(client)
+@pytest.mark.parametrize("older", [False, True])
+def test_in_offboard_only_the_client_that_started_it_moves_the_goal(
+    client: MavlinkClient, older: bool
+) -> None:
+    if older:
+        client.ask("set_mode", 1, 1, OFFBOARD)
+    else:
+        offboard(client)
     by(client, OTHER, "set_position_target_local_ned", *target(0.1))
     assert "target refused: another client is in offboard" in client.texts()
     assert aim(client) == 0.0
