@@ -35,6 +35,13 @@ def test_a_sample_is_in_the_bmi088s_registers_when_its_interrupt_comes() -> None
     assert not parts.accel[0x18:].any()
 
 
+def test_at_power_on_all_lines_are_pulled_up_but_those_of_a_ready_sample_and_a_busy_radio_chip() -> None:
+    bench = Bench()
+    Parts(bench.chip, np.zeros(8192, np.uint8))
+    levels = {port: bench[GPIOA_IDR + 0x400 * index] for index, port in enumerate("ABCDE")}
+    assert levels == dict.fromkeys("ABCDE", 0xFFFF) | {"A": 0xFFEF, "C": 0xBFFF}
+
+
 def send(bench: DeckBench, data: bytes) -> None:
     """Let the microcontroller write to its radio chip."""
     bench[USART6 + 8], bench[USART6 + 0xC] = 84, 1 << 13 | 1 << 3  # BRR, UE and TE
