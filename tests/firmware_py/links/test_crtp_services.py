@@ -343,6 +343,19 @@ def test_each_parameter_of_set_point_and_commander_sets_its_own_number(client: C
     assert (defaults.take_off_velocity, defaults.landing_velocity, defaults.groups) == (0.25, 2.0, 3)
 
 
+def test_what_a_parameter_reads_can_be_written_and_deviations_are_roots_of_variances(
+    client: CrtpClient, params
+) -> None:
+    fields = client.firmware._core.parameters.fields
+    for name, field in (("extPosStdDev", "measured_position"), ("extQuatStdDev", "measured_attitude")):
+        assert client.write(params, f"locSrv.{name}", 0.25) == 0.25
+        assert getattr(fields, field) == 0.0625
+    for name, (_, kind) in params.items():
+        if not kind & 0x40:
+            before = client.read(params, name)
+            assert client.write(params, name, before) == pytest.approx(before, rel=1e-6), name
+
+
 def test_sensors_and_decks_reported_present_are_the_board_s(client: CrtpClient, params) -> None:
     present = {
         name for name in params if name.startswith(("imu_sensors.", "deck.")) and client.read(params, name)
