@@ -24,7 +24,7 @@ from ground_station.clock import clock_us
 from ground_station.config import LinkSettings, StationConfig
 from ground_station.controls import REPEAT_US, Answer, ControlAction, ControlRequest
 from ground_station.errors import LinkError
-from ground_station.links.mavlink import MavlinkLink
+from ground_station.links.mavlink import TEXTS, MavlinkLink
 from ground_station.links.mavlink_budget import TELEMETRY_HZ, link_budget
 from ground_station.links.mavlink_controls import REASON_US, MavlinkControls
 from ground_station.links.mavlink_serial import MavlinkSerialLink, named, parse_uri
@@ -439,6 +439,8 @@ def test_a_text_in_pieces_is_one_line_unless_its_beginning_was_lost():
         assert (len(pieces) == 1) == (length == 50)
         bench.hear(20, *pieces)
         assert bench.link.texts[-1] == f"board: {line[:length]}"
+    bench.hear(30, *(services.status_text(6, f"line {number}")[0] for number in range(TEXTS + 3)))
+    assert list(bench.link.texts) == [f"board: line {number}" for number in range(3, TEXTS + 3)]
 
 
 @pytest.mark.parametrize(("result", "word"), [(2, "denied"), (5, "in progress"), (77, "77")])
