@@ -112,6 +112,24 @@ def test_input_that_comes_before_time_starts_is_not_in_the_past(wall: Wall) -> N
     assert heard == [20_000]
 
 
+def test_all_who_have_input_are_called_at_its_instant_unless_another_one_closed_them(wall: Wall) -> None:
+    paced, heard = Paced(), list[int]()
+    pairs = [socket.socketpair() for _ in range(4)]
+    for number, (reader, writer) in enumerate(pairs):
+        paced.readers[reader] = lambda _, number=number: (
+            heard.append(number),
+            paced.readers.pop(pairs[3][0], None),
+        )
+        if number != 1:
+            writer.send(b"input")
+    paced.start(0)
+    paced.serve(paced.wait_until(10_000))
+    assert heard == [0, 2]
+    for pair in pairs:
+        for end in pair:
+            end.close()
+
+
 def test_input_of_a_high_descriptor_is_read() -> None:
     """`select` refuses those above 1023."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)

@@ -15,6 +15,7 @@ from firmware_py.config import LogicConfig, parameters_of
 from firmware_py.logic.loading import load_logic, sensed_by
 from firmware_py.signals import CONTROL, COUNTERS, ESTIMATOR, INPUT
 from firmware_py.wire.supervisor import Cause, State
+from hil.board import image_firmware
 from hil.board.image_firmware import ChipImage, ChipSupervisor, ImageFirmware, differences
 from hil.board.pins import Requests, VirtualBoard
 from hil.config import load_config
@@ -69,6 +70,20 @@ def test_an_image_without_the_app_has_no_input_and_signals_of_the_stock_firmware
     assert np.isnan(firmware.signals.estimate).all()
     assert firmware.differences(load_config()) == ""
     assert firmware.parameter_numbers == {"test.gain": 0, "test.revision": 1, "wait.timeout": 3}
+
+
+@pytest.mark.parametrize("law", ["", "controller", "estimator", "both"])
+@pytest.mark.parametrize("in_image", [False, True])
+def test_an_image_has_a_user_s_logic_where_the_profile_has_any(
+    monkeypatch: pytest.MonkeyPatch, law: str, in_image: bool
+) -> None:
+    config, without = load_config(), load_logic(LogicConfig())
+    monkeypatch.setattr(image_firmware, "load_logic", lambda logic: without)
+    chosen = [name for name in ("controller", "estimator") if law in (name, "both")]
+    own = config.model_copy(update={"logic": LogicConfig(**dict.fromkeys(chosen, "own.py"))})
+    told = differences(parameters_of(config).memory, own, lambda name: in_image)
+    wanted = "one of the user's" if law else "the core's"
+    assert told == ("" if bool(law) == in_image else f"control law, the profile has {wanted}")
 
 
 def test_an_image_of_another_version_is_named_with_both_sizes() -> None:

@@ -21,6 +21,8 @@ from ground_station.errors import LinkError
 from hil.commands import fly, identify, paper, param
 from hil.commands.options import say
 from hil.config import load_config
+from hil.deploy.targets import TARGETS
+from hil.errors import LabError
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.metric_pairs import MetricPair
 from hil.laboratory.replay import Misses
@@ -717,6 +719,20 @@ def test_a_check_flies_the_last_flight_with_targets_of_its_own_logic_and_ends_wi
     assert plan[1:4] == (None, False, False), "a linked image is not built afresh"
     judged = [one for one in asked if one[0] == "_check_around"]
     assert judged == ([] if code == 130 else [("_check_around", Path("cf2.elf"), "floaty", ("a.b=1",))])
+
+
+@pytest.mark.parametrize(("options", "fresh"), [
+    ("", True), ("--targets c-O0", True), (f"--targets {','.join(TARGETS)}", True), ("--targets udp://127.0.0.1:9", False),
+    ("--source core.c", False), ("--elf cf2.elf", False), ("--elf cf2.elf --targets cortex-m4", False),
+])  # fmt: skip
+def test_all_states_are_checked_for_what_is_exported_and_built_afresh(
+    cli: Cli, asked: Asked, options: str, fresh: bool
+) -> None:
+    for name in ("core.c", "cf2.elf"):
+        Path(name).touch()
+    asked.answer({"deploy.check.plan": failing(LabError("planned"))})
+    assert "planned" in cli.refusal("deploy", "check", *options.split())
+    assert asked[0][:4] == ("plan", None, False, fresh)
 
 
 def test_a_study_flies_alone_into_a_folder_of_its_name(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict, Unpack
 
 import numpy as np
 import pytest
@@ -40,6 +40,16 @@ def called(first: float, *rest: str, name: Literal["a", "b", "c"] = "a", **more:
     return first, rest, name, more
 
 
+class Wishes(TypedDict, total=False):
+    seed: int
+    profile: str
+
+
+@checked
+def asked(name: str, **wishes: Unpack[Wishes]) -> Any:
+    return name, wishes
+
+
 @checked
 class Made:
     def __init__(self, x: float, y: tuple[float, float] = (0.0, 0.0)) -> None:
@@ -54,6 +64,9 @@ class Made:
         (lambda: called(1, name="d"), "called: name = 'd': expected 'a', 'b' or 'c'"),
         (lambda: called(), "called: missing a required argument: 'first'"),
         (lambda: called(1, first=2), "called: multiple values for argument 'first'"),
+        (lambda: asked("a", seed=1, profile=2), "asked: profile = 2: expected text"),
+        (lambda: asked("a", profile="b", seed="c"), "asked: seed = 'c': expected a whole number"),
+        (lambda: asked("a", sead=1), "asked: unknown argument 'sead'; did you mean seed?"),
         (lambda: Made(1, z=2), "Made: unknown argument 'z'; there are x, y"),
         (lambda: Made(1, (1, 2, 3)), "Made: y = (1, 2, 3): expected "),
         (lambda: Known("flap", {"left": 1})["lefd"], "flap 'lefd': there is none; did you mean left?"),
@@ -68,6 +81,7 @@ def test_a_wrong_call_is_one_line(call: Callable[[], Any], error: str) -> None:
 def test_a_right_call_gets_its_values_and_numbers_of_numpy_as_those_of_python() -> None:
     first, rest, name, more = called(np.float64(1.5), "a", "b", name="c")
     assert (first, rest, name, more, type(first)) == (1.5, ("a", "b"), "c", {}, float)
+    assert asked("a", seed=np.int64(7), profile="b") == ("a", {"seed": 7, "profile": "b"})
     made = Made(np.int32(3), y=(1, 2))
     assert (made.x, made.y, type(made.x)) == (3, (1, 2), int)
 

@@ -170,7 +170,7 @@ def test_a_log_gets_the_goals_that_the_station_recorded_at_their_time(tmp_path: 
     record = tmp_path / "telemetry.csv"
     titles = ("board.t [ms]", "ground.t [s]", "goal.x [m]", "goal.y [m]", "goal.z [m]", "goal.yaw [rad]")
     rows = ("1,1.000009,1,2,3,0.1", "2,7.000040,4,5,6,0.2", "3,7.0000")
-    record.write_text("\n".join((",".join(titles), *rows)))
+    record.write_bytes("\n".join((",".join(titles), *rows)).encode() + b"\xff")
     columns = {"goal.x": 0.0, "goal.y": 0.0, "goal.z": 1.15, "goal.yaw": 0.0}
     clock = [1_000_008, 1_000_009, 7_000_039, 7_000_040, 9_000_000]
     log = pa.table({STATION_CLOCK: clock, **{name: [value] * 5 for name, value in columns.items()}})

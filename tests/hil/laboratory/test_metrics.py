@@ -57,7 +57,7 @@ def test_metrics_count_from_the_release_to_the_end() -> None:
         "truth.z": [*9 * [0.0], -0.11, 0.0, 0.06, 0.1, 0.0, 0.0],
         "truth.qw": [*14 * [1.0], np.cos(0.1)],
         "truth.qy": [*14 * [0.0], -np.sin(0.1)],
-        "supervisor.state": [*4 * [3], 3, 3, *9 * [2]],
+        "supervisor.state": [2, 0, 2, 3, 3, 3, *9 * [2]],
         "serial.up_busy": [9 * 10**5 * second for second in range(4)]
         + [3_600_000 + 10**5 * n for n in range(11)],
         "serial.down_busy": [10**6 * second // 2 for second in range(15)],

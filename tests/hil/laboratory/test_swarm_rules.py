@@ -62,13 +62,14 @@ def crowd_of(*flown: Flown, still_air: bool = True, **settings: float) -> tuple[
 
 def test_every_robot_is_in_the_room_with_its_place_speed_and_the_lift_along_its_own_axis() -> None:
     turns = Rotation.random(3, rng=np.random.default_rng(5))
-    flown = [Flown((0.1 * n, 0.2 * n, 0.3), turns[n], 0.2 + n) for n in range(3)]
+    lifts = (0.2, 1.2, -0.3)
+    flown = [Flown((0.1 * n, 0.2 * n, 0.3), turns[n], lifts[n]) for n in range(3)]
     crowd, near = crowd_of(*flown)
     crowd.exchange(4_000)
     for n, one in enumerate(flown):
         assert near.p_WB[n] == pytest.approx(one.body.p_WB + ORIGINS[n])
         assert near.v_WB[n] == pytest.approx([0.1, 0.2, 0.3])
-        assert near.lift_W[n] == pytest.approx(turns[n].apply([0.0, 0.0, 0.2 + n]))
+        assert near.lift_W[n] == pytest.approx(turns[n].apply([0.0, 0.0, lifts[n]]))
         assert one.advanced == [4_000]
     assert (near.wake, crowd_of(*flown, still_air=False)[1].wake) == (1.5, 0.0)
 

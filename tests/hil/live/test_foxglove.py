@@ -66,7 +66,8 @@ def test_changed_parameter_is_shown(screen: FoxgloveScreen, client: FoxgloveClie
         "the other one is still subscribed to"
     )
     screen.know({"extCtrl.y_P": 2.5})
-    client.send(op="setParameters", parameters=[{"name": "extCtrl.y_P", "value": "stop"}])
+    wrong = [{"name": "extCtrl.y_P", "value": value} for value in ("stop", True, None, [1.0])]
+    client.send(op="setParameters", parameters=wrong)
     assert values(client.receive("parameterValues")) == {"extCtrl.y_P": 2.5}
     for malformed in ({"op": "format"}, {"op": "subscribe"}, {"parameters": 1}):
         client.send(**malformed)

@@ -106,6 +106,15 @@ def test_evidence_tells_the_largest_and_its_instant_of_everything() -> None:
     known = pa.array(metrics.column(log, "truth.flap_2") + 0.6)
     lags = log.set_column(log.column_names.index("estimate.flap_2"), "estimate.flap_2", known)
     assert evidence(lags.slice(100)) == evidence(log.slice(100))[:-1], "the board knows that the flap lags"
+    late = np.arange(301) >= 230
+    for name, value in (
+        ("truth.flap_1", np.where(late, 0.1, 0.6)),
+        ("estimate.flap_3", np.where(late, 0.5, 0.0)),
+    ):
+        log = log.set_column(log.column_names.index(name), name, pa.array(value))
+    assert [text[:49] for text in evidence(log.slice(100)) if text.startswith("Flap")] == [
+        "Flap 1 was up to 29 deg away from its command: at", "Flap 2 was up to 34 deg away from its command: at",
+    ], "the third obeys, whatever the board believes"  # fmt: skip
 
 
 def test_close_ups_are_around_faults_that_begin_together_and_around_a_loss_or_limit_that_none_shows() -> None:

@@ -44,6 +44,19 @@ def test_distance_is_that_of_the_shortest_ray_in_the_cone(axis: tuple[float, flo
     assert ROOM.distance(p, d, 1.0) == pytest.approx(cast(p, d))
 
 
+@pytest.mark.parametrize(
+    ("p", "axis"),
+    [
+        ((0.3, 0.2, -0.2), (0, 0, -1)), ((0.3, 0.2, 2.6), (0, 0, 1)), ((2.1, 0.2, 1), (1, 0, 0)),
+        ((-2.1, 0.2, 1), (-1, 0, 0)), ((0.3, 2.1, 1), (0, 1, 0)), ((0.3, -2.1, 1), (0, -1, 0)),
+    ],
+)  # fmt: skip
+def test_a_place_in_a_wall_is_at_no_distance_from_it(p: tuple[float, ...], axis: tuple[float, ...]) -> None:
+    assert ROOM.distance(p, axis, 1.0) == ROOM.distance(p, axis, math.cos(HALF)) == 0.0
+    back = tuple(-one for one in axis)
+    assert ROOM.distance(p, back, 1.0) == pytest.approx(4.1 if axis[2] == 0 else 2.7)
+
+
 def test_without_walls_there_is_nothing_to_see_but_the_floor() -> None:
     assert Room().distance((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), 1.0) == math.inf
     assert Room().distance((0.0, 0.0, 1.0), (0.0, 0.0, -1.0), 1.0) == 1.0

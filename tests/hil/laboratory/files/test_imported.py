@@ -422,13 +422,15 @@ def test_the_topic_with_the_most_positions_comes_first_without_its_long_lists(tm
         writer = Writer(file)
         writer.start()
         for topic, rows, message in (
-            ("/a", 2, place), ("/b", 3, {**place, "few": [0] * 16, "many": [0] * 17}), ("/c", 9, {"gyro": 1.0}),
+            ("/said", 4, {"text": "ready"}), ("/a", 1, {"text": "ready"}), ("/a", 2, place),
+            ("/b", 3, {**place, "few": [0] * 16, "many": [0] * 17}), ("/c", 9, {"gyro": 1.0}),
         ):  # fmt: skip
             channel = writer.register_channel(topic, "json", 0)
             for ns in range(rows):
                 writer.add_message(channel, ns, json.dumps(message).encode(), ns)
         writer.finish()
     tables = read_tables(tmp_path / "a.mcap")
+    assert [table.left_out for table in tables] == [("/said",), (), ()], "once, and none that had numbers"
     assert [len(table.columns["timestamp [ns]"]) for table in tables] == [3, 2, 9]
     assert [*tables[0].columns] == [
         "timestamp [ns]",

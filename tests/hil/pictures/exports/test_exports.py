@@ -216,7 +216,8 @@ def turning_run(tmp_path: Path) -> Path:
     columns |= {f"truth.q{part}": q[:, index] for index, part in enumerate("wxyz")}
     columns |= {f"truth.{axis}": zero + 0.1 * number for number, axis in enumerate("xyz")}
     columns |= {f"motor.m{servo}": np.full(ROWS, 21 * (1400 + servo)) for servo in (1, 2, 3, 4)}
-    columns |= {"supervisor.state": np.full(ROWS, 2, np.int8), "battery.voltage": zero + 3.95}
+    state = np.repeat([1, 2, 3], (50, 100, ROWS - 150)).astype(np.int8)
+    columns |= {"supervisor.state": state, "battery.voltage": zero + 3.95}
     columns["wind.gust"] = np.array([0.5, np.nan, np.inf, -np.inf, *[1.5] * (ROWS - 4)])
     table = pa.table(columns).replace_schema_metadata({b"release_us": str(RELEASE_US).encode()})
     pq.write_table(table, tmp_path / "log.parquet")
@@ -246,6 +247,8 @@ def test_a_telemetry_log_has_the_estimate_in_the_world_with_yaw_within_half_a_tu
     assert {one.voltages[0] for one in said["BATTERY_STATUS"]} == {3950}
     first_us = round(1e6 * said["ATTITUDE"][0]._timestamp)
     assert [round(1e6 * one._timestamp) - first_us for one in said["HEARTBEAT"]] == [0, 1_000_000, 2_000_000]
+    armed = [bool(one.base_mode & mavutil.mavlink.MAV_MODE_FLAG_SAFETY_ARMED) for one in said["HEARTBEAT"]]
+    assert armed == [False, True, False], "while it flies"
     pulses = said["SERVO_OUTPUT_RAW"][0]
     assert [getattr(pulses, f"servo{servo}_raw") for servo in (1, 2, 3, 4)] == [1401, 1402, 1403, 1404]
 

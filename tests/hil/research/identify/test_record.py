@@ -71,9 +71,11 @@ from hil.research.identify.record import (
     EXCITATIONS,
     INPUTS,
     RATES,
+    SHARES,
     WRAP_MS,
     Record,
     _in_order,
+    _limited,
     _ticks,
     load_record,
 )
@@ -180,6 +182,19 @@ def test_flaps_at_their_limit_count_like_those_that_would_exceed_it(
     record = load_record(tmp_path / "telemetry.csv", profile)
     assert record.saturated == pytest.approx(1 / 3)
     assert np.abs(record.u[::3, 3]) == pytest.approx(abs(room), abs=1e-3)
+
+
+@pytest.mark.parametrize("flap", range(4))
+@pytest.mark.parametrize("beyond", [0.0, 0.05])
+def test_one_flap_at_its_limit_limits_what_the_inputs_do(flap: int, beyond: float) -> None:
+    allocation = CONFIG.allocation
+    moved = np.zeros((4, 4))
+    moved[1, flap] = allocation.opening_max - allocation.hover_angle
+    moved[2, flap] = allocation.opening_min - allocation.hover_angle
+    wanted = moved + beyond * np.sign(moved)
+    inputs, share = _limited(wanted @ SHARES.T / 4.0, CONFIG)
+    assert share == 0.5
+    assert inputs == pytest.approx(moved @ SHARES.T / 4.0, abs=1e-12)
 
 
 def rows_changed(change: Callable[[list[str]], list[str]]) -> Callable[[str], str]:

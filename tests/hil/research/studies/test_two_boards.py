@@ -20,7 +20,7 @@ from hil.laboratory.request import REAL, Bench, Request
 from hil.laboratory.run import fly
 from hil.laboratory.schedule import SCHEMA
 from hil.pictures.compare import FlownRun, load_flown
-from hil.research.studies.two_boards import CLOCK, RATES, _radio, comparable, seeds_of, two_boards
+from hil.research.studies.two_boards import CLOCK, RATES, _boot, _radio, comparable, seeds_of, two_boards
 
 Columns = dict[str, NDArray[np.generic]]
 RELEASE, FLOWN = 100, 30  # rows
@@ -68,6 +68,26 @@ def test_a_board_that_closes_its_loop_earlier_differs_by_its_boot_time(flown: Pa
     (cause,) = found.causes
     assert cause.startswith("boot time: the loops are closed at ")
     assert "0.000 | 3.100 s when the record began" in cause
+
+
+def test_another_boot_time_is_not_why_counts_differ_once_both_loops_are_closed(
+    flown: Path, tmp_path: Path
+) -> None:
+    def change(columns: Columns) -> None:
+        begin = int(np.argmax(columns["supervisor.state"] == 2))
+        columns["supervisor.state"][begin - 4 : begin] = 2
+        bumped(columns)
+
+    found = two_boards(load_flown(flown), other(flown, tmp_path / "b", change))
+    assert found.first is not None
+    assert (found.first.row, found.first.why) == (RELEASE + 1, "none of the known causes")
+    assert [cause.partition(":")[0] for cause in found.causes] == ["boot time"]
+
+
+def test_a_board_that_never_closes_its_loop_has_no_time_at_which_it_does(flown: Path, tmp_path: Path) -> None:
+    b = other(flown, tmp_path / "b", lambda columns: columns["supervisor.state"].fill(0))
+    logs = load_flown(flown).log, b.log
+    assert [_boot(pair) for pair in (logs, logs[::-1], logs[1:] * 2)] == [""] * 3
 
 
 def test_another_gyro_zero_is_measured_before_the_flights_part(flown: Path, tmp_path: Path) -> None:
