@@ -1,12 +1,17 @@
 """Robots on one time line, without a wall clock: let go, lost, put back, rebooted, faulted; alone and beside others."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from firmware_py.firmware import Firmware
 from firmware_py.wire.crtp import PORT_CONSOLE
+from ground_station.trajectory import Goal
+from hil import fly
 from hil.board.board_firmware import PowerOn, PythonBoard
 from hil.board.clock import FreeRunning, Paced
 from hil.board.uart import VirtualSerial
@@ -20,6 +25,7 @@ from hil.laboratory.experiments import find_experiment
 from hil.laboratory.faults import Fault, parse
 from hil.laboratory.laboratory import Laboratory
 from hil.laboratory.lockstep import ModelledLine, lockstep_flight
+from hil.laboratory.request import Bench as FlightBench
 from hil.laboratory.request import Request
 from hil.laboratory.robot import Ports, Robot, Site, Streams, nobody_listens
 from hil.servers.built_in_station import fly_built_in
@@ -354,3 +360,29 @@ def test_a_firmware_without_a_client_can_switch_its_board_off(kind: int, powered
     lab.end_at(2 * SECOND_US)
     lab.run()
     assert robot.powered is powered
+
+
+def test_a_crazyflie_s_goals_begin_and_end_on_the_floor() -> None:
+    request = Request(find_experiment("hover"), "crazyflie", (), 0, 12.0, (), FlightBench(board="cf2.elf"))
+    floor, home, times = (
+        Goal((0.0, 0.0, pytest.approx(0.0145)), 0.0),
+        Goal((0.0, 0.0, 1.0), 0.0),
+        request.times,
+    )
+    assert times is not None
+    assert request.trajectory.at(0) == request.trajectory.at(20_000_000) == floor
+    assert request.trajectory.at(times.begin_us) == request.trajectory.at(times.land_us) == home
+
+
+def test_a_flight_whose_experiment_cannot_be_prepared_closes_its_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    closed, close = [], ModelledLine.close
+    monkeypatch.setattr(ModelledLine, "close", lambda line: closed.append(close(line)))
+
+    def fail(robot: Any) -> None:
+        raise LabError("not ready")
+
+    with pytest.raises(LabError, match="not ready"):
+        fly(replace(find_experiment("hover"), prepare=fail), tmp_path / "run", duration_s=0.1)
+    assert len(closed) == 1

@@ -236,7 +236,7 @@ def test_checkpoints_are_the_closer_the_nearer_to_the_present_and_the_oldest_sta
     checkpoints, others = Checkpoints(), dict[int, socket.socket]()
     for number in range(1, 10 * LIMIT):
         ours, others[number] = socket.socketpair()
-        checkpoints.kept.append(Checkpoint((number,), number * PERIOD, 0, ours))
+        checkpoints.kept.append(Checkpoint((number,), number * PERIOD, 1, ours))  # 1 is no child of ours
         checkpoints._thin_out(number * PERIOD)
         kept = [one.position[0] for one in checkpoints.kept]
         assert (len(kept), kept[0], kept[-1]) == (min(number, LIMIT), 1, number)
@@ -244,10 +244,11 @@ def test_checkpoints_are_the_closer_the_nearer_to_the_present_and_the_oldest_sta
         assert all(older - younger <= 1 + 0.4 * older for older, younger in pairwise(ages))
     told_to_end = {number: other.recv(SIZE_BYTES) for number, other in others.items() if number not in kept}
     assert set(told_to_end.values()) == {bytes(SIZE_BYTES)}
+    checkpoints.clear()
+    assert [others[number].recv(SIZE_BYTES) for number in kept] == [bytes(SIZE_BYTES)] * len(kept)
+    assert (checkpoints.kept, checkpoints._ended) == ([], [])
     for other in others.values():
         other.close()
-    for one in checkpoints.kept:
-        one.line.close()
 
 
 def test_a_process_with_threads_cannot_be_copied_nor_any_of_another_system(

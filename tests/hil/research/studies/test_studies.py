@@ -19,7 +19,7 @@ from hil.research.design.linear import point_of
 from hil.research.design.sweeps import RESERVE
 from hil.research.design.trim import speed_at
 from hil.research.studies.catalogue import STUDIES
-from hil.research.studies.paper_report import study_picture
+from hil.research.studies.paper_report import _study, study_picture
 from hil.research.studies.study import (
     OUTCOMES,
     Curve,
@@ -159,6 +159,8 @@ def judged(expected: Expected, *cells: str) -> list[str]:
     ]
     result = StudyResult(study, (Curve(variant, tuple(flown)),))
     assert result.holds == (len(cells) == 3 and not result.surprises(result.curves[0]))
+    (told,) = _study(result)["variants"]
+    assert told["surprises"] == result.surprises(result.curves[0])
     return result.surprises(result.curves[0])
 
 
