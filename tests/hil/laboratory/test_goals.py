@@ -61,14 +61,14 @@ LIMITS = {
     "floaty": (
         "tunnel.hover_height=1",
         "plant.limits.radius=0.5",
-        "plant.limits.below=0.75",
+        "plant.limits.below=0.5",
         "plant.limits.above=0.75",
     ),
     "crazyflie": ("quadrotor.room=0.5", "quadrotor.ceiling=1.75"),
 }
 
 
-@pytest.mark.parametrize(("profile", "lowest"), [("floaty", 0.25), ("crazyflie", 0.0)])
+@pytest.mark.parametrize(("profile", "lowest"), [("floaty", 0.5), ("crazyflie", 0.0)])
 @pytest.mark.parametrize("axis", range(3))
 def test_a_place_on_the_limit_is_inside_and_the_next_one_outside(
     axis: int, profile: str, lowest: float

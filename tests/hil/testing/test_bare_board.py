@@ -91,14 +91,6 @@ def test_forces_come_out_as_they_were_fed_and_counts_go_before_them(board: BareB
     assert board.read("acc.z") == pytest.approx(1365 * 24 / 32768, abs=1e-3)
 
 
-@pytest.mark.parametrize(("sign", "limit"), [(1.0, 32_767), (-1.0, -32_768)])
-def test_what_an_imu_cannot_measure_is_its_largest_count_of_16_bits(
-    board: BareBoard, sign: float, limit: int
-) -> None:
-    board.feed_imu(omega_B=(0.0, 0.0, sign * 99.0), f_B=(0.0, 0.0, sign * 999.0))
-    assert board._fed == (0, 0, limit, 0, 0, limit)
-
-
 def test_a_silent_imu_finds_no_zero(board: BareBoard) -> None:
     board.imu_running = False
     board.run(ms=300)

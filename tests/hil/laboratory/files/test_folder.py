@@ -12,7 +12,7 @@ import pytest
 
 from hil import LabError, fly, load_run
 from hil.api import request_of
-from hil.laboratory.files.folder import folder_of, reserved
+from hil.laboratory.files.folder import OLDER, folder_of, other_in, reserved
 from hil.laboratory.files.recorder import PARQUET
 from hil.laboratory.files.whole_files import write_whole
 from support.command import Cli
@@ -47,6 +47,17 @@ def test_a_flight_replaces_the_same_request_alone() -> None:
     assert longer.folder == Path("runs/hover-1-2")
     assert stored("runs/hover-1") == kept
     assert fly("hover", duration_s=0.1).folder == longer.folder
+
+
+def test_a_flight_that_was_just_made_way_for_counts_and_an_empty_place_for_it_does_not() -> None:
+    folder = fly("hover", duration_s=SHORT).folder
+    (folder / OLDER).mkdir()
+    same, longer = (request_of("hover", duration_s=duration_s) for duration_s in (SHORT, 0.1))
+    for kept in (folder, folder / OLDER):
+        for path in [] if kept == folder else [*folder.glob("*.*")]:
+            path.rename(kept / path.name)
+        assert other_in(folder, same) == ""
+        assert other_in(folder, longer) == "another flight (duration 0.05 s)"
 
 
 def test_every_part_of_the_request_counts() -> None:

@@ -445,6 +445,17 @@ def test_our_own_mcap_file_has_the_log_s_path_again(run: Run, tmp_path: Path) ->
         assert column(log, f"cameras.{name}") == pytest.approx(column(run.log, f"truth.{name}"), abs=1e-6)
 
 
+def test_every_kind_of_number_is_a_column_by_its_name_without_blanks(tmp_path: Path) -> None:
+    columns = {" whole ": [1, 2], "part\t": [0.5, 1.5], "on": [True, False], "text": ["a", "b"]}
+    stamps = {" when": pa.array([3, 4], pa.timestamp("us"))}
+    pa.parquet.write_table(pa.table(columns | stamps), tmp_path / "log.parquet")
+    (table,) = read_tables(tmp_path / "log.parquet")
+    assert {name: values.tolist() for name, values in table.columns.items()} == {
+        "whole": [1.0, 2.0], "part": [0.5, 1.5], "on": [1.0, 0.0], "when [ns]": [3000.0, 4000.0],
+    }  # fmt: skip
+    assert table.left_out == ("text",)
+
+
 def test_parquet_with_time_stamps_is_read(tmp_path: Path) -> None:
     stamps = pa.array((1_700_000_000_000_000_000 + 1e9 * T).astype(np.int64), pa.timestamp("ns"))
     pa.parquet.write_table(pa.table({"time": stamps, **place("x", "y", "z")}), tmp_path / "log.parquet2")

@@ -46,7 +46,7 @@ PROFILE = CpuProfile(
     (Masked("BASEPRI", 7 * US, 500_000.0, "from.c", "to.c", "KALMAN"),),
 )  # fmt: skip
 IMAGE: Any = SimpleNamespace(
-    stack_free_bytes={"KALMAN": 400, "IDLE": 20}, heap_free_bytes=900, heap_least_free_bytes=300
+    stack_free_bytes={"IDLE": 400, "KALMAN": 20}, heap_free_bytes=900, heap_least_free_bytes=300
 )
 
 
@@ -65,7 +65,7 @@ def test_a_profile_names_every_share_once_and_the_greatest_first(tmp_path: Path)
         "often 9 1.0 1.0 1.0 20.0 0.0000", "rare 1 1.0 2.0 3.0 5.0 0.2500",
     ]  # fmt: skip
     assert "by BASEPRI: 7.0 us at 0.5000 s, in KALMAN: from from.c to to.c" in lines
-    assert after["Stacks, bytes that were never used"][:2] == ["IDLE 20", "KALMAN 400"]
+    assert after["Stacks, bytes that were never used"][:2] == ["KALMAN 20", "IDLE 400"]
     assert "Heap: 900 bytes free at the end, 300 when it was fullest" in lines
     assert "KALMAN, longest activation: 0.0400 ms from 0.002000 s on, of which 0.0090 ms its own" in lines
     assert [line for line in lines if "part " in line] == [
