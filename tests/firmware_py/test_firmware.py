@@ -43,6 +43,23 @@ def test_controller_writes_counts_every_ten_milliseconds(bench: FirmwareBench) -
     assert set(late_us) == {cost.stabilizer_us + cost.controller_us}
 
 
+def test_each_cost_is_its_task_s_alone() -> None:
+    def spent_us(*overrides: str) -> dict[str, int]:
+        kernel = FirmwareBench("cpu.measured=false", *overrides)
+        kernel.run(1_000_000)
+        tasks = kernel.firmware.kernel.tasks
+        return {task.name: kernel.firmware.kernel.run_time_us(task) for task in tasks if task.name != "IDLE"}
+
+    cost, usual = load_config().cpu, spent_us()
+    for name, task, times in (
+        ("sensors", "SENSORS", 1000), ("stabilizer", "STABILIZER", 1000), ("controller", "STABILIZER", 100),
+        ("kalman", "KALMAN", 1000), ("estimator", "KALMAN", 100),
+    ):  # fmt: skip
+        now = spent_us(f"cpu.{name}_us={getattr(cost, f'{name}_us') + 20}")
+        more = {one: now[one] - usual[one] for one in now if now[one] != usual[one]}
+        assert more == {task: pytest.approx(20 * times, rel=0.15)}, name
+
+
 def test_a_pose_reaches_the_flaps_within_eleven_milliseconds(bench: FirmwareBench) -> None:
     bench.poses(605_000, 800_000)
     bench.run(800_000)

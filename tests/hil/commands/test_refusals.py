@@ -203,7 +203,7 @@ design --angle nan | '--angle': nan is not in the range 0<=x<=70
 design --json --speed 9.5 | --speed: does not change what --json prints, the model of the profile
 design --json --length 2 --out o | --length, --out: does not change what --json prints
 design --speed 9 optimise | --speed: before optimise, which does not read it
-design --write mine.txt | --write mine.txt: a profile's name ends in .toml
+design --write mine.toml.txt | --write mine.toml.txt: a profile's name ends in .toml
 design --profile crazyflie | takes robots of flat plates; this one's body is crazyflie
 drag-model --profile crazyflie | takes robots of flat plates; this one's body is crazyflie
 tune --profile nobody | neither the name of a profile
