@@ -97,7 +97,10 @@ def test_a_stop_acts_within_eleven_milliseconds_and_the_crazyflie_s_lasts_until_
     flying.one(SUPERVISOR, 1, b"\1\1")
     locked = act in STOPS
     assert after(flying, 11_000)[1] is (cause if locked else Cause.NONE)
-    assert bool(flying.one(SUPERVISOR, 0, b"\x0c")[1] & 1 << 6) is locked
+    bits = int.from_bytes(flying.one(SUPERVISOR, 0, b"\x0c")[1:3], "little")
+    assert bool(bits & 1 << 6) is locked
+    each = [flying.one(SUPERVISOR, 0, bytes((number,))) for number in range(1, 12)]
+    assert each == [bytes((0x80 | number, bits >> number - 1 & 1)) for number in range(1, 12)]
     flying.reboot()
     flying.poses(flying.now_us + 605_000, flying.now_us + 2_000_000)
     assert after(flying, 1_000_000) == (State.FLYING, Cause.NONE)

@@ -409,7 +409,9 @@ def test_a_source_that_is_not_there_is_named_as_it_was_chosen(monkeypatch: pytes
             raise MocapError("cave: no answer")
 
     monkeypatch.setattr(program, "find_source", lambda mocap, capture: Gone())
-    for mocap, begin in (("vrpn:cave", "--mocap vrpn:cave"), (None, "capture.system = optitrack")):
+    for mocap, begin in (
+        ("vrpn:cave", "--mocap vrpn:cave"), ("", "--mocap "), (None, "capture.system = optitrack"),
+    ):  # fmt: skip
         with pytest.raises(MocapError) as caught:
             program._open_source(mocap, GroundConfig().capture)
         assert str(caught.value) == f"{begin}: cave: no answer"

@@ -4,6 +4,7 @@ import ast
 
 import pytest
 
+from firmware_py.export.literals import constant_literal
 from firmware_py.export.ranges import FULL, Ranges
 from firmware_py.export.syntax import I32, Constant, Module, Signature, StructField, StructType, ValueType
 
@@ -62,6 +63,14 @@ def test_an_expression_has_the_values_that_its_numbers_give(text: str) -> None:
     scope = {"MANY": 4, "i32": int, "charged_end": lambda budget, begin, end, step: end}
     tried = [eval(text, scope | {"n": n}) for n in values(GUARD)]
     assert narrowed(GUARD).of(expression(text)) == (0, 3) if "% " in text else (min(tried), max(tried))
+
+
+@pytest.mark.parametrize("number", [0, 2**31 - 1, 1 - 2**31, 2**31, -(2**31), 2**40])
+def test_a_constant_is_a_number_of_32_bits_but_the_least(number: int) -> None:
+    """C has no literal of the least: it is the negative of one that is too large."""
+    fits = abs(number) < 2**31
+    for text in (str(number), f"i32({number})"):
+        assert constant_literal(expression(text)) == ((I32, str(number)) if fits else None)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,8 @@ from firmware_py.links.console import Notices, pieces
 from firmware_py.links.crtp_stack import PORT_QUEUE
 from firmware_py.links.parameters import ParameterStorage
 from firmware_py.wire import crtp, telemetry
-from firmware_py.wire.localisation import pack_quaternion, unpack_quaternion
+from firmware_py.wire.localisation import encode_packed_poses, pack_quaternion, unpack_quaternion
+from firmware_py.wire.memories import CONFIG_SIZE, RadioSettings, encode_config
 from firmware_py.wire.parameters import TYPE_READ_ONLY
 from firmware_py.wire.scalars import LOG_SCALARS, PARAMETER_SCALARS, Scalar
 from firmware_py.wire.toc import Toc
@@ -636,6 +637,25 @@ def test_24_bytes_are_read_at_once_up_to_the_last_one(client: CrtpClient) -> Non
 
 
 unit = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(x * x for x in q) > 0.01)
+
+
+@pytest.mark.parametrize("address", [0xE7E7E7E7E7, 0x1122334455])
+def test_of_packed_poses_a_board_takes_those_of_the_last_byte_of_its_address(address: int) -> None:
+    client = CrtpClient()
+    client.eeprom[:CONFIG_SIZE] = encode_config(RadioSettings(address=address))
+    client.reboot()
+    for last, seen in (
+        (address & 0xFF, True),
+        *((address >> 8 * byte & 0xFF ^ 0x80, False) for byte in range(5)),
+    ):
+        client.firmware.pilot.seen_us = -1
+        client.send(LOC, 1, encode_packed_poses(((last, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),)))
+        client.run(client.now_us + 5_000)
+        assert (client.firmware.pilot.seen_us >= 0) is seen
+    if address & 0xFF != address >> 32:
+        client.send(LOC, 1, encode_packed_poses(((address >> 32, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),)))
+        client.run(client.now_us + 5_000)
+        assert client.firmware.pilot.seen_us == -1
 
 
 @given(unit)

@@ -123,6 +123,20 @@ def test_to_ask_whether_a_place_is_admitted_changes_nothing_that_flies(absolute:
     assert {name for name in before if before[name] != after[name]} == {"setpoint"}
 
 
+@pytest.mark.parametrize(
+    ("places", "admitted"),
+    [((0.0, 0.0), True), ((0.0, 7.0, 0.0), False), ((0.0, 7.0), False), ((8.0, 7.0, 0.0), True), ((8.0, 0.0, 7.0), False),
+     ((8.0, 9.0, 0.0), False), ((8.0, 7.0), False)],
+)  # fmt: skip
+def test_a_path_is_admitted_that_ends_in_the_box_and_is_never_further_outside_than_where_it_begins(
+    absolute: Flyer, monkeypatch: pytest.MonkeyPatch, places: tuple[float, ...], admitted: bool
+) -> None:
+    pilot, refused = absolute.firmware.pilot, list[str]()
+    monkeypatch.setattr(pilot, "_refuse", lambda kind, text: refused.append(text))
+    assert pilot.admits([(HERE[0] + x, *HERE[1:]) for x in places]) is admitted
+    assert bool(refused) is not admitted
+
+
 def test_a_stream_that_stops_without_the_notice_is_reported_before_the_board_locks(absolute: Flyer) -> None:
     absolute.post(absolute.low_level.send_position_setpoint, *HERE, 0.0)
     absolute.wait(0.7)
