@@ -1,7 +1,7 @@
 """The planner's polynomials against numpy's linear algebra and scipy's Bezier curves; its paths by their laws."""
 
 import struct
-from errno import EBUSY
+from errno import EBUSY, ENOEXEC
 from math import pi, tau
 from types import SimpleNamespace
 
@@ -28,6 +28,7 @@ from firmware_py.crazyflie.planner import (
     straight_up,
 )
 from firmware_py.crazyflie.trajectories import COMPRESSED, LOCATION_MEMORY, POLYNOMIALS, decode_trajectory
+from firmware_py.wire import WireError
 from firmware_py.wire.high_level import Define, PathCommand
 
 NUMBERS = st.floats(-2.0, 2.0)
@@ -98,6 +99,44 @@ def test_trajectories_are_read_as_cflib_packs_them_at_any_place_of_the_memory() 
         (1.49999, (0.2, 0.0, 0.4, 1.5)),
     ):  # a Bezier curve's middle, the end
         assert (*path.at(t).position, path.at(t).yaw) == pytest.approx(place, abs=1e-3)
+
+
+@pytest.mark.parametrize("durations", [(), (0.0,), (1.0, 0.0), (-1.0, 1.0)])
+def test_a_trajectory_of_no_pieces_or_one_that_takes_no_time_is_none(durations: tuple[float, ...]) -> None:
+    axes = [Poly4D.Poly([0.0] * 8)] * 4
+    memory = b"".join(Poly4D(duration, *axes).pack() for duration in durations)
+    with pytest.raises(WireError, match="has no pieces, or one that takes no time"):
+        decode_trajectory(memory, Define(1, LOCATION_MEMORY, POLYNOMIALS, 0, len(durations)))
+
+
+def test_a_compressed_trajectory_is_neither_scaled_nor_reversed_nor_turned() -> None:
+    """As by crtp_commander_high_level.c; one of polynomials is all of that."""
+    packed = b"".join(
+        part.pack()
+        for part in (
+            CompressedStart(0.0, 0.0, 0.0, 0.0), CompressedSegment(1.0, [0.2], [], [], []),
+            CompressedSegment(0.0, [], [], [], []),
+        )
+    )  # fmt: skip
+    line = Poly4D(1.0, *map(Poly4D.Poly, ([0.0, 0.2] + [0.0] * 6, *([0.0] * 8,) * 3))).pack()
+    board = SimpleNamespace(estimate=lambda: REST, admits=lambda places: True)
+    for kind, content in ((COMPRESSED, packed), (POLYNOMIALS, line)):
+        for scale, reverse, turned in ((1.0, 0, 0), (1.0, 0, 1), (2.0, 0, 0), (1.0, 1, 0)):
+            commander = HighLevelCommander(board, lambda kind, text: None)
+            commander.block(False)
+            commander.memory[: len(content)] = content
+            up = struct.pack("<BBff?f", PathCommand.TAKE_OFF, 0, 1.0, pi / 2, False, 0.5)
+            assert commander.execute(up, 0.0) == 0
+            commander.setpoint(1.0)
+            assert commander.execute(struct.pack("<BBBBIB", PathCommand.DEFINE, 1, 1, kind, 0, 1), 1.0) == 0
+            start = struct.pack("<BB???Bf", PathCommand.START, 0, True, turned, reverse, 1, scale)
+            plain = kind == POLYNOMIALS or (scale, reverse) == (1.0, 0)
+            assert commander.execute(start, 1.0) == (0 if plain else ENOEXEC)
+            goal = commander.planner.goal(1.0 + 0.5 * scale)
+            assert goal is not None
+            moved = np.subtract(goal.position[:2], REST.position[:2]) if plain else (0.0, 0.0)
+            along = (0.0, 0.1) if turned and kind == POLYNOMIALS else (-0.1 if reverse else 0.1, 0.0)
+            assert moved == pytest.approx(along if plain else (0.0, 0.0), abs=1e-4)
 
 
 def wavy(pieces: int = 3) -> Path:

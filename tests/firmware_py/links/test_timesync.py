@@ -72,6 +72,15 @@ def test_an_answer_counts_once_and_only_when_it_was_asked_for() -> None:
     assert clock.exchanges == 1
 
 
+def test_of_more_requests_than_four_only_the_last_four_can_be_answered() -> None:
+    for asked in range(1, 7):
+        clock = RemoteClock()
+        for number in range(asked):
+            clock.request(1000 + number)
+        answered = [clock.answer(5000, 1000 + number, AHEAD_US) for number in range(asked)]
+        assert answered == [number >= asked - 4 for number in range(asked)]
+
+
 def test_a_long_round_trip_is_not_believed() -> None:
     clock = RemoteClock()
     assert not exchange(clock, 0, LONGEST_US, 1)

@@ -80,6 +80,8 @@ def test_an_action_that_the_graph_itself_limits_is_taken(tmp_path: Path) -> None
         [("Tanh", []), ("Softmax", [])],
         [("Clip", [-1.0, 2.0])],
         [("Clip", [-1.0])],
+        [("Clip", [1.0, -1.0])],
+        [("Clip", [0.0, 0.0])],
         [("Pow", [2.0])],
     ],
     ids=str,
@@ -88,6 +90,25 @@ def test_a_node_that_no_perceptron_has_is_named(tmp_path: Path, nodes: Any) -> N
     path = with_nodes(write_onnx(tmp_path / "net.onnx", random_network(20, 8, 4)), *nodes)
     with pytest.raises(PolicyError, match=rf"^{nodes[-1][0]} end: a policy consists of Gemm, MatMul, "):
         read_policy(path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "allowed"), [("Add", True), ("Mul", True), ("Sub", False), ("Div", False), ("MatMul", False)]
+)
+def test_a_constant_ahead_of_the_observation_is_one_of_a_commutative_node(
+    tmp_path: Path, kind: str, allowed: bool
+) -> None:
+    path = with_nodes(write_onnx(tmp_path / "net.onnx", random_network(20, 8, 4)), (kind, [2.0]))
+    model = onnx.load(path)
+    value, constant = model.graph.node[-1].input
+    model.graph.node[-1].input[:] = [constant, value]
+    onnx.save(model, path)
+    if allowed:
+        policy = read_policy(path)
+        assert np.abs(answer_of(policy.steps, SEEN) - policy.answer(SEEN)).max() < 1e-5
+    else:
+        with pytest.raises(PolicyError, match=rf"^{kind} end: a policy consists of "):
+            read_policy(path)
 
 
 def test_a_node_of_two_paths_is_named(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire import mavlink_services as services
+from firmware_py.wire.mavlink_dialect import Timesync
 from firmware_py.wire.mavlink_frames import HALF_FRAME_US, FrameReceiver, FrameSender, Signing
 
 KEY = sha256(b"floaty").digest()
@@ -318,3 +319,10 @@ def test_unknown_messages_are_counted_and_not_lost() -> None:
             frame = golden(codec, [services.timesync(0, 1)])[0]
         receiver.feed(0, frame)
     assert (receiver.counters.frames, receiver.counters.unknown, receiver.counters.lost) == (40, 10, 0)
+
+
+@pytest.mark.parametrize("addressee", [(3, 7), (7, 3), (3, 0), (0, 0)])
+def test_a_time_request_has_its_addressee(addressee: tuple[int, int]) -> None:
+    frame = FrameSender(1, 1).encode(0, Timesync(0, 5, *addressee))
+    (message,) = FrameReceiver().feed(0, frame)
+    assert (message.target_system, message.target_component) == addressee
