@@ -237,6 +237,18 @@ def test_seeds_that_were_interrupted_are_counted_and_folders_that_moved_are_name
     assert covered == [5, 4], "once for all seeds"
 
 
+def test_several_seeds_count_the_lines_of_one_image_beside_its_own_elf_file(asked: Asked) -> None:
+    asked.answer({"pictures.exports.coverage.check_image_coverage": None})
+    bench = Made(
+        coverage=Path("out"), board="cf2.bin", elf="cf2.elf", check_many=lambda *many: asked.append(many)
+    )
+    request: Any = Made(bench=bench)
+    fly._check_seeds(3, request, None)
+    assert asked == [("--seeds", 3), ("check_image_coverage", Path("out"), "cf2.bin", "cf2.elf")]
+    with pytest.raises(LabError, match=r"^--seeds 3: --view: for one flight only"):
+        fly._check_seeds(3, request, "window")
+
+
 @pytest.mark.parametrize("out", [(), ("--out", "x")])
 def test_a_flight_whose_usual_folder_is_another_s_says_why(
     cli: Cli, monkeypatch: pytest.MonkeyPatch, out: tuple[str, ...]

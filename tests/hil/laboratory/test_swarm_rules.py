@@ -127,12 +127,12 @@ def test_places_are_a_v_with_even_robots_on_the_left_or_the_first_of_the_profile
 def test_robots_have_seeds_in_turn_their_own_homes_and_the_longest_duration() -> None:
     hover, step = find_experiment("hover"), EXPERIMENTS["yaw-step"]
     swarm = swarm_of(
-        [hover, replace(step, duration_s=hover.duration_s + 3.0), hover],
+        [hover, replace(step, duration_s=hover.duration_s + 0.25), hover],
         seed=7,
         overrides=("tunnel.fan_factor=0", "swarm.spacing=0.1"),
     )
     assert [one.seed for one in swarm.robots] == [7, 8, 9]
-    assert [one.duration_s for one in swarm.robots] == [hover.duration_s + 3.0] * 3
+    assert [one.duration_s for one in swarm.robots] == [hover.duration_s + 0.25] * 3
     homes = np.array([one.config.flight.home for one in swarm.robots])
     assert swarm.still_air
     assert homes - homes[0] == pytest.approx(np.array(places_of(swarm.config, 3)))

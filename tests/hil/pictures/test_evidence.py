@@ -106,6 +106,9 @@ def test_evidence_tells_the_largest_and_its_instant_of_everything() -> None:
     known = pa.array(metrics.column(log, "truth.flap_2") + 0.6)
     lags = log.set_column(log.column_names.index("estimate.flap_2"), "estimate.flap_2", known)
     assert evidence(lags.slice(100)) == evidence(log.slice(100))[:-1], "the board knows that the flap lags"
+    unseen = np.where(np.arange(301) < 110, 0.0, metrics.column(log, "estimator.fused"))
+    later = log.set_column(log.column_names.index("estimator.fused"), "estimator.fused", pa.array(unseen))
+    assert evidence(later.slice(100))[3] == evidence(log.slice(100))[3], "no pose for 250 ms"
     late = np.arange(301) >= 230
     for name, value in (
         ("truth.flap_1", np.where(late, 0.1, 0.6)),

@@ -78,6 +78,14 @@ def test_the_station_gets_its_link_its_cameras_and_the_profile(
     assert found == (f"{linked.SITE}:user" if link.startswith("radio") else "user")
 
 
+def test_a_station_without_a_search_path_of_the_user_s_imports_nothing_from_its_folder(
+    stack: ExitStack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    line = line_of(stack, tmp_path, "radio://0/80/2M/E7E7E7E7E7")
+    assert line._environment["PYTHONPATH"] == str(linked.SITE), "an empty part is the current folder"
+
+
 @pytest.mark.parametrize(
     ("link", "told"),
     [

@@ -212,12 +212,14 @@ def test_the_built_in_station_sends_what_was_asked_for(
     assert flown == calls
 
 
-def test_each_robot_has_a_seed_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_robot_has_a_seed_and_a_radio_chip_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     seeds, of_seed = list[int](), Streams.of_seed
     monkeypatch.setattr(Streams, "of_seed", lambda seed: seeds.append(seed) or of_seed(seed))
-    config = load_config()
+    config, chips = load_config(), set[bytes]()
     for number in (1, 2, 3):
-        Server(Service(config, number, seed=5), print, room=SharedRoom(config, 3)).close()
+        with closing(Server(Service(config, number, seed=5), print, room=SharedRoom(config, 3))) as server:
+            chips.add(server.served.nrf51._chip)
+    assert len(chips) == 3
     assert [seeds[0], *seeds[-2:]] == [5, 6, 7]
     assert set(seeds) == {5, 6, 7}
 

@@ -324,6 +324,10 @@ def test_gains_are_the_best_for_the_worst_robots_and_their_integral_is_a_third(
     assert asked[:2] == [0, 0], "both starts"
     alone = design(task(HEIGHT), loops[:1], start)
     assert alone == pytest.approx([1.0, 1.0, 1.0 / 3.0], abs=0.005)
+    asked.clear()
+    alike: list[Any] = [SimpleNamespace(wish=wishes[0], number=n, lost=False) for n in range(4)]
+    assert design(task(HEIGHT), alike, start).tolist() == alone.tolist()
+    assert [asked.count(number) for number in (1, 2, 3)] == [1, 1, 1], "no robot is worse than the first"
     loops[2].lost = True
     with pytest.raises(
         LabError, match=r"^no gains: height: 1 of 4 robots that the intervals allow are unstable with"

@@ -12,9 +12,10 @@ import pytest
 from hil.config import load_config
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import parse
+from hil.laboratory.metrics import METRICS
 from hil.laboratory.request import Options
 from hil.pictures.drawing import png
-from hil.research.campaigns.jobs import fly_job
+from hil.research.campaigns.jobs import Row, fly_job
 from hil.research.design.linear import point_of
 from hil.research.design.sweeps import RESERVE
 from hil.research.design.trim import speed_at
@@ -28,6 +29,7 @@ from hil.research.studies.study import (
     StudyResult,
     Variant,
     VariantOutcome,
+    distance,
     flights_of,
     outcome_of,
     summarise,
@@ -220,6 +222,26 @@ def test_a_study_that_was_cut_short_has_a_picture_and_does_not_hold() -> None:
     assert [len(curve.cells) for curve in result.curves] == [1]
     assert not result.holds
     assert png(lambda: study_picture(result)).startswith(b"\x89PNG")
+
+
+def test_how_far_a_robot_was_from_its_goal_is_known_of_flights_that_were_completed() -> None:
+    study = STUDIES["loss"]
+    job = next(flights_of(study, 1))
+    rows = [
+        Row(
+            job,
+            outcome,
+            "",
+            True,
+            "",
+            dict.fromkeys(METRICS, 0.0) | {f"rms_{axis}": 0.01 * n for axis in "xyz"},
+            {},
+        )
+        for n, outcome in enumerate(("completed", "reset", "lost", "error", "completed"))
+    ]
+    ((cell,),) = (curve.cells for curve in summarise(study, [(job, row) for row in rows]).curves)
+    assert cell.outcomes == ("holds", "failsafe", "lost", "error", "holds")
+    assert cell.errors == tuple(distance(rows[n].metrics) for n in (0, 4))
 
 
 @pytest.mark.long
