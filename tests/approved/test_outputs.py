@@ -386,18 +386,23 @@ def written(path: Path, place: str, seen: set[str]) -> Iterator[str]:
 NUMBER = re.compile(r"(?<![\w.])-?\d+\.?\d*(?:e[-+]?\d+)?(?![\w])")
 
 
-def close(line: str, known: str) -> bool:
-    """Whether two lines differ at most in digits that another processor's linear algebra changes."""
+def close(line: str, known: str, share: float) -> bool:
+    """Whether two lines differ at most in digits that another processor's linear algebra changes, a share of a number."""
     if NUMBER.sub("#", line) != NUMBER.sub("#", known):
         return False
     pairs = zip(NUMBER.findall(line), NUMBER.findall(known), strict=True)
     return all(
-        a == b or ("." in a + b and math.isclose(float(a), float(b), rel_tol=1e-4, abs_tol=1e-9))
+        a == b or ("." in a + b and math.isclose(float(a), float(b), rel_tol=share, abs_tol=1e-9))
         for a, b in pairs
     )
 
 
 LONG = ("optimise", "programs", "tuning")
+SEARCHED = (
+    "design",
+    "optimise",
+    "tuning",
+)  # their gains have four digits, the last of which a processor may choose
 PACKAGES = (
     "click",
     "foxglove-sdk",
@@ -416,7 +421,8 @@ PACKAGES = (
 def test_users_get_what_they_got(name: str) -> None:
     (made_with, *known), found = (APPROVED / f"{name}.txt").read_text().splitlines(), [*outputs(name)]
     if len(found) == len(known):
-        found = [old if close(line, old) else line for line, old in zip(found, known, strict=True)]
+        share = 1.1e-3 if name in SEARCHED else 1e-4
+        found = [old if close(line, old, share) else line for line, old in zip(found, known, strict=True)]
     difference = list(difflib.unified_diff(known, found, "approved", "now", lineterm="", n=1))
     if difference:
         skip_unless(made_with, versions(*PACKAGES))

@@ -257,7 +257,8 @@ def test_research_computes_the_numbers_that_it_computed(name: str, tmp_path: Pat
     known = json.loads(NUMBERS.read_text(encoding="utf-8"))
     now = {key: flat(one) for key, one in FOUND[name](tmp_path).items()}
     then = {key: [float(number) for number in text.split()] for key, text in known[name].items()}
-    close = {key: pytest.approx(one, rel=1e-5, abs=1e-9, nan_ok=True) for key, one in then.items()}
+    share = 5e-3 if name.startswith("tuned") else 1e-5  # a search, whose gains are rounded to four digits
+    close = {key: pytest.approx(one, rel=share, abs=1e-9, nan_ok=True) for key, one in then.items()}
     if now != close:
         skip_unless(known["versions"], versions(*PACKAGES))
     assert now == close
