@@ -105,11 +105,15 @@ def _verify(loader: Cloader, image: bytes, progress: Progress) -> None:
 
 def _read(loader: Cloader, page: int) -> bytes:
     """Return a page, empty when it cannot be read; cflib takes a late answer for that of the next request."""
-    while loader.link.receive_packet(0) is not None:
-        pass
+    _drain(loader, 0.0)
     with contextlib.suppress(struct.error):
         if content := loader.read_flash(TargetTypes.STM32, page):
             return bytes(content)
-    while loader.link.receive_packet(QUIET_S) is not None:
-        pass
+    _drain(loader, QUIET_S)
     return b""
+
+
+def _drain(loader: Cloader, wait_s: float) -> None:
+    """Drop the answers that wait, and those that come less than a time apart."""
+    while loader.link.receive_packet(wait_s) is not None:
+        pass

@@ -152,11 +152,13 @@ class CrtpControls(Dialogue[crtp.Packet]):
     def _exchange_for(self, channel: int, entry: TocEntry, value: bytes = b"") -> Exchange[crtp.Packet]:
         """Return the exchange whose reply has the request's channel and number, followed by a value."""
         packet = crtp.Packet(crtp.PORT_PARAMETERS, channel, parameters.encode_ident(entry.number) + value)
-        value_at = 3 if channel == parameters.CHANNEL_READ else 2  # behind a status, which an error ends with
+        value_at = (
+            3 if channel == parameters.CHANNEL_READ else 2
+        )  # of a read, behind a status; an error has no value
 
         def fits(got: crtp.Packet) -> bool:
-            failed = got.data[2:value_at] > bytes((parameters.OK,))
-            size = value_at + (0 if failed else entry.scalar.size)
+            failed = any(got.data[2:value_at])
+            size = value_at if failed else value_at + entry.scalar.size
             return len(got.data) >= size and parameters.decode_ident(got.data) == entry.number
 
         return self._until(packet, fits)

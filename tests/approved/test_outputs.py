@@ -398,11 +398,8 @@ def close(line: str, known: str, share: float) -> bool:
 
 
 LONG = ("optimise", "programs", "tuning")
-SEARCHED = (
-    "design",
-    "optimise",
-    "tuning",
-)  # their gains have four digits, the last of which a processor may choose
+# Their gains have four digits, the last of which a processor may choose.
+SEARCHED = ("design", "optimise", "tuning")
 PACKAGES = (
     "click",
     "foxglove-sdk",

@@ -4,8 +4,9 @@ If a change is meant: make approve.
 """
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -33,7 +34,7 @@ from hil.research.identify.record import Array, Record
 from hil.research.identify.response import LAG, one_step, outputs, response
 from hil.research.identify.robots import KnownModel, beside, robots_of
 from hil.research.identify.two_controllers import closed_loop, input_constant, two_controllers
-from support.approved import skip_unless, versions
+from support.approved import approve, skip_unless, versions
 
 NUMBERS = Path(__file__).with_name("research.json")
 PACKAGES = ("numpy", "scipy", "control")
@@ -252,6 +253,11 @@ FOUND: dict[str, Callable[[Path], Any]] = {
 }
 
 
+def texts(find: Callable[[Path], Any], folder: Path) -> dict[str, str]:
+    """Return the numbers as the file has them."""
+    return {key: " ".join(map(str, flat(one))) for key, one in find(folder).items()}
+
+
 @pytest.mark.parametrize("name", FOUND)
 def test_research_computes_the_numbers_that_it_computed(name: str, tmp_path: Path) -> None:
     known = json.loads(NUMBERS.read_text(encoding="utf-8"))
@@ -264,13 +270,6 @@ def test_research_computes_the_numbers_that_it_computed(name: str, tmp_path: Pat
     assert now == close
 
 
-def all_found() -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield the numbers of each name as texts."""
-    with TemporaryDirectory() as place:
-        for name, find in FOUND.items():
-            yield name, {key: " ".join(map(str, flat(one))) for key, one in find(Path(place)).items()}
-
-
 if __name__ == "__main__":
-    content = {"versions": versions(*PACKAGES)} | dict(all_found())
-    NUMBERS.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    with TemporaryDirectory() as place:
+        approve(NUMBERS, {name: partial(texts, find, Path(place)) for name, find in FOUND.items()}, *PACKAGES)

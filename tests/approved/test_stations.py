@@ -112,14 +112,10 @@ class Followed(Cameras):
             services.timesync(0, 7 * self.below(10**9)),
             services.timesync_answer(self.now_us * 1000, services.timesync(0, link._time_request_ns)),
             *[mavlink.flight_array(self.now_us, values)] * 4,
-            mavlink.sys_status(*self.sizes()), *texts[: 1 + self.below(2)],
+            mavlink.sys_status(*(self.below(90) for _ in range(5))), *texts[: 1 + self.below(2)],
             services.command_ack(self.pick(511, 400, 245, 185), self.pick(0, 0, 2, 4), 255, 190),
             services.parameter(name, self.pick(0.0, 1.5, -2.0), index, count), request,
         )  # fmt: skip
-
-    def sizes(self) -> tuple[int, ...]:
-        """Return what a status has."""
-        return tuple(self.below(90) for _ in range(mavlink.sys_status.__code__.co_argcount))
 
     def told(self, seed: int) -> dict[str, str]:
         period_us, self.now_us = self.pick(5_000, 8_333, 10_000), 10_000
@@ -235,6 +231,15 @@ TABLE = {
 class Board(Random):
     """A Crazyflie that answers packets of the parameter, platform, supervisor and log ports, or refuses, or stays silent."""
 
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self.back: list[bytes] = []  # on its way to the station
+
+    def transmit(self, at_us: int, data: bytes) -> None:
+        """Take a packet, and send what comes back."""
+        self.log.note("sent", at_us, data.hex())
+        self.back.extend(self.answer(data))
+
     def answer(self, raw: bytes) -> list[bytes]:
         """Return what comes back."""
         packet = crtp.decode(raw)
@@ -272,13 +277,8 @@ class Asked(Board):
     """Requests of an operator to a Crazyflie."""
 
     def told(self, seed: int) -> dict[str, str]:
-        now_us, back = 0, []
-
-        def transmit(data: bytes) -> None:
-            self.log.note("sent", now_us, data.hex())
-            back.extend(self.answer(data))
-
-        controls = CrtpControls(transmit, lambda: TABLE)
+        now_us = 0
+        controls = CrtpControls(lambda data: self.transmit(now_us, data), lambda: TABLE)
         for _ in range(700):
             now_us += self.pick(5_000, 40_000, 150_000)
             if self.below(9) == 0:
@@ -286,8 +286,8 @@ class Asked(Board):
                 controls.ask(
                     now_us, ControlRequest(self.pick(*ControlAction), name, self.pick(1.0, 2.5, 300.0, -1.0))
                 )
-            while back and self.below(3):
-                controls.receive(now_us, crtp.decode(back.pop(0)))
+            while self.back and self.below(3):
+                controls.receive(now_us, crtp.decode(self.back.pop(0)))
             if (answer := controls.answer(now_us)) is not None:
                 self.log.note("answer", now_us, answer.error, *answer.values)
             self.log.note("busy", controls.busy)
@@ -298,7 +298,7 @@ class Stock(Board):
     """A flight of a Crazyflie with its own firmware, whose goal moves in one of two flights; telemetry by log blocks."""
 
     def told(self, seed: int) -> dict[str, str]:
-        now_us, back = 0, []
+        now_us = 0
         config = PilotConfig(
             enabled=True, parameters={"own": {"count": 3.0}, "extCtrl": {"y_P": 2.0, "no": 1.0}}, poses=seed != 2,
             take_off_s=1.5, settle_s=0.5, land_s=2.0,
@@ -311,17 +311,13 @@ class Stock(Board):
         if seed == 3:
             numbers.pop(CRAZYFLIE_BLOCKS[-1].variables[0].name)
 
-        def transmit(at_us: int, data: bytes) -> None:
-            self.log.note("sent", at_us, data.hex())
-            back.extend(self.answer(data))
-
         flown = (
             Offsets(HOME, times.begin_us, y=Square(0.2, -0.1, 0.7), z=Sine(0.1, 0.5))
             if seed != 1
             else Hold(HOME)
         )
         whole = FromFloor(flown, 0.02, HOME, config, times)
-        link = CrazyflieLink(transmit, 1_900, lambda: numbers, TABLE, config, HOME, times)
+        link = CrazyflieLink(self.transmit, 1_900, lambda: numbers, TABLE, config, HOME, times)
         link.start_telemetry(0)
         self.log.note("times", times, link.latency)
         for turn in range(700):
@@ -335,8 +331,8 @@ class Stock(Board):
             )
             if self.below(40) == 0:
                 link.start_telemetry(now_us)
-            while back and self.below(4):
-                link.receive(now_us, back.pop(0))
+            while self.back and self.below(4):
+                link.receive(now_us, self.back.pop(0))
             block = self.pick(*CRAZYFLIE_BLOCKS)
             size = sum(variable.type.size for variable in block.variables)
             head = bytes((block.id if self.below(20) else 77, *(now_us // 1000).to_bytes(3, "little")))
@@ -361,24 +357,19 @@ class Logged(Board):
     """Telemetry of Floaty's own blocks, of which a board may lack some variables, begins at any time."""
 
     def told(self, seed: int) -> dict[str, str]:
-        back: list[bytes] = []
         numbers = {
             variable.name: place for place, variable in
             enumerate(variable for block in ALL_BLOCKS for variable in block.variables) if seed != 2 or place != 9
         }  # fmt: skip
 
-        def transmit(at_us: int, data: bytes) -> None:
-            self.log.note("sent", at_us, data.hex())
-            back.extend(self.answer(data))
-
-        logs, now_us = LogBlocks(transmit, lambda: numbers if seed != 3 else {}), 16_777_000_000
+        logs, now_us = LogBlocks(self.transmit, lambda: numbers if seed != 3 else {}), 16_777_000_000
         for _ in range(600):
             now_us += self.pick(3_000, 10_000, 120_000)
             if self.below(60) == 0:
                 logs.request(now_us)
             logs.repeat(now_us)
-            while back and self.below(4):
-                packet = crtp.decode(back.pop(0))
+            while self.back and self.below(4):
+                packet = crtp.decode(self.back.pop(0))
                 if packet.port == crtp.PORT_LOG:
                     logs.receive(now_us, packet)
             block = self.pick(*ALL_BLOCKS)

@@ -42,7 +42,7 @@ def approve(path: Path, finders: Mapping[str, Callable[[], Any]], *packages: str
 
 
 class Log:
-    """Notes of what happened, by kind; `told` returns the count of each kind, a hash of all its notes and the last one."""
+    """Keeps notes by kind. `told` returns how many there are of each kind, a hash of them, and the last one."""
 
     def __init__(self) -> None:
         self._rows: dict[str, list[str]] = {}

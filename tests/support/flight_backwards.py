@@ -1,4 +1,4 @@
-"""A flight that runs in a process of its own, and goes back in time when its debugger asks."""
+"""A flight in its own process; its debugger can make it go back in time."""
 
 import os
 import re
