@@ -238,10 +238,14 @@ class CoreAnswer:
     number: int
     body: bytes
 
-    def check_size(self) -> None:
-        """Raise `WireError` when the body is too short for an answer of its kind."""
+    def check(self, kind: Message, request: bytes) -> None:
+        """Raise `WireError` when it does not answer such a request: it has another kind or is too short."""
+        if self.kind not in (kind, Message.REFUSED):
+            raise WireError(f"an answer of kind {self.kind} to a request of kind {kind}")
         if self.kind in _ANSWERS:
             _unpack(_ANSWERS[self.kind], self.body)
+        elif kind == Message.READ and len(self.body) < (size := _PLACE_SIZE.unpack(request)[1]):
+            raise _short(self.body, size)
 
     def about(self) -> About:
         """Read the answer to HELLO."""
@@ -338,5 +342,9 @@ def decode_answer(data: bytes) -> CoreAnswer:
 
 def _unpack(layout: struct.Struct, body: bytes) -> tuple[Any, ...]:
     if len(body) < layout.size:
-        raise WireError(f"{len(body)} bytes behind the head: at least {layout.size} are expected")
+        raise _short(body, layout.size)
     return layout.unpack_from(body)
+
+
+def _short(body: bytes, least: int) -> WireError:
+    return WireError(f"{len(body)} bytes behind the head: at least {least} are expected")

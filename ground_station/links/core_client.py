@@ -101,7 +101,7 @@ class CoreClient:
             for index in range(sent, min(begin + WINDOW, len(requests))):
                 self._send(requests[index], index)
                 sent = index + 1
-            answer = self._receive(wait_s, len(requests))
+            answer = self._receive(wait_s, requests)
             if answer is not None:
                 wait_s, silent_s = FIRST_WAIT_S, 0.0
                 answers[answer.number - self._number & 0xFFFF] = answer
@@ -122,16 +122,22 @@ class CoreClient:
         self.sent += 1
         self.packets.send(core_port.encode_request(*request, self._session, self._number + index))
 
-    def _receive(self, timeout_s: float, count: int) -> core_port.CoreAnswer | None:
-        """Return an answer to one of `count` requests; answers to earlier requests are skipped."""
+    def _receive(self, timeout_s: float, requests: Sequence[Request]) -> core_port.CoreAnswer | None:
+        """Return an answer to one of the requests; answers to earlier requests are skipped."""
         for data in iter(lambda: self.packets.receive(timeout_s), None):
             try:
                 answer = core_port.decode_answer(data)
             except WireError:
                 continue
-            if answer.session == self._session and answer.number - self._number & 0xFFFF < count:
+            index = answer.number - self._number & 0xFFFF
+            if answer.session == self._session and index < len(requests):
+                kind, body = requests[index]
+                if (
+                    answer.kind == core_port.Message.HELLO != kind
+                ):  # late, of a repeated HELLO, which has number 0
+                    continue
                 try:
-                    answer.check_size()
+                    answer.check(kind, body)
                 except WireError as error:
                     raise LinkError(f"{self.name}: {error}") from None
                 if answer.kind == core_port.Message.REFUSED:

@@ -1,6 +1,7 @@
 """The exported app executes the core call by call for a host: each request once, whatever the link does to packets."""
 
 import struct
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from zlib import crc32
@@ -38,7 +39,7 @@ from firmware_py.wire.core_port import (
     read,
     write,
 )
-from firmware_py.wire.crtp import encode_ext_pose
+from firmware_py.wire.crtp import MAX_DATA, encode_ext_pose
 from firmware_py.wire.supervisor import Cause, State
 from ground_station.errors import LinkError
 from ground_station.links.core_client import CoreClient
@@ -497,16 +498,49 @@ def test_silence_counts_from_the_last_answer_on() -> None:
     assert [answer.kind for answer in answers] == [Message.CALL] * 3
 
 
-@pytest.mark.parametrize("kind", [Message.HELLO, Message.CALL, Message.HEALTH, Message.REFUSED])
-def test_an_answer_that_lacks_its_last_byte_is_one_line_and_not_silence(kind: Message) -> None:
-    size = {Message.HELLO: ABOUT, Message.CALL: CALLED, Message.HEALTH: HEALTH, Message.REFUSED: WHY}[
-        kind
-    ].struct.size
-    client = CoreClient(ShortAnswers(kind, size - 1), "app")
+def asked(client: CoreClient, kind: Message) -> None:
+    """Send a request of a kind."""
+    bodies = {Message.READ: read(0, 5)[1]}
+    client.begin() if kind == Message.HELLO else client.execute([(kind, bodies.get(kind, b""))])
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"),
+    [
+        (Message.HELLO, ABOUT.struct.size), (Message.CALL, CALLED.struct.size), (Message.READ, 5),
+        (Message.HEALTH, HEALTH.struct.size), (Message.REFUSED, WHY.struct.size),
+    ],
+)  # fmt: skip
+def test_an_answer_that_lacks_its_last_byte_is_one_line_and_not_silence(kind: Message, size: int) -> None:
     with pytest.raises(
         LinkError, match=rf"^app: {size - 1} bytes behind the head: at least {size} are expected$"
     ):
-        client.begin() if kind == Message.HELLO else client.execute([(kind, b"")])
+        asked(CoreClient(ShortAnswers(kind, size - 1), "app"), kind)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in Message if kind != Message.REFUSED])
+@pytest.mark.parametrize("answer", [kind for kind in Message if kind != Message.HELLO])
+def test_an_answer_is_of_the_kind_that_was_asked_for_or_a_refusal(kind: Message, answer: Message) -> None:
+    wrong = f"an answer of kind {answer} to a request of kind {kind}"
+    expected = {kind: None, Message.REFUSED: "it refuses a request"}.get(answer, wrong)
+    with pytest.raises(LinkError) if expected else nullcontext() as raised:
+        asked(CoreClient(ShortAnswers(answer, MAX_DATA), "app"), kind)
+    assert raised is None or str(raised.value) == f"app: {expected}"
+
+
+class TwiceGreeted(AppPackets):
+    """The link to a board whose answer to HELLO comes twice."""
+
+    def send(self, data: bytes) -> None:
+        super().send(data)
+        if data[0] == Message.HELLO:
+            super().send(data)
+
+
+def test_a_late_answer_to_hello_does_not_answer_the_first_request(app: App) -> None:
+    client = CoreClient(TwiceGreeted(app), "app")
+    client.begin()
+    assert client.memory(READ_MAX) == bytes(READ_MAX)
 
 
 def test_a_core_of_another_layout_is_refused_in_one_line(app: App, tmp_path: Path) -> None:
