@@ -1,0 +1,60 @@
+"""The experiments that ship are those that users know: how long, where to, under which conditions, within which limits.
+
+`experiments.json` can be read: a number that changes there changes what a run's verdict means.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ground_station.trajectory import Goal
+from hil.laboratory.experiment import Experiment
+from hil.laboratory.experiments import EXPERIMENTS
+from support.approved import approve, judge
+
+KNOWN = Path(__file__).with_name("experiments.json")
+HOME, RELEASE_US = Goal((0.1, -0.2, 1.15), 0.3), 1_000_000
+LOOK_US = 990_000
+
+
+def call_of(function: Any) -> str:
+    """Return the name of a function with the values bound to it."""
+    bound = [*getattr(function, "args", ()), *getattr(function, "keywords", {}).items()]
+    return " ".join(map(str, [getattr(function, "func", function).__name__, *bound]))
+
+
+def goals(experiment: Experiment) -> list[str]:
+    """Return time, place and yaw of each goal that differs from the one before."""
+    course, found = experiment.trajectory(HOME, RELEASE_US), [""]
+    for t_us in range(0, RELEASE_US + round(experiment.duration_s * 1e6), LOOK_US):
+        goal = course.at(t_us)
+        text = " ".join(f"{number + 0.0:.5f}" for number in (*goal.p_WG, goal.yaw))
+        if not found[-1].endswith(f": {text}"):
+            found.append(f"{t_us / 1e6:g} s: {text}")
+    return found[1:]
+
+
+def asked(experiment: Experiment) -> dict[str, Any]:
+    """Return all that an experiment asks of a flight."""
+    functions = (experiment.prepare, experiment.script, experiment.measure)
+    return {
+        "summary": experiment.summary,
+        "duration_s": round(experiment.duration_s, 6),
+        "limits": dict(experiment.limits),
+        "settings": [*experiment.settings],
+        "faults": [*map(str, experiment.faults)],
+        "metrics": {name: str(metric) for name, metric in experiment.metrics.items()},
+        "functions": [*map(call_of, functions)],
+        "pictures": [*experiment.pictures],
+        "goals": goals(experiment),
+    }
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_an_experiment_asks_what_it_asked(name: str) -> None:
+    judge(KNOWN, name, asked(EXPERIMENTS[name]))
+
+
+if __name__ == "__main__":
+    approve(KNOWN, {name: lambda one=one: asked(one) for name, one in EXPERIMENTS.items()})  # type: ignore[misc]
