@@ -127,7 +127,7 @@ class Flown(Used):
         now_us = 0
         for number in range(120):
             self.act(now_us)
-            now_us += self.pick(0, 400, 1_000, 2_000, 7_300)
+            now_us += self.pick(0, 400, 1_000, 2_000, 7_300, next_period_us(now_us) - now_us)
             body.advance(now_us)
             if number % 10 == 0:
                 battery.draw(now_us, body.draw(now_us, battery.voltage))
@@ -444,7 +444,7 @@ class Window(Used):
     def told(self) -> dict[str, str]:
         window, now_us, received, used, lost = SampleWindow(), 0, 0, 0, 0
         for number in range(1500):
-            now_us += self.pick(0, 300, 1_000, 1_000, 20_000 if number % 50 == 0 else 0)
+            now_us += self.pick(0, 300, 1_000, 1_000, 60_000 if number % 20 == 0 else 0)
             if not window.full:
                 window.put((number, number + 1, number + 2))
             packet = window.packet(now_us)
