@@ -36,7 +36,9 @@ from hil.laboratory.bodies import make_body
 from hil.world.battery import Battery, endurance
 from hil.world.body import OwnSensor
 from hil.world.config import MassConfig
-from hil.world.quadrotor import Rotors
+from hil.world.floaty.correction import OperatingPoint
+from hil.world.floaty.plant import SERVO_FAILURES, Plant
+from hil.world.quadrotor import MOTOR_FAILURES, Rotors
 from hil.world.rigid import RigidBody
 from hil.world.room import Room, to_body, to_world
 from hil.world.scene import ball, box, cylinder, disc, eight_markers
@@ -141,6 +143,11 @@ class Flown(Used):
                 )
                 self.note("values", one.read())
         self.look("left")
+        if isinstance(body, Plant):
+            for _ in range(2):
+                inputs = (*self.three(0.05), 0.02)
+                point = OperatingPoint(inputs, self.turn(0.1)[1:], self.three(0.5), self.pick(None, 9.0))  # type: ignore[arg-type]
+                self.note("linear", body.linearise(point), *body.mounted_wrench(inputs))
         return self.log.told()
 
     def config(self, config: LabConfig) -> LabConfig:
@@ -487,6 +494,8 @@ def fixed() -> dict[str, str]:
         used.note("angles", commanded_angles(counts, (0.1, 0.2, 0.3, 0.4), (1.0, 2.0, 3.0, 4.0)))
     for now_us in (0, 1, 2_500, 2_501, 5_000, 5_001, 123_456_789):
         used.note("period", next_period_us(now_us))
+    for name, failure in sorted((SERVO_FAILURES | MOTOR_FAILURES).items()):
+        used.note("failures", name, failure)
     battery = load_config().battery
     for power, empty_V in ((0.0, 3.0), (3.4, 3.0), (9.0, 3.3), (100.0, 3.0)):
         used.note("endurance", endurance(battery.model_copy(update={"capacity": 90.0}), power, empty_V))

@@ -20,6 +20,7 @@ from hil.emulator.stm32f405.checkpoints import (
     SIZE_BYTES,
     Checkpoint,
     Checkpoints,
+    _written_files,
     why_none,
 )
 from hil.emulator.stm32f405.chip import SOFTWARE
@@ -249,6 +250,22 @@ def test_checkpoints_are_the_closer_the_nearer_to_the_present_and_the_oldest_sta
     assert (checkpoints.kept, checkpoints._ended) == ([], [])
     for other in others.values():
         other.close()
+
+
+def test_files_that_may_be_written_get_their_length_back_and_no_others(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        before, files = _written_files(), {}
+        for mode in ("rb", "r+b", "wb", "ab"):
+            (tmp_path / mode).write_bytes(b"content")
+            files[mode] = stack.enter_context((tmp_path / mode).open(mode, buffering=0))
+        files["r+b"].seek(3)
+        files["wb"].write(b"four")
+        for end in socket.socketpair():
+            stack.enter_context(end)
+        found = {number: (size, place) for number, size, place in _written_files()}
+        expected = {"r+b": (7, 3), "wb": (4, 4), "ab": (7, 7)}
+        known = {number: (size, place) for number, size, place in before}
+        assert found == known | {files[mode].fileno(): one for mode, one in expected.items()}
 
 
 def test_a_process_with_threads_cannot_be_copied_nor_any_of_another_system(

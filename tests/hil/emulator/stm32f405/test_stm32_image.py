@@ -274,6 +274,29 @@ def test_a_bin_that_cannot_start_is_refused(content: bytes, expected: str, tmp_p
     assert expected in refused(tmp_path / "cf2.bin")
 
 
+@pytest.mark.parametrize(
+    ("inside", "behind", "whole"),
+    [(0, 24, True), (0, 25, False), (2500, 30, True), (2500, 31, False)],
+)
+@pytest.mark.parametrize(("at", "beyond"), [(0, 0x080F_FFFF), (None, None)])
+def test_a_bin_leads_behind_its_end_at_most_as_often_as_whole_ones(
+    inside: int, behind: int, whole: bool, at: int | None, beyond: int | None, tmp_path: Path
+) -> None:
+    """An address of its first byte or just behind its last is inside; one outside of the flash is none."""
+    base, size = 0x0800_4000, 4 * (2 + max(inside, 1) + behind + 3)
+    within = [base if at == 0 else base + size] * max(inside - 1, 0)
+    after = [beyond or base + size + 1] * behind
+    words = [0x2002_0000, base + 9, *within, *after, base - 1, 0x0810_0000, 0x0810_0001]
+    words += [0] * (size // 4 - len(words))
+    (tmp_path / "cf2.bin").write_bytes(np.array(words, "<u4").tobytes())
+    if whole:
+        Image(tmp_path / "cf2.bin")
+    else:
+        assert f"truncated: {size} bytes from 0x08004000 on, and {behind} addresses" in refused(
+            tmp_path / "cf2.bin"
+        )
+
+
 @pytest.mark.parametrize("fraction", [0.0001, 0.001, 0.3, 0.9, 0.9999])
 def test_a_truncated_file_is_refused(elf: Path, tmp_path: Path, fraction: float) -> None:
     short = tmp_path / "short.elf"

@@ -13,7 +13,7 @@ from hil.emulator.crazyflie.log_table import log_table, parameter_table
 from hil.emulator.stm32f405 import stopped_tasks
 from hil.emulator.stm32f405.chip import Chip, StopReason, build_machine
 from hil.emulator.stm32f405.crash import CrashReports
-from hil.emulator.stm32f405.freertos import FreeRtos, Wait
+from hil.emulator.stm32f405.freertos import QUEUE_CODE, FreeRtos, Wait
 from hil.emulator.stm32f405.image import Image
 from hil.emulator.stm32f405.processor import ChipProcessor
 from hil.emulator.stm32f405.stopped_tasks import StoppedTask, TaskWatch
@@ -66,6 +66,37 @@ def test_the_tasks_are_those_that_were_created(compiler: str) -> None:
     ]  # fmt: skip
     assert {tasks["SPIN-0"].state, tasks["SPIN-1"].state} == {"ready", "running"}
     assert tasks[kernel.name(kernel.current_block)].state == "running"
+
+
+def test_a_task_has_the_state_of_the_list_that_it_is_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = FirmwareOnChip()
+    kernel, variables = FreeRtos(machine.image, machine.chip.read), machine.image._variables
+    run_to_end(machine, 30)
+    delayed = variables.pop("xDelayedTaskList1")
+    lists = {
+        "xDelayedTaskList1": "blocked", "xDelayedTaskList2": "blocked", "xSuspendedTaskList": "suspended",
+        "xTasksWaitingTermination": "deleted", "pxReadyTasksLists": "ready", "xPendingReadyList": "ready",
+    }  # fmt: skip
+    for name, state in lists.items():
+        with monkeypatch.context() as patch:
+            patch.setitem(variables, name, delayed)
+            states = {task.name: task.state for task in kernel.tasks()}
+        assert states.get("REPORT") == state, name
+
+
+def test_without_the_code_of_queues_tasks_are_known_and_waits_have_an_address(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    machine = FirmwareOnChip()
+    image, whole = machine.image, FreeRtos(machine.image, machine.chip.read)
+    run_to_end(machine, 30)
+    has = image.has
+    monkeypatch.setattr(image, "has", lambda name: name != QUEUE_CODE and has(name))
+    without = FreeRtos(image, machine.chip.read)
+    assert without._queue is None
+    assert without.tasks() == whole.tasks()
+    event = image.symbol("bus_guard").address + whole._queue["xTasksWaitingToReceive"].offset  # type: ignore[index]
+    assert without._wait_in(event) == Wait(f"it waits at {image.name_of(event, without._word)}")
 
 
 @COMPILERS

@@ -58,6 +58,16 @@ def test_the_last_instruction_of_an_it_block_may_jump(mask: int, condition: int)
     assert list(coverage._branches(image)) == found  # type: ignore[arg-type]
 
 
+def test_a_constant_ends_an_it_block() -> None:
+    words = np.array([0xBF08, 0x1234, 0xE7FE, NOP], "<u2")  # IT EQ, a constant, B
+    image = SimpleNamespace(
+        code=words.tobytes(), base=0x100, functions=[SimpleNamespace(address=0x100)], constants={1}
+    )
+    assert list(coverage._branches(image)) == []  # type: ignore[arg-type]
+    image.constants = {0}
+    assert list(coverage._branches(image)) == []  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("index", [10, 11])
 def test_constants_lie_where_capstone_has_them(index: int) -> None:
     """Relative to the word-aligned address four behind the instruction; a load of less than a word keeps its word."""
