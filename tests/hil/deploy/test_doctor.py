@@ -254,6 +254,11 @@ def test_a_gyro_s_zero_is_that_of_the_last_look_and_a_loop_reports_what_it_held_
         "noise 17.3, zero not found yet"
     )
 
+    for millivolts, good in ((2999, False), (3000, True), (4350, True), (4351, False)):
+        looks[-1] = looks[-1]._replace(battery_mv=millivolts)
+        pending = iter(looks)
+        assert {one.subject: one.good for one in doctor._health(client)}["battery"] == good
+
     class Window:
         """A window of which the board takes 250 samples at each look."""
 

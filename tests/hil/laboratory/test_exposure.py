@@ -71,6 +71,16 @@ def test_instants_between_two_exposures_are_known_up_to_a_tenth_of_a_second(gap_
     assert (np.isfinite(x[(times > begin) & (times < begin + gap_us)]) == known).all()
 
 
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_a_place_lies_between_the_exposures_around_it_from_the_first_to_the_last(count):
+    times = np.arange(0.0, 100_000.0, 2_500.0)
+    seen = np.array([10_000.0, 25_000.0, 30_000.0, 55_000.0, 80_000.0])[:count]
+    exposed = np.append(seen, np.full(len(times) - count, seen[-1]))
+    x = at_exposure(log_of(exposed, times)).column("cameras.x").to_numpy()
+    expected = np.interp(times, seen, place(seen)[:, 0], left=np.nan, right=np.nan)
+    assert x == pytest.approx(expected, abs=1e-12, nan_ok=True)
+
+
 def test_before_the_first_pose_there_is_none():
     times, exposed = rows(100)
     exposed[:50] = np.nan

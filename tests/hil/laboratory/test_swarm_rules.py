@@ -99,6 +99,17 @@ def test_a_contact_and_a_wake_end_once_and_the_least_distance_stays() -> None:
     assert str(nearest) == "robots 1 and 2, 0.50 s after the release"
 
 
+def test_a_wake_alone_and_a_contact_alone_are_felt() -> None:
+    upright = Rotation.identity()
+    for below, wake, touch in (((0.0, 0.0, 0.3), True, False), ((0.1, 0.0, 1.0), False, True)):
+        origin = np.array(ORIGINS[1])
+        flown = [Flown((0.0, 0.0, 1.0), upright, 0.3), Flown(tuple(np.array(below) - origin), upright, 0.3)]
+        crowd, _ = crowd_of(*flown)
+        crowd.exchange(RELEASE_US)
+        assert any(map(any, flown[1].winds)) == wake
+        assert any(map(any, flown[1].touches)) == touch
+
+
 def test_packets_go_to_all_others_that_still_fly_once() -> None:
     flown = [Flown((float(n), 0.0, 0.0), Rotation.identity(), 0.3) for n in range(3)]
     crowd, near = crowd_of(*flown)

@@ -217,6 +217,22 @@ def test_a_column_of_numbers_may_have_few_texts(
     assert numbers is None or np.isfinite(table.columns["x"]).sum() == numbers
 
 
+@pytest.mark.parametrize(
+    ("text", "x"),
+    [
+        ("t,x\n1,2\n2,2.5\n", [2.0, 2.5]),
+        ("t;x\n1,5;2,5\n2,5;3\n", [2.5, 3.0]),
+        ("t;x\n1.5;2.5\n2.5;3\n", [2.5, 3.0]),
+        ("t\tx\n1,5\t2,5\n2,5\t3\n", [2.5, 3.0]),
+    ],
+)
+def test_a_comma_between_columns_is_none_within_numbers(text: str, x: list[float], tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    (table,) = read_tables(path)
+    assert (table.columns["x"].tolist(), table.notes) == (x, ())
+
+
 def test_what_is_missing_is_unknown_or_said(tmp_path: Path) -> None:
     done = import_log(
         [csv(tmp_path / "log.csv", {"t": T, **place("x", "y", "z"), "fan [rpm]": 900 + T})], tmp_path
@@ -291,6 +307,11 @@ def test_times_without_a_unit_have_that_of_a_usual_step(step: float, unit: str) 
     assert joined.clock == f"t [{unit}]"
     assert joined.columns["x"].tolist() == [0.0, 4.0, 7.0, 9.0]
     assert joined.notes == ["6 rows are left out: t does not advance there"]
+
+
+def test_a_table_of_one_row_has_no_usual_step() -> None:
+    joined = join("log", [Table({"t": np.array([2.0]), "x": np.array([5.0])}, ())], None)
+    assert (joined.columns["x"].tolist(), joined.notes) == ([5.0], [])
 
 
 def test_the_first_table_must_have_the_clock_that_a_map_names() -> None:
