@@ -22,7 +22,14 @@ from hil.errors import LabError
 from hil.live import rerun_screen
 from hil.servers.dongle_plugin import Backend
 from support.command import Cli
+from support.paths import ROOT
 from support.serving import CAMERAS, free_port
+
+NEEDS = [
+    one
+    for path in sorted((ROOT / "hil/commands").glob("*.py"))
+    for one in re.findall(r'require\("([^"]+)", "([\w-]+)"', path.read_text("utf-8"))
+]
 
 TABLE = r"""
 fly hovver | experiment 'hovver': unknown; did you mean hover?
@@ -387,3 +394,13 @@ def test_a_server_names_the_port_that_another_program_has(cli: Cli, taken: str) 
     assert said.startswith(
         f"floaty: natnet port {taken}: Address already in use; --set capture.port=0 takes a free one"
     )
+
+
+@pytest.mark.parametrize(("words", "extra"), NEEDS)
+def test_a_command_that_needs_an_extra_names_itself_and_an_extra_that_exists(words: str, extra: str) -> None:
+    program, name, *options = words.split()
+    assert program == "floaty"
+    command = app.get_command(click.Context(app), name)
+    assert command is not None
+    assert {*options} <= {option for one in command.params for option in one.opts}
+    assert re.search(rf"^{extra} = \[", (ROOT / "pyproject.toml").read_text("utf-8"), re.MULTILINE)

@@ -384,16 +384,16 @@ def test_every_number_of_a_shape_at_a_bound_of_the_search_is_named(number: int) 
     """With the reason; a shape inside of all bounds has no line."""
     geometry = PAPER.geometry
     assert at_bounds(geometry) == []
-    span = geometry.footprint
+    one, span = SEARCHED[number], geometry.footprint
     for x, end in ((LOW[number], "lower"), (HIGH[number], "upper")):
         kink, height, base, strip = np.where(np.arange(4) == number, x, shape_of(geometry)).tolist()
         shape = balanced(
             geometry, height * span, kink_angle=kink, base_side=base * span, strip_width=strip * span
         )
         (line,) = at_bounds(shape)
-        assert line.startswith(f"{SEARCHED[number].name} = ")
-        assert f"at the {end} bound of the search (" in line
-    one = SEARCHED[number]
+        value = f"{math.degrees(x):.0f} deg" if number == 0 else f"{x:.3g} of the footprint"
+        why = one.why_low if end == "lower" else one.why_high
+        assert line == f"{one.name} = {value}: at the {end} bound of the search ({why})"
     for share, end in ((0.0009, "lower"), (0.0011, ""), (0.9989, ""), (0.9991, "upper")):
         found = one.reached(one.low + share * (one.high - one.low))
         assert (f"at the {end} bound" in found) if end else not found

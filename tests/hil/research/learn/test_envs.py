@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
 from gymnasium.utils.env_checker import check_env
 from scipy.spatial.transform import Rotation
 
@@ -18,7 +19,7 @@ from ground_station.trajectory import Goal
 from hil.config import load_config
 from hil.errors import LabError
 from hil.research.learn.batch import EstimateErrors, Fleet
-from hil.research.learn.envs import REACH, FastEnv, FirmwareEnv, Setup, make_env
+from hil.research.learn.envs import REACH, FastEnv, Fidelity, FirmwareEnv, Setup, make_env, make_vec
 from hil.research.learn.tasks import PUSHES, TASKS, EpisodeTask, draw_episode
 from hil.world.floaty.plant import Plant
 from hil.world.servos import next_period_us
@@ -38,6 +39,15 @@ def actions(count: int, size: float) -> np.ndarray:
 def test_gymnasium_s_checker_passes(task: str, fidelity: str) -> None:
     env = gymnasium.make(f"floaty/{task}-v0", fidelity=fidelity, duration_s=0.5)
     check_env(env.unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("fidelity", ["fast", "firmware"])
+def test_both_fidelities_take_four_actions_and_show_twenty_numbers(fidelity: Fidelity) -> None:
+    env = make_env("Hover", fidelity, render_mode=None)
+    assert env.observation_space == Box(-REACH, REACH, (20,), np.float32)
+    assert env.action_space == Box(-1.0, 1.0, (4,), np.float32)
+    env.close()
+    assert make_vec("Hover", 2, render_mode=None).single_action_space == env.action_space
 
 
 def test_stable_baselines_checker_passes() -> None:
@@ -318,19 +328,22 @@ def test_an_age_of_the_pose_delays_the_observation_of_the_cameras_alone() -> Non
     np.testing.assert_array_equal(old[:, 9:], fresh[:, 9:])
 
 
-def test_the_fast_model_shows_distance_and_velocity_along_its_heading_wherever_the_goal_looks() -> None:
+def test_the_fast_model_shows_distance_and_velocity_along_its_heading_each_with_its_own_error() -> None:
     quiet: Any = {"overrides": STILL, "errors": EstimateErrors(0.0, 0.0, 0.0, 0.0)}
     env = make_env("Track", **quiet)
     assert isinstance(env, FastEnv)
     env.reset(seed=11)
     amplitude, hertz = env._fleet._memory[-1]["path"][0]
     home = np.array([*load_config().flight.home, 0.0])
+    errors, lasting = 0.01 * np.array([3, -5, 7, 2, 11, -4, 1, 6, -8]), env._fleet._sensing.fields.lasting
     for action in actions(60, 0.3):
+        env._fleet.agents["errors"][0, :9] = errors / lasting
         seen, body = env.step(action)[0], env.truth.body.fields
         goal = home + amplitude * np.sin(2e-6 * np.pi * hertz * body.time_us)
-        yaw = Rotation.from_quat(body.q_WB, scalar_first=True).as_euler("ZYX")[0]
-        expected = Rotation.from_euler("Z", yaw).apply([goal[:3] - body.p_WB, body.v_WB], inverse=True)
-        assert seen[8] == pytest.approx(goal[3] - yaw, abs=2e-6)
+        yaw, pitch, roll = Rotation.from_quat(body.q_WB, scalar_first=True).as_euler("ZYX") + errors[:5:-1]
+        seen_W = [goal[:3] - body.p_WB - errors[:3], body.v_WB + errors[3:6]]
+        expected = Rotation.from_euler("Z", yaw).apply(seen_W, inverse=True)
+        assert seen[6:9] == pytest.approx([roll, pitch, goal[3] - yaw], abs=2e-6)
         assert seen[:6].reshape(2, 3) == pytest.approx(expected, abs=2e-6)
     assert abs(goal[3]) > 0.1
 

@@ -136,6 +136,16 @@ def test_a_clock_with_long_microseconds_is_measured_through_its_carries(flown: P
     assert found.causes == ("long microsecond: a microsecond of the boards' clocks lasts 1.0000 | 1.0119 us",)
 
 
+def test_only_rows_that_both_boards_have_are_compared(flown: Path, tmp_path: Path) -> None:
+    def shorter(columns: Columns) -> None:
+        bumped(columns)
+        columns.update({name: column[: RELEASE + 9] for name, column in columns.items()})
+
+    a, b = load_flown(flown), other(flown, tmp_path / "b", shorter)
+    firsts = [one.first for one in (two_boards(a, b), two_boards(b, a))]
+    assert [(one.row, one.servo) for one in firsts if one] == [(RELEASE + 1, "motor.m3")] * 2
+
+
 def test_an_unexplained_difference_is_reported(flown: Path, tmp_path: Path) -> None:
     found = two_boards(load_flown(flown), other(flown, tmp_path / "b", bumped))
     assert found.first is not None
