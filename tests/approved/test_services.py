@@ -1,7 +1,8 @@
 """A board answers the same random operators with the same bytes at the same instants as it did.
 
 An operator flies, steers, arms, disarms, stops, asks, logs, stores, loses the link, drains the battery and sends
-nonsense, in any order. If a change is meant, compare what it does with the original firmware, and write the answers anew:
+nonsense, in any order; its commander and its small services get each request. If a change is meant,
+compare what it does with the original firmware, and write the answers anew:
 
     make approve
 """
@@ -9,7 +10,8 @@ nonsense, in any order. If a change is meant, compare what it does with the orig
 import hashlib
 import struct
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +19,18 @@ import numpy as np
 import pymavlink.dialects.v20.development as dialect
 import pytest
 
+from firmware_py.crazyflie.high_level_commander import HighLevelCommander
+from firmware_py.crazyflie.planner import PathPoint
+from firmware_py.crazyflie.trajectories import POINTS
+from firmware_py.geometry import Vector
 from firmware_py.wire import crtp, setpoints
 from firmware_py.wire.high_level import PathCommand, encode
 from firmware_py.wire.parameters import encode_pose_kind
-from support.approved import approve, judge
+from support.approved import Log, approve, judge
 from support.crtp_client import LINK, LOC, LOG, MEM, PARAM, PLATFORM, SUPERVISOR, CrtpClient
 from support.firmware_bench import LEVEL, FirmwareBench
 from support.mavlink_client import MavlinkClient
+from support.random_use import Random
 
 ANSWERS = Path(__file__).with_name("services.json")
 OPERATIONS, SEEDS = 220, range(1, 7)
@@ -276,8 +283,109 @@ def hashed(rows: list[bytes]) -> str:
     return hashlib.sha256(b"\n".join(rows)).hexdigest()[:12]
 
 
+class Commanded(Random):
+    """A high-level commander that gets commands of all kinds, for paths of any kind, also while it is blocked."""
+
+    place = PathPoint((0.1, -0.2, 1.0), 0.3)
+
+    def estimate(self) -> PathPoint:
+        """Return where the robot is."""
+        return self.place
+
+    def admits(self, places: Sequence[Vector]) -> bool:
+        """Return whether a path may be flown: not into one corner."""
+        self.log.note("asked", *(round(one, 5) for place in places for one in place))
+        return min(places[-1]) < 1.5
+
+    def number(self, low: float, high: float) -> float:
+        return float(np.float32(self.rng.uniform(low, high)))
+
+    def command(self) -> bytes:
+        """Return a packet's data of a command, seldom cut or unknown."""
+        kind, flag = (
+            self.pick(*PathCommand, *(PathCommand.START, PathCommand.DEFINE) * 4),
+            partial(self.below, 2),
+        )
+        groups, time = self.pick(0, 0, 0, 1, 6), self.pick(0.0, self.number(0.2, 3.0), self.number(0.2, 3.0))
+        height, yaw = self.number(-0.3, 1.6), self.number(-4.0, 4.0)
+        number = self.pick(0, 1, 2, 3, 30, 31)
+        fields: Any = {
+            PathCommand.SET_GROUP_MASK: (self.pick(0, 0, 2, 5),),
+            PathCommand.STOP: (groups,),
+            PathCommand.TAKE_OFF_1: (groups, height, time),
+            PathCommand.LAND_1: (groups, height, time),
+            PathCommand.TAKE_OFF: (groups, height, yaw, flag(), time),
+            PathCommand.LAND: (groups, height, yaw, flag(), time),
+            PathCommand.TAKE_OFF_WITH_VELOCITY: (groups, height, flag(), yaw, flag(), self.pick(0.0, 0.3)),
+            PathCommand.LAND_WITH_VELOCITY: (groups, height, flag(), yaw, flag(), self.pick(0.0, 0.3)),
+            PathCommand.GO_TO_1: (groups, flag(), *(self.number(-1, 1) for _ in range(3)), yaw, time),
+            PathCommand.GO_TO: (groups, flag(), flag(), *(self.number(-1, 1) for _ in range(3)), yaw, time),
+            PathCommand.SPIRAL: (
+                groups, flag(), flag(), self.number(-7, 7), self.number(-1, 2), self.number(-1, 2), height, time,
+            ),
+            PathCommand.START_1: (groups, flag(), flag(), number, self.pick(1.0, 1.0, 0.5, 0.0)),
+            PathCommand.START: (groups, flag(), flag(), self.pick(0, 0, 1), number, self.pick(1.0, 1.0, 1.5)),
+            PathCommand.DEFINE: (
+                number, *self.pick((1, 0, 0), (1, 0, 132), (1, 1, 2000), (1, 0, 4000), (0, 1, 2000), (1, 2, 0)),
+                self.pick(1, 2, 2, 0),
+            ),
+        }[kind]  # fmt: skip
+        data = encode(kind, *fields)[1:]
+        return self.pick(*(data,) * 20, data[:-1], data + b"\0", bytes((self.pick(14, 99, 255),)), b"")
+
+    def told(self) -> dict[str, str]:
+        """Return what it answered, reported and flew."""
+        flown = HighLevelCommander(self, partial(self.log.note, "reported"))
+        for offset in (0, 132, 264):
+            pieces = self.rng.normal(0.0, 0.2, 32), self.rng.uniform(0.5, 1.5, 1)
+            flown.memory[offset : offset + 132] = np.concatenate(pieces).astype("<f4").tobytes()
+        packed = struct.pack("<4h", *self.rng.integers(-500, 500, 4))
+        for kinds in (0b10_01_11_10, 0b01_00_10_11):
+            points = sum(POINTS[kinds >> 2 * axis & 3] for axis in range(4))
+            packed += struct.pack("<BH", kinds, 700) + struct.pack(
+                f"<{points}h", *self.rng.integers(-500, 500, points)
+            )
+        flown.memory[2000 : 2000 + len(packed) + 3] = packed + bytes(3)
+        t = 0.0
+        for _ in range(1500):
+            if self.rng.random() < 0.5:
+                data = self.command()
+                self.log.note(f"command {data[:1].hex()}", data.hex(), flown.execute(data, t))
+            if self.rng.random() < 0.05:
+                flown.block(bool(self.below(3) == 0))
+                self.place = PathPoint(
+                    (self.number(-1, 1), self.number(-1, 1), self.number(0, 2)), self.number(-3, 3)
+                )
+            if self.rng.random() < 0.05:
+                flown.defaults.take_off_velocity = self.pick(0.3, 0.7)
+                flown.defaults.landing_velocity = self.pick(0.2, 0.6)
+            wanted = flown.setpoint(t)
+            numbers = (*(wanted.place or ()), wanted.yaw, *wanted.velocity)
+            self.log.note("flown", *(f"{one + 0.0:.5g}" for one in numbers), flown.bits(t))
+            t += self.pick(0.01, 0.1, 0.4)
+        return self.log.told()
+
+
+def requests() -> dict[str, str]:
+    """Return the answers to each first byte on each channel of the small services, with several tails."""
+    bench, log = CrtpClient(), Log()
+    for port in (LINK, PLATFORM, SUPERVISOR, MEM):
+        for channel in range(4):
+            for first in (*range(16), 0x81, 0xFF):
+                for tail in (b"", b"\0", b"\1", b"\1\0", b"\2\0\0\0\4", b"\2\xfc\x0f\0\0\4"):
+                    bench.sent.clear()
+                    bench.send(port, channel, bytes((first,)) + tail)
+                    bench.run(bench.now_us + 2_000)
+                    counted = bench.firmware.link.malformed, bench.firmware.pilot.stabilizer.supervisor.bits
+                    answers = [raw.hex() for _, raw in bench.sent]
+                    log.note(f"{port} {channel}", first, tail.hex(), *answers, *counted)
+    return log.told()
+
+
 FLIGHTS: dict[str, Callable[[], dict[str, str]]] = {
     **{f"radio {seed}": lambda seed=seed: CrtpOperator(CrtpClient(), seed).fly() for seed in SEEDS},  # type: ignore[misc]
+    **{f"commanded {seed}": lambda seed=seed: Commanded(seed).told() for seed in SEEDS},  # type: ignore[misc]
+    "requests": requests,
     **{f"mavlink {seed}": lambda seed=seed: MavlinkOperator(MavlinkClient(), seed).fly() for seed in SEEDS},  # type: ignore[misc]
 }
 
