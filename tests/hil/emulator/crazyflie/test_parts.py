@@ -2,6 +2,7 @@
 
 import struct
 from types import SimpleNamespace
+from weakref import ref
 
 import numpy as np
 import pytest
@@ -40,6 +41,19 @@ def test_at_power_on_all_lines_are_pulled_up_but_those_of_a_ready_sample_and_a_b
     Parts(bench.chip, np.zeros(8192, np.uint8))
     levels = {port: bench[GPIOA_IDR + 0x400 * index] for index, port in enumerate("ABCDE")}
     assert levels == dict.fromkeys("ABCDE", 0xFFFF) | {"A": 0xFFEF, "C": 0xBFFF}
+
+
+def test_an_eeprom_has_its_size_and_memory_of_devices_lives_as_long_as_the_chip() -> None:
+    chip = Bench().chip
+    for size in (8191, 8193):
+        with pytest.raises(ValueError, match=f"^an EEPROM of {size} bytes: it has 8192$"):
+            Parts(chip, np.zeros(size, np.uint8))
+    memory, rpm = np.zeros(8, np.uint8), np.zeros(1)
+    kept = ref(memory), ref(rpm)
+    chip.add_device(2, 0x51, memory)
+    chip.add_esc(1, 0, rpm, 12)
+    del memory, rpm
+    assert all(one() is not None for one in kept)
 
 
 def send(bench: DeckBench, data: bytes) -> None:

@@ -8,6 +8,7 @@ import subprocess
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import capstone
@@ -17,11 +18,13 @@ from capstone import arm
 pytest.importorskip("unicorn")
 pytest.importorskip("cffi")
 
+from firmware_py.export.elf import Symbol
 from hil.api import fly
 from hil.board import image_firmware
 from hil.emulator.stm32f405 import coverage
 from hil.emulator.stm32f405.chip import StopReason
 from hil.emulator.stm32f405.coverage import FileCoverage, ImageLines
+from hil.emulator.stm32f405.debug_info import LineRow
 from hil.emulator.stm32f405.image import Image
 from hil.errors import LabError
 from hil.laboratory.experiments import find_experiment
@@ -227,3 +230,15 @@ def test_the_instruction_in_which_the_chip_sleeps_has_run_and_the_next_one_has_n
         bench.wait(10)
         runs = coverage.runs_of(bench.chip.passages)[4:10]
         assert runs.tolist() == [1, 1, 1, 0, 0, 0]  # two NOPs, WFI, the jump back to it
+
+
+@pytest.mark.parametrize(("size", "last"), [(4, 11), (8, 12), (64, 12), (0, 12)])
+def test_a_function_ends_with_its_size_or_where_the_next_one_begins(size: int, last: int) -> None:
+    begin = 0x0800_4000
+    rows = [LineRow(begin + 4 * n, begin + 4 * n + 4, "a.c", 11 + n, True) for n in range(4)]
+    functions = [Symbol("one", begin, size, True, False), Symbol("two", begin + 8, 8, True, False)]
+    image: Any = SimpleNamespace(
+        debug=SimpleNamespace(rows=rows), functions=functions, code=bytes(16), base=begin, constants=()
+    )
+    found = [(name, end) for name, _, end, _ in ImageLines(image)._with_places()]
+    assert found == [("one", last), ("two", 14)]
