@@ -1,6 +1,7 @@
 """Flashing page by page, on a bootloader whose flash is an array and whose answers may come late."""
 
 import struct
+from contextlib import nullcontext
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
@@ -187,6 +188,14 @@ def test_only_radio_flashes(uri: str) -> None:
 def test_an_invalid_firmware_is_not_sent(image: bytes) -> None:
     with pytest.raises(LinkError, match="not an image for the board"):
         check_image(image)
+
+
+@pytest.mark.parametrize("low", [0x1000_0000, 0x2000_0000])
+def test_the_stack_begins_in_memory_or_at_its_end(low: int) -> None:
+    high = low + (0x1_0000 if low < 0x2000_0000 else 0x2_0000)
+    for stack, fits in ((low, False), (low + 4, True), (high, True), (high + 4, False)):
+        with nullcontext() if fits else pytest.raises(LinkError, match="not an image for the board"):
+            check_image(struct.pack("<II", stack, BASE + 101) + bytes(200))
 
 
 def test_an_image_must_fit() -> None:

@@ -134,7 +134,10 @@ REFUSED_KERNELS = [
     ("@kernel\ndef f(x: f32):\n    '''Do.'''\n", 1, "f has no result type"),
     ("@kernel\ndef f(x: f32) -> float:\n    '''Do.'''\n", 1, "f has no result type"),
     ("@kernel\ndef f(x: f32 = LIMIT) -> None:\n    '''Do.'''\n", 1, "f: only plain arguments without defaults"),
-    ("@kernel\ndef f(*x: f32) -> None:\n    '''Do.'''\n", 1, "f: only plain arguments without defaults"),
+    *(
+        (f"@kernel\ndef f({one}) -> None:\n    '''Do.'''\n", 1, "f: only plain arguments without defaults")
+        for one in ("*x: f32", "**x: f32", "*, x: f32", "x: f32, /")
+    ),
     ("@kernel\ndef f(register: f32) -> None:\n    '''Do.'''\n", 1, "register is a word of C"),
     ("@kernel\ndef f(x: f32) -> None:\n    y = x\n", 1, "no docstring"),
     ("@kernel\ndef f(x: f32) -> None:\n    '''Do.'''\n    return\n", 1, "argument x is not used"),

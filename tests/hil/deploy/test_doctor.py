@@ -21,7 +21,7 @@ from support.core_streams import MEMORY
 from support.crazyflie_app import App, build_app
 
 URI = "udp://127.0.0.1:9"
-VERSION = b"\xd1\x012026.08 +2"  # as the platform service of the stock firmware answers
+VERSION = b"\xd1\x012026.08 +2\0\0"  # as the platform service of the stock firmware answers
 
 
 class Board(AppPackets):

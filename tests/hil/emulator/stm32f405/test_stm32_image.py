@@ -290,7 +290,8 @@ def test_a_bin_leads_behind_its_end_at_most_as_often_as_whole_ones(
     words += [0] * (size // 4 - len(words))
     (tmp_path / "cf2.bin").write_bytes(np.array(words, "<u4").tobytes())
     if whole:
-        Image(tmp_path / "cf2.bin")
+        (flash,) = Image(tmp_path / "cf2.bin").memory
+        assert (flash.name, flash.used, flash.size) == ("flash", size, 0x0810_0000 - base)
     else:
         assert f"truncated: {size} bytes from 0x08004000 on, and {behind} addresses" in refused(
             tmp_path / "cf2.bin"

@@ -9,7 +9,7 @@ from scipy import stats
 
 from hil.config import load_config
 from hil.errors import LabError
-from hil.research.campaigns.config import Distribution, Spec
+from hil.research.campaigns.config import Distribution, SampledFault, Spec
 from hil.research.campaigns.sampling import (
     as_flown,
     axes,
@@ -115,6 +115,12 @@ def test_a_fault_happens_in_its_share_of_the_flights_with_its_distributed_size()
     assert len(sizes) == pytest.approx(256, abs=2)
     assert stats.kstest(sizes, stats.uniform(1.0, 11.0).cdf).pvalue > 0.2
     assert {fault[0].partition("=")[0] for fault in faults if fault} == {"push.y@0.1"}
+
+
+@pytest.mark.parametrize(("probability", "happens"), [(0.99, True), (1.0, False)])
+def test_whether_a_fault_happens_is_an_axis_where_it_may_not(probability: float, happens: bool) -> None:
+    spec = spec_of(faults=[SampledFault(kind="push.y", start_s=0.1, size=2.0, probability=probability)])
+    assert ("fault 1 push.y happens" in [axis.name for axis in axes(spec)]) == happens
 
 
 def test_each_point_is_flown_by_every_experiment_profile_and_seed() -> None:
