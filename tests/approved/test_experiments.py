@@ -1,8 +1,10 @@
-"""The experiments that ship are those that users know: how long, where to, under which conditions, within which limits.
+"""The experiments and faults that ship are those that users know: how long, where to, how strong, within which limits.
 
 `experiments.json` can be read: a number that changes there changes what a run's verdict means.
 """
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ import pytest
 from ground_station.trajectory import Goal
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.experiments import EXPERIMENTS
+from hil.laboratory.fault_kinds import KINDS, SHIPPED
 from support.approved import approve, judge
 
 KNOWN = Path(__file__).with_name("experiments.json")
@@ -51,10 +54,27 @@ def asked(experiment: Experiment) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_an_experiment_asks_what_it_asked(name: str) -> None:
-    judge(KNOWN, name, asked(EXPERIMENTS[name]))
+def kinds() -> dict[str, str]:
+    """Return unit, bounds and links of each kind of fault, and what it makes of the values 3 and 0.5 of its knobs."""
+    return {
+        name: f"{kind.unit} {kind.size} {kind.low}..{kind.high} x {kind.scale:.5g}, {kind.duration_s} s, {kind.outcome}, "
+        f"link {kind.link}, markers {kind.markers}, body {kind.body}, "
+        f"knobs {' '.join(f'{one.blend(3.0, 0.5):g}' for one in kind.knobs)}"
+        for name, kind in KINDS.items()
+        if name in SHIPPED
+    }
+
+
+FOUND: dict[str, Callable[[], Any]] = {
+    **{name: partial(asked, one) for name, one in EXPERIMENTS.items()},
+    "kinds of faults": kinds,
+}
+
+
+@pytest.mark.parametrize("name", FOUND)
+def test_an_experiment_and_a_fault_are_what_they_were(name: str) -> None:
+    judge(KNOWN, name, FOUND[name]())
 
 
 if __name__ == "__main__":
-    approve(KNOWN, {name: lambda one=one: asked(one) for name, one in EXPERIMENTS.items()})  # type: ignore[misc]
+    approve(KNOWN, FOUND)
