@@ -132,9 +132,8 @@ class CoreClient:
             index = answer.number - self._number & 0xFFFF
             if answer.session == self._session and index < len(requests):
                 kind, body = requests[index]
-                if (
-                    answer.kind == core_port.Message.HELLO != kind
-                ):  # late, of a repeated HELLO, which has number 0
+                # A repeated HELLO is answered twice, and has the number of the first request.
+                if answer.kind == core_port.Message.HELLO != kind:
                     continue
                 try:
                     answer.check(kind, body)
