@@ -101,10 +101,11 @@ class CoreClient:
             for index in range(sent, min(begin + WINDOW, len(requests))):
                 self._send(requests[index], index)
                 sent = index + 1
-            answer = self._receive(wait_s, requests)
-            if answer is not None:
+            received = self._receive(wait_s, requests)
+            if received is not None:
                 wait_s, silent_s = FIRST_WAIT_S, 0.0
-                answers[answer.number - self._number & 0xFFFF] = answer
+                index, answer = received
+                answers[index] = answer
                 while begin in answers:
                     begin += 1
                 continue
@@ -122,26 +123,29 @@ class CoreClient:
         self.sent += 1
         self.packets.send(core_port.encode_request(*request, self._session, self._number + index))
 
-    def _receive(self, timeout_s: float, requests: Sequence[Request]) -> core_port.CoreAnswer | None:
-        """Return an answer to one of the requests; answers to earlier requests are skipped."""
+    def _receive(
+        self, timeout_s: float, requests: Sequence[Request]
+    ) -> tuple[int, core_port.CoreAnswer] | None:
+        """Return the index of one of the requests and its answer; answers to earlier requests are skipped."""
         for data in iter(lambda: self.packets.receive(timeout_s), None):
             try:
                 answer = core_port.decode_answer(data)
             except WireError:
                 continue
             index = answer.number - self._number & 0xFFFF
-            if answer.session == self._session and index < len(requests):
-                kind, body = requests[index]
-                # A repeated HELLO is answered twice, and has the number of the first request.
-                if answer.kind == core_port.Message.HELLO != kind:
-                    continue
-                try:
-                    answer.check(kind, body)
-                except WireError as error:
-                    raise LinkError(f"{self.name}: {error}") from None
-                if answer.kind == core_port.Message.REFUSED:
-                    raise LinkError(f"{self.name}: {TEXTS.get(answer.refusal(), 'it refuses a request')}")
-                return answer
+            if answer.session != self._session or index >= len(requests):
+                continue
+            kind, body = requests[index]
+            # A repeated HELLO is answered twice, and has the number of the first request.
+            if answer.kind == core_port.Message.HELLO != kind:
+                continue
+            try:
+                answer.check(kind, body)
+            except WireError as error:
+                raise LinkError(f"{self.name}: {error}") from None
+            if answer.kind == core_port.Message.REFUSED:
+                raise LinkError(f"{self.name}: {TEXTS.get(answer.refusal(), 'it refuses a request')}")
+            return index, answer
         return None
 
 

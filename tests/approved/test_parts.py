@@ -38,7 +38,7 @@ from hil.errors import LabError
 from hil.world.body import Carrier
 from support.approved import Log, approve, judge
 from support.deck_bench import DeckBench
-from support.random_use import Random, hash_of
+from support.random_use import Random, by_seed, hash_of
 from support.stm32_bench import Bench
 
 USES = Path(__file__).with_name("parts.json")
@@ -515,11 +515,8 @@ def accepted() -> dict[str, str]:
     return log.told()
 
 
-FOUND: dict[str, Callable[[], dict[str, str]]] = {
-    f"{kind.__name__} {seed}": lambda kind=kind, seed=seed: kind(seed).told()  # type: ignore[misc]
-    for kind in (RadioChip, Loader, Line, DeckUser, Sensors, Releases, Boards, Tables, Events, Weather)
-    for seed in SEEDS
-} | {"accepted": accepted}
+KINDS = (RadioChip, Loader, Line, DeckUser, Sensors, Releases, Boards, Tables, Events, Weather)
+FOUND = by_seed(KINDS, SEEDS, lambda kind, seed: kind(seed).told()) | {"accepted": accepted}
 
 
 @pytest.mark.parametrize("name", FOUND)

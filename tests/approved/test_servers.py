@@ -48,7 +48,7 @@ from hil.servers.server import Endpoints, OpenEndpoints, Server, Service
 from hil.servers.tcp_port import TcpPort
 from hil.servers.udp_server import UdpServer
 from support.approved import approve, judge
-from support.random_use import Random, hash_of
+from support.random_use import Random, by_seed, hash_of
 from support.watching import Watcher
 
 ANSWERS = Path(__file__).with_name("servers.json")
@@ -849,12 +849,9 @@ def opened() -> dict[str, str]:
     return own.log.told()
 
 
+KINDS = (Cameras, Datagrams, Connections, Cable, Bus, Lines, Processes, Apart, Robot, Hidden)
 FOUND: dict[str, Callable[[], dict[str, str]]] = {
-    **{
-        f"{kind.__name__} {seed}": lambda kind=kind, seed=seed: kind(seed).told(seed)  # type: ignore[misc]
-        for kind in (Cameras, Datagrams, Connections, Cable, Bus, Lines, Processes, Apart, Robot, Hidden)
-        for seed in SEEDS
-    },
+    **by_seed(KINDS, SEEDS, lambda kind, seed: kind(seed).told(seed)),
     "opened": opened,
     "addresses": lambda: addresses(0),
 }

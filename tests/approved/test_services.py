@@ -302,10 +302,8 @@ class Commanded(Random):
 
     def command(self) -> bytes:
         """Return a packet's data of a command, seldom cut or unknown."""
-        kind, flag = (
-            self.pick(*PathCommand, *(PathCommand.START, PathCommand.DEFINE) * 4),
-            partial(self.below, 2),
-        )
+        kind = self.pick(*PathCommand, *(PathCommand.START, PathCommand.DEFINE) * 4)
+        flag = partial(self.below, 2)
         groups, time = self.pick(0, 0, 0, 1, 6), self.pick(0.0, self.number(0.2, 3.0), self.number(0.2, 3.0))
         height, yaw = self.number(-0.3, 1.6), self.number(-4.0, 4.0)
         number = self.pick(0, 1, 2, 3, 30, 31)
@@ -352,7 +350,7 @@ class Commanded(Random):
                 data = self.command()
                 self.log.note(f"command {data[:1].hex()}", data.hex(), flown.execute(data, t))
             if self.rng.random() < 0.05:
-                flown.block(bool(self.below(3) == 0))
+                flown.block(self.below(3) == 0)
                 self.place = PathPoint(
                     (self.number(-1, 1), self.number(-1, 1), self.number(0, 2)), self.number(-3, 3)
                 )

@@ -58,7 +58,7 @@ from ground_station.trajectory import Course, FlightPlan, Goal, Hold, Offsets, S
 from ground_station.unused import Reason
 from support import natnet_packets
 from support.approved import approve, judge
-from support.random_use import Random, hash_of
+from support.random_use import Random, by_seed, hash_of
 
 ANSWERS = Path(__file__).with_name("stations.json")
 SEEDS = range(1, 4)
@@ -1009,25 +1009,9 @@ def courses(seed: int) -> dict[str, str]:
     return own.log.told()
 
 
+KINDS = (Followed, Asked, Stock, Logged, Typed, Live, Replayed, Batches, Streamed, Captured, Mailbox, Serial)
 FOUND: dict[str, Callable[[], dict[str, str]]] = {
-    **{
-        f"{kind.__name__} {seed}": lambda kind=kind, seed=seed: kind(seed).told(seed)  # type: ignore[misc]
-        for kind in (
-            Followed,
-            Asked,
-            Stock,
-            Logged,
-            Typed,
-            Live,
-            Replayed,
-            Batches,
-            Streamed,
-            Captured,
-            Mailbox,
-            Serial,
-        )
-        for seed in SEEDS
-    },
+    **by_seed(KINDS, SEEDS, lambda kind, seed: kind(seed).told(seed)),
     "courses": lambda: courses(0),
 }
 

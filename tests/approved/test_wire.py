@@ -27,9 +27,9 @@ from firmware_py.wire import (
     setpoints,
 )
 from firmware_py.wire.scalars import PARAMETER_SCALARS, Scalar
-from firmware_py.wire.telemetry import ALL_BLOCKS
+from firmware_py.wire.telemetry import ALL_BLOCKS, Sample
 from support.approved import approve, judge
-from support.random_use import Random
+from support.random_use import Random, shown
 
 RETURNED = Path(__file__).with_name("wire.json")
 PACKAGES = ("pymavlink",)
@@ -41,23 +41,18 @@ CALLS, TRIES = 200, 30
 UNFIT = (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError, struct.error)
 
 
-def shown(value: Any) -> str:
-    """Return a value with six digits, so that no mathematics library shows in it."""
+def seen(value: Any) -> str:
+    """Return a value with six digits; of a message its fields, of a sample the number of its block."""
     match value:
-        case bool() | int() | str() | Enum() | None:
-            return repr(value)
-        case float():
-            return f"{value + 0.0:.6g}"
         case bytes():
             return value.hex()
         case dialect.MAVLink_message():
-            return f"{value.get_type()} {shown(value.to_dict())}"
-        case dict():
-            return " ".join(f"{key} {shown(one)}" for key, one in value.items())
+            return seen([*value.to_dict().items()])
+        case Sample():
+            return seen((value.block.id, value.timestamp_ms, value.values))
         case tuple() | list():
-            return f"({', '.join(map(shown, value))})"
-    fields = getattr(value, "__dataclass_fields__", ())
-    return f"{type(value).__name__} {shown([getattr(value, name) for name in fields])}"
+            return f"({', '.join(map(seen, value))})"
+    return shown(value, digits=6)
 
 
 @cache
@@ -162,7 +157,7 @@ class Callers(Random):
                     self.packed.append(one)
                 if isinstance(one, dialect.MAVLink_message):
                     self.messages.append(one)
-            return shown(result)
+            return seen(result)
         return "unfit"
 
 
@@ -181,8 +176,7 @@ def returned(module: ModuleType) -> dict[str, str]:
     for _ in range(CALLS):
         for name, function in functions(module).items():
             callers.log.note(name, callers.call(function))
-    told: dict[str, str] = callers.log.told()
-    return told
+    return callers.log.told()
 
 
 def units() -> dict[str, str]:
@@ -194,9 +188,8 @@ def units() -> dict[str, str]:
     for number, block in enumerate(ALL_BLOCKS):
         for _ in range(20):
             values = block.unpack(callers.rng.bytes(block.layout.size))
-            callers.log.note(f"block {number}", shown(values), shown(block.si_of(values)))
-    told: dict[str, str] = callers.log.told()
-    return told
+            callers.log.note(f"block {number}", seen(values), seen(block.si_of(values)))
+    return callers.log.told()
 
 
 FOUND: dict[str, Callable[[], dict[str, str]]] = {

@@ -5,7 +5,7 @@ is meant: make approve.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -45,28 +45,11 @@ from hil.world.scene import ball, box, cylinder, disc, eight_markers
 from hil.world.servos import commanded_angles, next_period_us
 from hil.world.structs import Air, Flaps, Rigid
 from support.approved import approve, judge
-from support.random_use import Random, hash_of
+from support.random_use import Random, by_seed, hash_of, shown
 
 USES = Path(__file__).with_name("world.json")
 SEEDS = range(1, 4)
 ARMS = (MassConfig(mass=0.01, place=(0.03, 0.02, -0.05), size=(0.01, 0.02, 0.03), mirrored=True),)
-
-
-def shown(value: Any) -> str:
-    """Return any value as text, its numbers to five digits."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return (
-            f"{type(value).__name__}({', '.join(shown(getattr(value, one.name)) for one in fields(value))})"
-        )
-    if callable(value):
-        return shown(value())
-    if isinstance(value, np.ndarray):
-        return shown(value.tolist())
-    if isinstance(value, list | tuple):
-        return f"[{' '.join(map(shown, value))}]"
-    if isinstance(value, float):
-        return f"{value + 0.0:.5g}"
-    return str(value)
 
 
 class Used(Random):
@@ -191,10 +174,8 @@ class Flown(Used):
         )
 
     def act(self, now_us: int) -> None:
-        body, what = (
-            self.body,
-            self.pick("counts", "counts", "air", "setting", "place", "hold", "release", "push"),
-        )
+        body = self.body
+        what = self.pick("counts", "counts", "air", "setting", "place", "hold", "release", "push")
         if what == "counts":
             if self.profile == "crazyflie":
                 counts = [self.pick(0, 40, 100, 168, 200, 256, -3, 65_535) for _ in range(4)]
@@ -215,15 +196,10 @@ class Flown(Used):
             self.note(what, name, setting.read())
         elif what == "place":
             speeds = (self.three(0.5), self.three(2.0))[: self.below(3)]
-            place, act = (
-                (*self.three(0.1)[:2], 0.05 + 1.3 * self.rng.random()),
-                self.pick("place", "place", "put_back"),
-            )
-            given = (
-                (place, self.pick(self.turn(), self.turn(), (0, 0, 0, 0)), *speeds)
-                if act == "place"
-                else (place,)
-            )
+            given: tuple[Any, ...] = ((*self.three(0.1)[:2], 0.05 + 1.3 * self.rng.random()),)
+            act = self.pick("place", "place", "put_back")
+            if act == "place":
+                given += (self.pick(self.turn(), self.turn(), (0, 0, 0, 0)), *speeds)
             self.attempt(act, partial(getattr(body, act), *given))
         elif what == "push":
             body.push(*(self.three(0.3), self.three(0.01))[: 1 + self.below(2)])
@@ -243,7 +219,7 @@ class Flying(Flown):
 
 
 class OwnBody(Flown):
-    """A body of the user's, with actuators, sensors and columns of its own."""
+    """A body that a user wrote, with its own actuators, sensors and log columns."""
 
     def robot(self, config: LabConfig) -> Any:
         class Own(RigidBody):
@@ -508,11 +484,8 @@ def fixed() -> dict[str, str]:
     return used.log.told()
 
 
-FOUND: dict[str, Callable[[], dict[str, str]]] = {
-    f"{kind.__name__} {seed}": lambda kind=kind, seed=seed: kind(seed).told()  # type: ignore[misc]
-    for kind in (Flown, Flying, OwnBody, Carried, Watched, Pins, Window)
-    for seed in SEEDS
-} | {"fixed": fixed}
+KINDS = (Flown, Flying, OwnBody, Carried, Watched, Pins, Window)
+FOUND = by_seed(KINDS, SEEDS, lambda kind, seed: kind(seed).told()) | {"fixed": fixed}
 
 
 @pytest.mark.parametrize("name", FOUND)

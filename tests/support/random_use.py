@@ -1,10 +1,38 @@
 """Random use of one part, and what was seen of it."""
 
+from collections.abc import Callable, Iterable
+from dataclasses import fields, is_dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from support.approved import Log
+
+
+def shown(value: Any, digits: int = 5) -> str:
+    """Return any value as text, its numbers to some digits, so that no mathematics library shows in it."""
+    again = partial(shown, digits=digits)
+    if is_dataclass(value) and not isinstance(value, type):
+        content = ", ".join(again(getattr(value, one.name)) for one in fields(value))
+        return f"{type(value).__name__}({content})"
+    if callable(value):
+        return again(value())
+    if isinstance(value, np.ndarray):
+        return again(value.tolist())
+    if isinstance(value, list | tuple):
+        return f"[{' '.join(map(again, value))}]"
+    if isinstance(value, float):
+        return f"{value + 0.0:.{digits}g}"
+    return str(value)
+
+
+def by_seed(
+    kinds: Iterable[Any], seeds: Iterable[int], told: Callable[[Any, int], dict[str, str]]
+) -> dict[str, Callable[[], dict[str, str]]]:
+    """Return what tells of each kind with each seed, by their names."""
+    seeds = tuple(seeds)
+    return {f"{kind.__name__} {seed}": partial(told, kind, seed) for kind in kinds for seed in seeds}
 
 
 class Random:
