@@ -2,7 +2,8 @@
 
 A test in `tests/realtime/` or marked `realtime` needs the wall clock and a part of a core: such tests run side by side
 (`make test-all`), but alone where marked `alone`, and whenever they are repeated. One that fails while this machine
-stood still is inconclusive. All other tests pass however busy the machine is.
+stood still is inconclusive, and skipped when the last repetition is, too. All other tests pass however busy the machine
+is.
 A test that exceeds its tier's time limit fails (pytest-timeout); one that does not even return from C takes its process
 with it, and pytest-xdist names it and goes on. Property tests try the same examples on every machine, and
 look for new ones with FLOATY_FUZZ set.
@@ -59,7 +60,7 @@ def _own_search_path() -> Iterator[None]:
 
 
 class InconclusiveError(Exception):
-    """A real-time test failed on a machine that stood still: it says nothing. `make test-all` repeats it."""
+    """A real-time test failed on a machine that stood still: it says nothing. `make test-all` repeats it twice."""
 
 
 class StallMeter(threading.Thread):
@@ -220,8 +221,16 @@ def judged(item: pytest.Item) -> Iterator[Any]:
                 f"the machine stood still for {METER.longest_ms:.0f} ms, its servers for {served_ms:.0f} ms"
             )
             MACHINE.doubtful = True
+            if METER.longest_ms > STANDSTILL_MS and is_last_repetition(item):
+                pytest.skip(f"inconclusive at last: {text}: {type(error).__name__}")
             raise InconclusiveError(f"{text}: {type(error).__name__}: {error}") from error
         raise
+
+
+def is_last_repetition(item: pytest.Item) -> bool:
+    """Whether pytest-rerunfailures repeats tests, and this one no more."""
+    repetitions = item.config.getoption("reruns", None) or 0
+    return 0 < repetitions < getattr(item, "execution_count", 1)
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,5 @@
-"""The time limits of the tests: a test without an end is named, and the rest goes on."""
+"""The tiers of the tests: one without an end is named, and the rest goes on; one that fails on a machine that stands still
+is repeated."""
 
 import re
 import subprocess
@@ -10,11 +11,13 @@ import pytest
 from support.paths import ROOT
 
 CONFTEST = f"""
-import importlib.util
+import importlib.util, types
 spec = importlib.util.spec_from_file_location("tiers", {str(ROOT / "tests" / "conftest.py")!r})
 tiers = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(tiers)
-tiers.LIMITS_S, tiers.GRACE_S = {{"long": 2.0, "fast": 0.5}}, 0.5
+tiers.LIMITS_S, tiers.GRACE_S = {{"realtime": 60.0, "long": 2.0, "fast": 0.5}}, 0.5
+tiers.STEADY_S = 0.0
+tiers.METER = types.SimpleNamespace(is_alive=lambda: True, longest_ms=0.0)  # no clock decides
 globals().update({{name: value for name, value in vars(tiers).items() if name.startswith("pytest_")}})
 """
 TESTS = """
@@ -40,28 +43,75 @@ def test_last():
 """
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("workers", [0, 1])
-def test_a_test_without_an_end_is_named_and_the_rest_goes_on(tmp_path: Path, workers: int) -> None:
-    (tmp_path / "conftest.py").write_text(CONFTEST)
-    (tmp_path / "test_endless.py").write_text(TESTS)
-    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = long: takes long\n")
+MACHINES = """
+import sys
+import pytest
+
+pytestmark = pytest.mark.realtime
+conftest = sys.modules["conftest"].tiers
+
+def stand_still():
+    conftest.METER.longest_ms = 101.0
+
+def test_on_a_machine_that_stands_still():
+    stand_still()
+    assert False
+
+def test_on_one_that_stood_still_once(request):
+    if request.node.execution_count == 1:
+        stand_still()
+        assert False
+
+def test_on_one_that_stood_still_before(request):
+    if request.node.execution_count == 1:
+        stand_still()
+    assert False
+
+def test_that_is_wrong():
+    assert False
+"""
+
+
+def failing(folder: Path, tests: str, *options: str) -> str:
+    """Return what pytest shows of tests of which some fail, with this project's tiers."""
+    (folder / "conftest.py").write_text(CONFTEST)
+    (folder / "test_tiers.py").write_text(tests)
+    (folder / "pytest.ini").write_text(
+        "[pytest]\nmarkers =\n  long: takes long\n  realtime: needs the clock\n  alone: not with others\n"
+    )
     ran = subprocess.run(
-        [sys.executable, "-m", "pytest", "-v", "-n", str(workers), "-p", "no:cacheprovider", tmp_path],
-        cwd=tmp_path,
+        [sys.executable, "-m", "pytest", "-v", *options, "-p", "no:cacheprovider", folder],
+        cwd=folder,
         env={"PYTHONPATH": str(ROOT / "tests")},
         capture_output=True,
         text=True,
         timeout=120,
         check=False,
     )
-    shown = ran.stdout + ran.stderr
-    assert ran.returncode == 1, shown
+    assert ran.returncode == 1, ran.stdout + ran.stderr
+    return ran.stdout + ran.stderr
+
+
+@pytest.mark.long
+def test_a_failure_on_a_machine_that_stands_still_says_nothing_and_any_other_counts(tmp_path: Path) -> None:
+    shown = failing(tmp_path, MACHINES, "--reruns", "2", "-rsf")
+    assert "2 failed, 1 passed, 1 skipped, 7 rerun" in shown, shown
+    assert "inconclusive at last: the machine stood still for 101 ms" in shown, shown
+    for name in ("stood_still_before", "is_wrong"):
+        assert re.search(rf"FAILED test_tiers.py::test_\w*{name} - assert False", shown), shown
+    shown = failing(tmp_path, MACHINES)
+    assert shown.count("InconclusiveError: the machine stood still for 101 ms"), shown
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_test_without_an_end_is_named_and_the_rest_goes_on(tmp_path: Path, workers: int) -> None:
+    shown = failing(tmp_path, TESTS, "-n", str(workers))
     assert " in test_endless_in_c\n" in shown, shown
     if not workers:
         assert re.search(r"::test_endless_in_python .*?FAILED", shown, re.DOTALL), shown
         assert "::test_longer_than_fast PASSED" in shown, shown
     else:  # another worker takes over
         assert "Failed: Timeout (>0.5s) from pytest-timeout." in shown, shown
-        assert "crashed while running 'test_endless.py::test_endless_in_c'" in shown, shown
+        assert "crashed while running 'test_tiers.py::test_endless_in_c'" in shown, shown
         assert "2 failed, 3 passed" in shown, shown

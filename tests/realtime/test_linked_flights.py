@@ -82,7 +82,8 @@ def test_experiments_hold_their_limits_over_real_links(tmp_path: Path, name: str
 @pytest.mark.parametrize(
     ("link", "faults"),
     [
-        (DONGLE, ("radio.cut@1:0.7", "cpu.load@3=0.3", "imu.freeze@4")),
+        # Too short for cflib to give the link up, and to connect anew for more than a second.
+        (DONGLE, ("radio.cut@1:0.3", "cpu.load@3=0.3", "imu.freeze@4")),
         ("udp", ("radio.loss@1:1=0.3", "mocap.dropout@3:0.7", "servo.slow.1@1=0.5")),
         ("mavlink:pty", ("serial.cut@1:0.7", "push.y@3=0.5", "battery.sag@4:0.5=0.2")),
     ],
@@ -100,8 +101,7 @@ def test_faults_of_every_layer_act_on_every_link(tmp_path: Path, link: str, faul
     log = load_log(tmp_path / "run")
     assert column(log, "fault.active").max() >= 1
     state, free = column(log, "supervisor.state"), column(log, "flight.free") == 1
-    blind = any("cut" in fault or "dropout" in fault for fault in faults)
-    assert (state[free] == 3).any() == blind  # 0.7 s of silence is the failsafe, and it ends by itself
+    assert (state[free] == 3).any()  # without poses or IMU for longer than admitted; it ends by itself
     assert state[-1] == 2
 
 
