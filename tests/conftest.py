@@ -37,7 +37,7 @@ REALTIME = Path(__file__).parent / "realtime"
 STANDSTILL_MS = 100  # of the test's own process, which no real-time test need survive
 METER_PERIOD_S = 0.005
 STEADY_MS, STEADY_S = 20, 5.0  # a machine runs steadily when a busy process misses no longer time for so long
-PATIENCE_S = 600.0  # that the tests of one session wait for a steady machine, together
+PATIENCE_S = 120.0  # that the tests of one session wait for a steady machine, together
 LIMITS_S = {
     "realtime": 600.0,
     "long": 600.0,

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from hil.research.design.linear import Point
 from hil.world.config import GeometryConfig
-from hil.world.floaty.geometry import axis_of, weigh
-from hil.world.floaty.shape import MIRRORS, MIX, SIGNS, flap_plates
+from hil.world.floaty.geometry import weigh
+from hil.world.floaty.shape import MIRRORS, MIX, SIGNS, turning_plates
 from hil.world.motion import GRAVITY
 
 GRID = 11  # openings of each flap between its limits
@@ -33,18 +33,15 @@ class Attainable:
 
 def wrenches(geometry: GeometryConfig, openings: NDArray[np.float64], pressure: float) -> Wrenches:
     """Return force and torque for openings (N, 4) [rad] in an updraft of dynamic pressure times C_D `pressure` [N/m2]."""
-    height, axis = weigh(geometry).axis_height, axis_of(geometry)
+    height = weigh(geometry).axis_height
     total = np.zeros((len(openings), 6))
     total[:, 2] = pressure * geometry.base_side**2
-    for part in flap_plates(geometry):
+    for area, *turning in turning_plates(geometry):
         for flap, mirror in enumerate(MIRRORS):
             # Cosine and sine in the sense of rotation of flap 2.
             c, s = np.cos(openings[:, flap])[:, None], -np.sin(openings[:, flap])[:, None]
-            n, r = (
-                mirror * ((axis @ v) * axis + c * (v - (axis @ v) * axis) + s * np.cross(axis, v))
-                for v in (part.normal, part.centre)
-            )
-            force = pressure * part.area * (n[:, 2] * np.abs(n[:, 2]))[:, None] * n
+            n, r = (mirror * (along + c * across + s * beside) for along, across, beside in turning)
+            force = pressure * area * (n[:, 2] * np.abs(n[:, 2]))[:, None] * n
             total[:, :3] += force
             total[:, 3:] += np.cross(r + np.array([0.0, 0.0, height]), force)
     return total

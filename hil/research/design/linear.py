@@ -5,6 +5,7 @@ States: velocity x, y, z (W), small turns about x, y, z, rates about x, y, z (B)
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -80,6 +81,7 @@ def calm_plates(geometry: GeometryConfig, speed: float, opening: float) -> Float
     return calm(blocks, speed)
 
 
+@lru_cache(4)  # a search looks at the same hover several times
 def linear(geometry: GeometryConfig, speed: float, opening: float) -> Linear:
     """Return the dynamics of the plates in a hover at a speed [m/s] and opening [rad]."""
     probe = Probe(calm_plates(geometry, speed, opening))

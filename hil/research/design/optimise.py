@@ -12,6 +12,7 @@ the least authority along it, from the best shape and from the profile's, repeat
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,7 @@ NO_HOVER = 10.0  # loss
 # Typical sizes of the conditions: Routh's three of an axis, and steering times stiffness.
 SIZES = (5.0, 100.0, 1000.0, 1000.0)
 STEP = math.radians(3.0)  # between the checked openings of a range of speeds
+IS_SHARE = np.arange(len(QUANTITIES) + 24) < len(QUANTITIES)  # of what a climb keeps positive
 BAD = -1.0  # figure of a robot that violates a condition
 
 
@@ -169,13 +171,17 @@ class Shapes:
     def climb(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the shape with the largest least authority, climbing along the conditions from x."""
 
-        def above(z: NDArray[np.float64]) -> NDArray[np.float64]:
-            point = self.build(LOW + z[:-1] * (HIGH - LOW))
+        @lru_cache(2 * len(LOW))  # slopes ask for the shape where they begin again and again
+        def reached(*z: float) -> NDArray[np.float64]:
+            point = self.build(LOW + np.array(z) * (HIGH - LOW))
             if point is None:
-                return np.full(len(QUANTITIES) + 24, -NO_HOVER)
+                return np.full(len(IS_SHARE), -NO_HOVER)
             found = authorities(point)
-            shares = [found[name] / self.share[name] - z[-1] for name in QUANTITIES]
+            shares = [found[name] / self.share[name] for name in QUANTITIES]
             return np.concatenate([shares, conditions(point) - MARGIN])
+
+        def above(z: NDArray[np.float64]) -> NDArray[np.float64]:
+            return reached(*z[:-1].tolist()) - z[-1] * IS_SHARE
 
         z = np.append((x - LOW) / (HIGH - LOW), 0.0)
         slope = np.append(np.zeros(len(LOW)), -1.0)

@@ -30,7 +30,8 @@ DRAG_COEFFICIENTS = (0.1, 3.0)  # plausible for a plate
 def _turning(vector: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return A, B, C, (3, 3), of a vector that turns about the flap's axis."""
     along = axis * math.fsum(axis * vector)
-    return np.array([along, vector - along, np.cross(axis, vector)])
+    (x, y, z), (u, v, w) = axis.tolist(), vector.tolist()
+    return np.array([along, vector - along, (y * w - z * v, z * u - x * w, x * v - y * u)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +54,16 @@ def flap_plates(geometry: GeometryConfig) -> tuple[Plate, Plate]:
     return Plate(flat[0], normals[0], flat[1]), Plate(strip[0], normals[1], strip[1])
 
 
+@lru_cache(256)
+def turning_plates(geometry: GeometryConfig) -> list[tuple[float, NDArray[np.float64], NDArray[np.float64]]]:
+    """Return the area [m2] of the parts of flap 2, and A, B, C, (3, 3), of normal and centre [m]."""
+    axis = axis_of(geometry)
+    return [
+        (part.area, _turning(part.normal, axis), _turning(part.centre, axis))
+        for part in flap_plates(geometry)
+    ]
+
+
 def _quadrant(geometry: GeometryConfig) -> list[tuple[float, NDArray[np.float64]]]:
     """Return area and centre for a quadrant without the base plate's corner; G0's hashes depend on these sums."""
     side, corner = geometry.footprint / 2, geometry.base_side / 2
@@ -71,10 +82,10 @@ def drag_coefficient(geometry: GeometryConfig, airspeed: float, hover_angle: flo
     """Return the C_D at which the robot hovers at a speed [m/s] and an opening of its flaps [rad]."""
     lift = geometry.base_side * geometry.base_side  # [m2] per dynamic pressure and C_D
     c, s = cos(hover_angle), -sin(hover_angle)  # flap 2 hovers at the negative angle
-    for part in flap_plates(geometry):
-        a, b, d = _turning(part.normal, axis_of(geometry))[:, 2].tolist()
+    for area, normal, _ in turning_plates(geometry):
+        a, b, d = normal[:, 2].tolist()
         across = a + b * c + d * s
-        lift += 4.0 * part.area * across * across * abs(across)
+        lift += 4.0 * area * across * across * abs(across)
     pressure = AIR_DENSITY * airspeed * airspeed
     return 2.0 * weigh(geometry).mass * GRAVITY / (pressure * lift) if lift > 0.0 else math.inf
 
@@ -93,13 +104,13 @@ def check_hover(geometry: GeometryConfig, plant: PlantConfig) -> None:
 
 def place_plates(flaps: Flaps, geometry: GeometryConfig, hover_angle: float) -> None:
     """Write the areas, normals and centres of pressure of all plates, and the hover angles."""
-    height, axis = weigh(geometry).axis_height, axis_of(geometry)
+    height = weigh(geometry).axis_height
     flaps.base_area = geometry.base_side * geometry.base_side
     flaps.hover[:] = SIGNS * hover_angle
     flaps.hover_turn[:] = cos(hover_angle), -sin(hover_angle)
     flaps.flow_points[:, :2], flaps.flow_points[:, 2] = geometry.flow_point * MIRRORS[:, :2], height
     lift = np.array([[0.0, 0.0, height], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    for plate, (mirror, part) in enumerate(product(MIRRORS, flap_plates(geometry))):
-        flaps.area[plate] = part.area
-        flaps.normal[plate] = (mirror * _turning(part.normal, axis)).ravel()
-        flaps.centre[plate] = (mirror * _turning(part.centre, axis) + lift).ravel()
+    for plate, (mirror, (area, normal, centre)) in enumerate(product(MIRRORS, turning_plates(geometry))):
+        flaps.area[plate] = area
+        flaps.normal[plate] = (mirror * normal).ravel()
+        flaps.centre[plate] = (mirror * centre + lift).ravel()
