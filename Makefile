@@ -19,7 +19,7 @@ test-all: .venv/test.stamp
 
 # The outputs of tests/approved as they are now: read what git shows of them, and commit what was meant.
 approve: .venv/test.stamp
-	for test in outputs kernels translations services emulator parts world servers stations research policies experiments wire; do PYTHONPATH=tests $(BIN)/python tests/approved/test_$$test.py || exit; done
+	for test in outputs kernels translations services emulator parts world servers stations research policies experiments wire numbers; do PYTHONPATH=tests $(BIN)/python tests/approved/test_$$test.py || exit; done
 	git diff --stat tests/approved
 
 check: .venv/test.stamp
