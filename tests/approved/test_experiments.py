@@ -3,14 +3,18 @@
 `experiments.json` can be read: a number that changes there changes what a run's verdict means.
 """
 
+import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace as Made
 from typing import Any
 
 import pytest
 
 from ground_station.trajectory import Goal
+from hil.config import load_config
+from hil.deploy.drill import DRILL, FAILURE
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import KINDS, SHIPPED
@@ -65,8 +69,29 @@ def kinds() -> dict[str, str]:
     }
 
 
+def drilled(experiment: Experiment) -> dict[str, Any]:
+    """Return all that a drill asks of a flight, and what its script plans."""
+    planned: list[str] = []
+    mocap = Made(dropout=0.25)
+
+    def plan(at_us: int, act: Callable[[int], None]) -> None:
+        before, count = mocap.dropout, len(planned)
+        act(at_us)
+        if len(planned) == count:
+            planned.append(f"{at_us / 1e6:g} s: dropout {before:g} to {mocap.dropout:g}")
+
+    line = Made(command=lambda now_us, packet: planned.append(f"{now_us / 1e6:g} s: {packet!r}"))
+    flight: Any = Made(
+        config=load_config(), release_us=11_000_000, robot=Made(mocap=mocap), line=line, events=Made(at=plan)
+    )
+    experiment.script(flight)
+    settings = [re.sub("=/.*/", "=", one) for one in experiment.settings]
+    return asked(experiment) | {"settings": settings, "planned": planned}
+
+
 FOUND: dict[str, Callable[[], Any]] = {
     **{name: partial(asked, one) for name, one in EXPERIMENTS.items()},
+    **{one.name: partial(drilled, one) for one in (DRILL, FAILURE)},
     "kinds of faults": kinds,
 }
 

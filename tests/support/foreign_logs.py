@@ -65,12 +65,13 @@ FOREIGN: Mapping[str, Mapping[str, Any]] = {
 
 
 def micro_sd(version: int) -> bytes:
-    """Return a log of two kinds of events, as tools/usdlog of the firmware reads it."""
+    """Return a log of two kinds of events and one that never happened, as tools/usdlog of the firmware reads it."""
     stamp, step = ("<HI", 20) if version == 1 else ("<HQ", 20_000)
-    data = b"\xbc" + struct.pack("<HH", version, 2)
+    data = b"\xbc" + struct.pack("<HH", version, 3)
     data += struct.pack("<H", 0) + b"fixedFrequency\0" + struct.pack("<H", 3)
     data += b"stateEstimate.x(f)\0stateEstimate.y(f)\0stateEstimate.z(f)\0"
     data += struct.pack("<H", 7) + b"estTDOA\0" + struct.pack("<H", 2) + b"idA(B)\0difference(f)\0"
+    data += struct.pack("<H", 9) + b"estTOF\0" + struct.pack("<H", 1) + b"distance(f)\0"
     for row, p in enumerate(PLACE):
         data += struct.pack(stamp, 0, row * step) + struct.pack("<3f", *p)
         if row == 5:

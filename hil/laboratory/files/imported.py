@@ -134,8 +134,6 @@ def _complete(what: str, found: dict[str, tuple[Any, str, str]], count: int, not
     angles = [found.pop(f"cameras.{angle}", None) for angle in ("roll", "pitch", "yaw")]
     turn = [f"cameras.q{part}" for part in "wxyz"]
     if not set(turn) <= found.keys():
-        for name in turn:
-            found.pop(name, None)
         if None in angles:
             notes.append("the attitude is unknown: nothing gives a quaternion, or roll, pitch and yaw")
             quaternions = np.full((count, 4), np.nan)

@@ -33,6 +33,7 @@ from hil.research.design.claims import Claim
 from hil.research.design.linear import point_of
 from hil.research.studies.catalogue import STUDIES
 from hil.research.studies.paper_identification import COLUMNS, WHY, PaperConstant
+from hil.research.studies.two_boards import FirstCount, TwoBoards
 from support.command import Cli
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -558,16 +559,25 @@ def test_each_file_of_own_logic_that_can_fly_is_a_line_and_one_refusal_is_enough
 
 
 @pytest.mark.parametrize("identical", [True, False])
-def test_logs_are_identical_only_with_the_same_columns(cli: Cli, asked: Asked, identical: bool) -> None:
+@pytest.mark.parametrize(("boards", "why"), [(None, ()), (TwoBoards(None, ()), ("no servo count differs",)),
+    (TwoBoards(FirstCount(7, 0.07, "m3", (5, 6), "radio"), ("radio: late", "gyro: cold")),
+    ("first servo count: row 7, 0.070 s from the release, m3: 5 | 6: radio", "radio: late", "gyro: cold"))])  # fmt: skip
+def test_logs_are_identical_only_with_the_same_columns_and_boards_say_why_they_differ(
+    cli: Cli, asked: Asked, identical: bool, boards: TwoBoards | None, why: tuple[str, ...]
+) -> None:
     comparison = Made(identical=identical, first=None, unmeasured=("own.py:turn",))
     asked.answer({
         "pictures.compare.load_flown": lambda folder, find: f"flown {folder}", "pictures.compare.compare": comparison,
-        "research.studies.two_boards.comparable": False, "pictures.compare.write_comparison": "page",
+        "research.studies.two_boards.comparable": boards is not None, "research.studies.two_boards.two_boards": boards,
+        "pictures.compare.write_comparison": "page",
         "commands.compare.print_comparison": None,
     })  # fmt: skip
     assert cli("compare", "a", "b") == (0 if identical else 1)
-    assert ("write_comparison", Path("b"), "flown a", "flown b", comparison, ()) in asked
-    assert (cli.out, cli.err.count("'--experiment own.py:turn' executes it")) == ("  page\n", 1)
+    assert ("write_comparison", Path("b"), "flown a", "flown b", comparison, why) in asked
+    assert (cli.out, cli.err.count("'--experiment own.py:turn' executes it")) == (
+        "\n".join((*why, "  page\n")),
+        1,
+    )
 
 
 def test_a_robot_of_another_size_is_analysed_and_written_as_a_profile_of_its_length(

@@ -98,6 +98,11 @@ def test_a_server_says_how_a_program_gets_the_bus_and_where_its_cameras_are(
     assert cli.refusal("serve", "--usb") == "floaty: --usb: no bus\n"
 
 
+def test_an_override_without_an_effect_is_refused_by_its_option(cli: Cli) -> None:
+    refused = cli.refusal("serve", "--set", "quadrotor.mass=1")
+    assert refused == "floaty: --set quadrotor.mass=1: has no effect on the robot of profile floaty\n"
+
+
 @pytest.mark.parametrize(("words", "absolute", "plan", "endpoints"), [
     ("", True, (1, False, [], None), (19850, None, [], None, True)),
     ("--station --seed 7", False, (7, False, [], None), (19850, None, [], "corrections", True)),

@@ -10,7 +10,19 @@ import pytest
 
 from firmware_py.core.structs import Control
 from firmware_py.export.profile_c import profile_hash
-from firmware_py.wire.core_port import HEAD, READ_MAX, Health, Hil, Message, read
+from firmware_py.wire.core_port import (
+    _LOOP,
+    CHANNEL_LOOP,
+    HEAD,
+    PORT_CORE,
+    READ_MAX,
+    Health,
+    Hil,
+    Loop,
+    Message,
+    read,
+)
+from firmware_py.wire.crtp import Packet, encode
 from ground_station.links import packets
 from ground_station.links.core_client import CoreClient
 from hil.config import load_config
@@ -137,6 +149,34 @@ def test_a_reading_is_judged_at_both_of_its_bounds(
     client.begin()
     board.app._struct(Control).count[2] = int(values.get("count", 30_000))
     assert {one.subject: one.good for one in doctor._health(client)}[subject] == good
+
+
+def test_the_core_is_reset_and_called_in_the_order_of_a_tick(
+    board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    called: list[str] = []
+    call = doctor.RealCore.call
+    monkeypatch.setattr(doctor.RealCore, "call", lambda core, name: called.append(name) or call(core, name))
+    client = CoreClient(board, "board")
+    assert doctor._core(client, client.begin(), load_config()).good
+    assert called == ["reset", *20 * ["estimate", "supervise", "control"]]
+
+
+@pytest.mark.parametrize(("full", "timeout_s"), [(False, 0.0), (True, 0.001)])
+def test_a_full_window_waits_for_reports_and_the_last_one_counts(full: bool, timeout_s: float) -> None:
+    reports = [Loop(n, *range(n + 1, n + len(Loop._fields)))._replace(fresh=True) for n in (1, 2)]
+    sent = [encode(Packet(port, channel, _LOOP.pack(*report))) for report in reports
+        for port, channel in ((PORT_CORE, CHANNEL_LOOP), (PORT_CORE, CHANNEL_LOOP + 1), (2, CHANNEL_LOOP))]  # fmt: skip
+    waited: list[float] = []
+    noted: list[Loop] = []
+    client: Any = SimpleNamespace(
+        packets=SimpleNamespace(received=lambda timeout_s: waited.append(timeout_s) or sent)
+    )
+    window: Any = SimpleNamespace(full=full, on_report=lambda report, now_us: noted.append(report))
+    assert doctor._last_report(client, window) == reports[1]
+    assert (waited, noted) == ([timeout_s], reports)
+    sent.clear()
+    assert doctor._last_report(client, window) is None
 
 
 def test_a_board_without_samples_is_reported(cli: Cli, board: Board, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,6 @@ from pathlib import Path
 from types import SimpleNamespace as Made
 from typing import Any
 
-import numpy as np
 import pytest
 from cflib.crazyflie.high_level_commander import HighLevelCommander
 from cflib.crazyflie.localization import Localization
@@ -39,27 +38,6 @@ def test_the_drill_s_states_and_refusals_come_when_they_are_planned(tmp_path: Pa
         assert 1e-6 * one["t_us"] == pytest.approx(t_s, abs=0.003), one
     states = [text for _, text in PLANNED if text.split(",")[0] in ("waiting", "flying", "failsafe")]
     assert beside.states_of(tmp_path / "run") == states
-
-
-def test_every_planned_change_of_a_parameter_lasts_a_fifth_of_a_second(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    changed: dict[str, list[float]] = {}
-    line = Made(command=lambda packet: None)
-    events = Made(at=lambda at_us, call: None)
-    monkeypatch.setattr(
-        "hil.deploy.drill.KINDS", {"mocap.dropout": Made(knobs=[Made(turn=lambda *how: None)])}
-    )
-    monkeypatch.setattr(
-        "hil.deploy.drill.plan",
-        lambda flight, start_s, *writes: [
-            changed.setdefault(name, []).append(start_s + at_s) for at_s, name, *_ in writes
-        ],
-    )
-    flight: Any = Made(config=load_config(), robot=None, events=events, line=line, release_us=11_000_000)
-    drill(flight)
-    assert {"extCtrl.manual", "floaty.armed", "floaty.stop", "extPose.absolute"} <= changed.keys()
-    assert min(min(np.diff(times)) for times in changed.values()) == pytest.approx(0.2)
 
 
 def test_its_packets_are_those_that_cflib_sends() -> None:

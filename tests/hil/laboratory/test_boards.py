@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from hil.config import load_config
+from hil.laboratory import request
 from hil.laboratory.files.recorder import load_log
 from hil.laboratory.files.result import Result
 from hil.laboratory.lockstep import image_at
@@ -87,3 +88,22 @@ def test_the_emulated_chip_is_compiled_only_once(tmp_path: Path, monkeypatch: py
         assert list(folder.iterdir()) == []
     (library,) = places
     assert library.is_relative_to(tmp_path / "cache")
+
+
+@pytest.mark.parametrize(("link", "board", "expected"), [
+    ("radio", "c", []),
+    ("mavlink", "python", [("--link mavlink", "mavlink", "pymavlink")]),
+    ("mavlink:pty", "c", [("--link mavlink:pty", "mavlink", "pymavlink", "serial")]),
+    ("udp://127.0.0.1:1", "c", [("--link udp://127.0.0.1:1", "radio", "cflib")]),
+    ("radio", "usb://0", [("--board usb://0", "radio", "cflib")]),
+    ("mavlink", "cortex-m4", [("--link mavlink", "mavlink", "pymavlink"),
+        ("--board cortex-m4", "deploy", "unicorn", "elftools", "ziglang")]),
+    ("radio", __file__, [(f"--board {__file__}", "deploy", "unicorn", "cffi", "elftools")]),
+])  # fmt: skip
+def test_each_link_and_board_needs_its_own_packages(
+    monkeypatch: pytest.MonkeyPatch, link: str, board: str, expected: list[tuple[str, ...]]
+) -> None:
+    needed: list[tuple[str, ...]] = []
+    monkeypatch.setattr(request, "require", lambda *what: needed.append(what))
+    request.Bench(link, board).check()
+    assert needed == expected

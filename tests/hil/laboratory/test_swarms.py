@@ -73,6 +73,27 @@ def test_boards_hear_what_the_others_send(tmp_path: Path, monkeypatch: pytest.Mo
         assert sum("peer says hello" in line for line in events) == 2
 
 
+def test_ctrl_c_ends_each_robot_that_still_flies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(now_us: int, end_us: int) -> None:
+        raise KeyboardInterrupt
+
+    booted: list[Firmware] = []
+
+    class Board(PythonBoard):
+        def boot(self, start: PowerOn) -> Firmware:
+            booted.append(PythonBoard().boot(start))
+            if len(booted) == 1:
+                booted[0].radio_received = lambda *_: 1 / 0
+            return booted[-1]
+
+    monkeypatch.setattr(flying, "executor_of", lambda request, stack: Board())
+    request = swarm_of([find_experiment("hover")] * 3, duration_s=0.2, overrides=APART)
+    result = flying.fly_swarm(request, tmp_path, stop)
+    assert [one.outcome for one in result.robots] == ["error", "interrupted", "interrupted"]
+    texts = [(one.folder / "events.jsonl").read_text() for one in result.robots]
+    assert ["interrupted by the user" in text for text in texts] == [False, True, True]
+
+
 def neighbours(*places: tuple[float, float, float], **settings: float) -> Neighbours:
     """Return robots of 30 g at places, after one computation."""
     block = Neighbours.allocate()

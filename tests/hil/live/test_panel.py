@@ -72,8 +72,13 @@ def receive(loop: IOLoop, socket: WebSocketClientConnection) -> dict:
 @pytest.mark.parametrize("program", COMMANDS)
 def test_a_program_s_panel_has_its_commands(program: str) -> None:
     panel = PanelScreen(program, [].append)
-    page = urllib.request.urlopen(panel.address, timeout=20).read().decode()
+    with urllib.request.urlopen(panel.address, timeout=20) as answered:
+        page, headers = answered.read().decode(), answered.headers
     panel.close()
+    policy = ("default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
+        f"connect-src ws://{panel.origin[7:]}; frame-src http://127.0.0.1:*; frame-ancestors 'none'")  # fmt: skip
+    kept = ("Content-Security-Policy", "Referrer-Policy", "Cache-Control")
+    assert [headers[name] for name in kept] == [policy, "no-referrer", "no-store"]
     content = json.loads(page.split('id="content">')[1].split("</script>")[0])
     assert content["commands"] == list(COMMANDS[program])
     assert bool(content["faults"]) == (program != "station")

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from hil.config import load_config
 from hil.laboratory.experiments.power import VEHICLES
-from hil.pictures import charts, swarm
+from hil.pictures import charts, drawing, gallery, swarm
 from hil.pictures.curves import BLUE, GREEN, GREY, ORANGE, PINK, RED, SKY, YELLOW, task_colour
 from hil.pictures.drawing import figure_of, name_marks
-from hil.pictures.panels import Bar, Instant, Interval, Marks, Panel, Plot, Series
+from hil.pictures.panels import Bar, Instant, Interval, Marks, Panel, Plot, Series, Still
 from hil.pictures.path import FlownPath, _grid, _Wall, path_of
 from hil.world.floaty.geometry import weigh
 from support.html_page import lines_of
@@ -226,6 +226,12 @@ def test_an_overload_has_the_misses_per_second_and_the_largest_error_at_each_sha
     assert error.lines[3].get_ydata() == pytest.approx([10.0, 10.0])
     assert (late.get_yscale(), error.get_yscale()) == ("symlog", "log")
     assert [axes.get_ylabel() for axes in (late, error)] == ["missed deadlines [1/s]", "largest error [cm]"]
+
+
+def test_a_chart_is_drawn_of_all_flights(monkeypatch: pytest.MonkeyPatch) -> None:
+    flights = [pa.table({"t": [0]}), pa.table({"t": [1]})]
+    monkeypatch.setattr(drawing, "png", lambda draw, *of: repr((draw, *of)).encode())
+    assert gallery.chart("compare", *flights) == Still(repr((charts.compare, *flights)).encode(), "png")
 
 
 def test_vehicles_have_their_power_per_mass_and_floaty_the_mean_of_its_flights() -> None:

@@ -101,6 +101,7 @@ def test_a_broken_controller_is_one_message_without_traceback(pytester: pytest.P
     assert f"{tests}:14: experiment 'no-such': unknown" in shown
     assert "hil/" not in shown
     assert "LabError" not in shown
+    assert "floaty flights" not in shown, "of a test that flew nothing"
 
 
 @pytest.mark.long
@@ -399,10 +400,12 @@ def test_a_package_that_a_test_file_needs_is_one_line(
         test_learn="import gymnasium",
         test_any="from hil.testing import faults",
         test_late="def test_it(floaty):\n    import gymnasium",
+        test_other="from hil.errors import LabError\n\ndef test_it():\n    raise LabError('mine')",
     )
     result = pytester.runpytest_inprocess("--continue-on-collection-errors")
-    result.assert_outcomes(failed=1, errors=2)
+    result.assert_outcomes(failed=2, errors=2)
     shown = result.stdout.str()
+    assert "raise LabError('mine')" in shown, "a test without the fixture is not the plugin's"
     for place, package in (("learn.py", "gymnasium"), ("any.py", ".*hypothesis"), ("late.py:2", "gymnasium")):
         assert re.search(rf"^test_{place}: {package} is missing: .* -m pip install ", shown, re.MULTILINE)
     assert "Traceback" not in shown

@@ -92,15 +92,19 @@ def test_a_profile_names_every_share_once_and_the_greatest_first(tmp_path: Path)
     }  # fmt: skip
 
 
-def test_the_counts_of_flights_add_up_beyond_32_bits(tmp_path: Path) -> None:
+def test_the_counts_of_flights_add_up_beyond_32_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     out = tmp_path / "cov.v1"
     (tmp_path / "cov.v1.counts").touch()  # of a process that was killed
     counts = np.zeros((2**19 + 1, 3), np.uint64)
     counts[[0, 7, -1]] = (1, 2, 3), (2**32 - 1, 0, 5), (0, 0, 9)
-    for flights in (1, 2, 3):
+    for flights, names in ((1, None), (2, Path("names")), (3, None)):
         check_coverage(out, "image")
-        add_executed(out, Executed("image", 2, counts, "board", None))
+        add_executed(out, Executed("image", 2, counts, "board", names))
         found = read_executed(out)
+        assert (found.board, found.elf) == (str(tmp_path / "board"), names and tmp_path / "names"), (
+            "from anywhere"
+        )
         assert (found.flights, (found.counts == flights * counts).all()) == (2 * flights, True)
     assert [base_of(tmp_path / name).name for name in ("a", "a.info", "a.v1", "a.v1.info")] == [
         "a",
