@@ -68,8 +68,8 @@ def test_the_goal_moves_once_the_board_flies_and_judges_the_flight(tmp_path: Pat
     times, goal = column(log, "t") * 1e-6, column(log, "goal.yaw")
     released = times[np.argmax(column(log, "flight.free"))]
     (stepped,) = times[1:][np.diff(goal) != 0.0]
-    # 1 s after the trajectory's begin, which the station sees by telemetry.
-    assert 0.5 < stepped - released < 1.3
+    # 1 s of the station after the trajectory's begin, which it sees by telemetry; a busy board has flown less by then.
+    assert 0.2 < stepped - released < 1.3
     assert goal[-1] == pytest.approx(np.radians(110.0))
 
 
