@@ -63,6 +63,7 @@ class CrazyradioLink(LiveLink):
         self._crazyflie: Crazyflie | None = None
         self._connected = threading.Event()
         self._lost = ""  # cflib's reason for it
+        self._unsafe = False  # without safelink: nothing answered when cflib tried to switch it on
         self._console = b""  # the unfinished line that the board has printed
         self._logs = LogBlocks(self._queue, self._log_table)
         self._telemetry_us = 0  # arrival of the last packet of a log block
@@ -74,17 +75,20 @@ class CrazyradioLink(LiveLink):
             raise LinkError(f"{self.uri}: expected radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:19850")
         start_cflib()
         self._connected = connected = threading.Event()
-        self._lost, self._logs = "", LogBlocks(self._queue, self._log_table)
+        self._lost, self._unsafe, self._logs = "", False, LogBlocks(self._queue, self._log_table)
         crazyflie = self._crazyflie = Crazyflie(rw_cache=self._cache)
         # The thread of cflib's own pings waits for itself when it is the first to meet a lost link.
         crazyflie.link_statistics.latency.start = lambda: None
-        crazyflie.packet_received.add_callback(self._on_any_packet)
+        crazyflie.packet_received.add_callback(partial(self._on_any_packet, crazyflie))
         crazyflie.connected.add_callback(lambda uri: connected.set())
         for event in ("connection_failed", "connection_lost", "disconnected_link_error"):
             getattr(crazyflie, event).add_callback(partial(self._on_lost, crazyflie))
         crazyflie.open_link(self.uri)
 
     def _connect(self) -> bool:
+        if self._unsafe:  # a board that has it switched on takes no second packet
+            self._close()
+            self._open()
         crazyflie = self._crazyflie
         if crazyflie is None or not self._connected.wait(POLL_S):
             return False
@@ -137,8 +141,10 @@ class CrazyradioLink(LiveLink):
         crazyflie, self._crazyflie = self._crazyflie, None
         if crazyflie is not None:
             closing = threading.Thread(target=crazyflie.close_link, name="closing", daemon=True)
+            has_link = crazyflie.link is not None  # cflib itself closes a lost one
             closing.start()
-            closing.join(CFLIB_CLOSES_S)
+            if has_link:
+                closing.join(CFLIB_CLOSES_S)
 
     def _log_table(self) -> dict[str, int]:
         """Return the numbers of the board's log variables, as fetched by cflib."""
@@ -208,7 +214,10 @@ class CrazyradioLink(LiveLink):
         self._logs.notices.clear()
         return samples
 
-    def _on_any_packet(self, packet: CRTPPacket) -> None:
+    def _on_any_packet(self, crazyflie: Crazyflie, packet: CRTPPacket) -> None:
+        link = crazyflie.link
+        if crazyflie is self._crazyflie and link is not None:
+            self._unsafe = link.needs_resending
         if packet.header & NULL_MASK != NULL_HEADER:  # the radio chip answers even without a board behind it
             self.received_us = clock_us()
 

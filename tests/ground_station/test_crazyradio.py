@@ -4,7 +4,7 @@ import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace as Made
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
@@ -45,12 +45,14 @@ class Cflib:
 
     protocol = 10
     answers = True  # connects
+    safelinks: ClassVar[list[bool]] = [True]  # whether each link has safelink, the last one again and again
 
     def __init__(self, rw_cache: str) -> None:
         self.sent: list[bytes] = []
         self.set: dict[str, float] = {}
         self.callbacks: dict[int, list[Callable[[CRTPPacket], None]]] = defaultdict(list)
         self.closed = 0
+        self.link: Made | None = None
         for event in (
             "packet_received",
             "connected",
@@ -80,7 +82,11 @@ class Cflib:
         """Cflib's own pings are not answered."""
 
     def open_link(self, uri: str) -> None:
+        safe = self.safelinks.pop(0) if self.safelinks[1:] else self.safelinks[0]
+        self.link = Made(needs_resending=not safe)
         if self.answers:
+            self.receive(bytes((0xFF, 1, 40)))
+        if self.answers and safe:
             self.receive(bytes((0xF0,)))
             self.connected.call(uri)
 
@@ -159,6 +165,46 @@ def test_a_board_that_connects_is_told_of_corrections_and_asked_for_telemetry_ea
         assert set(board.board.periods) == {block.id for block in ALL_BLOCKS}
         air.link.close()
         assert board.closed == 1
+
+
+def test_a_link_without_safelink_is_opened_anew_until_it_has_one(
+    air: Air, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A board with safelink on takes none of its packets but the first: cflib would wait for an answer for ever."""
+    monkeypatch.setattr(Cflib, "safelinks", [False, False, True])
+    monkeypatch.setattr(crazyradio, "POLL_S", 0.0)
+    board = air.open()
+    assert [one.closed for one in air.boards] == [1, 1, 0]
+    assert board is air.boards[2]
+    air.link.check()
+
+
+def test_closing_waits_for_cflib_unless_the_link_is_lost(air: Air, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes up to a second, which a robot without corrections need not survive; until then an older one says nothing."""
+    waited: list[float] = []
+
+    class Closing(threading.Thread):
+        def join(self, timeout: float | None = None) -> None:
+            super().join()
+            if self.name == "closing":
+                waited.append(timeout or 0.0)
+
+    monkeypatch.setattr(threading, "Thread", Closing)
+    first = air.open()
+    air.link.close()
+    assert waited == [crazyradio.CFLIB_CLOSES_S]
+    second = air.open()
+    second.link = None
+    second.connection_lost.call(URI, "Too many packets lost")
+    air.link.close()
+    third = air.open()
+    for old in (first, second):
+        old.link = Made(needs_resending=True)
+        old.receive(bytes((0xFF, 1, 40)))
+        old.disconnected_link_error.call(URI, "older")
+    assert not air.link._unsafe
+    air.link.check()
+    assert (len(waited), third.closed) == (1, 0)
 
 
 def test_without_the_parameter_of_absolute_poses_none_is_written(
