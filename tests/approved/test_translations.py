@@ -1,7 +1,7 @@
 """What the translators said to random programs with a mistake, they still say: the refusal, or a hash of the C.
 
-Two thirds of the mistakes are statements that users write, the others wrong operators, calls and numbers. If a change is
-meant: make approve.
+Two thirds of the mistakes are statements that users write, the others wrong operators, calls and numbers. Modules of
+random structs and hooks are read as they were. If a change is meant: make approve.
 """
 
 import hashlib
@@ -15,13 +15,17 @@ import numpy as np
 import pytest
 
 from firmware_py.core.subset import i32
+from firmware_py.export.c99 import core_texts
 from firmware_py.export.errors import ExportError
 from firmware_py.export.kernels import translate
 from firmware_py.export.live_reading import Arrays
+from firmware_py.export.reading import read_modules
 from firmware_py.logic.loading import LogicError, check_file
+from firmware_py.logic.plugs import POINTS, read_plug
 from support.approved import approve, judge
 from support.random_frames import KERNEL, KERNEL_HEAD, LIVE, OWN, law_of, names_in
 from support.random_mistakes import mistaken
+from support.random_modules import random_module
 from support.random_programs import Programs
 
 KNOWN = Path(__file__).with_name("translations.json")
@@ -67,7 +71,25 @@ def answer(folder: str, translated: Callable[[], str]) -> str:
         return str(error).replace(folder, "")
 
 
-FINDERS = {"laws": laws, "kernels": kernels}
+def modules() -> list[list[str]]:
+    """Return what modules provide at each plug point, and their refusals."""
+    core, said = core_texts(), []
+    for point in POINTS:
+        for seed in range(6):
+            text = random_module(point.name, seed)
+            module = read_modules(core | {"own": text}, {"own": point.name}, "own")[-1]
+            plug = read_plug(point, module)
+            hooks = [f"{hook} {arguments}" for hook, arguments in plug.hooks.items()]
+            bounds = [f"{one.name} {one.low:g} {one.high:g} {one.default:g}" for one in plug.parameters]
+            named = [
+                f"{one.name} {one.scalar.name} {one.unit} in {one.place.block}.{one.place.field} {one.place.index}"
+                for one in (*plug.parameters, *plug.variables)
+            ]
+            said.append([*plug.structs, *hooks, *bounds, *named, *module.refusals.lines()])
+    return said
+
+
+FINDERS = {"laws": laws, "kernels": kernels, "modules": modules}
 
 
 @pytest.mark.parametrize("name", FINDERS)
