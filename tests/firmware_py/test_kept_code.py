@@ -205,6 +205,7 @@ def test_sources_are_replaced_where_another_process_may_compile_them() -> None:
     text = "int one(void) { return 1; }\n"
     *_, last = compilers()  # zig would fill its empty cache
     result = compile_texts({"one.c": text}, ("one.c",), ("-shared", "-fPIC"), "one.so", last)
+    assert result.stat().st_mode & 0o777 == 0o700
     with result.with_name("one.c").open() as mapped:
         result.unlink()
         assert compile_texts({"one.c": text}, ("one.c",), ("-shared", "-fPIC"), "one.so", last) == result

@@ -502,6 +502,20 @@ def test_late_reads_count_from_their_arrival():
     assert (answered_us, answer.tc1, answer.ts1) == (1_010_200, 1_007_200_000, 777)
 
 
+def test_after_a_late_read_a_request_goes_on_at_the_present_instant():
+    bench = LinkWithCodec()
+    stopped = services.parameter(services.mavlink_name("floaty.stop"), 0.0, 0, 1)
+    refused = dialect.MAVLink_command_ack_message(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 2)
+    bench.link.controls.ask(1_000, ControlRequest(ControlAction.ARM))
+    for arrived_us, reply in ((2_000, stopped), (12_000, stopped), (22_000, refused)):
+        assert bench.link.controls.answer(arrived_us) is None
+        bench.link.receive(arrived_us, reply.pack(bench.codec), arrived_us + 8_000)
+    went_on = [at_us for at_us, one in bench.sent if one.get_type() in ("PARAM_SET", "COMMAND_LONG")]
+    assert went_on == [10_000, 20_000]
+    assert bench.link.controls.answer(22_000 + REASON_US) is None
+    assert bench.link.controls.answer(22_000 + REASON_US + REPEAT_US).error.endswith("denied")
+
+
 # What goes wrong
 
 

@@ -145,6 +145,25 @@ def test_variances_are_those_of_the_plain_filter_before_the_pose() -> None:
             one.update(seen.p_WB, (0.0, 0.0, 0.0))
 
 
+def test_a_deviation_is_the_distance_and_twice_the_tangents_of_the_half_turn_from_the_prediction() -> None:
+    """In the body's axes: from the reference, and squared from where the rate has turned it since."""
+    rng = np.random.default_rng(3)
+    one = PoseFilter(0.005, 0.0005, 0.004, CONFIG.acceleration, CONFIG.angular_acceleration)
+    for _ in range(20):
+        start, turn, p = Rotation.random(rng=rng), 0.3 * rng.normal(size=3), rng.normal(size=3)
+        one.begin(tuple(rng.normal(size=3)), tuple(start.as_quat(scalar_first=True)))
+        one.predict(1, widen=True)
+        _, w = one.update(tuple(rng.normal(size=3)), tuple(0.1 * rng.normal(size=3)))
+        one.predict(1, widen=True)
+        place, q = one.pose
+        seen = Rotation.from_quat(q, scalar_first=True) * Rotation.from_rotvec(turn)
+        distance2, angle2, theta = one.deviation(tuple(p), tuple(seen.as_quat(scalar_first=True)))
+        angle = np.linalg.norm(turn)
+        assert theta == pytest.approx(2 * np.tan(angle / 2) * turn / angle, rel=1e-9)
+        assert distance2 == pytest.approx(((p - place) ** 2).sum(), rel=1e-9)
+        assert angle2 == pytest.approx(((np.array(theta) - 0.005 * np.array(w)) ** 2).sum(), rel=1e-9)
+
+
 def test_a_filter_that_begins_again_is_a_new_one() -> None:
     noise = 0.005, 0.0005, 0.004, CONFIG.acceleration, CONFIG.angular_acceleration
     used, new = PoseFilter(*noise), PoseFilter(*noise)

@@ -289,6 +289,56 @@ def tallied(failed: np.ndarray) -> Rate:
     return tally.rate
 
 
+def rate_of(failed: np.ndarray, size: int) -> tuple[int, int, float]:
+    """Failed, flown, and the variance over that of independent flights: from the clusters' scatter, with two whole ones."""
+    flown, fails = len(failed), int(failed.sum())
+    rare, clusters = min(fails, flown - fails), flown / size
+    if not rare or clusters <= 1:
+        return fails, flown, max(1, min(size, flown))
+    sums = np.array([failed[begin : begin + size].sum() for begin in range(0, flown, size)])
+    scatter = ((sums**2).sum() - fails**2 / clusters) / (1 - 1 / clusters)
+    design = scatter / (fails * (1 - fails / flown))
+    return fails, flown, min(size, max(1.0, (rare * design + 2 * size) / (rare + 2)))
+
+
+@pytest.mark.parametrize("size", [1, 2, 4])
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.7, 1.0])
+def test_a_campaign_s_rate_is_that_of_the_clusters_of_the_flights_that_are_known(
+    size: int, share: float
+) -> None:
+    """After each row, whatever their order; at the end of the flights up to it only."""
+    rng = np.random.default_rng(size)
+    failed, order = rng.random(48) < share, rng.permutation(48)
+    plan = SimpleNamespace(flights=48, half_width=0.2, cluster=size)
+    progress, seen = Progress(plan), Tally(size)  # type: ignore[arg-type]
+    arrived: list[int] = []
+    for index in (None, *order.tolist()):
+        if index is not None:
+            progress.add(index, not failed[index])
+            seen.add(index // size, not failed[index])
+            arrived.append(index)
+        interim = progress.interim
+        if progress.end is None:
+            assert interim.interval == seen.rate.interval
+            expected: Any = rate_of(failed[arrived], 1)[:2]
+        else:
+            expected = rate_of(failed[: progress.end], size)
+        assert (interim.failed, interim.flown, interim.design)[: len(expected)] == pytest.approx(expected)
+    assert progress.end is not None
+    assert progress.end % size == 0
+
+
+@pytest.mark.parametrize("size", [1, 2, 4])
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.7, 1.0])
+def test_a_rate_has_the_variance_of_its_clusters_from_none_on(size: int, share: float) -> None:
+    failed, tally = np.random.default_rng(size).random(30) < share, Tally(size)
+    for count in range(31):
+        rate = tally.rate
+        assert (rate.failed, rate.flown, rate.design) == pytest.approx(rate_of(failed[:count], size))
+        if count < 30:
+            tally.add(count // size, not failed[count])
+
+
 @pytest.mark.parametrize("alike", [0.0, 0.9])
 def test_the_interval_of_clusters_is_that_of_a_bootstrap_over_the_clusters(alike: float) -> None:
     failed = pairs(1000, 0.2, alike)
