@@ -69,10 +69,11 @@ class Callers(Random):
         super().__init__(seed)
         layouts = [one.size for one in vars(module).values() if isinstance(one, struct.Struct)]
         self.sizes = [size + extra for size in layouts for extra in (-1, 0, 1, 2)] + [0, 1, 2]
-        text = inspect.getsource(module)
+        text = inspect.getsource(module).upper()
         self.kinds = [one for _, one in sorted(dialect.mavlink_map.items()) if one.msgname in text]
         self.packed: list[bytes] = []
-        self.messages: list[dialect.MAVLink_message] = []
+        self.messages: dict[type[dialect.MAVLink_message], list[dialect.MAVLink_message]] = {}
+        self.fitting: dict[str, list[type[dialect.MAVLink_message]]] = {}  # by function
 
     def number(self) -> float:
         """Return a number as programs send them, seldom an extreme one."""
@@ -89,13 +90,14 @@ class Callers(Random):
             return bytes((self.below(self.pick(16, 256)),)) + self.data(
                 *[max(0, size - 1) for size in self.sizes]
             )
+        known = known[self.below(2) :]  # also without a packet's header
         return known[: len(known) - self.below(2)] if self.below(4) == 0 else known
 
-    def message(self) -> dialect.MAVLink_message:
-        """Return another function's message, or one of a type that the module names, with random fields."""
-        if self.messages and self.below(3):
-            return self.pick(*self.messages)
-        kind = self.pick(*self.kinds)
+    def message(self, fitting: Sequence[type[dialect.MAVLink_message]]) -> dialect.MAVLink_message:
+        """Return another function's message, or one of a type that fits or that the module names, with random fields."""
+        kind = self.pick(*fitting) if fitting and self.below(4) else self.pick(*self.kinds)
+        if kind in self.messages and self.below(2):
+            return self.pick(*self.messages[kind])
         fields = [self.field(kind, index) for index in range(len(kind.fieldnames))]
         made = kind(*fields)
         made._header = dialect.MAVLink_header(kind.id, srcSystem=self.below(9), srcComponent=self.below(9))
@@ -110,7 +112,7 @@ class Callers(Random):
         values = [self.number() if real else self.below(100) for _ in range(max(1, size))]
         return values if size else values[0]
 
-    def value(self, kind: Any) -> Any:
+    def value(self, kind: Any, function: str = "") -> Any:
         """Return an argument of a type."""
         text = str(kind)
         if kind in (int, float, bool, bytes, str):
@@ -121,7 +123,7 @@ class Callers(Random):
         if kind is Scalar:
             return self.pick(*(one[1] for one in sorted(PARAMETER_SCALARS.items())))
         if kind is dialect.MAVLink_message:
-            return self.message()
+            return self.message(self.fitting.get(function, ()))
         arguments = [one for one in getattr(kind, "__args__", ()) if one is not type(None)]
         if " | " in text or "Union" in text or "Optional" in text:
             return self.value(self.pick(*arguments))
@@ -139,7 +141,11 @@ class Callers(Random):
         """Return arguments of a function."""
         found = []
         for kind, many in declared(function):
-            found += [self.value(kind) for _ in range(self.below(9) if many else 1)]
+            if many:
+                kinds = (kind, int) if kind is float else (kind,)
+                found += [self.value(self.pick(*kinds)) for _ in range(self.below(9))]
+            else:
+                found.append(self.value(kind, function.__name__))
         return found
 
     def call(self, function: Callable[..., Any]) -> str:
@@ -152,11 +158,13 @@ class Callers(Random):
                 return f"refused {error}"
             except UNFIT:
                 continue
+            kinds = self.fitting.setdefault(function.__name__, [])
+            kinds += [type(one) for one in arguments if type(one) in {*self.kinds} - {*kinds}]
             for one in result if isinstance(result, tuple | list) else (result,):
                 if isinstance(one, bytes):
                     self.packed.append(one)
                 if isinstance(one, dialect.MAVLink_message):
-                    self.messages.append(one)
+                    self.messages.setdefault(type(one), []).append(one)
             return seen(result)
         return "unfit"
 
