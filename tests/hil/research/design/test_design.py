@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from hil.commands import design
 from hil.config import load_config
 from hil.errors import LabError
 from hil.research.design import analysis, sweeps
@@ -388,3 +389,14 @@ def test_the_model_on_board_is_printed_for_other_tools(cli: Cli, empty_folder: P
     assert height["A"] == [[0.0, 1.0, 0.0], [0.0, -2.5, model.z_u4], [0.0, 0.0, -rate]]
     assert height["B"] == [[0.0], [0.0], [rate]]
     assert not [*empty_folder.iterdir()]
+
+
+def test_a_robot_may_hover_above_one_and_up_to_sixty_metres_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the profile that is written has it."""
+    for speed, allowed in ((1.0, False), (math.nextafter(1.0, 2.0), True), (60.0, True), (60.1, False)):
+        monkeypatch.setattr(Point, "speed", speed)
+        if allowed:
+            assert design.point_of("floaty", ()).opening == HOVER
+        else:
+            with pytest.raises(LabError, match=rf"^hover at 25 deg takes {speed:g} m/s: outside 1\.\.60"):
+                design.point_of("floaty", ())
