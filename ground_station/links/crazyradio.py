@@ -139,12 +139,15 @@ class CrazyradioLink(LiveLink):
 
     def _close(self) -> None:
         crazyflie, self._crazyflie = self._crazyflie, None
-        if crazyflie is not None:
-            closing = threading.Thread(target=crazyflie.close_link, name="closing", daemon=True)
-            has_link = crazyflie.link is not None  # cflib itself closes a lost one
-            closing.start()
-            if has_link:
-                closing.join(CFLIB_CLOSES_S)
+        if crazyflie is None:
+            return
+        closing = threading.Thread(target=crazyflie.close_link, name="closing", daemon=True)
+        link = crazyflie.link  # None: cflib itself has closed a lost one
+        if link is not None and self._unsafe:
+            link.close()  # before the next one takes the air
+        closing.start()
+        if link is not None and not self._unsafe:
+            closing.join(CFLIB_CLOSES_S)
 
     def _log_table(self) -> dict[str, int]:
         """Return the numbers of the board's log variables, as fetched by cflib."""

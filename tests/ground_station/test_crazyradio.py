@@ -53,6 +53,7 @@ class Cflib:
         self.callbacks: dict[int, list[Callable[[CRTPPacket], None]]] = defaultdict(list)
         self.closed = 0
         self.link: Made | None = None
+        self.closed_links: list[str] = []
         for event in (
             "packet_received",
             "connected",
@@ -83,7 +84,7 @@ class Cflib:
 
     def open_link(self, uri: str) -> None:
         safe = self.safelinks.pop(0) if self.safelinks[1:] else self.safelinks[0]
-        self.link = Made(needs_resending=not safe)
+        self.link = Made(needs_resending=not safe, close=lambda: self.closed_links.append(uri))
         if self.answers:
             self.receive(bytes((0xFF, 1, 40)))
         if self.answers and safe:
@@ -174,12 +175,23 @@ def test_a_link_without_safelink_is_opened_anew_until_it_has_one(
     monkeypatch.setattr(Cflib, "safelinks", [False, False, True])
     monkeypatch.setattr(crazyradio, "POLL_S", 0.0)
     board = air.open()
-    assert [one.closed for one in air.boards] == [1, 1, 0]
+    assert [one.closed_links for one in air.boards] == [[URI], [URI], []]
     assert board is air.boards[2]
     air.link.check()
 
 
-def test_closing_waits_for_cflib_unless_the_link_is_lost(air: Air, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_that_is_opened_anew_has_time_to_answer(air: Air, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Cflib, "safelinks", [False])
+    monkeypatch.setattr(crazyradio, "POLL_S", 0.0)
+    air.link._open()
+    monkeypatch.setattr(Cflib, "answers", False)
+    assert [air.link._connect() for _ in range(3)] == [False] * 3
+    assert len(air.boards) == 2
+
+
+def test_closing_waits_for_cflib_unless_the_link_is_lost_or_has_no_safelink(
+    air: Air, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It takes up to a second, which a robot without corrections need not survive; until then an older one says nothing."""
     waited: list[float] = []
 
@@ -190,21 +202,23 @@ def test_closing_waits_for_cflib_unless_the_link_is_lost(air: Air, monkeypatch: 
                 waited.append(timeout or 0.0)
 
     monkeypatch.setattr(threading, "Thread", Closing)
-    first = air.open()
+    monkeypatch.setattr(crazyradio, "POLL_S", 0.0)
+    monkeypatch.setattr(Cflib, "safelinks", [True, True, False, True])
+    air.open()
     air.link.close()
     assert waited == [crazyradio.CFLIB_CLOSES_S]
     second = air.open()
     second.link = None
     second.connection_lost.call(URI, "Too many packets lost")
     air.link.close()
-    third = air.open()
-    for old in (first, second):
+    last = air.open()
+    for old in air.boards[:3]:
         old.link = Made(needs_resending=True)
         old.receive(bytes((0xFF, 1, 40)))
         old.disconnected_link_error.call(URI, "older")
     assert not air.link._unsafe
     air.link.check()
-    assert (len(waited), third.closed) == (1, 0)
+    assert (len(waited), last.closed) == (1, 0)
 
 
 def test_without_the_parameter_of_absolute_poses_none_is_written(
