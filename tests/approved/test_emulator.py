@@ -380,6 +380,7 @@ def kernel(seed: int) -> dict[str, str]:
                 "uxItemSize", "uxLength", "uxMessagesWaiting", "pcHead", "u.xSemaphore.xMutexHolder")],
             [(block + task["xStateListItem.xItemValue"].offset, pick(0, 7, 3_600_000, 0x7FFF_FFFF))],
             [(block + task["ucNotifyState"].offset, pick(0, 1, 2))],
+            [(lie + named._list["uxNumberOfItems"].offset, pick(0, 1, 2, 0xFFFF_FFFF))],
         )  # fmt: skip
         for at, word in words:
             chip.write(at, struct.pack("<I", word))
@@ -502,6 +503,71 @@ def reasons() -> dict[str, str]:
     return log.told()
 
 
+class Stopped:
+    """A chip that has stopped anywhere: with any registers, status and frame."""
+
+    def __init__(self, chip: Chip, at: int, codes: list[int], calls: list[int], seed: int) -> None:
+        (self.rng, pick), self._chip, task = picking(seed), chip, RAM + 0x1_F800
+        self.state = Made(task_return=pick(0xFFFF_FFFD, 0xFFFF_FFED))
+        bits = 1 << int(self.rng.integers(26))
+        self.words = {
+            crashes.CFSR: pick(0, bits, bits, 1 << 12, 1 << 15 | bits, 1 << 7 | bits, 0x8080),
+            crashes.HFSR: pick(0, 2, 1 << 30, 1 << 31), crashes.MMFAR: 0x1234, crashes.BFAR: 0x5678,
+        }  # fmt: skip
+        frame = [*self.rng.integers(1 << 32, size=5).tolist(), pick(*calls) | 1, pick(*codes)]
+        status = pick(0, 0, 15, 56, 0x200, 0x20F) | 1 << 24
+        above = [pick(*calls) | 1 if pick(True, False) else task for _ in range(64)]
+        chip.write(task, struct.pack("<72I", *frame, status, *above))
+        ends = (task, task, task, task + 4, 0x3000_0000, RAM + 0x2_0000 - 32, RAM + 0x2_0000 - 28)
+        self._registers = {f"r{n}": pick(task, at, 0x2000_0000, n) for n in range(13)} | {
+            "sp": pick(task, task + 32, *ends), "msp": pick(*ends), "psp": pick(*ends),
+            "lr": pick(0xFFFF_FFFD, 0xFFFF_FFED, 0xFFFF_FFF9, 0xFFFF_FFF1, pick(*calls) | 1),
+            "xpsr": pick(0, 0, 3, 4, 5, 6, 7, 15, 56) | 1 << 24, "pc": pick(at, *codes[:4]),
+        }  # fmt: skip
+
+    def register(self, name: str) -> int:
+        return int(self._registers[name])
+
+    def read(self, address: int, size: int) -> bytes:
+        word = self.words.get(address)
+        return self._chip.read(address, size) if word is None else struct.pack("<I", word)
+
+
+def reported(seed: int) -> dict[str, str]:
+    """Return what is reported of a chip that has stopped anywhere, before its scheduler runs and after it."""
+    (_, pick), firmware, log = picking(seed), FirmwareOnChip(), Log()
+    while firmware.chip.now_us < 30_000:
+        firmware.run(30_000)
+    elf, chip = firmware.image, firmware.chip
+    own = elf if seed != SEEDS[-1] else Image(Path("cf2.bin"), None, elf.code)
+    kernel = FreeRtos(elf, chip.read)
+    blocks = [view.block for view in kernel.tasks()]
+    whole = crashes.CrashReports(elf, chip, kernel, "assertFail")
+    calls = [at for at in range(elf.base, elf.base + len(elf.code) + 3, 2) if whole._follows_call(at)]
+    starts = [one.address for one in elf.functions]
+    log.note("calls", len(calls), calls[:3], calls[-3:])
+    for number in range(120):
+        codes = [pick(*starts), pick(*calls), pick(*starts) + pick(0, 2, 4, 10), pick(0, 0x3000_0000)]
+        text = elf.base + elf.code.find(pick(b"how != ASSERTION", b"firmware.c", b"\0\0"))
+        stopped: Any = Stopped(chip, elf.symbol("assertFail").address, codes, calls, 1_000 * seed + number)
+        stopped._registers |= {"r0": pick(text, 0x3000_0000), "r1": pick(text, elf.base), "r2": number}
+        firmware.poke("xSchedulerRunning", pick(0, 1, 1))
+        running = kernel.current_block
+        reports = crashes.CrashReports(own, stopped, pick(kernel, kernel, kernel, None), "assertFail")
+        for name in ("here", "watchdog", "lockup", "software_reset", "division"):
+            log.note(name, getattr(reports, name)())
+        log.note("low", reports.low_access(pick(0, 0x3FF, 0x400, 0x8000), pick(True, False)))
+        if reports._kernel is None:
+            continue
+        begin, block = kernel.stack_begin(running), pick(running, running, *blocks)
+        stopped._registers["sp"] = pick(begin - 4, begin, begin + 4, stopped.register("sp"))
+        log.note("overflow", reports.overflow(block))
+        log.note("hang", reports.hang(block, pick(999, 1_000, 211_999)))
+        silent_us, period_us = pick((70_000, 1_000), (999_999, 12_345), (1_500, 1))
+        log.note("stopped", reports.stopped(block, silent_us, period_us, "it waits"))
+    return log.told()
+
+
 def memory(seed: int) -> dict[str, str]:
     """Return what a chip holds after random writes, runs and returns to what was saved."""
     (rng, pick), firmware, log = picking(seed), FirmwareOnChip(), Log()
@@ -567,7 +633,7 @@ FOUND: dict[str, Callable[[], list[str] | dict[str, str]]] = {
     "reasons": reasons,
     **{
         f"{use.__name__} {seed}": lambda use=use, seed=seed: use(seed)  # type: ignore[misc]
-        for use in (kernel, time_line, watch, memory, remote, backwards)
+        for use in (kernel, time_line, watch, memory, remote, backwards, reported)
         for seed in SEEDS
     },
 }

@@ -84,7 +84,7 @@ class CrashReports:
     def overflow(self, task: int) -> Crash:
         """Return the task whose stack overflowed, and its current place: it may have returned."""
         registers, what = self._registers_of(task), "stack overflow"
-        if self._kernel is not None and registers[SP] >= self._kernel.stack_begin(task):
+        if self._kernel is not None and registers.get(SP, 0) >= self._kernel.stack_begin(task):
             what += ", some calls before this place"
         return Crash(what, self._task(task), self._trace(registers))
 
@@ -164,17 +164,21 @@ class CrashReports:
         return f"task {self._kernel.name(task)}"
 
     def _registers_of(self, task: int) -> dict[int, int]:
-        """Return the registers of a task: saved by the scheduler, interrupted, or running."""
+        """Return the registers of a task: saved by the scheduler, interrupted, or running; none without memory there."""
         assert self._kernel is not None
-        if task != self._kernel.current_block:
-            return self._numbered(self._kernel.saved_registers(task))
-        if not self._chip.register("xpsr") & 0x1FF:
+        if task == self._kernel.current_block and not self._chip.register("xpsr") & 0x1FF:
             return self._registers()
-        psp, exc_return = self._chip.register("psp"), int(self._chip.state.task_return)
-        return self._numbered(stacked_registers(self._chip.read, psp, exc_return))
+        with suppress(LabError):
+            if task != self._kernel.current_block:
+                return self._numbered(self._kernel.saved_registers(task))
+            psp, exc_return = self._chip.register("psp"), int(self._chip.state.task_return)
+            return self._numbered(stacked_registers(self._chip.read, psp, exc_return))
+        return {}
 
     def _trace(self, registers: dict[int, int]) -> tuple[str, ...]:
-        """Return the places of a backtrace, as far as the stack can be read."""
+        """Return the places of a backtrace, as far as the stack can be read; none without registers."""
+        if not registers:
+            return ()
         pcs: list[int] = []
         with suppress(LabError):
             for pc in self._image.debug.frames.backtrace(registers, self._word):

@@ -176,6 +176,23 @@ def test_a_lock_up_is_a_failure_once_and_nothing_is_looked_for_behind_it(
     assert (board.crazyflie.failures, board.crazyflie.resets) == ([said], {WATCHDOG: 0, SOFTWARE: 0})
 
 
+def test_a_busy_task_that_loses_its_stack_is_reported_and_then_the_fault() -> None:
+    board, end_ms, running = Board(), 30, 0
+    own = board.crazyflie
+    board.run(0, end_ms)
+    while own.processor.longest_busy(5_000) is None or running != own.processor.longest_busy(5_000)[0]:  # type: ignore[index]
+        board.run(end_ms, end_ms + 1)
+        end_ms += 1
+        running = 0 if own.chip.register("xpsr") & 0x1FF else own.processor.current.block
+    own.chip.set_register("sp", 0x3000_0000)
+    own.chip.pin("C", 14, True)  # an interrupt, whose frame has no memory
+    hang, fault = board.run(end_ms, end_ms + 20)
+    assert re.fullmatch(r"hang: busy for \d\d ms without waiting for anything, in task SPIN-[01]", hang)
+    assert re.fullmatch(
+        r"HardFault: no memory .* while entering an exception; .*, 0x30000000, in task SPIN-[01]", fault
+    )
+
+
 def test_the_firmwares_own_clock_counts_its_timers_overflows() -> None:
     board, own = Board(), image()
     assert board.crazyflie.clock_us is None
