@@ -125,6 +125,9 @@ def test_all_who_have_input_are_called_at_its_instant_unless_another_one_closed_
     paced.start(0)
     paced.serve(paced.wait_until(10_000))
     assert heard == [0, 2]
+    paced.serve(10_000)
+    paced.readers.clear()
+    assert (heard, paced.wait_until(30_000)) == ([0, 2], 30_000), "input is served once"
     for pair in pairs:
         for end in pair:
             end.close()

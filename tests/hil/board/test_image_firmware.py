@@ -32,14 +32,24 @@ def plain() -> Image:
     return Image(build())
 
 
-def booted(image: Image, logic: Any = None) -> ImageFirmware:
+def booted(image: Image, logic: Any = None, rest: Any = None) -> ImageFirmware:
     requests = Requests(radio_command=lambda *_: None)
     board = VirtualBoard(lambda *_: None, lambda *_: True, lambda *_: None, requests=requests)
-    return ImageFirmware(ChipImage(image, build_machine()), board, None, logic=logic)
+    return ImageFirmware(ChipImage(image, build_machine()), board, rest, logic=logic)
 
 
 def put(firmware: ImageFirmware, name: str, content: np.ndarray[Any, Any]) -> None:
     firmware.chip.write(firmware.image.symbol(name).address, content.tobytes())
+
+
+def test_an_image_rests_a_while_before_the_laboratorys_time_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(image_firmware, "WARM_UP_US", 5_000)
+    rested = list[int]()
+    firmware = booted(plain(), rest=lambda: rested.append(1) or (0,) * 6)
+    assert (firmware.kernel.now_us, firmware.chip.now_us // 1_000, len(rested)) == (0, 5, 5)
+    firmware.kernel.run(2_000)
+    assert (firmware.kernel.now_us, firmware.chip.now_us // 1_000) == (2_000, 7)
+    assert booted(plain()).kernel.now_us == 0
 
 
 def test_the_app_s_signals_are_views_on_its_memory() -> None:

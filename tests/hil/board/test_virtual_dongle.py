@@ -409,6 +409,19 @@ def test_a_board_that_listens_no_more_when_the_packet_comes_does_not_answer(
     assert (answers, bench.stm.packets) == ([b"\x00"], [])
 
 
+def test_what_a_board_answered_before_it_was_switched_off_does_not_answer_a_later_try() -> None:
+    bench, answers = DongleAndBoard(), list[bytes]()
+    draws = [0.0, 0.9, 0.9]  # the first answer is lost, the second try and its answer are not
+    bench.dongle._transmitter._uniform = lambda: draws.pop(0)
+    bench.board.air.uplink_loss, bench.board.air.downlink_loss = 0.0, 0.5
+    bench.dongle.transmit(0, b"\x10hello", lambda _, answer: answers.append(answer))
+    bench.wait(600)
+    assert len(bench.stm.packets) == 1
+    bench.board.command(600, syslink.SWITCH_OFF, b"")
+    bench.wait(10_000)
+    assert answers == [b"\x00"]
+
+
 @given(st.lists(st.sampled_from(sorted(ACTS)), max_size=8))
 def test_the_processor_runs_exactly_while_the_board_is_on_whatever_is_switched(acts: list[str]) -> None:
     """It is neither started while it runs nor stopped while it does not."""

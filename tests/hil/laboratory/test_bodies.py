@@ -202,6 +202,8 @@ def test_a_body_that_has_failed_is_clamped_where_it_is(tmp_path: Path) -> None:
     body.advance(600_000)
     assert body.state.tolist() == place
     assert body.specific_force_B == pytest.approx([0.0, 0.0, 9.81])
+    body.release()
+    assert body.specific_force_B == pytest.approx([0.0, 0.0, 0.0]), "nothing pushes it any more"
 
 
 def test_the_tutorial_shows_the_robot_that_a_new_project_has() -> None:

@@ -52,6 +52,11 @@ def test_a_mesh_is_read_from_both_kinds_of_stl(written: Callable[[Points], bytes
     assert part.triangles == pytest.approx(0.001 * shape.triangles)
 
 
+def test_a_mesh_has_as_many_triangles_as_every_log_should_carry(tmp_path: Path) -> None:
+    (tmp_path / "hull.stl").write_bytes(binary(np.ones((TRIANGLES_MAX, 3, 3))))
+    assert len(mesh(tmp_path / "hull.stl").triangles) == TRIANGLES_MAX
+
+
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
@@ -59,6 +64,10 @@ def test_a_mesh_is_read_from_both_kinds_of_stl(written: Callable[[Points], bytes
         (b"\x89PNG" * 40, "not an STL file: no triangles of finite numbers in it"),
         (
             binary(box((1.0, 1.0, 1.0)).triangles)[:-1],
+            "not an STL file: no triangles of finite numbers in it",
+        ),
+        (
+            binary(box((1.0, 1.0, 1.0)).triangles) + b"\0",
             "not an STL file: no triangles of finite numbers in it",
         ),
         (text(box((1.0, 1.0, 1.0)).triangles)[:-120], "not an STL file: "),

@@ -2,6 +2,7 @@
 
 import math
 import struct
+from collections.abc import Callable
 from typing import get_args
 
 import numpy as np
@@ -13,8 +14,9 @@ pytest.importorskip("cffi")
 from hil.config import RobotConfig, load_config
 from hil.emulator.crazyflie import syslink
 from hil.emulator.crazyflie.decks import DECKS, EXPANDER_ADDRESS
-from hil.emulator.crazyflie.ranger import ADDRESS
+from hil.emulator.crazyflie.ranger import ADDRESS, Ranger
 from support.deck_bench import DeckBench
+from support.stm32_bench import Bench
 
 FLOW, MULTIRANGER = 0x0F, 0x0C  # products, of Bitcraze's drivers
 START, DATA_READY, RESULT = 0x0087, 0x0031, 0x0089
@@ -125,6 +127,22 @@ def test_a_ranger_reports_out_of_reach() -> None:
     bench.wait(30_000)
     status, distance = ranged(bench, ADDRESS)
     assert (status, distance > 8.0) == (4, True)
+
+
+@pytest.mark.parametrize(("distance", "status"), [(2.9, 9), (np.nextafter(2.9, 3.0), 4)])
+def test_a_ranger_sees_up_to_its_reach(distance: float, status: int) -> None:
+    bench, waiting = Bench(), list[Callable[[int], object]]()
+    ranger = Ranger(bench.chip, 1, lambda _, do: waiting.append(do), lambda: distance, lambda: 0.0)
+    ranger.switch(True)
+    registers = ranger._registers
+    registers[0x5E:0x64] = np.frombuffer(MEDIUM, np.uint8)
+    registers[START] = 0x10
+    ranger._obey()
+    waiting.pop()(0)
+    assert registers[0x89] == status
+    registers[0x8B] = 255
+    ranger._finish(ranger._run, False, 0)
+    assert registers[0x8B] == 128, "the count of measurements goes on with its upper half"
 
 
 @pytest.mark.parametrize("stop", ["off", "abort", "again"])

@@ -24,8 +24,10 @@ def test_a_sample_is_in_the_bmi088s_registers_when_its_interrupt_comes() -> None
     bench[SYSCFG + 0x14] = PORT_C << 8  # EXTI14
     bench[EXTI], bench[EXTI + 8] = 1 << 14, 1 << 14  # IMR, RTSR
     assert not bench[EXTI + 0x14]
-    parts.sample((1, -2, 300, -4, 500, -6))
-    assert bench[EXTI + 0x14] == 1 << 14
+    for _ in range(2):  # each comes with an edge of its own
+        parts.sample((1, -2, 300, -4, 500, -6))
+        assert bench[EXTI + 0x14] == 1 << 14
+        bench[EXTI + 0x14] = 1 << 14
     assert struct.unpack_from("<3h", parts.gyro, 0x02) == (1, -2, 300)
     assert struct.unpack_from("<3h", parts.accel, 0x12) == (-4, 500, -6)
     assert (parts.gyro[0x00], parts.accel[0x00], parts.accel[0x03] >> 7) == (

@@ -5,6 +5,7 @@ import re
 from dataclasses import astuple, replace
 from pathlib import Path
 from struct import pack
+from types import SimpleNamespace as Made
 
 import numpy as np
 import pytest
@@ -290,6 +291,26 @@ def test_a_task_that_waits_is_not_busy() -> None:
     assert found is not None
     kernel = FreeRtos(machine.image, machine.chip.read)
     assert kernel.name(found[0]) in ("SPIN-0", "SPIN-1")  # REPORT, FILTER and FROZEN are above them
+
+
+A, B, C, IDLE = range(1, 5)
+
+
+@pytest.mark.parametrize(("since_us", "found"), [
+    ({}, None), ({A: 9_001}, None), ({A: 9_000}, (A, 1_000)), ({IDLE: 1}, None), ({IDLE: 1, A: 8_000}, (A, 2_000)),
+    ({A: 1, C: 8_000}, (C, 2_000)), ({C: 9_500, A: 1}, (A, 9_999)), ({A: 7_000, B: 5_000}, (B, 5_000)),
+    ({A: 5_000, B: 7_000}, (A, 5_000)),
+])  # fmt: skip
+def test_the_task_that_blocks_others_is_busy_long_enough_not_idle_and_first_by_priority(
+    since_us: dict[int, int], found: tuple[int, int] | None
+) -> None:
+    names = {A: ("a", 1), B: ("b", 1), C: ("c", 2), IDLE: ("IDLE", 9)}
+    views = {block: Made(name=name, priority=priority) for block, (name, priority) in names.items()}
+    tasks = [Made(block=block, busy_since=168 * since_us.get(block, 0)) for block in views]
+    chip = Made(state=Made(task=tasks, task_count=4, now=168 * 10_000))
+    kernel = Made(places=(0,) * 5, task=lambda block, state: views[block])
+    processor = ChipProcessor(chip, kernel, lambda why: None, lambda until: 0)  # type: ignore[arg-type]
+    assert processor.longest_busy(1_000) == found
 
 
 @COMPILERS
