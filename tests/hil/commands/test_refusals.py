@@ -211,8 +211,8 @@ design --json --speed 9.5 | --speed: does not change what --json prints, the mod
 design --json --length 2 --out o | --length, --out: does not change what --json prints
 design --speed 9 optimise | --speed: before optimise, which does not read it
 design --write mine.toml.txt | --write mine.toml.txt: a profile's name ends in .toml
-design --profile crazyflie | takes robots of flat plates; this one's body is crazyflie
-drag-model --profile crazyflie | takes robots of flat plates; this one's body is crazyflie
+design --profile crazyflie | floaty design takes robots of flat plates; this one's body is crazyflie
+drag-model --profile crazyflie | floaty drag-model takes robots of flat plates; this one's body is crazyflie
 tune --profile nobody | neither the name of a profile
 tune --profile lqr | tune makes gains for the built-in control law
 tune --profile lqr --repeat 1 | tune makes gains for the built-in control law

@@ -105,9 +105,12 @@ def test_a_page_without_the_token_or_by_another_name_is_refused(panel: PanelScre
     refused.value.close()
 
 
-@pytest.mark.parametrize("wrong", ["token", "origin"])
+@pytest.mark.parametrize("wrong", ["token", "origin", "longer origin"])
 def test_a_foreign_socket_is_refused(panel: PanelScreen, loop: IOLoop, typed: list[str], wrong: str) -> None:
-    token, origin = ("guessed", panel.origin) if wrong == "token" else (panel.token, "http://evil.example")
+    token = "guessed" if wrong == "token" else panel.token
+    origin = {"token": panel.origin, "origin": "http://evil.example"}.get(
+        wrong, f"{panel.origin}.evil.example"
+    )
     with pytest.raises(HTTPClientError) as refused:
         connect(loop, panel, token, origin)
     assert refused.value.code == 403

@@ -61,18 +61,17 @@ def test_the_station_gets_its_link_its_cameras_and_the_profile(
     monkeypatch.setenv("PYTHONPATH", "user")
     line = line_of(stack, tmp_path, link, overrides=("controller.gain_r=0.08",))
     words = line.started_by
-    assert words[1:5] == ["-m", "hil.commands", "station", "yaw-step"]
-    given = dict(zip(words[5::2], words[6::2], strict=False))
-    shown = given["--link"]
-    assert shown == link if not link.startswith("mavlink") else shown.startswith("mavlink:/dev/pts/")
-    assert shown.endswith(f",{load_config().serial.baud}") is link.startswith("mavlink")
-    assert given["--mocap"] == f"optitrack:127.0.0.1:{line._motive.port},body=floaty,y-up"
-    assert given["--log"] == str(tmp_path / "telemetry.csv")
-    assert ("--tlog" in given) is link.startswith("mavlink")
-    assert given["--profile"] == "floaty"
-    assert {"--set=controller.gain_r=0.08", "--set=capture.yaw=0", "--set=capture.origin=[0,0,0]"} <= set(
-        words
-    )
+    shown, serial, log = words[6], link.startswith("mavlink"), tmp_path / "telemetry.csv"
+    mocap = f"optitrack:127.0.0.1:{line._motive.port},body=floaty,y-up"
+    assert words == [
+        sys.executable, "-m", "hil.commands", "station", "yaw-step", "--link", shown, "--mocap", mocap, "--start", "1.0",
+        "--log", f"{log}", *(["--tlog", f"{tmp_path / 'link.tlog'}"] if serial else []), "--profile", "floaty",
+        *(f"--set={one}" for one in EXPERIMENTS["yaw-step"].settings), "--set=controller.gain_r=0.08",
+        "--set=capture.origin=[0,0,0]", "--set=capture.yaw=0",
+        "--set=capture.body_offset=[0,0,0]", "--set=capture.body_yaw=0", "--set=capture.multicast=false",
+    ]  # fmt: skip
+    assert shown.startswith("mavlink:/dev/pts/" if serial else link)
+    assert shown.endswith(f",{load_config().serial.baud}") is serial
     assert (VARIABLE in line._environment) is link.startswith("radio")
     found = line._environment.get("PYTHONPATH", "user")  # the first `sitecustomize` on it counts
     assert found == (f"{linked.SITE}:user" if link.startswith("radio") else "user")

@@ -8,6 +8,8 @@ from contextlib import closing
 from itertools import pairwise
 from struct import pack
 
+import numpy as np
+import pyarrow as pa
 import pytest
 
 from firmware_py.config import parameters_of
@@ -39,12 +41,18 @@ def _short_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(image_firmware, "WARM_UP_US", 20_000)
 
 
-def test_rows_of_a_served_robot_describe_its_look() -> None:
+def test_rows_of_a_served_robot_describe_its_look_and_go_on_after_a_restart_with_home_as_the_goal() -> None:
     watcher = Watcher()
-    server = Server(Service(load_config()), lambda text: None, watcher)
+    config = load_config(overrides=["flight.home=[0.1,-0.2,1.2]"])
+    server = Server(Service(config), lambda text: None, watcher)
+    server.lab.events.at(500_000, server.robot.boot)
     server.lab.end_at(1_000_000)
     server.lab.run()
     server.close()
+    rows = pa.Table.from_batches(watcher.batches)
+    ran_us = rows.column("cpu.KALMAN").to_numpy()
+    assert (np.diff(ran_us) < 0).sum() == 1, "of the firmware that runs"
+    assert [{*rows.column(f"goal.{axis}").to_pylist()} for axis in "xyz"] == [{0.1}, {-0.2}, {1.2}]
     look = VisualModel.read(stored_in(watcher.batches[0].schema.metadata, "look"))
     own = server.robot.body.look
     assert [part.name for part in look.parts] == [part.name for part in own.parts]
