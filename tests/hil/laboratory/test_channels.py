@@ -13,6 +13,8 @@ from firmware_py.wire.supervisor import State
 from firmware_py.wire.telemetry import ALL_BLOCKS, ATTITUDE, Sample
 from ground_station.trajectory import Goal, Hold
 from hil.laboratory.channels import (
+    MEASUREMENTS,
+    _scheduler_channels,
     _stock_channels,
     battery_channel,
     excitation_channel,
@@ -37,6 +39,24 @@ def columns(channel: Channel) -> Mapping[str, float]:
     """What a channel reads, by the names of its columns."""
     names = [name for quantity in channel.quantities for name in quantity.names]
     return dict(zip(names, channel.read(), strict=True))
+
+
+def test_the_scheduler_s_counters_are_sums_over_the_queues_of_measurements() -> None:
+    tasks = [
+        SimpleNamespace(name=name, deadline_misses=next(numbers)) for name in ("KALMAN", "IDLE", "STABILIZER")
+    ]
+    queues = [SimpleNamespace(name=name, high_water=next(numbers), dropped=next(numbers))
+        for name in (MEASUREMENTS, "other", MEASUREMENTS)]  # fmt: skip
+    scheduler = SimpleNamespace(tasks=tasks, queues=queues, run_times_us=lambda: [70, 80, 90, 100])
+    firmware: Any = SimpleNamespace(scheduler=scheduler)
+    (channel,) = _scheduler_channels(firmware)
+    first, _, last = queues
+    assert columns(channel) == {
+        "rtos.measurements_high_water": first.high_water + last.high_water,
+        "rtos.measurements_dropped": first.dropped + last.dropped,
+        "late.KALMAN": tasks[0].deadline_misses, "late.STABILIZER": tasks[2].deadline_misses,
+        "cpu.KALMAN": 70, "cpu.IDLE": 80, "cpu.STABILIZER": 90,
+    }  # fmt: skip
 
 
 def test_the_radio_s_counters() -> None:

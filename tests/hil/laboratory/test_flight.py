@@ -4,6 +4,7 @@ import gc
 import json
 import re
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import in_lockstep, lockstep_flight
 from hil.laboratory.metrics import ALWAYS, column
 from hil.laboratory.request import LOCKSTEP, Bench, Request
-from hil.laboratory.run import fly
+from hil.laboratory.run import Started, fly
 from hil.research.campaigns.jobs import Job, row_of
 from support.flights import explain, flown, hover
 from support.full_disk import small_files
@@ -52,6 +53,17 @@ def test_flight_without_a_recorder_keeps_what_is_noted() -> None:
     assert flight.run().lost is None
     flight.close()
     assert [flight._early.count(("lab", text)) for text in ("before the start", "late")] == [1, 1]
+
+
+def test_a_flight_that_is_over_records_nothing_more(tmp_path: Path) -> None:
+    """Its laboratory may run on, for a link that is still to send something."""
+    with ExitStack() as stack:
+        started = Started(Request.of(HOVER, duration_s=0.1), tmp_path, stack)
+        started.fly()
+        end_us = started.flight.now_us
+        started.flight.lab.run_to(end_us + 50_000)
+        started.close()
+    assert 0 <= end_us - load_log(tmp_path).column("t")[-1].as_py() < 10_000
 
 
 @pytest.mark.parametrize(("board", "faults"), [("python", ()), ("c", ("push.y@0.6=20",))])

@@ -364,6 +364,14 @@ def real_log(rows: int = 30) -> pa.Table:
     return pa.table(columns).replace_schema_metadata({"request": request, "look": look})
 
 
+def test_a_recording_has_the_name_of_its_flight(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names: list[str] = []
+    monkeypatch.setattr(rerun.RecordingStream, "send_recording_name", lambda _, name: names.append(name))
+    for log in (load_log(folder), real_log()):
+        RerunFlight(rerun.RecordingStream("name"), log.schema)
+    assert names == ["hover, seed 1", "hover, real flight"]
+
+
 def test_a_real_flight_has_the_same_scene_without_unknown_parts(tmp_path: Path) -> None:
     path = staged(tmp_path / "real.rrd", real_log())
     assert timeline_of(real_log().schema.metadata) == (FROM_START, 0)

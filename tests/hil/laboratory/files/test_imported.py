@@ -19,7 +19,7 @@ from hil.laboratory.files.imported import import_log
 from hil.laboratory.files.joined import Joined, join
 from hil.laboratory.files.log_map import Map, guess
 from hil.laboratory.files.recorder import load_events
-from hil.laboratory.files.tables import Table, _tlog, read_tables
+from hil.laboratory.files.tables import Table, read_tables
 from hil.pictures.viewer.recording import recording_of
 from support.command import Cli, floaty
 from support.foreign_logs import (
@@ -136,7 +136,10 @@ def test_a_telemetry_log_of_mavlink_is_in_the_world_s_frame(run: Run, tmp_path: 
     )
 
 
-def test_the_rows_of_a_tlog_are_those_of_its_best_pose_behind_bytes_that_are_no_frame() -> None:
+@pytest.mark.parametrize("version", [1, 2])
+def test_the_rows_of_a_tlog_are_those_of_its_best_pose_behind_bytes_that_are_no_frame(
+    tmp_path: Path, version: int
+) -> None:
     codec = dialect.MAVLink(None, 1, 1)
     messages = [
         dialect.MAVLink_attitude_message(0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0),
@@ -145,8 +148,10 @@ def test_the_rows_of_a_tlog_are_those_of_its_best_pose_behind_bytes_that_are_no_
     ]
     content = b""
     for number, message in enumerate(messages, 1):
-        content += number.to_bytes(8, "big") + message.pack(codec) + b"abc" * (number == 2)
-    tables = _tlog(Path("log.tlog"), content)
+        frame = message.pack(codec, force_mavlink1=version == 1)
+        content += number.to_bytes(8, "big") + frame + b"abc" * (number == 2)
+    (tmp_path / "log.tlog").write_bytes(content)
+    tables = read_tables(tmp_path / "log.tlog")
     kinds = ["LOCAL_POSITION_NED", "VISION_POSITION_ESTIMATE", "ATTITUDE"]
     assert [next(name.split(".")[0] for name in table.columns if "." in name) for table in tables] == kinds
     assert [table.columns["timestamp [us]"].tolist() for table in tables] == [[3], [2], [1]]

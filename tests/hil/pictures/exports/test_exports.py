@@ -263,3 +263,14 @@ def test_an_mcap_file_has_a_gap_where_there_is_no_number_and_angles_in_their_ord
         q = message.pose.orientation
         angles = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_euler("ZYX")
         assert angles == pytest.approx([turning()[row], -0.2, 0.1], abs=1e-9)
+
+
+def test_an_mcap_file_has_only_the_frames_that_are_known(turning_run: Path) -> None:
+    log = load_log(turning_run)
+    names = [name for name in log.column_names if not name.startswith("estimate.")]
+    pq.write_table(log.select(names), turning_run / "log.parquet")
+    found = messages(write_mcap(turning_run))
+    assert "/estimate/pose" not in found
+    assert {tuple(sent.child_frame_id for sent in one.transforms) for _, one in found["/tf"]} == {
+        ("body", "goal")
+    }
