@@ -162,6 +162,24 @@ def test_the_core_is_reset_and_called_in_the_order_of_a_tick(
     assert called == ["reset", *20 * ["estimate", "supervise", "control"]]
 
 
+@pytest.mark.parametrize("bit", [None, *range(13)])
+def test_a_memory_that_ignores_a_bit_of_an_address_is_found(
+    monkeypatch: pytest.MonkeyPatch, bit: int | None
+) -> None:
+    memory, ignored = bytearray(8192), 0 if bit is None else 1 << bit
+
+    def execute(writes: list[tuple[int, bytes]]) -> None:
+        for start, data in writes:
+            for at, value in enumerate(data, start):
+                memory[at & ~ignored] = value
+
+    client: Any = SimpleNamespace(
+        execute=execute, memory=lambda size: bytes(memory[at & ~ignored] for at in range(size))
+    )
+    monkeypatch.setattr(doctor, "write", lambda at, data: (at, data))
+    assert doctor._memory(client, len(memory)).good == (bit is None)
+
+
 @pytest.mark.parametrize(("full", "timeout_s"), [(False, 0.0), (True, 0.001)])
 def test_a_full_window_waits_for_reports_and_the_last_one_counts(full: bool, timeout_s: float) -> None:
     reports = [Loop(n, *range(n + 1, n + len(Loop._fields)))._replace(fresh=True) for n in (1, 2)]

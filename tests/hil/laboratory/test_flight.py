@@ -61,7 +61,8 @@ def test_a_flight_that_is_over_records_nothing_more(tmp_path: Path) -> None:
         started = Started(Request.of(HOVER, duration_s=0.1), tmp_path, stack)
         started.fly()
         end_us = started.flight.now_us
-        started.flight.lab.run_to(end_us + 50_000)
+        started.flight.lab.end_at(end_us + 50_000)
+        started.flight.lab.run()
         started.close()
     assert 0 <= end_us - load_log(tmp_path).column("t")[-1].as_py() < 10_000
 
