@@ -4,6 +4,7 @@ import pytest
 
 from firmware_py.wire.memories import CONFIG_SIZE, decode_config
 from hil.board.eeprom import factory_config
+from hil.board.pins import VirtualBoard
 from hil.config import load_config
 from hil.errors import LabError
 from hil.laboratory.experiments import EXPERIMENTS
@@ -42,3 +43,13 @@ def test_an_address_that_leaves_boards_none_of_their_own_or_is_a_number_is_refus
     with pytest.raises(LabError, match=r"^radio.address = .*10 hexadecimal digits in .* at most FFE7E7E7D7$"):
         load_config(overrides=(f"radio.address={address}",))
     load_config(overrides=('radio.address="1122334455"',))
+
+
+def test_before_it_boots_a_board_has_the_hardwares_time_and_an_empty_eeprom() -> None:
+    said: list[tuple[int, str]] = []
+    board = VirtualBoard(lambda *_: None, lambda *_: True, lambda *line: said.append(line))
+    assert (board.now_us, bytes(board.eeprom)) == (0, b"\xff" * 8192)
+    board.debug_write("on")
+    board.boot(7_000)
+    board.debug_write("again")
+    assert said == [(0, "on"), (7_000, "again")]

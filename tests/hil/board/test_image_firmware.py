@@ -1,5 +1,6 @@
 """What is read from and written into the memory of an image with the exported app: the tests' firmware, with its symbols."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace as Made
@@ -50,6 +51,18 @@ def test_an_image_rests_a_while_before_the_laboratorys_time_begins(monkeypatch: 
     firmware.kernel.run(2_000)
     assert (firmware.kernel.now_us, firmware.chip.now_us // 1_000) == (2_000, 7)
     assert booted(plain()).kernel.now_us == 0
+
+
+def test_another_image_in_flash_keeps_the_debugger_and_loses_what_watched_the_first() -> None:
+    debugger: Any = Made()
+    first = replace(ChipImage.flashed(plain(), Path("machine.so")), debugger=debugger, observers=(Made(),))
+    assert first.flashed_with(first.in_flash + b"\xff\xff") is first
+    padded = ChipImage.flashed(Image(Path("cf2.bin"), None, plain().code + b"\xff" * 8), first.library)
+    assert padded.flashed_with(padded.in_flash[:-8]) is padded
+    flash = first.in_flash[:-1] + bytes((first.in_flash[-1] ^ 1,))
+    second = first.flashed_with(flash)
+    assert (second.in_flash, second.debugger, second.library) == (flash, debugger, first.library)
+    assert (second.observers, second.image.named, len(second.notes)) == ((), False, 1)
 
 
 def test_the_app_s_signals_are_views_on_its_memory() -> None:

@@ -34,6 +34,15 @@ def test_packets_grow_with_those_in_flight_up_to_a_limit() -> None:
     assert window.batch == SAMPLES_MAX
 
 
+def test_a_report_of_more_than_is_under_way_changes_nothing() -> None:
+    window, _ = filled(5)
+    assert window.on_report(report(1, 1), 0)
+    for used, waiting in ((6, 0), (5, 1), (1, 5), (0, 2)):  # an older one, or another flight's
+        assert not window.on_report(report(used, waiting), 0)
+        assert (window.used, window.count, window.full) == (1, 5, False)
+    assert window.on_report(report(5, 0), 0)
+
+
 def test_a_window_is_full_until_the_board_has_taken_some() -> None:
     window, _ = filled(WINDOW - 1)
     assert not window.full

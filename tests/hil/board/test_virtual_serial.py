@@ -150,6 +150,7 @@ def test_a_deaf_board_overruns_and_counts_it():
     bench.uplink(0, message)
     bench.run(20_000)
     assert bench.line.overruns == 200 - 128
+    assert bench.line.up.delivered_bytes == 128
     assert bench.line.read() == message[:128]
     bench.uplink(20_000, b"again")
     bench.run()

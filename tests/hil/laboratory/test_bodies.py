@@ -206,6 +206,15 @@ def test_a_body_that_has_failed_is_clamped_where_it_is(tmp_path: Path) -> None:
     assert body.specific_force_B == pytest.approx([0.0, 0.0, 0.0]), "nothing pushes it any more"
 
 
+def test_an_error_in_a_body_s_file_outranks_where_it_was_lost_before(tmp_path: Path) -> None:
+    robot = FLOATING.replace("0.981", "5.0 if self.time_s < 1.0 else 1 / 0")
+    body = make_body(load_config(project(tmp_path, robot)), np.random.default_rng(1), (0.0, 0.0, 1.15))
+    body.advance(900_000)
+    assert str(body.lost).startswith("left the flow: 0.85 m above")
+    body.advance(1_100_000)
+    assert str(body.lost).endswith("division by zero at 1.00 s")
+
+
 def test_the_tutorial_shows_the_robot_that_a_new_project_has() -> None:
     text = (PROJECT / "robot.py.in").read_text(encoding="utf-8")
     assert f"```python\n{text}```" in (ROOT / "docs/tutorials/your-own-robot.md").read_text(encoding="utf-8")

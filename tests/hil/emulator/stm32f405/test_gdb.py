@@ -16,7 +16,7 @@ pytest.importorskip("unicorn")
 
 from hil.emulator.stm32f405.backwards import Goal, Position, Search
 from hil.emulator.stm32f405.checkpoints import Checkpoints
-from hil.emulator.stm32f405.chip import CYCLES_PER_US, Chip, StopReason
+from hil.emulator.stm32f405.chip import CYCLES_PER_US, FLASH, Chip, StopReason
 from hil.emulator.stm32f405.debugged_chip import DebuggedChip
 from hil.emulator.stm32f405.freertos import FreeRtos
 from hil.emulator.stm32f405.gdb import GdbServer
@@ -32,6 +32,7 @@ from hil.emulator.stm32f405.gdb_protocol import (
 from hil.emulator.stm32f405.image import Image
 from hil.errors import LabError
 from support import stm32_firmware
+from support.stm32_bench import Bench
 from support.stm32_machine import FirmwareOnChip
 
 RAM = 0x2000_0000
@@ -377,6 +378,21 @@ def test_a_breakpoint_where_crashes_are_reported_stops_for_both() -> None:
     assert why == StopReason.BREAK  # the report's
     assert machine.chip.register("pc") == place
     assert answers[-2:] == [b"T05thread:1;", pack("<I", place).hex().encode()]
+
+
+@pytest.mark.parametrize("crashes", [False, True])
+def test_a_breakpoint_in_an_it_block_stops_at_its_end(crashes: bool) -> None:
+    bench, server = Bench(bytes.fromhex("8042 04bf 0131 0231 0431 00bf")), GdbServer(0)  # cmp r0, r0; itt eq
+    place = FLASH + 14  # adds r1, #2
+    bench.chip.crash_points |= {place} if crashes else set()
+    with socket.create_connection(("127.0.0.1", server.port)) as line:
+        packets = (b"QStartNoAckMode", b"Z0,%x,2" % place, b"c", b"p0f", b"p01", b"D")
+        line.sendall(b"".join(map(framed, packets)))
+        why = DebuggedChip(bench.chip, server).run(CYCLES_PER_US)
+        server.close()
+        answers = contents(b"".join(iter(lambda: line.recv(1 << 16), b"")))
+    assert why == StopReason.TIME
+    assert answers[2:5] == [b"T05thread:1;", pack("<I", FLASH + 22).hex().encode(), b"07000000"]
 
 
 @pytest.mark.parametrize(("kind", "name"), [(b"2", "xTickCount"), (b"3", "planted"), (b"4", "planted")])
