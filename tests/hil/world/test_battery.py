@@ -94,6 +94,9 @@ def test_a_load_beyond_the_battery_leaves_half_the_voltage() -> None:
     battery = Battery(CONFIG)
     battery.spend(1000.0, 0.01)
     assert battery.voltage == pytest.approx(open_circuit_voltage(1.0) / 2)
+    battery.sag_V = 5.0
+    battery.spend(0.0, 0.01)
+    assert (battery.voltage, battery.millivolts) == (0.0, 0), "no more than all of it is lost on the way"
 
 
 def test_the_log_holds_the_power_of_the_flaps_that_moved(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from hil.errors import LabError
 from hil.laboratory.fault_kinds import KINDS
 from hil.world.config import BatteryConfig, TunnelConfig
 from hil.world.quadrotor import MOTOR_FAILURES, STEPS, Quadrotor, QuadrotorConfig, rpm_for, steady_rpm
+from hil.world.room import Room
 
 G = 9.81
 HIGH = (0.0, 0.0, 2.0)  # the ground effect is below 0.01 % there
@@ -201,6 +202,10 @@ def test_a_loss_names_its_cause_and_value(
     assert body.lost.startswith(text)
     body.put_back((0.0, 0.0, 1.0))
     assert body.lost is None
+
+
+def test_its_sensors_see_the_floor_the_walls_and_the_ceiling_that_end_its_flight() -> None:
+    assert make(room=1.7, ceiling=2.2).room == Room(0.0, 1.7, 2.2)
 
 
 def test_it_looks_like_four_rotors_whose_numbers_are_the_motors() -> None:

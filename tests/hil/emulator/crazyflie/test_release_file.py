@@ -3,7 +3,7 @@
 import json
 import zipfile
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,15 @@ def test_the_firmware_of_the_stm32_is_taken_and_the_rest_is_named(version: int) 
         f"{PATH}: took cf2.bin, release 2025.09 for platform cf2; left cf2_nrf.bin (nrf51 fw), "
         "aideck.bin (bcAI:esp+bcAI:gap8 fw)"
     )
+
+
+@pytest.mark.parametrize(("name_size", "size", "fits"), [(100, 1 << 20, True), (100, 1 + (1 << 20), False),
+                                                         (101, 1, False)])  # fmt: skip
+def test_a_firmware_may_fill_the_flash_and_its_name_a_line(name_size: int, size: int, fits: bool) -> None:
+    name = "cf2.bin".rjust(name_size, "x")
+    content = zipped({"version": 2, "files": {name: STM32}}, {name: bytes(size)})
+    with nullcontext() if fits else pytest.raises(LabError):
+        assert released_firmware(PATH, content).content == bytes(size)
 
 
 def test_a_zip_is_known_by_content_or_name() -> None:

@@ -48,6 +48,31 @@ def test_flash_is_erased_around_the_code_and_memories_are_empty(base: int) -> No
     assert not made.ccm.any()
 
 
+ENDS = (
+    *(base + size for base, size, _ in chip.WINDOWS), chip.FLASH_SIZE, chip.FLASH + chip.FLASH_SIZE,
+    chip.RAM + chip.RAM_SIZE, chip.CCM + chip.CCM_SIZE, chip.SYSTEM + chip.SYSTEM_SIZE,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_the_last_word_of_each_memory_is_read_and_written_and_none_behind_it(end: int) -> None:
+    made = Bench().chip
+    assert len(made.read(end - 4, 4)) == 4
+    made.write(end - 4, bytes(4))
+    for use in (lambda: made.read(end - 3, 4), lambda: made.write(end - 3, bytes(4))):
+        with pytest.raises(LabError, match=r"no memory there$"):
+            use()
+
+
+def test_code_that_a_debugger_writes_runs_from_the_first_half_word_of_flash_on() -> None:
+    bench = Bench()
+    for code in ("0130 fee7", "0230 fee7"):  # adds r0, #1 or #2; b .
+        bench.chip.write(chip.FLASH, bytes.fromhex(code))
+        bench.chip.set_register("pc", chip.FLASH)
+        bench.wait(1)
+    assert bench.chip.register("r0") == 3
+
+
 @pytest.mark.parametrize(
     ("was", "is_now"),
     [
