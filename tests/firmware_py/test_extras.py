@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError
 import pytest
 from packaging.requirements import Requirement
 
-from firmware_py.extras import install_command
+from firmware_py.extras import install_command, packages_of_extras
 from support.paths import ROOT
 
 
@@ -37,6 +37,14 @@ def test_without_an_installation_the_command_installs_the_clone(monkeypatch: pyt
     monkeypatch.setattr("importlib.metadata.requires", requires)
     *_, option, place = shlex.split(install_command("view"))
     assert (option, place) == ("--editable", f"{ROOT}[view]")
+
+
+def test_the_packages_of_an_extra_are_found_however_the_wheel_writes_its_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    listed = ["numpy", "a>=1; extra == 'view'", 'b; extra == "view"', 'c<3; extra == "radio"']
+    monkeypatch.setattr("importlib.metadata.requires", lambda name: listed)
+    assert packages_of_extras() == {"view": ["a>=1", "b"], "radio": ["c<3"]}
 
 
 @pytest.mark.parametrize("package", ["firmware_py", "ground_station", "hil"])

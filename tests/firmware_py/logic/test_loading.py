@@ -88,6 +88,10 @@ IN_THE_LAW = [
     ("raise ValueError", 0, "raise: write an if"),
     ("assert memory.ticks == 0", 0, "assert: write an if"),
     ("a = memory.ticks in (1, 2)", 0, "comparison memory.ticks in (1, 2): write memory.ticks == 1 or memory.ticks == 2"),
+    ("a = 3000000000", 0, "literal 3000000000: write a number of 32 bits"),
+    ("a = 2j", 0, "literal 2j: write a number, as f32(0.5) or 3"),
+    ("a = None", 0, "literal None: write a number, as f32(0.5) or 3"),
+    ("a = 'text'", 0, "literal 'text': write a number, as f32(0.5) or 3"),
     ("a = memory is control", 0, "comparison memory is control: write memory == control"),
     ("a = memory.ticks is not 3", 0, "comparison memory.ticks is not 3: write memory.ticks != 3"),
 ]  # fmt: skip

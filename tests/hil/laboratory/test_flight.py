@@ -260,3 +260,11 @@ def test_a_board_that_is_reset_has_not_completed_its_flight(tmp_path: Path) -> N
     assert not result.passed
     patient = replace(experiment, limits={"resets": 3.0, "uncontrolled": 0.6})
     assert fly(Request.of(patient), tmp_path / "patient").passed
+
+
+def test_only_the_resets_after_the_release_are_counted() -> None:
+    flight = lockstep_flight(Request.of(HOVER, duration_s=0.2))
+    for moment_us in (200_000, 1_050_000, 1_100_000):
+        flight.events.at(moment_us, flight.robot._reset)
+    flight.run()
+    assert (flight.robot.resets, flight.resets) == (3, 2)

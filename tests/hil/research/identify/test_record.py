@@ -412,7 +412,7 @@ def test_the_covariance_of_the_mean_is_that_of_numpy_over_the_lines_around() -> 
         assert found.C[row] == pytest.approx(expected), line
 
 
-@pytest.mark.parametrize(("off", "refused"), [(0.0498, False), (0.0503, True)])
+@pytest.mark.parametrize(("off", "refused"), [(0.05003, False), (0.0501, True)])
 def test_an_excitation_of_which_a_twentieth_is_off_its_lines_is_refused(off: float, refused: bool) -> None:
     sizes = np.zeros((4, 2, 4))
     sizes[:, :, 0] = 1.0, off
