@@ -172,6 +172,9 @@ def test_all_that_a_ground_station_knows() -> None:
         (told["locSrv.poses"], told["locSrv.rejected"]),
         (3, 5),
     )
+    values = tuple({"locSrv.poses": 2, "locSrv.rejected": 1}.get(one.name, 0) for one in ATTITUDE.variables)
+    ground.telemetry[ATTITUDE.id] = Sample(ATTITUDE, 10, values)
+    assert channels[3].read()[-2:] == (5, 6), "its clock went back: the board counts from 0 again"
 
 
 def test_the_excitation_of_each_input() -> None:

@@ -16,6 +16,7 @@ from hil.api import column, fly, fly_swarm, load_run
 from hil.board.board_firmware import PowerOn, PythonBoard
 from hil.emulator.crazyflie import syslink
 from hil.errors import LabError
+from hil.laboratory import lockstep
 from hil.laboratory.experiments import find_experiment, find_experiments
 from hil.laboratory.experiments.trajectories import BEGIN_S, in_csv
 from hil.laboratory.swarms import flying
@@ -78,6 +79,11 @@ def test_ctrl_c_ends_each_robot_that_still_flies(tmp_path: Path, monkeypatch: py
         raise KeyboardInterrupt
 
     booted: list[Firmware] = []
+    numbers: list[int] = []
+    config = lockstep.factory_config
+    monkeypatch.setattr(
+        lockstep, "factory_config", lambda number, radio: numbers.append(number) or config(number, radio)
+    )
 
     class Board(PythonBoard):
         def boot(self, start: PowerOn) -> Firmware:
@@ -90,6 +96,7 @@ def test_ctrl_c_ends_each_robot_that_still_flies(tmp_path: Path, monkeypatch: py
     request = swarm_of([find_experiment("hover")] * 3, duration_s=0.2, overrides=APART)
     result = flying.fly_swarm(request, tmp_path, stop)
     assert [one.outcome for one in result.robots] == ["error", "interrupted", "interrupted"]
+    assert numbers == [1, 2, 3], "each with an address of its own"
     texts = [(one.folder / "events.jsonl").read_text() for one in result.robots]
     assert ["interrupted by the user" in text for text in texts] == [False, True, True]
 

@@ -160,7 +160,7 @@ def test_a_goal_without_yaw_keeps_that_of_its_instant() -> None:
 
 def test_a_parameter_is_set_over_the_radio_and_noted_when_the_board_has_it(tmp_path: Path) -> None:
     view = Script({
-        120: ["set controller.gain_y -1.5", "set controller.gain_x -1.5"],
+        120: ["set controller.gain_y -1.5", "set controller.gain_x -1.5", "set controller.gain_y -1.5"],
         140: ["set controller.gain_y 1e9", "set controller.gian_y 1", "set controller.gain_y", "set predictor.horizon 1.5"],
         160: ["set supervisor.pose_timeout_us 300000"],
     })  # fmt: skip
@@ -173,7 +173,10 @@ def test_a_parameter_is_set_over_the_radio_and_noted_when_the_board_has_it(tmp_p
     assert view.known["extCtrl.y_P"] == 1.5, "the board's gain has the other sign"
     assert view.known["supervisor.poseTimeout"] == 300
     assert view.answers == [
-        "set controller.gain_x -1.5: the board has not answered 'set controller.gain_y -1.5' yet",
+        *(
+            f"set controller.gain_{axis} -1.5: the board has not answered 'set controller.gain_y -1.5' yet"
+            for axis in "xy"
+        ),
         "set controller.gain_y 1e9: expected -20..20",
         "set controller.gian_y: no such parameter; did you mean controller.gain_y?",
         "set : expected set NAME VALUE",

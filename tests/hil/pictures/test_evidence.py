@@ -201,6 +201,10 @@ def test_a_story_tells_everything_once_in_order() -> None:
         (0.9, "failsafe begins: the gyro delivers nothing new"), (1.1, "failsafe ends"),
         (1.2, "fault servo.stuck.2@1.2 begins"), (1.2, "flap 2 saturates for the first time"),
         (1.4, "planted"), (2.0, "lost: fell")]  # fmt: skip
+    begun = flown_log().slice(190)  # in failsafe
+    assert (0.9, "failsafe begins") in [
+        (round(float(one.t_s), 3), one.text) for one in story_of(begun, judged({}, {}))
+    ]
 
 
 def test_a_report_s_rows_have_values_and_limits_in_customary_units_those_with_a_limit_first() -> None:

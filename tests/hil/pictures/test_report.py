@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import hil.pictures.figures
+import hil.pictures.report
 from firmware_py.wire.supervisor import State
 from ground_station.latency import STAGES
 from ground_station.telemetry_log import TELEMETRY
@@ -178,6 +179,21 @@ def test_a_killed_flight_has_a_report(folder: Path) -> None:
     page = report(folder)
     assert page.tables["events"][1:] == []
     assert {"rms_x", "flown"} <= {row[0] for row in page.tables["metrics"][1:]}
+
+
+@pytest.mark.usefixtures("few_pictures")
+@pytest.mark.parametrize(("outcome", "lost"), [("lost", "why"), ("error", None), ("reset", None)])
+def test_only_a_lost_robot_has_the_mark_of_a_loss(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, outcome: str, lost: str | None
+) -> None:
+    change_result(folder, outcome=outcome, cause="why")
+    marked: list[str | None] = []
+    marks = hil.pictures.report.marks_of_flight
+    monkeypatch.setattr(
+        hil.pictures.report, "marks_of_flight", lambda log, lost: marked.append(lost) or marks(log, lost)
+    )
+    write_report(folder)
+    assert marked == [lost]
 
 
 @pytest.mark.usefixtures("few_pictures")

@@ -489,14 +489,17 @@ def test_faults_share_a_lane_and_a_push_is_an_arrow_that_can_be_seen(folder: Pat
         "fault imu.noise@0.1:1=2 begins",
         "fault push.y@0.1=2 ends",
         "fault own.kind@1 begins",
+        "fault imu.noise@0.4:1=3 begins",
+        "fault imu.noise@0.1:1=2 ends",
     ]
     events = [
         {"t_us": 1_100_000 + 100_000 * row, "source": "lab", "text": text} for row, text in enumerate(texts)
     ]
     path = staged(tmp_path / "faults.rrd", load_log(folder), events)
     lane = values(path, "/state/faults", "StateChange:state")[:, 0].tolist()
-    assert lane == ["push.y", "push.y + imu.noise", "imu.noise", "imu.noise + own.kind"]
-    assert len(moments(path, "/plot/position/marks/fault")) == 3
+    assert lane == ["push.y", "push.y + imu.noise", "imu.noise", "imu.noise + own.kind",
+        "imu.noise + own.kind + imu.noise", "own.kind + imu.noise"]  # fmt: skip
+    assert len(moments(path, "/plot/position/marks/fault")) == 4
     (arrow,) = [
         batch for batch in chunks(path, "/world/held/push_y") if "Arrows3D:vectors" in batch.schema.names
     ]
