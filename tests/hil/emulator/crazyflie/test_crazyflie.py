@@ -10,7 +10,7 @@ pytest.importorskip("cffi")
 
 from firmware_py.export.elf import Symbol
 from hil.emulator.crazyflie import crazyflie, radio_line
-from hil.emulator.stm32f405.chip import SOFTWARE, WATCHDOG
+from hil.emulator.stm32f405.chip import SOFTWARE, WATCHDOG, StopReason
 from hil.emulator.stm32f405.image import Image
 from hil.emulator.stm32f405.stopped_tasks import SETTLED_US, StoppedTask
 from support.crazyflie_board import Board, image
@@ -191,6 +191,15 @@ def test_a_busy_task_that_loses_its_stack_is_reported_and_then_the_fault() -> No
     assert re.fullmatch(
         r"HardFault: no memory .* while entering an exception; .*, 0x30000000, in task SPIN-[01]", fault
     )
+
+
+def test_two_causes_at_once_are_one_reset_by_the_watchdog() -> None:
+    board = Board()
+    board.run(0, 10)
+    board.crazyflie._act(StopReason.WATCHDOG | StopReason.RESET)
+    assert board.crazyflie.resets == {WATCHDOG: 1, SOFTWARE: 0}
+    assert [line.partition(":")[0] for line in board.said] == ["hang", "watchdog reset"]
+    assert board.crazyflie.chip.resets == 2, "that of power-on, and this one"
 
 
 def test_the_firmwares_own_clock_counts_its_timers_overflows() -> None:

@@ -313,6 +313,15 @@ def test_the_task_that_blocks_others_is_busy_long_enough_not_idle_and_first_by_p
     assert processor.longest_busy(1_000) == found
 
 
+def test_tasks_of_one_name_are_numbered_and_their_names_have_no_spaces() -> None:
+    names = {1: "my task", 2: "other", 3: "my task", 4: "my task", 5: "other"}
+    kernel = Made(places=(0,) * 5, task=lambda block, state: Made(name=names[block], priority=1))
+    state = Made(task=[Made(block=block) for block in names], task_count=5)
+    processor = ChipProcessor(Made(state=state), kernel, lambda why: None, lambda until: 0)  # type: ignore[arg-type]
+    for _ in range(2):
+        assert processor.task_names == ["my_task", "other", "my_task#2", "my_task#3", "other#2"]
+
+
 @COMPILERS
 def test_a_stack_that_overflows_names_its_task_at_once(compiler: str) -> None:
     machine = FirmwareOnChip(compiler, planted=OVERFLOW)
