@@ -24,6 +24,7 @@ pytest.importorskip("cffi")
 from hil.emulator.stm32f405 import crash as crashes
 from hil.emulator.stm32f405.chip import CYCLES_PER_US, RAM, SOFTWARE, WATCHDOG, Chip, StopReason
 from hil.emulator.stm32f405.coverage import ImageLines
+from hil.emulator.stm32f405.cpu_profile import functions_of
 from hil.emulator.stm32f405.debugged_chip import DebuggedChip
 from hil.emulator.stm32f405.freertos import FreeRtos, Wait
 from hil.emulator.stm32f405.gdb import GdbServer
@@ -576,6 +577,7 @@ def memory(seed: int) -> dict[str, str]:
     chip.record()
     if seed == 2:
         chip.empty_flash_cache()
+    chip.profile([(one.address, one.address + one.size) for one in functions_of(firmware.image)])
     kept = [chip.save()]
     places = (0, 0x0800_4000, 0x0810_0000 - 8, 0x1000_0000, 0x1001_0000 - 4, RAM + 0x1F000, RAM + 0x2_0000 - 8,
               0x1FFF_7800, 0x1FFF_7A10, 0x4000_0000, 0x4002_3800, 0x4007_FFFC, 0xE000_ED00, 0x3000_0000)  # fmt: skip
@@ -615,6 +617,9 @@ def memory(seed: int) -> dict[str, str]:
             int(chip.passages.sum()),
             chip.ram[::97].sum(),
         )
+    profile = chip.profiled()
+    nodes = profile.node[0 : profile.nodes]
+    log.note("profile", *((one.function, one.cycles, one.asleep, one.calls) for one in nodes))
     log.note("cycles", chip.cycles_of_code().sum(), np.flatnonzero(chip.cycles_of_code())[:40])
     return log.told()
 

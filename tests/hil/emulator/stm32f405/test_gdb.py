@@ -380,6 +380,18 @@ def test_a_breakpoint_where_crashes_are_reported_stops_for_both() -> None:
     assert answers[-2:] == [b"T05thread:1;", pack("<I", place).hex().encode()]
 
 
+def test_a_step_that_ends_at_a_crash_leaves_its_report_to_the_next_run() -> None:
+    bench, server = Bench(bytes.fromhex("00bf 00bf 00bf")), GdbServer(0)
+    bench.chip.crash_points.add(FLASH + 10)
+    with socket.create_connection(("127.0.0.1", server.port)) as line:
+        line.sendall(b"".join(map(framed, (b"QStartNoAckMode", b"s", b"p0f", b"c"))))
+        assert DebuggedChip(bench.chip, server).run(CYCLES_PER_US) == StopReason.BREAK
+        server.close()
+        answers = contents(b"".join(iter(lambda: line.recv(1 << 16), b"")))
+    assert answers[1:] == [b"T05thread:1;", pack("<I", FLASH + 10).hex().encode()]
+    assert bench.chip.register("pc") == FLASH + 10
+
+
 @pytest.mark.parametrize("crashes", [False, True])
 def test_a_breakpoint_in_an_it_block_stops_at_its_end(crashes: bool) -> None:
     bench, server = Bench(bytes.fromhex("8042 04bf 0131 0231 0431 00bf")), GdbServer(0)  # cmp r0, r0; itt eq

@@ -68,7 +68,8 @@ def test_code_that_a_debugger_writes_runs_from_the_first_half_word_of_flash_on()
     bench = Bench()
     for code in ("0130 fee7", "0230 fee7"):  # adds r0, #1 or #2; b .
         bench.chip.write(chip.FLASH, bytes.fromhex(code))
-        bench.chip.set_register("pc", chip.FLASH)
+        bench.chip.set_register("pc", chip.FLASH | 1)
+        assert bench.chip.register("pc") == chip.FLASH
         bench.wait(1)
     assert bench.chip.register("r0") == 3
 
