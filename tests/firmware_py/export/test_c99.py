@@ -78,6 +78,11 @@ REFUSED = [
     ("y = n", "y changes its type to i32"),
     ("if n > 0:\n    z = x\ny = z", "z is read before it has a value: write z = f32(0.0) before line 19"),
     ("y = z\nz = x", "z is read before it has a value"),
+    ("z = z + x\ny = z", "z is read before it has a value"),
+    (
+        "if n > 0:\n    return z\nz = x\ny = z",
+        "z is read before it has a value: write z = f32(0.0) before line 19",
+    ),
     ("x = y", "x is an argument or a loop variable and is assigned"),
     ("for i in range(4):\n    i = 2", "i is an argument or a loop variable and is assigned"),
     ("for i in range(4):\n    y = x\ny = f32(i)", "i is no value here"),
@@ -126,6 +131,28 @@ def test_code_outside_the_subset_is_refused_with_file_line_and_reason(body: str,
     assert match, refusal.value
     assert reason in match[2]
     assert 19 <= int(match[1]) <= 19 + body.count("\n")
+
+
+@pytest.mark.parametrize(
+    ("body", "at_head", "inside"),
+    [
+        ("if n > 0:\n    z = x\n    y = z\nelse:\n    z = y\n    y = z + x", True, False),
+        ("if n > 0:\n    z = x\n    y = z", False, True),
+        ("if n > 0:\n    y = x\nelse:\n    z = y\n    y = z + x", False, True),
+        ("if n > 0:\n    y = x\nelif n > -3:\n    z = y\n    y = z\nelse:\n    z = x\n    y = -z", True, False),
+        ("if n > 0:\n    z = x\nelse:\n    z = y\ny = z", True, False),
+        ("for i in range(4):\n    z = x\n    y = z\nfor j in range(4):\n    z = y\n    y = z", True, False),
+        ("for i in range(4):\n    z = x\n    y = y + z", False, True),
+        ("z = x\nif n > 0:\n    y = z", False, False),
+    ],
+)  # fmt: skip
+def test_a_local_is_declared_in_the_block_that_has_all_its_uses(
+    body: str, at_head: bool, inside: bool
+) -> None:
+    _, _, text = translated(body).source.partition("float floaty_core_probe(")
+    lines = text.split("\n}\n")[0].splitlines()[1:]
+    assert ("    float z = 0.0f;" in lines[:1]) == at_head
+    assert any(re.match(r" {8}(const )?float z = ", line) for line in lines) == inside
 
 
 REFUSED_KERNELS = [
