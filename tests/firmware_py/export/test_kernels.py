@@ -245,6 +245,13 @@ def fraction(numbers: F64s) -> float:
 
 
 @kernel
+def by_itself(numbers: F64s) -> None:
+    """Do."""
+    y = y + numbers[0]  # type: ignore[has-type]  # noqa: F821
+    numbers[1] = y
+
+
+@kernel
 def recursive(numbers: F64s) -> None:
     """Do."""
     recursive(numbers)
@@ -259,6 +266,7 @@ def recursive(numbers: F64s) -> None:
         (asks_and_goes_on, "a call of Python: the function must return an integer"),
         (listed, "call of max, which is no kernel"),
         (by_float, "an index is f64, not i64"),
+        (by_itself, "y is read before it has a value"),
         (beyond, "index 11: f64 array of 11 has 0..10"),
         (retyped, "i64 = f64"),
         (untyped, "typing.Any has no equal in C"),

@@ -395,6 +395,13 @@ def test_pawn_is_that_of_salib() -> None:
     assert pawn(slices(points), values) == pytest.approx(expected, abs=0.005)
 
 
+def test_a_point_at_an_edge_is_in_the_slice_above_it() -> None:
+    """Of the edges between slices four lie at the lower value, one between both and four at the upper value."""
+    found = slices(np.repeat([[0.0, 1.0], [1.0, 0.0]], 50, axis=0))
+    assert found.argmax(axis=2).tolist() == 50 * [[4, 9]] + 50 * [[9, 4]]
+    assert (found.sum(axis=2) == 1).all()
+
+
 def test_both_values_of_an_axis_of_two_count_for_pawn() -> None:
     points = np.repeat([[0.0], [1.0]], 50, axis=0)
     assert pawn(slices(points), points[:, 0]) == pytest.approx([0.5])

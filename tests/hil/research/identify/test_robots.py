@@ -102,6 +102,8 @@ def test_a_profile_has_all_constants_of_an_axis_of_which_one_is_known(tmp_path: 
     [
         ({"values": {"roll_u1": 1.0}}, "belongs to another"),
         ({"covariance": [[1.0]]}, "the covariance of 4 constants has 4 rows"),
+        ({"covariance": [[1.0] * 3] * 3}, "the covariance of 4 constants has 4 rows"),
+        ({"covariance": [[1.0] * 4] * 3}, "the covariance of 4 constants has 4 rows"),
         ({"delay": "soon"}, "delay: Input should be a valid number"),
         ({"more": 1}, "more: Extra inputs"),
     ],
