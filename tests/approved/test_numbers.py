@@ -28,12 +28,13 @@ import firmware_py
 import ground_station
 import hil
 from support.approved import approve, judge
+from support.paths import ROOT
 
 NUMBERS = Path(__file__).with_name("numbers.json")
-FILLED = ("_LIBRARIES", "_SOURCES")  # while kernels are compiled
+VARYING = {"firmware_py.compiling": ("_LIBRARIES", "_SOURCES", "PLAIN")}  # filled, or of the environment
 LONG = 160
 HERE = {
-    sys.executable: "PYTHON", str(Path(hil.__file__).parents[1]): "PLACE",
+    sys.executable: "PYTHON", str(ROOT): "PLACE",
     f"python{sys.version_info.major}.{sys.version_info.minor}": "PYTHON",
 }  # fmt: skip
 STARTED = ("__main__", "sitecustomize")  # run when they are imported
@@ -72,7 +73,7 @@ def shown(value: Any) -> str:
         case re.Pattern():
             return repr(value.pattern)
         case Path():
-            return value.name
+            return value.name if value != ROOT else "PLACE"
     if is_dataclass(value) and not isinstance(value, type):
         return f"{type(value).__name__}{shown([getattr(value, one.name) for one in fields(value)])}"
     return getattr(value, "__name__", type(value).__name__)
@@ -126,7 +127,11 @@ def numbers(name: str) -> dict[str, str]:
     names = sorted(set(assigned(ast.parse(inspect.getsource(module)).body)))
     own = [one for one in vars(module).values() if getattr(one, "__module__", "") == name]
     found = chain(
-        ((one, getattr(module, one)) for one in names if one.strip("_").isupper() and one not in FILLED),
+        (
+            (one, getattr(module, one))
+            for one in names
+            if one.strip("_").isupper() and one not in VARYING.get(name, ())
+        ),
         *(members(one) for one in own if inspect.isclass(one) and not issubclass(one, BaseModel)),
         *(defaults(one.__name__, one) for one in own if inspect.isfunction(one)),
     )
