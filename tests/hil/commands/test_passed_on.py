@@ -580,6 +580,40 @@ def test_logs_are_identical_only_with_the_same_columns_and_boards_say_why_they_d
     )
 
 
+def test_folders_of_seeds_are_compared_only_with_one_another(cli: Cli, asked: Asked) -> None:
+    for name in ("a", "b", "run"):
+        Path(name).mkdir()
+    Path("run/log.parquet").touch()
+    asked.answer({"research.studies.two_boards.seeds_of": "seeds", "commands.compare._print_seeds": 1,
+        "pictures.compare.load_flown": failing(LabError("no log"))})  # fmt: skip
+    assert cli("compare", "a", "b") == 1
+    assert asked == [("seeds_of", Path("a"), Path("b")), ("_print_seeds", Path("a"), Path("b"), "seeds")]
+    for folders in (("a", "run"), ("run", "b")):
+        asked.clear()
+        assert cli.refusal("compare", *folders) == "floaty: no log\n"
+        assert [one[0] for one in asked] == ["load_flown"]
+
+
+@pytest.mark.parametrize("flown", [0, 1, 2])
+def test_an_experiment_of_the_user_s_is_checked_against_the_second_run_unless_the_first_flew_it(
+    cli: Cli, asked: Asked, flown: int
+) -> None:
+    """It flew in neither, the first or the second run; a run that flew it was found by it."""
+    given = EXPERIMENTS["hover"]
+    runs = {name: Made(result=Made(request=Made(experiment=given if flown == n else None)))
+        for n, name in enumerate("ab", 1)}  # fmt: skip
+    comparison = Made(identical=True, first=None, unmeasured=())
+    asked.answer({
+        "laboratory.experiments.find_experiment": given, "laboratory.experiments.check_flown": None,
+        "pictures.compare.load_flown": lambda folder, find: runs[str(folder)], "pictures.compare.compare": comparison,
+        "research.studies.two_boards.comparable": False, "pictures.compare.write_comparison": "page",
+        "commands.compare.print_comparison": None,
+    })  # fmt: skip
+    assert cli("compare", "a", "b", "--experiment", "mine.py:turn") == 0
+    checked = [one[1:] for one in asked if one[0] == "check_flown"]
+    assert checked == ([] if flown == 1 else [(given, runs["b"].result)])
+
+
 def test_a_robot_of_another_size_is_analysed_and_written_as_a_profile_of_its_length(
     cli: Cli, asked: Asked
 ) -> None:

@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 
 from hil.config import load_config
+from hil.errors import LabError
 from hil.laboratory import request
+from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.files.recorder import load_log
 from hil.laboratory.files.result import Result
 from hil.laboratory.lockstep import image_at
@@ -107,3 +109,11 @@ def test_each_link_and_board_needs_its_own_packages(
     monkeypatch.setattr(request, "require", lambda *what: needed.append(what))
     request.Bench(link, board).check()
     assert needed == expected
+
+
+@pytest.mark.parametrize("name", [name for name, one in EXPERIMENTS.items() if one.faults])
+def test_a_shorter_flight_leaves_out_its_experiment_s_later_faults_but_not_the_user_s(name: str) -> None:
+    short = request.Request.of(EXPERIMENTS[name], duration_s=0.01)
+    assert len(short.planned_faults) == len(EXPERIMENTS[name].faults)
+    with pytest.raises(LabError, match=r"push\.y@9"):
+        request.Request.of(EXPERIMENTS[name], duration_s=0.01, faults=("push.y@9=1",))
