@@ -94,6 +94,8 @@ class Crew:
             self.looks.append([sorted(job.index for _, job in pool.open) for pool in self.pools])
             for pool in self.pools:
                 pool.end()
+            ended = any(future.done() for future in flying)
+            assert self.workers._bell.is_set() or not ended, "noticed at once"
             return done(flying)
 
         patch.setattr(self.workers, "_done", look)
