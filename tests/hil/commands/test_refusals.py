@@ -88,8 +88,8 @@ fly hover --set swarm.wake=0 | --set swarm.wake=0: has no effect on one robot
 fly hover --set quadrotor.mass=0.03 | --set quadrotor.mass=0.03: has no effect on the robot of profile floaty
 fly hover --profile crazyflie --board empty.elf --set controller.gain_z=3 | has no effect on the robot of profile crazyflie
 fly hover --profile crazyflie --board empty.elf --set actuators.tau=0.1 | has no effect on the robot of profile crazyflie
-fly take-off-landing --profile crazyflie --board empty.elf | experiment take-off-landing: plant.limits.below=1.15: has no effect on the robot of profile crazyflie
-fly airspeed-9 --profile crazyflie --board empty.elf | experiment airspeed-9: allocation.hover_angle=0.0000: has no effect
+fly take-off-landing --profile crazyflie --board empty.elf | experiment take-off-landing: plant.limits.below=1.15
+fly airspeed-9 --profile crazyflie --board empty.elf | experiment airspeed-9: allocation.hover_angle=0.0000
 fly identify --profile crazyflie --board empty.elf | has no effect on the robot of profile crazyflie
 fly hover --profile crazyflie --set 'robot.decks=["flow3"]' | robot.decks[0] = 'flow3': input should be 'flow2' or 'multir
 fly hover --profile crazyflie --set 'robot.decks=["flow2", "flow2"]' | ['flow2', 'flow2']: each deck at most once
