@@ -21,7 +21,7 @@ from cflib.crazyflie.param import ParamTocElement
 from cflib.crtp.crtpstack import CRTPPacket, CRTPPort
 
 from firmware_py.wire.crtp import PORT_CONSOLE, PORT_LOG, decode, encode_ext_pose
-from firmware_py.wire.parameters import ABSOLUTE
+from firmware_py.wire.parameters import ABSOLUTE, encode_pose_kind
 from firmware_py.wire.scalars import PARAMETER_SCALARS
 from firmware_py.wire.telemetry import Sample, state_in
 from ground_station.clock import clock_us
@@ -102,7 +102,7 @@ class CrazyradioLink(LiveLink):
         statistics.uplink_rssi_updated.add_callback(partial(setattr, self, "rssi"))
         statistics.uplink_rate_updated.add_callback(partial(setattr, self, "_rate"))
         if crazyflie.param.toc.get_element_by_complete_name(ABSOLUTE) is not None:
-            crazyflie.param.set_value(ABSOLUTE, 0)  # it is corrections that follow
+            self._queue(0, encode_pose_kind(absolute=False))  # cflib would first read all values
         self._telemetry_us = now_us = clock_us()
         self._logs.request(now_us)
         return True

@@ -38,6 +38,7 @@ class Sender:
 
     def __init__(self) -> None:
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()  # only a few; at most one pose
+        self._useless = False
         self._thread = threading.Thread(target=self._run, name="sender", daemon=True)
         self._thread.start()
 
@@ -45,13 +46,15 @@ class Sender:
         """Queue a job behind those before it."""
         self._jobs.put(job)
 
-    def close(self) -> None:
-        """End the thread after the queued jobs; a job that hangs is left alone."""
+    def close(self, lost: bool) -> None:
+        """End the thread after the queued jobs, or without them on a lost link; a job that hangs is left alone."""
+        self._useless = lost
         self._jobs.put(None)
-        self._thread.join(CLOSE_TIMEOUT_S)
+        if not lost:
+            self._thread.join(CLOSE_TIMEOUT_S)
 
     def _run(self) -> None:
-        while (job := self._jobs.get()) is not None:
+        while (job := self._jobs.get()) is not None and not self._useless:
             job()
 
 
@@ -178,7 +181,7 @@ class LiveLink(ABC):
         self.mute()
         sender, self._sender = self._sender, None
         if sender is not None:
-            sender.close()
+            sender.close(lost=bool(self._failure()))
         self._close()
 
     # Uplink

@@ -3,6 +3,7 @@
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from functools import partial
 from types import SimpleNamespace as Made
 from typing import Any, ClassVar
 
@@ -18,7 +19,7 @@ from cflib.crtp.crtpstack import CRTPPacket
 from cflib.utils.callbacks import Caller
 
 from firmware_py.wire import crtp
-from firmware_py.wire.parameters import ABSOLUTE
+from firmware_py.wire.parameters import ABSOLUTE, encode_pose_kind
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.telemetry import ALL_BLOCKS, CONTROL
 from ground_station.config import LinkSettings
@@ -34,6 +35,7 @@ from support.log_board import TABLE, LogBoard, data_packet
 
 URI = "radio://0/80/2M"
 PATIENCE_S = 30.0
+CORRECTIONS = encode_pose_kind(absolute=False)
 PARAMETERS = (
     (3, 0x08, "stabilizer", "estimator"), (9, 0x46, "imu_sensors", "BMP388"), (5, 0x06, *ABSOLUTE.split(".")),
     (6, 0x07, "twice", "float"), (7, 0x11, "stored", "gain"),
@@ -41,7 +43,7 @@ PARAMETERS = (
 
 
 class Cflib:
-    """cflib's Crazyflie, whose board answers requests for telemetry; `sent` are the packets, `set` the values written."""
+    """cflib's Crazyflie, whose board answers requests for telemetry; `sent` are the packets."""
 
     protocol = 10
     answers = True  # connects
@@ -49,7 +51,6 @@ class Cflib:
 
     def __init__(self, rw_cache: str) -> None:
         self.sent: list[bytes] = []
-        self.set: dict[str, float] = {}
         self.callbacks: dict[int, list[Callable[[CRTPPacket], None]]] = defaultdict(list)
         self.closed = 0
         self.link: Made | None = None
@@ -65,7 +66,7 @@ class Cflib:
         self.link_statistics = LinkStatistics(self)
         self.connected.add_callback(lambda uri: self.link_statistics.start())
         self.platform = Made(get_protocol_version=lambda: self.protocol)
-        self.param, self.log = Made(toc=Toc(), set_value=self.set.__setitem__), Made(toc=Toc())
+        self.param, self.log = Made(toc=Toc()), Made(toc=Toc())
         for number, kind, group, name in PARAMETERS:
             element = ParamTocElement(number, bytes((kind,)) + f"{group}\0{name}\0".encode())
             if element.is_extended():
@@ -162,7 +163,7 @@ def test_a_board_that_connects_is_told_of_corrections_and_asked_for_telemetry_ea
     for count in (1, 2):
         board = air.open()
         assert len(air.boards) == count
-        assert board.set == {ABSOLUTE: 0}
+        assert board.sent.count(CORRECTIONS) == 1
         assert set(board.board.periods) == {block.id for block in ALL_BLOCKS}
         air.link.close()
         assert board.closed == 1
@@ -221,11 +222,38 @@ def test_closing_waits_for_cflib_unless_the_link_is_lost_or_has_no_safelink(
     assert (len(waited), last.closed) == (1, 0)
 
 
+def test_a_lost_link_waits_for_no_job_that_hangs_and_forgets_the_queued_ones(air: Air) -> None:
+    """cflib blocks for 2 s what is sent while it closes a lost link; the robot has no corrections meanwhile."""
+    hangs, goes_on = threading.Event(), threading.Event()
+    done: list[str] = []
+
+    def hang() -> None:
+        hangs.set()
+        goes_on.wait()
+
+    air.open()
+    air.link._do(partial(done.append, "in order"))
+    air.link.close()
+    assert done == ["in order"]
+    second = air.open()
+    thread = air.link._sender._thread
+    air.link._do(hang)
+    air.link._do(partial(done.append, "late"))
+    hangs.wait()
+    second.link = None
+    second.connection_lost.call(URI, "Too many packets lost")
+    air.link.close()
+    assert thread.is_alive()
+    goes_on.set()
+    thread.join()
+    assert done == ["in order"]
+
+
 def test_without_the_parameter_of_absolute_poses_none_is_written(
     air: Air, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Toc, "get_element_by_complete_name", lambda toc, name: None)
-    assert air.open().set == {}
+    assert CORRECTIONS not in air.open().sent
 
 
 def test_telemetry_tells_the_state_and_keeps_the_link(air: Air) -> None:
