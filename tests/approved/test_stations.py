@@ -843,7 +843,9 @@ class Mailbox(Random):
             patch.setattr(
                 live_link,
                 "Sender",
-                lambda: Made(put=jobs.append, close=partial(self.log.note, "sender closed")),
+                lambda: Made(
+                    put=jobs.append, close=lambda lost: self.log.note(f"sender closed{', lost' * lost}")
+                ),
             )
             link = Kept(self)
             for turn in range(1500):
@@ -926,7 +928,7 @@ class Serial(Random):
             patch.setattr(mavlink_serial, "signing_start", lambda: 77)
             patch.setattr(mavlink_serial, "POLL_S", 0.0)
             patch.setattr(mavlink_serial, "_Port", opened)
-            patch.setattr(live_link, "Sender", lambda: Made(put=lambda job: job(), close=lambda: None))
+            patch.setattr(live_link, "Sender", lambda: Made(put=lambda job: job(), close=lambda lost: None))
             for uri in (
                 "mavlink:/dev/ttyUSB0",
                 "mavlink:COM3,57600",

@@ -181,7 +181,9 @@ class Shapes:
             return np.concatenate([shares, conditions(point) - MARGIN])
 
         def above(z: NDArray[np.float64]) -> NDArray[np.float64]:
-            return reached(*z[:-1].tolist()) - z[-1] * IS_SHARE
+            *shape, level = z.tolist()
+            found: NDArray[np.float64] = reached(*shape) - level * IS_SHARE
+            return found
 
         z = np.append((x - LOW) / (HIGH - LOW), 0.0)
         slope = np.append(np.zeros(len(LOW)), -1.0)
