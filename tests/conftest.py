@@ -150,12 +150,16 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark the tests in `tests/realtime/`, and give every test its time limit."""
+    """Mark the tests in `tests/realtime/`, give every test its time limit, and let long ones begin.
+
+    At the end, one worker would wait minutes for another's.
+    """
     for item in items:
         if item.path.is_relative_to(REALTIME):
             item.add_marker("realtime")
         if config.pluginmanager.hasplugin("timeout"):  # `make` installs it
             item.add_marker(pytest.mark.timeout(limit_s(item), method="signal"))
+    items.sort(key=lambda item: "realtime" in item.keywords or "long" not in item.keywords)
 
 
 def limit_s(item: pytest.Item) -> float:

@@ -13,13 +13,16 @@ from numpy.typing import NDArray
 from hil.api import Run, column
 from hil.config import load_config
 from hil.emulator.crazyflie.log_table import ImageVariable
-from hil.laboratory.experiments import Experiment, find_experiment
+from hil.laboratory.experiments import EXPERIMENTS, Experiment, find_experiment
 from hil.laboratory.files.result import Result
 from hil.laboratory.lockstep import image_at
 from hil.laboratory.request import Options, Request
 from hil.laboratory.run import fly
 from hil.servers.built_in_station import fly_built_in
 from hil.servers.server import Server, Service
+
+FAMILIES = ("yaw-", "height-sine", "y-square", "pushes", "side-wind-", "occlusion", "airspeed-")
+PAPER = [name for name in EXPERIMENTS if name.startswith(FAMILIES)]
 
 
 def flown(folder: Path, experiment: str | Experiment, *overrides: str, **options: Unpack[Options]) -> Result:

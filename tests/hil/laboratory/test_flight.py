@@ -22,7 +22,7 @@ from hil.laboratory.metrics import ALWAYS, column
 from hil.laboratory.request import LOCKSTEP, Bench, Request
 from hil.laboratory.run import Started, fly
 from hil.research.campaigns.jobs import Job, row_of
-from support.flights import explain, flown, hover
+from support.flights import PAPER, explain, flown, hover
 from support.full_disk import small_files
 
 HOVER = EXPERIMENTS["hover"]
@@ -133,8 +133,8 @@ def test_hover_with_the_authors_gains_swings_in_y_and_survives(tmp_path: Path) -
         assert np.mean([result.metrics[f"within_6cm_{axis}"] for result in results]) > 0.95
 
 
-HEALTHY = (
-    *((name, ()) for name in EXPERIMENTS if name != "endurance"),
+HEALTHY = (  # besides those of the paper, which test_experiments.py flies
+    *((name, ()) for name in EXPERIMENTS if name not in ("endurance", *PAPER)),
     ("hover", ("push.x@1=20",)),
     ("hover", ("push.y@1=20",)),
     ("hover", ("push.z@1=-20",)),

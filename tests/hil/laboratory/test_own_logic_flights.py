@@ -104,8 +104,9 @@ def test_a_flight_on_another_board_is_bit_identical(failed: Result, tmp_path: Pa
 @pytest.mark.long
 @pytest.mark.parametrize("profile", ["original", "lqr"])
 def test_shipped_laws_hover_within_limits_and_alike_on_every_board(tmp_path: Path, profile: str) -> None:
+    assert hover(tmp_path / "whole", profile=profile).passed
     results = [
-        hover(tmp_path / board, profile=profile, board=board) for board in ("python", "c", "cortex-m4")
+        hover(tmp_path / board, profile=profile, board=board, duration_s=4.0)
+        for board in ("python", "c", "cortex-m4")
     ]
-    assert [result.passed for result in results] == [True] * 3
     assert len({result.hash for result in results}) == 1

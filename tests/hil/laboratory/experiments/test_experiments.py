@@ -19,7 +19,7 @@ from hil.laboratory.experiments.disturbances import FAULTS, PUSHES
 from hil.laboratory.experiments.measures import recoveries, response, steps, y_steps
 from hil.laboratory.faults import Fault
 from hil.laboratory.files.recorder import load_events, load_log
-from hil.laboratory.metrics import ALWAYS, METRICS
+from hil.laboratory.metrics import ALWAYS, METRICS, column
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.pictures.gallery import pictures_of
@@ -28,10 +28,8 @@ from hil.world.config import TunnelConfig
 from hil.world.floaty.correction import TABLE
 from hil.world.floaty.plant import Plant
 from hil.world.floaty.shape import SIGNS
-from support.flights import explain, flown
+from support.flights import PAPER, explain, flown
 
-FAMILIES = ("yaw-", "height-sine", "y-square", "pushes", "side-wind-", "occlusion", "airspeed-")
-PAPER = [name for name in EXPERIMENTS if name.startswith(FAMILIES)]
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -164,7 +162,10 @@ def test_the_default_profile_holds_the_limits(tmp_path: Path, name: str, link: s
     result = flown(tmp_path / "run", name, seed=seed, link=link)
     assert result.passed, explain(result)
     assert result.verdicts
-    assert is_drawn(pictures_of(EXPERIMENTS[name])[0].draw(load_log(result.folder)))
+    log = load_log(result.folder)
+    assert is_drawn(pictures_of(EXPERIMENTS[name])[0].draw(log))
+    refused = column(log, "tracker.refused")[-1], column(log, "tracker.restarts")[-1]
+    assert refused == (0, 0), "of poses that are all healthy"
 
 
 @pytest.mark.long
