@@ -33,7 +33,7 @@ settings.register_profile("reproducible", derandomize=True, deadline=None)  # a 
 if "FLOATY_FUZZ" not in os.environ:
     settings.load_profile("reproducible")
 
-REALTIME = Path(__file__).parent / "realtime"
+REALTIME, TOOLS = Path(__file__).parent / "realtime", Path(__file__).parent / "tools"
 STANDSTILL_MS = 100  # of the test's own process, which no real-time test need survive
 METER_PERIOD_S = 0.005
 STEADY_MS, STEADY_S = 20, 5.0  # a machine runs steadily when a busy process misses no longer time for so long
@@ -150,16 +150,13 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark the tests in `tests/realtime/`, give every test its time limit, and let long ones begin.
-
-    At the end, one worker would wait minutes for another's.
-    """
+    """Mark the tests in `tests/realtime/`, and give every test its time limit; those of the tools, minutes long, begin."""
     for item in items:
         if item.path.is_relative_to(REALTIME):
             item.add_marker("realtime")
         if config.pluginmanager.hasplugin("timeout"):  # `make` installs it
             item.add_marker(pytest.mark.timeout(limit_s(item), method="signal"))
-    items.sort(key=lambda item: "realtime" in item.keywords or "long" not in item.keywords)
+    items.sort(key=lambda item: not item.path.is_relative_to(TOOLS))
 
 
 def limit_s(item: pytest.Item) -> float:
