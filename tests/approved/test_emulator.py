@@ -47,6 +47,7 @@ from hil.world.room import Room
 from support.approved import Log, approve, judge
 from support.crazyflie_board import Board, image
 from support.flight_backwards import Flight
+from support.random_use import by_seed
 from support.stm32_firmware import build
 from support.stm32_machine import FirmwareOnChip, Profiled
 
@@ -636,11 +637,9 @@ FOUND: dict[str, Callable[[], list[str] | dict[str, str]]] = {
     **{f"session {seed}": lambda seed=seed: Session(seed).told() for seed in SEEDS},  # type: ignore[misc]
     "profiles": profiles,
     "reasons": reasons,
-    **{
-        f"{use.__name__} {seed}": lambda use=use, seed=seed: use(seed)  # type: ignore[misc]
-        for use in (kernel, time_line, watch, memory, remote, backwards, reported)
-        for seed in SEEDS
-    },
+    **by_seed(
+        (kernel, time_line, watch, memory, remote, backwards, reported), SEEDS, lambda use, seed: use(seed)
+    ),
 }
 
 

@@ -30,7 +30,7 @@ def shown(value: Any, digits: int = 5) -> str:
 def by_seed(
     kinds: Iterable[Any], seeds: Iterable[int], told: Callable[[Any, int], dict[str, str]]
 ) -> dict[str, Callable[[], dict[str, str]]]:
-    """Return what tells of each kind with each seed, by their names."""
+    """Return a function for every kind and seed, named after both, that uses the kind and returns what was seen."""
     seeds = tuple(seeds)
     return {f"{kind.__name__} {seed}": partial(told, kind, seed) for kind in kinds for seed in seeds}
 

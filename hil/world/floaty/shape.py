@@ -43,7 +43,6 @@ class Plate:
     centre: NDArray[np.float64]  # (3,) [m] of pressure
 
 
-@lru_cache(256)
 def flap_plates(geometry: GeometryConfig) -> tuple[Plate, Plate]:
     """Return the flat part and the kinked strip of flap 2."""
     parts = surfaces(geometry) if geometry.outline else ()
