@@ -6,7 +6,7 @@ import hashlib
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from math import nan
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -27,7 +27,7 @@ from firmware_py.logic.plugs import GROUP, POINTS, SENSED, Plug, PlugPoint, read
 from firmware_py.table import CoreParameter, CoreVariable
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Loaded:
     """Logic that is ready to fly, with the defaults that its modules declare."""
 
@@ -35,9 +35,14 @@ class Loaded:
     digest: str  # of the modules' texts
     calls: Mapping[str, tuple[str, ...]]
     entry: ModuleType  # the calls, as Python
-    translation: Translation
     structs: Mapping[str, type[Struct]]  # of the blocks that own logic adds to the core's
     files: Mapping[str, str]  # by plug point
+    texts: Mapping[str, str]  # as they fly, with the core's, by module
+
+    @cached_property
+    def translation(self) -> Translation:
+        """Return the logic and the core as C."""
+        return translate(self.texts, {f"own_{name}": _shown(file) for name, file in self.files.items()})
 
     @property
     def parameters(self) -> tuple[CoreParameter, ...]:
@@ -176,18 +181,14 @@ def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
     texts = core_texts() | {f"own_{name}": text for name, _, text in modules}
     shown = {f"own_{name}": _shown(file) for name, file, _ in modules}
     lines: list[str] = []
-    plugs = tuple(_checked(point, texts, shown, lines) for point in POINTS if f"own_{point.name}" in texts)
+    checked = [_checked(point, texts, shown, lines) for point in POINTS if f"own_{point.name}" in texts]
     if lines:
         raise ExportError("\n".join(lines))
+    plugs = tuple(plug for plug, _ in checked)
     _check_names(plugs, shown)
     digest = hashlib.sha256(repr([(name, text) for name, _, text in modules]).encode()).hexdigest()
-    translation = translate(texts | {"entry": compose(plugs).text}, shown)
-    flown = {plug.point.name: _with_budget(plug, texts, shown) for plug in plugs}
-    plugs = tuple(plug for plug, _ in flown.values())
     entry = compose(plugs)
-    texts |= {f"own_{name}": text for name, (_, text) in flown.items()} | {"entry": entry.text}
-    if any(plug.charged for plug in plugs):
-        translation = translate(texts, shown)
+    texts |= {f"own_{plug.point.name}": text for plug, text in checked} | {"entry": entry.text}
     files = {name: file for name, file, _ in modules}
     own = SimpleNamespace()
     for plug in plugs:
@@ -199,24 +200,35 @@ def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
         setattr(own, name, module)
     run = _run(ENTRY, entry.text, f"{ENTRY}.py", own)
     structs = {block: getattr(run, struct) for block, struct in own_blocks(plugs).items()}
-    return Loaded(plugs, digest, entry.calls, run, translation, structs, files)
+    return Loaded(plugs, digest, entry.calls, run, structs, files, texts)
 
 
-def _checked(point: PlugPoint, texts: Mapping[str, str], shown: Mapping[str, str], lines: list[str]) -> Plug:
-    """Return what a module provides, and add its refusals to the lines."""
+def _checked(
+    point: PlugPoint, texts: Mapping[str, str], shown: Mapping[str, str], lines: list[str]
+) -> tuple[Plug, str]:
+    """Return what a module provides, with its text as it flies: loops whose length depends on data are charged.
+
+    Its refusals are added to the lines.
+    """
     name = f"own_{point.name}"
-    empty = Plug(point, {}, {}, (), (), {})
     try:
         modules = read_modules(texts, shown, name)
         plug = read_plug(point, modules[-1])
         check(modules, plug.hooks)
-        if not modules[-1].refusals.found:
-            budgeted(texts[name], modules)
+        flown = None if modules[-1].refusals.found else budgeted(texts[name], modules)
     except RefusalError as error:  # no Python, or no part of the core
         lines.append(str(error))
-        return empty
-    lines += modules[-1].refusals.lines()
-    return plug
+        flown = None
+    else:
+        lines += modules[-1].refusals.lines()
+    if flown is None:
+        return Plug(point, {}, {}, (), (), {}), ""
+    hooks = {
+        hook: (ARGUMENT, *arguments) if hook in flown.charged else arguments
+        for hook, arguments in plug.hooks.items()
+    }
+    charged = {hook: cycles for hook, cycles in flown.charged.items() if hook in hooks}
+    return replace(plug, hooks=hooks, charged=charged), flown.text
 
 
 def _run(name: str, text: str, file: str, own: SimpleNamespace) -> ModuleType:
@@ -229,18 +241,6 @@ def _run(name: str, text: str, file: str, own: SimpleNamespace) -> ModuleType:
     module.__dict__["__builtins__"] = vars(builtins) | {"__import__": import_}
     exec(compile(text, file, "exec"), module.__dict__)
     return module
-
-
-def _with_budget(plug: Plug, texts: Mapping[str, str], shown: Mapping[str, str]) -> tuple[Plug, str]:
-    """Return a module with its text as it flies: loops whose length depends on data are charged."""
-    name = f"own_{plug.point.name}"
-    found = budgeted(texts[name], read_modules(texts, shown, name))
-    hooks = {
-        hook: (ARGUMENT, *arguments) if hook in found.charged else arguments
-        for hook, arguments in plug.hooks.items()
-    }
-    charged = {hook: cycles for hook, cycles in found.charged.items() if hook in hooks}
-    return replace(plug, hooks=hooks, charged=charged), found.text
 
 
 def _check_names(plugs: tuple[Plug, ...], shown: Mapping[str, str]) -> None:
