@@ -102,6 +102,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
         "hil/live/feed.py", "hil/live/local_server.py", "hil/research/campaigns/workers.py",
         "ground_station/links/live_link.py", "ground_station/links/crazyradio.py", "ground_station/links/mavlink_serial.py",
         "ground_station/terminal.py", "hil/servers/dongle_plugin.py", "hil/emulator/stm32f405/checkpoints.py",
+        "firmware_py/export/syntax.py",
     ),
     "prompt_toolkit": ("ground_station/terminal.py",),
     "multiprocessing": ("hil/research/campaigns/workers.py", "hil/servers/swarm.py"),

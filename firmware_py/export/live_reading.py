@@ -37,6 +37,7 @@ from firmware_py.export.syntax import (
     StructField,
     StructType,
     ValueType,
+    parsed,
 )
 
 ARGUMENTS: tuple[tuple[Any, ValueType], ...] = (
@@ -130,7 +131,7 @@ class _Reader:
         path = function.__code__.co_filename
         if path not in self._modules:
             text = Path(path).read_text("utf-8")
-            tree = ast.parse(text, path)
+            tree = parsed(text, path)
             functions = {
                 min([node.lineno, *(one.lineno for one in node.decorator_list)]): node
                 for node in tree.body

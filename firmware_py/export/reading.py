@@ -34,6 +34,7 @@ from firmware_py.export.syntax import (
     StructField,
     StructType,
     ValueType,
+    parsed,
 )
 
 MOST_NUMBERS = 65536  # in the constant arrays of a module: 256 KiB, a quarter of the flash
@@ -63,7 +64,7 @@ def _read_after_imports(
         return
     path = own.get(name, f"firmware_py/core/{name}.py")
     try:
-        tree = ast.parse(texts[name], path)
+        tree = parsed(texts[name], path)
     except SyntaxError as error:
         raise RefusalError(path, error.lineno or 1, str(error.msg)) from None
     for node in tree.body:

@@ -3,6 +3,7 @@
 import ast
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from threading import RLock
 from typing import Union
 
 from firmware_py.core.subset import Logged, Sensed, Settable, Tunable
@@ -22,6 +23,16 @@ C_KEYWORDS = frozenset(
         "while", "NULL", "offsetof",
     }
 )  # fmt: skip
+_PARSING = RLock()
+
+
+def parsed(text: str, path: str = "") -> ast.Module:
+    """Return Python source as its tree. Raises `SyntaxError`.
+
+    CPython 3.11 counts the depth of all threads' trees in one place: two that parse at once fail by chance.
+    """
+    with _PARSING:
+        return ast.parse(text, path)
 
 
 @dataclass(frozen=True, slots=True)

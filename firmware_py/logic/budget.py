@@ -14,7 +14,7 @@ from firmware_py.core.budget import CALL_CYCLES
 from firmware_py.export.errors import refusal
 from firmware_py.export.expressions import Expressions
 from firmware_py.export.locals import find_locals
-from firmware_py.export.syntax import I32, PACKAGE, SUBSET, Module, Signature
+from firmware_py.export.syntax import I32, PACKAGE, SUBSET, Module, Signature, parsed
 
 CLOCK_MHZ = 168
 SLOW, STEP, CALL = 14, 4, 4  # cycles
@@ -170,9 +170,7 @@ def _end(node: ast.expr | ast.stmt) -> tuple[int, int]:
 
 def _import(text: str) -> Edit:
     """Return the import that the edits need, behind that of the subset."""
-    found = [
-        node for node in ast.parse(text).body if isinstance(node, ast.ImportFrom) and node.module == SUBSET
-    ]
+    found = [node for node in parsed(text).body if isinstance(node, ast.ImportFrom) and node.module == SUBSET]
     return _end(found[0]), _end(found[0]), f"; from {PACKAGE}.budget import {STRUCT}, charged_end"
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from firmware_py.core import entry
-from firmware_py.export.syntax import OWN, VOID
+from firmware_py.export.syntax import OWN, VOID, parsed
 from firmware_py.logic.budget import ARGUMENT, STRUCT
 from firmware_py.logic.plugs import BLOCKS, CALLS, CONTROLLER, ESTIMATOR, Plug
 
@@ -101,7 +101,7 @@ def compose(plugs: Sequence[Plug]) -> EntryText:
         points |= {core: own.format(**calls) for core, own in POINTS[plug.point.name].items()}
     types = {**BLOCKS, **own_blocks(plugs)}
     points[IMPORTS] = head
-    body = _exchanged(ast.parse(TEXT).body, points)
+    body = _exchanged(parsed(TEXT).body, points)
     taken = dict(CALLS)
     for node in body:
         if isinstance(node, ast.FunctionDef):
@@ -117,7 +117,7 @@ def compose(plugs: Sequence[Plug]) -> EntryText:
 
 def _exchanged(body: Sequence[ast.stmt], points: dict[str, str]) -> list[ast.stmt]:
     """Return statements; at a plug point, those that take its place out of `points`."""
-    return [new for line in map(ast.unparse, body) for new in ast.parse(points.pop(line, line)).body]
+    return [new for line in map(ast.unparse, body) for new in parsed(points.pop(line, line)).body]
 
 
 def _hook_calls(plug: Plug) -> dict[str, str]:

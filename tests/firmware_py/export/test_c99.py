@@ -1,7 +1,10 @@
 """The exporter: C that strict compilers accept, laid out as numpy does, and refusals with file, line and reason."""
 
 import ctypes
+import gc
+import os
 import re
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from firmware_py.export.compilers import Compiler, compilers
 from firmware_py.export.literals import float_literal
 from firmware_py.export.native import STRICT, build
 from firmware_py.export.profile_c import profile_hash, profile_source
+from firmware_py.export.syntax import parsed
 from firmware_py.logic.plugs import ANSWERING, CALLS
 from hil.config import load_config
 
@@ -133,6 +137,7 @@ def test_code_outside_the_subset_is_refused_with_file_line_and_reason(body: str,
     assert 19 <= int(match[1]) <= 19 + body.count("\n")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("body", "at_head", "inside"),
     [
@@ -226,6 +231,7 @@ def test_the_shortest_of_two_arrays_bounds_an_index(arrays: tuple[str, str]) -> 
         of_index(4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("standard", ["-std=c99", "-std=gnu11"])
 @pytest.mark.parametrize("compiler", COMPILERS, ids=IDS)
 def test_strict_compilers_accept_the_core_without_a_warning(compiler: Compiler, standard: str) -> None:
@@ -241,6 +247,7 @@ def test_the_c_has_no_double_no_library_and_no_memory_of_its_own() -> None:
     assert not re.search(r"^(static (?!const)|(?!typedef|extern|static|#|\}|enum)\w)[^(\n]*;", code, re.M)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 def test_a_struct_of_another_layout_does_not_compile() -> None:
     swapped = C.header.replace("int32_t quiet_ticks;", "int32_t spare;\n    int32_t quiet_ticks;")
@@ -295,6 +302,7 @@ def test_constants_that_two_modules_define_get_the_modules_name() -> None:
     assert "static const float CONTROLLER_DT = 0.01f;" in C.source
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 def test_every_float_literal_is_read_by_the_compiler_as_that_float() -> None:
     bits = np.random.default_rng(4).integers(0, 2**32, 20_000, np.uint32)
@@ -319,3 +327,17 @@ def test_a_profile_in_c_has_the_bits_of_the_emulators_parameters(overrides: list
     text = profile_hash(config).encode()
     assert ctypes.string_at(ctypes.addressof(ctypes.c_char.in_dll(library, "floaty_profile_hash"))) == text
     assert profile_hash(config) != profile_hash(load_config(overrides=["servo.trim=[9, 9, 9, 9]"]))
+
+
+def test_threads_read_modules_side_by_side() -> None:
+    """A system call in the collector changes threads in the midst of a tree."""
+    text, threshold = core_texts()["estimator"], gc.get_threshold()
+    gc.callbacks.append(give_way := lambda *_: os.stat("/"))
+    gc.set_threshold(50)
+    try:
+        with ThreadPoolExecutor(2) as threads:
+            trees = [*threads.map(parsed, [text] * 40)]
+    finally:
+        gc.set_threshold(*threshold)
+        gc.callbacks.remove(give_way)
+    assert {len(tree.body) for tree in trees} == {len(parsed(text).body)}
