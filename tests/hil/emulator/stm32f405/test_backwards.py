@@ -1,6 +1,7 @@
 """Going back in time: a chip's saved state comes back whole, and a search ends where it has to."""
 
 import os
+import select
 import signal
 import socket
 import sys
@@ -144,6 +145,7 @@ def children(pid: int) -> list[int]:
     return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
+@pytest.mark.long
 def test_time_runs_backwards_through_the_instants_at_which_it_ran_forward(tmp_path: Path) -> None:
     flight = Flight(tmp_path / "log")
     begin, line = flight.instant(), b"0,%x,2" % flight.place("send_line")
@@ -165,6 +167,7 @@ def test_time_runs_backwards_through_the_instants_at_which_it_ran_forward(tmp_pa
     assert flight.path.read_text() == "".join(f"{number}\n" for number in range(1, 131))
 
 
+@pytest.mark.long
 def test_the_way_back_passes_each_access_of_a_watchpoint_and_ends_at_the_last_change(tmp_path: Path) -> None:
     flight = Flight(tmp_path / "log")
     ticks = flight.place("xTickCount")
@@ -189,6 +192,7 @@ def test_the_way_back_passes_each_access_of_a_watchpoint_and_ends_at_the_last_ch
     assert flight.end() == 7
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("planted", "at", "before"), [
     (NULL_CALL, "Stuck_Handler", "go_wrong"), (ASSERTION, "assertFail", "go_wrong"),
 ])  # fmt: skip
@@ -212,6 +216,7 @@ def test_a_crash_stops_once_and_the_way_back_leads_to_its_instruction(
     assert [line for line in lines if line != "crash"] == [f"{number}" for number in range(1, 131)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("how", "code"), [
     ("interrupted", 130), ("killed", -signal.SIGKILL), ("killed by the debugger", 130), ("hung up", 7),
     ("out of memory", 128 + signal.SIGKILL),
@@ -231,6 +236,21 @@ def test_no_process_of_a_flight_outlives_it(tmp_path: Path, how: str, code: int)
     elif how == "hung up":
         flight.line.shutdown(socket.SHUT_RDWR)
     assert flight.end(b"k" if how == "killed by the debugger" else b"") == code
+
+
+def test_a_flight_that_ends_before_the_process_that_woke_it_has_its_own_exit_code() -> None:
+    pid = os.fork()
+    if not pid:
+        for number, *_ in _written_files():
+            os.close(number)
+        flown, ends = Checkpoints(), os._exit
+        flown.begin()
+        if flown.leave_copy((0,), 0) is None:
+            os._exit = lambda code: (select.select([], [], [], 0.2), ends(code))  # type: ignore[assignment,return-value]
+            flown.wake(flown.kept[0], {"go": "back"})
+        flown.finish()
+        ends(7)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 7
 
 
 def test_checkpoints_are_the_closer_the_nearer_to_the_present_and_the_oldest_stays() -> None:
