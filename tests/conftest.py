@@ -24,7 +24,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from hypothesis import settings
 
-from support.serving import SERVED, STANDSTILL
+pytest.register_assert_rewrite("support")  # what a helper asserts is shown, too
+
+from support.serving import SERVED, STANDSTILL  # noqa: E402
 
 if TYPE_CHECKING:
     from support.command import Cli

@@ -26,10 +26,13 @@ import pytest
 import firmware_py.core
 import firmware_py.logic.laws
 from firmware_py import compiling
-from firmware_py.config import parameters_of
+from firmware_py.config import LogicConfig, parameters_of
 from firmware_py.core.structs import Estimator, Parameters
 from firmware_py.core.subset import Block, Struct
+from firmware_py.export import c99
 from firmware_py.export.kernels import translate
+from firmware_py.logic.laws import SHIPPED_LAWS
+from firmware_py.logic.loading import translation_of
 from hil import RigidBody, fly_swarm
 from hil.config import load_config
 from hil.laboratory.bodies import make_body
@@ -164,18 +167,25 @@ def results(module: ModuleType) -> dict[str, str]:
 
 
 def texts() -> dict[str, str]:
-    """Return the hash of each part of the libraries that a flight, a quadrotor and the fast model bind."""
+    """Return the hash of each part of the core, of laws, and of the libraries that flights bind."""
     found: dict[str, str] = {}
     make = compiling._library
 
-    def library(functions: compiling.Functions, arrays: tuple[Any, ...]) -> Path:
+    def note(place: str, text: str) -> None:
         parts: dict[str, str] = {}
-        for part in translate(functions, arrays).split("\n\n"):
+        for part in text.split("\n\n"):
             name = re.search(r"(\w+)\(.*\{$", part, re.MULTILINE)
-            key = f"{functions[0].__module__}.{functions[0].__name__} {name[1] if name else ''}"
+            key = f"{place} {name[1] if name else ''}"
             parts[key] = parts.get(key, "") + part
         found.update({key: hashlib.sha256(part.encode()).hexdigest()[:12] for key, part in parts.items()})
+
+    def library(functions: compiling.Functions, arrays: tuple[Any, ...]) -> Path:
+        note(f"{functions[0].__module__}.{functions[0].__name__}", translate(functions, arrays))
         return make(functions, arrays)
+
+    note("core", c99.translate().source)
+    for law in SHIPPED_LAWS.values():
+        note(Path(law).name, translation_of(LogicConfig(controller=str(law))).source)
 
     class Own(RigidBody):
         mass, inertia = 0.1, (1e-3, 1e-3, 1e-3)
@@ -200,6 +210,7 @@ def test_the_c_of_every_kernel_that_flies_is_what_it_was() -> None:
     judge(RESULTS.with_name("flown_c.json"), "functions", texts())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("module", MODULES, ids=lambda module: module.__name__)
 def test_a_kernel_computes_from_random_memory_what_it_computed(module: ModuleType) -> None:
     known = json.loads(RESULTS.read_text())

@@ -28,19 +28,14 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from firmware_py import compiling
-from firmware_py.export.kernels import translate
-from hil import fly, fly_swarm
 from hil.commands import options
 from hil.commands.app import app
-from hil.config import load_config, profile_names
-from hil.laboratory.bodies import make_body
 from hil.laboratory.files.recorder import load_log
 from hil.pictures.drawing import DPI
 from hil.research.learn.envs import make_env
 from hil.research.learn.tasks import TASKS
 from support import described, disturbed, foreign_logs
-from support.approved import skip_unless, versions
+from support.approved import skip_unless, tiers, versions
 from support.command import floaty
 from support.paths import ROOT
 
@@ -66,7 +61,7 @@ SCRIPTS = {
         DISTURB a 1
         report a --experiment gallery.py:EVERY
         PLOT a
-        export a --csv --mcap --gif
+        export a --csv --mcap
         fly hover --duration 0.8 --link mavlink --profile original --out b
         DISTURB b 2
         report b
@@ -92,6 +87,8 @@ SCRIPTS = {
         fly hover --profile tilt/profile.toml --duration 0.5
         deploy write app
         deploy write own --profile law/profile.toml
+    """,
+    "checked": """
         deploy check --duration 0.1 --targets c-O0
         deploy check take-off-landing --duration 0.1 --targets plain --fault push.y@0.05 --seed 2
     """,
@@ -137,7 +134,7 @@ SCRIPTS = {
         compare liked flown
     """,
     "optimise": """
-        design optimise --generations 1 --updrafts 9.5 10 --write best.toml
+        design optimise --generations 1 --seed 11 --updrafts 9.5 10 --write best.toml
     """,
     "design": """
         design
@@ -224,30 +221,6 @@ def learned() -> Iterator[str]:
                 seen, info = env.reset()
 
 
-def translated() -> Iterator[str]:
-    """Yield, of each C function that flies here, the hash of its text."""
-    texts: dict[str, str] = {}
-    library = compiling._library
-
-    def kept(functions: compiling.Functions, arrays: tuple[Any, ...]) -> Path:
-        if (name := " ".join(one.__name__ for one in functions)) not in texts:
-            texts[name] = translate(functions, arrays)
-        return library(functions, arrays)
-
-    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiling, "_library", kept)
-        for profile in profile_names():
-            config = load_config(profile)
-            make_body(config, np.random.default_rng(0), config.flight.home)
-        fly("hover", Path(folder) / "alone", duration_s=0.02)
-        fly_swarm("hover", 2, Path(folder) / "swarm", duration_s=0.02)
-        make_env("Hover", "fast", duration_s=0.1).reset(seed=1)
-    for name, text in texts.items():
-        yield f"--- {name}"
-        for part in re.split(r"\n\n(?=\S)", text):
-            yield f"{part.splitlines()[0]} {hashlib.sha256(part.encode()).hexdigest()[:12]}"
-
-
 def disturb(_: str, run: str, seed: str) -> int:
     """Put random values into a log, and write its recording anew."""
     from hil.pictures.viewer.recording import write_run_rrd
@@ -313,7 +286,6 @@ PYTHON = {
     "learned": learned,
     "live": live,
     "programs": programs,
-    "translated": translated,
 }
 
 
@@ -397,7 +369,18 @@ def close(line: str, known: str, share: float) -> bool:
     )
 
 
-LONG = ("optimise", "programs", "tuning")
+LONG = (
+    "campaigns",
+    "design",
+    "identification",
+    "optimise",
+    "paper",
+    "programs",
+    "projects",
+    "study",
+    "tested",
+    "tuning",
+)
 # Their gains have four digits, the last of which a processor may choose.
 SEARCHED = ("design", "optimise", "tuning")
 PACKAGES = (
@@ -411,10 +394,7 @@ PACKAGES = (
 )  # shape the outputs
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=pytest.mark.long) if name in LONG else name for name in (*SCRIPTS, *PYTHON)],
-)
+@pytest.mark.parametrize("name", tiers((*SCRIPTS, *PYTHON), LONG))
 def test_users_get_what_they_got(name: str) -> None:
     (made_with, *known), found = (APPROVED / f"{name}.txt").read_text().splitlines(), [*outputs(name)]
     if len(found) == len(known):

@@ -47,7 +47,7 @@ from hil.servers.served_robot import ServedRobot
 from hil.servers.server import Endpoints, OpenEndpoints, Server, Service
 from hil.servers.tcp_port import TcpPort
 from hil.servers.udp_server import UdpServer
-from support.approved import approve, judge
+from support.approved import approve, judge, tiers
 from support.random_use import Random, by_seed, hash_of
 from support.watching import Watcher
 
@@ -857,7 +857,11 @@ FOUND: dict[str, Callable[[], dict[str, str]]] = {
 }
 
 
-@pytest.mark.parametrize("name", FOUND)
+# Which reach nothing that the others do not.
+LONG = ["Robot 1", "Cameras 2", "Cameras 3"]
+
+
+@pytest.mark.parametrize("name", tiers(FOUND, LONG))
 def test_a_server_answers_random_clients_as_it_did(name: str) -> None:
     judge(ANSWERS, name, FOUND[name]())
 

@@ -26,7 +26,7 @@ from firmware_py.geometry import Vector
 from firmware_py.wire import crtp, setpoints
 from firmware_py.wire.high_level import PathCommand, encode
 from firmware_py.wire.parameters import encode_pose_kind
-from support.approved import Log, approve, judge
+from support.approved import Log, approve, judge, tiers
 from support.crtp_client import LINK, LOC, LOG, MEM, PARAM, PLATFORM, SUPERVISOR, CrtpClient
 from support.firmware_bench import LEVEL, FirmwareBench
 from support.mavlink_client import MavlinkClient
@@ -388,7 +388,15 @@ FLIGHTS: dict[str, Callable[[], dict[str, str]]] = {
 }
 
 
-@pytest.mark.parametrize("name", FLIGHTS)
+# Which reach nothing that the others do not.
+LONG = [
+    *(f"mavlink {number}" for number in (1, 2, 4)),
+    *(f"radio {number}" for number in (3, 4, 6)),
+    *(f"commanded {number}" for number in range(2, 7)),
+]
+
+
+@pytest.mark.parametrize("name", tiers(FLIGHTS, LONG))
 def test_a_board_answers_a_random_operator_as_it_did(name: str) -> None:
     judge(ANSWERS, name, FLIGHTS[name](), "pymavlink")
 

@@ -111,6 +111,7 @@ def bench(make: Make) -> Bench:
     return Bench(make)
 
 
+@pytest.mark.long
 def test_time_counts_from_the_boot_and_goes_where_it_is_led(bench: Bench) -> None:
     kernel = bench.firmware.kernel
     assert kernel.now_us == 0
@@ -121,6 +122,7 @@ def test_time_counts_from_the_boot_and_goes_where_it_is_led(bench: Bench) -> Non
     assert kernel.now_us == 20_950
 
 
+@pytest.mark.long
 def test_views_have_the_core_s_shapes_and_follow_it(bench: Bench, request: pytest.FixtureRequest) -> None:
     assert has_core(bench.firmware) == (request.node.callspec.params["make"] != "image")
     signals = bench.firmware.signals
@@ -134,6 +136,7 @@ def test_views_have_the_core_s_shapes_and_follow_it(bench: Bench, request: pytes
         assert tuple(signals.count.tolist()) == bench.counts[-1]
 
 
+@pytest.mark.long
 def test_a_supervisor_calibrates_first_and_has_no_cause(bench: Bench) -> None:
     supervisor = bench.firmware.signals.supervisor
     first = State.CALIBRATING if has_core(bench.firmware) else State.WAITING
@@ -143,6 +146,7 @@ def test_a_supervisor_calibrates_first_and_has_no_cause(bench: Bench) -> None:
     assert supervisor.cause in Cause
 
 
+@pytest.mark.long
 def test_poses_are_counted_and_the_last_one_has_its_age_in_microseconds(bench: Bench) -> None:
     if not has_core(bench.firmware):
         return
@@ -162,6 +166,7 @@ def test_poses_are_counted_and_the_last_one_has_its_age_in_microseconds(bench: B
     assert max(ages_us[1:]) == pytest.approx(40_000 + added_us, abs=1200)
 
 
+@pytest.mark.long
 def test_variables_have_names_of_their_own_and_numbers_of_their_types(bench: Bench) -> None:
     bench.run(50_000)
     names = [variable.name for variable in bench.firmware.variables]
@@ -172,6 +177,7 @@ def test_variables_have_names_of_their_own_and_numbers_of_their_types(bench: Ben
         assert variable.scalar.is_float or value == variable.scalar.cast(value), variable.name
 
 
+@pytest.mark.long
 def test_scheduler_and_statistics_report_the_same_tasks(bench: Bench) -> None:
     bench.run(100_000)
     scheduler, reports = bench.firmware.scheduler, bench.firmware.reports()
@@ -189,6 +195,7 @@ def test_scheduler_and_statistics_report_the_same_tasks(bench: Bench) -> None:
     assert all(queue.dropped == 0 <= queue.high_water <= queue.length for queue in scheduler.queues)
 
 
+@pytest.mark.long
 def test_interrupt_load_is_counted_beside_the_tasks(bench: Bench) -> None:
     scheduler = bench.firmware.scheduler
     if scheduler is None:
@@ -201,6 +208,7 @@ def test_interrupt_load_is_counted_beside_the_tasks(bench: Bench) -> None:
     assert 70_000 < sum(times.values()) < 81_000
 
 
+@pytest.mark.long
 def test_a_trace_goes_forward_and_ends(bench: Bench) -> None:
     scheduler = bench.firmware.scheduler
     if scheduler is None:
@@ -231,12 +239,14 @@ def test_whatever_the_radio_brings_the_board_goes_on(bench: Bench) -> None:
     assert bench.firmware.kernel.now_us == 120_000
 
 
+@pytest.mark.long
 def test_servos_get_four_counts_of_a_pulse(bench: Bench) -> None:
     bench.run(100_000)
     assert all(len(counts) == 4 for counts in bench.counts)
     assert all(0 <= count <= 52_501 for counts in bench.counts for count in counts)  # 0: not set yet
 
 
+@pytest.mark.long
 def test_missing_reports_are_none(bench: Bench) -> None:
     firmware = bench.firmware
     assert firmware.mavlink is None
@@ -256,6 +266,7 @@ def test_missing_reports_are_none(bench: Bench) -> None:
         assert (report.watchdog_resets, report.software_resets) == (0, 0)
 
 
+@pytest.mark.long
 def test_a_reboot_restores_the_initial_views(bench: Bench) -> None:
     bench.run(30_000)
     first = bench.firmware

@@ -40,6 +40,7 @@ def test_every_body_that_ships_is_tried() -> None:
     assert {load_config(profile).robot.body for profile in PROFILES} == set(BODIES)
 
 
+@pytest.mark.long
 def test_held_it_stays_and_feels_its_weight(body: Body) -> None:
     before = body.state.tobytes()
     body.advance(100_000)
@@ -48,6 +49,7 @@ def test_held_it_stays_and_feels_its_weight(body: Body) -> None:
     assert body.lost is None
 
 
+@pytest.mark.long
 def test_views_keep_their_memory_and_cannot_be_written(body: Body) -> None:
     views = (body.state, body.p_WB, body.q_WB, body.omega_B, body.specific_force_B, body.flow_W, body.pushes)
     places = [view.ctypes.data for view in views]

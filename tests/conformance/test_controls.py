@@ -155,6 +155,7 @@ def test_an_unknown_name_is_refused_with_the_nearest_one(bench: Bench) -> None:
         assert "did you mean" in told.error
 
 
+@pytest.mark.long
 def test_all_that_can_be_set_is_listed_with_the_value_that_is_in_force(bench: Bench) -> None:
     ask(bench, ControlAction.WRITE, "extCtrl.y_P", -0.75)
     values = dict(ask(bench, ControlAction.LIST).values)
@@ -163,6 +164,7 @@ def test_all_that_can_be_set_is_listed_with_the_value_that_is_in_force(bench: Be
     assert values[bench.name("supervisor.poseTimeout")] == 500
 
 
+@pytest.mark.long
 def test_a_group_is_listed_whole(bench: Bench) -> None:
     group = bench.name("extCtrl.y_P")[:3].upper()
     told = [
@@ -173,6 +175,7 @@ def test_a_group_is_listed_whole(bench: Bench) -> None:
     assert told == [name for name in everything if name.upper().startswith(group)]
 
 
+@pytest.mark.long
 def test_saved_values_survive_a_boot(bench: Bench) -> None:
     ask(bench, ControlAction.WRITE, "extCtrl.y_P", -1.75)
     assert ask(bench, ControlAction.SAVE) == Answer(())
@@ -192,6 +195,7 @@ def test_a_stop_lasts_until_a_reboot(bench: Bench) -> None:
     assert (supervisor.state, supervisor.cause) == (State.FAILSAFE, Cause.EMERGENCY_STOP)
 
 
+@pytest.mark.long
 def test_arming_leaves_what_can_be_left(bench: Bench) -> None:
     bench.run(GYRO_ZERO_US)  # type: ignore[attr-defined]
     supervisor = bench.firmware.signals.supervisor
@@ -213,6 +217,7 @@ def test_a_stop_of_which_only_the_question_arrives_is_sent_again(bench: Bench) -
     assert bench.firmware.signals.supervisor.stopped
 
 
+@pytest.mark.long
 def test_an_impossible_request_is_refused_in_one_line(bench: Bench) -> None:
     assert ask(bench, ControlAction.STOP) == Answer(())
     bench.run(GYRO_ZERO_US)  # type: ignore[attr-defined]
@@ -233,6 +238,7 @@ def test_over_mavlink_a_refusal_and_its_reason_are_one_line() -> None:
     assert list(bench.link.texts) == []
 
 
+@pytest.mark.long
 def test_a_line_that_loses_much_delays_and_spoils_nothing(bench: Bench) -> None:
     rng = np.random.default_rng(1)
     bench.lossy = lambda: bool(rng.random() < 0.15)
@@ -244,6 +250,7 @@ def test_a_line_that_loses_much_delays_and_spoils_nothing(bench: Bench) -> None:
     assert ask(bench, ControlAction.STOP).error == ""
 
 
+@pytest.mark.long
 def test_a_board_that_is_not_there_is_an_error_after_two_seconds(bench: Bench) -> None:
     bench.lossy = lambda: True
     begin_us = bench.now_us
@@ -253,6 +260,7 @@ def test_a_board_that_is_not_there_is_an_error_after_two_seconds(bench: Bench) -
         assert PATIENCE_US <= bench.now_us - begin_us <= PATIENCE_US + REPEAT_US + 2 * TURN_US
 
 
+@pytest.mark.long
 def test_a_new_request_replaces_the_one_before(bench: Bench) -> None:
     """A stop does not wait until a long list is there."""
     bench.controls.ask(bench.now_us, ControlRequest(ControlAction.READ, "extCtrl.y_P"))
@@ -267,6 +275,7 @@ def test_a_new_request_replaces_the_one_before(bench: Bench) -> None:
         assert bench.controls.answer(bench.now_us) is None
 
 
+@pytest.mark.long
 def test_every_value_of_a_profile_is_the_board_s_times_the_factor() -> None:
     """A board that boots with the values has the same parameters as one to which they are written."""
     bench, values = CrtpBench(), {}

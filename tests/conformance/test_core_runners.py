@@ -31,12 +31,14 @@ def core_at_start(recording: Recording, runner: RunnerFactory) -> CoreBlocks:
     return core
 
 
+@pytest.mark.long
 def test_arbitrary_calls_give_the_bits_of_python(recording: Recording, runner: RunnerFactory) -> None:
     core = core_at_start(recording, runner)
     for number, (step, after) in enumerate(zip(recording.steps, recording.after, strict=True)):
         assert run_step(core, step) == after, f"call {number}, {step.call}"
 
 
+@pytest.mark.long
 def test_one_runner_continues_what_another_began(recording: Recording, runner: RunnerFactory) -> None:
     """All state lies in the blocks: runners that take turns with Python's compute what one alone does."""
     core = core_at_start(recording, runner)
@@ -63,6 +65,7 @@ def test_no_call_writes_parameters_or_the_tasks_inputs(recording: Recording, run
         assert written <= WRITES.get(step.call, set()), step.call
 
 
+@pytest.mark.long
 def test_a_pose_is_on_time_too_old_or_none(runner: RunnerFactory) -> None:
     core = CoreBlocks(parameters_of(load_config()), runner)
     core.run.call("reset")

@@ -55,6 +55,7 @@ def test_clients_come_and_go(pair: Pair) -> None:
     assert open_end.received == b"012"
 
 
+@pytest.mark.long
 def test_a_client_that_does_not_read_delays_no_other(pair: Pair) -> None:
     open_end, connect = pair
     client = connect(open_end)

@@ -166,6 +166,7 @@ def test_the_latency_is_the_stated_one_until_it_is_measured(board: BoardEnd) -> 
     assert (board.link.latency.us, board.link.latency.measured) == (LATENCY_US, False)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", BOARDS)
 @given(pieces=st.lists(st.binary(max_size=40), max_size=5))
 def test_no_bytes_do_harm(name: str, pieces: list[bytes]) -> None:

@@ -72,6 +72,7 @@ def test_every_program_has_the_answers_of_its_referee() -> None:
     assert set(recorded("stock")) == STOCK
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_the_python_board_answers_as_the_image(python: ServiceBench, name: str) -> None:
     assert list(differences(recorded("app")[name], played(python, PROGRAMS[name]))) == []
@@ -130,6 +131,7 @@ def bits_of(answer: str) -> tuple[int, Sequence[str]]:
     return int(words[words.index("bits") + 1], 16), words
 
 
+@pytest.mark.long
 @settings(max_examples=5, deadline=None, suppress_health_check=list(HealthCheck))
 @given(GENERATED)
 def test_bits_and_states_fit_together_whatever_a_client_does(python: ServiceBench, program: str) -> None:

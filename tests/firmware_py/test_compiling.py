@@ -8,6 +8,7 @@ import weakref
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from firmware_py.compiling import bound, compiler
 from firmware_py.core.subset import I32s, i32
@@ -49,6 +50,7 @@ def half(x: float) -> float:
 """
 
 
+@pytest.mark.long
 def test_compiled_code_is_kept_until_a_source_changes(tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": str(ROOT), "FLOATY_CACHE_DIR": str(tmp_path / "cache")}
     package = tmp_path / "package"
@@ -114,6 +116,7 @@ def test_the_memory_of_a_bound_call_lives_as_long_as_the_call() -> None:
     assert alive() is None
 
 
+@pytest.mark.long
 def test_compiled_functions_depend_on_no_file_that_their_cache_does_not_look_at() -> None:
     looked_at = (
         "hil.world.",

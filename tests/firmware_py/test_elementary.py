@@ -32,6 +32,7 @@ def test_multiples_of_a_quarter_turn(quarters: int) -> None:
     assert elementary.cos(angle) == pytest.approx(math.cos(angle), abs=1e-16)
 
 
+@pytest.mark.long
 @given(st.floats(-745.0, 709.0))
 def test_exponential(x: float) -> None:
     assert ulps(elementary.exp(x), math.exp(x)) <= ULPS
@@ -42,11 +43,13 @@ def test_exponential_beyond_the_range() -> None:
     assert elementary.exp(1e300) == elementary.exp(math.inf) == math.inf
 
 
+@pytest.mark.long
 @given(st.one_of(st.floats(-1.0, 1.0, exclude_min=True), st.floats(0.0, 1e300), st.floats(-1e-9, 1e-9)))
 def test_logarithm(x: float) -> None:
     assert ulps(elementary.log_1p(x), math.log1p(x)) <= ULPS
 
 
+@pytest.mark.long
 @given(st.floats(-1e9, 1e9), st.floats(-1e9, 1e9))
 def test_angle_of_a_vector(y: float, x: float) -> None:
     x += 0.0  # no zero below zero
@@ -55,11 +58,13 @@ def test_angle_of_a_vector(y: float, x: float) -> None:
     assert math.copysign(1.0, angle) == math.copysign(1.0, y)
 
 
+@pytest.mark.long
 @given(st.floats(-1.0, 1.0))
 def test_arc_sine(x: float) -> None:
     assert ulps(elementary.asin(x), math.asin(x)) <= ULPS
 
 
+@pytest.mark.long
 @given(st.floats(0.5, 1.0), st.integers(0, 400))
 def test_whole_powers(base: float, exponent: int) -> None:
     assert elementary.power(base, exponent) == pytest.approx(base**exponent, rel=1e-13)

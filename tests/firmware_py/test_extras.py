@@ -23,6 +23,7 @@ def test_the_command_names_what_the_extra_needs(extra: str) -> None:
     assert {Requirement(word) for word in words[4:]} == {Requirement(text) for text in described[extra]}
 
 
+@pytest.mark.long
 def test_the_command_works_in_a_shell() -> None:
     command = install_command("deploy") + " --dry-run --no-index"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=60, check=False)

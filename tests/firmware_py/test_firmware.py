@@ -43,6 +43,7 @@ def test_controller_writes_counts_every_ten_milliseconds(bench: FirmwareBench) -
     assert set(late_us) == {cost.stabilizer_us + cost.controller_us}
 
 
+@pytest.mark.long
 def test_each_cost_is_its_task_s_alone() -> None:
     def spent_us(*overrides: str) -> dict[str, int]:
         kernel = FirmwareBench("cpu.measured=false", *overrides)
@@ -119,6 +120,7 @@ def test_gyro_zero_is_the_mean_of_a_still_window() -> None:
     assert gyro.bias == [6.0, -3.0, 100.0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize(("noise", "still"), [(100, True), (101, False), (32767, False)])
 def test_gyro_zero_waits_until_the_robot_is_still(axis: int, noise: int, still: bool) -> None:
@@ -182,6 +184,7 @@ def test_an_error_in_a_task_names_task_and_time(bench: FirmwareBench) -> None:
         bench.run(60_000)
 
 
+@pytest.mark.long
 def test_the_watchdog_bites_after_its_longest_time_and_not_before(bench: FirmwareBench) -> None:
     bench.run(1_000_000)
     path, now_us = bench.firmware.flight_tasks._path.fields, bench.firmware.kernel.now_us

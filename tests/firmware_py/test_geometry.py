@@ -27,6 +27,7 @@ def scipy_of(q):
     return Rotation.from_quat(q, scalar_first=True)
 
 
+@pytest.mark.long
 @given(quaternions(), quaternions())
 def test_product_is_scipys_composition(a, b):
     ours = scipy_of(geometry.multiply(a, b))
@@ -34,18 +35,21 @@ def test_product_is_scipys_composition(a, b):
     assert geometry.multiply(geometry.conjugate(a), a) == pytest.approx(geometry.IDENTITY, abs=1e-12)
 
 
+@pytest.mark.long
 @given(quaternions(), vector)
 def test_rotation_of_a_vector_is_scipys(q, v):
     assert geometry.rotate(q, v) == pytest.approx(scipy_of(q).apply(v), abs=1e-9)
     assert geometry.rotation_matrix(q) @ v == pytest.approx(scipy_of(q).apply(v), abs=1e-9)
 
 
+@pytest.mark.long
 @given(angle, angle, angle)
 def test_euler_angles_become_scipys_attitude(roll, pitch, yaw):
     ours = scipy_of(geometry.from_euler_zyx(roll, pitch, yaw))
     assert (ours.inv() * Rotation.from_euler("ZYX", (yaw, pitch, roll))).magnitude() < 1e-9
 
 
+@pytest.mark.long
 @given(quaternions())
 def test_attitude_becomes_scipys_euler_angles(q):
     assume(abs(scipy_of(q).as_matrix()[2, 0]) < 1 - 1e-6)  # not straight up or down
@@ -62,12 +66,14 @@ def test_looking_straight_up_is_a_pitch_of_a_right_angle():
     )
 
 
+@pytest.mark.long
 @given(angle, vector)
 def test_yaw_turns_about_the_vertical(yaw, v):
     expected = Rotation.from_euler("z", yaw).apply(v)
     assert geometry.rotate(geometry.yaw_quaternion(yaw), v) == pytest.approx(expected, abs=1e-9)
 
 
+@pytest.mark.long
 @given(st.floats(-1000.0, 1000.0))
 def test_wrapped_angle_is_the_same_direction_within_half_a_turn(a):
     wrapped = geometry.wrap_angle(a)

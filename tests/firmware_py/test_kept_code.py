@@ -129,6 +129,7 @@ def twice(x: F64s) -> None:
     x[0] = 2.0 * x[0]
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not list(compilers()), reason="no C compiler")
 def test_a_library_is_compiled_once_and_again_when_others_may_have_written_it(
     cache_home: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -201,6 +202,7 @@ def test_folders_that_nobody_has_used_for_long_are_deleted() -> None:
     assert (old.exists(), used.exists()) == (False, True)
 
 
+@pytest.mark.long
 def test_sources_are_replaced_where_another_process_may_compile_them() -> None:
     """A file that is written over while a compiler has it mapped ends that by SIGBUS."""
     text = "int one(void) { return 1; }\n"

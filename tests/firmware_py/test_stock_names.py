@@ -119,6 +119,7 @@ def test_the_target_is_logged_where_stock_controllers_log_theirs(client: CrtpCli
     assert client.log(logs, "controller.yaw") == pytest.approx([28.6479])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("millivolts", "passes"), [(3199, 0), (3200, 1), (4000, 1)])
 def test_a_battery_passes_from_the_voltage_on_at_which_it_counts_as_low(
     client: CrtpClient, tables, millivolts: int, passes: int

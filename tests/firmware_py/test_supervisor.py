@@ -106,6 +106,7 @@ def test_a_stop_acts_within_eleven_milliseconds_and_the_crazyflie_s_lasts_until_
     assert after(flying, 1_000_000) == (State.FLYING, Cause.NONE)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("make", "silence_us", "ask", "sign_of_life"),
     [
@@ -193,6 +194,7 @@ def in_flight(happen: Callable[[SupervisorBench], object], now_us: int = 0) -> S
     return bench
 
 
+@pytest.mark.long
 @EVENTS
 @pytest.mark.parametrize("manual", MANUALS)
 def test_manual_angles_act_unless_the_robot_was_stopped(
@@ -235,6 +237,7 @@ ENDS = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 @EVENTS
 def test_every_cause_ends_as_documented_each_time_and_by_nothing_else(
     happen: Callable[[SupervisorBench], object], cause: Cause, flown_by: tuple[int, int, int]
@@ -279,6 +282,7 @@ def test_an_episode_after_a_silent_one_restarts() -> None:
 STARTS_US = pytest.mark.parametrize("start_us", [0, 2**31 - 1_000_000, 2**32 - 1_000_000, 3_600_000_000])
 
 
+@pytest.mark.long
 @STARTS_US
 @pytest.mark.parametrize("waited_us", [0, 30_000])
 def test_silence_begins_when_the_last_pose_is_as_old_as_its_limit(start_us: int, waited_us: int) -> None:
@@ -290,6 +294,7 @@ def test_silence_begins_when_the_last_pose_is_as_old_as_its_limit(start_us: int,
     assert bench.view.cause is Cause.SILENCE
 
 
+@pytest.mark.long
 @STARTS_US
 @pytest.mark.parametrize(
     ("happen", "cause"),
@@ -461,6 +466,7 @@ def silence(client: CrtpClient, silent: bool) -> None:
     client.imu_alive = not silent
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fail", [freeze, silence])
 def test_a_gyro_that_delivers_nothing_new_opens_the_loop_until_it_has_worked_for_a_while(
     flying: CrtpClient, fail: Callable[[CrtpClient, bool], None]

@@ -12,6 +12,7 @@ from ground_station.program import Session
 pytestmark = pytest.mark.usefixtures("own_signal_handlers")
 
 
+@pytest.mark.long
 def test_it_loads_nothing_of_the_laboratory() -> None:
     code = "import sys, ground_station.__main__; sys.exit(any(name.split('.')[0] == 'hil' for name in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -51,6 +51,7 @@ def test_motive_s_default_up_axis_is_y() -> None:
     assert Alignment(CaptureConfig(system="optitrack", axes="z-up")).axes == "z-up"
 
 
+@pytest.mark.long
 @given(lengths, angle, lengths, angle, lengths, st.integers(0, 2**32 - 1))
 def test_every_alignment_is_the_chain_of_homogeneous_transforms(
     origin: tuple[float, float, float], yaw: float, offset: tuple[float, float, float], body_yaw: float,

@@ -69,6 +69,7 @@ class StationWithPackets:
         return [round(crtp.decode_ext_pose(data[1:]).p_GB[0] * 1000) for _, data in self.sent]
 
 
+@pytest.mark.long
 @given(st.tuples(metres, metres, metres), st.tuples(metres, metres, metres), angle, angle, angle, angle)
 def test_correction_is_scipys_pose_in_the_goal_frame(p, goal, goal_yaw, roll, pitch, yaw):
     correction = correct(MocapFrame(0, p, from_euler_zyx(roll, pitch, yaw), True), Goal(goal, goal_yaw), 0)
@@ -79,6 +80,7 @@ def test_correction_is_scipys_pose_in_the_goal_frame(p, goal, goal_yaw, roll, pi
     assert (ours.inv() * R_GW * R_WB).magnitude() < 1e-7
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("camera_hz", [10, 25, 40, 45, 50, 60, 90, 100, 120, 180, 200, 240, 360, 1000])
 def test_fifty_corrections_leave_per_second_or_as_many_as_slower_cameras_have(camera_hz):
     bench = StationWithPackets()
@@ -88,6 +90,7 @@ def test_fifty_corrections_leave_per_second_or_as_many_as_slower_cameras_have(ca
     assert gaps_us.max() <= 20_000 + 1e6 / camera_hz
 
 
+@pytest.mark.long
 @given(
     st.lists(
         st.integers(-70_000, 70_000) | st.sampled_from((15_000, 17_499, 17_500, 20_000, -22_500, -22_501))
@@ -202,6 +205,7 @@ def test_the_goal_of_the_moment_counts_not_that_of_the_exposure():
     assert bench.numbers() == [0, -500]
 
 
+@pytest.mark.long
 @given(st.binary(max_size=40))
 def test_any_packet_is_counted_and_none_is_raised(data):
     bench = StationWithPackets()

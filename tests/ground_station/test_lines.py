@@ -12,6 +12,7 @@ from ground_station.lines import print_line, visible
 from ground_station.terminal import READ_SIZE, Terminal
 
 
+@pytest.mark.long
 @given(st.text(st.characters(exclude_categories=())))
 def test_whatever_arrives_is_printable_and_what_was_printable_is_unchanged(text: str) -> None:
     assert visible(text).isprintable()

@@ -73,6 +73,7 @@ class Board(LiveLink):
         self.send(now_us, MocapFrame(now_us - age_us, (number, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), True), HOME)
 
 
+@pytest.mark.long
 @given(st.sets(st.integers(0, 300)), st.integers(1, 30))
 def test_pieces_cover_the_changed_places_of_a_core_s_memory_and_each_fits_a_packet(places, longest):
     pieces = list(runs(sorted(places), longest))

@@ -79,6 +79,7 @@ def test_a_request_is_one_packet_and_the_next_one_waits_for_its_answer():
     assert len(line.board.periods) == len(ALL_BLOCKS)
 
 
+@pytest.mark.long
 @given(st.lists(st.booleans(), max_size=40))
 def test_a_lost_request_is_repeated_after_a_tenth_of_a_second(arrives):
     line, now_us = Line(), 0
@@ -151,6 +152,7 @@ def test_attitudes_of_a_crazyflie_come_in_degrees_and_are_samples_in_radians(lin
     assert sample.values == pytest.approx((*np.radians((10, 20, 30)), 41, 5, 6))
 
 
+@pytest.mark.long
 @given(phase=st.integers(0, 19), after=st.tuples(*[st.integers(1, 19)] * 3), begin=st.integers(0, 1000))
 def test_blocks_of_one_period_share_the_instant_of_the_controllers_block(phase, after, begin):
     line = Line()

@@ -557,6 +557,7 @@ def test_the_budget_of_the_downlink_is_what_the_board_sends(baud):
     assert sent / 5.0 == pytest.approx(link_budget(baud, 50.0).down_load * baud / 10, rel=0.04)
 
 
+@pytest.mark.long
 @given(st.integers(9600, 1_000_000), st.floats(1.0, 200.0), st.booleans())
 def test_the_budget_allows_exactly_what_fits(baud, pose_hz, signed):
     """Frames as measured with pymavlink: pose 48, goal 65, heartbeat 21, time 30, array 144 bytes; 986.8 bytes/s unasked."""

@@ -28,6 +28,7 @@ POSE = (1.0, 2.0, 3.0, 0.5, -0.5, 0.5, 0.5)
 LATENCY_US = 7_000
 
 
+@pytest.mark.long
 @given(st.integers(0, 2**63 - 1), st.dictionaries(names, body, max_size=3))
 @settings(max_examples=50)
 def test_a_line_reports_a_pose(t_us: int, bodies: dict[str, tuple[float, ...]]) -> None:
@@ -50,6 +51,7 @@ json = st.recursive(
 )
 
 
+@pytest.mark.long
 @given(st.binary(max_size=60) | json.map(lambda value: repr(value).replace("'", '"').encode()))
 def test_no_bytes_of_the_other_process_do_harm(line: bytes) -> None:
     with suppress(MocapError):
@@ -317,6 +319,7 @@ def lines(tmp_path: Path) -> Callable[..., list[Arrival | str]]:
     return run
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("system", ["vicon", "vrpn"])
 def test_the_process_sends_frames_and_why_it_ends_and_lives_five_seconds_without(
     lines: Callable[..., list[Arrival | str]], system: str
@@ -330,6 +333,7 @@ def test_the_process_sends_frames_and_why_it_ends_and_lives_five_seconds_without
     assert [frame.bodies for frame in frames if isinstance(frame, Arrival)] == expected
 
 
+@pytest.mark.long
 def test_why_the_process_cannot_begin_is_one_line(lines: Callable[..., list[Arrival | str]]) -> None:
     text = "raise ImportError(\"No module named 'motioncapture'\")"
     assert lines(text, "vicon") == [f"No module named 'motioncapture': {install_command('mocap')}"]

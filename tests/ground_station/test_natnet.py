@@ -1,7 +1,4 @@
-"""NatNet: packets are read as other clients read them, and no bytes can do harm.
-
-FLOATY_FUZZ is the number of packets of the long run (default 20,000).
-"""
+"""NatNet: packets are read as other clients read them, and no bytes can do harm."""
 
 import struct
 from contextlib import suppress
@@ -80,6 +77,7 @@ def test_the_server_and_its_echo_are_read() -> None:
     assert decode(packets.packet(100, b""), (3, 0)) == Other(100)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("version", VERSIONS)
 def test_a_packet_cut_anywhere_is_refused_in_one_line(version: Version) -> None:
     for whole in (packets.frame(1, version, TICKS), packets.model_definition({"floaty": 7}, version)):
@@ -105,6 +103,7 @@ def test_a_count_of_more_than_there_is_is_refused_at_once() -> None:
         decode(packets.packet(7, bytes(4) + b"\xff" * 4 + bytes(40)), (3, 0))
 
 
+@pytest.mark.long
 @given(st.binary(max_size=200), st.integers(0, 20), st.sampled_from(VERSIONS))
 def test_any_payload_is_read_or_refused(payload: bytes, message: int, version: Version) -> None:
     with suppress(MocapError):

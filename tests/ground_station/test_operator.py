@@ -98,6 +98,7 @@ def test_a_trajectory_begins_when_it_is_typed_and_not_again_when_the_station_s_o
     assert bench.noted == ["fly yaw-step"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "line",
     [
@@ -118,6 +119,7 @@ def test_bad_input_is_one_line_and_changes_nothing(bench, line):
     assert bench.type("get extCtrl.y_P") != []  # it goes on
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("line", "near"),
     [
@@ -150,6 +152,7 @@ def test_params_lists_a_group_and_completes_from_then_on(bench):
     assert "extCtrl.y_P" in bench.operator.known
 
 
+@pytest.mark.long
 def test_reset_goes_back_to_what_last_flew_well(bench):
     first = bench.value("extCtrl.y_P")
     bench.type("set extCtrl.y_P 1.5", "set extCtrl.x_P 1.25")
@@ -173,6 +176,7 @@ def test_before_anything_flew_well_reset_goes_back_to_what_the_board_had(bench):
     assert bench.value("extCtrl.y_P") == first
 
 
+@pytest.mark.long
 def test_values_that_a_reset_is_about_to_change_have_not_flown_well(bench):
     """The robot flies well for long enough while the reset waits for its answer; what it then meets is refused."""
     first = bench.value("extCtrl.y_P"), bench.value("extCtrl.x_P")
@@ -190,6 +194,7 @@ def test_values_that_a_reset_is_about_to_change_have_not_flown_well(bench):
     assert (bench.value("extCtrl.y_P"), bench.value("extCtrl.x_P")) == first
 
 
+@pytest.mark.long
 def test_after_a_reset_that_broke_off_what_is_left_has_to_fly_well_for_as_long_again(bench):
     first = bench.value("extCtrl.y_P"), bench.value("extCtrl.x_P")
     bench.state = State.FAILSAFE
@@ -204,6 +209,7 @@ def test_after_a_reset_that_broke_off_what_is_left_has_to_fly_well_for_as_long_a
     assert (bench.value("extCtrl.y_P"), bench.value("extCtrl.x_P")) == first
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("off_m", "well"), [(0.099, True), (0.101, False)])
 def test_a_value_has_flown_well_after_five_seconds_within_ten_centimetres(bench, off_m, well):
     bench.place = (off_m, 0.0, 1.15)
@@ -214,6 +220,7 @@ def test_a_value_has_flown_well_after_five_seconds_within_ten_centimetres(bench,
     assert (bench.operator._good["extCtrl.y_P"] == 1.5) == well
 
 
+@pytest.mark.long
 def test_stop_waits_for_nothing_and_lasts_until_a_reboot(bench):
     bench.type(
         "params", *["mark x"] * 3, " stop ", wait_us=300_000
@@ -244,6 +251,7 @@ def test_lines_are_done_in_their_order(bench):
     assert bench.noted[1] == "mark now it's on"
 
 
+@pytest.mark.long
 def test_too_many_lines_are_refused_and_reported(bench):
     for number in range(LINES + 5):
         bench.operator.queue_line(f"mark {number}")
@@ -252,6 +260,7 @@ def test_too_many_lines_are_refused_and_reported(bench):
     assert bench.noted == [f"mark {number}" for number in range(LINES)]
 
 
+@pytest.mark.long
 def test_help_has_every_command(bench):
     assert bench.type("help") == HELP.splitlines()
     assert set(COMMANDS) == {
@@ -259,6 +268,7 @@ def test_help_has_every_command(bench):
     }  # fmt: skip
 
 
+@pytest.mark.long
 def test_a_parameter_listener_gets_all_values_and_every_change(bench):
     known = {}
     bench.operator = Operator(find, bench.said.append, bench.noted.append, known.update)

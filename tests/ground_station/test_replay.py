@@ -166,6 +166,7 @@ def test_frames_may_arrive_at_one_instant_and_at_any_that_a_float_counts(tmp_pat
     assert [arrival_us for arrival_us, _ in read_frames(path)] == [1, 1, 2**53]
 
 
+@pytest.mark.long
 @given(rows=st.binary(max_size=200), header=st.sampled_from([b"", b"arrival [us],mocap.t [us]\n", None]))
 @settings(max_examples=200)
 def test_any_file_loads(tmp_path_factory: pytest.TempPathFactory, rows: bytes, header: bytes | None) -> None:

@@ -115,6 +115,7 @@ def test_the_clock_follows_drift_and_shrugs_off_late_packets() -> None:
         assert abs(clock.to_station_us(server_us) - now_us) < 60
 
 
+@pytest.mark.long
 def test_a_server_whose_clock_was_set_is_followed_again() -> None:
     bench = ServedStream()
     bench.echo()

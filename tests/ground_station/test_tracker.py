@@ -95,6 +95,7 @@ class Plain:
         self.kf.x[6:9] = 0.0
 
 
+@pytest.mark.long
 def test_it_is_the_plain_kalman_filter_over_random_gaps() -> None:
     """Frames missing, or there without a pose, for up to 30 periods."""
     rng = np.random.default_rng(7)
@@ -181,6 +182,7 @@ def test_a_filter_that_begins_again_is_a_new_one() -> None:
     assert found[0] == found[1]
 
 
+@pytest.mark.long
 def test_the_attitude_is_of_unit_length_from_the_first_pose_on_and_however_long_the_robot_turns() -> None:
     one = PoseFilter(0.005, 0.0005, 0.004, CONFIG.acceleration, CONFIG.angular_acceleration)
     one.begin((0.0, 0.0, 0.0), (0.95, 0.0, 0.0, 0.0))
@@ -267,6 +269,7 @@ def test_the_exact_opposite_attitude_is_refused(w: float) -> None:
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("p", "q"),
     [
@@ -287,6 +290,7 @@ def test_an_invalid_pose_counts_as_not_seen(p, q) -> None:
     assert qualities(*[frame(n, p, q) for n in range(5)]) == [NOT_YET] * 5
 
 
+@pytest.mark.long
 def test_a_push_of_20_newton_is_accepted() -> None:
     """59 m/s^2 for 0.1 s on each axis and its opposite, and 0.2 N m (154 rad/s^2) at the same time."""
     for axis in np.vstack((np.eye(3), -np.eye(3))):
@@ -374,6 +378,7 @@ def test_after_the_time_to_reacquire_the_track_restarts_at_the_newest_pose() -> 
     assert tracker.counters.restarts == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("jump_us", [-(10**15), -3_600_000_000, -400_000, 400_000, 10**15])
 def test_a_clock_that_jumps_costs_two_frames(jump_us: int) -> None:
     tracker, rng = tracking(), np.random.default_rng(2)
@@ -412,12 +417,14 @@ def told(tracker: Tracker, frames: list[MocapFrame]) -> list[tuple[int, str]]:
     return lines
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("after", "periods"), [(0.6, 1), (1.4, 1), (1.6, 2), (2.4, 2), (2.6, 3)])
 def test_a_frame_between_two_periods_counts_as_the_nearer_one(after: float, periods: int) -> None:
     tracks = [tracking().track_frame(frame(99 + shift, (0.101, -0.2, 1.15))) for shift in (after, periods)]
     assert tracks[0].v_WB == tracks[1].v_WB
 
 
+@pytest.mark.long
 @given(st.integers(0, 2**32), st.integers(0, 9))
 @settings(max_examples=20, deadline=None)
 def test_a_track_after_a_loss_is_that_of_a_new_tracker(seed: int, missing: int) -> None:
@@ -473,6 +480,7 @@ def test_one_line_reports_refused_poses() -> None:
     ]
 
 
+@pytest.mark.long
 def test_a_track_that_is_lost_and_restarted_is_reported() -> None:
     rng = np.random.default_rng(2)
     blind = [replace(noisy(rng, n), valid=False) for n in range(100, 400)]
@@ -484,6 +492,7 @@ def test_a_track_that_is_lost_and_restarted_is_reported() -> None:
     ]
 
 
+@pytest.mark.long
 def test_occasional_outliers_are_reported_at_most_twice_a_second() -> None:
     rng = np.random.default_rng(2)
     frames = [noisy(rng, n) if n % 10 else frame(n, rng.uniform(-1, 1, 3)) for n in range(100, 2100)]

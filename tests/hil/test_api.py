@@ -59,6 +59,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return fly("hover", folder, duration_s=SHORT, faults=["push.y@0.1=3"])
 
 
+@pytest.mark.long
 def test_a_run_is_read_again_as_it_was_flown(run: Run) -> None:
     again = load_run(run.folder)
     assert repr(again.result) == repr(run.result)
@@ -78,6 +79,7 @@ def test_the_table_counts_seconds_from_the_release(run: Run) -> None:
     assert (run.units["t"], run.units["truth.z"], run.unit_of("rms_x")) == ("us", "m", "m")
 
 
+@pytest.mark.long
 def test_the_progress_of_a_flight_rises_to_one(capsys: pytest.CaptureFixture[str]) -> None:
     shares: list[float] = []
     fly("hover", duration_s=1.0, progress=shares.append)
@@ -102,6 +104,7 @@ def test_what_a_run_shows_names_the_failed_limit_and_the_folder() -> None:
     assert 'href="runs/hover-1/report.html"' in run._repr_html_()
 
 
+@pytest.mark.long
 def test_a_request_is_flown_as_it_is() -> None:
     request = Request.of(EXPERIMENTS["hover"], seed=3, duration_s=SHORT)
     assert fly(request).hash == fly("hover", seed=3, duration_s=SHORT, folder="other").hash
@@ -162,6 +165,7 @@ def test_an_experiment_without_a_file_has_no_command() -> None:
     assert command_of(request_of("hover", trajectory=Along(lambda t: (0.0, 0.0, 0.0)))) is None
 
 
+@pytest.mark.long
 def test_an_own_metric_has_its_unit_and_a_value_also_where_it_was_not_measured() -> None:
     tilt = Metric("rad", "max", "tilt")
     mine = Experiment("mine", "", SHORT, {"tilt": 1.0}, metrics={"tilt": tilt})

@@ -12,6 +12,7 @@ from hil.config import LabConfig, load_config, profile_names, read_config, setti
 from hil.errors import LabError
 
 
+@pytest.mark.long
 def test_shipped_profiles_load() -> None:
     assert profile_names() == [
         "as-flown", "cad", "crazyflie", "crazyflie-brushless", "crazyflie-decks", "design-best",

@@ -191,15 +191,13 @@ READERS: dict[str, Read] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("read", "examples"),
     [
         pytest.param(load_everything, 50, id="load_run"),
-        *(
-            # two plots by matplotlib per comparison
-            pytest.param(read, 8 if "compare" in name else 40, id=name, marks=pytest.mark.long)
-            for name, read in READERS.items()
-        ),
+        # two plots by matplotlib per comparison
+        *(pytest.param(read, 4 if "compare" in name else 40, id=name) for name, read in READERS.items()),
     ],
 )
 def test_a_damaged_run_is_read_or_refused_in_one_line(
@@ -227,6 +225,7 @@ def without_event(path: Path) -> None:
     path.write_text("\n".join((first, '{"t_us": "soon"}', *others)), encoding="utf-8")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("file", "change", "told"),
     [
@@ -253,6 +252,7 @@ def test_the_line_that_was_being_written_is_no_damage(copy: Callable[[], Path]) 
     assert load_events(run) == whole[:-1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("files", "words"),
     [

@@ -123,6 +123,7 @@ def called(call: Call, arguments: dict[str, Any]) -> object:
     return call.function(*([flights()] if is_method else []), **arguments)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("call", CALLS, ids=str)
 def test_a_wrong_name_is_refused_with_the_nearest_one(call: Call) -> None:
     for name in call.right:
@@ -166,6 +167,7 @@ def is_right(name: str, value: object) -> bool:
     }[name]
 
 
+@pytest.mark.long
 @given(data=st.data())
 @settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_flight_with_one_wrong_value_is_refused(data: st.DataObject) -> None:
@@ -178,6 +180,7 @@ def test_a_flight_with_one_wrong_value_is_refused(data: st.DataObject) -> None:
     assert not os.listdir(), os.listdir()
 
 
+@pytest.mark.long
 @given(data=st.data())
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_other_call_returns_or_is_refused(data: st.DataObject) -> None:
@@ -217,6 +220,7 @@ def is_there(value: object) -> bool:
     return isinstance(value, str) and value in THERE
 
 
+@pytest.mark.long
 @given(
     name=st.text(max_size=8).filter(lambda name: not is_there(name)),
     value=JUNK.filter(lambda one: not is_there(one)),

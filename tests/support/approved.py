@@ -1,7 +1,7 @@
 """Judges what came out now by what was approved, where the libraries that shape it are those of then."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -25,6 +25,15 @@ def skip_unless(made_with: str, here: str) -> None:
     """Skip the test, whose outputs differ, if they were approved with other versions."""
     if made_with != here:
         pytest.skip(f"differs, but was approved with {made_with}; here are {here}")
+
+
+def tiers(names: Iterable[Any], long: Collection[str]) -> list[Any]:
+    """Return the parameters of a test, those of some names for the long tier."""
+    called = {getattr(name, "__name__", name): name for name in names}
+    return [
+        pytest.param(one, id=name, marks=pytest.mark.long if name in long else ())
+        for name, one in called.items()
+    ]
 
 
 def judge(path: Path, name: str, found: Any, *packages: str) -> None:

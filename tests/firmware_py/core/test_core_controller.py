@@ -109,6 +109,7 @@ def original(state: NDArray[np.float64], free: bool) -> Loop:
     return loop
 
 
+@pytest.mark.long
 def test_attitude_inputs_of_all_300_states_are_the_original_firmwares() -> None:
     for state, c in zip(STATES, C, strict=True):
         u1, u2, u3, _ = original(state, free=False).u
@@ -118,6 +119,7 @@ def test_attitude_inputs_of_all_300_states_are_the_original_firmwares() -> None:
         assert u1 == pytest.approx(-c[1], abs=y_integral + TABLE_SINE)
 
 
+@pytest.mark.long
 def test_height_input_without_priority_is_the_original_firmwares_up_to_its_upper_limit() -> None:
     limited = 0
     for state, c in zip(STATES, C, strict=True):
@@ -127,6 +129,7 @@ def test_height_input_without_priority_is_the_original_firmwares_up_to_its_upper
     assert 0 < limited < 150
 
 
+@pytest.mark.long
 def test_flaps_without_priority_are_the_original_firmwares() -> None:
     compared = 0
     for state, c, flaps in zip(STATES, C, FLAPS, strict=True):
@@ -137,6 +140,7 @@ def test_flaps_without_priority_are_the_original_firmwares() -> None:
     assert compared > 190
 
 
+@pytest.mark.long
 def test_where_no_flap_saturates_height_and_flaps_are_the_original_firmwares() -> None:
     given_way = 0
     for state, c, flaps in zip(STATES, C, FLAPS, strict=True):
@@ -158,6 +162,7 @@ def test_where_no_flap_saturates_height_and_flaps_are_the_original_firmwares() -
 states = st.lists(st.floats(-3, 3, width=32), min_size=12, max_size=12)
 
 
+@pytest.mark.long
 @law
 @given(states, st.tuples(*4 * (st.floats(-2, 2, width=32),)))
 def test_feedback_is_the_papers_in_the_heading_frame(state: list[float], target: tuple[float, ...]) -> None:
@@ -201,6 +206,7 @@ def test_height_error_is_integrated_at_100_hz_up_to_its_limit_and_forgotten_when
 # Allocation
 
 
+@pytest.mark.long
 @law
 @given(four)
 def test_allocation_is_the_matrix_form_of_the_priority_rule(u: tuple[float, ...]) -> None:
@@ -212,6 +218,7 @@ def test_allocation_is_the_matrix_form_of_the_priority_rule(u: tuple[float, ...]
     assert loop.control.fields.command == pytest.approx(loop.flaps - SIGNS * HOVER, abs=SMALL)
 
 
+@pytest.mark.long
 @law
 @given(st.tuples(*4 * (any_number,)), any_number, any_number)
 def test_openings_never_leave_their_limits(u: tuple[float, ...], gain: float, hover: float) -> None:
@@ -224,6 +231,7 @@ def test_openings_never_leave_their_limits(u: tuple[float, ...], gain: float, ho
     assert all(21_000 <= count <= 42_000 for count in loop.control.fields.count)
 
 
+@pytest.mark.long
 @law
 @given(st.tuples(*4 * (st.floats(-0.3125, 0.3125, width=32),)))
 def test_attitude_inputs_are_realised_exactly_whenever_any_height_allows_it(u: tuple[float, ...]) -> None:
@@ -248,6 +256,7 @@ def test_open_loop_holds_the_hover_angles_whatever_the_state(mode: int) -> None:
     assert not loop.control.fields.command.any()
 
 
+@pytest.mark.long
 @law
 @given(st.tuples(*4 * (any_number,)))
 def test_angles_from_outside_are_held_within_a_quarter_turn(angles: tuple[float, ...]) -> None:

@@ -224,11 +224,12 @@ TIGHT = {"position": 5e-7, "velocity": 1e-5, "attitude": 3e-6, "rate": 1e-5, "fl
 LOOSE = {"position": 5e-5, "velocity": 1.5e-3, "attitude": 1e-3, "rate": 2e-4, "flap": 3e-4}  # and the series
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("level", "limits", "covariance"),
     [
         pytest.param(series(), TIGHT, 3e-4, id="series"),
-        pytest.param(exact(), LOOSE, 6e-3, id="expm", marks=pytest.mark.long),
+        pytest.param(exact(), LOOSE, 6e-3, id="expm"),
     ],
 )
 def test_state_prediction_and_covariance_are_filterpys_in_every_tick_of_a_flight(
@@ -241,6 +242,7 @@ def test_state_prediction_and_covariance_are_filterpys_in_every_tick_of_a_flight
     assert worst["P"] < covariance  # in units of the two standard deviations
 
 
+@pytest.mark.long
 def test_recorded_flight_exercises_the_filter(flight: list[Record]) -> None:
     x = np.array([core.x for _, core in replay(flight)])
     span = x.max(axis=0) - x.min(axis=0)
@@ -305,6 +307,7 @@ def test_state_and_covariance_stay_sane_whatever_comes_in(ticks, predict, measur
 BAD = (math.nan, math.inf, -math.inf)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("p", "q"),
     [
@@ -484,6 +487,7 @@ def rest(record: Record) -> tuple[list[int], int, Vector, Vector]:
     return record.gyro_sum, record.samples, record.bias, record.command
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=60)
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(-math.pi, math.pi), st.floats(0.92, 1.08))
 def test_first_pose_is_adopted_at_any_attitude(roll: float, pitch: float, yaw: float, length: float) -> None:
@@ -527,6 +531,7 @@ def test_silent_gyro_leaves_the_last_rates() -> None:
 # Bounds and recovery
 
 
+@pytest.mark.long
 def test_fast_and_far_motion_does_not_reset() -> None:
     core = Core()
     for tick in range(400):
@@ -552,6 +557,7 @@ def test_state_beyond_its_bounds_is_held_there_and_counted() -> None:
 BOUNDS = np.repeat(np.float32([1.1, 2.2, 0.7, 3.3, 1.6]), (3, 3, 3, 3, 4))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("state", [state for state in range(16) if state != 8])  # not the yaw
 @pytest.mark.parametrize("sign", [1, -1])
 def test_each_state_is_held_at_its_own_bound_and_counted(state: int, sign: int) -> None:
@@ -587,6 +593,7 @@ def test_a_variance_is_held_between_its_bounds_and_covariances_below_their_produ
     assert core.P[5, 9] == core.P[9, 5] == pytest.approx(held)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bad", BAD)
 @pytest.mark.parametrize(
     "place", [*(("x", state) for state in range(16)), ("P", (4, 4)), ("P", (8, 8)), ("P", (4, 9))]

@@ -67,6 +67,7 @@ def test_a_realisation_is_periodic_and_the_next_has_other_phases_on_the_same_lin
         assert np.abs(np.exp(1j * turned).mean()) < 0.5  # random phases differ in all directions
 
 
+@pytest.mark.long
 def test_the_first_realisation_follows_the_last_and_peaks_stay_low() -> None:
     board = Board(EXCITE_MULTISINE, **RMS)
     every = board.fly(REALISATION * REALISATIONS)

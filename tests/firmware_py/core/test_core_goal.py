@@ -84,6 +84,7 @@ def test_a_set_point_becomes_the_goal_and_one_without_yaw_keeps_the_goals(yaw: f
     assert data.goal[:3] == pytest.approx(HOME)
 
 
+@pytest.mark.long
 def test_an_absolute_pose_is_filed_as_it_looks_from_the_goal() -> None:
     """The goal is upright at p_WG, turned by its yaw: R_GB = R_WG^-1 R_WB, p_GB = R_WG^-1 (p_WB - p_WG)."""
     rng, core = np.random.default_rng(2), Core()

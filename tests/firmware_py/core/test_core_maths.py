@@ -22,6 +22,7 @@ def turn_apart(a: float, b: float) -> float:
     return abs(math.remainder(a - b, 2 * math.pi))
 
 
+@pytest.mark.long
 @law
 @given(finite, finite)
 @example(0.0, -1.0)
@@ -39,6 +40,7 @@ def test_arc_tangent_is_exact_to_3e_7_on_the_circle(y: float, x: float) -> None:
         assert math.copysign(1, got) == math.copysign(1, y) or y == 0.0
 
 
+@pytest.mark.long
 @law
 @given(st.floats(-1, 1, width=32) | any_number)
 @example(1.0)
@@ -49,6 +51,7 @@ def test_arc_sine_is_exact_to_3e_7_and_saturates_outside_its_domain(x: float) ->
     assert float(maths.asin(f32(x))) == pytest.approx(expected, abs=3e-7)
 
 
+@pytest.mark.long
 @law
 @given(st.floats(-10, 10, width=32))
 @example(3.1415927410125732)
@@ -60,6 +63,7 @@ def test_wrapped_angle_is_the_same_angle_inside_half_a_turn(x: float) -> None:
     assert abs(got) <= float(f32(math.pi))
 
 
+@pytest.mark.long
 @law
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @given(any_number, any_number)
@@ -76,6 +80,7 @@ def test_no_number_gives_more_than_a_bounded_number(y: float, x: float) -> None:
     assert abs(float(maths.asin(f32(x)))) <= math.pi / 2 + 3e-7
 
 
+@pytest.mark.long
 @law
 @given(angles | any_number)
 @example(1000.0)
@@ -88,6 +93,7 @@ def test_sine_and_cosine_are_exact_to_1e_7_wrap_to_6e_5_and_saturate_beyond_1000
     assert turn_apart(float(maths.wrap(f32(x))), held) < 6e-5
 
 
+@pytest.mark.long
 @law
 @given(any_number, finite, finite)
 def test_clamp_is_numpys_and_takes_nan_to_the_lower_bound(x: float, a: float, b: float) -> None:
@@ -96,12 +102,14 @@ def test_clamp_is_numpys_and_takes_nan_to_the_lower_bound(x: float, a: float, b:
     assert float(maths.clamp(f32(x), f32(low), f32(high))) == expected
 
 
+@pytest.mark.long
 @law
 @given(any_number)
 def test_finite_is_numpys(x: float) -> None:
     assert bool(maths.finite(f32(x))) == bool(np.isfinite(x))
 
 
+@pytest.mark.long
 @law
 @given(finite)
 @example(9.019999504089355)

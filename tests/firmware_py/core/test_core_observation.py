@@ -18,6 +18,7 @@ CONFIG = load_config("floaty")
 number = st.floats(-1.5, 1.5, width=32)
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=100)
 @given(st.tuples(*16 * (number,)), st.tuples(*4 * (number,)), st.tuples(*4 * (number,)))
 def test_an_observation_is_error_and_motion_in_heading_frame(state: Any, target: Any, previous: Any) -> None:

@@ -55,6 +55,7 @@ def test_the_age_that_is_reported_is_the_poses_own_whether_it_is_used_or_not(pre
     assert int(core.fields.pose_age_us) == 44_000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("age_us", [20_000, 40_000, 120_000])
 def test_without_prediction_the_estimate_lags_by_the_age(age_us: int) -> None:
     core = no_couplings(Core(predict=0))
@@ -96,6 +97,7 @@ def true_motion(ticks: int, steps: int = 10) -> Vector:
 TRUTH = true_motion(400)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("age_us", [0, 17_000, 40_000, 80_000, 120_000])
 def test_prediction_follows_the_model_through_the_buffered_commands(age_us: int) -> None:
     core, worst = Core(), np.zeros(16)
@@ -138,6 +140,7 @@ def test_pose_without_age_counts_as_40_ms_old() -> None:
 ages = st.lists(st.integers(0, 4), min_size=30, max_size=60)
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=60)
 @given(ages)
 def test_estimate_of_the_past_does_not_depend_on_when_a_pose_came_in(late: list[int]) -> None:
@@ -163,6 +166,7 @@ def test_estimate_of_the_past_does_not_depend_on_when_a_pose_came_in(late: list[
     assert (regular.P == shuffled.P).all()
 
 
+@pytest.mark.long
 @given(st.integers(0, 124_999))
 @example(124_999)
 @settings(deadline=None)
@@ -180,6 +184,7 @@ def test_pose_waits_at_the_tick_nearest_to_its_instant(age_us: int) -> None:
 # The horizon
 
 
+@pytest.mark.long
 def test_measured_horizon_follows_an_older_pose_at_once_and_a_younger_one_slowly() -> None:
     core = Core()
     glide(core, 100, 40_000)
@@ -228,6 +233,7 @@ def test_fixed_horizon_ignores_the_age() -> None:
     assert len({core.estimator.bytes() for core in cores}) == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("horizon", [-(2**31), -5, 0, 13, 1000, 2**31 - 1])
 @pytest.mark.parametrize("measured", [0, 1])
 def test_senseless_horizon_parameter_acts_as_the_nearest_one(horizon: int, measured: int) -> None:
@@ -241,6 +247,7 @@ def test_senseless_horizon_parameter_acts_as_the_nearest_one(horizon: int, measu
     assert core.estimator.bytes() == nearest.estimator.bytes()
 
 
+@pytest.mark.long
 def test_a_horizon_that_grows_and_shrinks_neither_loses_nor_repeats_history() -> None:
     """The past is estimated with the same bits as by a filter that waited from the start and goes on to."""
     follows, waits = Core(), Core(horizon=12)
@@ -263,6 +270,7 @@ def test_a_horizon_that_grows_and_shrinks_neither_loses_nor_repeats_history() ->
     assert all(estimates[follows][tick] == estimates[waits][tick] for tick in common)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("first", "then"), [(4, 9), (9, 4), (1, 12), (12, 1)])
 def test_fixed_horizon_may_change_in_flight(first: int, then: int) -> None:
     """After it has settled, the filter is one that had the new horizon from the start."""
@@ -281,6 +289,7 @@ def test_fixed_horizon_may_change_in_flight(first: int, then: int) -> None:
     assert changed.counters.get("refused") is None
 
 
+@pytest.mark.long
 def test_predictor_may_be_switched_in_flight() -> None:
     core = no_couplings(Core())
     for part, predict in enumerate((1, 0, 1)):
@@ -318,6 +327,7 @@ def test_senseless_default_age_files_no_pose_in_the_future(default_age_us: int) 
     assert core.estimator.bytes() == nearest.estimator.bytes()
 
 
+@pytest.mark.long
 def test_horizon_outlasts_a_silence() -> None:
     core = Core()
     glide(core, 100, 40_000)

@@ -26,6 +26,7 @@ def answers(core: Core, ticks: int, omega: object = STILL, age_us: int = 40_000,
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rate", [0.0, 5.0])
 @pytest.mark.parametrize("axis", range(3))
 def test_the_pose_of_a_robot_at_rest_may_repeat_even_with_a_wrong_zero_of_the_gyro(
@@ -37,6 +38,7 @@ def test_the_pose_of_a_robot_at_rest_may_repeat_even_with_a_wrong_zero_of_the_gy
     assert core.fields.fused > 490
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("omega", [*(np.eye(3) * 50 * DEGREE), *(np.eye(3) * -8 * DEGREE)])
 @pytest.mark.parametrize("age_us", [0, 40_000, 100_000])
 def test_a_pose_that_stays_the_same_while_the_robot_turns_is_refused_until_any_bit_differs(
@@ -57,6 +59,7 @@ def test_a_pose_that_stays_the_same_while_the_robot_turns_is_refused_until_any_b
     assert core.pose(PLACE, quaternion(roll=1e-6), age_us) == POSE_ON_TIME
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("age_us", "known"), [(40_000, True), (100_000, True), (-1, False)])
 def test_poses_from_before_the_turn_are_used(age_us: int, known: bool) -> None:
     core = Core()
@@ -86,6 +89,7 @@ def test_a_repeated_pose_is_frozen_when_it_was_exposed_after_the_turn(
     )
 
 
+@pytest.mark.long
 def test_a_turn_by_half_of_the_limit_changes_the_coarsest_pose() -> None:
     rng = np.random.default_rng(1)
     for _ in range(2000):

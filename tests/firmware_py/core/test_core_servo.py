@@ -35,6 +35,7 @@ def drive(angles: tuple[float, ...], parameters: Block | None = None) -> Block:
     return core.control
 
 
+@pytest.mark.long
 def test_words_and_counts_of_300_flap_positions_are_the_original_firmwares() -> None:
     parameters = parameters_of(CONFIG)
     for row in ANGLES:
@@ -66,6 +67,7 @@ def test_word_of_a_senseless_angle_is_a_word(angle: float, trim: float) -> None:
     assert 0 <= servo.word_of_angle(np.float32(angle), np.float32(trim)) <= 65535
 
 
+@pytest.mark.long
 @settings(deadline=None)
 @given(any_four, any_four, any_four)
 def test_no_angle_trim_or_direction_leaves_the_range_of_the_pulse(

@@ -50,6 +50,7 @@ def coefficients(
     return Polynomial(np.linalg.solve(np.array(rows), np.array(wanted)))
 
 
+@pytest.mark.long
 @given(MOTIONS, MOTIONS, DURATIONS)
 @settings(max_examples=15, deadline=None)
 def test_motions_are_joined_without_jerk_at_ends(begin: PathPoint, end: PathPoint, duration: float) -> None:
@@ -67,6 +68,7 @@ def test_motions_are_joined_without_jerk_at_ends(begin: PathPoint, end: PathPoin
     assert path.at(0.4 * duration).yaw_rate == pytest.approx(yaw.deriv()(0.4 * duration), abs=1e-5)
 
 
+@pytest.mark.long
 @given(POINTS, DURATIONS)
 @settings(max_examples=50, deadline=None)
 def test_a_bezier_curve_is_scipys(points: list[float], duration: float) -> None:

@@ -87,6 +87,7 @@ def app(library: Path, tmp_path: Path) -> App:
     return app
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("flying", [False, True])
 def test_the_app_takes_back_what_the_python_board_refuses_and_nothing_else(app: App, flying: bool) -> None:
     place = (ctypes.c_float * 4).in_dll(app.c, "floaty_commanded")

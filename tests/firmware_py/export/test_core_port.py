@@ -92,6 +92,7 @@ def ticks(app: App, number: int) -> int:
     return struct.unpack("<i", ask(app, number, read(TICK, 4)).body)[0]
 
 
+@pytest.mark.long
 def test_a_session_begins_with_what_is_on_board_and_memory_of_zeros(app: App) -> None:
     about = ask(app, 0, hello()).about()
     assert f'"{about.core}' in translate().header
@@ -103,6 +104,7 @@ def test_a_session_begins_with_what_is_on_board_and_memory_of_zeros(app: App) ->
     assert ask(app, 0, read(about.size - READ_MAX, READ_MAX)).body == bytes(READ_MAX)
 
 
+@pytest.mark.long
 def test_a_call_is_answered_with_cycles_and_the_digest_of_all_memory(app: App) -> None:
     blocks = CoreBlocks(parameters_of(load_config()), default_runner)
     blocks.run.call("reset")
@@ -317,6 +319,7 @@ class Silence(AppPackets):
         return None
 
 
+@pytest.mark.long
 def test_a_flight_on_the_app_equals_python_bitwise_whatever_is_lost(app: App) -> None:
     client, _ = client_of(app, 0.1)
     request = Request.of(find_experiment("hover"), duration_s=2.0, faults=(parse("mocap.outlier@1"),))

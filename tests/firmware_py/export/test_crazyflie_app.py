@@ -145,6 +145,7 @@ def scenario(rng: np.random.Generator, steps: int) -> dict[int, list[Event]]:
     return events
 
 
+@pytest.mark.long
 def test_app_and_laboratory_turn_the_same_samples_into_the_same_bits(app: App) -> None:
     rng = np.random.default_rng(7)
     laboratory, steps = Laboratory(), 9000
@@ -628,6 +629,7 @@ HOME = (0.0, 0.0, 1.15)
 P_WB, Q_WB = (1.0, 2.0, 3.0), from_euler_zyx(0.1, -0.2, 1.3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", ["attitude", "quaternion"])
 def test_absolute_poses_become_corrections(app: App, library: Path, tmp_path: Path, how: str) -> None:
     rng = np.random.default_rng(5)
@@ -749,6 +751,7 @@ def test_an_app_that_has_booted_takes_absolute_poses(app: App) -> None:
     assert app.get("extPose.absolute") == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place", [(0.0, 0.0, 1.1), (0.7, 0.7, 0.0), (0.0, 0.0, -2.1)])
 def test_impossible_corrections_are_counted_and_reported_every_ten_seconds(
     app: App, place: tuple[float, float, float]
@@ -857,6 +860,7 @@ def test_parameters_have_the_names_types_and_defaults_of_the_laboratory(app: App
             assert app.c.stub_param_persistent(index) == twin.persistent, name
 
 
+@pytest.mark.long
 @given(data=st.data())
 def test_the_board_accepts_the_laboratory_s_parameters_only(functions: App, data: st.DataObject) -> None:
     laboratory = LABORATORY
@@ -901,6 +905,7 @@ def test_log_variables_have_names_of_the_laboratory(app: App) -> None:
 FLOATS = st.floats(width=32) | st.floats(-1.25, 1.25, width=32)
 
 
+@pytest.mark.long
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.binary(max_size=31)
@@ -937,6 +942,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_only_an_empty_folder_or_an_app_is_written_to(written: Path, tmp_path: Path) -> None:
     config = load_config()
     before = {path: path.read_bytes() for path in (written / "src").glob("*.[ch]")}
@@ -950,6 +956,7 @@ def test_only_an_empty_folder_or_an_app_is_written_to(written: Path, tmp_path: P
         write_app(config, "floaty", tmp_path / "full" / "thesis.tex")
 
 
+@pytest.mark.long
 def test_every_source_is_built_and_every_include_is_there(written: Path) -> None:
     source = written / "src"
     kbuild = (source / "Kbuild").read_text()
@@ -970,6 +977,7 @@ def test_the_stubs_are_as_the_firmwares_headers(tmp_path: Path) -> None:
     assert built.returncode == 0, built.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("header", sorted(STUBS.glob("*.h")), ids=lambda header: header.name)
 def test_the_stubs_declare_nothing_that_the_facts_do_not_state(header: Path) -> None:
     words_of_c = (
@@ -1012,6 +1020,7 @@ def compile_for_arm(folder: Path) -> Path:
     return folder / "src"
 
 
+@pytest.mark.long
 def test_the_app_compiles_with_the_crazyflies_flags_and_fits(arm_build: Path) -> None:
     objects = sorted(map(str, arm_build.glob("*.o")))
     lines = subprocess.run(
@@ -1032,6 +1041,7 @@ def test_the_app_compiles_with_the_crazyflies_flags_and_fits(arm_build: Path) ->
     assert max(stack.values()) < STABILIZER_STACK // 2
 
 
+@pytest.mark.long
 def test_the_core_on_arm_neither_fuses_nor_computes_in_double(arm_build: Path) -> None:
     code = subprocess.run(
         ("arm-none-eabi-objdump", "-d", str(arm_build / "floaty_core.o")), capture_output=True, text=True, check=True

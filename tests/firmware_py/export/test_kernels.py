@@ -105,6 +105,7 @@ def test_c_computes_the_bits_of_python(compiler: Compiler) -> None:
     holds()
 
 
+@pytest.mark.long
 def test_random_kernels_compute_the_bits_of_python(tmp_path: Path) -> None:
     path = tmp_path / "random_kernels.py"
     kernels = (KERNEL.format(name=n, body=indent(Programs(LIVE, n).body(), "    ")) for n in range(30))

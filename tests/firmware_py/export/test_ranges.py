@@ -41,6 +41,7 @@ TESTS = [
 ]  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("holds", [True, False])
 @pytest.mark.parametrize("test", TESTS)
 def test_a_condition_bounds_a_number_to_those_for_which_it_holds(test: str, holds: bool) -> None:
@@ -58,6 +59,7 @@ EXPRESSIONS = (
 )  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("text", EXPRESSIONS)
 def test_an_expression_has_the_values_that_its_numbers_give(text: str) -> None:
     scope = {"MANY": 4, "i32": int, "charged_end": lambda budget, begin, end, step: end}

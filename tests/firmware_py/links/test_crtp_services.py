@@ -64,6 +64,7 @@ def test_the_board_is_named_and_a_program_s_notice_comes_back_whole(client: Crtp
     assert client.one(PLATFORM, 0, b"\3\1") == b"\3\1"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("port", "channel", "data", "malformed", "unserved"),
     [
@@ -151,6 +152,7 @@ def test_a_battery_is_shown_by_the_stock_firmwares_curve_and_is_low_below_its_li
     assert client.log(logs, "pm.batteryLevel", "pm.state", "pm.vbatMV") == [level, 3 * (mv < 3000), mv]
 
 
+@pytest.mark.long
 def test_telemetry_tells_the_excitation_sample_by_sample(client: CrtpClient, params) -> None:
     client.poses(605_000, 3_000_000)
     client.write(params, "excite.u1", 0.05)
@@ -168,6 +170,7 @@ def test_telemetry_tells_the_excitation_sample_by_sample(client: CrtpClient, par
         assert {row[9:] for row in rows} == {(0.0, 0.0, 0.0)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["a block", "telemetry"])
 def test_rows_end_a_second_after_silence_and_the_next_gets_none(client: CrtpClient, logs, kind: str) -> None:
     if kind == "telemetry":
@@ -290,6 +293,7 @@ def test_a_block_that_the_processor_kept_waiting_returns_to_its_grid(client: Crt
     assert max(np.diff(stamps)) > 40
 
 
+@pytest.mark.long
 @given(
     st.sampled_from(sorted(C_TYPES, key=lambda scalar: scalar.log_number)),
     st.integers(-(2**31), 2**32 - 1)
@@ -300,6 +304,7 @@ def test_integers_are_cast_as_in_c(scalar: Scalar, value: int) -> None:
     assert scalar.unpack(scalar.pack(float(value))) == C_TYPES[scalar](value).value
 
 
+@pytest.mark.long
 @given(st.floats(allow_nan=False))
 def test_floats_are_rounded_as_numpy_does(value: float) -> None:
     with np.errstate(over="ignore"):
@@ -467,6 +472,7 @@ def test_each_request_about_a_parameter_has_the_firmware_s_answer_to_its_kind(
     assert client.one(PARAM, 3, head).hex() == head.hex() + absent
 
 
+@pytest.mark.long
 @given(st.binary(max_size=80), st.integers(0, 200))
 @settings(deadline=None)
 def test_a_spoilt_store_is_an_empty_one(noise: bytes, place: int) -> None:
@@ -485,6 +491,7 @@ def test_a_spoilt_store_is_an_empty_one(noise: bytes, place: int) -> None:
 CHANGE = st.tuples(st.sampled_from(("a.b", "a.longer", "\xff\x80")), st.none() | st.binary(max_size=255))
 
 
+@pytest.mark.long
 @given(st.lists(CHANGE, max_size=12), st.integers(0, 600))
 @example(
     [("a.b", bytes(7)), ("a.b", bytes(8)), ("a.b", b""), ("a.b", None), ("a.b", None)], 12
@@ -552,6 +559,7 @@ class Handler:
         element.write_done(element, address)
 
 
+@pytest.mark.long
 def test_cflib_reads_and_writes_the_configuration_block(client: CrtpClient) -> None:
     element, done = I2CElement(0, 0, 8191, Handler(client)), []
     element.update(done.append)
@@ -683,6 +691,7 @@ def test_power_set_words_reach_the_timers_as_in_the_original(client: CrtpClient,
 # Console
 
 
+@pytest.mark.long
 @given(st.text(max_size=120))
 def test_console_pieces_are_whole_characters_of_at_most_thirty_bytes(text: str) -> None:
     parts = list(pieces(text))

@@ -102,6 +102,7 @@ def test_what_cannot_be_flown_is_named_once_on_the_console(absolute: Flyer) -> N
     ]
 
 
+@pytest.mark.long
 def test_a_reason_that_comes_again_after_a_followed_set_point_is_named_again(absolute: Flyer) -> None:
     line = "commander: set-point not followed: only positions are"
     for times in (1, 2):
@@ -123,6 +124,7 @@ def test_to_ask_whether_a_place_is_admitted_changes_nothing_that_flies(absolute:
     assert {name for name in before if before[name] != after[name]} == {"setpoint"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("places", "admitted"),
     [((0.0, 0.0), True), ((0.0, 7.0, 0.0), False), ((0.0, 7.0), False), ((8.0, 7.0, 0.0), True), ((8.0, 0.0, 7.0), False),
@@ -157,6 +159,7 @@ def test_only_the_notice_0_hands_the_lead_back_and_other_channels_have_none(abso
     assert absolute.goal()[2] == pytest.approx(2.0)
 
 
+@pytest.mark.long
 def test_take_off_go_to_and_land_move_the_goal_and_the_estimator_gets_the_error(absolute: Flyer) -> None:
     assert absolute.order(absolute.commander.takeoff, 1.0, 2.0) == 0
     absolute.wait(2.2)
@@ -200,6 +203,7 @@ def test_robot_that_was_pushed_out_of_the_box_may_return(boxed: Flyer) -> None:
     assert boxed.order(boxed.commander.go_to, 0.31, 0.0, 1.15, 0.0, 1.0) == ENOEXEC
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place", [(0.0, 0.0, 1.1), (0.95, 0.0, 0.0), (0.7, 0.7, 0.0), (0.0, 0.0, -2.1)])
 def test_an_impossible_correction_only_reports(relative: Flyer, place: tuple[float, float, float]) -> None:
     before = relative.estimate()

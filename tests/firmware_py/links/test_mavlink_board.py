@@ -80,6 +80,7 @@ def test_masked_parts_of_a_goal_stay_unchanged(client: MavlinkClient) -> None:
     assert last_pose(client)[0] == pytest.approx((-0.5, 0.0, 0.0), abs=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("estimator", "expected"),
     [(dialect.MAV_ESTIMATOR_TYPE_MOCAP, State.FLYING), (dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT, State.WAITING)],
@@ -148,6 +149,7 @@ def test_ages_within_the_clock_error_are_zero_else_unknown(lag_us: int, age_us: 
     assert age_ms == pytest.approx(-1.0 if found is None else 1e-3 * found)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("clock_us", "asked_ms"),
     [
@@ -250,6 +252,7 @@ def test_another_sender_is_no_relocalisation() -> None:
     assert not any("frame" in text for text in client.texts())
 
 
+@pytest.mark.long
 def test_only_the_clock_of_the_sender_of_poses_counts() -> None:
     client = MavlinkClient()
     client.clock_ahead_us = 5_000_000
@@ -273,6 +276,7 @@ def test_only_the_clock_of_the_sender_of_poses_counts() -> None:
 # Streams
 
 
+@pytest.mark.long
 def test_after_boot_every_stream_keeps_its_rate() -> None:
     client = MavlinkClient()
     client.run(5_100_000)
@@ -324,6 +328,7 @@ def test_an_interval_is_set_read_switched_off_and_reset(client: MavlinkClient) -
     assert client.command(511, 0, 0)[0].result == 0  # of heartbeats the default alone may be asked for
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "params",
     [
@@ -376,6 +381,7 @@ def test_headings_of_goal_and_robot_are_reported_within_half_a_turn(client: Mavl
         assert client.of(kind)[-1].yaw == pytest.approx(math.radians(heading), abs=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("addressee", "answered"),
     [((0, 0), True), ((1, 1), True), ((1, 0), True), ((7, 1), False), ((1, 99), False)],
@@ -397,6 +403,7 @@ def test_a_timesync_is_answered_to_its_sender_alone(
     assert [payload[16:18] for payload in found] == ([bytes((255, 190))] if answered else [])
 
 
+@pytest.mark.long
 def test_streams_go_on_after_the_processor_was_taken_from_them(client: MavlinkClient) -> None:
     taken_us = 0
     client.firmware.kernel.occupy("LOAD", lambda: taken_us)
@@ -424,6 +431,7 @@ def test_messages_of_one_period_carry_one_time_stamp(client: MavlinkClient) -> N
     assert [m.time_usec for m in client.of("DEBUG_FLOAT_ARRAY")] == [1000 * stamp for stamp in stamps_ms]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("goal_yaw", [-0.5, 2.0])
 def test_the_reported_velocity_is_the_derivative_of_the_reported_position(goal_yaw: float) -> None:
     client = MavlinkClient()
@@ -504,6 +512,7 @@ GROUPS = {  # of MAV_DATA_STREAM
 GROUPS["ALL"] = tuple(name for group in GROUPS.values() for name in group)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("group", GROUPS)
 def test_the_older_request_sets_groups_of_streams(client: MavlinkClient, group: str) -> None:
     for start, times in ((1, 10), (0, 0)):
@@ -527,6 +536,7 @@ def test_a_mode_is_described_by_its_index_or_all_are(client: MavlinkClient) -> N
     ]  # fmt: skip
 
 
+@pytest.mark.long
 def test_manual_control_of_this_board_is_refused_and_long_texts_are_numbered_from_1(
     client: MavlinkClient,
 ) -> None:
@@ -592,6 +602,7 @@ def test_a_stream_that_is_set_while_its_message_waits_begins_anew(
     assert stamps == ([] if first_ms is None else list(range(first_ms, 301, interval_us // 1000)))
 
 
+@pytest.mark.long
 def test_more_streams_than_the_queue_takes_have_their_turns_too(client: MavlinkClient) -> None:
     slow_line(client, bytes_per_ms=1)
     numbers = (
@@ -608,6 +619,7 @@ def test_more_streams_than_the_queue_takes_have_their_turns_too(client: MavlinkC
     assert 2 * min(counts.values()) >= max(counts.values()) - 2
 
 
+@pytest.mark.long
 def test_waiting_messages_leave_within_a_tick_of_room(client: MavlinkClient) -> None:
     for wait_us in range(1_000_000, 1_020_000, 2_000):
         client.uart_room = 0
@@ -932,6 +944,7 @@ def test_the_boards_own_frames_are_ignored_when_they_come_back(client: MavlinkCl
     assert client.firmware.signals.supervisor.armed
 
 
+@pytest.mark.long
 def test_a_client_is_there_for_three_seconds_after_its_last_message(client: MavlinkClient) -> None:
     client.run(10_000_000)
     assert not client.stack.connected
@@ -977,6 +990,7 @@ def test_with_a_key_nothing_unsigned_is_accepted_and_everything_sent_is_signed()
     assert not client.firmware.signals.supervisor.armed
 
 
+@pytest.mark.long
 def test_the_trace_names_no_interrupt_that_the_hardware_did_not_raise() -> None:
     client = MavlinkClient()
     raised: list[None] = []

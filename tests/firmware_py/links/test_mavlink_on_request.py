@@ -50,6 +50,7 @@ def velocity(client: MavlinkClient) -> tuple[float, float, float]:
     return found.vx, found.vy, found.vz
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", ON_REQUEST)
 def test_rare_messages_are_sent_only_on_request_at_the_requested_rate(number: int) -> None:
     client = MavlinkClient()
@@ -123,6 +124,7 @@ def test_the_board_reports_whether_it_is_in_the_air() -> None:
     assert landed(2_100_000) == dialect.MAV_LANDED_STATE_UNDEFINED  # silence
 
 
+@pytest.mark.long
 def test_slow_streams_come_within_five_seconds_with_right_values(moving: MavlinkClient) -> None:
     moving.messages.clear()
     moving.run(moving.now_us + 5_100_000)

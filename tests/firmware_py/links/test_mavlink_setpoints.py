@@ -60,6 +60,7 @@ def aim(client: MavlinkClient) -> float:
 # What is not served
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", UNSERVED)
 def test_unserved_requests_are_reported_once_then_seldom(client: MavlinkClient, name: str) -> None:
     line = f"{name.upper()} is not served"
@@ -76,6 +77,7 @@ def test_unserved_requests_are_reported_once_then_seldom(client: MavlinkClient, 
     assert [texts(client, name, *UNSERVED[name]) for _ in range(2)] == [[line], []]  # seldom again
 
 
+@pytest.mark.long
 def test_a_thousand_senders_get_no_thousand_texts(client: MavlinkClient) -> None:
     for number in range(1, 1001):
         sender = 2 + number % 5, 1 + number % 250
@@ -84,6 +86,7 @@ def test_a_thousand_senders_get_no_thousand_texts(client: MavlinkClient) -> None
     assert client.texts()[-1] == "requests of further kinds or senders refused"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "fields"),
     [
@@ -108,6 +111,7 @@ def test_exclusive_control_is_refused(client: MavlinkClient) -> None:
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("fields", "line"),
     [

@@ -23,6 +23,7 @@ def test_the_offset_is_unknown_before_the_first_answer() -> None:
     assert clock.offset_us(2000) is None
 
 
+@pytest.mark.long
 @given(st.lists(st.tuples(delays, delays), min_size=1, max_size=2 * WINDOW))
 def test_the_offset_error_is_at_most_half_the_shortest_round_trip(rounds: list[tuple[int, int]]) -> None:
     clock = RemoteClock()

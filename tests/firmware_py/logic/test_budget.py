@@ -68,6 +68,7 @@ def test_the_budget_is_the_part_of_the_control_slot_that_the_pages_state() -> No
 SUM = "for i in range({}):\n    memory.hidden = memory.hidden + DT"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("body", "before", "at"),
     [
@@ -96,6 +97,7 @@ def test_a_known_loop_beyond_the_budget_is_refused(tmp_path: Path, body: str, be
     assert str(error.value).endswith(": a call has 672000 (4 ms of a Cortex-M4): write a part for each tick")
 
 
+@pytest.mark.long
 def test_a_call_of_exactly_the_budget_is_admitted_and_one_more_cycle_is_not(tmp_path: Path) -> None:
     longest, one = (
         CALL_CYCLES // 5,
@@ -115,6 +117,7 @@ def test_a_call_of_exactly_the_budget_is_admitted_and_one_more_cycle_is_not(tmp_
         own_config(tmp_path, law(one + body))
 
 
+@pytest.mark.long
 def test_a_call_costs_four_cycles_more_than_what_it_calls(tmp_path: Path) -> None:
     add = "memory.hidden = memory.hidden + DT"
     helper = f"@kernel\ndef step(memory: Memory) -> None:\n    {add}\n\n\n"
@@ -229,6 +232,7 @@ def test_a_loop_fits_to_the_last_cycle_and_the_first_that_does_not_is_named(star
         assert (budget.exceeded, budget.line, budget.end) == (1, 12, start + 7)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("board", EVERY)
 def test_an_estimator_that_exceeds_its_budget_has_no_estimate(blocks_of: Make, board: str) -> None:
     old = "    memory.ticks = i32(memory.ticks + 1)\n"
@@ -258,6 +262,7 @@ def test_a_call_with_a_loop_in_an_expression_is_refused(tmp_path: Path) -> None:
         own_config(tmp_path, text)
 
 
+@pytest.mark.long
 def test_logic_without_such_loops_flies_as_it_is_written(blocks_of: Make) -> None:
     blocks = blocks_of(law(SUM.format("100000")), estimator=ESTIMATOR)
     assert blocks.logic is not None
@@ -265,9 +270,8 @@ def test_logic_without_such_loops_flies_as_it_is_written(blocks_of: Make) -> Non
     assert not any("budget" in name for name in blocks.named)
 
 
-@pytest.mark.parametrize(
-    ("form", "before"), [(FORMS[0][0], ""), pytest.param(FORMS[5][0], FILL, marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize(("form", "before"), [(FORMS[0][0], ""), (FORMS[5][0], FILL)])
 def test_the_cycles_counted_are_at_most_those_of_the_machine_code(
     blocks_of: Make, form: str, before: str
 ) -> None:

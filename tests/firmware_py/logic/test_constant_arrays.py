@@ -66,6 +66,7 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> LabConfig:
     return own_config(tmp_path_factory.mktemp("matrix"), LAW)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("board", BOARDS[1:])
 def test_matrix_times_vector_is_equal_everywhere(config: LabConfig, board: str) -> None:
     logic = load_logic(config.logic)

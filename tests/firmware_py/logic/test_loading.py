@@ -269,6 +269,7 @@ def test_a_wrong_profile_value_is_refused_with_the_range(project: Path, values: 
     assert str(error.value).startswith(told)
 
 
+@pytest.mark.long
 def test_names_of_two_modules_that_clients_could_not_tell_apart_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
         LabError, match=r"estimator.py: GAIN_IY: this name exists already: gain_iy in .*controller.py"
@@ -291,6 +292,7 @@ def test_a_file_that_is_not_there_is_one_line_and_exit_code_two(cli: Cli, tmp_pa
     assert cli.err.endswith("lqrr: No such file or directory; laws that ship: lqr, original\n")
 
 
+@pytest.mark.long
 def test_a_wrong_module_is_one_line_always(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     make_project(tmp_path, changed(LAW, "f32(0.01)", "0.01"))
@@ -305,6 +307,7 @@ def test_a_wrong_module_is_one_line_always(cli: Cli, monkeypatch: pytest.MonkeyP
         )
 
 
+@pytest.mark.long
 def test_paths_begin_at_the_profile_that_names_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     project, child = tmp_path / "project", tmp_path / "child"
     project.mkdir()
@@ -333,6 +336,7 @@ def test_an_edited_module_is_never_mistaken_for_what_it_was(tmp_path: Path) -> N
     assert {path.suffix for path in tmp_path.rglob("*")} == {".py", ".toml"}, "compiled code in a project"
 
 
+@pytest.mark.long
 def test_a_project_gets_no_compiled_code(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -347,6 +351,7 @@ def test_a_project_gets_no_compiled_code(
     assert {path.suffix for path in project.rglob("*")} == {".py", ".toml"}
 
 
+@pytest.mark.long
 def test_without_a_compiler_own_logic_flies_as_python_and_one_line_names_what_to_install(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -399,6 +404,7 @@ def control_law(parameters: Parameters, estimator: Estimator, control: Control, 
 )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("otherwise", "known"),
     [

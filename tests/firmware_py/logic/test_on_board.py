@@ -52,6 +52,7 @@ def bench(config: LabConfig) -> Bench:
     return bench
 
 
+@pytest.mark.long
 def test_parameters_are_taken_inside_their_bounds_and_can_be_stored(bench: Bench) -> None:
     gain = bench.parameter("logic.gain_iy")
     assert (gain.unit, gain.minimum, gain.maximum, gain.persistent) == ("rad/m/s", -2.0, 2.0, True)
@@ -65,6 +66,7 @@ def test_parameters_are_taken_inside_their_bounds_and_can_be_stored(bench: Bench
     assert after.set(1_000_000) == OK
 
 
+@pytest.mark.long
 def test_only_marked_memory_is_logged(bench: Bench) -> None:
     names = [variable.name for variable in bench.firmware.variables if variable.name.startswith("logic.")]
     assert names == ["logic.integral", "logic.errors1", "logic.errors2", "logic.errors3", "logic.ticks"]
@@ -77,6 +79,7 @@ def test_only_marked_memory_is_logged(bench: Bench) -> None:
     assert bench.read("logic.ticks") == before + 10
 
 
+@pytest.mark.long
 def test_mavlink_has_room_for_the_longest_name(config: LabConfig) -> None:
     client = MavlinkClient(f"logic.controller={config.logic.controller!r}")
     client.run(20_000)
@@ -140,6 +143,7 @@ def loop(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     return blocks
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("place", ["u", "flap"])
 @pytest.mark.parametrize("index", range(4))

@@ -176,6 +176,7 @@ def accepted(tmp_path_factory: pytest.TempPathFactory) -> LabConfig:
     return own_config(tmp_path_factory.mktemp("laws"), law_of(ACCEPTED + RANDOM))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("board", BOARDS[1:])
 def test_accepted_laws_compute_the_same_bits_in_c_and_elsewhere(accepted: LabConfig, board: str) -> None:
     logic = load_logic(accepted.logic)
@@ -197,6 +198,7 @@ def test_accepted_laws_compute_the_same_bits_in_c_and_elsewhere(accepted: LabCon
             assert flown.named[name].bytes() == beside.named[name].bytes(), (name, ticks)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "compiler", [one for one in compilers() if one.name != "cc"], ids=lambda one: str(one.name)
 )
@@ -211,6 +213,7 @@ def test_strict_compilers_accept_the_laws_without_a_warning(accepted: LabConfig,
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("board", ["c", "python"])
 def test_a_loop_that_the_data_bounds_keeps_the_bounds_of_its_indices(accepted: LabConfig, board: str) -> None:
     law = ACCEPTED.index(next(body for body in ACCEPTED if body.startswith("n = min(")))

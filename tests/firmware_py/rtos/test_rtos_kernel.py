@@ -27,6 +27,7 @@ def run_until(kernel, end_us, interrupts=()):
 INSTANTS_US = st.lists(st.integers(0, 20_000), max_size=30)
 
 
+@pytest.mark.long
 @given(
     length=st.integers(1, 5),
     from_isr=INSTANTS_US,
@@ -241,6 +242,7 @@ LOOPS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("traced", [False, True])
 @pytest.mark.parametrize("loop", LOOPS)
 def test_a_task_that_never_lets_time_pass_is_named(loop, traced):

@@ -36,6 +36,7 @@ def test_trace_is_that_of_freertos(name, mode, plain, monkeypatch):
     assert "".join(lines) == recorded(name, mode)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mode", ["coop", "preempt"])
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_without_a_trace_the_calls_return_the_same_at_the_same_instants(name, mode):
@@ -58,11 +59,13 @@ def command(*arguments):
     )
 
 
+@pytest.mark.long
 def test_command_prints_the_trace_of_its_mode():
     result = command(VECTORS / "freertos" / "slices.txt", "--mode", "coop")
     assert (result.returncode, result.stdout) == (0, recorded("freertos/slices", "coop"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
@@ -98,6 +101,7 @@ def test_bad_scenario_is_one_line_and_exit_code_2(tmp_path, monkeypatch, capsys,
     assert error.count("\n") == 1
 
 
+@pytest.mark.long
 def test_missing_file_and_bad_mode_are_exit_code_2(tmp_path):
     missing = command(tmp_path / "missing.txt")
     assert missing.returncode == 2

@@ -89,6 +89,7 @@ SAME = (
 PAIRS = [(ours, theirs, *pair.split()) for ours, theirs, pairs in SAME for pair in pairs.split(",")]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("ours", "theirs", "name", "called"), PAIRS, ids=lambda one: str(one)[:40])
 def test_a_number_is_cflibs(ours: object, theirs: object, name: str, called: str) -> None:
     assert getattr(ours, name) == getattr(theirs, called)

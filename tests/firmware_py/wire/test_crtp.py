@@ -48,6 +48,7 @@ def test_packets_are_cflibs(port, channel, data):
     assert crtp.decode(raw) == crtp.Packet(port, channel, data)
 
 
+@pytest.mark.long
 @given(st.tuples(metres, metres, metres), st.integers(0, 200_000))
 def test_external_pose_is_cflibs_bytes_and_the_age(p, age_us):
     ours = crtp.encode_ext_pose(p, (0.5, -0.5, 0.5, -0.5), age_us)
@@ -117,6 +118,7 @@ def test_packet_of_impossible_length_is_refused(raw):
         crtp.decode(raw)
 
 
+@pytest.mark.long
 @given(st.integers(0, 255), st.integers(0, 1 << 25), st.binary(max_size=26))
 def test_log_data_is_laid_out_as_cflib_reads_it(block_id, timestamp_ms, values):
     # cflib/crazyflie/log.py: port 5, channel 2; id, then three bytes of time
@@ -162,6 +164,7 @@ def test_cflib_reads_the_block(block):
     assert received == {variable.name: value for variable, value in zip(block.variables, values, strict=True)}
 
 
+@pytest.mark.long
 @given(st.lists(st.tuples(st.integers(0, 255), *[st.floats(-32.0, 32.0)] * 3), min_size=1, max_size=3))
 def test_packed_positions_are_the_nearest_millimetre_of_each_robot(robots):
     sent = localisation.encode_packed_poses((address, p, Q) for address, *p in robots)

@@ -78,6 +78,7 @@ def test_frames_count_themselves_and_carry_pymavlinks_signature(key: bytes | Non
     assert mine == golden(peer(key, link_id=3), messages)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("key", [None, KEY], ids=["unsigned", "signed"])
 def test_chunks_of_any_size_give_the_same_messages(key: bytes | None) -> None:
     frames = golden(peer(key), conversation(np.random.default_rng(2), 10))
@@ -111,6 +112,7 @@ def test_a_field_that_does_not_fit_is_refused_and_takes_no_sequence_number() -> 
 # Damage
 
 
+@pytest.mark.long
 def test_garbage_before_frames_loses_no_frame() -> None:
     rng = np.random.default_rng(3)
     frames = golden(peer(), conversation(rng, 3000))
@@ -126,6 +128,7 @@ def test_garbage_before_frames_loses_no_frame() -> None:
     assert len(good) < len(frames) - 100  # the stream is a hard one
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stray", [b"\xfd", b"\xfe", b"\xfd\xfd\xfd", b"\xfe\xfd", b"\xfd\xfe"])
 def test_stray_start_byte_does_not_delay_the_frame_behind_it(stray: bytes) -> None:
     receiver = FrameReceiver()
@@ -142,6 +145,7 @@ def test_a_frame_cut_anywhere_costs_only_itself() -> None:
         assert receiver.counters.lost + receiver.counters.unknown == 1  # unknown: cut in the message number
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("key", [None, KEY], ids=["unsigned", "signed"])
 def test_any_flipped_bit_costs_only_its_frame(key: bytes | None) -> None:
     frames = golden(peer(key), conversation(np.random.default_rng(6), 5))
@@ -270,6 +274,7 @@ def count(order: Iterable[int]) -> tuple[int, int, int]:
     return receiver.counters.frames, receiver.counters.lost, receiver.counters.late
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("order", "counted"),
     [

@@ -242,6 +242,7 @@ def test_attitude_home_and_version_are_the_standards() -> None:
     assert not version.capabilities & dialect.MAV_PROTOCOL_CAPABILITY_FTP
 
 
+@pytest.mark.long
 @given(st.floats(-7.0, 7.0) | st.sampled_from([0.0, 1e-5, -1e-5, np.pi, -np.pi, 2 * np.pi]))
 def test_a_heading_is_the_yaw_clockwise_from_north_and_less_than_a_full_turn(yaw: float) -> None:
     north = np.degrees(-yaw)

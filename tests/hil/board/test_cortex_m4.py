@@ -138,6 +138,7 @@ def memory(blocks: CoreBlocks) -> list[bytes]:
     return [block.bytes() for block in blocks.named.values()]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["image", "optimised"])
 def test_instructions_and_cycles_are_those_of_capstone(kind: str, request: pytest.FixtureRequest) -> None:
     image = request.getfixturevalue(kind)
@@ -155,6 +156,7 @@ def test_instructions_and_cycles_are_those_of_capstone(kind: str, request: pytes
     assert wrong == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["image", "optimised"])
 def test_a_call_costs_the_instructions_of_its_path(kind: str, request: pytest.FixtureRequest) -> None:
     image = request.getfixturevalue(kind)
@@ -239,6 +241,7 @@ def test_code_that_goes_astray_is_stopped(image: CoreImage) -> None:
         runner.call("control")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("statement", "reason"),
     [
@@ -259,6 +262,7 @@ def test_a_call_that_cannot_end_names_its_reason(core: Translation, statement: s
         assert blocks.control.fields.count.all()
 
 
+@pytest.mark.long
 def test_memory_that_leaves_no_room_for_the_stack_is_refused(image: CoreImage) -> None:
     blocks, runner = started(image)
     most = ROOM - STACK_LEAST
@@ -286,6 +290,7 @@ def test_the_core_leaves_room_on_the_board(image: CoreImage) -> None:
     assert 0 < usage.entries["estimate"].mean_us < usage.entries["estimate"].worst_us
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "refused"),
     [

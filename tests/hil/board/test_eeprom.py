@@ -15,6 +15,7 @@ from hil.servers.server import Server, Service
 RATES = ("250K", "1M", "2M")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("first", "number", "own"),
     [

@@ -43,6 +43,7 @@ def put(firmware: ImageFirmware, name: str, content: np.ndarray[Any, Any]) -> No
     firmware.chip.write(firmware.image.symbol(name).address, content.tobytes())
 
 
+@pytest.mark.long
 def test_an_image_rests_a_while_before_the_laboratorys_time_begins(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(image_firmware, "WARM_UP_US", 5_000)
     rested = list[int]()

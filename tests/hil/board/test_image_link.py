@@ -72,6 +72,7 @@ def test_the_radio_starts_when_the_firmware_is_ready(line: Line) -> None:
     assert len(polls) == pytest.approx(50_000 / POLL_PERIOD_US, abs=1)
 
 
+@pytest.mark.long
 def test_a_firmware_that_never_says_it_is_ready_is_polled_after_three_seconds(line: Line) -> None:
     line.wait(GATE_US - 25_000)
     assert line.received() == []
@@ -79,6 +80,7 @@ def test_a_firmware_that_never_says_it_is_ready_is_polled_after_three_seconds(li
     assert set(line.received()) == {POLL}
 
 
+@pytest.mark.long
 def test_a_busy_link_has_no_polls_beside_its_own(line: Line) -> None:
     """A Crazyflie that boots empties its queue of 8 once per tick: half a frame more per millisecond resets it."""
     line.say(syslink.RADIO_READY)
@@ -118,6 +120,7 @@ def test_packets_of_peers_carry_port_and_signal_strength(line: Line) -> None:
     ]
 
 
+@pytest.mark.long
 def test_the_radio_chip_answers_for_its_version_and_the_decks_memories(line: Line) -> None:
     line.say(syslink.VERSION)
     line.say(syslink.SCAN_MEMORIES)
@@ -127,6 +130,7 @@ def test_the_radio_chip_answers_for_its_version_and_the_decks_memories(line: Lin
     assert [kind for kind, _ in line.commands] == [syslink.VERSION, syslink.SCAN_MEMORIES]
 
 
+@pytest.mark.long
 def test_settings_are_echoed_and_commands_reach_the_radio(line: Line) -> None:
     settings = [
         (syslink.RADIO_CHANNEL, b"\x50"),

@@ -122,6 +122,7 @@ def test_a_board_given_a_profile_has_its_constants_bit_for_bit() -> None:
     assert "RandConsts.openMin -0.192" in said
 
 
+@pytest.mark.long
 def test_every_profile_without_own_laws_can_be_set() -> None:
     for profile in ("as-flown", "cad", "design-best", "design-half"):
         config = load_config(profile)
@@ -130,6 +131,7 @@ def test_every_profile_without_own_laws_can_be_set() -> None:
         assert board.constants.bytes() == parameters_of(config).bytes(), profile
 
 
+@pytest.mark.long
 def test_settings_arrive_over_a_link_that_loses_a_third() -> None:
     config = load_config("floaty", list(OTHER))
     dice = random.Random(3)

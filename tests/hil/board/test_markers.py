@@ -80,6 +80,7 @@ def test_four_markers_sit_where_no_flap_moves_them() -> None:
     assert len(PLACES) == COUNT
 
 
+@pytest.mark.long
 def test_no_other_assignment_of_labels_fits() -> None:
     """All 40319 of them, by a Kabsch of our own; the noise makes 1.5 mm, the limit is 5."""
     labels = np.array(list(itertools.permutations(range(COUNT))))[1:]
@@ -102,6 +103,7 @@ def test_any_three_markers_are_far_from_one_line() -> None:
 # The fit
 
 
+@pytest.mark.long
 @given(places, turns, st.integers(0, 2**32), st.sets(st.integers(0, COUNT - 1), min_size=3))
 def test_noisy_points_give_scipys_kabsch_pose(p_WB: Array, turn: Rotation, seed: int, rows: set[int]) -> None:
     seen = np.isin(np.arange(COUNT), list(rows))
@@ -113,6 +115,7 @@ def test_noisy_points_give_scipys_kabsch_pose(p_WB: Array, turn: Rotation, seed:
     assert Rotation.from_quat(fit.q_WB, scalar_first=True).as_matrix() == pytest.approx(R, abs=1e-7)
 
 
+@pytest.mark.long
 def test_the_noise_of_the_pose_is_that_of_the_specification() -> None:
     """`[mocap]` says 0.5 mm and 0.004 rad; what least squares makes of 1.1 mm is known in closed form."""
     turn = Rotation.from_euler("ZYX", [1.0, 0.2, -0.3])
@@ -189,6 +192,7 @@ def test_unseen_markers_are_placed_on_the_body() -> None:
 # Labels
 
 
+@pytest.mark.long
 @given(turns, st.sampled_from(list(itertools.combinations(range(COUNT), 2))))
 def test_two_exchanged_labels_keep_the_pose_or_visibly_flip_it(turn: Rotation, pair: tuple[int, int]) -> None:
     points = turn.apply(PLACES)
@@ -230,6 +234,7 @@ def test_swapped_markers_are_refused_unless_the_limit_is_wide() -> None:
         assert np.flatnonzero(~here.sighting_of(HOME, LEVEL).seen).tolist() == [2]
 
 
+@pytest.mark.long
 def test_share_of_mislabelled_frames_is_the_configured_one_and_leaves_the_others_as_they_were() -> None:
     plain, wrong = markers(), markers(MarkersConfig(enabled=True, mislabelled=0.2))
     pairs = [(plain.sighting_of(HOME, LEVEL), wrong.sighting_of(HOME, LEVEL)) for _ in range(1000)]
@@ -255,6 +260,7 @@ def ray_hits(marker: Array, camera: Array) -> set[bool]:
     return hits
 
 
+@pytest.mark.long
 @settings(max_examples=40)
 @given(
     turns,
@@ -287,6 +293,7 @@ def test_a_marker_is_seen_when_enough_rays_are_free(
     assert seen[row] == (sum(free) >= config.min_cameras)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("tilt", "fewest"), [(0, 8), (10, 8), (20, 8), (90, 7), (180, 6)])
 def test_hovering_shows_all_markers_and_lying_on_the_side_hides_some(tilt: int, fewest: int) -> None:
     seen = []
@@ -304,6 +311,7 @@ def test_as_many_cameras_as_must_see_a_marker_are_there() -> None:
 # Ghosts
 
 
+@pytest.mark.long
 def test_ghosts_lie_near_the_body_have_no_label_and_do_not_change_its_pose() -> None:
     plain, haunted = markers(), markers(MarkersConfig(enabled=True, ghosts=7))
     for _ in range(NOISE_ROWS + 1):
@@ -350,6 +358,7 @@ def test_faults_of_whole_poses_act_on_those_of_markers_too() -> None:
     assert seen[0] is seen[1] is seen[2] is not seen[3] is not None  # markers freeze with the pose
 
 
+@pytest.mark.long
 def test_markers_leave_all_other_randomness_as_it_was() -> None:
     """The air around the held robot, the gyro's noise, and which frames are lost."""
     seen: list[list[object]] = []

@@ -259,6 +259,7 @@ def cflib_host(bench: DongleAndBoard) -> Iterator[bytes | None]:
         received = bytes(ack.data) if ack.data and ack.data[0] & 0xF3 != 0xF3 else None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("up", "down", "ber"),
     [(0.0, 0.0, 0.0), (0.1, 0.1, 0.0), (0.5, 0.0, 0.0), (0.0, 0.5, 0.0), (0.3, 0.3, 1e-3)],
@@ -422,6 +423,7 @@ def test_what_a_board_answered_before_it_was_switched_off_does_not_answer_a_late
     assert answers == [b"\x00"]
 
 
+@pytest.mark.long
 @given(st.lists(st.sampled_from(sorted(ACTS)), max_size=8))
 def test_the_processor_runs_exactly_while_the_board_is_on_whatever_is_switched(acts: list[str]) -> None:
     """It is neither started while it runs nor stopped while it does not."""

@@ -93,6 +93,7 @@ def test_mean_of_ten_samples_has_the_noise_of_the_specification() -> None:
     assert np.abs(np.corrcoef(counts.reshape(-1, 6).T) - np.eye(6)).max() < 0.04
 
 
+@pytest.mark.long
 def test_every_specimen_has_its_own_constant_bias() -> None:
     plant = still_plant()
     quiet = ImuConfig(gyro_noise=0, accel_noise=0, gyro_bias=0.03, accel_bias=0.2)

@@ -45,6 +45,7 @@ def test_frames_carry_the_exposure_and_white_noise_of_the_specification() -> Non
     assert np.abs(together).max() < 0.07
 
 
+@pytest.mark.long
 def test_share_of_lost_and_wrong_frames_is_the_configured_one() -> None:
     lost = sum(not frame.valid for frame in frames(4000, MocapConfig(dropout=0.2)))
     assert lost / 4000 == pytest.approx(0.2, abs=0.025)

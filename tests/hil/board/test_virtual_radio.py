@@ -72,6 +72,7 @@ def test_saturated_link_is_as_fast_as_cflibs_echo_over_an_emulated_dongle(size, 
     assert len(bench.on_ground) / 3 == pytest.approx(per_second, rel=0.06)
 
 
+@pytest.mark.long
 def test_usb_jitter_lengthens_every_exchange_by_half_of_it():
     bench = RadioWithEnds(**QUIET | {"usb_jitter_us": 400})
     bench.pose_every(300, 10_000)
@@ -155,6 +156,7 @@ def test_loss_follows_the_geometric_law(loss):
     assert air.retried / air.exchanges == pytest.approx(repetitions, abs=4 * 1.5 / np.sqrt(air.exchanges))
 
 
+@pytest.mark.long
 def test_wrong_bits_are_losses_by_the_length_of_the_packet():
     bench = RadioWithEnds(**QUIET | {"uplink_bit_error_rate": 1e-3, "downlink_bit_error_rate": 1e-3})
     bench.pose_every(100, 20_000)
@@ -191,6 +193,7 @@ def polled_latencies(loss, rng, count):
     return latencies
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("loss", [0.1, 0.3, 0.5])
 def test_drawn_polls_delay_like_real_ones(loss):
     bench = RadioWithEnds(uplink_loss=loss, downlink_loss=loss, usb_jitter_us=0)
@@ -272,6 +275,7 @@ def test_uplink_jitter_delays_within_its_bound_and_can_be_switched_in_flight():
     assert len(bench.on_board) == 501
 
 
+@pytest.mark.long
 def test_ground_station_expects_the_latency_that_this_link_has():
     bench = RadioWithEnds()
     bench.pose_every(20_000, 3000)

@@ -88,6 +88,7 @@ def test_messages_without_a_gap_share_chunks(writes, chunks):
     assert bench.on_ground == chunks
 
 
+@pytest.mark.long
 def test_line_load_and_latency_are_counted():
     bench = LineWithEnds(baud=57_600)
     for number in range(1000):
@@ -215,6 +216,7 @@ def test_bytes_on_a_pulled_cable_are_lost_and_counted():
 messages = st.lists(st.tuples(st.integers(0, 3000), st.binary(min_size=1, max_size=300)), max_size=40)
 
 
+@pytest.mark.long
 @given(
     up=messages,
     down=messages,

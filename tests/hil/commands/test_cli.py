@@ -37,6 +37,7 @@ WITH_OTHERS = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 def test_fly_writes_everything_and_prints_where(cli: Cli, tmp_path: Path) -> None:
     assert cli("fly", "hover", "--duration", "3", "--seed", "5") == 0
     folder = tmp_path / "runs" / "hover-5"
@@ -51,6 +52,7 @@ def test_fly_writes_everything_and_prints_where(cli: Cli, tmp_path: Path) -> Non
     assert json.loads((folder / "result.json").read_text())["passed"] is True
 
 
+@pytest.mark.long
 def test_a_flight_that_leaves_its_baseline_is_compared_with_it(cli: Cli) -> None:
     fly_it = ("fly", "hover", "--duration", "0.4")
     fly("hover", "before", duration_s=0.4)
@@ -139,6 +141,7 @@ def test_a_killed_flight_can_still_be_reported(cli: Cli, tmp_path: Path) -> None
     assert cli("report", "run") == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("arguments", "module", "extra"),
     [
@@ -173,6 +176,7 @@ def test_a_missing_package_is_one_line_before_anything_is_flown_or_deleted(
 IMPORTED = re.compile(r"^ *(?:import|from) (\w+)[\w.]*(?: import .*| as \w+)?$", re.MULTILINE)
 
 
+@pytest.mark.long
 def test_every_package_of_an_extra_has_its_line_when_it_is_missing() -> None:
     ours = ("firmware_py", "ground_station", "hil")
     files = [file for one in ours for file in (ROOT / one).rglob("*.py") if "__pycache__" not in file.parts]
@@ -230,6 +234,7 @@ def test_a_package_that_is_loaded_late_has_its_line_too(command: str, module: st
     assert "Traceback" not in ended.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "command",
     ["list", "--help", "fly hover --duration 0.05", "report runs/hover-1", "export runs/hover-1 --csv", "new mine"],
@@ -304,6 +309,7 @@ HEAVY = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 def test_no_help_loads_what_is_slow_to_load() -> None:
     """Of every command and command of a group; each imports only its own file."""
     code = f"""
@@ -340,6 +346,7 @@ OTHER_PROGRAMS = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 def test_every_option_and_key_that_a_text_names_exists() -> None:
     plugin = ROOT / "hil" / "testing" / "plugin.py"
     known = OTHER_PROGRAMS | MOVED.keys() | set(OPTION.findall(plugin.read_text(encoding="utf-8")))
@@ -362,6 +369,7 @@ def test_every_option_and_key_that_a_text_names_exists() -> None:
             assert hasattr(getattr(config, section), key), (path, section, key)
 
 
+@pytest.mark.long
 def test_a_command_imports_no_other() -> None:
     code = "from hil.commands.app import main; import sys; sys.argv = ['floaty', 'new', '-h']; main()"
     code = f"import atexit, sys; atexit.register(lambda: print('DESIGN', 'hil.commands.design' in sys.modules)); {code}"
@@ -369,6 +377,7 @@ def test_a_command_imports_no_other() -> None:
     assert shown.endswith("DESIGN False\n")
 
 
+@pytest.mark.long
 def test_a_module_loads_what_it_needs_alone() -> None:
     """One after the other in one process, each without what it need not load."""
     steps = {

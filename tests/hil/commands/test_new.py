@@ -42,6 +42,7 @@ def test_a_project_has_everything_that_a_flight_and_a_test_need(cli: Cli) -> Non
     assert find_experiment(f"{project}/experiments.py:figure_eight").duration_s == 12.0
 
 
+@pytest.mark.long
 def test_pytest_without_the_laboratory_is_one_line(cli: Cli) -> None:
     assert cli("new", "law") == 0
     code = "import sys; sys.modules['firmware_py'] = None; import pytest; sys.exit(pytest.main(['-p', 'no:floaty']))"
@@ -53,6 +54,7 @@ def test_pytest_without_the_laboratory_is_one_line(cli: Cli) -> None:
     assert ran.stderr.strip().count("\n") == 0
 
 
+@pytest.mark.long
 def test_files_that_an_editor_begins_with_the_mark_of_utf8_are_read(cli: Cli) -> None:
     assert cli("new", "law") == 0
     for path in (Path("law/profile.toml"), Path("law/controller.py"), Path("law/experiments.py")):
@@ -94,6 +96,7 @@ def test_an_impossible_folder_is_one_line(cli: Cli, tmp_path: Path, folder: str,
     assert Path("taken/controller.py").read_text() == "years of work"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", [("new",), ("deploy", "write")])
 def test_after_a_full_disk_the_same_folder_can_be_written(cli: Cli, command: tuple[str, ...]) -> None:
     with small_files(1500):

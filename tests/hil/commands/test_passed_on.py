@@ -558,6 +558,7 @@ def test_each_file_of_own_logic_that_can_fly_is_a_line_and_one_refusal_is_enough
     assert cli.err.splitlines() == ["bad.py:3: one", "bad.py:4: two"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("identical", [True, False])
 @pytest.mark.parametrize(("boards", "why"), [(None, ()), (TwoBoards(None, ()), ("no servo count differs",)),
     (TwoBoards(FirstCount(7, 0.07, "m3", (5, 6), "radio"), ("radio: late", "gyro: cold")),
@@ -594,6 +595,7 @@ def test_folders_of_seeds_are_compared_only_with_one_another(cli: Cli, asked: As
         assert [one[0] for one in asked] == ["load_flown"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("flown", [0, 1, 2])
 def test_an_experiment_of_the_user_s_is_checked_against_the_second_run_unless_the_first_flew_it(
     cli: Cli, asked: Asked, flown: int
@@ -777,6 +779,7 @@ def test_a_check_flies_the_last_flight_with_targets_of_its_own_logic_and_ends_wi
     assert judged == ([] if code == 130 else [("_check_around", Path("cf2.elf"), "floaty", ("a.b=1",))])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("options", "fresh"), [
     ("", True), ("--targets c-O0", True), (f"--targets {','.join(TARGETS)}", True), ("--targets udp://127.0.0.1:9", False),
     ("--source core.c", False), ("--elf cf2.elf", False), ("--elf cf2.elf --targets cortex-m4", False),

@@ -305,6 +305,7 @@ TYPED = [  # options that take a number or one of some words
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("names", "option"), TYPED, ids=[" ".join((*n, o.opts[-1])) for n, o in TYPED])
 def test_every_option_with_a_number_or_a_choice_names_itself_and_what_it_is_not(
     cli: Cli, names: tuple[str, ...], option: click.Option
@@ -385,6 +386,7 @@ def taken() -> Iterator[str]:
         yield str(held.getsockname()[1])
 
 
+@pytest.mark.long
 def test_a_server_names_the_port_that_another_program_has(cli: Cli, taken: str) -> None:
     said = cli.refusal("serve", "--no-motive", "--udp", taken)
     assert said == f"floaty: udp port {taken}: Address already in use\n"

@@ -138,6 +138,7 @@ def test_a_server_is_planned_as_it_is_asked_for(
     assert (ends.udp, ends.radio, mavlink, ends.station, ends.motive) == endpoints
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_ctrl_c")
 @pytest.mark.parametrize(("settings", "options"), [
     (("multicast=true", "axes=z-up"), ",multicast,z-up"), (("axes=z-up",), ",z-up"), (("axes=y-up",), ""),
@@ -169,6 +170,7 @@ class View:
         return lambda *what, **more: None
 
 
+@pytest.mark.long
 def test_lines_of_the_panel_are_answered_at_the_terminal_and_in_the_picture(
     cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -193,6 +195,7 @@ class Answers(list[int]):
         return len(self._view.answers) == 2
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_ctrl_c")
 def test_the_cameras_track_every_robot_and_a_lost_output_is_told_by_the_exit_code(
     cli: Cli, monkeypatch: pytest.MonkeyPatch

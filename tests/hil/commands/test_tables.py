@@ -68,6 +68,7 @@ def test_a_table_into_a_closed_pipe_is_an_error_that_a_flight_handles(
     assert shown.getvalue().count("rms_x") == 1
 
 
+@pytest.mark.long
 def test_a_held_limit_is_ok_and_a_missed_one_fails(flown: Result, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("report.html", "flight.rrd"):
         (flown.folder / name).touch()

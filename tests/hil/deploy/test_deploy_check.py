@@ -62,6 +62,7 @@ def one_ulp(values: np.ndarray, index: tuple[int, ...]) -> None:
     values[index] = np.nextafter(values[index], np.float32(np.inf))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("call", "tick", "spoil", "struct", "field", "bits"),
     [
@@ -96,6 +97,7 @@ def test_a_differing_target_is_found() -> None:
     assert found.differences[0].values == (0, 1)
 
 
+@pytest.mark.long
 def test_a_target_that_has_differed_does_not_hide_the_others(capsys: pytest.CaptureFixture[str]) -> None:
     def factories(stack: ExitStack) -> dict[str, RunnerFactory]:
         def spoil(blocks: CoreBlocks) -> None:
@@ -131,6 +133,7 @@ def test_states_and_causes_that_flights_reached_are_told_from_those_that_none_di
     assert set(missed.split(", ")) == {"waiting", *words} - {"silence", "out of bounds"}
 
 
+@pytest.mark.long
 def test_default_flights_are_ten_thousand_ticks_with_every_fault_in_time() -> None:
     flights: list[Request] = plan(None, False)
     assert [(one.experiment.name, bool(one.faults)) for one in flights] == [
@@ -147,6 +150,7 @@ def test_default_flights_are_ten_thousand_ticks_with_every_fault_in_time() -> No
     ]
 
 
+@pytest.mark.long
 def test_another_robot_flies_with_the_faults_that_act_on_it() -> None:
     floaty, other = plan(None, False), plan(None, False, overrides=("robot.body=robot.py",))
     assert set(floaty[2].faults) - set(other[2].faults) == {"servo.slow.2@42:4=0.5"}
@@ -214,7 +218,8 @@ class Watch(NativeRunner):
         return answer
 
 
-@pytest.mark.parametrize("target", ["c-O2", pytest.param("cortex-m4", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("target", ["c-O2", "cortex-m4"])
 def test_changed_operator_is_found(
     cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path, target: str
 ) -> None:
@@ -323,11 +328,13 @@ def test_the_core_inside_a_linked_firmware_is_checked(
         assert "150 ticks, c beside cortex-m4: no bit differs" in shown
 
 
+@pytest.mark.long
 def test_c_that_does_not_compile_is_one_line_and_exit_code_two(cli: Cli) -> None:
     Path("broken.c").write_text("int x = ;\n", encoding="utf-8")
     cli.refusal("deploy", "check", "hover", "--targets", "c-O2", "--source", "broken.c")
 
 
+@pytest.mark.long
 def test_the_exported_app_holds_the_c_that_is_checked(cli: Cli) -> None:
     assert cli("deploy", "write", "app", "--profile", "as-flown") == 0
     shown = [Path(line) for line in cli.out.splitlines()]
@@ -336,6 +343,7 @@ def test_the_exported_app_holds_the_c_that_is_checked(cli: Cli) -> None:
     assert Path("app/Makefile") in shown
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

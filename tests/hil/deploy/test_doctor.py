@@ -81,6 +81,7 @@ def findings(cli: Cli) -> dict[str, str]:
     return {line[2:12].strip(): line[:2].strip() + line[12:] for line in lines}
 
 
+@pytest.mark.long
 def test_a_board_that_is_well_is_described_and_gets_its_own_gyro_back(
     cli: Cli, board: Board, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -111,6 +112,7 @@ def test_a_board_that_is_well_is_described_and_gets_its_own_gyro_back(
     assert board.closed == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("state", "subject", "said"),
     [
@@ -129,6 +131,7 @@ def test_a_defect_is_marked_and_is_exit_code_one(
     assert [text for text in found.values() if text.startswith("!")] == [found[subject]]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("subject", "values", "good"),
     [
@@ -162,6 +165,7 @@ def test_the_core_is_reset_and_called_in_the_order_of_a_tick(
     assert called == ["reset", *20 * ["estimate", "supervise", "control"]]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bit", [None, *range(13)])
 def test_a_memory_that_ignores_a_bit_of_an_address_is_found(
     monkeypatch: pytest.MonkeyPatch, bit: int | None
@@ -204,6 +208,7 @@ def test_a_board_without_samples_is_reported(cli: Cli, board: Board, monkeypatch
     assert findings(cli)["loop"].startswith("!carries 0 samples/s of 1000: ")
 
 
+@pytest.mark.long
 def test_another_profile_on_board_is_reported(cli: Cli, board: Board) -> None:
     assert cli("board", "doctor", URI, "--profile", "as-flown") == 1
     assert findings(cli)["profile"].startswith(f"!{profile_hash(load_config())[:8]}, ")
@@ -218,6 +223,7 @@ def test_a_core_that_computes_differently_is_found(cli: Cli, tmp_path: Path, boa
     assert findings(cli)["computes"].startswith("!OTHER bits than here in 20 calls")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("flown", "silent", "said"), [(True, False, "it may be in the air"), (False, True, "silent for 3 s")]
 )

@@ -82,6 +82,7 @@ def board(library: Path, tmp_path: Path) -> AppBoard:
     return AppBoard(app)
 
 
+@pytest.mark.long
 def test_every_parameter_of_the_app_is_as_in_the_table_and_is_left_as_it_was(board: AppBoard) -> None:
     before = [board.value(one.name) for one in TABLE]
     done: list[int] = []
@@ -343,6 +344,7 @@ def test_an_image_is_checked_on_the_bench_and_in_flight_and_each_part_has_its_fi
     ]
 
 
+@pytest.mark.long
 def test_programs_that_the_boards_answer_differently_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("goals outside the box are refused", "the values of a robot that stands askew")
     monkeypatch.setattr(image_check, "PROGRAMS", {name: PROGRAMS[name] for name in names})
@@ -366,6 +368,7 @@ def test_numbers_of_two_boards_may_be_apart_by_their_tolerance() -> None:
         assert bool(list(differences(Answers([], [place]), Answers([], [found])))) == apart
 
 
+@pytest.mark.long
 def test_answers_come_in_the_order_of_the_programs_of_which_as_many_run_as_there_are_processors(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -412,6 +415,7 @@ def test_flights_of_other_lengths_are_compared_from_the_release_on() -> None:
         assert {one.found for one in compare_flights(*pair)} == {0.0}  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("bound", BOUNDS, ids=lambda bound: f"{bound.name} {bound.size}")
 def test_each_bound_is_that_of_its_size_in_every_one_of_its_columns(bound: Bound, sign: int) -> None:

@@ -58,6 +58,7 @@ def test_a_parameter_that_is_set_in_flight_reaches_every_target(project: Path) -
     assert made[0].targets[0].divergence is None
 
 
+@pytest.mark.long
 def test_exporting_from_a_user_s_folder_writes_the_c_that_is_checked(cli: Cli, project: Path) -> None:
     assert cli("deploy", "write", "app", "--profile", "profile.toml", "--set", "logic.gain_iy=0.5") == 0
     core = (project / "app" / "src" / "floaty_core.c").read_text(encoding="utf-8")

@@ -63,6 +63,7 @@ def test_targets_are_named_once_each_with_or_without_spaces() -> None:
     assert target_names(None) == TARGETS
 
 
+@pytest.mark.long
 def test_c_is_built_with_the_optimisation_that_its_target_names(monkeypatch: pytest.MonkeyPatch) -> None:
     built: list[str] = []
     monkeypatch.setattr(
@@ -77,6 +78,7 @@ def test_c_is_built_with_the_optimisation_that_its_target_names(monkeypatch: pyt
     assert (factories["plain"], box.machine_code) == (PlainRunner, None)
 
 
+@pytest.mark.long
 def test_a_board_behind_a_link_is_opened_for_each_flight_and_its_cycles_add_up(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -98,6 +100,7 @@ def test_a_board_behind_a_link_is_opened_for_each_flight_and_its_cycles_add_up(
         }  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("elf", "flash"), [(None, 5), (Path("cf2.elf"), None)])
 def test_a_core_that_is_part_of_a_firmware_has_no_flash_of_its_own(
     monkeypatch: pytest.MonkeyPatch, elf: Path | None, flash: int | None

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hil.emulator.events import EVENTS_AT_ONE_INSTANT, EndlessInstantError, EventQueue
 
 
+@pytest.mark.long
 @given(st.lists(st.integers(0, 20)), st.integers(0, 25))
 def test_due_events_run_in_time_order_and_first_come_first_served(times, now_us):
     events, ran = EventQueue(), []
@@ -57,6 +58,7 @@ def test_a_callback_that_raises_leaves_the_rest_planned():
     assert ran == [2]
 
 
+@pytest.mark.long
 @given(
     st.lists(st.tuples(st.sampled_from([4, 5, 10, 12]), st.sampled_from([0, 5, 10])), max_size=4),
     st.integers(0, 4),
@@ -139,6 +141,7 @@ def test_a_callback_that_plans_itself_at_its_own_instant_for_ever_is_named(in_a_
     assert len(ran) == EVENTS_AT_ONE_INSTANT
 
 
+@pytest.mark.long
 def test_events_of_many_instants_are_not_counted_together():
     events, ran = EventQueue(), []
     for time_us in range(0, 3 * EVENTS_AT_ONE_INSTANT // 2):

@@ -67,6 +67,7 @@ def flown(options: Options, folder: Path, change: Callable[[Flight], None] | Non
     return result.hash, schedule, (folder / "events.jsonl").read_text()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("options", FLIGHTS.values(), ids=FLIGHTS)
 def test_a_flight_in_c_is_that_of_the_time_line(
     options: Options, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -76,6 +77,7 @@ def test_a_flight_in_c_is_that_of_the_time_line(
     assert flown(options, tmp_path / "python") == in_c
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
 def test_a_changed_board_is_the_same_in_c_and_on_the_time_line(
     change: Callable[[Flight], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -87,6 +89,7 @@ def test_a_changed_board_is_the_same_in_c_and_on_the_time_line(
     assert flown({}, tmp_path / "python", change) == in_c
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not any(compilers()), reason="no C compiler")
 def test_the_robot_takes_every_sample_by_itself(tmp_path: Path) -> None:
     """Otherwise the same flight takes twice as long."""

@@ -23,6 +23,7 @@ def usual(tmp_path_factory: pytest.TempPathFactory) -> Result:
     return hover(tmp_path_factory.mktemp("usual"), RELEASE, board="c", duration_s=DURATION_S)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("board", ["python", "cortex-m4"])
 def test_a_flight_on_another_board_has_the_same_records(tmp_path: Path, usual: Result, board: str) -> None:
     result = hover(tmp_path, RELEASE, board=board, duration_s=DURATION_S)
@@ -111,6 +112,7 @@ def test_each_link_and_board_needs_its_own_packages(
     assert needed == expected
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [name for name, one in EXPERIMENTS.items() if one.faults])
 def test_a_shorter_flight_leaves_out_its_experiment_s_later_faults_but_not_the_user_s(name: str) -> None:
     short = request.Request.of(EXPERIMENTS[name], duration_s=0.01)

@@ -60,6 +60,7 @@ def test_the_ball_of_a_new_project_hovers(flown: Result) -> None:
     assert json.loads((flown.folder / "result.json").read_text())["robot"] == flown.program.robot
 
 
+@pytest.mark.long
 def test_its_log_has_its_motion_and_no_flaps(flown: Result) -> None:
     log = free_flight(load_log(flown.folder))
     assert column(log, "truth.z").mean() == pytest.approx(1.15, abs=0.03)
@@ -226,6 +227,7 @@ def test_a_fault_of_floatys_parts_is_refused_for_another_body(tmp_path: Path) ->
         hover(tmp_path / "run", profile=project(tmp_path), duration_s=2.0, faults=[parse("servo.stuck.1@1")])
 
 
+@pytest.mark.long
 def test_faults_of_the_air_cameras_and_battery_act_on_it(tmp_path: Path) -> None:
     faults = [parse("wind.fan@0.2:0.3=0.5"), parse("mocap.dropout@0.2:0.1"), parse("battery.sag@0.2=0.5")]
     result = hover(
@@ -240,6 +242,7 @@ def test_faults_of_the_air_cameras_and_battery_act_on_it(tmp_path: Path) -> None
     write_report(result.folder)  # with close-ups of the faults
 
 
+@pytest.mark.long
 def test_its_report_and_scene_show_what_it_describes(flown: Result) -> None:
     write_report(flown.folder)
     page = (flown.folder / "report.html").read_text(encoding="utf-8")
@@ -263,6 +266,7 @@ TILTING = """
 """
 
 
+@pytest.mark.long
 def test_a_part_with_an_angle_turns_with_its_column(tmp_path: Path) -> None:
     head = "from dataclasses import replace\nfrom hil.world.scene import box\n"
     run = hover(tmp_path / "run", profile=project(tmp_path, head + FLOATING + TILTING), duration_s=0.5)
@@ -283,6 +287,7 @@ declare("own.weak", Kind("factor on the lift", "", 0.8, 0.0, 1.5, (
 """
 
 
+@pytest.mark.long
 def test_a_robot_s_own_fault_acts_on_it_alone(cli: Cli, tmp_path: Path) -> None:
     robot = (
         "from hil import Kind, Knob, declare\n" + FLOATING.replace("0.981)", "0.981 * self.strength)") + WEAK

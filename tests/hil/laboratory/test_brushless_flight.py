@@ -35,6 +35,7 @@ def test_firmware_of_another_board_is_one_clear_line(
         fly("hover", tmp_path / "run", profile=profile, board=image)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("device_type", "expected"),
     [

@@ -63,6 +63,7 @@ def test_a_text_gives_kind_start_duration_and_size() -> None:
     assert parse("push.y@1:inf") == Fault("push.y", 1.0, math.inf, 2.0)
 
 
+@pytest.mark.long
 @given(st.data())
 def test_a_fault_reads_back_from_its_text(data: st.DataObject) -> None:
     name = data.draw(st.sampled_from(sorted(KINDS)))
@@ -264,17 +265,8 @@ def rows_between(table: pa.Table, begin_s: float, end_s: float) -> pa.Table:
     return table.filter((times >= begin_s) & (times < end_s))
 
 
-# The others are in the long tier.
-QUICK_SIGNS = ("mocap.dropout", "serial.cut", "imu.bias.p", "push.y=-1", "cpu.load")
-
-
-@pytest.mark.parametrize(
-    "sign",
-    [
-        pytest.param(sign, id=sign.fault, marks=() if sign.fault in QUICK_SIGNS else pytest.mark.long)
-        for sign in SIGNS
-    ],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("sign", SIGNS, ids=lambda sign: sign.fault)
 def test_a_fault_acts_from_its_begin_to_its_end(sign: Sign) -> None:
     name, _, size = sign.fault.partition("=")
     link = KINDS[name].link or RADIO
@@ -290,6 +282,7 @@ def test_a_fault_acts_from_its_begin_to_its_end(sign: Sign) -> None:
         assert low <= figure <= high, f"{figure}, from {start_s} s on"
 
 
+@pytest.mark.long
 def test_the_station_names_frozen_frames(tmp_path: Path) -> None:
     go(tmp_path / "run", "mocap.freeze@0.2:0.3", duration_s=1.2)
     lines = [event["text"] for event in load_events(tmp_path / "run") if event["source"] == "station"]
@@ -303,6 +296,7 @@ def test_every_kind_has_a_sign() -> None:
     )  # see below; the Crazyflie's: tests/hil/world/test_quadrotor.py
 
 
+@pytest.mark.long
 def test_a_sagging_battery_is_what_the_board_reads() -> None:
     flight = lockstep_flight(Request.of(HOVER, duration_s=3.0, faults=[parse("battery.sag@1:1=0.5")]))
     read: list[int] = []
@@ -317,6 +311,7 @@ def test_a_sagging_battery_is_what_the_board_reads() -> None:
 # Several faults
 
 
+@pytest.mark.long
 def test_faults_on_one_knob_add_up_and_leave_it_as_it_was() -> None:
     texts = [
         "wind.side_y@0.2:0.6=1",
@@ -401,6 +396,7 @@ def test_a_fault_that_would_begin_at_the_end_is_refused() -> None:
         Request.of(HOVER, duration_s=1.0, faults=["push.y@1"])
 
 
+@pytest.mark.long
 def test_a_change_between_two_faults_persists_beside_a_third() -> None:
     faults = ["wind.fan@0.1:0.1=0.9", "wind.fan@0.5:0.1=0.9", "imu.noise@0=2"]
     flight = lockstep_flight(Request.of(HOVER, duration_s=1.0, faults=faults))
@@ -409,6 +405,7 @@ def test_a_change_between_two_faults_persists_beside_a_third() -> None:
     assert flight.robot.body.tunnel.fan_factor == 1.1
 
 
+@pytest.mark.long
 def test_the_log_counts_the_faults_in_force_and_names_them(tmp_path: Path) -> None:
     result = go(tmp_path / "run", "push.x@0.5=0.1", "imu.noise@0.2:1=2", "push.x@1.5=1", duration_s=2.0)
     log = load_log(result.folder)
@@ -427,6 +424,7 @@ def test_the_log_counts_the_faults_in_force_and_names_them(tmp_path: Path) -> No
     assert len(texts) == 6
 
 
+@pytest.mark.long
 def test_an_experiments_faults_that_do_not_concern_the_flight_are_left_out(tmp_path: Path) -> None:
     own = (*map(parse, ("push.x@0.2=0.1", "push.x@1=0.1", "serial.cut@0.1", "marker.swap@0.1")),)
     experiment = Experiment("hover", "", 10.0, {}, faults=own)
@@ -439,6 +437,7 @@ def test_an_experiments_faults_that_do_not_concern_the_flight_are_left_out(tmp_p
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("link", [RADIO, MAVLINK])
 def test_faults_that_together_leave_a_knobs_range_stop_at_its_end_and_give_it_back(link: str) -> None:
     """Every kind three times at once, at its largest and at its smallest: the flight goes on, and ends as it began."""
@@ -462,6 +461,7 @@ def test_faults_that_together_leave_a_knobs_range_stop_at_its_end_and_give_it_ba
     assert board.active == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "size", "most"),
     [("wind.fan", 2.0, 2.0), ("wind.gusts", 5.0, 5.0), ("imu.noise", 1000.0, 1000.0), ("cpu.load", 1.0, 1.0)],
@@ -505,12 +505,12 @@ STATED = {**{f"{name}@1": kind.outcome for name, kind in OF_FLOATY.items()}, **L
 # The others are in the long tier.
 QUICK = ("mocap.outlier@1", "radio.cut@1:0.7", "servo.stuck.1@1", "push.y@1")
 FLIGHTS = [
-    pytest.param(text, seed, marks=() if text in QUICK and seed == 1 else pytest.mark.long)
-    for text in STATED
-    for seed in (1, 2)
+    pytest.param(text, 1 + place % 2, marks=() if text in QUICK else pytest.mark.long)
+    for place, text in enumerate(STATED)
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("text", "seed"), FLIGHTS)
 def test_the_hover_has_the_stated_outcome(tmp_path: Path, text: str, seed: int) -> None:
     link = KINDS[parse(text).kind].link or RADIO
@@ -570,6 +570,7 @@ def test_a_flight_without_faults_has_no_table_of_them(tmp_path: Path) -> None:
     assert json.loads((folder / "result.json").read_text())["faults"] == []
 
 
+@pytest.mark.long
 def test_the_list_tells_every_kind(cli: Cli) -> None:
     assert cli("list", "--faults") == 0
     shown = cli.out

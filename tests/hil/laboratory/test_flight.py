@@ -55,6 +55,7 @@ def test_flight_without_a_recorder_keeps_what_is_noted() -> None:
     assert [flight._early.count(("lab", text)) for text in ("before the start", "late")] == [1, 1]
 
 
+@pytest.mark.long
 def test_a_flight_that_is_over_records_nothing_more(tmp_path: Path) -> None:
     """Its laboratory may run on, for a link that is still to send something."""
     with ExitStack() as stack:
@@ -67,6 +68,7 @@ def test_a_flight_that_is_over_records_nothing_more(tmp_path: Path) -> None:
     assert 0 <= end_us - load_log(tmp_path).column("t")[-1].as_py() < 10_000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("board", "faults"), [("python", ()), ("c", ("push.y@0.6=20",))])
 def test_an_estimate_that_is_not_finite_fails_the_flight_and_is_reported(
     tmp_path: Path, board: str, faults: tuple[str, ...]
@@ -108,6 +110,7 @@ def test_an_estimate_that_is_not_finite_again_after_a_reset_is_reported_again() 
     assert flight.logic_failed == told[0], "the first is the cause"
 
 
+@pytest.mark.long
 def test_flight_makes_no_garbage_that_only_the_collector_frees() -> None:
     for duration_s in (0.1, 0.5):  # the first one leaves what is made once per process
         flight = lockstep_flight(Request.of(HOVER, duration_s=duration_s))
@@ -152,6 +155,7 @@ def test_the_tracker_refuses_no_healthy_pose(tmp_path: Path, name: str, faults: 
     assert column(log, "tracker.refused")[-1] == column(log, "tracker.restarts")[-1] == 0
 
 
+@pytest.mark.long
 def test_pacing_changes_nothing_that_is_flown(tmp_path: Path) -> None:
     request = Request.of(HOVER, overrides=["flight.release_us=100000"], seed=3, duration_s=0.2)
     free = fly(request, tmp_path / "free")
@@ -173,6 +177,7 @@ def test_ctrl_c_keeps_what_was_flown(tmp_path: Path) -> None:
     assert read_result(result.folder).outcome == "interrupted"
 
 
+@pytest.mark.long
 def test_an_error_of_the_firmware_ends_the_flight_with_its_log(tmp_path: Path) -> None:
     def burn(counts: Sequence[int]) -> None:
         raise ValueError("no pin is left")
@@ -211,6 +216,7 @@ def test_estimate_follows_the_truth(hovered: Result) -> None:
     assert np.sqrt((p[late] ** 2).mean()) < 0.15
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("link", LOCKSTEP)
 def test_a_full_disk_leaves_no_file_of_the_flight_open(tmp_path: Path, link: str) -> None:
     request = Request.of(HOVER, duration_s=1.0, link=link)
@@ -262,6 +268,7 @@ def test_a_board_that_is_reset_has_not_completed_its_flight(tmp_path: Path) -> N
     assert fly(Request.of(patient), tmp_path / "patient").passed
 
 
+@pytest.mark.long
 def test_only_the_resets_after_the_release_are_counted() -> None:
     flight = lockstep_flight(Request.of(HOVER, duration_s=0.2))
     for moment_us in (200_000, 1_050_000, 1_100_000):

@@ -57,6 +57,7 @@ class Bench:
         return self.server.robot
 
 
+@pytest.mark.long
 def test_a_robot_flies_in_its_holder_for_a_second_before_each_release() -> None:
     bench = Bench((parse("push.x@0:0.1=5"),))
 
@@ -88,6 +89,7 @@ def test_a_robot_that_is_lost_is_put_back_after_a_second_and_flies_again_among_t
     assert bench.robot.body.servo_speed[0] == pytest.approx(0.9)  # the servo is as slow as before
 
 
+@pytest.mark.long
 def test_a_robot_of_a_swarm_flies_as_one_alone_with_its_seed() -> None:
     third, alone = Bench(number=3, seed=5), Bench(seed=7)
     for bench in (third, alone):
@@ -98,6 +100,7 @@ def test_a_robot_of_a_swarm_flies_as_one_alone_with_its_seed() -> None:
     assert third.server.served.uri == "radio://0/80/2M/E7E7E7E703"
 
 
+@pytest.mark.long
 def test_firmware_that_waits_for_every_instant_flies_as_one_that_runs_ahead() -> None:
     """What a wall clock does to the time line, on one that never sleeps."""
 
@@ -113,6 +116,7 @@ def test_firmware_that_waits_for_every_instant_flies_as_one_that_runs_ahead() ->
     assert ahead.robot.firmware.signals.estimate.tolist() == waiting.robot.firmware.signals.estimate.tolist()
 
 
+@pytest.mark.long
 def test_power_off_stops_a_board_which_boots_with_its_memories_and_a_new_clock() -> None:
     bench = Bench()
     bench.fly(3.0)
@@ -140,6 +144,7 @@ def test_power_off_stops_a_board_which_boots_with_its_memories_and_a_new_clock()
             assert served.nrf51.power is power
 
 
+@pytest.mark.long
 def test_a_processor_that_hangs_is_reset_by_its_watchdog_and_goes_on_under_the_same_load() -> None:
     bench = Bench((parse("cpu.load@0.5:0.4=1"),))
     said = bench.fly(8.0)
@@ -176,6 +181,7 @@ def test_each_boot_has_the_failures_before_the_same_load_and_a_board_whose_time_
     assert sent == []
 
 
+@pytest.mark.long
 def test_a_line_passes_the_pilots_notices_once_and_a_peers_packet_after_its_time() -> None:
     flight = lockstep_flight(Request.of(find_experiment("hover"), duration_s=0.1))
     line, heard = flight.line, []
@@ -192,6 +198,7 @@ def test_a_line_passes_the_pilots_notices_once_and_a_peers_packet_after_its_time
     assert [one for one in heard if one[2:]] == [(at_us, packet, True)]
 
 
+@pytest.mark.long
 def test_the_battery_of_a_served_robot_empties() -> None:
     bench = Bench()
     full = bench.robot.battery.charge
@@ -206,6 +213,7 @@ def live(bench: Bench) -> tuple[Callable[[str], None], list[str]]:
     return lambda line: faults.execute_line(line, bench.server.lab.now_us), answers
 
 
+@pytest.mark.long
 def test_a_typed_fault_acts_at_once_and_ends_by_itself() -> None:
     bench = Bench()
     type_line, answers = live(bench)
@@ -225,6 +233,7 @@ def test_a_typed_fault_acts_at_once_and_ends_by_itself() -> None:
     assert any(text.endswith("fault push.y:0.2=0.5 ends") for text in bench.said)
 
 
+@pytest.mark.long
 def test_a_typed_status_lists_the_faults_and_whether_the_robot_is_held() -> None:
     bench = Bench()
     type_line, answers = live(bench)
@@ -239,6 +248,7 @@ def test_a_typed_status_lists_the_faults_and_whether_the_robot_is_held() -> None
     assert answers[2].startswith("robot 1: without power")
 
 
+@pytest.mark.long
 def test_a_radio_that_a_client_has_moved_is_reported_where_it_stays_and_returns_with_a_restart() -> None:
     bench = Bench()
     type_line, answers = live(bench)

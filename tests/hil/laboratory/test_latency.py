@@ -84,6 +84,7 @@ def test_the_budget_forgets_what_is_long_ago() -> None:
     assert "(99 %: 39.4)" in str(budget)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("link", [RADIO, MAVLINK])
 def test_the_age_on_board_is_the_true_one_while_the_latency_changes(link: str) -> None:
     """A pose that the estimator thinks to be so old was sent: poses are 20 ms apart."""
@@ -119,6 +120,7 @@ def test_the_age_on_board_is_the_true_one_while_the_latency_changes(link: str) -
     assert wrong_us.max() <= 1000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("link", "name", "off_us"), [(RADIO, "radio", 40.0), (MAVLINK, "serial", 500.0)])
 def test_a_flight_has_its_budget(tmp_path: Path, link: str, name: str, off_us: float) -> None:
     """The first packets up are short: they ask for telemetry. On the serial line the way down is not quite that up."""
@@ -144,6 +146,7 @@ def test_a_budget_has_mean_and_99th_of_the_pose_and_the_means_of_its_parts() -> 
     assert (budget_line(stages), budget_line([])) == (told, "no pose sent")
 
 
+@pytest.mark.long
 def test_cut_telemetry_is_read_up_to_the_cut(tmp_path: Path) -> None:
     result = fly(Request.of(HOVER, duration_s=0.5), tmp_path / "run")
     telemetry, log = tmp_path / "run" / "telemetry.csv", load_log(tmp_path / "run")

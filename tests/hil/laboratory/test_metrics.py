@@ -33,6 +33,7 @@ place = st.tuples(length, length, length)
 rows = st.tuples(place, st.tuples(tilt, tilt, angle).map(lambda euler: from_euler_zyx(*euler)), place, angle)
 
 
+@pytest.mark.long
 @given(st.lists(rows, min_size=1, max_size=5))
 def test_errors_are_the_pose_in_the_goal_frame(flight) -> None:
     values = np.array([(*p_WB, *q_WB, *p_WG, yaw) for p_WB, q_WB, p_WG, yaw in flight]).T
@@ -239,6 +240,7 @@ def turned(yaw: np.ndarray, goal: np.ndarray) -> pa.Table:
     return pa.table(columns | {"estimator.pose_age_us": zero + 40_000})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("facing", [0.0, 180.0, -180.0, 179.0, -179.0, 540.0])
 @pytest.mark.parametrize("first", [0.01, -0.01])
 def test_metrics_are_the_same_when_yaw_crosses_180_degrees(facing: float, first: float) -> None:

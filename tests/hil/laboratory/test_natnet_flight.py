@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from ground_station.config import CaptureConfig
 from ground_station.mocap import MocapFrame
@@ -82,6 +83,7 @@ class NatnetFlight:
         ]
 
 
+@pytest.mark.long
 def test_hover_holds_its_limits_among_packets_out_of_order_twice_or_broken(tmp_path: Path) -> None:
     """A tenth of the packets each: overtaken by the next one, sent twice, cut short, followed by noise."""
     rng = np.random.default_rng(3)
@@ -109,6 +111,7 @@ def test_hover_holds_its_limits_among_packets_out_of_order_twice_or_broken(tmp_p
     assert notice.startswith("motion capture: 1 packet cannot be read: ")
 
 
+@pytest.mark.long
 def test_a_stream_that_stops_is_failsafe_and_one_line_and_flies_again_when_it_is_back(tmp_path: Path) -> None:
     """Motive stops from 2 to 4 s, with the robot still in its holder."""
 
@@ -126,6 +129,7 @@ def test_a_stream_that_stops_is_failsafe_and_one_line_and_flies_again_when_it_is
     assert back == "motion capture: frames arrive again after 2.0 s"
 
 
+@pytest.mark.long
 def test_a_body_that_is_taken_out_in_flight_is_failsafe_and_one_line(tmp_path: Path) -> None:
     lab = NatnetFlight(lambda now_us, data: [data], 3.0, "flight.release_us=5000000")
     rename = packets.model_definition({"wand": 3}, V)

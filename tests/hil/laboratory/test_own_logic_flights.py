@@ -49,6 +49,7 @@ def failed(tmp_path_factory: pytest.TempPathFactory) -> Result:
     return hover(folder / "run", "logic.after=80", "logic.gain_iy=0.5", profile=str(profile), duration_s=0.5)
 
 
+@pytest.mark.long
 def test_a_law_that_puts_out_nan_is_a_failed_flight_that_names_it(failed: Result) -> None:
     assert failed.outcome == "error"
     assert not failed.passed
@@ -67,6 +68,7 @@ def test_a_law_that_puts_out_nan_is_a_failed_flight_that_names_it(failed: Result
     assert np.isfinite(flaps).all()
 
 
+@pytest.mark.long
 def test_a_law_with_an_endless_loop_is_a_failed_flight_that_names_file_and_line(tmp_path: Path) -> None:
     old = "    memory.ticks = i32(memory.ticks + 1)\n"
     loop = "    for i in range(memory.ticks * 4000000):\n        memory.hidden = memory.hidden + DT\n"
@@ -80,6 +82,7 @@ def test_a_law_with_an_endless_loop_is_a_failed_flight_that_names_file_and_line(
     assert any(event["source"] == "lab" and where in event["text"] for event in load_events(result.folder))
 
 
+@pytest.mark.long
 def test_own_logic_s_log_is_recorded_and_drawn(failed: Result) -> None:
     log = load_log(failed.folder)
     own = {field.name: field.metadata[b"unit"] for field in log.schema if field.name.startswith("logic.")}

@@ -53,6 +53,7 @@ def changed(text: str, *changes: tuple[str, str]) -> str:
     return text
 
 
+@pytest.mark.long
 def test_own_logic_flies_by_what_its_sensor_measures(tmp_path: Path) -> None:
     run = hover(tmp_path / "run", "logic.height=1.2", profile=project(tmp_path), duration_s=2.5)
     log = load_log(run.folder)
@@ -73,6 +74,7 @@ def test_a_sensor_is_read_alike_on_every_board(tmp_path: Path, board: str) -> No
     assert usual.hash == other.hash
 
 
+@pytest.mark.long
 def test_noise_delay_and_dropout_are_those_of_the_profile(tmp_path: Path) -> None:
     law = (PROJECT / "controller.py.in").read_text(encoding="utf-8")  # which does not read it
     run = hover(
@@ -91,6 +93,7 @@ def test_noise_delay_and_dropout_are_those_of_the_profile(tmp_path: Path) -> Non
     assert t[first] >= 50_000
 
 
+@pytest.mark.long
 def test_several_numbers_are_an_array_and_both_modules_may_read_a_sensor(tmp_path: Path) -> None:
     robot = (
         changed(RANGING, ('{"range": ("range", "m")}', '{"range": ("range", "m"), "flow": ("vx vy", "m/s")}'))
@@ -157,6 +160,7 @@ def test_a_mistake_is_one_line(
     assert all("controller.py:" in line for line in more)
 
 
+@pytest.mark.long
 def test_a_shipped_robot_has_no_own_sensors(cli: Cli, tmp_path: Path) -> None:
     (tmp_path / "law.py").write_text(RANGED, encoding="utf-8")
     law = f"logic.controller={tmp_path / 'law.py'}"

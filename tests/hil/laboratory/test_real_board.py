@@ -41,6 +41,7 @@ def flown(folder: Path, duration_s: float, **arguments: object) -> str:
     return fly(Request.of(find_experiment("hover"), duration_s=duration_s, **arguments), folder).hash
 
 
+@pytest.mark.long
 def test_a_flight_on_a_board_has_the_hash_of_python(
     plugged: Plug, library: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -60,6 +61,7 @@ def test_experiments_are_equal_at_loss(plugged: Plug, library: Path, tmp_path: P
     assert hashes[0] == hashes[1]
 
 
+@pytest.mark.long
 def test_measured_cycles_are_the_tasks_processor_time(plugged: Plug, library: Path, tmp_path: Path) -> None:
     link = plugged(library)
     link.app.cycles.value = 168 * 700
@@ -73,6 +75,7 @@ def test_measured_cycles_are_the_tasks_processor_time(plugged: Plug, library: Pa
     assert spent_us["KALMAN"] == 700 * (entries["estimate"].calls + entries["file_pose"].calls)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("happens", "cause"),
     [("silent", "silent for 3 s"), ("reboots", "it has rebooted, or another program uses it")],
@@ -96,6 +99,7 @@ def test_a_board_that_fails_in_flight_ends_it_in_one_line_with_what_was_flown(
     assert link.closed == 1
 
 
+@pytest.mark.long
 def test_the_check_compares_a_board_and_prints_measurements(cli: Cli, plugged: Plug, library: Path) -> None:
     plugged(library).app.cycles.value = 1234
     arguments = ("deploy", "check", "hover", "--duration", "0.3", "--targets", URI)
@@ -132,6 +136,7 @@ def test_a_check_whose_board_falls_silent_fails_in_one_line(
     assert f"hover, seed 1: error: board {URI}: silent for 3 s" in cli.out
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

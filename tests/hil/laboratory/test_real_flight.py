@@ -112,6 +112,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return real, simulated
 
 
+@pytest.mark.long
 def test_the_cameras_judge_a_flight_as_the_truth_does(both: tuple[Path, Path]) -> None:
     """The turn by 110 degrees: poses that stood 40 ms late in the log would settle 40 ms later."""
     real, truth = (load_log(folder) for folder in both)
@@ -137,6 +138,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_a_real_flight_lies_over_the_simulated_one(both: tuple[Path, Path], simulated: Path) -> None:
     comparison = compare(load_flown(both[0]), load_flown(simulated))
     apart = {one.name: one for one in comparison.apart}
@@ -148,6 +150,7 @@ def test_a_real_flight_lies_over_the_simulated_one(both: tuple[Path, Path], simu
     assert "cameras.x" in comparison.missing[1]
 
 
+@pytest.mark.long
 def test_the_report_of_a_real_flight_names_the_cameras(both: tuple[Path, Path], tmp_path: Path) -> None:
     folder = Path(shutil.copytree(both[0], tmp_path / "run"))
     page = Page(write_report(folder).read_text(encoding="utf-8"))
@@ -163,6 +166,7 @@ def test_the_report_of_a_real_flight_names_the_cameras(both: tuple[Path, Path], 
     )  # its own, path, path against goal, latency budget
 
 
+@pytest.mark.long
 def test_the_operator_s_actions_are_marked_in_the_figures(both: tuple[Path, Path]) -> None:
     events = [
         {
@@ -186,6 +190,7 @@ def test_the_operator_s_actions_are_marked_in_the_figures(both: tuple[Path, Path
             )
 
 
+@pytest.mark.long
 def test_a_real_flight_is_exported_as_what_the_cameras_saw(both: tuple[Path, Path], tmp_path: Path) -> None:
     folder = Path(shutil.copytree(both[0], tmp_path / "run"))
     with write_mcap(folder).open("rb") as file:
@@ -264,6 +269,7 @@ def test_the_judged_part_lasts_from_trajectory_to_experiment_end(tmp_path: Path)
     assert bars == ["not judged", "judged", "not judged"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("comes_back", [True, False])
 def test_time_without_poses_is_not_flown_and_fails_its_limit(tmp_path: Path, comes_back: bool) -> None:
     """A server that was killed in flight: turns go on, frames do not."""
@@ -283,6 +289,7 @@ def test_time_without_poses_is_not_flown_and_fails_its_limit(tmp_path: Path, com
     assert not result.passed
 
 
+@pytest.mark.long
 def test_a_comparison_shows_what_was_judged_and_a_second_around_it(tmp_path: Path) -> None:
     bench = StationBench(tmp_path / "run", "yaw-step")
     bench.fly(5.0)
@@ -302,6 +309,7 @@ def test_a_robot_is_lost_by_its_tilt_about_any_axis_wherever_it_faces(axis: tupl
         assert (why is not None) == (beyond > 0.0)
 
 
+@pytest.mark.long
 def test_a_robot_that_leaves_the_flow_is_lost_and_what_follows_is_not_judged(tmp_path: Path) -> None:
     bench = StationBench(tmp_path / "run")
     bench.plan.start(bench.now_us)

@@ -36,6 +36,7 @@ def replayed(run: Run, folder: Path, *overrides: str, profile: str = "floaty") -
     return load_run(folder)
 
 
+@pytest.mark.long
 def test_the_core_that_flew_is_replayed_exactly(flown: Run, tmp_path: Path) -> None:
     run = replayed(flown, tmp_path / "again")
     assert run.hash == flown.hash
@@ -50,6 +51,7 @@ def test_the_core_that_flew_is_replayed_exactly(flown: Run, tmp_path: Path) -> N
     assert misses(run.folder)[0] == misses(run.folder)[1]
 
 
+@pytest.mark.long
 def test_another_core_gets_the_inputs_of_the_flight_and_moves_nothing(flown: Run, tmp_path: Path) -> None:
     gates = ("estimator.gate_sigma=1", "estimator.gate_position=0.001", "estimator.gate_attitude=0.01")
     strict = replayed(flown, tmp_path / "strict", *gates)
@@ -92,6 +94,7 @@ def test_a_row_shows_what_the_second_core_knew_then_through_the_clock_s_wrap_and
         )
 
 
+@pytest.mark.long
 def test_the_command_shows_both_and_the_report_draws_them(flown: Run, cli: Cli, tmp_path: Path) -> None:
     assert cli("replay", flown.folder, "--set", "predictor.enabled=false", "--out", tmp_path / "late") == 0
     assert "Replay" in (tmp_path / "late" / "report.html").read_text(encoding="utf-8")

@@ -27,7 +27,7 @@ from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
-from support.other_machine import TARGETS, CoreElsewhere, OtherMachine
+from support.other_machine import CoreElsewhere, OtherMachine
 from support.paths import TESTS
 
 FAULTS = (
@@ -97,9 +97,8 @@ def test_without_a_system_compiler_the_world_makes_the_same_flights(usual: list[
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("target", TARGETS)
 def test_core_and_world_on_another_machine_make_the_same_recorded_flight(
-    target: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Each call of the core, the body and the IMU is computed there; only the scheduler, which is integers, runs here."""
     request = Request.of(EXPERIMENTS["hover"], duration_s=1.0, faults=[parse(fault) for fault in FAULTS])
@@ -108,11 +107,11 @@ def test_core_and_world_on_another_machine_make_the_same_recorded_flight(
         def bound(functions: compiling.Functions, *memory: compiling.Memory) -> list[Callable[..., Any]]:
             arrays = tuple(one.memory if isinstance(one, Block) else one for one in memory)
             texts = {"kernels.c": kernels.translate(functions, arrays)}
-            machine = stack.enter_context(OtherMachine(target, texts))
+            machine = stack.enter_context(OtherMachine(texts))
             return [partial(machine.call, function.__name__, arrays) for function in functions]
 
         monkeypatch.setattr(compiling, "bound_together", bound)
-        core = stack.enter_context(OtherMachine(target, texts_of(c99.translate())))
+        core = stack.enter_context(OtherMachine(texts_of(c99.translate())))
         return lockstep_flight(request, telemetry, PythonBoard(partial(CoreElsewhere, core)))
 
     here = fly(request, tmp_path / "here")

@@ -60,12 +60,14 @@ def test_wrong_bits_cost_frames_and_nothing_else(tmp_path: Path) -> None:
         assert column(log, f"serial.{way}_lost")[-1] > 0
 
 
+@pytest.mark.long
 def test_a_signed_line_flies(tmp_path: Path) -> None:
     result = hover(tmp_path / "run", f"mavlink.signing_key='{KEY}'", duration_s=1.0, link=MAVLINK)
     assert result.passed, explain(result)
     assert column(load_log(result.folder), "serial.up_bad")[-1] == 0
 
 
+@pytest.mark.long
 def test_telemetry_over_the_line_is_the_estimate(result: Result) -> None:
     lines = (result.folder / "telemetry.csv").read_text().splitlines()
     names = lines[0].split(",")
@@ -86,6 +88,7 @@ def test_telemetry_over_the_line_is_the_estimate(result: Result) -> None:
         assert np.abs(told[good] - known).max() <= 2 * step, title
 
 
+@pytest.mark.long
 def test_the_report_shows_the_line(result: Result) -> None:
     names = load_log(result.folder).column_names
     shown = [picture.title for picture in PICTURES if picture.fits(names)]

@@ -74,6 +74,7 @@ def test_boards_hear_what_the_others_send(tmp_path: Path, monkeypatch: pytest.Mo
         assert sum("peer says hello" in line for line in events) == 2
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_each_robot_that_still_flies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(now_us: int, end_us: int) -> None:
         raise KeyboardInterrupt
@@ -127,6 +128,7 @@ def test_a_wake_carries_the_momentum_of_the_thrust(below: float) -> None:
     assert not neighbours((0.0, 0.0, 1.0), (0.0, 0.0, 1.5), wake=1.0).wake_W[1].any()  # above it
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(20))
 def test_wakes_contacts_and_the_nearest_two_are_those_of_the_formulas_for_vectors(seed: int) -> None:
     rng, count = np.random.default_rng(seed), 2 + seed % 4

@@ -63,6 +63,7 @@ def unseen(tmp_path_factory: pytest.TempPathFactory) -> str:
     return flight_hash(tmp_path_factory.mktemp("unseen") / "run", None)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("program", "taken"),
     [
@@ -81,6 +82,7 @@ def test_the_picture_does_not_affect_flights(program: str, taken: range, unseen:
     assert view.offered - missed in taken
 
 
+@pytest.mark.long
 def test_rows_beyond_the_queue_are_dropped_and_counted() -> None:
     view = LiveView(picture(STALLS), [].append)
     for piece in range(2000):
@@ -126,6 +128,7 @@ def test_a_picture_reports_its_address_and_typed_lines() -> None:
     assert view.lines() == []
 
 
+@pytest.mark.long
 def test_texts_and_parameters_travel_with_the_rows() -> None:
     """The picture's program is the test's own: it says back what it got."""
     program = """
@@ -257,6 +260,7 @@ print('failed out of words', flush=True)
 """
 
 
+@pytest.mark.long
 def test_a_picture_that_opened_late_catches_up_and_what_ends_it_later_is_said_at_once() -> None:
     """An answer goes with no rows; nobody waits for a picture that has ended."""
     said: list[str] = []

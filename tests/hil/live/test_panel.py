@@ -177,6 +177,7 @@ def test_a_page_shows_only_the_newest_row(panel: PanelScreen, loop: IOLoop, tmp_
     socket.close()
 
 
+@pytest.mark.long
 def test_the_scene_has_the_goals_of_the_whole_flight_and_the_path_of_the_last_seconds(
     panel: PanelScreen, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -68,10 +68,12 @@ def flown(folder: Path, view: Script | None, lockstep: bool = True) -> str:
     return fly(Request.of(EXPERIMENTS["hover"], duration_s=1.0), folder, progress, view).hash
 
 
+@pytest.mark.long
 def test_a_panel_that_is_only_open_does_not_change_the_flight(tmp_path: Path) -> None:
     assert flown(tmp_path / "seen", Script({})) == flown(tmp_path / "alone", None)
 
 
+@pytest.mark.long
 def test_goal_fault_and_note_act_and_are_events(tmp_path: Path) -> None:
     view = Script({
         120: ["goal 0.05 0 1.15 10", "mark here", "mocap.dropout:0.2"],
@@ -158,6 +160,7 @@ def test_a_goal_without_yaw_keeps_that_of_its_instant() -> None:
     flight.close()
 
 
+@pytest.mark.long
 def test_a_parameter_is_set_over_the_radio_and_noted_when_the_board_has_it(tmp_path: Path) -> None:
     view = Script({
         120: ["set controller.gain_y -1.5", "set controller.gain_x -1.5", "set controller.gain_y -1.5"],
@@ -195,6 +198,7 @@ def test_a_paused_flight_steps_and_ends_as_an_unpaused_one(tmp_path: Path) -> No
     assert not view.gone, "a step pauses once"
 
 
+@pytest.mark.long
 def test_a_flight_whose_station_is_another_program_does_not_pause(tmp_path: Path) -> None:
     view = Script({100: ["pause", "step 50"]})
     flown(tmp_path / "run", view, lockstep=False)
@@ -202,11 +206,13 @@ def test_a_flight_whose_station_is_another_program_does_not_pause(tmp_path: Path
     assert "which cannot pause" in view.answers[0]
 
 
+@pytest.mark.long
 def test_a_panel_that_is_closed_lets_a_paused_flight_go_on(tmp_path: Path) -> None:
     flown(tmp_path / "run", Script({100: ["pause"]}))
     assert load_log(tmp_path / "run").num_rows > 190
 
 
+@pytest.mark.long
 def test_stop_interrupts_the_flight(tmp_path: Path) -> None:
     flown(tmp_path / "run", Script({100: ["stop"]}))
     texts = [event["text"] for event in load_events(tmp_path / "run")]

@@ -76,6 +76,7 @@ def test_a_port_that_is_taken_gives_way_to_one_that_is_free() -> None:
         assert free_port(wanted) != wanted
 
 
+@pytest.mark.long
 def test_a_server_takes_another_port_when_its_own_is_in_use_and_leaves_no_socket() -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         server = LocalServer(other.getsockname()[1], None, {})

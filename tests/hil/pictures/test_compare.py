@@ -39,6 +39,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     }
 
 
+@pytest.mark.long
 def test_the_same_seed_is_identical(runs: dict[str, Path]) -> None:
     comparison = compare(load_flown(runs["one"]), load_flown(runs["again"]))
     assert comparison.identical
@@ -47,6 +48,7 @@ def test_the_same_seed_is_identical(runs: dict[str, Path]) -> None:
     assert all(pair.difference == 0 for pair in comparison.metrics)
 
 
+@pytest.mark.long
 def test_the_first_difference_is_the_first_by_row_then_by_column(runs: dict[str, Path]) -> None:
     a, b = load_flown(runs["one"]), load_flown(runs["two"])
     found = next(  # slow and plain: Python rows instead of numpy columns
@@ -90,6 +92,7 @@ def test_metrics_are_side_by_side_in_the_unit_of_the_table(runs: dict[str, Path]
     assert told["rms_x"].difference == pytest.approx(100 * (b["rms_x"] - a["rms_x"]))
 
 
+@pytest.mark.long
 def test_metrics_of_unequal_flights_cover_the_common_time(runs: dict[str, Path]) -> None:
     long = load_flown(runs["one"])
     rows = long.log.num_rows - 30  # 0.3 s less

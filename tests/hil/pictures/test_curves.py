@@ -110,6 +110,7 @@ PLOTTED |= {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PLOTTED)
 def test_a_curve_shows_the_member_of_a_group_that_its_name_says(name: str) -> None:
     plot = PLOTTED[name]
@@ -143,6 +144,7 @@ def units(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return {one.name: (one.metadata or {}).get(b"unit", b"").decode() for one in log.schema} | OTHERWISE
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PLOTTED)
 def test_a_curve_is_in_the_unit_that_it_names(name: str, units: dict[str, str]) -> None:
     """Others count: events so far or per second, packets, poses, or have units of their own in their names."""

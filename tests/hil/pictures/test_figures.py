@@ -84,6 +84,7 @@ def test_a_task_has_one_colour_in_every_figure_whatever_tasks_are_there() -> Non
     assert drawn == [("SENSORS", 200, sensors), ("KALMAN", 100, kalman), ("KALMAN", 100, kalman)]
 
 
+@pytest.mark.long
 @given(
     st.lists(
         st.tuples(st.integers(0, 2), st.sampled_from("ABC"), st.sampled_from(["IN", "READY"])), max_size=20

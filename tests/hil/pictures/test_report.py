@@ -82,6 +82,7 @@ def keep_rows(folder: Path, count: int) -> None:
     pq.write_table(load_log(folder).slice(0, count), folder / "log.parquet")
 
 
+@pytest.mark.long
 def test_the_report_tells_every_metric_and_every_limit(folder: Path) -> None:
     result, rows = read_result(folder), report(folder).tables["metrics"][1:]
     assert {row[0] for row in rows} == {
@@ -121,6 +122,7 @@ def test_the_latency_budget_adds_up_to_their_age_and_survives_a_cut_file(folder:
     report(folder)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("few_pictures")
 def test_the_report_tells_where_the_age_of_the_poses_comes_from(folder: Path) -> None:
     stages = read_result(folder).ages
@@ -148,6 +150,7 @@ def test_the_report_tells_where_the_flight_comes_from(folder: Path) -> None:
     assert "released" in [row[2] for row in page.tables["events"]]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("few_pictures")
 def test_a_failed_limit_comes_first_and_its_instant_is_shown_close_up(folder: Path) -> None:
     log = load_log(folder)
@@ -181,6 +184,7 @@ def test_a_killed_flight_has_a_report(folder: Path) -> None:
     assert {"rms_x", "flown"} <= {row[0] for row in page.tables["metrics"][1:]}
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("few_pictures")
 @pytest.mark.parametrize(("outcome", "lost"), [("lost", "why"), ("error", None), ("reset", None)])
 def test_only_a_lost_robot_has_the_mark_of_a_loss(

@@ -82,6 +82,7 @@ def moments(path: Path, entity: str) -> list[int]:
     ]
 
 
+@pytest.mark.long
 def test_a_recording_holds_every_row_of_the_log(folder: Path) -> None:
     log, path = load_log(folder), write_run_rrd(folder)
     assert log.num_rows == 150
@@ -104,6 +105,7 @@ def test_a_recording_holds_every_row_of_the_log(folder: Path) -> None:
     assert (held[1] == (0.0, 0.0, 0.0, 1.0)).all(), "pushes along axes of the world"
 
 
+@pytest.mark.long
 def test_texts_and_changes_of_state_are_recorded_once(folder: Path) -> None:
     path = write_run_rrd(folder)
     states = values(path, "/state/supervisor", "StateChange:state")[:, 0].tolist()
@@ -127,6 +129,7 @@ def marked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_markers_change_colour_where_they_come_into_sight_or_go(marked: Path) -> None:
     path = write_run_rrd(marked)
     colours = values(path, "/world/robot/markers", "Points3D:colors")
@@ -160,6 +163,7 @@ def content(path: Path) -> dict[tuple[str, str], list[tuple[int, str]]]:
     return {key: sorted(rows) for key, rows in found.items()}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [40, 7])
 def test_a_flight_in_pieces_as_it_comes_live_has_the_recording_of_the_whole(
     marked: Path, tmp_path: Path, size: int
@@ -223,6 +227,7 @@ def test_a_live_flight_sends_what_the_file_holds(folder: Path, tmp_path: Path) -
     assert seen == expected
 
 
+@pytest.mark.long
 def test_an_empty_log_has_a_recording(folder: Path, tmp_path: Path) -> None:
     write_rrd(iter([load_log(folder).slice(0, 0)]), [], SCHEMA.empty_table(), tmp_path / "empty.rrd")
     assert rows_by_entity(tmp_path / "empty.rrd")["/world/robot/parts/flap_1"] == 1  # its mesh
@@ -285,6 +290,7 @@ def test_the_drawn_areas_are_the_papers() -> None:
     assert sum(areas) == pytest.approx(0.23**2)
 
 
+@pytest.mark.long
 def test_drag_acts_on_the_turned_flaps(folder: Path) -> None:
     log = load_log(folder)
     flaps = column(log, *(f"truth.flap_{number}" for number in (1, 2, 3, 4)))
@@ -449,6 +455,7 @@ def test_tether_net_and_nozzle_are_those_of_the_flight_s_own_place(
     assert ("/world/tunnel/nozzle" in entities, "/world/tunnel/flow" in entities) == (fan_factor > 0.0,) * 2
 
 
+@pytest.mark.long
 def test_the_goal_has_a_path_where_it_moves(tmp_path: Path) -> None:
     moving = np.where(np.arange(30) < 20, 0.0, 0.01 * np.arange(30))
     log = real_log()
@@ -473,6 +480,7 @@ def test_rates_are_those_of_the_second_before() -> None:
     np.testing.assert_allclose(found[1:], [[50.0, 300.0]] * 3)
 
 
+@pytest.mark.long
 def test_the_stages_of_the_age_lie_on_one_another(folder: Path) -> None:
     ages = {"camera": 20e3, "processing": 18e3, "network": 1e3, "mocap": 39e3, "station": 100.0, "link": 2e3}
     table = pa.table({f"age.{name}": [age_us] for name, age_us in ages.items()})
@@ -483,6 +491,7 @@ def test_the_stages_of_the_age_lie_on_one_another(folder: Path) -> None:
     assert counted["/plot/age/stages"] > 60  # by the station's own record, and their names
 
 
+@pytest.mark.long
 def test_faults_share_a_lane_and_a_push_is_an_arrow_that_can_be_seen(folder: Path, tmp_path: Path) -> None:
     texts = [
         "fault push.y@0.1=2 begins",

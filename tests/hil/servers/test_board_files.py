@@ -17,6 +17,7 @@ def serve(state: Path | None, number: int = 1) -> Server:
     return Server(Service(load_config(), number, state=state), lambda line: None)
 
 
+@pytest.mark.long
 def test_the_eeprom_of_each_board_is_kept_over_a_restart(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "boards"
     servers = [serve(folder, number) for number in (1, 2)]
@@ -47,6 +48,7 @@ def test_every_change_is_written_at_once(tmp_path: Path) -> None:
     assert (tmp_path / "board-1.eeprom").read_bytes()[8000:8003] == b"aga"
 
 
+@pytest.mark.long
 def test_without_a_folder_every_server_begins_with_new_boards() -> None:
     server = serve(None)
     server.robot.board.eeprom[8000:8003] = b"new"

@@ -160,6 +160,7 @@ def test_a_trajectory_between_take_off_and_landing_is_followed(station: bool) ->
     assert script.follows(13.0)
 
 
+@pytest.mark.long
 def test_the_position_commander_goes_from_place_to_place() -> None:
     script = Script(station=True)
     with (

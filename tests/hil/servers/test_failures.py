@@ -50,6 +50,7 @@ def lab(held: MavlinkLab) -> MavlinkLab:
     return held
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("unit", "failing"), EXPECTED)
 def test_a_unit_fails_as_commanded_until_ok(lab: MavlinkLab, unit: int, failing: int) -> None:
     assert lab.command(INJECT, unit, failing) == ACCEPTED
@@ -60,6 +61,7 @@ def test_a_unit_fails_as_commanded_until_ok(lab: MavlinkLab, unit: int, failing:
     assert lab.faults == {}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("unit", [*range(10), 99, *range(100, 107), -1, 0.5, math.nan])
 def test_unknown_failures_are_unsupported(lab: MavlinkLab, unit: float) -> None:
     for failing in (OFF, STUCK, GARBAGE, WRONG, SLOW, DELAYED, INTERMITTENT, 8, -1, math.nan):
@@ -129,6 +131,7 @@ def test_a_command_that_comes_twice_acts_once_and_another_takes_its_place(lab: M
     lab.command(INJECT, GYRO, OK)
 
 
+@pytest.mark.long
 def test_a_line_is_cut_after_the_answer_and_heals_by_itself(lab: MavlinkLab) -> None:
     assert lab.command(INJECT, SIGNAL, OFF) == ACCEPTED
     lab.run(0.1)
@@ -142,6 +145,7 @@ def test_a_line_is_cut_after_the_answer_and_heals_by_itself(lab: MavlinkLab) -> 
     assert lab.of("HEARTBEAT")
 
 
+@pytest.mark.long
 def test_a_flight_without_poses_ends_in_failsafe_and_goes_on_with_them() -> None:
     lab = MavlinkLab(flying=True)
     lab.run(2.0)
@@ -155,6 +159,7 @@ def test_a_flight_without_poses_ends_in_failsafe_and_goes_on_with_them() -> None
 # Reboot
 
 
+@pytest.mark.long
 def test_a_reboot_ends_the_emergency_stop_and_nothing_else_does() -> None:
     lab = MavlinkLab(flying=True)
     lab.run(2.0)

@@ -482,6 +482,7 @@ def test_only_lost_samples_are_sent_again(app: App, tmp_path: Path) -> None:
     assert metrics["samples_doubled"] < 0.2 * metrics["samples_lost"]
 
 
+@pytest.mark.long
 def test_faults_of_plant_and_cameras_act_in_the_loop(app: App, tmp_path: Path) -> None:
     result, _ = flown(tmp_path / "run", app, 2.0, ("mocap.dropout@0.5:0.8", "push.y@0.2=0.5"))
     assert result.metrics["failsafe"] == pytest.approx(0.3, abs=0.1)
@@ -503,6 +504,7 @@ def test_a_board_that_dies_in_the_loop_ends_the_flight_in_one_line(app: App, tmp
     assert load_log(tmp_path / "run").num_rows in range(248, 256)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("drift", "slower"), [(2e-3, True), (-2e-3, False)])
 def test_the_plants_clock_follows_the_boards(app: App, tmp_path: Path, drift: float, slower: bool) -> None:
     air = AppAir(app, drift=drift)

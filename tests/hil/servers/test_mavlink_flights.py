@@ -69,6 +69,7 @@ def lab(request: pytest.FixtureRequest) -> MavlinkLab:
     return lab
 
 
+@pytest.mark.long
 def test_poses_of_every_kind_fly_the_robot_to_its_goals(lab: MavlinkLab) -> None:
     for goal in (HOME, (0.1, -0.05, 1.3)):
         lab.repeat(goal, 2.0)
@@ -77,6 +78,7 @@ def test_poses_of_every_kind_fly_the_robot_to_its_goals(lab: MavlinkLab) -> None
     assert ages_ms[-1] == pytest.approx(40.5, abs=2.0)  # camera 20, processing 18, line 1.5 to 4
 
 
+@pytest.mark.long
 def test_frozen_poses_of_every_kind_are_named_and_end_in_the_failsafe_until_they_move(
     lab: MavlinkLab,
 ) -> None:
@@ -93,13 +95,8 @@ def test_frozen_poses_of_every_kind_are_named_and_end_in_the_failsafe_until_they
     assert lab.place == pytest.approx(HOME, abs=0.3)
 
 
-@pytest.mark.parametrize(
-    "poses",
-    [
-        "mavlink",
-        *(pytest.param(f"crtp {poses}", marks=pytest.mark.long) for poses in ("corrections", "poses")),
-    ],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("poses", ["mavlink", "crtp corrections", "crtp poses"])
 def test_offboard_flies_to_its_goals_and_holds_the_last_one_when_they_stop(poses: str) -> None:
     absolute = poses == "crtp poses"
     lab = MavlinkLab(

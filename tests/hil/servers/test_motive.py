@@ -59,11 +59,13 @@ markers = st.lists(st.builds(MarkerDescription, vector, u32, text), max_size=3).
 described = st.builds(BodyDescription, text, u32, u32, vector, markers)
 
 
+@pytest.mark.long
 @given(frames, st.sampled_from(VERSIONS))
 def test_a_frame_arrives_as_it_was_sent(frame: Frame, version: tuple[int, int]) -> None:
     assert decode(encode_frame(frame, version), version) == frame
 
 
+@pytest.mark.long
 @given(st.lists(described, max_size=3), st.sampled_from(VERSIONS[2:]))
 def test_model_definitions_arrive_unchanged(models: list[BodyDescription], version: tuple[int, int]) -> None:
     sent = ModelDefinition(tuple(models))
@@ -366,6 +368,7 @@ def test_unreadable_packets_are_counted_and_not_answered(lab: MotiveBench, clien
     assert client.hears_nothing()
 
 
+@pytest.mark.long
 def test_no_bytes_stop_the_server(lab: MotiveBench, client: NatNetSocket) -> None:
     @settings(max_examples=300, deadline=None)
     @given(st.sampled_from([*MessageId, 3000]), st.binary(max_size=40), st.integers(-3, 3))

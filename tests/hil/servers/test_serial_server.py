@@ -30,6 +30,7 @@ def test_several_tcp_clients_all_exchange_bytes_with_the_board() -> None:
     third.close()
 
 
+@pytest.mark.long
 def test_a_tcp_client_that_does_not_read_takes_nothing_from_another() -> None:
     bench = OpenEnd(Address("tcp").open)
     asleep, awake = TcpClient(bench), TcpClient(bench)

@@ -41,6 +41,7 @@ def _short_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(image_firmware, "WARM_UP_US", 20_000)
 
 
+@pytest.mark.long
 def test_rows_of_a_served_robot_describe_its_look_and_go_on_after_a_restart_with_home_as_the_goal() -> None:
     watcher = Watcher()
     config = load_config(overrides=["flight.home=[0.1,-0.2,1.2]"])
@@ -90,6 +91,7 @@ def test_firmware_without_the_app_is_reported() -> None:
     assert [line for line in lines if "the image lacks Floaty's app" in line]
 
 
+@pytest.mark.long
 def test_constants_that_stay_the_images_are_said_and_it_is_polled_while_a_client_on_udp_listens(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -198,6 +200,7 @@ def test_a_new_client_on_the_radio_ends_the_session_on_udp() -> None:
 # Where several robots of one server start
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("spacing", "sides"), [(0.0, (0.0, 0.0, 0.0, 0.0)), (0.5, (0.0, 0.5, -0.5, 1.0))])
 def test_robots_of_one_room_start_side_by_side(spacing: float, sides: tuple[float, ...]) -> None:
     config = load_config("floaty", [f"flight.spacing={spacing}"])
@@ -209,6 +212,7 @@ def test_robots_of_one_room_start_side_by_side(spacing: float, sides: tuple[floa
         assert server.clock.stood_still_us == number
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("sent", "calls"), [(None, []), ("corrections", [False]), ("poses", [True])])
 def test_the_built_in_station_sends_what_was_asked_for(
     monkeypatch: pytest.MonkeyPatch, sent: str | None, calls: list[bool]

@@ -144,6 +144,7 @@ def test_a_typed_line_goes_to_the_robot_whose_number_it_has(served: Served, line
     served.wait_for(answer, PATIENCE_S)
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_all_processes_in_order_and_keeps_every_robots_eeprom(tmp_path: Path) -> None:
     with serve("--boards", "2", "--udp", "0", "--state", str(tmp_path)) as served:
         pids = others(served)
@@ -154,6 +155,7 @@ def test_ctrl_c_ends_all_processes_in_order_and_keeps_every_robots_eeprom(tmp_pa
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"board-{number}.eeprom" for number in (1, 2)]
 
 
+@pytest.mark.long
 def test_robots_do_not_outlive_a_server_that_is_killed() -> None:
     with serve("--boards", "2", "--udp", "0") as served:
         served.process.kill()
@@ -176,6 +178,7 @@ class Talker(PythonBoard):
         return firmware
 
 
+@pytest.mark.long
 def test_a_peer_packet_of_one_board_reaches_those_of_all_other_processes() -> None:
     said: list[str] = []
     plan, endpoints = Service(load_config(), executor=Talker()), Endpoints(udp=0)
@@ -207,6 +210,7 @@ class Cameras:
         self.streamed.add(number)
 
 
+@pytest.mark.long
 def test_a_robot_whose_process_dies_is_named_and_lost_and_the_others_continue() -> None:
     said, motive = list[str](), Cameras()
     plan, endpoints = Service(load_config()), Endpoints(udp=0, motive=True)
@@ -232,7 +236,8 @@ def test_a_robot_whose_process_dies_is_named_and_lost_and_the_others_continue() 
             assert answers[0].startswith("robot 2: held, ")
 
 
-@pytest.mark.parametrize("radius", [0.07, pytest.param(0.0, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("radius", [0.07, 0.0])
 def test_robots_of_several_processes_that_touch_push_each_other_apart(radius: float) -> None:
     settings = ("flight.spacing=0.1", f"swarm.radius={radius}")
     standing = [parse(f"motor.stop.{motor}@0") for motor in (1, 2, 3, 4)]
@@ -254,6 +259,7 @@ def test_robots_of_several_processes_that_touch_push_each_other_apart(radius: fl
     assert swarm.room.rows[[0, 2]].all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("profile", "share"), [("crazyflie", True), ("floaty", False)])
 def test_robots_share_a_room_in_still_air_only(profile: str, share: bool) -> None:
     """Where fans blow, each robot flies at home in its own tunnel, so their places must not be compared."""

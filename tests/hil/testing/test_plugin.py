@@ -86,6 +86,7 @@ def test_check(floaty):
 """
 
 
+@pytest.mark.long
 def test_a_broken_controller_is_one_message_without_traceback(pytester: pytest.Pytester) -> None:
     make_project(pytester.path, LAW.replace("DT * memory", "sum([v for v in control.u]) * memory"))
     tests = pytester.makepyfile(BROKEN).name
@@ -174,6 +175,7 @@ def test_it(floaty):
 """
 
 
+@pytest.mark.long
 def test_a_baseline_is_made_kept_and_left(pytester: pytest.Pytester) -> None:
     test = pytester.path / "tests" / "test_push.py"
     test.parent.mkdir()
@@ -437,6 +439,7 @@ def test_a_wrong_mark_fails_the_collection_in_one_line(pytester: pytest.Pytester
     assert "Traceback" not in result.stdout.str()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("options", "told"),
     [
@@ -456,6 +459,7 @@ def test_a_bad_option_is_refused_first(pytester: pytest.Pytester, options: list[
 # Records
 
 
+@pytest.mark.long
 def test_the_junit_file_has_hash_command_and_metrics(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(FLY)
     pytester.runpytest_inprocess("--junitxml=junit.xml", "--floaty-keep=all")
@@ -514,6 +518,7 @@ def test_the_examples_of_the_page_work(
     pytester.runpytest_inprocess("tests/test_pinned.py").assert_outcomes(passed=1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("keep", ["failed", "none"])
 def test_flights_of_a_failed_test_are_drawn_once_and_named_where_kept(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, keep: str

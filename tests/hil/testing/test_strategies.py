@@ -17,6 +17,7 @@ QUICK = settings(database=None, derandomize=True)
 HOME = Goal((0.0, 0.0, 1.15), 0.0)
 
 
+@pytest.mark.long
 @given(fault=faults(start_s=(0.0, 2.0), duration_s=(0.1, 1.0)))
 @settings(max_examples=200)
 def test_every_fault_is_possible_and_reads_back_from_its_text(fault: Fault) -> None:
@@ -26,6 +27,7 @@ def test_every_fault_is_possible_and_reads_back_from_its_text(fault: Fault) -> N
     assert parse(str(fault)) == fault
 
 
+@pytest.mark.long
 def test_every_size_of_a_kind_s_grid_can_be_asked_for_alone() -> None:
     for kind in (one for one in KINDS.values() if one.sized):
         none, step = (
@@ -45,6 +47,7 @@ def test_sizes_stay_within_what_is_asked(fault: Fault) -> None:
     assert (fault.start_s, fault.duration_s) == (1.0, 0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "size"),
     [("push.y", 0.0), ("wind.fan", 1.0), ("imu.saturation", 2000.0), ("mocap.swap", 0.001)],
@@ -54,6 +57,7 @@ def test_the_smallest_fault_is_none_at_all(kind: str, size: float) -> None:
     assert smallest.size == pytest.approx(size, rel=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("bound", "smallest"), [(2.31, 2.4), (-2.31, -2.4)])
 def test_a_failure_shrinks_to_the_first_size_beyond_the_bound(bound: float, smallest: float) -> None:
     def fails(fault: Fault) -> bool:
@@ -63,6 +67,7 @@ def test_a_failure_shrinks_to_the_first_size_beyond_the_bound(bound: float, smal
     assert (found.size, found.start_s) == (smallest, 0.5)
 
 
+@pytest.mark.long
 @given(way=trajectories(reach_m=0.05, turn_rad=0.2, every_s=0.5, most=3), t_s=st.floats(0.0, 10.0))
 def test_every_goal_is_within_reach_of_home_where_the_way_begins(way: Along, t_s: float) -> None:
     path = way(HOME, 0)
@@ -78,6 +83,7 @@ def test_a_path_holds_every_goal_for_its_time_and_the_last_to_the_end() -> None:
     assert [way(t)[0] for t in (0.0, 0.49, 0.5, 0.99, 1.0, 9.5)] == [0.0, 0.0, 0.01, 0.01, 0.02, 0.02]
 
 
+@pytest.mark.long
 def test_a_failing_way_shrinks_to_one_goal_on_one_axis() -> None:
     def fails(way: Along) -> bool:
         return any(abs(goal[1]) > 0.025 for goal in way.path.goals)  # type: ignore[attr-defined]

@@ -32,11 +32,13 @@ def test_both_of_the_papers_voltages_are_true_of_one_cell() -> None:
     assert energy == pytest.approx(0.925, rel=0.01)
 
 
+@pytest.mark.long
 @given(st.floats(0.0, 0.999), st.floats(1e-3, 0.001))
 def test_voltage_falls_with_the_charge(charge: float, less: float) -> None:
     assert open_circuit_voltage(charge + less) > open_circuit_voltage(charge)
 
 
+@pytest.mark.long
 @given(st.floats(0.05, 1.0), st.floats(0.1, 12.0), st.integers(1, 4), st.floats(0.0, 0.5))
 def test_power_leaves_and_the_resistance_heats(charge: float, power: float, cells: int, sag_V: float) -> None:
     config = BatteryConfig(charge=charge, cells=cells)
@@ -50,6 +52,7 @@ def test_power_leaves_and_the_resistance_heats(charge: float, power: float, cell
     assert drop == pytest.approx(current * config.resistance, rel=1e-6, abs=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("power", [2.0, 3.4, 6.0])
 def test_endurance_is_that_of_the_differential_equation(power: float) -> None:
     def current(charge: float) -> float:

@@ -13,6 +13,7 @@ shapes = st.tuples(st.integers(1, 6), st.integers(1, 6), st.integers(1, 6))
 seeds = st.integers(0, 2**32)
 
 
+@pytest.mark.long
 @given(shapes, seeds)
 def test_product_is_numpys(shape: tuple[int, int, int], seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -21,6 +22,7 @@ def test_product_is_numpys(shape: tuple[int, int, int], seed: int) -> None:
     assert product(A, B.T.copy().T) == pytest.approx(A @ B, abs=1e-13)
 
 
+@pytest.mark.long
 @given(st.integers(1, 4), st.integers(0, 6), seeds)
 def test_eigenvalues_and_vectors_are_numpys(size: int, rank: int, seed: int) -> None:
     A = np.random.default_rng(seed).standard_normal((size, rank))
@@ -35,6 +37,7 @@ def test_eigenvalues_and_vectors_are_numpys(size: int, rank: int, seed: int) -> 
         assert (same == V).all()
 
 
+@pytest.mark.long
 @given(st.integers(0, 6), st.integers(7, 50), seeds)
 def test_polynomial_is_that_of_least_squares(order: int, points: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -58,6 +61,7 @@ def test_noise_has_the_same_bits_whatever_the_last_bit_of_a_logarithm() -> None:
     assert (ours == normal(OtherLibrary(np.random.default_rng(1)), 100_000)).all()
 
 
+@pytest.mark.long
 def test_noise_is_numpys_to_the_rounding_and_normal() -> None:
     drawn = normal(np.random.default_rng(2), 20_000)
     assert drawn == pytest.approx(np.random.default_rng(2).standard_normal(20_000), abs=0.5 / STEPS)

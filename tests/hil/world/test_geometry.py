@@ -83,6 +83,7 @@ def test_mass_centre_and_inertia_are_those_of_a_cloud_of_points() -> None:
     assert weight.inertia == pytest.approx(moments, rel=2e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("geometry", geometries(20))
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_a_mirrored_robot_feels_the_mirrored_force_and_torque(geometry: GeometryConfig, axis: str) -> None:

@@ -95,6 +95,7 @@ def test_hover_carries_the_weight_without_torque(variant: str) -> None:
     assert torque == pytest.approx([0, 0, 0], abs=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("tilt", "felt"), [(20, 20), (50, 35), (-20, -20), (-50, -35), (120, 35), (-120, -35)]
 )
@@ -121,6 +122,7 @@ def test_flap_forces_at_hover_are_those_of_the_specification_and_mirror_images()
     assert plant.plate_forces_W[0] == pytest.approx([0, 0, 0.159 * 0.34 * 9.81], abs=3e-3)
 
 
+@pytest.mark.long
 @given(wind=st.tuples(*3 * [st.floats(-15.0, 15.0)]), angles=st.tuples(*4 * [st.floats(-1.5, 1.5)]))
 def test_opposite_flow_gives_opposite_force(wind: tuple[float, ...], angles: tuple[float, ...]) -> None:
     felt = []
@@ -179,6 +181,7 @@ def test_accelerometer_feels_everything_but_gravity() -> None:
     )
 
 
+@pytest.mark.long
 @given(st.lists(st.integers(0, 300_000), max_size=30))
 @settings(max_examples=25, deadline=None)
 def test_truth_does_not_depend_on_how_time_is_cut(instants: list[int]) -> None:
@@ -277,6 +280,7 @@ def test_short_tether_ends_a_flight() -> None:
     assert (plant.lost or "").startswith("tether taut, 0.25 m below")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "setting",
     [{"fan_factor": 0.8}, {"side_wind": (1.0, -2.0, 0.5)}, {"turbulence": "T1"}, {"hover_height": 0.9}],
@@ -335,6 +339,7 @@ def test_plant_is_not_placed_at_nonsense() -> None:
 vector = st.tuples(*3 * (st.floats(-1, 1),))
 
 
+@pytest.mark.long
 @given(vector, vector, vector, st.tuples(*4 * (st.floats(-1, 1),)), st.tuples(*4 * (st.floats(-1.6, 1.6),)))
 @settings(max_examples=60, deadline=None)
 def test_any_tumble_stays_finite_and_bounded(

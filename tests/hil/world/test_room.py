@@ -29,6 +29,7 @@ def cast(p: np.ndarray, direction: np.ndarray) -> float:
     return float(np.min(np.where(direction == 0, np.inf, ways)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("axis", [(0, 0, -1), (0, 0, 1), (1, 0, 0), (0.6, -0.8, 0), (0.48, 0.36, -0.8)])
 def test_distance_is_that_of_the_shortest_ray_in_the_cone(axis: tuple[float, float, float]) -> None:
     p, d = np.array((0.3, -0.7, 0.9)), np.array(axis, float)

@@ -54,6 +54,7 @@ def test_pulses_of_0_5_to_2_5_ms_move_the_servo(width_ms: float, moves: bool) ->
     assert (angle != 9.0) == moves
 
 
+@pytest.mark.long
 @given(st.integers(0, 10**10))
 def test_next_period_is_the_first_whole_microsecond_of_the_next_pwm_period(now_us: int) -> None:
     period = Fraction(52501, 21)

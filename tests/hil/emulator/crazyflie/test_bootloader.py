@@ -59,6 +59,7 @@ def test_cflib_reads_the_sectors_of_the_stm32() -> None:
     assert mapping[-1] + 128 == 4 * 16 + 64 + 7 * 128  # pages: the whole flash
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # cflib leaves the file open
 @pytest.mark.parametrize(("name", "start"), [("stm32", 16), ("nrf51", 88)])
 @pytest.mark.parametrize("size", [1, 25, 1024, 1025, 10 * 1024, 30_321])
@@ -108,6 +109,7 @@ COMMANDS = st.builds(
 )
 
 
+@pytest.mark.long
 @given(
     st.builds(
         bytes.__add__, COMMANDS | st.sampled_from([b"\xff\xff", b"\xff\xfe", b""]), st.binary(max_size=25)

@@ -25,6 +25,7 @@ BUSY = (
 )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("planted", "line"), [
     (BUS_FAULT, f"HardFault: access to where there is no memory at 0x30000000{IN_REPORT}"),
     (UNDEFINED, f"HardFault: undefined instruction{IN_REPORT}"),
@@ -73,6 +74,7 @@ def test_a_watchdog_that_nobody_feeds_resets_and_names_who_ran_each_time() -> No
     assert board.crazyflie.resets == {WATCHDOG: 2, SOFTWARE: 0}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("planted", "line"), [
     (NULL_READ, f"null pointer: read at 0x00000008, where the chip has its flash again; .*{IN_REPORT}"),
     (NULL_WRITE, f"null pointer: write to 0x0000000c, which has no effect and causes no fault{IN_REPORT}"),
@@ -85,6 +87,7 @@ def test_what_has_no_effect_is_reported_once_and_is_no_failure(planted: int, lin
     assert (board.crazyflie.failures, board.crazyflie.known) == ([], [])
 
 
+@pytest.mark.long
 def test_a_mistake_that_bitcraze_s_firmware_is_known_for_is_kept_and_not_printed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -37,6 +37,7 @@ def test_profile_knows_the_decks_that_there_are() -> None:
 # One-wire memories
 
 
+@pytest.mark.long
 def test_memories_are_found_and_read_in_pieces() -> None:
     decks = DeckBench("flow2", "multiranger").decks
     assert decks.answer(syslink.SCAN_MEMORIES, b"") == b"\2"
@@ -259,6 +260,7 @@ def about(axis: int, angle: float) -> tuple[float, ...]:
     return tuple(q)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("to", "wanted"), [((0.5, 0.0), (0.0, -1.0)), ((0.0, 0.5), (-1.0, 0.0)), ((0.0, 0.0), (0.0, 0.0))]
 )

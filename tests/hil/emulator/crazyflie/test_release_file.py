@@ -111,6 +111,7 @@ def test_another_zip_is_refused_in_one_line(content: bytes, expected: str) -> No
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.long
 @settings(max_examples=200)
 @given(damage=st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 255)), min_size=1, max_size=4))
 def test_a_damaged_zip_is_read_or_refused(damage: list[tuple[int, int]]) -> None:

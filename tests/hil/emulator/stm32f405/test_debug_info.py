@@ -57,6 +57,7 @@ def program() -> Any:
     return dwarf.line_program_for_CU(next(dwarf.iter_CUs()))
 
 
+@pytest.mark.long
 @settings(max_examples=100)
 @given(st.lists(OPERATIONS, max_size=30), st.sampled_from([1, 2]), st.booleans())
 def test_a_line_program_has_the_rows_that_pyelftools_reads(

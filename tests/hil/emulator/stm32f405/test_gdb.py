@@ -115,6 +115,7 @@ def test_unknown_packets_get_an_empty_answer(protocol: RemoteProtocol) -> None:
         assert ask(protocol, packet) == b""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "packet", [b"m", b"m,", b"m20000000", b"mxyz,4", b"p", b"pff", b"P0", b"P0=12", b"M20000000,4:00",
                b"M20000000,0:", b"Z0", b"Z1,", b"c-1", b"M20000000,1:zz"],
@@ -361,6 +362,7 @@ def contents(answers: bytes) -> list[bytes]:
     return re.findall(rb"\$([^#]*)#", answers)
 
 
+@pytest.mark.long
 def test_a_breakpoint_where_crashes_are_reported_stops_for_both() -> None:
     machine, server = FirmwareOnChip(planted=ASSERTION), GdbServer(0)
     place = machine.image.symbol("assertFail").address
@@ -407,6 +409,7 @@ def test_a_breakpoint_in_an_it_block_stops_at_its_end(crashes: bool) -> None:
     assert answers[2:5] == [b"T05thread:1;", pack("<I", FLASH + 22).hex().encode(), b"07000000"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "name"), [(b"2", "xTickCount"), (b"3", "planted"), (b"4", "planted")])
 def test_a_watchpoint_stops_after_the_access(kind: bytes, name: str) -> None:
     def packets(image: Image) -> list[bytes]:
@@ -508,6 +511,7 @@ def test_kill_ends_the_flight_like_ctrl_c() -> None:
         on_chip(lambda _: [b"k"], 2_000)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("packet", "request_", "backwards"), [
     (b"vCont;c", ResumeRequest.RUN, False), (b"vCont;C05", ResumeRequest.RUN, False),
     (b"vCont;s:1;c", ResumeRequest.STEP, False),

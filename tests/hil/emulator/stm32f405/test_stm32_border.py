@@ -54,6 +54,7 @@ ENDS = (
 )  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("end", ENDS)
 def test_the_last_word_of_each_memory_is_read_and_written_and_none_behind_it(end: int) -> None:
     made = Bench().chip
@@ -74,6 +75,7 @@ def test_code_that_a_debugger_writes_runs_from_the_first_half_word_of_flash_on()
     assert bench.chip.register("r0") == 3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("was", "is_now"),
     [

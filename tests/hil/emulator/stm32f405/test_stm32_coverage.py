@@ -135,6 +135,7 @@ def test_functions_lines_and_branches_are_those_of_gcov_on_the_host(compiler: st
     }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("compiler", ["gcc", "clang"])
 def test_counts_are_those_that_the_firmware_keeps_itself(compiler: str) -> None:
     firmware = Recorded(compiler)

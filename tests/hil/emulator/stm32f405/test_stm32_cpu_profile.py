@@ -62,6 +62,7 @@ def test_every_cycle_and_call_is_charged_to_the_task_that_the_firmware_counts(co
     assert 20 < masked.cycles < 1000
 
 
+@pytest.mark.long
 def test_cycles_add_up_across_a_reset() -> None:
     firmware = Profiled("clang", planted=ASSERTION)
     profile = firmware.run_with_samples(100_000)
@@ -69,6 +70,7 @@ def test_cycles_add_up_across_a_reset() -> None:
     assert sum(calls_of(one, "Reset_Handler") for one in profile.roots) > 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scenario", [MASKING, NESTED])
 def test_masked_interrupts_and_nested_exceptions_are_seen(scenario: int) -> None:
     firmware = Profiled("gcc", scenario=scenario)

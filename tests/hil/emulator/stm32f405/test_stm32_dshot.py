@@ -89,6 +89,7 @@ def test_a_frame_of_sixteen_pulses_is_a_throttle(wire: Wire) -> None:
     assert wire.throttle == 2047
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bit", range(16))
 def test_a_frame_with_a_wrong_bit_is_ignored(wire: Wire, bit: int) -> None:
     wire.send(frame_of(0))
@@ -151,6 +152,7 @@ def test_a_reset_of_the_chip_is_silence_for_the_esc(wire: Wire) -> None:
     assert wire.throttle == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [WORDS, HALF_WORDS], ids=["words", "half words"])
 @pytest.mark.parametrize("channel", range(4))
 @pytest.mark.parametrize("timer", TIMERS)

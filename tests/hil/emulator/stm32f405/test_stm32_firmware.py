@@ -28,6 +28,7 @@ def run(machine: FirmwareOnChip, begin_ms: int, end_ms: int, gyro: bool = True) 
     return sent
 
 
+@pytest.mark.long
 @COMPILERS
 def test_two_tasks_with_floats_keep_them_while_they_are_switched(compiler: str) -> None:
     machine = FirmwareOnChip(compiler)
@@ -36,6 +37,7 @@ def test_two_tasks_with_floats_keep_them_while_they_are_switched(compiler: str) 
     assert min(machine.peek_all("fp_rounds", 2)) > 100
 
 
+@pytest.mark.long
 @COMPILERS
 def test_every_sample_of_a_kilohertz_passes_the_queue(compiler: str) -> None:
     machine = FirmwareOnChip(compiler)
@@ -46,6 +48,7 @@ def test_every_sample_of_a_kilohertz_passes_the_queue(compiler: str) -> None:
     assert machine.peek("samples_lost") == 0
 
 
+@pytest.mark.long
 @COMPILERS
 def test_the_eeprom_is_written_and_read_back_by_dma(compiler: str) -> None:
     machine = FirmwareOnChip(compiler)
@@ -55,6 +58,7 @@ def test_the_eeprom_is_written_and_read_back_by_dma(compiler: str) -> None:
     assert machine.peek("i2c_reads") == machine.peek("dma_interrupts") >= 6
 
 
+@pytest.mark.long
 def test_lines_leave_the_usart_by_dma_and_bytes_arrive_by_interrupt() -> None:
     machine = FirmwareOnChip()
     sent = run(machine, 0, 60)
@@ -79,6 +83,7 @@ def test_dshot_by_dma_moves_an_esc_and_its_answer_is_captured(compiler: str) -> 
     assert period_us(edges, 0.8 * 281) == pytest.approx(60e6 / (2400 * 6), rel=0.005)
 
 
+@pytest.mark.long
 def test_a_hungry_watchdog_resets_and_a_failed_assertion_keeps_its_snapshot_over_the_reset() -> None:
     machines = [FirmwareOnChip(planted=planted) for planted in (HUNGRY_WATCHDOG, ASSERTION)]
     for machine, expected in zip(machines, (StopReason.WATCHDOG, StopReason.RESET), strict=True):
@@ -109,6 +114,7 @@ def test_a_step_into_an_interrupt_ends_in_front_of_its_handler() -> None:
     assert chip.state.instructions > instructions
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("taken_us", [0, 400, 900])
 def test_processor_load_takes_time_only_from_tasks(taken_us: int) -> None:
     machine = FirmwareOnChip()

@@ -84,6 +84,7 @@ def test_flash_between_segments_is_erased(elf: Path, changed) -> None:
     assert code == whole[:gap] + b"\xff" * 64 + whole[gap:]
 
 
+@pytest.mark.long
 @COMPILERS
 @pytest.mark.parametrize("function", ["Reset_Handler", "assertFail", "vTaskSwitchContext"])
 def test_an_address_is_reported_as_function_and_line(compiler: str, function: str) -> None:
@@ -113,6 +114,7 @@ def test_lines_are_those_of_binutils() -> None:
     assert {a for a, _ in differ} <= {""}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("compiler", ["clang", "gcc"])
 def test_a_line_has_its_first_address_also_in_units_of_many_pieces(compiler: str) -> None:
     """With a section for each function, lines of code are those that coverage counts, as gcov confirms."""
@@ -337,6 +339,7 @@ def test_a_vector_table_that_no_cortex_m_could_start_from_is_refused(elf: Path, 
     assert "the reset vector there, 0x08090001" in refused(changed(vectors + 4, "<I", 0x0809_0001))
 
 
+@pytest.mark.long
 @settings(max_examples=60)
 @given(damage=st.lists(st.tuples(st.integers(-700, 179), st.integers(0, 255)), min_size=1, max_size=4))
 def test_a_file_with_damaged_headers_is_read_or_refused_in_one_line(

@@ -69,6 +69,7 @@ def test_the_tasks_are_those_that_were_created(compiler: str) -> None:
     assert tasks[kernel.name(kernel.current_block)].state == "running"
 
 
+@pytest.mark.long
 def test_a_task_has_the_state_of_the_list_that_it_is_in(monkeypatch: pytest.MonkeyPatch) -> None:
     machine = FirmwareOnChip()
     kernel, variables = FreeRtos(machine.image, machine.chip.read), machine.image._variables
@@ -85,6 +86,7 @@ def test_a_task_has_the_state_of_the_list_that_it_is_in(monkeypatch: pytest.Monk
         assert states.get("REPORT") == state, name
 
 
+@pytest.mark.long
 def test_without_the_code_of_queues_tasks_are_known_and_waits_have_an_address(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -100,6 +102,7 @@ def test_without_the_code_of_queues_tasks_are_known_and_waits_have_an_address(
     assert without._wait_in(event) == Wait(f"it waits at {image.name_of(event, without._word)}")
 
 
+@pytest.mark.long
 @COMPILERS
 def test_the_high_water_mark_is_what_was_never_written(compiler: str) -> None:
     machine = FirmwareOnChip(compiler)
@@ -160,6 +163,7 @@ def test_a_fault_is_reported_with_its_place(compiler: str, planted: int, reason:
     assert crash.startswith(f"HardFault: {reason}, in task REPORT: {place} < report (firmware.c:")
 
 
+@pytest.mark.long
 @COMPILERS
 def test_an_assertion_is_reported_with_text_and_caller(compiler: str) -> None:
     machine = FirmwareOnChip(compiler, planted=ASSERTION)
@@ -209,6 +213,7 @@ def stopped(machine: FirmwareOnChip, why: StopReason) -> tuple[ChipProcessor, Cr
     return processor, reports_of(machine)
 
 
+@pytest.mark.long
 @COMPILERS
 @pytest.mark.parametrize(
     ("planted", "why", "expected", "text"),
@@ -230,6 +235,7 @@ def test_a_null_access_reports_once(
     assert machine.peek("lines_sent") > lines + 3
 
 
+@pytest.mark.long
 def test_flash_is_read_at_address_0() -> None:
     machine = FirmwareOnChip(planted=NULL_READ)
     stopped(machine, StopReason.LOW_READ)
@@ -238,6 +244,7 @@ def test_flash_is_read_at_address_0() -> None:
     assert 0xFFFF_FFFF in words  # erased: the image begins at 16 kB
 
 
+@pytest.mark.long
 @COMPILERS
 def test_the_first_division_by_zero_is_reported_where_it_is(compiler: str) -> None:
     machine = FirmwareOnChip(compiler, planted=DIVISION)
@@ -248,6 +255,7 @@ def test_the_first_division_by_zero_is_reported_where_it_is(compiler: str) -> No
     assert run_to_end(machine, 100) == StopReason.TIME
 
 
+@pytest.mark.long
 @COMPILERS
 def test_the_task_that_hangs_is_named_while_others_run(compiler: str) -> None:
     machine = FirmwareOnChip(compiler, planted=HANG)
@@ -322,6 +330,7 @@ def test_tasks_of_one_name_are_numbered_and_their_names_have_no_spaces() -> None
         assert processor.task_names == ["my_task", "other", "my_task#2", "my_task#3", "other#2"]
 
 
+@pytest.mark.long
 @COMPILERS
 def test_a_stack_that_overflows_names_its_task_at_once(compiler: str) -> None:
     machine = FirmwareOnChip(compiler, planted=OVERFLOW)
@@ -347,6 +356,7 @@ def test_an_assertion_without_text_is_reported_by_its_addresses() -> None:
     assert text.startswith("assertion 0x30000000 failed at 0x08080000:")
 
 
+@pytest.mark.long
 def test_a_watchdog_reset_names_the_running_task() -> None:
     machine = FirmwareOnChip(planted=HUNGRY_WATCHDOG)
     reports = reports_of(machine)
@@ -379,6 +389,7 @@ def test_an_unreadable_frame_is_reported() -> None:
     assert text.endswith("0x30000000; there is no memory at its stack pointer, 0x30000000, in task REPORT")
 
 
+@pytest.mark.long
 def test_an_unhandled_fault_is_reported_as_lock_up() -> None:
     machine = FirmwareOnChip()
     run_to_end(machine, 30)
@@ -421,6 +432,7 @@ def test_a_real_crazyflie_image_is_read() -> None:
     assert kernel.heap_bytes[0] == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("planted", "reason"),
     [
@@ -459,6 +471,7 @@ def test_a_regular_task_that_waits_for_ever_is_named_with_what_it_waits_for(
     ), crash
 
 
+@pytest.mark.long
 def test_a_task_without_samples_is_named_with_the_list_where_it_waits(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -469,6 +482,7 @@ def test_a_task_without_samples_is_named_with_the_list_where_it_waits(
     assert kernel.endless_wait(task.block) == Wait("it waits at waiting_for_samples")
 
 
+@pytest.mark.long
 @COMPILERS
 def test_tasks_are_found_by_their_shape_without_symbols(compiler: str, tmp_path: Path) -> None:
     elf = Image(build(compiler, ("-g", "-DUSUAL_PLACES", "-fno-strict-aliasing")))

@@ -159,6 +159,7 @@ def requested(bench: Bench) -> set[int]:
     return {irq for irq in range(112) if bench.is_pending(irq)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", USART_AT)
 def test_a_usart_requests_while_an_enabled_flag_is_set(number: int) -> None:
     base, irq = USART_AT[number]
@@ -188,6 +189,7 @@ def test_a_usart_requests_while_an_enabled_flag_is_set(number: int) -> None:
     assert (requested(bench), bench[base + 4], requested(bench)) == ({irq}, 0, set())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", SPI_AT)
 def test_a_spi_requests_while_an_enabled_flag_is_set(number: int) -> None:
     base, irq = SPI_AT[number]
@@ -206,6 +208,7 @@ def test_a_spi_requests_while_an_enabled_flag_is_set(number: int) -> None:
     assert (requested(bench), bench[base + 12], requested(bench)) == ({irq}, 0xFF, set())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", I2C_AT)
 def test_an_i2c_controller_requests_events_and_errors_while_an_enabled_flag_is_set(number: int) -> None:
     base, irq = I2C_AT[number]

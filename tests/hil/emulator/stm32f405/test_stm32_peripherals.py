@@ -70,6 +70,7 @@ def test_there_is_room_for_sixteen_devices(bench: Bench) -> None:
         bench.chip.add_device(1, 16, np.zeros(1, np.uint8))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lines", [3, 64, 65, 90])
 def test_a_line_of_flash_waits_unless_it_is_among_the_64_used_last(lines: int) -> None:
     """Random jumps, by a table in memory, between lines that each have one: ldr pc, [r4], #4."""
@@ -111,6 +112,7 @@ SYSTEM = (0xE000_E010, 0xE000_E100, 0xE000_E200, 0xE000_E400, 0xE000_ED04)
 CORE = (*(f"r{number}" for number in range(13)), "sp", "pc", "primask", "basepri", "faultmask", "control")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(2))
 def test_a_reset_chip_is_like_a_fresh_one(bench: Bench, seed: int) -> None:
     """Whatever was written to its registers, and while it runs on."""

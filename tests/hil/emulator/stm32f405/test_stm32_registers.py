@@ -67,6 +67,7 @@ def test_a_bit_that_does_not_exist_reads_as_0(bench: Bench) -> None:
         assert bench[place] == bits, hex(place)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("base", CLOCKS, ids=hex)
 def test_a_peripheral_answers_the_core_with_its_own_clock_only(base: int) -> None:
     bench = Bench(bytes.fromhex("2068 2068"))  # ldr r0, [r4], twice
@@ -169,6 +170,7 @@ def test_a_byte_of_a_register_is_read_alone(byte: int) -> None:
     assert bench.chip.register("r0") == 0x11 * (byte + 1)
 
 
+@pytest.mark.long
 def test_interrupts_of_pins_follow_a_model(bench: Bench) -> None:
     rng = np.random.default_rng(6)
     mask, rising, falling, pending, sources, levels = 0, 0, 0, 0, [0] * 16, {}
@@ -206,6 +208,7 @@ def test_interrupts_of_pins_follow_a_model(bench: Bench) -> None:
         assert {irq for irq in range(64) if bench.is_pending(irq)} == wanted
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("prescaler", range(8))
 def test_a_watchdog_bites_after_its_time_unless_it_is_fed(bench: Bench, prescaler: int) -> None:
     bench[IWDG + 4], bench[IWDG + 8] = prescaler, 9

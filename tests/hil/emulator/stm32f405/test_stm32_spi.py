@@ -75,6 +75,7 @@ def test_each_controller_has_its_clock_and_its_interrupt(number: int) -> None:
     assert bench[base + SR] == TXE
 
 
+@pytest.mark.long
 def test_a_read_counts_on_from_its_address_and_a_write_too(bench: Selected) -> None:
     assert bench.transfer(bytes((0x16, 0, 0, 0)))[1:] == bytes((0x16, 0x17, 0x18))
     bench.transfer(bytes((0x20 | WRITE, 7, 8)))

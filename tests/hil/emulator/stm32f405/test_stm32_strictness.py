@@ -74,6 +74,7 @@ def ids(table: dict[str, str]) -> dict[str, object]:
     return {"argvalues": list(table.values()), "ids": list(table)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("code", **ids(EVERY))
 @pytest.mark.parametrize("enabled", [False, True], ids=["", "handled"])
 def test_an_unaligned_multiple_floating_or_exclusive_access_is_a_usage_fault(
@@ -88,6 +89,7 @@ def test_an_unaligned_multiple_floating_or_exclusive_access_is_a_usage_fault(
     assert bench.chip.read(DATA, len(WORDS)) == WORDS
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("code", **ids(ALIGNED))
 def test_a_half_word_is_no_alignment_for_them(code: str) -> None:
     bench = Strict(code, {"r4": DATA + 2})
@@ -95,12 +97,14 @@ def test_a_half_word_is_no_alignment_for_them(code: str) -> None:
     assert bench.cfsr == UNALIGNED
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("code", **ids(EVERY))
 def test_the_same_accesses_to_aligned_words_pass(code: str) -> None:
     bench = Strict(code, {"r4": DATA + 20})  # not a multiple of eight
     assert (bench.run(), bench.cfsr) == (0, 0)
 
 
+@pytest.mark.long
 def test_an_unaligned_access_that_is_not_executed_is_no_fault() -> None:
     # cmp r6, #1; ite eq; vldreq d0, [r4]; movne r7, #5
     bench = Strict("012e 0cbf 94ed 000b 0527", {"r4": DATA + 1})
@@ -156,6 +160,7 @@ def random_access(rng: np.random.Generator) -> tuple[bytes, int, int]:
     return pack("<2H", first, target << 12 | 0x800 | flags | number), base, index
 
 
+@pytest.mark.long
 def test_each_load_and_store_of_one_register_is_that_of_a_core_that_aligns_nothing() -> None:
     from unicorn import UC_ARCH_ARM, UC_MODE_THUMB, Uc, arm_const
 
@@ -193,6 +198,7 @@ def test_unalign_trp_forbids_every_unaligned_access(code: str) -> None:
     assert (bench.cfsr, bench.stacked_pc) == (UNALIGNED, START)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("address", "status"),
     [
@@ -258,6 +264,7 @@ def test_a_step_does_not_wake_a_processor_that_sleeps() -> None:
     assert (chip.register("pc"), chip.state.now) == (START + 2, slept_at + 500)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("code", "kind", "first", "last"),
     [
@@ -321,6 +328,7 @@ STACKING = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("code", **ids(STACKING))
 def test_each_instruction_that_lowers_the_stack_pointer_may_overflow_a_stack(code: str) -> None:
     for room, overflows in ((0, True), (64, False)):
@@ -355,6 +363,7 @@ ARMV8_M = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("code", **ids(ARMV8_M))
 def test_an_instruction_of_a_later_core_is_undefined(code: str) -> None:
     bench = Strict(code, {"r4": DATA})
@@ -386,6 +395,7 @@ FLOAT_INSTRUCTIONS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("code", **ids(FLOAT_INSTRUCTIONS))
 def test_floats_before_they_are_enabled_are_a_usage_fault(code: str) -> None:
     bench = Strict(code, {"r4": DATA}, cpacr=0)
@@ -403,6 +413,7 @@ def test_floats_are_enabled_and_disabled_by_the_code_itself() -> None:
     assert (bench.cfsr, bench.stacked_pc) == (NOCP, START + 24)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("code", ["91fb f2f0", "b1fb f2f0", "91fb fcf0"], ids=["sdiv", "udiv", "by r12"])
 def test_a_division_by_zero_is_a_usage_fault_if_the_firmware_wants_it_so(code: str) -> None:
     bench = Strict(code, {"r1": 7, "r4": 1}, ccr=STKALIGN | DIV_0_TRP)
@@ -450,6 +461,7 @@ def test_a_breakpoint_instruction_without_a_debugger_is_a_hard_fault() -> None:
 # Memory
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("target", "exception", "status"),
     [
@@ -473,6 +485,7 @@ def test_no_code_is_fetched_from_devices_and_from_where_no_bus_leads(
     assert (bench.cfsr, bench.stacked_pc) == (status, target)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("code", ["2068", "2060"], ids=["read", "written"])
 @pytest.mark.parametrize(
     "address", [NO_MEMORY, RAM + 0x2_0000, 0x4008_0000, 0x6000_0000, 0xC000_0000], ids=hex
@@ -496,6 +509,7 @@ def test_a_store_to_locked_flash_has_no_effect() -> None:
     assert bench.chip.read(FLASH + 0x8000, 4) == b"\xff" * 4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bit", [0, 6, 15, 31])
 @pytest.mark.parametrize("before", [0, 0xFFFF_FFFF, 0x5A5A_A5A5])
 @pytest.mark.parametrize("place", [DATA + 4, APB1ENR])
@@ -558,6 +572,7 @@ def test_an_invalid_return_from_an_exception_is_a_fault(handler: str, status: in
     assert bench.stacked_pc & 1 == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("code", "ccr", "padding"), [
     ("01b4 00df", STKALIGN, 4), ("01b4 00df", 0, 0), ("00ee 100a 01b4 00df", STKALIGN, 4), ("00ee 100a 01b4 00df", 0, 4),
 ])  # fmt: skip

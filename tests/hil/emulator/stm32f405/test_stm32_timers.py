@@ -32,6 +32,7 @@ def start(bench: Bench, timer: int, prescaler: int = 83, period: int = 99, contr
     bench[timer + CR1] = control
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", TIMERS)
 def test_each_timer_has_its_clock_its_width_and_its_interrupt(bench: Bench, number: int) -> None:
     base, cycles, irq = TIMERS[number]
@@ -51,6 +52,7 @@ def test_each_timer_has_its_clock_its_width_and_its_interrupt(bench: Bench, numb
     assert bench.is_pending(irq)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", TIMERS)
 def test_a_timer_counts_and_requests_as_a_model(number: int) -> None:
     """Whatever is written in between; the model counts tick by tick."""

@@ -97,6 +97,7 @@ def test_items_are_set_until_the_first_has_moved(bench: Bench) -> None:
     assert bench[stream + CR] == 0, "nothing to move"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dma", [0, 1])
 @pytest.mark.parametrize("number", range(8))
 def test_each_stream_has_its_flag_and_its_interrupt(bench: Bench, dma: int, number: int) -> None:
@@ -138,6 +139,7 @@ def test_a_transfer_into_nothing_ends_with_an_error(bench: Bench, control: int, 
 # USART
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", USARTS)
 def test_each_usart_has_its_clock_and_its_interrupt(bench: Bench, number: int) -> None:
     base, irq, fast = USARTS[number]
@@ -187,6 +189,7 @@ def test_a_receiver_that_is_off_takes_nothing(bench: Bench, control: int) -> Non
     assert bench[USART6 + SR] == TXE | TC
 
 
+@pytest.mark.long
 def test_a_line_holds_4096_bytes_in_each_direction(bench: Bench) -> None:
     sent = np.random.default_rng(1).bytes(4100)
     bench[USART6 + BRR], bench[USART6 + CR1] = 8, RECEIVING | SENDING
@@ -304,6 +307,7 @@ def test_dma_cannot_reach_the_core_coupled_memory(bench: Bench) -> None:
     assert bench.chip.read(CCM, 1) == b"\0"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_transfers_on_i2c_move_the_bytes_of_a_model(number: int) -> None:
     """Writes and reads by registers or DMA, behind a stop or a repeated start; a pointer goes on behind what was used."""

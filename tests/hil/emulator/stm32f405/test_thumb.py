@@ -29,6 +29,7 @@ def read(first: int, second: int = 0, at: int = 0) -> tuple[str, str]:
     return (one.mnemonic.removesuffix(".w"), one.op_str) if one is not None else ("", "")
 
 
+@pytest.mark.long
 def test_jumps_are_those_of_capstone() -> None:
     seen = set()
     for first, second in (*((first, 0) for first in NARROW), *WIDE):
@@ -45,6 +46,7 @@ def test_jumps_are_those_of_capstone() -> None:
     assert len(seen) == 14 + 2 + 4 + 3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mask", range(16))
 @pytest.mark.parametrize("condition", [0, 7, 13, 14])
 def test_the_last_instruction_of_an_it_block_may_jump(mask: int, condition: int) -> None:

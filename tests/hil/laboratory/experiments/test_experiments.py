@@ -43,6 +43,7 @@ def is_drawn(shown: Plot | Still) -> bool:
 # Measures against other implementations
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("damping", [0.3, 0.5, 0.7])
 def test_settling_rise_and_overshoot_are_those_of_the_textbook(damping: float) -> None:
     natural = 6.0
@@ -93,6 +94,7 @@ def test_gain_and_lag_are_those_of_a_first_order_lag() -> None:
     assert lag == pytest.approx(-np.angle(expected), abs=0.005)
 
 
+@pytest.mark.long
 @given(
     st.floats(0.2, 2.0), st.floats(-1.5, 1.5), st.floats(-3.0, 3.0), st.sampled_from([0.02, 0.05, 0.1, 0.15])
 )
@@ -145,6 +147,7 @@ def test_at_its_hover_angle_the_plant_carries_itself(speed: float) -> None:
     assert pytest.approx(TABLE.z_u4 / 9.81) == LIFT_PER_RAD
 
 
+@pytest.mark.long
 def test_no_flap_angle_carries_the_plant_at_eight_metres_per_second() -> None:
     assert max(lift(8.0, opening, "plate") for opening in np.linspace(-0.2, 0.9, 23)) < 0.8
     assert lift(10.0, 0.0, "plate") == pytest.approx(1.18, abs=0.01)  # a prototype apart from this code
@@ -156,8 +159,10 @@ def test_no_flap_angle_carries_the_plant_at_eight_metres_per_second() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("link", "seed"), [("radio", 7), ("mavlink", 1)])
-@pytest.mark.parametrize("name", PAPER)
+@pytest.mark.parametrize(
+    ("name", "link", "seed"),
+    [(name, *(("radio", 7), ("mavlink", 1))[place % 2]) for place, name in enumerate(PAPER)],
+)
 def test_the_default_profile_holds_the_limits(tmp_path: Path, name: str, link: str, seed: int) -> None:
     result = flown(tmp_path / "run", name, seed=seed, link=link)
     assert result.passed, explain(result)
@@ -218,6 +223,7 @@ def test_a_flight_too_short_to_measure_fails_its_limits(tmp_path: Path) -> None:
 # The list
 
 
+@pytest.mark.long
 def test_every_limit_of_every_profile_names_an_experiment_and_metrics() -> None:
     for experiment in EXPERIMENTS.values():
         assert set(experiment.limits) <= set(METRICS), experiment.name

@@ -48,6 +48,7 @@ def test_overload_names_the_loads_at_which_tasks_are_late_and_the_hover_fails(tm
     assert '<table id="tasks">' in page
 
 
+@pytest.mark.long
 def test_processor_time_adds_up(tmp_path: Path) -> None:
     result = flown(tmp_path, hover(), duration_s=2.0)
     cost = load_config().cpu
@@ -63,12 +64,14 @@ def test_processor_time_adds_up(tmp_path: Path) -> None:
     assert spent == pytest.approx(rows.column("t")[-1].as_py(), abs=1000)  # the idle task has the rest
 
 
+@pytest.mark.long
 def test_without_costs_no_time_is_spent(tmp_path: Path) -> None:
     costs = [f"cpu.{name}=0" for name in type(load_config().cpu).model_fields]
     result = flown(tmp_path, hover(), *costs, duration_s=0.5)
     assert {task.run_time_us for task in result.tasks} == {0}
 
 
+@pytest.mark.long
 def test_a_task_that_never_ends_with_interrupts_off_is_named_by_the_watchdog(tmp_path: Path) -> None:
     def seize(flight: Flight) -> None:
         kernel = flight.robot.firmware.kernel
@@ -89,6 +92,7 @@ def test_a_task_that_never_ends_with_interrupts_off_is_named_by_the_watchdog(tmp
     assert json.loads((tmp_path / "result.json").read_text())["outcome"] == "lost"
 
 
+@pytest.mark.long
 def test_a_critical_section_that_ends_costs_samples_and_nothing_else(tmp_path: Path) -> None:
     def pause(flight: Flight) -> None:
         kernel = flight.robot.firmware.kernel
@@ -108,6 +112,7 @@ def test_a_critical_section_that_ends_costs_samples_and_nothing_else(tmp_path: P
     assert 0 <= late < 5
 
 
+@pytest.mark.long
 def test_a_task_that_raises_is_named_and_the_log_is_there(tmp_path: Path) -> None:
     def plant_bug(flight: Flight) -> None:
         def buggy() -> Generator[int, None, None]:
@@ -123,6 +128,7 @@ def test_a_task_that_raises_is_named_and_the_log_is_there(tmp_path: Path) -> Non
     assert load_log(tmp_path).num_rows == 121
 
 
+@pytest.mark.long
 def test_a_full_queue_is_counted_and_noted_again_after_a_second_if_it_dropped_more(tmp_path: Path) -> None:
     """Starved from 0.5 s to 2.5 s, then never again; each note says more than the last, and the last says it all."""
 
@@ -149,6 +155,7 @@ def test_a_full_queue_is_counted_and_noted_again_after_a_second_if_it_dropped_mo
     assert {name: counts[-1] for name, counts in noted.items()} == dropped
 
 
+@pytest.mark.long
 def test_perfetto_has_a_track_per_task_and_the_slices_of_the_schedule(tmp_path: Path) -> None:
     plain = flown(tmp_path / "plain", hover(), duration_s=0.3)
     traced = flown(tmp_path / "traced", hover(), duration_s=0.3, trace=True)

@@ -52,6 +52,7 @@ def test_a_function_of_time_moves_the_goal_from_home_after_the_release() -> None
 # Files
 
 
+@pytest.mark.long
 def test_an_experiment_of_a_file_is_flown_and_its_run_names_the_file_and_its_hash() -> None:
     write(
         "def measure(flight): return {'rows': flight.num_rows}\n"
@@ -115,6 +116,7 @@ def test_the_only_experiment_of_a_file_needs_no_name() -> None:
     assert in_file("mine.py").reference == str(Path("mine.py:wide").absolute())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("text", "name", "told"),
     [
@@ -232,6 +234,7 @@ def flown() -> Path:
     return run.folder
 
 
+@pytest.mark.long
 def test_reading_a_run_executes_nothing_that_it_names(flown: Path, cli: Cli) -> None:
     """Nor do `report` and `compare`, below."""
     for command in (
@@ -278,6 +281,7 @@ def test_what_the_user_names_is_executed(flown: Path, cli: Cli) -> None:
         load_run(flown, "hover")
 
 
+@pytest.mark.long
 def test_two_flights_of_unequal_length_are_compared_without_code_or_with_what_the_user_names(
     flown: Path, cli: Cli
 ) -> None:
@@ -312,6 +316,7 @@ def site(monkeypatch: pytest.MonkeyPatch, empty_folder: Path) -> None:
         monkeypatch.delitem(sys.modules, name, raising=False)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("site")
 def test_an_installed_experiment_is_listed_with_its_package_and_flown_by_name(cli: Cli) -> None:
     install("wide = " + PLAIN % "")

@@ -31,6 +31,7 @@ def standing(**changes: float) -> Plant:
     return plant
 
 
+@pytest.mark.long
 def test_a_drop_bounces_by_spring_and_damper() -> None:
     def motion(t: float, state: np.ndarray) -> list[float]:
         z, v = state

@@ -36,6 +36,7 @@ def stored(folder: str) -> list[tuple[str, bytes]]:
     return [(path.name, path.read_bytes()) for path in sorted(Path(folder).iterdir())]
 
 
+@pytest.mark.long
 def test_a_flight_replaces_the_same_request_alone() -> None:
     first = fly("hover", duration_s=SHORT)
     (first.folder / "note.txt").write_text("mine")
@@ -49,6 +50,7 @@ def test_a_flight_replaces_the_same_request_alone() -> None:
     assert fly("hover", duration_s=0.1).folder == longer.folder
 
 
+@pytest.mark.long
 def test_a_flight_that_was_just_made_way_for_counts_and_an_empty_place_for_it_does_not() -> None:
     folder = fly("hover", duration_s=SHORT).folder
     (folder / OLDER).mkdir()
@@ -60,6 +62,7 @@ def test_a_flight_that_was_just_made_way_for_counts_and_an_empty_place_for_it_do
         assert other_in(folder, longer) == "another flight (duration 0.05 s)"
 
 
+@pytest.mark.long
 def test_every_part_of_the_request_counts() -> None:
     fly("hover", duration_s=SHORT)
     for options in (
@@ -72,6 +75,7 @@ def test_every_part_of_the_request_counts() -> None:
     assert folder_of(request_of("hover", seed=2, duration_s=SHORT)) == Path("runs/hover-2")
 
 
+@pytest.mark.long
 def test_a_folder_that_was_asked_for_keeps_another_flight_unless_it_may_be_replaced() -> None:
     fly("hover", "mine", duration_s=SHORT)
     kept = stored("mine")
@@ -84,6 +88,7 @@ def test_a_folder_that_was_asked_for_keeps_another_flight_unless_it_may_be_repla
     assert fly("hover", "mine", replace=True, duration_s=0.1, profile="lqr").request.profile == "lqr"
 
 
+@pytest.mark.long
 def test_an_unreadable_folder_is_not_replaced() -> None:
     run = fly("hover", duration_s=SHORT)
     result = json.loads((run.folder / "result.json").read_text())
@@ -93,6 +98,7 @@ def test_an_unreadable_folder_is_not_replaced() -> None:
     assert folder_of(request_of("hover", seed=2)) == Path("runs/hover-2-2")
 
 
+@pytest.mark.long
 def test_a_flight_whose_process_was_killed_is_known_by_its_log() -> None:
     run = fly("hover", duration_s=SHORT)
     (run.folder / "result.json").unlink()

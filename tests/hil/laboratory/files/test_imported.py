@@ -64,6 +64,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return run
 
 
+@pytest.mark.long
 def test_a_table_of_this_laboratory_is_its_log_again(run: Run, tmp_path: Path) -> None:
     import_log([run.folder / "flight.csv"], tmp_path)
     again = load_run(tmp_path)
@@ -77,6 +78,7 @@ def test_a_table_of_this_laboratory_is_its_log_again(run: Run, tmp_path: Path) -
     assert again.metrics["rms_x"] == pytest.approx(run.metrics["rms_x"])
 
 
+@pytest.mark.long
 def test_the_release_is_where_the_path_fits_that_of_another_flight(cli: Cli, tmp_path: Path) -> None:
     run = fly("yaw-step", tmp_path / "run", duration_s=2.0, faults=("push.x@0.5=2",))
     rows = run.log.slice(60, 200).to_pydict()  # 0.4 s before the release and 1.6 s after it
@@ -117,6 +119,7 @@ def test_the_best_fit_is_found_between_the_steps_of_the_search(offset_us: int, l
             released_like("log", few, chosen, flight)
 
 
+@pytest.mark.long
 def test_a_telemetry_log_of_mavlink_is_in_the_world_s_frame(run: Run, tmp_path: Path) -> None:
     tlog = tmp_path / "flight.tlog"
     whole = (run.folder / "flight.tlog").read_bytes()
@@ -432,6 +435,7 @@ def test_a_micro_sd_log_is_read(version: int, tmp_path: Path) -> None:
     assert log.column("robot.idA").to_numpy()[[4, 5, -1]] == pytest.approx([np.nan, 3, 3], nan_ok=True)
 
 
+@pytest.mark.long
 def test_an_mcap_file_of_ros_2_gives_pose_and_goal(cli: Cli, tmp_path: Path) -> None:
     assert cli("import", ros_bag(tmp_path / "bag.mcap"), "--out", tmp_path / "run") == 0
     log = load_run(tmp_path / "run").log
@@ -551,6 +555,7 @@ def test_a_wrong_map_is_refused(text: str | None, reason: str, tmp_path: Path) -
     assert reason.lower() in str(told.value).lower()
 
 
+@pytest.mark.long
 def test_an_imported_run_without_attitude_is_shown_compared_and_exported(
     run: Run, cli: Cli, tmp_path: Path
 ) -> None:

@@ -82,6 +82,7 @@ def test_a_long_log_is_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert sorted(tmp_path.iterdir()) == files
 
 
+@pytest.mark.long
 def test_a_long_log_is_readable_with_freed_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = 20 * ROWS_PER_BATCH * BATCHES_PER_PIECE
     recorder = make(tmp_path, np.ones(2))

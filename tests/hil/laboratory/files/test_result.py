@@ -114,6 +114,7 @@ def test_a_complete_run_within_limits_passes(result: Result, outcome: Any, holds
     assert read_result(result.folder).passed is passed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("damage", "told"),
     [

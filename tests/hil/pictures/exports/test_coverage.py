@@ -57,6 +57,7 @@ def test_the_page_has_the_lines_around_those_that_never_ran() -> None:
     assert Shares.of([FILE, FILE]).functions == Share(2, 4)
 
 
+@pytest.mark.long
 @given(lines=st.dictionaries(st.integers(1, 40), st.integers(0, 1)))
 def test_pieces_are_the_runs_of_lines_beside_one_that_never_ran(lines: dict[int, int]) -> None:
     covered = _covered(replace(FILE, lines=lines), (Path("a.c"), 30 * ["text"]), "")

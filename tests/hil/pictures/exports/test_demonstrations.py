@@ -9,6 +9,7 @@ from firmware_py.wire.supervisor import State
 from hil import fly
 
 
+@pytest.mark.long
 def test_a_dataset_has_what_the_law_saw_and_did_in_every_step_of_the_closed_loop(tmp_path: Path) -> None:
     run = fly("yaw-step", duration_s=2.0, seed=4, folder=tmp_path / "run")
     data, log = run.to_dataset(), run.to_pandas().reset_index()

@@ -37,6 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_the_wide_table_has_every_column_with_its_unit_in_seconds_from_the_release(folder: Path) -> None:
     log = load_log(folder)
     with write_csv(folder).open(newline="") as file:
@@ -142,6 +143,7 @@ def test_frames_lead_from_the_world_to_the_estimate(found: dict[str, list[tuple[
     assert miss < np.radians(8.0), "the estimate is near the truth"
 
 
+@pytest.mark.long
 def test_pymavlink_reads_the_flight_in_the_world_s_frame(folder: Path) -> None:
     log = load_log(folder)
     said: dict[str, list[Any]] = {}
@@ -265,6 +267,7 @@ def test_an_mcap_file_has_a_gap_where_there_is_no_number_and_angles_in_their_ord
         assert angles == pytest.approx([turning()[row], -0.2, 0.1], abs=1e-9)
 
 
+@pytest.mark.long
 def test_an_mcap_file_has_only_the_frames_that_are_known(turning_run: Path) -> None:
     log = load_log(turning_run)
     names = [name for name in log.column_names if not name.startswith("estimate.")]

@@ -80,6 +80,7 @@ def test_the_dataset_is_the_same_for_any_number_of_workers(tmp_path: Path, stop:
     assert (standings[0].flown < 200) == bool(stop)
 
 
+@pytest.mark.long
 def test_a_row_describes_its_flight_and_columns_have_units(tmp_path: Path) -> None:
     spec = spec_of()
     flown_into(tmp_path / "out", spec, workers(1))
@@ -94,6 +95,7 @@ def test_a_row_describes_its_flight_and_columns_have_units(tmp_path: Path) -> No
     assert table.schema.field("metric.max_y").metadata == {b"unit": b"m"}
 
 
+@pytest.mark.long
 def test_every_metric_and_limit_of_every_flight_has_a_column() -> None:
     spec = spec_of(experiments=["hover", "y-square"], profiles=["floaty", "as-flown"], faults=[])
     plan = plan_of(spec)
@@ -105,6 +107,7 @@ def test_every_metric_and_limit_of_every_flight_has_a_column() -> None:
     assert {f"holds.{name}" for one in requests for name in one.limits} <= columns
 
 
+@pytest.mark.long
 def test_a_campaign_that_was_interrupted_flies_the_rest_and_nothing_twice(tmp_path: Path) -> None:
     spec = spec_of()
     asked: list[int] = []
@@ -160,6 +163,7 @@ def flown_and_killed(folder: Path, when: str) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("when", ["writing", "packing"])
 def test_kill_9_loses_no_row_that_was_there_and_repeats_none(tmp_path: Path, when: str) -> None:
     child = os.fork()
@@ -177,6 +181,7 @@ def test_kill_9_loses_no_row_that_was_there_and_repeats_none(tmp_path: Path, whe
     assert bytes_of(tmp_path / "out") == bytes_of(tmp_path / "straight")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("limit", [30_000, 4_000])
 def test_a_full_disk_is_one_line_and_what_is_there_is_kept(tmp_path: Path, limit: int) -> None:
     """4 kB do not even take the file that the first lines become."""
@@ -193,6 +198,7 @@ def test_a_full_disk_is_one_line_and_what_is_there_is_kept(tmp_path: Path, limit
     )
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_full_disk_for_a_flight_s_files_ends_the_campaign_without_a_row() -> None:
     with small_files(10_000), pytest.raises(LabError, match=r"flight 0: .*File too large"):
@@ -200,6 +206,7 @@ def test_a_full_disk_for_a_flight_s_files_ends_the_campaign_without_a_row() -> N
     gc.collect()  # the telemetry log that found no room
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("changed", "what"), [("robot.py", "profiles"), ("cf2.elf", "image")])
 def test_a_campaign_resumes_only_with_its_original_files(changed: str, what: str, tmp_path: Path) -> None:
     (tmp_path / "own.toml").write_text('base = "floaty"\n[robot]\nbody = "robot.py"\n')
@@ -236,6 +243,7 @@ def test_a_folder_is_not_mistaken_for_another_campaign(tmp_path: Path) -> None:
         flown_into(Path("/proc/floaty"), spec, workers(1))
 
 
+@pytest.mark.long
 def test_flying_stops_at_the_first_flight_by_which_the_rate_is_known_well_enough(tmp_path: Path) -> None:
     spec = spec_of(flights=2000, stop="failure rate known to ±6 %")
     interim = flown_into(tmp_path / "out", spec, workers(3))
@@ -257,6 +265,7 @@ def test_the_interval_is_wilson_s() -> None:
     assert (low, high) == pytest.approx((0.01787621, 0.40415005), abs=1e-6)  # statsmodels, proportion_confint
 
 
+@pytest.mark.long
 def test_the_planted_effect_is_found(tmp_path: Path) -> None:
     spec = spec_of(flights=128, sampling="sobol", table={"constants": ["roll_u1"]})
     flown_into(tmp_path, spec, workers(2))
@@ -328,6 +337,7 @@ def test_the_report_has_rates_influences_commands_and_pictures(reported: tuple[P
             "half_interval_95": {}}  # fmt: skip
 
 
+@pytest.mark.long
 def test_a_cell_of_the_failure_map_leads_to_its_flights(reported: tuple[Path, Findings]) -> None:
     path, found = reported
     text = path.read_text(encoding="utf-8")
@@ -381,6 +391,7 @@ def test_a_report_of_nothing_and_of_nothing_that_failed_can_be_written(tmp_path:
     assert "No flight failed a limit." in text
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("sampling", "flights", "method"), [("saltelli", 640, "total Sobol index"), ("morris", 80, "Morris' mu*")]
 )

@@ -62,6 +62,7 @@ def ended(passed: list[bool], order: list[int], flights: int, half_width: float 
     return progress.end, progress.interim
 
 
+@pytest.mark.long
 @settings(max_examples=20)
 @given(st.data())
 def test_a_campaign_ends_at_the_same_flight_whatever_order_its_rows_arrive_in(data: st.DataObject) -> None:
@@ -190,6 +191,7 @@ def test_rows_beyond_the_end_are_dropped_and_a_row_that_came_twice_counts_once(t
     assert rows.table(["index"])["index"].to_pylist() == [0, 1, 2, 3]
 
 
+@pytest.mark.long
 def test_every_point_has_the_row_of_its_flight() -> None:
     """Two profiles fly each point: flights 2 n and 2 n + 1."""
     spec = spec_of(flights=120, profiles=["floaty", "as-flown"])
@@ -301,6 +303,7 @@ def rate_of(failed: np.ndarray, size: int) -> tuple[int, int, float]:
     return fails, flown, min(size, max(1.0, (rare * design + 2 * size) / (rare + 2)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [1, 2, 4])
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.7, 1.0])
 def test_a_campaign_s_rate_is_that_of_the_clusters_of_the_flights_that_are_known(
@@ -349,6 +352,7 @@ def test_the_interval_of_clusters_is_that_of_a_bootstrap_over_the_clusters(alike
     assert (high - low) / (naive[1] - naive[0]) == pytest.approx((1.0 + alike) ** 0.5, rel=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rate", [0.05, 0.2])
 def test_nineteen_of_twenty_intervals_contain_the_rate_of_pairs_that_agree_in_94_percent(rate: float) -> None:
     alike = 1.0 - 0.06 / (2 * rate * (1 - rate))
@@ -439,6 +443,7 @@ def test_a_failure_map_needs_five_failures_and_five_flights_that_hold(failures: 
     assert (found.failure_map is not None) == mapped
 
 
+@pytest.mark.long
 def test_the_logistic_map_is_pulled_to_no_influence_as_by_one_flight_more() -> None:
     """At the optimum the residuals balance the prior, whose precision is an axis' variance; the offset has none."""
     spec = spec_of(flights=40)

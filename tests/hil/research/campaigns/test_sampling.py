@@ -27,6 +27,7 @@ from support.campaigns import spec_of
 SAMPLINGS = {"random": 40, "sobol": 40, "latin": 40, "saltelli": 40, "morris": 40}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sampling", SAMPLINGS)
 def test_a_flight_depends_on_its_number_and_on_nothing_that_was_drawn_before(sampling: str) -> None:
     spec = spec_of(sampling=sampling)
@@ -108,6 +109,7 @@ def test_every_choice_is_as_likely_as_the_others() -> None:
     assert [drawn.count(name) for name in "abc"] == pytest.approx([100, 100, 100], abs=1)
 
 
+@pytest.mark.long
 def test_a_fault_happens_in_its_share_of_the_flights_with_its_distributed_size() -> None:
     spec = spec_of(flights=512, sampling="sobol")
     faults = [draw(spec, index).options["faults"] for index in range(512)]
@@ -135,6 +137,7 @@ def test_each_point_is_flown_by_every_experiment_profile_and_seed() -> None:
     assert {one.options["seed"] for one in drawn} == {10, 11, 12, 13}
 
 
+@pytest.mark.long
 def test_the_table_s_constants_lie_within_its_uncertainty_and_fill_it() -> None:
     spec = spec_of(table={"distribution": "uniform"}, parameters={}, faults=[], flights=256, sampling="sobol")
     drawn = [draw(spec, index).values for index in range(256)]

@@ -12,6 +12,7 @@ from support.command import Cli
 HOVER = 'experiments = ["hover"]\nflights = 64\n'
 
 
+@pytest.mark.long
 def test_the_example_flies_the_hover_on_every_robot_that_the_table_allows() -> None:
     spec = read_spec(find_spec("table"))
     check_spec(spec)

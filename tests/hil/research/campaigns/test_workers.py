@@ -288,6 +288,7 @@ def test_a_runner_flies_its_plans_with_the_same_workers_and_shows_how_far_it_is(
     assert flown[2:] == [(len(os.sched_getaffinity(0)), "")]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_a_signal_completes_the_flight_and_no_other_plan_is_flown(
     flown: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, number: int

@@ -3,7 +3,6 @@
 import math
 import tomllib
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,12 +23,14 @@ from hil.research.design.axes import AXES, HEIGHT, PITCH, ROLL, YAW, Axis, dynam
 from hil.research.design.bounds import HIGH, LOW, SEARCHED, at_bounds, shape_of
 from hil.research.design.gains import _least_cost, gains_of, profile_text
 from hil.research.design.linear import Linear, Point
+from hil.research.design.linear import point_of as shipped
 from hil.research.design.loop import held
 from hil.research.design.sweeps import flat_high
 from hil.research.design.trim import balanced, coefficient_of, scaled
 from hil.world.config import PlantConfig, PlantServoConfig, TunnelConfig
 from hil.world.floaty.geometry import weigh
 from hil.world.floaty.plant import Plant
+from support.paths import ROOT
 
 CONFIG = load_config()
 PAPER = Point(CONFIG.geometry, coefficient_of(CONFIG), math.radians(28.0), 0.0, 0.9)
@@ -93,6 +94,7 @@ def test_gains_cost_least_in_the_gusts_by_bryson_s_rule(axis: Axis) -> None:
         assert cost(gains * (1.0 + step)) > cost(gains)
 
 
+@pytest.mark.long
 def test_an_axis_that_no_input_reaches_is_refused_in_one_line() -> None:
     model = PAPER.linear
     dead = model.B.copy()
@@ -140,24 +142,6 @@ def test_the_flat_robot_falls_over_in_the_time_of_its_pole() -> None:
     assert 2 * math.atan2(plant.q_WB[1], plant.q_WB[0]) == pytest.approx(
         0.002 * math.exp(growth * seconds), rel=0.03
     )
-
-
-# Tests that share a search: pytest-xdist runs them in one process.
-SHARED_SEARCH = pytest.mark.xdist_group("small-search")
-
-
-@cache
-def small_search(figure: str, seed: int) -> search.Optimum:
-    return search.optimise(PAPER, figure, seed, generations=1)
-
-
-@SHARED_SEARCH
-@pytest.mark.long
-def test_searches_from_other_seeds_end_at_the_same_robot() -> None:
-    one, other = (small_search("least-authority", seed).best for seed in (1, 11))
-    assert other.authority == pytest.approx(one.authority, rel=0.002)
-    kinks = [math.degrees(found.point.geometry.kink_angle) for found in (one, other)]
-    assert kinks[0] == pytest.approx(kinks[1], abs=0.5)
 
 
 @pytest.mark.parametrize("name", DESIGNS)
@@ -325,21 +309,29 @@ def test_a_shape_is_the_worse_the_more_it_violates_conditions() -> None:
     assert not shapes.tried
 
 
-@SHARED_SEARCH
 @pytest.mark.long
-def test_the_optimum_keeps_span_mass_speed_and_is_stable_and_steers_around_its_hover() -> None:
-    found = small_search("least-authority", 1)
+def test_the_optimum_keeps_span_mass_speed_is_stable_and_steers_around_its_hover_and_is_that_of_other_seeds() -> (
+    None
+):
+    floaty = shipped(CONFIG)
+    found = search.optimise(floaty, "least-authority", 1, generations=1)
     best = found.best.point
-    assert best.geometry.footprint == PAPER.geometry.footprint
-    assert weigh(best.geometry).mass == pytest.approx(weigh(PAPER.geometry).mass)
-    assert best.speed == pytest.approx(PAPER.speed, rel=1e-9)
+    assert best.geometry.footprint == floaty.geometry.footprint
+    assert weigh(best.geometry).mass == pytest.approx(weigh(floaty.geometry).mass)
+    assert best.speed == pytest.approx(floaty.speed, rel=1e-9)
     for opening in (best.opening - search.RESERVE, best.opening, best.opening + search.RESERVE):
         model = Point(best.geometry, best.coefficient, opening, best.low, best.high).linear
         assert max(model.growth(ROLL), model.growth(PITCH)) < 0.0
         assert min(model.steady(ROLL), model.steady(PITCH)) > 0.0
-    share = authorities(PAPER)
+    share = authorities(floaty)
     assert found.best.authority == pytest.approx(min(v / share[k] for k, v in authorities(best).items()))
     assert found.best.authority == max(one.authority for one in found.tried)
+    other = (ROOT / "tests" / "approved" / "optimise.txt").read_text(encoding="utf-8")  # of seed 11
+    kink = tomllib.loads(other.partition("\n[geometry]\n")[2].partition("\n[")[0])["kink_angle"]
+    assert best.geometry.kink_angle == pytest.approx(kink, abs=math.radians(0.5))
+    assert found.best.authority == pytest.approx(
+        float(other.partition("\nleast-authority: ")[2].partition(";")[0]), rel=0.002
+    )
 
 
 @pytest.mark.parametrize("figure", ["least-authority", "speed-range"])
@@ -399,6 +391,7 @@ def test_every_number_of_a_shape_at_a_bound_of_the_search_is_named(number: int) 
         assert (f"at the {end} bound" in found) if end else not found
 
 
+@pytest.mark.long
 def test_lighter_or_wider_robots_hold_slower_air_in_the_same_proportion(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -67,6 +67,7 @@ def by_differences(plant: Plant, opening: float) -> NDArray[np.float64]:
     return np.array(columns).T
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("geometry", geometries(20))
 def test_linearisation_is_the_central_difference_of_the_flown_plant(geometry: GeometryConfig) -> None:
     speed = speed_at(geometry, 1.3, HOVER)
@@ -200,6 +201,7 @@ def test_roll_stability_and_best_hover_angles_are_those_of_the_specification() -
     assert verdicts["airspeed over m / l²"] == "agrees"
 
 
+@pytest.mark.long
 def test_the_exponent_of_a_power_law_is_that_of_its_ends() -> None:
     for law in sweeps.scaling(PAPER):
         whole = law.x.argmax(), law.x.argmin()
@@ -363,6 +365,7 @@ def test_an_analysis_names_inputs_by_their_units_and_its_pictures_by_what_they_d
     assert found.claims == [(PAPER, "stability", "hover_angles", "scaling", 0.5)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("degrees", "phase", "until"), [(-170.0, 10.0, 10.0), (170.0, 10.0, 350.0), (-90.0, 90.0, 90.0)]
 )

@@ -46,6 +46,7 @@ def task(axis: Axis, delay: float = 0.001) -> GainTask:
     return GainTask(axis, Flow(flat(axis), 0.0, 0.0), CONFIG, NOW, delay)
 
 
+@pytest.mark.long
 def test_margins_are_those_of_a_third_order_plant_with_delay() -> None:
     late = 0.05
 
@@ -73,6 +74,7 @@ def test_the_search_s_delay_margin_is_that_of_python_control(profile: str, axis:
     assert delay_margin(loop.open_loop(gains)) == pytest.approx(margins(loop, gains).delay, rel=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("profile", ["floaty", "design-flat"])
 @pytest.mark.parametrize("axis", AXES, ids=NAMES)
 def test_at_the_gain_margin_the_loop_begins_to_grow(profile: str, axis: Axis) -> None:
@@ -93,6 +95,7 @@ def test_at_the_gain_margin_the_loop_begins_to_grow(profile: str, axis: Axis) ->
         assert radius(0.995 * found.least_gain) > 1.0 > radius(1.005 * found.least_gain)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("axis", AXES, ids=NAMES)
 def test_at_the_delay_margin_the_loop_begins_to_grow(axis: Axis) -> None:
     loop = build(axis, robot_of(CONFIG), CONFIG, NOW)
@@ -129,6 +132,7 @@ def test_the_y_loop_of_the_authors_gains_has_the_pole_that_the_specification_pri
     assert abs(slowest.imag) == pytest.approx(4.9, abs=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("axis", AXES, ids=NAMES)
 def test_poses_may_be_late_up_to_the_margin_and_no_later(axis: Axis) -> None:
     robot, gains = robot_of(CONFIG), gains_in(CONFIG, axis)

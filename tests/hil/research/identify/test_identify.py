@@ -157,6 +157,7 @@ def test_a_poor_log_is_refused(tmp_path: Path, seconds: float, change: Change, r
         identified(tmp_path, flight(5, seconds), change)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("wrong", "reason"),
     [

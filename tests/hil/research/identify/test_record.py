@@ -359,6 +359,7 @@ def excited(seconds: float, period_s: float = 0.02, begin_s: float = 3.0) -> Rec
     return Record("r", t, t, r, r, zero, t, np.zeros((len(t), 6)), 0.0, 0.0, CONFIG, False)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("period_s", [0.01, 0.02, 0.04, 0.05])
 @pytest.mark.parametrize("begin_s", [0.0, 3.0, 0.1, 17.77])
 def test_a_record_of_exactly_as_many_realisations_as_needed_is_used(period_s: float, begin_s: float) -> None:
@@ -451,6 +452,7 @@ def test_a_robot_that_follows_its_model_has_no_disturbance() -> None:
         assert own[1] < 0.1 * power(robot | {name: 1.5 * robot[name]})[1], name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("axis", AXES, ids=[axis.name for axis in AXES])
 def test_a_flow_of_known_density_is_found_on_every_axis(axis: Axis) -> None:
     robot, count, step = robot_of(CONFIG), 60_000, 0.02
@@ -669,6 +671,7 @@ def test_u3_is_straightened_by_the_law_of_flat_plates_sin_phi_cos_phi_squared() 
     assert straight.bent == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.long
 def test_the_bent_accelerations_are_those_of_a_robot_whose_weight_the_plates_carry(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -785,6 +788,7 @@ def test_the_instruments_intervals_are_student_s_with_two_numbers_for_each_line(
     assert found.misfit == max(misfits)
 
 
+@pytest.mark.long
 def test_the_misfit_of_the_instruments_is_one_where_the_scatter_is_as_stated() -> None:
     """On average of many draws: of three lines and two constants four numbers are free."""
     rng, w, model = np.random.default_rng(2), 2 * np.pi * np.array([0.5, 1.0, 3.0]), CONFIG.model
@@ -808,6 +812,7 @@ def test_a_flap_follows_the_held_input_of_which_the_mean_of_two_ticks_is_reporte
     assert flap_response(w, lag, delay) * reported == pytest.approx(held / (1 + 1j * w * lag))
 
 
+@pytest.mark.long
 def test_roll_lifts_a_robot_that_leans_and_no_other() -> None:
     t, zero = 0.02 * np.arange(3000), np.zeros((3000, 3))
     swing, still = 0.02 * np.sin(2 * np.pi * 0.5 * t), np.zeros((3000, 4))

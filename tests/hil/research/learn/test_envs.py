@@ -34,7 +34,8 @@ def actions(count: int, size: float) -> np.ndarray:
     return np.repeat(rng.uniform(-size, size, (-(-count // 5), 4)), 5, axis=0)[:count].astype(np.float32)
 
 
-@pytest.mark.parametrize("fidelity", ["fast", pytest.param("firmware", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("fidelity", ["fast", "firmware"])
 @pytest.mark.parametrize("task", TASKS)
 def test_gymnasium_s_checker_passes(task: str, fidelity: str) -> None:
     env = gymnasium.make(f"floaty/{task}-v0", fidelity=fidelity, duration_s=0.5)
@@ -80,6 +81,7 @@ def test_both_fidelities_fly_alike_in_open_loop_from_the_same_seed(task: str) ->
     whole.close()
 
 
+@pytest.mark.long
 def test_the_law_on_board_sees_what_the_environment_returns() -> None:
     env = make_env("Track", "firmware", duration_s=0.5)
     assert isinstance(env, FirmwareEnv)
@@ -95,6 +97,7 @@ def test_the_law_on_board_sees_what_the_environment_returns() -> None:
     env.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fidelity", ["fast", "firmware"])
 def test_the_same_seed_gives_the_same_bytes(fidelity: str) -> None:
     def flown(seed: int) -> bytes:
@@ -236,6 +239,7 @@ def test_a_step_is_rewarded_for_the_truth_at_its_end(fidelity: str) -> None:
     env.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fidelity", ["fast", "firmware"])
 def test_actions_are_limited_and_forgotten_at_a_reset(fidelity: str) -> None:
     limited, wild = (make_env("Hover", fidelity, duration_s=0.5) for _ in range(2))  # type: ignore[arg-type]
@@ -250,6 +254,7 @@ def test_actions_are_limited_and_forgotten_at_a_reset(fidelity: str) -> None:
         env.close()
 
 
+@pytest.mark.long
 def test_a_push_of_the_fast_model_acts_from_its_instant_on_for_a_tenth_of_a_second() -> None:
     env = make_env("Push", overrides=STILL)
     assert isinstance(env, FastEnv)
@@ -383,6 +388,7 @@ def test_each_robot_flies_in_the_gusts_of_its_own_tunnel_which_stay_as_strong_as
             fleet.advance(np.zeros((400, 4), np.float32), rng)
 
 
+@pytest.mark.long
 def test_robots_are_drawn_from_the_campaign_s_distributions_in_both_fidelities() -> None:
     options: Any = {"robots": "table", "robot_count": 5, "overrides": STILL, "duration_s": 0.2}
     fast, whole = make_env("Hover", "fast", **options), make_env("Hover", "firmware", **options)
@@ -413,6 +419,7 @@ def test_every_robot_is_another_point_of_its_campaign_and_the_user_s_settings_co
     assert {load_config("floaty", one).actuators.tau for one in found} == {0.07}
 
 
+@pytest.mark.long
 def test_faults_act_in_the_laboratory() -> None:
     env = make_env("Hover", "firmware", duration_s=1.0, faults=["servo.stuck.2@0.1"])
     assert isinstance(env, FirmwareEnv)

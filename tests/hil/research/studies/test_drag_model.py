@@ -58,6 +58,7 @@ def by_the_paper(flaps: NDArray[np.float64], kink: float, drag_coefficient: floa
     return total
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kink", [0.0, math.radians(42.5)])
 @settings(max_examples=40, deadline=None)
 @given(flaps=FLAPS)
@@ -79,6 +80,7 @@ def test_drag_coefficient_of_the_kinked_robot_is_that_of_the_specification() -> 
     assert WEIGHT / by_the_paper(hover, math.radians(42.5), 1.0)[2] == pytest.approx(1.353, rel=1e-3)
 
 
+@pytest.mark.long
 def test_samples_follow_each_other_every_millisecond_after_the_start() -> None:
     class Clamped:
         p_WB, q_WB = np.zeros(3), np.zeros(4)

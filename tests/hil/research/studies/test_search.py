@@ -118,6 +118,7 @@ def test_whole_numbers_stay_whole(tmp_path: Path) -> None:
     assert isinstance(after.value(7.6), int)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("text", "reason"), [
     *((f"controller.gain_y={bounds}", "expected KEY=LOW..HIGH") for bounds in ("1..1", "2..1", "-inf..1", "0..inf", "nan..1",
       "a..1", "1", "1..")), ("gain_y=1..2", "expected KEY=LOW..HIGH"),

@@ -46,6 +46,7 @@ def test_something_is_expected_of_every_variant_and_only_of_sizes_that_are_flown
         assert said <= set(study.sizes), variant.name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
 def test_sizes_of_a_study_change_the_flight(study: Study) -> None:
     for variant in study.variants:
@@ -80,6 +81,7 @@ FAULTS = {"dropout": "mocap.dropout", "swap": "mocap.swap", "gyro-noise": "imu.n
     "design-pushes": "push.roll"}  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
 def test_a_flight_has_the_size_of_its_study_and_what_the_variant_s_name_says(study: Study) -> None:
     """Sizes are in the study's unit; faults begin 2 s after the release, and last to the end or for the size."""

@@ -36,6 +36,7 @@ def test_the_profile_cad_has_the_plate_model_on_board() -> None:
     assert cad.controller == load_config("as-flown").controller
 
 
+@pytest.mark.long
 def test_an_axis_is_judged_by_old_and_new_gains_for_its_robot_and_by_the_worst_of_all(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

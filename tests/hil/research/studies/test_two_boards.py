@@ -51,6 +51,7 @@ def bumped(columns: Columns) -> None:
     columns["imu.gx"][RELEASE + 2 :] += 1
 
 
+@pytest.mark.long
 def test_a_board_that_closes_its_loop_earlier_differs_by_its_boot_time(flown: Path, tmp_path: Path) -> None:
     def change(columns: Columns) -> None:
         state = columns["supervisor.state"]
