@@ -12,10 +12,10 @@ fly: .venv/fly.stamp
 test: .venv/test.stamp
 	$(BIN)/python -m pytest -n auto
 
-# Real-time tests mostly wait: four run side by side. One that fails is repeated alone and listed as RERUN: repair what appears there.
+# Real-time tests mostly wait: three run side by side. One that fails is repeated alone and listed as RERUN: repair what appears there.
 test-all: .venv/test.stamp
 	$(BIN)/python -m pytest -n auto --dist worksteal -m 'not realtime' --durations 20
-	$(BIN)/python -m pytest -n 4 --dist loadfile -m realtime --reruns 2 -rsREf --durations 20
+	$(BIN)/python -m pytest -n 3 --dist loadfile -m realtime --reruns 2 -rsREf --durations 20
 
 # The outputs of tests/approved as they are now: read what git shows of them, and commit what was meant.
 approve: .venv/test.stamp
