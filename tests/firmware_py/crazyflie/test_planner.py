@@ -345,6 +345,20 @@ def test_a_path_in_flight_begins_at_the_goal_of_its_instant_between_two_set_poin
     assert (*after.position, *after.velocity) == pytest.approx((*before.position, *before.velocity), abs=1e-9)
 
 
+@pytest.mark.parametrize("mask", [0, 1, 6])
+def test_a_command_to_groups_moves_the_robots_whose_mask_has_one_of_them(mask: int) -> None:
+    board = SimpleNamespace(estimate=lambda: REST, admits=lambda places: True)
+    for groups in range(8):
+        commander = HighLevelCommander(board, lambda kind, text: None)
+        assert commander.execute(bytes((PathCommand.SET_GROUP_MASK, 7)), 0.0) == 0
+        assert commander.execute(bytes((PathCommand.SET_GROUP_MASK, mask)), 0.0) == 0, "also when blocked"
+        assert commander.defaults.groups == mask
+        commander.block(False)
+        take_off = struct.pack("<BBff?f", PathCommand.TAKE_OFF, groups, 0.5, 0.0, True, 2.0)
+        assert commander.execute(take_off, 1.0) == 0
+        assert commander.planner.rests == (groups != 0 and not groups & mask)
+
+
 @pytest.mark.parametrize("relative", [False, True])
 @pytest.mark.parametrize("velocity", [0.0, -1.0])
 def test_without_a_velocity_a_take_off_and_a_landing_have_each_their_own(

@@ -67,6 +67,13 @@ def test_a_robot_that_has_landed_may_take_off_again(flying: Bench) -> None:
     assert flying.look(TAKE_OFF_AT + 2040) is State.FLYING
 
 
+def test_a_second_landing_lasts_as_long_as_the_first(flying: Bench) -> None:
+    for take_off in (TAKE_OFF_AT, 5000):
+        assert flying.look(take_off) is State.FLYING
+        ticks = (take_off + 2000, take_off + 4990)
+        assert [flying.look(tick, turning=False) for tick in ticks] == [State.LANDED, State.LANDED]
+
+
 @pytest.mark.parametrize(("after_ms", "state"), [(30_000, State.READY), (30_001, State.CHECKS_NOT_PASSED)])
 def test_a_robot_that_does_not_take_off_is_checked_again_after_half_a_minute(
     after_ms: int, state: State

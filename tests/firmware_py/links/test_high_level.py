@@ -114,6 +114,18 @@ def test_a_reason_that_comes_again_after_a_followed_set_point_is_named_again(abs
             absolute.wait(0.48)
 
 
+def test_why_set_points_are_not_followed_is_said_once_until_one_is_followed(
+    absolute: Flyer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = list[str]()
+    monkeypatch.setattr(absolute.firmware.pilot, "_refuse", lambda kind, text: said.append(text))
+    for place in (90.0, 90.0, HERE[0], 90.0, 90.0):
+        absolute.post(absolute.low_level.send_position_setpoint, place, *HERE[1:], 0.0)
+        absolute.wait(0.02)
+    box = "it leaves the box, see box.radius, box.below and box.above"
+    assert said == [f"commander: set-point not followed: {box}"] * 2
+
+
 def test_to_ask_whether_a_place_is_admitted_changes_nothing_that_flies(absolute: Flyer) -> None:
     data = absolute.firmware._core.data.fields
     data.goal[:], data.goal_velocity[:], data.goal_kind = (1, 2, 3, 4), (5, 6, 7), i32(GOAL_OF_CORRECTIONS)
