@@ -355,6 +355,25 @@ def test_nothing_is_in_the_air_before_a_flight_and_five_seconds_after_it_was_sto
         bench.fly(10_000)
 
 
+def test_the_flaps_are_under_control_in_every_mode_but_the_hover() -> None:
+    bench = SupervisorBench()
+    for mode in (MODE_HOVER, MODE_FLY, MODE_MANUAL):
+        bench.data.mode = mode
+        assert bench.view.controlling is (mode != MODE_HOVER)
+
+
+@pytest.mark.parametrize("locks", [False, True])
+def test_floaty_s_own_stop_reads_as_one_that_can_be_undone(locks: bool) -> None:
+    firmware = CrtpClient().firmware
+    read = {one.name: one.read for one in firmware.parameters}
+    for stopped in (False, True):
+        if stopped:
+            supervisor = firmware._supervisor
+            (supervisor.emergency_stop if locks else supervisor.stop)()
+        shown = tuple(bool(read[f"{group}.stop"]()) for group in ("floaty", "stabilizer"))
+        assert shown == (stopped and not locks, stopped and locks)
+
+
 def test_flaps_that_are_moved_by_hand_are_not_at_rest() -> None:
     bench = SupervisorBench()
     bench.data.manual_mode = structs.MANUAL_ANGLES

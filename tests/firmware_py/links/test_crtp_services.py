@@ -252,6 +252,19 @@ def test_newer_start_counts_in_milliseconds_a_stop_ends_it_and_period_zero_sends
     assert len(client.packets(LOG, 2)) <= 1
 
 
+def test_a_period_in_milliseconds_has_two_bytes_and_one_in_tens_has_one(client: CrtpClient, logs) -> None:
+    assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
+    malformed = client.firmware.link.malformed
+    for start, count in ((struct.pack("<BBH", 8, 1, 0x0104), 1), (struct.pack("<BBH", 3, 1, 0x010D), 3)):
+        assert client.one(LOG, 1, start) == start[:2] + b"\0"
+        client.sent.clear()
+        client.run(client.now_us + 400_000)
+        assert len(client.packets(LOG, 2)) == count
+    for start in (bytes((8, 1)), bytes((8, 1, 4)), bytes((3, 1))):
+        assert client.ask(LOG, 1, start) == []
+    assert client.firmware.link.malformed == malformed + 3
+
+
 def test_at_most_128_variables_are_in_blocks(client: CrtpClient, logs) -> None:
     number = logs["supervisor.state"][0]
     assert client.create(16, (1, len(logs) - 1)) == 0

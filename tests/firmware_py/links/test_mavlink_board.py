@@ -944,6 +944,35 @@ def test_the_boards_own_frames_are_ignored_when_they_come_back(client: MavlinkCl
     assert client.firmware.signals.supervisor.armed
 
 
+@pytest.mark.parametrize("radio", [False, True])
+@pytest.mark.parametrize("serial", [False, True])
+def test_a_client_on_either_line_is_one_for_the_core(
+    client: MavlinkClient, radio: bool, serial: bool
+) -> None:
+    client.polling = False
+    client.firmware.link._heard_us = client.now_us - (0 if radio else 1_000_000)
+    client.stack._heard_us = client.now_us - (0 if serial else 3_000_000)
+    client.run(client.now_us + 11_000)
+    assert bool(client.firmware._core.data.fields.connected) is (radio or serial)
+
+
+def test_while_interrupts_are_off_nothing_arrives_and_bytes_wait_in_the_uart(client: MavlinkClient) -> None:
+    firmware, link = client.firmware, client.firmware.link
+    client.run(client.now_us + 500)
+    for off in (1, 0):
+        firmware.kernel._interrupts_off[0] = off
+        for tell in (firmware.radio_polled, lambda: firmware.radio_received(b"\xf0")):
+            link._heard_us = -1
+            tell()
+            assert (link._heard_us == -1) == off
+        client.send("ping", 1234, 5, 0, 0)
+        firmware.imu_ready()
+        given = len(firmware.flight_tasks.imu_ready), len(client.stack._received), len(link._syslink)
+        assert (sum(given) == 0) == off
+    assert given == (1, 1, 1)
+    assert len(client.uplink) > 0
+
+
 @pytest.mark.long
 def test_a_client_is_there_for_three_seconds_after_its_last_message(client: MavlinkClient) -> None:
     client.run(10_000_000)

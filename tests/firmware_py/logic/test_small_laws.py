@@ -250,6 +250,9 @@ def test_all_refusals_come_at_once_in_the_order_of_their_lines(
 def test_a_file_that_is_no_law_is_refused(cli: Cli, tmp_path: Path) -> None:
     assert cli("check", tmp_path / "missing.py") == 2
     assert cli.err == f"{tmp_path / 'missing.py'}: No such file or directory\n"
+    (tmp_path / "latin.py").write_bytes(b"# Newton\xe9\n")
+    assert cli("check", tmp_path / "latin.py") == 2
+    assert cli.err.startswith(f"{tmp_path / 'latin.py'}: 'utf-8' codec can't decode byte 0xe9")
     (tmp_path / "test_it.py").write_text("def test_it():\n    pass\n")
     assert cli("check", tmp_path / "test_it.py") == 2
     assert cli.err.endswith(
