@@ -134,6 +134,14 @@ def test_a_written_value_is_in_force_and_is_read_back(bench: Bench) -> None:
     assert ask(bench, ControlAction.WRITE, "extCtrl.y_P", 0.1 - 1).error == ""  # as float32
 
 
+def test_controls_that_were_asked_nothing_have_no_answer_and_take_no_message(bench: Bench) -> None:
+    bench.firmware.radio_received(crtp.encode(crtp.Packet(crtp.PORT_PARAMETERS, 1, bytes(2))))
+    for _ in range(5):
+        bench.turn()
+        assert not bench.controls.busy
+        assert bench.controls.answer(bench.now_us) is None
+
+
 def test_a_value_that_is_not_allowed_changes_nothing_and_is_one_line(bench: Bench) -> None:
     before = on_board(bench, "extCtrl.y_P")
     told = ask(bench, ControlAction.WRITE, "extCtrl.y_P", 1e9)

@@ -162,6 +162,16 @@ def test_a_goal_that_leaves_home_is_sent_until_the_landing() -> None:
     assert (last_us, end.channel) == (11_700_000, setpoints.CHANNEL_NOTICE)
 
 
+def test_a_moving_goal_is_sent_with_every_pose_however_close_they_are() -> None:
+    goal = Goal((0.1, 0.2, 1.3), 0.4)
+    flown, begin_us = Flown(Hold(goal), 8.0), 8_000_000
+    flown.sent.clear()
+    for now_us in range(begin_us, begin_us + 5):
+        flown.link.send(now_us, MocapFrame(now_us, (1.0, 2.0, 3.0), (0.5, 0.5, 0.5, 0.5), True), goal)
+    for port in (crtp.PORT_LOCALISATION, crtp.PORT_GENERIC_SETPOINT):
+        assert [us - begin_us for us, _ in flown.of(port)] == [0, 1, 2, 3, 4]
+
+
 @pytest.mark.parametrize(("away", "sent"), [(AWAY, False), (1.01 * AWAY, True)])
 def test_a_goal_within_a_millimetre_of_home_is_home(away: float, sent: bool) -> None:
     flown = Flown(Offsets(HOME, 8_000_000, y=Step(away)), 13.0)

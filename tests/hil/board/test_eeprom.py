@@ -6,6 +6,7 @@ from firmware_py.wire.memories import CONFIG_SIZE, decode_config
 from hil.board.eeprom import factory_config
 from hil.board.pins import VirtualBoard
 from hil.config import load_config
+from hil.emulator.crazyflie.config import RadioConfig
 from hil.errors import LabError
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.lockstep import lockstep_flight
@@ -15,14 +16,23 @@ from hil.servers.server import Server, Service
 RATES = ("250K", "1M", "2M")
 
 
+ADDRESSES = [
+    ("", 1, "E7E7E7E7E7"), ("", 2, "E7E7E7E702"), ("", 16, "E7E7E7E710"), ("E7E7E7E700", 1, "E7E7E7E700"),
+    ("e7e7e7e700", 4, "E7E7E7E703"), ("E7E7E7E7FF", 2, "E7E7E7E800"), ("FFE7E7E7D7", 16, "FFE7E7E7E6"),
+]  # fmt: skip
+
+
+def test_a_block_has_the_radio_of_the_profile_and_the_address_of_its_board() -> None:
+    for first, number, own in ADDRESSES:
+        for channel, rate in ((37, 250_000), (2, 1_000_000), (125, 2_000_000)):
+            radio = RadioConfig(address=first, channel=channel, bits_per_second=rate)
+            read = decode_config(factory_config(number, radio))
+            assert (f"{read.address:010X}", read.channel) == (own, channel)
+            assert read.data_rate == (250_000, 1_000_000, 2_000_000).index(rate)
+
+
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("first", "number", "own"),
-    [
-        ("", 1, "E7E7E7E7E7"), ("", 2, "E7E7E7E702"), ("", 16, "E7E7E7E710"), ("E7E7E7E700", 1, "E7E7E7E700"),
-        ("e7e7e7e700", 4, "E7E7E7E703"), ("E7E7E7E7FF", 2, "E7E7E7E800"), ("FFE7E7E7D7", 16, "FFE7E7E7E6"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("first", "number", "own"), ADDRESSES)
 def test_boards_count_up_from_the_first_address_in_lockstep_and_served(
     first: str, number: int, own: str
 ) -> None:
