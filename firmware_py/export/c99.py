@@ -13,6 +13,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from math import prod
 from pathlib import Path
 
@@ -68,7 +69,15 @@ def translate(texts: Mapping[str, str] | None = None, own: Mapping[str, str] = N
 
     Raises `ExportError` for anything outside the subset.
     """
-    texts = core_texts() if texts is None else texts
+    return _default_core() if texts is None else _translated(texts, own)
+
+
+@cache
+def _default_core() -> Translation:
+    return _translated(core_texts(), NO_PATHS)
+
+
+def _translated(texts: Mapping[str, str], own: Mapping[str, str]) -> Translation:
     modules = read_modules(texts, own)
     kernels = [thing for module in modules for thing in module.defined if isinstance(thing, Signature)]
     _rename_equal_constants(modules)
