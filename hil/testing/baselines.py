@@ -55,7 +55,7 @@ def file_of(home: Path, name: str) -> Path:
 
 def write(path: Path, flights: Sequence[Pinned]) -> None:
     """Write a baseline, a row of the path on each line."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(exist_ok=True)
     texts = []
     for one in flights:
         head = json.dumps({**asdict(one), "path": []}, indent=1).removesuffix("[]\n}")

@@ -38,12 +38,14 @@ def links(run: Path) -> Iterator[Links]:
 
 
 def answer(links: Links, path: str, **headers: str) -> tuple[int, str | None, str]:
-    """Status, where it leads, and what it says."""
+    """Status, where it leads, and what it says; with a page or a text of its own, in UTF-8, and nothing else."""
     connection = http.client.HTTPConnection(HOST, links.server_port, timeout=10)
     connection.request("GET", path, headers=headers)
     response = connection.getresponse()
     told = response.status, response.headers["Location"], response.read().decode()
     connection.close()
+    kinds = {200: "text/html; charset=utf-8", 302: None}
+    assert response.headers["Content-Type"] == kinds.get(told[0], "text/plain; charset=utf-8")
     return told
 
 

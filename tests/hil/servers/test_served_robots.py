@@ -236,6 +236,21 @@ def test_each_robot_has_a_seed_and_a_radio_chip_of_its_own(monkeypatch: pytest.M
     assert set(seeds) == {5, 6, 7}
 
 
+@pytest.mark.parametrize("watcher", [None, Watcher()], ids=["alone", "watched"])
+def test_only_a_robot_that_is_watched_has_rows_and_a_load_that_a_fault_may_add(
+    watcher: Watcher | None,
+) -> None:
+    config = load_config(overrides=["flight.home=[0.1,-0.2,1.2]"])
+    with closing(Server(Service(config), print, watcher)) as server:
+        assert (server.robot._thief is None, server._shown is None) == (watcher is None, watcher is None)
+        if server._shown is not None and watcher is not None:
+            server._shown.row(20_000)
+            server._shown.pass_rows()
+            (row,) = pa.Table.from_batches(watcher.batches).to_pylist()
+            assert [row[f"goal.{axis}"] for axis in ("x", "y", "z", "yaw")] == [0.1, -0.2, 1.2, 0.0]
+            assert (row["t"], "cpu.THIEF" in row) == (20_000, True)
+
+
 def test_a_radio_port_that_is_taken_is_named() -> None:
     with (
         socket.create_server(("127.0.0.1", 0)) as taken,

@@ -2,6 +2,9 @@
 
 import math
 import pickle
+from collections.abc import Callable
+from types import SimpleNamespace as Made
+from typing import Any
 
 import pytest
 from hypothesis import find, given, settings
@@ -39,6 +42,45 @@ def test_every_size_of_a_kind_s_grid_can_be_asked_for_alone() -> None:
         )
         for size in (round(none + index * step, 9) for index in indices):
             strategies._sizes(kind, (size, size))  # it raises for one that is not on the grid
+
+
+class Every(tuple[float, ...]):
+    """In place of a strategy: all that it may draw."""
+
+    def map(self, value_of: Callable[[Any], float]) -> "Every":
+        return Every(map(value_of, self))
+
+
+@pytest.fixture
+def _every(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(st, "integers", lambda low, high: Every(range(low, high + 1)))
+
+
+@pytest.mark.usefixtures("_every")
+def test_sizes_reach_from_bound_to_bound_of_every_kind_and_each_can_be_asked_for_alone() -> None:
+    for kind in (one for one in KINDS.values() if one.sized):
+        step = strategies._round_step((kind.high - kind.low) / strategies.GRID)
+        sizes: Any = strategies._sizes(kind, None)
+        assert -1e-9 <= sizes[0] - kind.low < step, kind.meaning
+        assert -1e-9 <= kind.high - sizes[-1] < step, kind.meaning
+        for one in sizes[:: len(sizes) // 20]:
+            assert strategies._sizes(kind, (one, one)) == (one,), kind.meaning
+
+
+@pytest.mark.usefixtures("_every")
+def test_goals_reach_equally_far_on_each_axis_and_turn_by_what_is_allowed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(st, "tuples", lambda *parts: parts)
+    monkeypatch.setattr(st, "lists", lambda goal, max_size: Made(map=lambda make: (goal, max_size, make)))
+    found: Any = trajectories(reach_m=0.29, turn_rad=math.radians(15), every_s=0.5, most=3)
+    goal, most, make = found
+    lengths, turns = [0.01 * n for n in range(-29, 30)], [math.radians(5 * n) for n in range(-3, 4)]
+    assert ([*map(pytest.approx, (lengths, lengths, lengths, turns))], most) == ([*map(list, goal)], 3)
+    goals = [(0.01, 0.02, 0.03, 0.04), (0.0, 0.0, 0.0, 0.0)]
+    assert make(goals) == Along(Waypoints(0.5, tuple(goals)))
+    begins: Any = strategies._grid(0.3, 0.7)
+    assert begins == (0.3, 0.4, 0.5, 0.6, 0.7)
 
 
 @given(fault=faults("push.y", size=(-1.0, 0.5)))

@@ -1,6 +1,7 @@
 """The files of a processor profile and of coverage from values written by hand, and the instants of `floaty debug`."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,9 +22,9 @@ from hil.emulator.stm32f405.cpu_profile import (
 )
 from hil.errors import LabError
 from hil.laboratory.experiments.position import HOVER
-from hil.laboratory.files import debugging
+from hil.laboratory.files import coverage, cpu_profile, debugging
 from hil.laboratory.files.coverage import Executed, add_executed, base_of, check_coverage, read_executed
-from hil.laboratory.files.cpu_profile import files_of, write_profile
+from hil.laboratory.files.cpu_profile import Profiler, files_of, write_profile
 from hil.laboratory.files.debugging import begin_us
 from hil.laboratory.request import Bench, Request
 
@@ -92,6 +93,28 @@ def test_a_profile_names_every_share_once_and_the_greatest_first(tmp_path: Path)
     }  # fmt: skip
 
 
+def test_a_profile_is_of_every_byte_of_every_function_and_read_at_the_flight_s_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    functions = [SimpleNamespace(address=0x100, size=4), SimpleNamespace(address=0x108, size=0x20)]
+    charged: list[tuple[int, int]] = []
+    written: list[Any] = []
+    monkeypatch.setattr(cpu_profile, "functions_of", {"image": functions}.get)
+    monkeypatch.setattr(cpu_profile, "Reader", lambda *given: SimpleNamespace(read=lambda: given))
+    monkeypatch.setattr(cpu_profile, "write_profile", lambda *given: written.append(given))
+    chip, kernel = SimpleNamespace(profile=charged.extend), SimpleNamespace(task_names="names", ahead_us=7)
+    firmware: Any = SimpleNamespace(image="image", chip=chip, kernel=kernel, report=lambda: IMAGE)
+    profiler = Profiler(tmp_path / "new" / "out")
+    profiler.begin(firmware)
+    assert charged == [(0x100, 0x104), (0x108, 0x128)]
+    assert profiler.out.parent.is_dir()
+    profiler.report(firmware, tmp_path)
+    assert written == [(profiler.out, tmp_path, ("image", chip, "names", 7), IMAGE)]
+    for folder in (tmp_path, Path()):
+        with pytest.raises(LabError, match=f"^--profile-cpu {folder}: a folder; expected the beginning"):
+            Profiler(folder).begin(firmware)
+
+
 def test_the_counts_of_flights_add_up_beyond_32_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     out = tmp_path / "cov.v1"
@@ -114,6 +137,28 @@ def test_the_counts_of_flights_add_up_beyond_32_bits(tmp_path: Path, monkeypatch
     ]
     with pytest.raises(LabError, match="has the coverage of another image"):
         check_coverage(out, "other")
+
+
+def test_a_flight_adds_its_counts_to_the_file_that_is_there_when_it_has_the_lock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While it waits for the lock of the first file, another flight puts a second one in its place."""
+    one = Executed("image", 1, np.eye(2**19 + 1, 3, dtype=np.uint64), "board", None)
+    out, kept = tmp_path / "cov", tmp_path / "cov.counts"
+    add_executed(out, one)
+    locked: list[Any] = []
+
+    def lock(file: Any, how: int) -> None:
+        locked.append(file)
+        if len(locked) == 1:
+            shutil.copy(kept, tmp_path / "second")
+            (tmp_path / "second").replace(kept)
+
+    monkeypatch.setattr("fcntl.flock", lock)
+    monkeypatch.setattr(coverage, "_read", lambda path, file: locked.append(file) or one)
+    add_executed(out, one)
+    assert len(locked) == 3
+    assert locked[2] is locked[1]
 
 
 def test_a_flight_is_debugged_from_before_its_crash_or_a_time(tmp_path: Path) -> None:
