@@ -1,6 +1,7 @@
 """`floaty board doctor`: what is connected, in plain words, on the exported app."""
 
 import ctypes
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from firmware_py.wire.core_port import (
     HEAD,
     PORT_CORE,
     READ_MAX,
+    WRITE_MAX,
     Health,
     Hil,
     Loop,
@@ -163,6 +165,48 @@ def test_the_core_is_reset_and_called_in_the_order_of_a_tick(
     client = CoreClient(board, "board")
     assert doctor._core(client, client.begin(), load_config()).good
     assert called == ["reset", *20 * ["estimate", "supervise", "control"]]
+
+
+@pytest.mark.parametrize("kept", [bytes, lambda size: b"\xff" * size], ids=["zeros", "ones"])
+def test_a_memory_that_keeps_nothing_is_found(
+    kept: Callable[[int], bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doctor, "write", lambda at, data: (at, data))
+    written: list[tuple[int, bytes]] = []
+    client: Any = SimpleNamespace(execute=written.extend, memory=kept)
+    found = doctor._memory(client, 1000)
+    data = b"".join(piece for _, piece in written)
+    wrong = sum(one != other for one, other in zip(data, kept(1000), strict=True))
+    assert [at for at, _ in written] == [*range(0, 1000, WRITE_MAX)]
+    assert found == doctor.Finding("memory", f"1000 B written and read back, {wrong} of them wrong", False)
+    assert wrong > 900
+
+
+@pytest.mark.parametrize("wrong", [0, 3])
+def test_cycles_are_those_of_a_call_of_each_entry_point(wrong: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    loads = {name: SimpleNamespace(cycles=20 * n + 7) for n, name in enumerate(("estimate", "control"), 300)}
+    core = SimpleNamespace(call=lambda name: None, load=loads, unexpected=wrong)
+    monkeypatch.setattr(doctor, "RealCore", lambda blocks, client: core)
+    found = doctor._core(SimpleNamespace(name="b"), SimpleNamespace(clock_mhz=168), load_config())  # type: ignore[arg-type]
+    verdict = "OTHER bits than here in 3 calls" if wrong else "the same bits as here"
+    assert found.text == f"{verdict}; estimate 300 cycles, control 301, at 168 MHz"
+    assert found.good is (wrong == 0)
+
+
+def test_a_board_is_examined_from_its_firmware_to_the_loop_with_the_profile_s_poses(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    about, config = SimpleNamespace(size=77), load_config(overrides=["mocap.period_us=5_000"])
+    client: Any = SimpleNamespace(begin=lambda: about)
+    monkeypatch.setattr(doctor, "_firmware", lambda *given: SimpleNamespace(good=True, given=given))
+    for name in ("_link", "_memory", "_core", "_loop"):
+        monkeypatch.setattr(doctor, name, lambda *given, name=name: (name, *given[1:]))
+    for name in ("_app", "_health"):
+        monkeypatch.setattr(doctor, name, lambda *given, name=name: iter([(name, *given)]))
+    firmware, *found = doctor.examine(client, config)
+    assert firmware.given == (client,)  # type: ignore[attr-defined]
+    assert found == [("_app", about, config), ("_link", 200.0), ("_memory", 77), ("_health", client),
+        ("_core", about, config), ("_loop",)]  # fmt: skip
 
 
 @pytest.mark.long

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from hil.errors import LabError
 from hil.laboratory.experiments import EXPERIMENTS, find_experiment
 from hil.laboratory.lockstep import ModelledLine
-from hil.laboratory.swarms.flying import Crowd
+from hil.laboratory.swarms.flying import SHOWN_US, SLICE_US, Crowd, _fly_in_turn
 from hil.laboratory.swarms.folder import other_swarm_in, swarm_folder, swarm_reserved
 from hil.laboratory.swarms.request import SwarmRequest, places_of, swarm_of
 from hil.laboratory.swarms.result import SWARM, Nearest, SwarmResult, folder_name, write_swarm
@@ -241,3 +241,41 @@ def test_a_swarm_is_named_by_its_first_robot_and_gets_the_first_folder_that_hold
     (tmp_path / "pushes-7-x3-2" / folder_name(3)).mkdir()
     (tmp_path / "pushes-7-x3-2" / folder_name(3) / "something").touch()
     assert other_swarm_in(tmp_path / "pushes-7-x3-2", request), "robot 3's folder holds something"
+
+
+class Turn:
+    """A robot that flies to its end, and notes what is asked of it."""
+
+    def __init__(self, name: str, end_us: int, asked: list[tuple[Any, ...]]) -> None:
+        self.flight, self.over = SimpleNamespace(end_us=end_us), False
+        self._note = lambda *what: asked.append((name, *what))
+
+    def begin(self) -> None:
+        self._note("begins")
+
+    def fly_to(self, now_us: int) -> None:
+        self._note(now_us)
+        self.over = now_us >= self.flight.end_us
+
+    def interrupt(self) -> None:
+        self._note("interrupted")
+
+
+@pytest.mark.parametrize("stopped_us", [None, 2 * SLICE_US])
+def test_robots_fly_in_turn_to_the_last_one_s_end_and_ctrl_c_ends_them_all(stopped_us: int | None) -> None:
+    asked, shown = list[Any](), list[tuple[int, int]]()
+    ends = {"a": SHOWN_US, "b": 2 * SHOWN_US, "c": SHOWN_US}
+
+    def exchange(now_us: int) -> None:
+        asked.append(("all", now_us))
+        if now_us == stopped_us:
+            raise KeyboardInterrupt
+
+    started: Any = [Turn(name, end_us, asked) for name, end_us in ends.items()]
+    crowd: Any = SimpleNamespace(exchange=exchange)
+    _fly_in_turn(started, crowd, lambda now_us, end_us: shown.append((now_us, end_us)))
+    last_us = stopped_us or 2 * SHOWN_US
+    turns = [(name, now_us) for now_us in range(SLICE_US, last_us + 1, SLICE_US) for name in (*ends, "all")]
+    ended = [(name, "interrupted") for name in ends if stopped_us]
+    assert asked == [*((name, "begins") for name in ends), *turns, *ended]
+    assert shown == [(now_us, 2 * SHOWN_US) for now_us in range(SHOWN_US, last_us + 1, SHOWN_US)]

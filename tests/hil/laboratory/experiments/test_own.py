@@ -355,6 +355,15 @@ def test_a_broken_package_is_one_line_and_hides_no_other(cli: Cli, text: str, en
 
 
 @pytest.mark.usefixtures("site")
+def test_an_installed_experiment_is_found_by_the_name_of_its_entry_and_has_the_hash_of_its_file() -> None:
+    install("wide = " + PLAIN % "")
+    found = find_experiment("wide-eight")
+    digest = hashlib.sha256(Path("site/eights/flights.py").read_bytes()).hexdigest()
+    assert (found.name, found.source) == ("mine", Source("wide-eight", digest, "eights 1.2"))
+    assert find_again("mine", found.source) == found
+
+
+@pytest.mark.usefixtures("site")
 def test_an_experiment_that_ships_goes_before_an_installed_one() -> None:
     install("wide = " + PLAIN % "", "hover = eights.flights:wide")
     assert find_experiment("hover") is EXPERIMENTS["hover"]
@@ -390,3 +399,10 @@ def test_each_file_imports_the_module_that_is_beside_it(tmp_path: Path) -> None:
     assert found == ["first", "second", "first"]
     places = [str(tmp_path / name) for name in ("first", "second")]
     assert [path for path in sys.path if path in places] == places
+
+
+def test_a_file_named_like_a_module_that_is_no_user_s_does_not_take_its_place(tmp_path: Path) -> None:
+    (tmp_path / "json.py").write_text("")
+    (tmp_path / "own.py").write_text("import json\n")
+    assert load_file("--experiment", tmp_path / "own.py")[0].json is json
+    assert sys.modules["json"] is json

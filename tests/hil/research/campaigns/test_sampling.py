@@ -1,6 +1,8 @@
 """Flight number i is a function of (spec, i): the same in any order, with the distributions that the spec names."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,12 +11,14 @@ from scipy import stats
 
 from hil.config import load_config
 from hil.errors import LabError
+from hil.laboratory.request import Options
 from hil.research.campaigns.config import Distribution, SampledFault, Spec
 from hil.research.campaigns.sampling import (
     as_flown,
     axes,
     check_design,
     cluster_of,
+    covered,
     draw,
     plan_of,
     points_of,
@@ -190,6 +194,14 @@ def test_a_campaign_over_seeds_alone_has_no_axes() -> None:
     spec = spec_of(parameters={}, faults=[], flights=3)
     assert axes(spec) == ()
     assert [draw(spec, index).options["seed"] for index in range(3)] == [1, 2, 3]
+
+
+def test_flights_add_their_coverage_to_one_file_wherever_they_are_flown() -> None:
+    plan = plan_of(spec_of())
+    for index in (0, 1):
+        one, other = covered(plan, Path("cov")).job(index), plan.job(index)
+        assert one.options == other.options | Options(coverage=Path.cwd() / "cov")
+        assert replace(one, options=other.options) == other
 
 
 def test_points_as_flown_say_which_faults_happened_and_nothing_of_those_that_did_not() -> None:

@@ -1,5 +1,6 @@
 """The drag model: the paper's equations by other means, the plant's plates, and what is measured in the tunnel."""
 
+import csv
 import math
 import re
 from itertools import islice, product
@@ -136,5 +137,9 @@ def test_the_page_has_a_picture_and_the_largest_misses_of_each_robot_and_sweep(
     assert re.findall(r"<td>([\d.]+)</td>", page) == largest
     captions = re.findall(r"differ by at most (\S+) N and (\S+) N m", page)
     assert captions == [(f"{0.03 * n:.2f}", f"{0.005 * n:.3f}") for n in (1, 2, 3, 4)]
+    header, *lines = csv.reader((tmp_path / "drag_model.csv").read_text().splitlines())
+    assert header[:6] == ["robot", "sweep", "angle_deg", "force_x_model", "force_x_mean", "force_x_deviation"]
+    assert lines[0][:9] == ["flat", SWEEPS[0].name, "0", "0", "0.02", "1", "0", "0.01", "1"]
+    assert (len(lines), {len(line) for line in lines}) == (16, {len(header)})
     names = {f"drag_model_{robot}_{sweep.name}.png" for robot, sweep in product(("flat", "kinked"), SWEEPS)}
     assert {path.name for path in tmp_path.iterdir()} == {"drag_model.csv", "drag_model.html", *names}
