@@ -4,6 +4,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from firmware_py.config import parameters_of
 from firmware_py.core.subset import F64s
 from firmware_py.core_runner import CoreBlocks, PlainRunner, default_runner
 from firmware_py.export import kernels
-from firmware_py.export.compilers import compile_texts, compilers
+from firmware_py.export.compilers import Compiler, compile_texts, compilers
 from firmware_py.export.errors import CompilerError, ExportError
 from firmware_py.export.kernels import library
 from firmware_py.export.live_reading import Arrays
@@ -200,6 +201,27 @@ def test_folders_that_nobody_has_used_for_long_are_deleted() -> None:
     assert kept_folder("c", "used") == used
     kept_folder("c", "new")
     assert (old.exists(), used.exists()) == (False, True)
+
+
+def test_what_was_compiled_is_found_by_all_that_it_was_made_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    runs: list[tuple[str, ...]] = []
+
+    def run(command: tuple[str, ...], cwd: Path, env: object) -> SimpleNamespace:
+        (cwd / command[command.index("-o") + 1]).write_bytes(b"code")
+        runs.append(command)
+        return SimpleNamespace(returncode=0)
+
+    monkeypatch.setattr("firmware_py.export.compilers._run", run)
+    usual = {"a.c": "int a;"}, ("a.c",), ("-O1",), "a.so", Compiler("cc", ("cc",), "1")
+    made = [
+        usual, ({"a.c": "int b;"}, *usual[1:]), ({"b.c": "int a;"}, *usual[1:]), (usual[0], ("a.c", "a.c"), *usual[2:]),
+        (*usual[:2], ("-O2",), *usual[3:]), (*usual[:4], Compiler("cc", ("gcc",), "1")),
+        (*usual[:4], Compiler("cc", ("cc",), "2")),
+    ]  # fmt: skip
+    assert len({compile_texts(*inputs) for inputs in made}) == len(runs) == len(made)
+    for inputs in made:
+        compile_texts(*inputs)
+    assert len(runs) == len(made)
 
 
 @pytest.mark.long

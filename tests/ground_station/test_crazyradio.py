@@ -256,6 +256,17 @@ def test_without_the_parameter_of_absolute_poses_none_is_written(
     assert CORRECTIONS not in air.open().sent
 
 
+def test_what_is_said_of_telemetry_is_told_once(air: Air) -> None:
+    board = air.open()
+    air.link.notices()
+    for number in (1, 2):
+        air.link._logs.notices.append(f"telemetry {number}")
+        for _ in range(2):
+            board.receive(data_packet(CONTROL, 500, [1] * len(CONTROL.variables)))
+            air.talk()
+        assert air.link.notices() == [f"telemetry {number}"]
+
+
 def test_telemetry_tells_the_state_and_keeps_the_link(air: Air) -> None:
     board = air.open()
     state = next(block for block in ALL_BLOCKS if "supervisor.state" in [one.name for one in block.variables])

@@ -158,6 +158,16 @@ def test_telemetry_is_asked_for_at_the_rate_of_the_budget(baud, hz):
     assert asked(bench) == [(ARRAY, 1_000_000 // hz)]
 
 
+def test_telemetry_is_asked_for_at_once_whatever_came_before():
+    bench = LinkWithCodec()
+    for start_us in (0, 900_000):
+        bench.sent.clear()
+        bench.link.start_telemetry(start_us)
+        assert asked(bench) == [(ARRAY, 20_000)]
+        for t_ms in range(0, 800, 20):
+            bench.hear(start_us + 1000 * t_ms, *telemetry(t_ms))
+
+
 @pytest.mark.parametrize(("period_ms", "again"), [(20, []), (260, [(ARRAY, 20_000)])])
 def test_only_telemetry_that_is_too_slow_is_asked_for_again(period_ms, again):
     bench = LinkWithCodec()

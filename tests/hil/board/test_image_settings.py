@@ -156,6 +156,12 @@ def test_values_without_a_parameter_are_reported_in_one_line() -> None:
         "set over the radio: extCtrl.limU3 0.6",
         "the image keeps its own age_measured = 1, in the profile 0",
     ]
+    unset = Told(load_config("floaty", ["predictor.age=fixed"]))
+    unset.listen(50_000)
+    differs = "age_measured = 1, in the profile 0"
+    assert (unset.writes_up, unset.said) == (
+        0, [f"the image was built with other constants: {differs}", f"the image keeps its own {differs}"]
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("packet", [b"\x2e", struct.pack("<BHf", 0x2E, 9999, 1.0), b"\x3c hello"])

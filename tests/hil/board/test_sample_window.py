@@ -79,6 +79,9 @@ def test_without_news_all_is_sent_again_after_a_time() -> None:
     assert window.repeated == PACKETS
     window.on_report(report(0, 15), since_us + REPEAT_US)  # the first ones had arrived
     assert number(window.packet(since_us + REPEAT_US)) == 15
+    told, _ = filled(WINDOW)
+    told.on_report(report(0, 0), since_us + 1)  # a report without news
+    assert number(told.packet(since_us + REPEAT_US)) == 0
     fed, _ = filled(WINDOW)
     fed.on_report(report(0, 9), since_us + 1)  # news, though it has taken none
     assert number(fed.packet(since_us + REPEAT_US)) == 21
