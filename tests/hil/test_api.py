@@ -101,7 +101,7 @@ def test_what_a_run_shows_names_the_failed_limit_and_the_folder() -> None:
     assert "<p>runs/hover-1</p>" in shown
     assert "report.html" not in run._repr_html_()
     run.paths["result.json"].with_name("report.html").touch()
-    assert 'href="runs/hover-1/report.html"' in run._repr_html_()
+    assert '<p><a href="runs/hover-1/report.html">runs/hover-1/report.html</a></p>' in run._repr_html_()
 
 
 @pytest.mark.long

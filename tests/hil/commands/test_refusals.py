@@ -86,6 +86,7 @@ fly hover --set serial.bauds=115200 | did you mean baud?
 fly hover --set serial.uplink_bit_error_rate=2 | less than or equal to 1
 fly hover --set swarm.wake=0 | --set swarm.wake=0: has no effect on one robot
 fly hover --set quadrotor.mass=0.03 | --set quadrotor.mass=0.03: has no effect on the robot of profile floaty
+fly hover --set " quadrotor.mass=0.03" | has no effect on the robot of profile floaty
 fly hover --profile crazyflie --board empty.elf --set controller.gain_z=3 | has no effect on the robot of profile crazyflie
 fly hover --profile crazyflie --board empty.elf --set actuators.tau=0.1 | has no effect on the robot of profile crazyflie
 fly take-off-landing --profile crazyflie --board empty.elf | experiment take-off-landing: plant.limits.below=1.15

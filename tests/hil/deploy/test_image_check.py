@@ -292,6 +292,8 @@ def test_switches_and_watch_of_the_controller_are_tried(
     board = Switches(*dead)
     assert list(board.check_switches()) == switches
     assert list(board.check_watch()) == watch
+    assert board.wrote[:5] == [(f"floaty.{name}", value) for name, value in
+        (("stop", 1), ("stop", 0), ("armed", 0), ("armed", 1), ("reset", 1))]  # fmt: skip
     assert board.wrote[-2:] == [("stabilizer.controller", 1), ("stabilizer.controller", 5.0)], "as before"
     assert board.ran == [20_000] * 5 + [150_000] * 2, (
         "until a request is served, and the app sees a controller that stands"

@@ -115,7 +115,7 @@ def test_each_line_acts_up_to_its_bounds_and_no_further(monkeypatch: pytest.Monk
     good = {
         1: ["goal 1 -1 2.15 10", "goal -0.5 0 1", "push.x:inf=0.1", "imu.noise:inf=2"],
         8: ["set controller.gain_y -20"], 16: ["set controller.gain_y 20"], 24: ["set predictor.horizon 1"],
-        32: ["set predictor.horizon 12"], 40: ["step 10", "step 60000"],
+        32: ["set predictor.horizon 12"], 40: ["step 10", "step 60000", "set supervisor.pose_timeout_us 300000"],
     }  # fmt: skip
     bad = [
         "goal 1.01 0 1.15", "goal 0 -1.01 1.15", "goal 0 0 0.14", "goal 0 0 inf", "step 9.9", "step 60001",
@@ -147,6 +147,7 @@ def test_each_line_acts_up_to_its_bounds_and_no_further(monkeypatch: pytest.Monk
         True
     ] * len(bad)
     assert (view.known["extCtrl.y_P"], view.known[OF_PROFILE["predictor.horizon"].name]) == (-20.0, 12.0)
+    assert view.known["supervisor.poseTimeout"] == 300, "the board counts milliseconds"
     flight.close()
 
 

@@ -158,7 +158,12 @@ def test_hash_depends_on_values_and_names_only(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_a_log_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(LabError, match=r"no log\.parquet"):
+    with pytest.raises(LabError, match=r"no log\.parquet or log\.arrows in it; expected a run folder$"):
+        load_log(tmp_path)
+    for name in "dbca":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "log.parquet").touch()
+    with pytest.raises(LabError, match=r"in it, but in a, b, c; expected a run folder$"):
         load_log(tmp_path)
     (tmp_path / "log.arrows").write_bytes(b"not arrow at all")
     with pytest.raises(LabError, match="not a flight log"):

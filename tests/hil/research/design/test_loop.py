@@ -26,7 +26,7 @@ from hil.research.design.axes import (
     gains_in,
     robot_of,
 )
-from hil.research.design.loop import FREQUENCIES, Timing, build, filter_gain, held
+from hil.research.design.loop import FREQUENCIES, Timing, _robot_tick, build, filter_gain, held
 from hil.research.design.margins import margins, margins_of, pose_delay_margin
 from hil.research.design.tune import Flow, GainTask, by_regulator, cost, delay_margin, design, motion
 
@@ -365,3 +365,15 @@ def test_loops_that_bear_less_delay_than_poses_have_are_refused_in_one_line() ->
     )
     with pytest.raises(LabError, match=r"^refused: roll, y tolerates 15\.0 ms"):
         tune.refuse_late([one, other], 0.0151)
+
+
+@pytest.mark.parametrize("axis", AXES, ids=lambda axis: axis.name)
+def test_an_input_acts_at_once_at_the_earliest_and_a_tick_later_at_the_latest(axis: Axis) -> None:
+    found = [_robot_tick(axis, robot_of(CONFIG) | {DELAY: delay}) for delay in (-0.004, 0.0, 0.01, 0.014)]
+    for early, late in (found[:2], found[2:]):
+        assert all(np.array_equal(one, other) for one, other in zip(early, late, strict=True))
+    (_, before, after, whole), (_, later, rest, _) = found[1:3]
+    assert before == pytest.approx(0.0)
+    assert after == pytest.approx(whole[:, :1])
+    assert rest == pytest.approx(0.0)
+    assert later == pytest.approx(whole[:, :1])
