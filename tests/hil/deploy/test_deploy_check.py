@@ -6,7 +6,8 @@ import subprocess
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import ClassVar
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from firmware_py.logic.plugs import CALLS
 from firmware_py.wire.supervisor import Cause, State
 from hil.board.board_firmware import PythonBoard
 from hil.commands.deploy import _print_flight, _print_sum
+from hil.deploy import check
 from hil.deploy.check import Checked, check_flight, plan, reached
 from hil.laboratory.experiments import EXPERIMENTS
 from hil.laboratory.lockstep import lockstep_flight
@@ -84,6 +86,37 @@ def test_the_first_difference_is_reported_with_its_tick_call_and_word(
     assert [one.field for one in found.differences] == [field]
     if bits is not None:
         assert found.differences[0].bits == bits
+
+
+def test_after_a_flight_the_controller_is_watched_a_second_later_and_the_core_starts_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also of a flight that was interrupted; not of one whose board has ended."""
+    called: list[tuple[str, int]] = []
+    fields = SimpleNamespace(now_us=0)
+
+    class Beside:
+        def __init__(self, blocks: Any, targets: Any) -> None:
+            self.blocks, self.targets, self.reached = blocks, targets, ()
+
+        def call(self, name: str) -> None:
+            called.append((name, fields.now_us))
+
+    def flight(request: Request, executor: PythonBoard) -> Any:
+        executor.runner(SimpleNamespace(data=SimpleNamespace(fields=fields)))  # type: ignore[arg-type]
+        return SimpleNamespace(run=lambda progress: ends.pop(), close=lambda: called.append(("close", 0)))
+
+    monkeypatch.setattr(check, "SideBySide", Beside)
+    monkeypatch.setattr(check, "lockstep_flight", flight)
+    request = Request.of(EXPERIMENTS["hover"])
+    ends = [SimpleNamespace(interrupted=False, lost="fell"), SimpleNamespace(interrupted=True, lost=None)]
+    for outcome, now_us in (("interrupted", 7), ("lost: fell", 9)):
+        called.clear()
+        fields.now_us = now_us
+        found = check_flight(request, lambda stack: {}, lambda *_: None)
+        later_us = now_us + 1_000_000
+        assert called == [("watch_control", later_us), ("restart", later_us), ("close", 0)]
+        assert found.outcome == outcome
 
 
 def test_a_differing_target_is_found() -> None:

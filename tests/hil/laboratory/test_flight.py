@@ -68,6 +68,20 @@ def test_a_flight_that_is_over_records_nothing_more(tmp_path: Path) -> None:
     assert 0 <= end_us - load_log(tmp_path).column("t")[-1].as_py() < 10_000
 
 
+def test_a_robot_that_was_lost_before_an_error_is_counted_as_lost(tmp_path: Path) -> None:
+    request = Request.of(HOVER, duration_s=0.03, overrides=["flight.release_us=10000"])
+    with ExitStack() as stack:
+        started = Started(request, tmp_path, stack)
+        started.fly()
+        started.close()
+    started._ended = "error", "broke"
+    for lost in (None, "left the flow"):
+        started.flight.lost = lost
+        result = started.result()
+        assert (result.outcome, result.cause) == ("error", "broke")
+        assert result.metrics["lost"] == (lost is not None)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("board", "faults"), [("python", ()), ("c", ("push.y@0.6=20",))])
 def test_an_estimate_that_is_not_finite_fails_the_flight_and_is_reported(

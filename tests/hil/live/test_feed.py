@@ -5,6 +5,8 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pyarrow as pa
 import pytest
@@ -112,6 +114,25 @@ def test_a_picture_that_cannot_come_up_is_an_error_before_the_flight_and_is_ende
     with pytest.raises(LabError, match=why):
         LiveView(picture(program), [].append, 5.0)
     assert [one.returncode is None for one in started] == [False]
+
+
+def test_a_picture_that_ends_is_told_once_it_was_open() -> None:
+    said: list[str] = []
+    lines = [
+        (feed.FAILED, "early"),
+        (feed.READY, "here"),
+        (feed.TAKEN, "20"),
+        (feed.TYPED, "set a 1"),
+        (feed.FAILED, "gone"),
+    ]
+    view: Any = SimpleNamespace(
+        _process=SimpleNamespace(stdout=[f"{word} {text}\n".encode() for word, text in lines]),
+        _up=threading.Event(), _line_arrived=threading.Event(), _typed=[], _failure="", taken=0,
+    )  # fmt: skip
+    LiveView._listen(view, said.append)
+    assert said == ["view   here", "the viewer has ended: gone"]
+    assert (view.address, view.taken, view._typed, view._failure) == ("here", 20, ["set a 1"], "gone")
+    assert (view._up.is_set(), view._line_arrived.is_set()) == (True, True)
 
 
 def test_a_picture_reports_its_address_and_typed_lines() -> None:
@@ -227,6 +248,8 @@ def test_nothing_is_imported_while_a_flight_is_recorded_and_shown() -> None:
     program = f"""
 import sys, tempfile
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from hil.laboratory.files.recorder import Recorder
 from hil.live.feed import LiveView
 from hil.world.body import Channel, Quantity

@@ -134,6 +134,19 @@ def test_lines_reach_the_flight_and_bad_ones_fail(panel: PanelScreen, loop: IOLo
     socket.close()
 
 
+def test_a_page_that_opens_later_gets_the_newest_texts_and_all_values() -> None:
+    told: list[Any] = []
+    pages = [SimpleNamespace(tell=told.append)]
+    panel: Any = SimpleNamespace(texts=[], values={}, pages=pages)
+    messages = [{"texts": [f"{n}", f"{n}+"], "values": {f"{n % 3}": n}} for n in range(TEXTS_MOST)]
+    for message in messages:
+        PanelScreen._tell(panel, message)
+    half = TEXTS_MOST // 2
+    assert panel.texts == [text for n in range(half, TEXTS_MOST) for text in (f"{n}", f"{n}+")]
+    assert sorted(panel.values.values()) == [TEXTS_MOST - 3, TEXTS_MOST - 2, TEXTS_MOST - 1]
+    assert told == messages
+
+
 def test_a_page_that_reads_slowly_gets_the_newest_rows_and_texts_and_all_values() -> None:
     page = SimpleNamespace(_late={}, _sending=True)
     for n in range(ROWS_MOST + 10):

@@ -145,7 +145,8 @@ def test_a_planted_robot_is_found_in_coloured_gusts(
     [
         (40.0, keep(lambda n: np.ones(n, bool)), "1 realisations of 22 s; at least 4"),
         (136.0, lambda columns: columns | {EXCITATIONS[1]: 0 * columns[EXCITATIONS[1]]}, "no excitation.*, or identify"),
-        (136.0, keep(lambda n: np.random.default_rng(3).random(n) > 0.5), "rows are missing"),
+        (136.0, keep(lambda n: np.random.default_rng(3).random(n) > 0.5),
+            r": (49|50|51)% of the telemetry's rows are missing; at most 30% may be$"),
         (136.0, lambda columns: columns | {BOARD_COLUMN: 0.5 * columns[BOARD_COLUMN]}, "not the same sum|realisations"),
         (136.0, lambda columns: columns | {BOARD_COLUMN: 1.02 * columns[BOARD_COLUMN]}, "not the same sum of lines"),
         (136.0, keep(lambda n: np.arange(n) % 8 == 0), "samples in a period|too far apart"),
