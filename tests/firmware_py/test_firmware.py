@@ -1,14 +1,17 @@
 """The firmware as a whole against a board of plain numbers: timing, hand-over, queues, failsafe."""
 
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
 from firmware_py.config import parameters_of
 from firmware_py.core import entry
 from firmware_py.core.sampling import WINDOW
 from firmware_py.core.structs import POSE_TOO_OLD, Input, Sampling
-from firmware_py.core_runner import CoreBlocks, default_runner
+from firmware_py.core_runner import CoreBlocks, costs_of, default_runner
 from firmware_py.errors import FirmwareError
 from firmware_py.firmware import OLDEST_POSE_US, WATCHDOG_US, Firmware
 from firmware_py.rtos import WatchdogError
@@ -222,6 +225,40 @@ def test_a_board_keeps_its_radio_s_settings_unless_they_are_spoilt(
     Firmware(load_config(), bench)
     assert decode_config(bytes(bench.eeprom[:CONFIG_SIZE])) == (RadioSettings() if spoilt else own)
     assert set(bench.eeprom[CONFIG_SIZE:]) == {7}
+
+
+def test_the_profile_s_costs_count_unless_a_board_measures_its_own() -> None:
+    cpu = load_config().cpu.model_copy(update={"estimator_us": 11, "controller_us": 22})
+    plain: Any = SimpleNamespace(call=int)
+    measuring: Any = SimpleNamespace(call=int, usage=None, estimate_us=lambda: 33, control_us=lambda: 44)
+    for runner, measured, expected in (
+        (plain, True, (11, 22)), (plain, False, (11, 22)), (measuring, False, (11, 22)), (measuring, True, (33, 44)),
+    ):  # fmt: skip
+        costs = costs_of(runner, cpu.model_copy(update={"measured": measured}))
+        assert (costs.estimate_us(), costs.control_us()) == expected
+
+
+def test_what_own_logic_sees_stays_as_it_was_when_the_next_samples_come() -> None:
+    blocks = CoreBlocks(parameters_of(load_config()), default_runner)
+    sample = np.zeros(2, np.float32)
+    blocks.sense({"flow": sample})
+    sample[:] = 5.0
+    assert blocks.sensed["flow"].tolist() == [0.0, 0.0]
+
+
+def test_an_excitation_s_amplitudes_are_those_of_the_inputs_in_their_order() -> None:
+    keys = [f"excitation.u{number}={number / 100}" for number in (1, 2, 3, 4)]
+    assert load_config(overrides=keys).excitation.rms == (0.01, 0.02, 0.03, 0.04)
+
+
+def test_the_processor_s_load_is_read_anew_after_a_tenth_of_a_second(bench: FirmwareBench) -> None:
+    (load,) = [one.read for one in bench.firmware.variables if one.name == "system.load"]
+    bench.run(150_000)
+    first = load()
+    bench.run(240_000)
+    assert load() == first > 0
+    bench.run(251_000)
+    assert load() != first
 
 
 def test_the_smallest_and_the_largest_angle_of_the_flaps_are_logged(bench: FirmwareBench) -> None:

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -40,6 +41,31 @@ def test_bad_input_is_one_line(
     shown = capsys.readouterr().err
     assert line in shown
     assert shown.count("\n") == 1
+
+
+def test_settings_may_begin_with_the_mark_of_utf8_and_every_record_is_passed_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    flown: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(alone, "fly_with", lambda *asked: flown.append(asked) or ("", False))
+    path = tmp_path / "ground.toml"
+    path.write_text("home = [1, 2, 3]", encoding="utf-8-sig")
+    options = [
+        "--mocap",
+        "vrpn:here",
+        "--log",
+        "telemetry.csv",
+        "--record",
+        "frames.csv",
+        "--duration",
+        "2.5",
+    ]
+    assert alone.main(["--link", "udp://127.0.0.1:1", "--settings", str(path), *options]) == 0
+    ((_, settings, session, _, duration_s),) = flown
+    assert (settings.home, duration_s, session.uri) == ((1.0, 2.0, 3.0), 2.5, "udp://127.0.0.1:1")
+    assert (session.mocap, session.log, session.record) == (
+        "vrpn:here", Path("telemetry.csv"), Path("frames.csv"),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -61,6 +61,16 @@ def test_a_call_goes_to_the_core_and_only_its_answer_is_taken(packets: CflibPack
     assert driver.closed
 
 
+def test_packets_of_others_leave_less_time_to_wait(
+    packets: CflibPackets, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    instants_us = iter(range(7_000_000, 9_000_000, 100_000))
+    monkeypatch.setattr("ground_station.links.packets.clock_us", lambda: next(instants_us))
+    packets._driver.waiting += [bytes((OTHER_PORT, 1))] * 5
+    assert packets.receive(0.35) is None
+    assert packets._driver.waits_s == pytest.approx([0.25, 0.15, 0.05])
+
+
 def test_all_that_waits_is_taken_whole_and_only_the_first_is_waited_for(packets: CflibPackets) -> None:
     driver = packets._driver
     driver.waiting += b"\x5d\1\2", b"\x0c"
