@@ -15,12 +15,13 @@ from firmware_py.config import parameters_of
 from firmware_py.core.subset import F64s
 from firmware_py.core_runner import CoreBlocks, PlainRunner, default_runner
 from firmware_py.export import kernels
-from firmware_py.export.compilers import Compiler, compile_texts, compilers
+from firmware_py.export.compilers import Compiler, by_first_that_works, compile_texts, compilers
 from firmware_py.export.errors import CompilerError, ExportError
 from firmware_py.export.kernels import library
 from firmware_py.export.live_reading import Arrays
 from firmware_py.kept_code import UNUSED_S, keep, kept_folder, may_load
 from hil.config import load_config
+from hil.world.plates import limit
 
 ABSENT_UID = 12345
 
@@ -201,6 +202,41 @@ def test_folders_that_nobody_has_used_for_long_are_deleted() -> None:
     assert kept_folder("c", "used") == used
     kept_folder("c", "new")
     assert (old.exists(), used.exists()) == (False, True)
+
+
+def test_each_kind_of_memory_has_a_library_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiling, "kept_library", lambda path, make: path)
+    monkeypatch.setattr(compiling, "_LIBRARIES", {})
+    memories = [
+        np.zeros(shape, kind) for shape in (2, 3, (2, 3), (3, 2)) for kind in (np.float64, np.float32)
+    ]
+    found = [[compiling._library((limit,), (one,)) for one in memories] for _ in range(2)]
+    assert found[0] == found[1]
+    assert len(set(found[0])) == len(memories)
+    assert compiling._library((limit,), (memories[0],) * 2) not in found[0]
+
+
+def test_the_first_compiler_that_works_is_taken_ziglang_last_or_the_first_complaint_is_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found = [Compiler(name, (name,), "1") for name in ("zig", "gcc", "clang")]
+    monkeypatch.setattr("firmware_py.export.compilers.compilers", lambda: iter(found))
+    for works in ("gcc", "clang", "zig", ""):
+        asked: list[str] = []
+
+        def make(compiler: Compiler, works: str = works, asked: list[str] = asked) -> Path:
+            asked.append(compiler.name)
+            if compiler.name != works:
+                raise CompilerError(compiler.name)
+            return Path(works)
+
+        if works:
+            assert by_first_that_works(make) == Path(works)
+        else:
+            with pytest.raises(CompilerError, match=r"^gcc$"):
+                by_first_that_works(make)
+        order = ["gcc", "clang", "zig"]
+        assert asked == order[: order.index(works) + 1 if works else 3]
 
 
 def test_what_was_compiled_is_found_by_all_that_it_was_made_of(monkeypatch: pytest.MonkeyPatch) -> None:

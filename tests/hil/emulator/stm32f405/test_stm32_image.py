@@ -6,7 +6,9 @@ import subprocess
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
-from struct import pack_into
+from struct import pack, pack_into
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -352,3 +354,42 @@ def test_a_file_with_damaged_headers_is_read_or_refused_in_one_line(
     damaged.write_bytes(content)
     with suppress(LabError):
         Image(damaged)
+
+
+UNREAD: Any = None
+
+
+def test_only_the_address_of_a_function_loses_its_lowest_bit_and_marks_are_no_variables() -> None:
+    names, entries = b"\0", []
+    for name, kind, address in (
+        ("code", 2, 0x801), ("byte", 1, 0x803), ("label", 0, 0x805), ("$d", 0, 0x807), ("section", 3, 0x809),
+    ):  # fmt: skip
+        entries.append(pack("<IIIBBH", len(names), address, 4, 0x10 | kind, 0, 1))
+        names += name.encode() + b"\0"
+    file = {".symtab": Table(b"".join(entries)), 7: Table(names)}
+    made = SimpleNamespace(get_section_by_name=file.get, get_section=file.get)
+    found = [(one.name, one.address, one.is_function, one.is_variable) for one in Elf._symbols(UNREAD, made)]
+    assert found == [
+        ("code", 0x800, True, False), ("byte", 0x803, False, True), ("label", 0x805, False, True),
+        ("$d", 0x807, False, False), ("section", 0x809, False, False),
+    ]  # fmt: skip
+
+
+class Table:
+    """A section of an ELF file."""
+
+    def __init__(self, content: bytes) -> None:
+        self.content = content
+
+    def data(self) -> bytes:
+        return self.content
+
+    def __getitem__(self, key: str) -> int:
+        return {"sh_link": 7}[key]
+
+
+def test_the_half_words_between_two_marks_are_constants_with_one_that_is_begun() -> None:
+    for end, expected in ((0x8000107, {0, 1, 2, 3}), (0x8000108, {0, 1, 2, 3}), (0x8000106, {0, 1, 2})):
+        marks = [Symbol(name, at, 0, False, False) for name, at in (("$d", 0x8000100), ("$t.1", end))]
+        read: Any = SimpleNamespace(symbols=[*marks, Symbol("$d", 0x8000200, 0, False, False)])
+        assert Elf.constants(read, 0x8000100, 0x100) == expected
