@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from firmware_py.geometry import from_euler_zyx, in_goal_frame, to_euler_zyx, yaw_quaternion
 from firmware_py.wire.supervisor import State
 from hil.errors import LabError
+from hil.laboratory.experiment import Experiment
 from hil.laboratory.experiments import measures
 from hil.laboratory.metric_pairs import MetricPair, differing, pairs_of, text_of
 from hil.laboratory.metrics import (
@@ -95,6 +96,7 @@ def test_metrics_count_from_the_release_to_the_end() -> None:
     calibrates = [*5 * [2], *4 * [State.CALIBRATING], *3 * [2], *3 * [State.CALIBRATING]]
     booted = table.set_column(table.column_names.index("supervisor.state"), "supervisor.state", [calibrates])
     assert (measure(booted, lost=False)["resets"], measure(booted, False, resets=5)["resets"]) == (2.0, 5.0)
+    assert Experiment("mine", "", 1.0, {}).metrics_of(booted, False, 5)["resets"] == 5.0
     short = measure(table.slice(0, 5), lost=True)  # a single row is free
     assert {name: value for name, value in short.items() if not np.isnan(value)} == {
         "lost": 1.0,

@@ -118,7 +118,8 @@ def test_each_line_acts_up_to_its_bounds_and_no_further(monkeypatch: pytest.Monk
         32: ["set predictor.horizon 12"], 40: ["step 10", "step 60000", "set supervisor.pose_timeout_us 300000"],
     }  # fmt: skip
     bad = [
-        "goal 1.01 0 1.15", "goal 0 -1.01 1.15", "goal 0 0 0.14", "goal 0 0 inf", "step 9.9", "step 60001",
+        "goal 1.01 0 1.15", "goal 0 -1.01 1.15", "goal 0 0 0.14", "goal 0 0 inf", "goal 0 0 1.15 nan",
+        "goal 0 0 1.15 inf", "step 9.9", "step 60001",
         "set controller.gain_y -20.1", "set controller.gain_y 20.1", "set predictor.horizon 0",
         "set predictor.horizon 13",
     ]  # fmt: skip

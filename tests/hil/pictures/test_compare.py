@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace as Made
 
 import numpy as np
 import pyarrow as pa
@@ -12,11 +13,11 @@ import pytest
 
 from hil.config import load_config
 from hil.laboratory.experiments import EXPERIMENTS
-from hil.laboratory.files.recorder import load_log
+from hil.laboratory.files.recorder import RELEASE_US, load_log
 from hil.laboratory.metrics import free_flight, measure, position_error
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
-from hil.pictures.compare import FlownRun, compare, difference, load_flown, shown_curves
+from hil.pictures.compare import FlownRun, _flown_s, compare, difference, load_flown, shown_curves
 from hil.pictures.curves import ORANGE
 from hil.pictures.trials import DARK
 from support.command import Cli
@@ -191,3 +192,15 @@ def test_a_bad_folder_is_one_line(cli: Cli, runs: dict[str, Path], tmp_path: Pat
     elif damage == "no json":
         (bad / "result.json").write_text("{")
     assert "bad" in cli.refusal("compare", runs["one"], bad, "--out", tmp_path / "out")
+
+
+@pytest.mark.parametrize(("place", "flown_s"), [("cameras.x", 1.0), ("truth.x", 2.0)])
+def test_a_real_flight_was_flown_as_long_as_it_was_judged_and_any_other_to_its_last_row(
+    place: str, flown_s: float
+) -> None:
+    times = [1_000_000 * second for second in range(4)]
+    log = pa.table(
+        {"t": times, "flight.free": [0, 1, 1, 0], place: [0.0] * 4}, metadata={RELEASE_US: b"1000000"}
+    )
+    whole, empty = Made(log=log), Made(log=log.slice(0, 0))
+    assert (_flown_s(whole), _flown_s(empty)) == (flown_s, 0.0)  # type: ignore[arg-type]

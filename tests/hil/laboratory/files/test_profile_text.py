@@ -21,6 +21,7 @@ from hil.emulator.stm32f405.cpu_profile import (
     TaskTimes,
 )
 from hil.errors import LabError
+from hil.laboratory.experiment import unknown
 from hil.laboratory.experiments.position import HOVER
 from hil.laboratory.files import coverage, cpu_profile, debugging
 from hil.laboratory.files.coverage import Executed, add_executed, base_of, check_coverage, read_executed
@@ -203,6 +204,11 @@ def test_only_a_flight_of_the_same_image_in_lockstep_is_flown_again_and_waits(
     assert asked("same") == asked(None) == again  # None: the process was killed
     with pytest.raises(LabError, match=r"another image than the one that flew in .*: fly it again"):
         asked("other")
+    foreign: Any = SimpleNamespace(
+        request=replace(request, experiment=unknown("mine", None)), folder=tmp_path, image=None
+    )
+    with pytest.raises(LabError, match="experiment mine: its code was not executed"):
+        debugging.debugged_request(foreign)
     for option in ({"board": "c"}, {"link": "mavlink:udp"}, {"realtime": True}):
         with pytest.raises(LabError, match="only flights of an image in lockstep are debugged"):
             asked("same", **option)

@@ -423,6 +423,18 @@ def test_a_metric_that_is_no_number_is_beyond_every_limit() -> None:
     assert _beyond(below_zero, -3.0) == 0.5  # type: ignore[arg-type]
 
 
+def test_the_threshold_of_chance_is_that_of_the_strongest_axis_of_random_orders(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    spec, rng = spec_of(flights=40), np.random.default_rng(3)
+    points, orders = rng.random((40, len(axes(spec)))), rng.random((20, 40))
+    monkeypatch.setattr("hil.research.campaigns.sampling.shuffled", lambda *given: orders)
+    strongest = sorted(max(pawn(slices(points), order)) for order in orders)
+    found = influence_of(spec, "max_y", points, orders[0])
+    assert found.chance == pytest.approx(0.95 * strongest[18] + 0.05 * strongest[19])
+    assert [*found.by_axis.values()] == pawn(slices(points), orders[0]).tolist()
+
+
 @pytest.mark.long
 def test_inert_axes_exceed_the_threshold_of_chance_in_one_of_twenty_campaigns() -> None:
     varied = ("actuators.tau", "plant.mass_factor", "plant.drag_factor")
