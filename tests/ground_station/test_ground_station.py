@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from firmware_py.geometry import from_euler_zyx
 from firmware_py.wire import crtp, telemetry
 from ground_station.clock import clock_us, epoch_us, signing_start
-from ground_station.config import GroundConfig, StationConfig, TrackerConfig
+from ground_station.config import GroundConfig, LinkSettings, StationConfig, TrackerConfig
 from ground_station.corrections import correct
 from ground_station.latency import LatencyBudget, LinkLatency
 from ground_station.links.log_blocks import START_ORDER
@@ -247,8 +247,9 @@ def test_a_link_expects_as_many_poses_as_are_wanted_and_seen(period_us, wanted_h
         station=StationConfig(corrections_hz=wanted_hz, link_latency_us=1300),
         frame_period_us=period_us,
         baud=57_600,
-    ).links()
-    assert (settings.corrections_hz, settings.latency_us, settings.baud) == (hz, 1300, 57_600)
+        signing_key="0f" * 32,
+    ).links(note := lambda now_us, frame: None)
+    assert settings == LinkSettings(hz, 1300, 57_600, b"\x0f" * 32, 0, note)
 
 
 def telemetry_packets(timestamp_ms, blocks=START_ORDER):

@@ -87,6 +87,12 @@ def test_pieces_cover_the_changed_places_of_a_core_s_memory_and_each_fits_a_pack
     )  # as few as possible
 
 
+def test_a_piece_begins_at_a_changed_place_and_reaches_as_far_as_a_packet():
+    assert list(runs([0, 5, 9, 10, 18, 20, 21], 10)) == [(0, 10), (10, 9), (20, 2)]
+    assert list(runs([3], 1)) == [(3, 1)]
+    assert list(runs([], 10)) == []
+
+
 def opened(**options):
     board = Board(**options)
     board.open(lambda: False)

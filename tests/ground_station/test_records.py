@@ -64,6 +64,15 @@ def test_an_output_that_fails_ends_no_other(tmp_path: Path) -> None:
     assert (tmp_path / "kept").stat().st_size == 5 * 28
 
 
+def test_frames_are_on_disk_before_they_are_much_more_than_two_seconds_old(tmp_path: Path) -> None:
+    frames = FrameLog(tmp_path / "frames")
+    for number in range(40):
+        frames.note(number * 250_000, b"seen")
+        written = (tmp_path / "frames").stat().st_size // 12
+        assert number - 9 <= written <= number
+    frames.close()
+
+
 def test_frames_are_in_the_order_of_their_times_though_received_ones_are_noted_later(tmp_path: Path) -> None:
     frames = FrameLog(tmp_path / "frames", epoch_us=7)
     times = [number * 300_000 for number in range(20)]
