@@ -94,6 +94,12 @@ def test_where_neither_folder_can_be_used_one_serves_that_ends_with_the_process(
     assert second.endswith(": in a folder that all may write: compiled code is kept elsewhere")
 
 
+def test_where_all_may_write_but_nobody_may_take_away_a_folder_is_used(cache_home: Path) -> None:
+    cache_home.mkdir(mode=0o700)
+    cache_home.chmod(0o1777)  # as of temporary files
+    assert kept_folder("c").is_relative_to(cache_home)
+
+
 def test_a_folder_that_cannot_be_written_is_not_used(
     cache_home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

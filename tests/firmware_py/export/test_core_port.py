@@ -4,6 +4,8 @@ import struct
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from zlib import crc32
 
 import pytest
@@ -25,6 +27,7 @@ from firmware_py.wire.core_port import (
     VERSION,
     WHY,
     WRITE_MAX,
+    About,
     Call,
     CoreAnswer,
     Hil,
@@ -317,6 +320,22 @@ class Silence(AppPackets):
     def receive(self, timeout_s: float) -> bytes | None:
         self.waits_s.append(timeout_s)
         return None
+
+
+def test_a_board_s_own_result_flies_where_it_is_another_than_here() -> None:
+    ours = CoreBlocks(parameters_of(load_config()), default_runner)
+    size = sum(block.memory.nbytes for block in ours.named.values())
+    theirs = bytes(number % 127 for number in range(size))
+    board: Any = SimpleNamespace(
+        begin=lambda: About(VERSION, 0, size, 0, 168, "", ""),
+        execute=lambda requests: [CoreAnswer(Message.CALL, 1, 0, CALLED.struct.pack(1, 336, crc32(theirs)))],
+        memory=lambda asked: theirs[:asked],
+    )
+    core = RealCore(ours, board)
+    for calls in (1, 2):
+        assert core.call("supervise") == 1
+        assert b"".join(block.memory.tobytes() for block in ours.named.values()) == theirs
+        assert (core.unexpected, core.load["supervise"].calls) == (calls, calls)
 
 
 @pytest.mark.long
