@@ -137,7 +137,7 @@ def test_robots_that_fly_together_are_a_row_each_and_their_common_limits(
         cause=cause,
                     metrics=row(seed, seed - 4.0).metrics, hash=f"{seed}" * 64)  # fmt: skip
 
-    robots = (robot(5, ""), robot(6, "", "max_x", "in_box"), robot(7, "fell", "max_x"))
+    robots = (robot(5, ""), robot(6, "", "max_x", "in_box"), robot(7, "fell"))
     verdicts = (Verdict("distance", 0.2, 0.3, False, "m", "min"),)
     tables.print_swarm(Made(request=Made(title="3 robots", robots=[one.request for one in robots]), robots=robots,
     verdicts=verdicts,

@@ -195,6 +195,32 @@ class Answers(list[int]):
         return len(self._view.answers) == 2
 
 
+def test_a_server_of_three_has_cameras_for_each_and_closes_what_it_has_opened(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    said, done = list[str](), list[Any]()
+    motive = Made(malformed=3, close=lambda: done.append("motive closed"))
+    swarm: Any = Made(
+        wait=lambda: [Made(dongles=8), Made(dongles=9)], terminals={}, close=lambda: done.append("swarm closed"),
+        listen=lambda own, answer, cameras: done.append(cameras is motive),
+    )  # fmt: skip
+    own: Any = Made(
+        lab=Made(now_us=0), run=lambda stopping: done.append(stopping()),
+        open=lambda endpoints, ports: done.append(ports) or Made(dongles=7),
+    )  # fmt: skip
+    monkeypatch.setattr(serve, "_motive", lambda own, count, say: done.append(count) or motive)
+    monkeypatch.setattr(
+        serve, "_print_addresses", lambda robots, say: done.append([one.dongles for one in robots])
+    )
+    monkeypatch.setattr(serve.common, "close_live", lambda view, say: done.append("view closed"))
+    monkeypatch.setattr("hil.servers.live_faults.LiveFaults", lambda *what: Made(listen=lambda stream: None))
+    monkeypatch.setattr(stops, "stop_signals", list)
+    asked: Any = Made(usb=False, program=())
+    assert serve._run(own, swarm, server.Endpoints(motive=True), None, said.append, asked) == 0
+    assert done == [[8, 9], [7, 8, 9], 3, True, False, "swarm closed", "view closed", "motive closed"]
+    assert said == ["serving; Ctrl-C ends", "motive could not read 3 packets"]
+
+
 @pytest.mark.long
 @pytest.mark.usefixtures("_ctrl_c")
 def test_the_cameras_track_every_robot_and_a_lost_output_is_told_by_the_exit_code(

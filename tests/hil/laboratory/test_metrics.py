@@ -19,6 +19,7 @@ from hil.laboratory.metrics import (
     ALWAYS,
     METRICS,
     PHASES,
+    Metric,
     _time_seen,
     attitude_error,
     judge,
@@ -97,6 +98,16 @@ def test_metrics_count_from_the_release_to_the_end() -> None:
     booted = table.set_column(table.column_names.index("supervisor.state"), "supervisor.state", [calibrates])
     assert (measure(booted, lost=False)["resets"], measure(booted, False, resets=5)["resets"]) == (2.0, 5.0)
     assert Experiment("mine", "", 1.0, {}).metrics_of(booted, False, 5)["resets"] == 5.0
+    own = Experiment(
+        "mine",
+        "",
+        1.0,
+        {},
+        measure=lambda flight: {"rows": flight.num_rows},
+        metrics={"rows": Metric("", "max", "rows")},
+    )
+    judged = [own.metrics_of(table.slice(0, count), False)["rows"] for count in (5, 6, 15)]
+    assert judged == pytest.approx([np.nan, 2.0, 11.0], nan_ok=True)
     short = measure(table.slice(0, 5), lost=True)  # a single row is free
     assert {name: value for name, value in short.items() if not np.isnan(value)} == {
         "lost": 1.0,
