@@ -306,6 +306,29 @@ def test_a_block_that_the_processor_kept_waiting_returns_to_its_grid(client: Crt
     assert max(np.diff(stamps)) > 40
 
 
+def test_rows_that_a_lost_partner_left_behind_are_dropped(client: CrtpClient, logs) -> None:
+    assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
+    client.one(LOG, 1, bytes((3, 1, 1)))
+    client.polling = client.radio_open = False
+    client.run(client.now_us + 900_000)
+    assert len(client.firmware.link._transmit) > 80
+    client.run(client.now_us + 150_000)
+    assert len(client.firmware.link._transmit) == 0
+    assert client.firmware.link.dropped == 0
+
+
+def test_numbers_at_the_edges_of_each_type_are_cast_as_in_c() -> None:
+    edges = [
+        sign * (2**bits + more) for bits in (7, 8, 15, 16, 31) for more in (-1, 0, 1) for sign in (1, -1)
+    ]
+    for scalar, c_type in C_TYPES.items():
+        assert [scalar.cast(value) for value in edges] == [c_type(value).value for value in edges]
+        assert [scalar.cast(value) for value in (inf, -inf, nan, -0.9, 1.9)] == [0, 0, 0, 0, 1]
+    for scalar, largest in ((Scalar.F16, 65504.0), (Scalar.F32, float(np.finfo(np.float32).max))):
+        found = [scalar.cast(sign * value) for sign in (1, -1) for value in (largest, 2.0 * largest, 1e300)]
+        assert found == [largest, inf, inf, -largest, -inf, -inf]
+
+
 @pytest.mark.long
 @given(
     st.sampled_from(sorted(C_TYPES, key=lambda scalar: scalar.log_number)),
@@ -527,6 +550,23 @@ def test_a_store_has_the_last_value_of_each_name_and_refuses_what_does_not_fit(
             kept,
             10 + sum(2 + len(one) + len(kept[one]) for one in kept),
         )
+
+
+def test_a_store_keeps_the_last_values_up_to_its_last_byte_and_is_empty_once_any_byte_is_spoilt() -> None:
+    eeprom = bytearray(b"\xff" * 1100)  # of which the list has the last 76
+    store = ParameterStorage(eeprom)
+    assert (store.load(), store.size, store.used) == ({}, 76, 10)
+    assert [store.store("a.b", bytes((value,))) for value in (1, 2)] == [True, True]
+    assert (store.load(), store.used) == ({"a.b": b"\2"}, 16)
+    assert not store.store("c.d", bytes(56))
+    assert store.load() == {"a.b": b"\2"}
+    assert store.store("c.d", bytes(55))
+    assert (store.load(), store.used) == ({"a.b": b"\2", "c.d": bytes(55)}, 76)
+    for place in range(1024, 1100):
+        spoilt = eeprom + b"\xff"
+        spoilt[place] ^= 1
+        assert ParameterStorage(spoilt).load() == {}
+    assert [store.clear("a.b"), store.clear("a.b"), store.load()] == [True, False, {"c.d": bytes(55)}]
 
 
 def test_of_a_store_only_persistent_parameters_of_the_right_size_count(client: CrtpClient, params) -> None:
