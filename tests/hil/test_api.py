@@ -265,3 +265,15 @@ def test_a_swarm_names_the_robots_that_failed_by_their_folders_numbers(
         request=SimpleNamespace(title="t"),
     )  # fmt: skip
     assert repr(Swarm(result)) == f"<t: {words}; f>"
+
+
+@pytest.mark.parametrize("out", [None, Path("cov")])
+def test_a_flight_writes_the_coverage_that_it_was_asked_for(
+    out: Path | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    request = Request.of(EXPERIMENTS["hover"])
+    written: list[Path] = []
+    monkeypatch.setattr("hil.api.fly_into", lambda *what, **how: "result")
+    monkeypatch.setattr("hil.pictures.exports.coverage.write_coverage", written.append)
+    run = fly(replace(request, bench=replace(request.bench, coverage=out)))
+    assert (run.result, written) == ("result", [out] * (out is not None))

@@ -325,6 +325,19 @@ def test_the_script_that_draws_is_uplot_as_npm_has_it() -> None:
     }
 
 
+@pytest.mark.parametrize(("outcome", "marked"), [("lost", "it fell"), ("error", None), ("interrupted", None)])
+def test_only_a_lost_flight_has_a_mark_of_its_cause(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, outcome: str, marked: str | None
+) -> None:
+    def mark(log: object, lost: str | None) -> None:
+        raise LookupError(lost)
+
+    change_result(folder, outcome=outcome, cause="it fell")
+    monkeypatch.setattr("hil.pictures.report.marks_of_flight", mark)
+    with pytest.raises(LookupError, match=f"^{marked}$"):
+        write_report(folder)
+
+
 def test_a_metric_without_a_value_is_a_dash_and_fails(folder: Path) -> None:
     verdict = {"metric": "rms_x", "value": None, "bound": 0.1, "holds": False, "unit": "m", "sense": "max"}
     change_result(folder, metrics={"rms_x": None}, verdicts=[verdict])

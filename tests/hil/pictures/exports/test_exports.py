@@ -255,6 +255,16 @@ def test_a_telemetry_log_has_the_estimate_in_the_world_with_yaw_within_half_a_tu
     assert [getattr(pulses, f"servo{servo}_raw") for servo in (1, 2, 3, 4)] == [1401, 1402, 1403, 1404]
 
 
+def test_a_telemetry_log_has_each_goal_once_when_it_changes(turning_run: Path, tmp_path: Path) -> None:
+    log = load_log(turning_run)
+    moved = pa.array([0.1 * (row // 20) for row in range(ROWS)])
+    index = log.column_names.index("goal.x")
+    pq.write_table(log.set_column(index, log.schema.field(index), moved), tmp_path / "log.parquet")
+    with closing(mavutil.mavlink_connection(str(write_tlog(tmp_path)))) as link:
+        goals = [*iter(lambda: link.recv_match(type="SET_POSITION_TARGET_LOCAL_NED"), None)]
+    assert [one.x for one in goals] == pytest.approx(sorted({*moved.to_pylist()}))
+
+
 def test_an_mcap_file_has_a_gap_where_there_is_no_number_and_angles_in_their_order(turning_run: Path) -> None:
     found = messages(write_mcap(turning_run))
     gusts = [content["wind_gust"] for _, content in found["/wind"]]

@@ -945,3 +945,19 @@ def test_lines_are_looked_for_up_to_four_fifths_of_half_the_rows_rate(hertz: flo
     record.excitation[:, 0] = np.cos(2 * np.pi * hertz * record.t + 0.3)
     lines = spectra.excited_lines(record, [4.0])
     assert [one.tolist() for one in lines] == [found, [], [], []]
+
+
+def test_constants_that_explain_all_are_no_better_known_than_the_scatter_of_the_spectra_allows() -> None:
+    """The first output is twice the second one, exactly; both scatter by one."""
+    lines = 20
+    seen = np.exp(1j * np.arange(lines))
+    spectra = SimpleNamespace(
+        w=np.ones(lines), Z=np.stack([2 * seen, seen], axis=1), C=np.stack([np.eye(2, dtype=complex)] * lines)
+    )
+
+    def rows(w: Any, response: Any, late: float) -> Any:
+        return np.tile([1.0, 0.0], (lines, 1)), np.tile([0.0, 1.0], (lines, 1, 1))
+
+    theta, covariance, misfit = _regress([(spectra, 0.0)], rows, 0.05, 0.01)  # type: ignore[list-item]
+    assert (theta, misfit) == (pytest.approx([2.0]), pytest.approx(0.0))
+    assert covariance == pytest.approx(np.array([[5.0 / (2.0 * lines)]]))
