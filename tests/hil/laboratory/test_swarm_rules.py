@@ -1,6 +1,7 @@
 """What robots of a swarm do to one another between two turns, where they stand, and what their common result says."""
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -279,3 +280,15 @@ def test_robots_fly_in_turn_to_the_last_one_s_end_and_ctrl_c_ends_them_all(stopp
     ended = [(name, "interrupted") for name in ends if stopped_us]
     assert asked == [*((name, "begins") for name in ends), *turns, *ended]
     assert shown == [(now_us, 2 * SHOWN_US) for now_us in range(SHOWN_US, last_us + 1, SHOWN_US)]
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+def test_the_folder_of_every_robot_is_locked_in_turn_and_replaced_if_all_are(
+    replaced: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    locked: list[Any] = []
+    monkeypatch.setattr(
+        "hil.laboratory.swarms.folder.reserved", lambda *what: locked.append(what) or nullcontext()
+    )
+    with swarm_reserved(SimpleNamespace(robots=("a", "b")), tmp_path, replaced):  # type: ignore[arg-type]
+        assert locked == [(one, tmp_path / folder_name(n), replaced) for n, one in enumerate("ab", 1)]

@@ -314,6 +314,7 @@ def test_a_thinned_curve_keeps_every_lowest_and_highest_value_and_its_gaps() -> 
         assert np.array_equal(np.nanmin(some, axis=0), np.nanmin(all_of, axis=0))
     few = np.zeros(300)
     assert thinned([few], 150).tolist() == list(range(300)), "nothing is lost of a short curve"
+    assert thinned([few, few], 75).tolist() == list(range(300)), "nor of two"
 
 
 def test_the_script_that_draws_is_uplot_as_npm_has_it() -> None:
