@@ -362,6 +362,14 @@ def test_the_flaps_are_under_control_in_every_mode_but_the_hover() -> None:
         assert bench.view.controlling is (mode != MODE_HOVER)
 
 
+def test_angles_by_hand_act_only_while_a_client_could_take_them_back() -> None:
+    bench = SupervisorBench()
+    bench.data.manual_mode = structs.MANUAL_ANGLES
+    for connected in (True, False, True):
+        bench.connected = connected
+        assert bench.look() == (MODE_MANUAL if connected else MODE_HOVER)
+
+
 @pytest.mark.parametrize("locks", [False, True])
 def test_floaty_s_own_stop_reads_as_one_that_can_be_undone(locks: bool) -> None:
     firmware = CrtpClient().firmware

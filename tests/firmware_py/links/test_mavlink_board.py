@@ -6,6 +6,7 @@ import struct
 import zlib
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from firmware_py.config import StreamRates
+from firmware_py.core.structs import ATTITUDE, POSITION, RATE, VELOCITY
+from firmware_py.links.mavlink_streams import GROUPS as SERVED
+from firmware_py.links.mavlink_telemetry import PoseInWorld
 from firmware_py.links.parameters import Parameter, ParameterStorage
 from firmware_py.signals import COUNTERS
 from firmware_py.wire import crtp, telemetry
@@ -476,6 +480,20 @@ def test_place_and_goal_are_those_in_the_world_whatever_the_poses_over_crtp_are(
     assert tuple(home + away) == reported("LOCAL_POSITION_NED")
 
 
+def test_place_and_velocity_in_the_world_turn_with_the_frame_of_the_estimate() -> None:
+    now = np.arange(1.0, 17.0) / 10
+    seen: Any = SimpleNamespace(now=now)
+    place, yaw = (1.0, 2.0, 3.0), 0.7
+    world = PoseInWorld(seen, seen, SimpleNamespace(frame=(place, yaw)))  # type: ignore[arg-type]
+    turn = Rotation.from_euler("z", yaw)
+    p_WB, v_W = world.motion()
+    assert p_WB == pytest.approx(place + turn.apply(now[POSITION : POSITION + 3]))
+    assert v_W == pytest.approx(turn.apply(now[VELOCITY : VELOCITY + 3]))
+    assert world.rates() == pytest.approx(now[RATE : RATE + 3])
+    roll, pitch, heading = now[ATTITUDE : ATTITUDE + 3]
+    assert world.angles() == pytest.approx((roll, pitch, heading + yaw))
+
+
 def test_the_flight_array_holds_the_telemetry_blocks() -> None:
     client = MavlinkClient()
     client.command(511, 350, 20_000)
@@ -510,6 +528,13 @@ GROUPS = {  # of MAV_DATA_STREAM
     "EXTRA1": ("ATTITUDE", "ATTITUDE_QUATERNION"), "EXTRA3": 5 * ("NAMED_VALUE_FLOAT",), "RAW_SENSORS": (),
 }  # fmt: skip
 GROUPS["ALL"] = tuple(name for group in GROUPS.values() for name in group)
+
+
+def test_the_groups_of_the_older_request_have_the_standard_s_numbers() -> None:
+    numbers = {
+        getattr(dialect, f"MAV_DATA_STREAM_{name}"): set(kinds) for name, kinds in GROUPS.items() if kinds
+    }
+    assert {number: set(kinds) for number, kinds in SERVED.items()} == numbers
 
 
 @pytest.mark.long
