@@ -435,6 +435,15 @@ def test_the_threshold_of_chance_is_that_of_the_strongest_axis_of_random_orders(
     assert [*found.by_axis.values()] == pawn(slices(points), orders[0]).tolist()
 
 
+def test_the_intervals_of_total_indices_are_theirs(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = {"S1": [7.0] * 3, "S1_conf": [8.0] * 3, "ST": [0.1, 0.2, 0.3], "ST_conf": [0.01, 0.02, 0.03]}
+    monkeypatch.setattr("hil.research.campaigns.findings.sobol.analyze", lambda *what, **how: told)
+    spec = spec_of(sampling="saltelli", flights=40)
+    found = influence_of(spec, "max_y", np.zeros((40, 3)), np.zeros(40))
+    assert [*found.by_axis.values()] == told["ST"]
+    assert [*found.halves.values()] == told["ST_conf"]
+
+
 @pytest.mark.long
 def test_inert_axes_exceed_the_threshold_of_chance_in_one_of_twenty_campaigns() -> None:
     varied = ("actuators.tau", "plant.mass_factor", "plant.drag_factor")

@@ -53,7 +53,10 @@ from hil.research.identify.identify import (
 )
 from hil.research.identify.joint import (
     DELAY_S,
+    DELAY_SPREAD_S,
+    LAG_SPREAD,
     LATE_S,
+    LATE_SPREAD_S,
     Estimate,
     Excited,
     JointFit,
@@ -391,6 +394,10 @@ def test_the_slopes_of_the_joint_fit_are_those_of_its_errors() -> None:
     assert np.abs(expected).max(axis=0).min() > 0.001
     assert fit.slopes(x) == pytest.approx(expected, rel=1e-3, abs=1e-3)
     assert [len(one) for one in (fit.errors(x), fit.prior(x))] == [expected.shape[0], 2 + 2 + 1]
+    at, late = fit.parted(x)
+    usual = [(at[LAG] / 0.05 - 1) / LAG_SPREAD, (at[DELAY] - DELAY_S) / DELAY_SPREAD_S]
+    usual += [(late[record] - LATE_S) / LATE_SPREAD_S for record in (1, 4)]
+    assert fit.prior(x) == pytest.approx([*usual, at[names[0]] * at[LAG]])
 
 
 def test_the_covariance_of_the_mean_is_that_of_numpy_over_the_lines_around() -> None:

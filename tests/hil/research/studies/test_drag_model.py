@@ -116,7 +116,7 @@ def test_the_sweeps_are_the_papers() -> None:
         assert flaps.tolist() == list(expected)
 
 
-SIZES = (0.02, 0.01, 0.03, 0.001, 0.005, 0.004)  # [N, N m]
+SIZES = (0.02, 0.01, 0.03, 0.005, 0.001, 0.004)  # [N, N m]
 
 
 def test_the_page_has_a_picture_and_the_largest_misses_of_each_robot_and_sweep(
