@@ -42,7 +42,7 @@ class Loaded:
     @cached_property
     def translation(self) -> Translation:
         """Return the logic and the core as C."""
-        return translate(self.texts, {f"own_{name}": _shown(file) for name, file in self.files.items()})
+        return translate(self.texts, _paths(self.files))
 
     @property
     def parameters(self) -> tuple[CoreParameter, ...]:
@@ -179,7 +179,8 @@ def _values(given: Mapping[str, float], parameters: tuple[CoreParameter, ...]) -
 def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
     """Load modules, each given as plug point, file and text."""
     texts = core_texts() | {f"own_{name}": text for name, _, text in modules}
-    shown = {f"own_{name}": _shown(file) for name, file, _ in modules}
+    files = {name: file for name, file, _ in modules}
+    shown = _paths(files)
     lines: list[str] = []
     checked = [_checked(point, texts, shown, lines) for point in POINTS if f"own_{point.name}" in texts]
     if lines:
@@ -189,7 +190,6 @@ def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
     digest = hashlib.sha256(repr([(name, text) for name, _, text in modules]).encode()).hexdigest()
     entry = compose(plugs)
     texts |= {f"own_{plug.point.name}": text for plug, text in checked} | {"entry": entry.text}
-    files = {name: file for name, file, _ in modules}
     own = SimpleNamespace()
     for plug in plugs:
         name = f"own_{plug.point.name}"
@@ -210,7 +210,7 @@ def _checked(
 
     Its refusals are added to the lines.
     """
-    name = f"own_{point.name}"
+    name, empty = f"own_{point.name}", (Plug(point, {}, {}, (), (), {}), "")
     try:
         modules = read_modules(texts, shown, name)
         plug = read_plug(point, modules[-1])
@@ -218,11 +218,10 @@ def _checked(
         flown = None if modules[-1].refusals.found else budgeted(texts[name], modules)
     except RefusalError as error:  # no Python, or no part of the core
         lines.append(str(error))
-        flown = None
-    else:
-        lines += modules[-1].refusals.lines()
+        return empty
+    lines += modules[-1].refusals.lines()
     if flown is None:
-        return Plug(point, {}, {}, (), (), {}), ""
+        return empty
     hooks = {
         hook: (ARGUMENT, *arguments) if hook in flown.charged else arguments
         for hook, arguments in plug.hooks.items()
@@ -258,6 +257,11 @@ def _check_names(plugs: tuple[Plug, ...], shown: Mapping[str, str]) -> None:
                     raise LogicError(f"{path}: {name}: this name exists already: {seen[key]}")
                 of_sensor = f"{SENSED}." if thing.place.block.endswith(SENSED) else ""
                 seen[key] = f"{of_sensor}{name} in {path}"
+
+
+def _paths(files: Mapping[str, str]) -> dict[str, str]:
+    """Return the files of own modules, given by plug point, as shown to the user, by module."""
+    return {f"own_{name}": _shown(file) for name, file in files.items()}
 
 
 def _shown(file: str) -> str:

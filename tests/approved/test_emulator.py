@@ -643,7 +643,7 @@ FOUND: dict[str, Callable[[], list[str] | dict[str, str]]] = {
 }
 
 
-# Which reach nothing that the others do not.
+# They reach no line that the others do not.
 LONG = [
     *(f"{use} 2" for use in ("backwards", "kernel", "reported")), "backwards 3", "known DWARF 4", "memory 3", "profiles",
     "reported 1", "session 3", *(f"mistake {planted}" for planted in MISTAKES[::2]),

@@ -184,8 +184,8 @@ def texts() -> dict[str, str]:
         return make(functions, arrays)
 
     note("core", c99.translate().source)
-    for law in SHIPPED_LAWS.values():
-        note(Path(law).name, translation_of(LogicConfig(controller=str(law))).source)
+    for name, law in SHIPPED_LAWS.items():
+        note(f"{name}.py", translation_of(LogicConfig(controller=law)).source)
 
     class Own(RigidBody):
         mass, inertia = 0.1, (1e-3, 1e-3, 1e-3)

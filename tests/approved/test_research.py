@@ -258,7 +258,7 @@ def texts(find: Callable[[Path], Any], folder: Path) -> dict[str, str]:
     return {key: " ".join(map(str, flat(one))) for key, one in find(folder).items()}
 
 
-# Which reach nothing that the others do not.
+# They reach no line that the others do not.
 LONG = ["loops pitch", "loops height", "loops yaw"]
 
 

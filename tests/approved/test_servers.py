@@ -857,7 +857,7 @@ FOUND: dict[str, Callable[[], dict[str, str]]] = {
 }
 
 
-# Which reach nothing that the others do not.
+# They reach no line that the others do not.
 LONG = ["Robot 1", "Cameras 2", "Cameras 3"]
 
 

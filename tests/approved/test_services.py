@@ -388,7 +388,7 @@ FLIGHTS: dict[str, Callable[[], dict[str, str]]] = {
 }
 
 
-# Which reach nothing that the others do not.
+# They reach no line that the others do not.
 LONG = [
     *(f"mavlink {number}" for number in (1, 2, 4)),
     *(f"radio {number}" for number in (3, 4, 6)),

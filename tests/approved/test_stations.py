@@ -1018,7 +1018,7 @@ FOUND: dict[str, Callable[[], dict[str, str]]] = {
 }
 
 
-# Which reach nothing that the others do not.
+# They reach no line that the others do not.
 LONG = ["Captured 3", *(f"{kind} 2" for kind in ("Live", "Streamed", "Followed", "Mailbox"))]
 
 

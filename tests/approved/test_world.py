@@ -488,7 +488,7 @@ KINDS = (Flown, Flying, OwnBody, Carried, Watched, Pins, Window)
 FOUND = by_seed(KINDS, SEEDS, lambda kind, seed: kind(seed).told()) | {"fixed": fixed}
 
 
-# Which reach nothing that the others do not.
+# They reach no line that the others do not.
 LONG = [f"{kind} {seed}" for kind in ("Watched", "OwnBody", "Carried", "Window", "Flown") for seed in (1, 2)]
 
 

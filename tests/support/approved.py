@@ -27,13 +27,9 @@ def skip_unless(made_with: str, here: str) -> None:
         pytest.skip(f"differs, but was approved with {made_with}; here are {here}")
 
 
-def tiers(names: Iterable[Any], long: Collection[str]) -> list[Any]:
-    """Return the parameters of a test, those of some names for the long tier."""
-    called = {getattr(name, "__name__", name): name for name in names}
-    return [
-        pytest.param(one, id=name, marks=pytest.mark.long if name in long else ())
-        for name, one in called.items()
-    ]
+def tiers(names: Iterable[str], long: Collection[str]) -> list[Any]:
+    """Return the parameters of a test, of which some are for the long tier."""
+    return [pytest.param(name, marks=pytest.mark.long if name in long else ()) for name in names]
 
 
 def judge(path: Path, name: str, found: Any, *packages: str) -> None:

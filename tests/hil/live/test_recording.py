@@ -38,7 +38,7 @@ def links(run: Path) -> Iterator[Links]:
 
 
 def answer(links: Links, path: str, **headers: str) -> tuple[int, str | None, str]:
-    """Status, where it leads, and what it says; with a page or a text of its own, in UTF-8, and nothing else."""
+    """Return an answer's status, the address to which it redirects, and its text, whose type is checked, too."""
     connection = http.client.HTTPConnection(HOST, links.server_port, timeout=10)
     connection.request("GET", path, headers=headers)
     response = connection.getresponse()
